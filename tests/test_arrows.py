@@ -1,0 +1,54 @@
+"""The import arrows of the house: pipeline <- stitch <- tiler, Dask and zarr only where they live."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# What each package may import of ours.
+ALLOWED = {
+    "pipeline": {"pipeline"},
+    "stitch": {"stitch", "pipeline"},
+    "tiler": {"tiler", "stitch", "pipeline"},
+}
+# The steps of the pipeline that stitch may not see: it takes data rooms and steps, never the composition.
+COMPOSING = {"pipeline.tile"}
+# Libraries with a clock, a disk or a process, and the only places that may import them.
+HOMES = {
+    "dask": ("tiler/",),
+    "distributed": ("tiler/",),
+    "zarr": ("tiler/store.py",),
+    "laspy": ("tiler/",),
+    "pyogrio": ("tiler/",),
+    "meshio": ("tiler/",),
+    "rich": ("tiler/",),
+    "triangle": ("pipeline/plane.py",),
+}
+
+
+def sources() -> list[Path]:
+    return sorted(path for package in ALLOWED for path in (ROOT / package).rglob("*.py"))
+
+
+def imports(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module or ""
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_follow_the_arrows(path: Path) -> None:
+    place = path.relative_to(ROOT).as_posix()
+    package = place.split("/")[0]
+    for name in imports(path):
+        top = name.split(".")[0]
+        if top in ALLOWED:
+            assert top in ALLOWED[package], f"{place} imports {name}"
+            assert not (package == "stitch" and name in COMPOSING), f"{place} imports {name}"
+        if top in HOMES:
+            assert place.startswith(HOMES[top]), f"{place} imports {name}"
