@@ -1,0 +1,97 @@
+"""Meshes as arrays: the plane mesh, the columns over it, and the explicit tetrahedra and boundary."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Marker(IntEnum):
+    """What a boundary facet bounds."""
+
+    GROUND = 1
+    WALL = 2
+    ROOF = 3
+    TOP = 4
+    WEST = 5
+    EAST = 6
+    SOUTH = 7
+    NORTH = 8
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneMesh:
+    """Triangulation of the plane with the walls as edges (step 3.1).
+
+    Attributes
+    ----------
+    xy : float64, (n, 2)
+        Vertices in the region's CRS (m), sorted by (x, y): local order is region-wide order.
+    triangles : int32, (m, 3)
+        Vertex indices, ascending in each row; orientation is that of the coordinates.
+    building : int32, (m,)
+        Row of the city model whose footprint holds the triangle, -1 on open ground.
+    """
+
+    xy: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+    building: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnMesh:
+    """Columns of vertices over a plane mesh: the volume mesh until a file is written.
+
+    Attributes
+    ----------
+    plane : PlaneMesh
+        The triangles that the columns stand on.
+    z_start : int64, (n + 1,)
+        Column ``i`` has the levels ``z[z_start[i]:z_start[i + 1]]``.
+    z : float64, (z_start[-1],)
+        Heights of the levels (m), ascending in every column.
+    bottom : int32, (m, 3)
+        For each corner of a triangle, the level of that corner's column where the triangle's cells begin:
+        the ground, or the roof in a building.
+    """
+
+    plane: PlaneMesh
+    z_start: NDArray[np.int64]
+    z: NDArray[np.float64]
+    bottom: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class TetMesh:
+    """Explicit tetrahedra.
+
+    Attributes
+    ----------
+    points : float64, (n, 3)
+        Vertices in the region's CRS (m).
+    cells : int32, (m, 4)
+        Vertex indices; ``det(p1 - p0, p2 - p0, p3 - p0) > 0`` in every row.
+    """
+
+    points: NDArray[np.float64]
+    cells: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Boundary:
+    """The boundary of a `TetMesh` as marked triangles.
+
+    Attributes
+    ----------
+    facets : int32, (k, 3)
+        Indices of the mesh's points, counter-clockwise seen from outside the air.
+    marker : int32, (k,)
+        A `Marker` value each.
+    building : int64, (k,)
+        Number of the building (`CityModel.numbers`) that a wall or roof belongs to, -1 elsewhere.
+    """
+
+    facets: NDArray[np.int32]
+    marker: NDArray[np.int32]
+    building: NDArray[np.int64]
