@@ -1,0 +1,200 @@
+"""Step 3.1: the 2D mesh of the region with the walls as edges. The one place that knows Triangle."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+import triangle
+from numpy.typing import NDArray
+
+from pipeline.errors import GeometryError
+from pipeline.mesh import PlaneMesh
+
+MIN_ANGLE = 25.0  # degrees; Triangle's quality bound (paper, step 3.1; higher may not terminate)
+STEINER_FACTOR = 40  # Steiner points allowed for each expected vertex before Triangle is stopped
+AREA_TOLERANCE = 1e-6  # relative; triangles of a building against its footprint
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneGraph:
+    """Planar straight-line graph: what the 2D mesher has to respect.
+
+    Attributes
+    ----------
+    xy : float64, (n, 2)
+        Vertices (m), no two alike.
+    segments : int32, (s, 2)
+        Edges of the region's border and of all walls, each once.
+    seeds : float64, (b, 2)
+        A place in each building, which labels the triangles around it.
+    """
+
+    xy: NDArray[np.float64]
+    segments: NDArray[np.int32]
+    seeds: NDArray[np.float64]
+
+
+def plane_graph(bounds: tuple[float, float, float, float], polygons: NDArray[np.object_]) -> PlaneGraph:
+    """Collect the border of the region and all walls as a planar straight-line graph.
+
+    Parameters
+    ----------
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    polygons : object, (b,)
+        Footprints strictly inside the region that do not cross each other; they may share vertices and
+        walls.
+    """
+    corners = shapely.get_coordinates(shapely.box(*bounds).exterior)[:-1]
+    rings = shapely.get_rings(polygons)
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
+    ends = np.flatnonzero(np.diff(ring, append=-1) != 0)
+    from_vertex = np.setdiff1d(np.arange(len(xy)), ends)
+    walls = np.column_stack((from_vertex, from_vertex + 1)) + 4
+    border = np.column_stack((np.arange(4), np.roll(np.arange(4), -1)))
+    unique, index = np.unique(np.concatenate((corners, xy)), axis=0, return_inverse=True)
+    segments = np.sort(index.reshape(-1)[np.concatenate((border, walls))], axis=1)
+    seeds = shapely.get_coordinates(shapely.point_on_surface(polygons))
+    return PlaneGraph(unique, np.unique(segments, axis=0).astype(np.int32), seeds)
+
+
+def triangulate_plane(
+    graph: PlaneGraph, *, max_area: float, min_angle: float = MIN_ANGLE
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32], bool]:
+    """Triangulate a planar straight-line graph with bounds on area and angle.
+
+    This function is all that the rest knows of the 2D mesher: another one takes Triangle's place here.
+
+    Parameters
+    ----------
+    graph : PlaneGraph
+        Edges to respect.
+    max_area : float
+        Largest triangle (m2).
+    min_angle : float
+        Smallest angle (degrees), but at corners of the input that are sharper.
+
+    Returns
+    -------
+    xy : float64, (n, 2)
+        Vertices (m); those of the graph come first, bit for bit.
+    triangles : int32, (m, 3)
+        Vertex indices, counter-clockwise.
+    label : int32, (m,)
+        The seed that the triangle's area holds, -1 where none.
+    complete : bool
+        False if the limit on added vertices stopped the refinement.
+
+    Raises
+    ------
+    GeometryError
+        If Triangle cannot make sense of the graph.
+    """
+    # Near the origin the predicates keep all their digits; added vertices are moved back.
+    origin = np.floor(graph.xy.min(axis=0))
+    local = graph.xy - origin
+    width, height = local.max(axis=0)
+    limit = STEINER_FACTOR * int(len(local) + width * height / max_area + 100)
+    data = {"vertices": local, "segments": graph.segments}
+    if len(graph.seeds):
+        # Labels count from 1: Triangle gives 0 to what no seed reaches.
+        number = np.arange(1.0, len(graph.seeds) + 1)
+        data["regions"] = np.column_stack((graph.seeds - origin, number, np.zeros(len(number))))
+    try:
+        out = triangle.triangulate(data, f"pq{min_angle:g}a{max_area:.12g}AS{limit}")
+        triangles = out["triangles"].astype(np.int32)
+    except (RuntimeError, KeyError) as error:
+        place = ", ".join(f"{value:.1f}" for value in graph.xy.mean(axis=0))
+        raise GeometryError(
+            f"plane mesh around ({place}), step 3.1: the 2D mesher failed on {len(local)} vertices and "
+            f"{len(graph.segments)} segments ({error}); raise --clearance or mend the footprints there"
+        ) from error
+    xy = out["vertices"] + origin
+    xy[: len(local)] = graph.xy
+    label = np.full(len(triangles), -1, np.int32)
+    if len(graph.seeds):
+        label = np.rint(out["triangle_attributes"][:, 0]).astype(np.int32) - 1
+    return xy, triangles, label, len(xy) - len(local) < limit
+
+
+def mesh_plane(
+    bounds: tuple[float, float, float, float],
+    polygons: NDArray[np.object_],
+    *,
+    mesh_size: float,
+    min_angle: float = MIN_ANGLE,
+) -> tuple[PlaneMesh, bool]:
+    """Mesh the region with all walls as edges (paper, step 3.1).
+
+    Parameters
+    ----------
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    polygons : object, (b,)
+        Footprints as in `plane_graph`.
+    mesh_size : float
+        Target edge length h (m); no triangle is larger than h**2 / 2.
+    min_angle : float
+        Bound on the angles (degrees).
+
+    Returns
+    -------
+    PlaneMesh
+        Vertices sorted by (x, y), triangles by their vertices.
+    bool
+        False if refinement was stopped by the limit on added vertices.
+
+    Raises
+    ------
+    GeometryError
+        If the triangles of a building do not cover its footprint.
+    """
+    graph = plane_graph(bounds, polygons)
+    xy, triangles, label, complete = triangulate_plane(graph, max_area=mesh_size**2 / 2, min_angle=min_angle)
+    used = np.unique(triangles)
+    order = used[np.lexsort((xy[used, 1], xy[used, 0]))]
+    rank = np.empty(len(xy), np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    sorted_triangles = np.sort(rank[triangles], axis=1)
+    rows = np.lexsort(sorted_triangles.T[::-1])
+    plane = PlaneMesh(xy[order], sorted_triangles[rows], label[rows])
+    _check_areas(plane, bounds, polygons)
+    return plane, complete
+
+
+def signed_areas(plane: PlaneMesh) -> NDArray[np.float64]:
+    """Area of each triangle (m2), negative where its ascending vertices run clockwise."""
+    a, b, c = (plane.xy[plane.triangles[:, k]] for k in range(3))
+    u, v = b - a, c - a
+    area: NDArray[np.float64] = 0.5 * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    return area
+
+
+def _check_areas(
+    plane: PlaneMesh, bounds: tuple[float, float, float, float], polygons: NDArray[np.object_]
+) -> None:
+    area = np.abs(signed_areas(plane))
+    region = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
+    if area.min() <= 0 or abs(area.sum() - region) > AREA_TOLERANCE * region:
+        raise GeometryError(
+            f"plane mesh, step 3.1: triangles cover {area.sum():.6f} m2 of {region:.6f} m2, the smallest has "
+            f"{area.min():.3g} m2; raise --clearance"
+        )
+    if len(polygons) == 0:
+        return
+    inside = plane.building >= 0
+    covered = np.bincount(plane.building[inside], area[inside], len(polygons))
+    wanted = shapely.area(polygons)
+    worst = int(np.argmax(np.abs(covered - wanted) / wanted))
+    if abs(covered[worst] - wanted[worst]) > AREA_TOLERANCE * wanted[worst]:
+        x, y = graph_place(polygons[worst])
+        raise GeometryError(
+            f"plane mesh, step 3.1: building at ({x:.1f}, {y:.1f}) has {wanted[worst]:.3f} m2, its triangles "
+            f"cover {covered[worst]:.3f} m2; its walls cross a neighbour's: raise --clearance"
+        )
+
+
+def graph_place(polygon: shapely.Polygon) -> tuple[float, float]:
+    """Return a place in the polygon for a message."""
+    point = polygon.representative_point()
+    return float(point.x), float(point.y)
