@@ -1,0 +1,100 @@
+"""Step 3.4: which layers of each column lie in a building and are removed."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import GeometryError
+from pipeline.mesh import PlaneMesh
+
+MIN_SQUEEZE = 0.4  # a layer below a roof is never squeezed under this part of its height
+
+
+def count_removed_layers(
+    z: NDArray[np.float64],
+    plane: PlaneMesh,
+    roof: NDArray[np.float64],
+    wall_ground: NDArray[np.float64],
+    *,
+    layer_height: float,
+) -> NDArray[np.int32]:
+    """Choose the layer that becomes the roof of each building: the closest, within limits (step 3.4).
+
+    Parameters
+    ----------
+    z : float64, (n, n_layers + 1)
+        Levels after step 3.3 (m).
+    plane : PlaneMesh
+        Plane mesh; every building has a triangle.
+    roof : float64, (b,)
+        Absolute roof heights (m).
+    wall_ground : float64, (b,)
+        Highest terrain at the walls of each building (m).
+    layer_height : float
+        Height of a layer of the slab (m).
+
+    Returns
+    -------
+    int32, (b,)
+        Number of layers removed in each building, at least 1 and at most ``n_layers - 1``.
+
+    Notes
+    -----
+    The closest level is that of the mean over the building's corners of triangles. No more layers are
+    removed than leave each at least 0.4 of its height between the highest terrain at a wall and the roof.
+    """
+    n_buildings, n_layers = len(roof), z.shape[1] - 1
+    inside = plane.building >= 0
+    label = np.repeat(plane.building[inside], 3)
+    corner = plane.triangles[inside].ravel()
+    count = np.bincount(label, minlength=n_buildings)
+    mean = np.column_stack(
+        [np.bincount(label, z[corner, k], n_buildings) / count for k in range(n_layers + 1)]
+    )
+    closest = np.abs(mean - roof[:, None]).argmin(axis=1)
+    room = np.floor((roof - wall_ground) / (MIN_SQUEEZE * layer_height)).astype(np.int64)
+    removed: NDArray[np.int32] = np.clip(np.minimum(closest, room), 1, n_layers - 1).astype(np.int32)
+    return removed
+
+
+def first_levels(plane: PlaneMesh, removed: NDArray[np.int32]) -> NDArray[np.int32]:
+    """First level of the cells over each triangle: 0 on open ground, the roof in a building."""
+    return np.where(plane.building >= 0, np.append(removed, 0)[plane.building], 0).astype(np.int32)
+
+
+def first_kept(plane: PlaneMesh, first: NDArray[np.int32]) -> NDArray[np.int32]:
+    """First level of each column that a cell uses."""
+    kept = np.full(len(plane.xy), np.iinfo(np.int32).max, np.int32)
+    np.minimum.at(kept, plane.triangles.ravel(), np.repeat(first, 3))
+    return kept
+
+
+def check_headroom(
+    z: NDArray[np.float64],
+    plane: PlaneMesh,
+    roof: NDArray[np.float64],
+    ids: NDArray[np.str_],
+    *,
+    layer_height: float,
+) -> None:
+    """Refuse a roof that comes closer than half a layer to the top of the domain.
+
+    Raises
+    ------
+    GeometryError
+        With the building, its place, and the domain height that would do.
+    """
+    inside = plane.building >= 0
+    label = np.repeat(plane.building[inside], 3)
+    corner = plane.triangles[inside].ravel()
+    top = np.full(len(roof), np.inf)
+    np.minimum.at(top, label, z[corner, -1])
+    missing = roof + layer_height / 2 - top
+    if len(roof) == 0 or missing.max() <= 0:
+        return
+    worst = int(missing.argmax())
+    x, y = plane.xy[corner[label == worst]].mean(axis=0)
+    raise GeometryError(
+        f"building {ids[worst]} at ({x:.1f}, {y:.1f}), step 3.4: its roof at {roof[worst]:.1f} m leaves no "
+        f"air below the domain's top at {top[worst]:.1f} m; raise --domain-height by "
+        f"{np.ceil(missing[worst]):.0f} m or more, or correct the building's height"
+    )
