@@ -100,9 +100,7 @@ def make_ids(polygons: NDArray[np.object_]) -> NDArray[np.str_]:
         ``"g"`` and 13 hexadecimal digits.
     """
     blobs = shapely.to_wkb(shapely.normalize(shapely.force_2d(polygons)), byte_order=1)
-    return np.array(
-        ["g" + hashlib.blake2b(blob, digest_size=7).hexdigest()[:13] for blob in blobs], dtype=np.str_
-    )
+    return np.array(["g" + hashlib.blake2b(blob, digest_size=7).hexdigest()[:13] for blob in blobs], dtype=np.str_)
 
 
 def _number(name: str) -> int:

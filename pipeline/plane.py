@@ -90,7 +90,8 @@ def triangulate_plane(
     GeometryError
         If Triangle cannot make sense of the graph.
     """
-    # Near the origin the predicates keep all their digits; added vertices are moved back.
+    # Near the origin the predicates keep all their digits. A whole number close by is taken off and put
+    # back without rounding, so the graph's vertices return bit for bit.
     origin = np.floor(graph.xy.min(axis=0))
     local = graph.xy - origin
     width, height = local.max(axis=0)
@@ -103,14 +104,13 @@ def triangulate_plane(
     try:
         out = triangle.triangulate(data, f"pq{min_angle:g}a{max_area:.12g}AS{limit}")
         triangles = out["triangles"].astype(np.int32)
-    except (RuntimeError, KeyError) as error:
+    except (RuntimeError, KeyError, ValueError) as error:
         place = ", ".join(f"{value:.1f}" for value in graph.xy.mean(axis=0))
         raise GeometryError(
             f"plane mesh around ({place}), step 3.1: the 2D mesher failed on {len(local)} vertices and "
             f"{len(graph.segments)} segments ({error}); raise --clearance or mend the footprints there"
         ) from error
     xy = out["vertices"] + origin
-    xy[: len(local)] = graph.xy
     label = np.full(len(triangles), -1, np.int32)
     if len(graph.seeds):
         label = np.rint(out["triangle_attributes"][:, 0]).astype(np.int32) - 1

@@ -35,6 +35,4 @@ class PointCloud:
     def __post_init__(self) -> None:
         n = len(self.xyz)
         if self.xyz.shape != (n, 3) or self.classification.shape != (n,):
-            raise ValueError(
-                f"xyz {self.xyz.shape} and classification {self.classification.shape} do not match"
-            )
+            raise ValueError(f"xyz {self.xyz.shape} and classification {self.classification.shape} do not match")

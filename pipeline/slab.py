@@ -73,15 +73,11 @@ def _terrain_on_grid(
 def _damping(wave: NDArray[np.float64], height: float, domain_height: float) -> NDArray[np.float64]:
     """cosh(k (H - z)) / cosh(k H), written so that nothing overflows."""
     above = np.exp(-2 * wave * (domain_height - height))
-    damping: NDArray[np.float64] = (
-        np.exp(-wave * height) * (1 + above) / (1 + np.exp(-2 * wave * domain_height))
-    )
+    damping: NDArray[np.float64] = np.exp(-wave * height) * (1 + above) / (1 + np.exp(-2 * wave * domain_height))
     return damping
 
 
-def _bilinear(
-    position: NDArray[np.float64], n_x: int, n_y: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _bilinear(position: NDArray[np.float64], n_x: int, n_y: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Flat indices and weights of the four nodes around each position, given in units of the grid."""
     cell = np.clip(np.floor(position).astype(np.int64), 0, [n_x - 1, n_y - 1])
     s, t = (position - cell).T

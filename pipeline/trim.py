@@ -47,9 +47,7 @@ def count_removed_layers(
     label = np.repeat(plane.building[inside], 3)
     corner = plane.triangles[inside].ravel()
     count = np.bincount(label, minlength=n_buildings)
-    mean = np.column_stack(
-        [np.bincount(label, z[corner, k], n_buildings) / count for k in range(n_layers + 1)]
-    )
+    mean = np.column_stack([np.bincount(label, z[corner, k], n_buildings) / count for k in range(n_layers + 1)])
     closest = np.abs(mean - roof[:, None]).argmin(axis=1)
     room = np.floor((roof - wall_ground) / (MIN_SQUEEZE * layer_height)).astype(np.int64)
     removed: NDArray[np.int32] = np.clip(np.minimum(closest, room), 1, n_layers - 1).astype(np.int32)
@@ -74,6 +72,7 @@ def check_headroom(
     roof: NDArray[np.float64],
     ids: NDArray[np.str_],
     *,
+    domain_height: float,
     layer_height: float,
 ) -> None:
     """Refuse a roof that comes closer than half a layer to the top of the domain.
@@ -93,8 +92,9 @@ def check_headroom(
         return
     worst = int(missing.argmax())
     x, y = plane.xy[corner[label == worst]].mean(axis=0)
+    enough = np.ceil(domain_height + missing[worst] + layer_height)
     raise GeometryError(
         f"building {ids[worst]} at ({x:.1f}, {y:.1f}), step 3.4: its roof at {roof[worst]:.1f} m leaves no "
-        f"air below the domain's top at {top[worst]:.1f} m; raise --domain-height by "
-        f"{np.ceil(missing[worst]):.0f} m or more, or correct the building's height"
+        f"air below the domain's top at {top[worst]:.1f} m; raise --domain-height to {enough:.0f}, or correct "
+        "the building's height"
     )
