@@ -180,10 +180,8 @@ def _choose_needless(rings: _Rings, tolerance: float) -> NDArray[np.int64]:
     """Choose the vertices whose triangle is thinner than the tolerance and than those of both neighbours."""
     back, ahead, base = _sides(rings, slice(None))
     double_area = np.abs(back[:, 0] * ahead[:, 1] - back[:, 1] * ahead[:, 0])
-    leg = np.minimum(np.hypot(*back.T), np.hypot(*ahead.T))
     longest = np.maximum(np.maximum(np.hypot(*back.T), np.hypot(*ahead.T)), base)
-    # The altitude is below the shortest side up to rounding only: a repeated vertex must give exactly zero.
-    altitude = np.minimum(double_area / np.where(longest > 0, longest, 1.0), leg)
+    altitude = double_area / np.where(longest > 0, longest, 1.0)
     thin = np.flatnonzero(altitude < tolerance)
     if not len(thin):
         return thin

@@ -40,7 +40,7 @@ def assert_same(a: Footprints, b: Footprints) -> None:
 
 
 def test_a_ring_is_oriented_canonical_and_without_needless_vertices() -> None:
-    corners = [(10, 8), (10, 4), (10, 0), (5, 0.004), (0, 0), (0, 0.003), (0, 8)]
+    corners = [(10, 8), (10.003, 8.003), (10, 4), (10, 0), (5, 0.004), (0, 0), (0, 0), (0, 0.003), (0, 8)]
     result, notes = clean(shapely.Polygon([(x, y, 7.0) for x, y in corners]))
     (polygon,) = result.polygons
     assert not polygon.has_z
@@ -49,9 +49,10 @@ def test_a_ring_is_oriented_canonical_and_without_needless_vertices() -> None:
 
 
 def test_the_same_ring_from_any_start_in_any_direction_gives_the_same_bytes() -> None:
-    corners = [(0.1, 0.2), (10, 0), (10.3, 8), (4, 6), (-0.0, 8)]
     blobs = set()
     for start in range(5):
+        zero = -0.0 if start % 2 else 0.0
+        corners = [(0.1, 0.2), (10, 0), (10.3, 8), (4, 6), (zero, 8)]
         turned = corners[start:] + corners[:start]
         for way in (turned, turned[::-1]):
             blobs.add(shapely.to_wkb(clean(shapely.Polygon(way))[0].polygons[0]))
@@ -98,6 +99,19 @@ def test_a_self_touching_ring_becomes_a_courtyard() -> None:
     (polygon,) = result.polygons
     assert polygon.is_valid
     assert polygon.area == pytest.approx(80 - 6)
+
+
+def test_parts_that_overlap_are_united() -> None:
+    result, notes = clean(shapely.MultiPolygon([shapely.box(0, 0, 4, 4), shapely.box(2, 2, 6, 6)]))
+    assert result.polygons[0].area == pytest.approx(28)
+    assert count_notes(notes) == {"footprint-repaired": 1}
+
+
+def test_a_hole_that_a_dropped_vertex_leaves_outside_is_repaired() -> None:
+    shell = [(0, 0), (5, -0.009), (10, 0), (10, 8), (0, 8)]
+    result, _ = clean(shapely.Polygon(shell, [[(5, -0.004), (2, 4), (8, 4)]]))
+    assert shapely.is_valid(result.polygons).all()
+    assert shapely.area(result.polygons).sum() == pytest.approx(80 - 12, abs=0.1)
 
 
 def test_parts_of_collections_are_taken_and_lines_left() -> None:

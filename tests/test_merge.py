@@ -278,6 +278,21 @@ def test_a_repair_that_comes_too_close_to_a_neighbour_merges_with_it() -> None:
     assert merged.counts["repaired-buffer"] >= 1
 
 
+def test_a_merged_polygon_with_a_short_edge_is_repaired() -> None:
+    notched = Polygon([(0, 0), (10, 0), (10, 10), (5.3, 10), (5.3, 6), (4.7, 6), (4.7, 10), (0, 10)])
+    # Their hull has the vertices (10, 10) and (10.06, 9.97).
+    merged = merge(notched, Polygon([(10.06, 9.97), (10.06, 0), (16, 0)]))
+    assert used(merged) == {"hull": 1, "repaired-simplify": 1}
+    assert merged.method == ("repaired-simplify",)
+    assert len(merged.polygons[0].exterior.coords) == 5
+
+
+def test_needless_vertices_go_also_where_nothing_is_merged() -> None:
+    merged = merge(Polygon([(0, 0), (2, 0.005), (4, 0), (4, 4), (0, 4)]))
+    assert merged.polygons[0].equals(box(0, 0, 4, 4))
+    assert merged.method == ("single",)
+
+
 def test_a_ring_that_touches_another_has_no_clearance() -> None:
     touching = UNSOUND["hole that touches the shell"][0]
     assert shapely.minimum_clearance(touching) > 1.0
