@@ -1,0 +1,105 @@
+"""Difficult real footprints, group by group through steps 1.4 and 2.1: all sound, nothing lost unsaid."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.citymodel import Footprints
+from pipeline.clearance import is_sound
+from pipeline.footprints import clean_footprints
+from pipeline.merge import MergedFootprints, merge_footprints
+from pipeline.notes import Note
+
+MIN_AREA, TOLERANCE, CLEARANCE, MIN_HOLE_AREA, FLOOR = 5.0, 0.01, 1.0, 10.0, 0.1
+# The group numbers of the file; gaps in them are as published.
+GROUPS = [*range(1, 20), *range(57, 99), *range(141, 189), *range(199, 214)]
+# A note of these kinds says that a footprint, or a part of one, is not there.
+GONE = {
+    "footprint-duplicate",
+    "footprint-empty",
+    "footprint-not-finite",
+    "footprint-sliver",
+    "footprint-too-small",
+}
+
+pytestmark = pytest.mark.shared
+
+
+@cache
+def read(path: Path) -> tuple[NDArray[np.object_], NDArray[np.int32]]:
+    # The file's coordinates are metres, whatever CRS it states.
+    meta, _, blobs, fields = pyogrio.raw.read(path)
+    group: NDArray[np.int32] = dict(zip(meta["fields"], fields, strict=True))["group"]
+    return shapely.from_wkb(blobs), group
+
+
+@pytest.fixture
+def nasty(shared_data: Path) -> tuple[NDArray[np.object_], NDArray[np.int32]]:
+    return read(shared_data / "nasty_footprints.geojson")
+
+
+def simplify(polygons: NDArray[np.object_]) -> tuple[Footprints, tuple[Note, ...], MergedFootprints]:
+    ids = np.array([f"{row:03d}" for row in range(len(polygons))], dtype=np.str_)
+    rows = Footprints(polygons, ids, np.full(len(polygons), np.nan))
+    clean, notes = clean_footprints(rows, min_area=MIN_AREA, tolerance=TOLERANCE)
+    merged = merge_footprints(
+        clean.polygons, clearance=CLEARANCE, min_hole_area=MIN_HOLE_AREA, floor=FLOOR, tolerance=TOLERANCE
+    )
+    return clean, notes, merged
+
+
+def assert_promises(clean: Footprints, merged: MergedFootprints) -> None:
+    assert shapely.is_valid(merged.polygons).all()
+    assert is_sound(merged.polygons, FLOOR).all()
+    distance = shapely.distance(merged.polygons[:, None], merged.polygons[None, :])
+    assert (distance[~np.eye(len(distance), dtype=np.bool_)] >= CLEARANCE).all()
+    rows = [row for members in merged.members for row in members.tolist()]
+    assert sorted(rows) == list(range(len(clean.ids)))
+
+
+def assert_nothing_lost(
+    given: NDArray[np.object_], notes: tuple[Note, ...], merged: MergedFootprints
+) -> None:
+    """Check that each footprint, and each part of one, is covered in one place at least or noted."""
+    gone = {note.subject for note in notes if note.kind in GONE}
+    city = shapely.union_all(merged.polygons)
+    for row, geometry in enumerate(given):
+        for part in shapely.get_parts(shapely.make_valid(geometry, method="structure")):
+            covered = city.distance(part.representative_point()) < FLOOR
+            assert covered or f"{row:03d}" in gone, f"footprint {row}: {part.wkt[:200]}"
+
+
+@pytest.mark.parametrize("number", GROUPS)
+def test_a_group_becomes_sound_and_keeps_its_buildings(
+    number: int, nasty: tuple[NDArray[np.object_], NDArray[np.int32]]
+) -> None:
+    polygons = nasty[0][nasty[1] == number]
+    clean, notes, merged = simplify(polygons)
+    assert_promises(clean, merged)
+    assert_nothing_lost(polygons, notes, merged)
+    # What merging covers, each building keeps but for the margins of the repairs.
+    assert merged_area_lost(clean, merged) <= FLOOR * shapely.length(clean.polygons).sum()
+
+
+def merged_area_lost(clean: Footprints, merged: MergedFootprints) -> float:
+    return float(shapely.union_all(clean.polygons).difference(shapely.union_all(merged.polygons)).area)
+
+
+def test_the_groups_are_those_of_the_file(nasty: tuple[NDArray[np.object_], NDArray[np.int32]]) -> None:
+    assert np.unique(nasty[1]).tolist() == GROUPS
+    assert len(nasty[0]) == 352
+
+
+def test_all_groups_together_merge_as_they_do_alone(
+    nasty: tuple[NDArray[np.object_], NDArray[np.int32]],
+) -> None:
+    clean, notes, merged = simplify(nasty[0])
+    assert_promises(clean, merged)
+    assert_nothing_lost(nasty[0], notes, merged)
+    alone = [simplify(nasty[0][nasty[1] == number])[2].polygons for number in GROUPS]
+    assert set(shapely.to_wkb(np.concatenate(alone))) == set(shapely.to_wkb(merged.polygons))
