@@ -58,14 +58,17 @@ class TinyCity:
 
 
 def make_city(
-    *, houses: Mapping[str, tuple[tuple[Square, ...], int]] = HOUSES, shape: tuple[int, int] = (10, 8)
+    *,
+    houses: Mapping[str, tuple[tuple[Square, ...], int]] = HOUSES,
+    shape: tuple[int, int] = (10, 8),
+    dtm: PlaneDtm = PlaneDtm(),
 ) -> TinyCity:
     """Build a box of prisms over a grid of squares and take out those under the roofs.
 
     The default has a house with a lower neighbour on a party wall, a courtyard, a house on the region's
     border, and two houses that touch in a corner.
     """
-    dtm, (nx, ny) = PlaneDtm(), shape
+    nx, ny = shape
     model = _make_model(houses, dtm)
     x, y = (CORNER[axis] + SIZE * np.arange(n + 1) for axis, n in enumerate(shape))
     xy = np.array([(a, b) for a in x for b in y])

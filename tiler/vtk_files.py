@@ -201,11 +201,14 @@ def read_vtp(path: Path) -> BoundaryPiece:
     Raises
     ------
     InputError
-        If the file is missing or damaged, or lacks `marker`, `building` or `vertex`.
+        If the file is missing or damaged, lacks `marker`, `building` or `vertex`, or has a coordinate
+        that is not finite.
     """
     sections = read_data_file(path, "PolyData")
     points, marks, point_data = sections["Points"]["Points"], sections["CellData"], sections["PointData"]
     facets = _read_rows(path, sections["Polys"], 3, len(points))
+    if not np.isfinite(points).all():
+        raise damaged(path, "a coordinate is not finite")
     for name, arrays in (("marker", marks), ("building", marks), ("vertex", point_data)):
         if name not in arrays or arrays[name].ndim != 1:
             raise damaged(path, f"the array {name!r} is missing")
