@@ -1,0 +1,292 @@
+"""VTK's XML files of a mesh and its boundary, written and read by hand (step 3.6).
+
+Arrays are appended raw in zlib blocks, little-endian, so a file streams to disk and no array is ever held
+twice. ParaView and vtk read all four kinds, meshio the volume.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.mesh import Boundary, TetMesh
+from tiler.vtk_xml import (
+    INDEX_BYTES,
+    VTK_TYPES,
+    Stream,
+    damaged,
+    make_stream,
+    opened,
+    read_data_file,
+    write_data_file,
+    write_index,
+)
+
+TETRA = 10  # VTK_TETRA
+Arrays = Mapping[str, NDArray[Any]]
+NO_ARRAYS: Arrays = {}
+
+
+@dataclass(frozen=True, eq=False)
+class VolumePiece:
+    """What a VTU file holds.
+
+    Attributes
+    ----------
+    mesh : TetMesh
+        Its points and cells.
+    point_data, cell_data : mapping of name to array, first axis (n_points,) or (n_cells,)
+        Its further arrays.
+    """
+
+    mesh: TetMesh
+    point_data: Arrays
+    cell_data: Arrays
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryPiece:
+    """What a VTP file holds.
+
+    Attributes
+    ----------
+    points : float64, (n, 3)
+        The vertices that facets use (m).
+    boundary : Boundary
+        Facets as indices of `points`, with their marks.
+    vertex : int64, (n,)
+        Index of each point among the points of the volume mesh.
+    point_data : mapping of name to array, first axis (n,)
+        Further arrays.
+    """
+
+    points: NDArray[np.float64]
+    boundary: Boundary
+    vertex: NDArray[np.int64]
+    point_data: Arrays
+
+
+def write_vtu(
+    path: Path, mesh: TetMesh, *, point_data: Arrays = NO_ARRAYS, cell_data: Arrays = NO_ARRAYS
+) -> None:
+    """Write a volume mesh as a VTU file.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it appears whole or not at all.
+    mesh : TetMesh
+        The tetrahedra; coordinates are written as they are, float64 (m).
+    point_data, cell_data : mapping of name to array, first axis (n_points,) or (n_cells,)
+        Further arrays: float64, float32, int64, int32 or uint8.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    ValueError
+        If an array has another length or type.
+
+    Notes
+    -----
+    Same input, same bytes. Beside the input, memory holds one block.
+    """
+    n_points, n_cells = len(mesh.points), len(mesh.cells)
+    sections = {
+        "Points": [make_stream("Points", mesh.points, np.float64)],
+        "Cells": [*_connectivity(mesh.cells, n_points), _types(n_cells)],
+        "PointData": _data_streams(point_data, n_points),
+        "CellData": _data_streams(cell_data, n_cells),
+    }
+    counts = {"NumberOfPoints": n_points, "NumberOfCells": n_cells}
+    write_data_file(path, "UnstructuredGrid", counts, sections)
+
+
+def write_vtp(
+    path: Path, points: NDArray[np.float64], boundary: Boundary, *, point_data: Arrays = NO_ARRAYS
+) -> None:
+    """Write the boundary of a volume mesh as a VTP file, with the points that it uses alone.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it appears whole or not at all.
+    points : float64, (n, 3)
+        Points of the volume mesh (m).
+    boundary : Boundary
+        Marked facets; `marker` and `building` become cell arrays.
+    point_data : mapping of name to array, first axis (n,)
+        Further arrays on the volume mesh's points. The array ``vertex``, each point's index among
+        `points`, is always there.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    ValueError
+        If an array has another length or type.
+    """
+    used = np.zeros(len(points), np.bool_)
+    used[boundary.facets.ravel()] = True
+    vertex = np.flatnonzero(used)
+    local = np.cumsum(used, dtype=np.int64) - 1
+    compact = {name: np.asarray(array)[vertex] for name, array in _checked(point_data, len(points)).items()}
+    n_facets = len(boundary.facets)
+    sections = {
+        "Points": [make_stream("Points", points[vertex], np.float64)],
+        "Polys": _connectivity(local[boundary.facets].reshape(-1, 3), len(vertex)),
+        "PointData": [make_stream("vertex", vertex, np.int64), *_data_streams(compact, len(vertex))],
+        "CellData": _data_streams(
+            {
+                "marker": boundary.marker.astype(np.int32, copy=False),
+                "building": boundary.building.astype(np.int64, copy=False),
+            },
+            n_facets,
+        ),
+    }
+    counts = {"NumberOfPoints": len(vertex), "NumberOfVerts": 0, "NumberOfLines": 0}
+    counts |= {"NumberOfStrips": 0, "NumberOfPolys": n_facets}
+    write_data_file(path, "PolyData", counts, sections)
+
+
+def write_pvtu(path: Path, pieces: Sequence[Path]) -> None:
+    """Write the index file over VTU pieces; see `write_pvtp`."""
+    write_index(path, pieces, "UnstructuredGrid")
+
+
+def write_pvtp(path: Path, pieces: Sequence[Path]) -> None:
+    """Write the index file over VTP pieces.
+
+    Parameters
+    ----------
+    path : Path
+        The index file; pieces are named relative to its folder, so the whole can be moved.
+    pieces : sequence of at least one Path
+        Existing pieces. Their declarations of arrays must agree: the index repeats them.
+
+    Raises
+    ------
+    InputError
+        If a piece cannot be read or declares other arrays than the first.
+    ValueError
+        If there is no piece.
+    """
+    write_index(path, pieces, "PolyData")
+
+
+def read_vtu(path: Path) -> VolumePiece:
+    """Read a VTU file that `write_vtu` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, or holds something else than tetrahedra.
+    """
+    sections = read_data_file(path, "UnstructuredGrid")
+    points, cells = sections["Points"]["Points"], sections["Cells"]
+    rows = _read_rows(path, cells, 4, len(points))
+    if "types" not in cells or np.any(cells["types"] != TETRA):
+        raise damaged(path, "it holds cells that are no tetrahedra")
+    return VolumePiece(TetMesh(points, rows), sections["PointData"], sections["CellData"])
+
+
+def read_vtp(path: Path) -> BoundaryPiece:
+    """Read a VTP file that `write_vtp` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, lacks `marker`, `building` or `vertex`, or has a coordinate
+        that is not finite.
+    """
+    sections = read_data_file(path, "PolyData")
+    points, marks, point_data = sections["Points"]["Points"], sections["CellData"], sections["PointData"]
+    facets = _read_rows(path, sections["Polys"], 3, len(points))
+    if not np.isfinite(points).all():
+        raise damaged(path, "a coordinate is not finite")
+    for name, arrays in (("marker", marks), ("building", marks), ("vertex", point_data)):
+        if name not in arrays or arrays[name].ndim != 1:
+            raise damaged(path, f"the array {name!r} is missing")
+    boundary = Boundary(
+        facets,
+        marks["marker"].astype(np.int32, copy=False),
+        marks["building"].astype(np.int64, copy=False),
+    )
+    rest = {name: array for name, array in point_data.items() if name != "vertex"}
+    return BoundaryPiece(points, boundary, point_data["vertex"].astype(np.int64, copy=False), rest)
+
+
+def read_piece_paths(path: Path) -> list[Path]:
+    """Read which pieces an index file (PVTU or PVTP) names, in its order.
+
+    Raises
+    ------
+    InputError
+        If the index file is missing or damaged, or if a piece is missing.
+    """
+    with opened(path) as file:
+        text = file.read(INDEX_BYTES)
+    try:
+        root = ET.fromstring(text)
+    except (ET.ParseError, ValueError, LookupError) as error:
+        raise damaged(path, str(error)) from None
+    pieces = [path.parent / element.get("Source", "") for element in root.findall("./*/Piece")]
+    if not pieces:
+        raise damaged(path, "it names no piece")
+    for piece in pieces:
+        if not piece.is_file():
+            raise InputError(f"{path}: the piece {piece} is missing; run the tile again")
+    return pieces
+
+
+def _connectivity(rows: NDArray[Any], n_points: int) -> list[Stream]:
+    n_rows, width = rows.shape
+    index = np.int32 if n_points < 2**31 else np.int64
+    offset = np.int32 if rows.size < 2**31 else np.int64
+    flat: NDArray[Any] = np.ascontiguousarray(rows).reshape(-1)
+
+    def offsets(i: int, j: int) -> NDArray[Any]:
+        ends: NDArray[Any] = np.arange(i + 1, j + 1, dtype=np.int64) * width
+        return ends
+
+    return [
+        Stream("connectivity", np.dtype(index), 1, rows.size, lambda i, j: flat[i:j]),
+        Stream("offsets", np.dtype(offset), 1, n_rows, offsets),
+    ]
+
+
+def _types(n_cells: int) -> Stream:
+    return Stream("types", np.dtype(np.uint8), 1, n_cells, lambda i, j: np.full(j - i, TETRA, np.uint8))
+
+
+def _data_streams(arrays: Arrays, n_rows: int) -> list[Stream]:
+    checked = _checked(arrays, n_rows)
+    return [make_stream(name, array, array.dtype) for name, array in checked.items()]
+
+
+def _checked(arrays: Arrays, n_rows: int) -> Arrays:
+    for name, array in arrays.items():
+        if array.dtype.name not in VTK_TYPES or array.ndim not in (1, 2) or len(array) != n_rows:
+            raise ValueError(
+                f"array {name!r} is {array.dtype} {array.shape}; expected {n_rows} rows of {list(VTK_TYPES)}"
+            )
+    return arrays
+
+
+def _read_rows(path: Path, arrays: Arrays, width: int, n_points: int) -> NDArray[np.int32]:
+    """Check that the rows have `width` indices each, all of them of points, and return them."""
+    if not {"connectivity", "offsets"} <= arrays.keys():
+        raise damaged(path, "no connectivity")
+    flat, offsets = arrays["connectivity"], arrays["offsets"]
+    if not np.array_equal(offsets, np.arange(1, len(offsets) + 1) * width):
+        raise damaged(path, f"cells that have not {width} vertices")
+    if flat.size and (flat.min() < 0 or flat.max() >= n_points):
+        raise damaged(path, f"vertex {flat.min()}..{flat.max()} of {n_points} points")
+    if n_points >= 2**31:
+        raise damaged(path, f"{n_points} points; a piece has fewer than 2**31")
+    return flat.astype(np.int32, copy=False).reshape(-1, width)

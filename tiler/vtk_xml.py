@@ -1,0 +1,289 @@
+"""VTK's XML container: named arrays, appended raw in zlib blocks, streamed to disk and read back.
+
+Files are little-endian with UInt64 headers. Nothing here knows of meshes: see `tiler.vtk_files`.
+"""
+
+import os
+import threading
+import xml.etree.ElementTree as ET
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any, BinaryIO
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+
+BLOCK_BYTES = 1 << 18  # uncompressed bytes of a zlib block
+ZLIB_LEVEL = 1
+HEAD_BYTES = 1 << 20  # bound on the XML in front of the data
+INDEX_BYTES = 1 << 28  # bound on an index file
+MAX_RATIO = 1032  # zlib cannot compress better than this
+# VTK's names of the types that we write.
+VTK_TYPES = {
+    "float64": "Float64",
+    "float32": "Float32",
+    "int64": "Int64",
+    "int32": "Int32",
+    "uint8": "UInt8",
+}
+DTYPES = {name: np.dtype(dtype).newbyteorder("<") for dtype, name in VTK_TYPES.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """One array on its way to the disk: ``items(i, j)`` makes its numbers ``i`` to ``j``."""
+
+    name: str
+    dtype: np.dtype[Any]
+    components: int
+    n_items: int
+    items: Callable[[int, int], NDArray[Any]]
+
+
+Sections = dict[str, list[Stream]]
+
+
+@dataclass(frozen=True)
+class _Head:
+    """The XML of a file: `piece` has the counts, `start` is where appended data begins."""
+
+    piece: ET.Element
+    start: int
+
+
+def make_stream(name: str, array: NDArray[Any], dtype: Any) -> Stream:
+    """Make a stream of an array (n,) or (n, components), to be written as `dtype`."""
+    flat = np.ascontiguousarray(array).reshape(-1)
+    components = array.shape[1] if array.ndim == 2 else 1
+    return Stream(name, np.dtype(dtype), components, flat.size, lambda i, j: flat[i:j])
+
+
+def write_data_file(path: Path, kind: str, counts: Mapping[str, int], sections: Sections) -> None:
+    """Write a file of one piece: ``counts`` are the piece's attributes, ``kind`` is VTK's data set type.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written; then it is not there, or is the old one.
+    """
+    streams = [stream for streams in sections.values() for stream in streams]
+    with _replacing(path) as file:
+        file.write(_render(kind, counts, sections, [0] * len(streams)))
+        start, offsets = file.tell(), []
+        for stream in streams:
+            offsets.append(file.tell() - start)
+            _write_blocks(file, stream)
+        file.write(b"\n  </AppendedData>\n</VTKFile>\n")
+        file.seek(0)
+        file.write(_render(kind, counts, sections, offsets))
+
+
+def _render(kind: str, counts: Mapping[str, int], sections: Sections, offsets: Sequence[int]) -> bytes:
+    """Make the XML in front of the data; its length does not depend on the offsets."""
+    left = iter(offsets)
+    numbers = " ".join(f'{name}="{n}"' for name, n in counts.items())
+    lines = [*_opening(kind, ' header_type="UInt64" compressor="vtkZLibDataCompressor"')]
+    lines += [f"  <{kind}>", f"    <Piece {numbers}>"]
+    for section, streams in sections.items():
+        lines.append(f"      <{section}>")
+        for stream in streams:
+            where = f'offset="{next(left)}"'
+            lines.append(f'        <DataArray {_declare(stream)} format="appended" {where:<28}/>')
+        lines.append(f"      </{section}>")
+    lines += ["    </Piece>", f"  </{kind}>", '  <AppendedData encoding="raw">', "   _"]
+    return "\n".join(lines).encode()
+
+
+def _opening(kind: str, more: str) -> list[str]:
+    return [
+        '<?xml version="1.0"?>',
+        f'<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian"{more}>',
+    ]
+
+
+def _declare(stream: Stream) -> str:
+    return _declaration(VTK_TYPES[stream.dtype.name], stream.name, str(stream.components))
+
+
+def _declaration(vtk_type: str, name: str, components: str) -> str:
+    # VTK leaves the number out for scalars, and meshio makes columns (n, 1) of them if it is there.
+    width = "" if components == "1" else f" NumberOfComponents={quoteattr(components)}"
+    return f"type={quoteattr(vtk_type)} Name={quoteattr(name)}{width}"
+
+
+def _write_blocks(file: BinaryIO, stream: Stream) -> None:
+    """Write one array: its table of block sizes, then its blocks; the table is filled in afterwards."""
+    dtype = stream.dtype.newbyteorder("<")
+    step = BLOCK_BYTES // dtype.itemsize
+    n_blocks = -(-stream.n_items // step)
+    table = np.zeros(3 + n_blocks, "<u8")
+    table[:3] = n_blocks, BLOCK_BYTES, stream.n_items * dtype.itemsize % BLOCK_BYTES
+    start = file.tell()
+    file.write(table.tobytes())
+    for k in range(n_blocks):
+        items = stream.items(k * step, min((k + 1) * step, stream.n_items))
+        block = zlib.compress(items.astype(dtype, copy=False).tobytes(), ZLIB_LEVEL)
+        table[3 + k] = len(block)
+        file.write(block)
+    end = file.tell()
+    file.seek(start)
+    file.write(table.tobytes())
+    file.seek(end)
+
+
+def write_index(path: Path, pieces: Sequence[Path], kind: str) -> None:
+    """Write the index file over existing pieces; see `tiler.vtk_files.write_pvtp`."""
+    if not pieces:
+        raise ValueError("an index file needs at least one piece")
+    declared = _declarations(pieces[0], kind)
+    for piece in pieces[1:]:
+        if _declarations(piece, kind) != declared:
+            raise InputError(f"{piece}: declares other arrays than {pieces[0]}; run the tile again")
+    lines = [*_opening(f"P{kind}", ' header_type="UInt64"'), f'  <P{kind} GhostLevel="0">']
+    for section in ("Points", "PointData", "CellData"):
+        arrays = [f"      <PDataArray {array}/>" for array in declared[section]]
+        lines += [f"    <P{section}>", *arrays, f"    </P{section}>"]
+    for piece in pieces:
+        source = PurePath(os.path.relpath(piece, path.parent)).as_posix()
+        lines.append(f"    <Piece Source={quoteattr(source)}/>")
+    lines += [f"  </P{kind}>", "</VTKFile>", ""]
+    with _replacing(path) as file:
+        file.write("\n".join(lines).encode())
+
+
+def _declarations(path: Path, kind: str) -> dict[str, list[str]]:
+    with opened(path) as file:
+        piece = _read_head(path, file, kind).piece
+    return {
+        section: [
+            _declaration(array.get("type", ""), array.get("Name", ""), array.get("NumberOfComponents", "1"))
+            for array in piece.findall(f"{section}/DataArray")
+        ]
+        for section in ("Points", "PointData", "CellData")
+    }
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[BinaryIO]:
+    """Open a file beside `path` that takes its place when all went well, and is gone otherwise."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.part")
+    try:
+        try:
+            with part.open("wb") as file:
+                yield file
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
+        ) from error
+
+
+def damaged(path: Path, why: str) -> InputError:
+    """Make the error for a file that cannot be what it should be."""
+    return InputError(f"{path}: not a file of ours or damaged ({why}); run the tile again")
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a file to read; whatever the system says against it becomes an `InputError`."""
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); run the tile again") from error
+
+
+def _read_head(path: Path, file: BinaryIO, kind: str) -> _Head:
+    text = file.read(HEAD_BYTES)
+    end = text.find(b"<AppendedData")
+    start = text.find(b"_", end)
+    if end < 0 or start < 0:
+        raise damaged(path, "no appended data")
+    try:
+        root = ET.fromstring(text[:end] + b"</VTKFile>")
+    except (ET.ParseError, ValueError, LookupError) as error:
+        raise damaged(path, str(error)) from None
+    piece = root.find(f"./{kind}/Piece")
+    if piece is None or root.get("header_type") != "UInt64" or root.get("byte_order") != "LittleEndian":
+        raise damaged(path, f"no little-endian {kind} with UInt64 headers")
+    return _Head(piece, start + 1)
+
+
+def read_data_file(path: Path, kind: str) -> dict[str, dict[str, NDArray[Any]]]:
+    """Read all arrays of a file of one piece, by section and name.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged.
+
+    Notes
+    -----
+    The length of every array follows from the counts of the piece and is bounded by the size of the
+    file, so a damaged file cannot ask for more memory than zlib could have packed into it.
+    """
+    with opened(path) as file:
+        head = _read_head(path, file, kind)
+        size = file.seek(0, os.SEEK_END)
+        try:
+            sections = {
+                section.tag: {
+                    array.get("Name", ""): _read_array(file, head, array, section.tag, size)
+                    for array in section
+                }
+                for section in head.piece
+            }
+        except (ValueError, KeyError, TypeError, zlib.error) as error:
+            raise damaged(path, f"{error}") from None
+    rows = "Cells" if kind == "UnstructuredGrid" else "Polys"
+    missing = {"Points", "PointData", "CellData", rows} - sections.keys()
+    if missing or "Points" not in sections["Points"] or sections["Points"]["Points"].dtype != np.float64:
+        raise damaged(path, f"no float64 points or no section {sorted(missing)}")
+    return sections
+
+
+def _read_array(file: BinaryIO, head: _Head, array: ET.Element, section: str, size: int) -> NDArray[Any]:
+    """Read one appended array; its length follows from the counts of the piece."""
+    name, components = array.attrib["Name"], int(array.get("NumberOfComponents", "1"))
+    dtype = DTYPES[array.attrib["type"]]
+    n_rows = _expected_rows(head.piece, section, name)
+    n_bytes = n_rows * components * dtype.itemsize
+    if components < 1 or n_rows < 0 or n_bytes > MAX_RATIO * size:
+        raise ValueError(f"array {name!r} of {n_bytes} bytes in a file of {size}")
+    file.seek(head.start + int(array.attrib["offset"]))
+    data = np.empty(n_bytes, np.uint8)
+    filled = 0
+    for block in _read_blocks(file, name, size):
+        if filled + len(block) > n_bytes:
+            raise ValueError(f"array {name!r} has more than {n_bytes} bytes")
+        data[filled : filled + len(block)] = np.frombuffer(block, np.uint8)
+        filled += len(block)
+    if filled != n_bytes:
+        raise ValueError(f"array {name!r} has {filled} of {n_bytes} bytes")
+    native = data.view(dtype).astype(dtype.newbyteorder("="), copy=False)
+    return native.reshape(n_rows, components) if components > 1 else native
+
+
+def _expected_rows(piece: ET.Element, section: str, name: str) -> int:
+    if section in ("Points", "PointData"):
+        return int(piece.attrib["NumberOfPoints"])
+    n_rows = int(piece.attrib["NumberOfPolys" if "NumberOfPolys" in piece.attrib else "NumberOfCells"])
+    return n_rows * {"Polys": 3, "Cells": 4}.get(section, 1) if name == "connectivity" else n_rows
+
+
+def _read_blocks(file: BinaryIO, name: str, size: int) -> Iterator[bytes]:
+    n_blocks, block_bytes, _ = np.frombuffer(file.read(24), "<u8", 3).tolist()
+    if n_blocks * 8 > size or not 0 < block_bytes <= MAX_RATIO * size:
+        raise ValueError(f"array {name!r} of {n_blocks} blocks of {block_bytes} bytes in a file of {size}")
+    for packed in np.frombuffer(file.read(8 * n_blocks), "<u8", n_blocks).tolist():
+        if packed > size:
+            raise ValueError(f"array {name!r} has a block of {packed} bytes in a file of {size}")
+        yield zlib.decompressobj().decompress(file.read(packed), block_bytes)
