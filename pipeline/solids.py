@@ -140,7 +140,7 @@ def _check(model: CityModel) -> None:
 def _round(model: CityModel, grid: float) -> tuple[NDArray[np.object_], list[Note]]:
     """Put footprints on the grid, still valid, shells counter-clockwise."""
     notes = []
-    polygons = shapely.set_precision(shapely.force_2d(model.polygons), grid, mode="valid_output")
+    polygons = shapely.set_precision(model.polygons, grid, mode="valid_output")
     for i in np.flatnonzero(shapely.get_type_id(polygons) != shapely.GeometryType.POLYGON):
         parts = shapely.get_parts(polygons[i])
         polygons[i] = parts[np.argmax(shapely.area(parts))]

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 import shapely
 from hypothesis import given, settings
@@ -231,6 +232,11 @@ def test_a_compound_crs_is_named(target: Path, crs: str) -> None:
     town, notes = write(target, make_model(HOUSE), crs=crs)
     assert town["metadata"]["referenceSystem"] == "https://www.opengis.net/def/crs/EPSG/0/7415"
     assert notes == ()
+
+
+def test_a_prj_file_is_recognised(target: Path) -> None:
+    town, _ = write(target, make_model(HOUSE), crs=pyproj.CRS(28992).to_wkt("WKT1_ESRI"))
+    assert town["metadata"]["referenceSystem"] == "https://www.opengis.net/def/crs/EPSG/0/28992"
 
 
 def test_a_crs_without_code_is_left_out_and_said(target: Path) -> None:
