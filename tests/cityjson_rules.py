@@ -1,0 +1,188 @@
+"""What a CityJSON 2.0 file of buildings must obey: the specification, and ISO 19107 for its solids."""
+
+import copy
+from collections import Counter
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import jsonschema
+import numpy as np
+from numpy.typing import NDArray
+
+Json = dict[str, Any]
+
+
+def record(properties: Json, *optional: str) -> Json:
+    """Schema of an object with these properties, all required but the optional ones, and no others."""
+    required = [name for name in properties if name not in optional]
+    return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
+
+
+def array(items: Json, least: int = 0, most: int | None = None) -> Json:
+    limits = {"minItems": least} | ({} if most is None else {"maxItems": most})
+    return {"type": "array", "items": items} | limits
+
+
+def geometry(kind: str, lod: str, boundaries: Json) -> Json:
+    values = array(array({"enum": [0, 1, 2]}, 5), 1, 1)
+    surface = record({"type": {"enum": ["GroundSurface", "WallSurface", "RoofSurface"]}})
+    semantics = record({"surfaces": array(surface, 1), "values": values})
+    fields = {"type": {"const": kind}, "lod": {"const": lod}, "boundaries": boundaries}
+    return record(fields | ({"semantics": semantics} if kind == "Solid" else {}))
+
+
+NUMBER = {"type": "number"}
+FACE = array(array({"type": "integer", "minimum": 0}, 3), 1)
+ATTRIBUTES = {
+    "type": "object",
+    "properties": {
+        "number": {"type": "integer"},
+        "ground_height": NUMBER,
+        "roof_height": NUMBER,
+        "height": NUMBER,
+        "members": array({"type": "string"}),
+    },
+    "required": ["number", "ground_height", "roof_height", "height", "members"],
+}
+# Sections 2 to 5 of https://www.cityjson.org/specs/2.0.1/, as far as the model's buildings go.
+SCHEMA = record(
+    {
+        "type": {"const": "CityJSON"},
+        "version": {"const": "2.0"},
+        "transform": record({"scale": array(NUMBER, 3, 3), "translate": array(NUMBER, 3, 3)}),
+        "metadata": record(
+            {
+                "geographicalExtent": array(NUMBER, 6, 6),
+                "identifier": {"type": "string", "pattern": "^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$"},
+                "title": {"type": "string"},
+                "referenceSystem": {
+                    "type": "string",
+                    "pattern": "^https://www.opengis.net/def/crs/EPSG/0/[0-9]+$",
+                },
+            },
+            "title",
+            "referenceSystem",
+        ),
+        "CityObjects": {
+            "type": "object",
+            "additionalProperties": record(
+                {
+                    "type": {"const": "Building"},
+                    "attributes": ATTRIBUTES,
+                    "geometry": array(
+                        {
+                            "oneOf": [
+                                geometry("MultiSurface", "0", array(FACE, 1)),
+                                geometry("Solid", "1.2", array(array(FACE, 5), 1, 1)),
+                            ]
+                        }
+                    ),
+                }
+            ),
+        },
+        "vertices": array(array({"type": "integer"}, 3, 3)),
+    }
+)
+
+
+def file_faults(document: Json) -> set[str]:
+    """Name what breaks the specification in a file."""
+    if any(True for _ in jsonschema.Draft202012Validator(SCHEMA).iter_errors(document)):
+        return {"schema"}
+    faults = set()
+    rows = [tuple(row) for row in document["vertices"]]
+    if len(set(rows)) < len(rows):
+        faults.add("duplicate vertex")
+    used = {
+        corner for item in geometries(document) for face in faces_of(item) for ring in face for corner in ring
+    }
+    if used and max(used) >= len(rows):
+        faults.add("vertex out of range")
+    if used < set(range(len(rows))):
+        faults.add("unused vertex")
+    for item in geometries(document):
+        values = item.get("semantics", {}).get("values", [[]])[0]
+        if item["type"] == "Solid" and len(values) != len(faces_of(item)):
+            faults.add("semantics do not match the faces")
+    return faults
+
+
+def solid_faults(document: Json) -> dict[str, set[str]]:
+    """Name what breaks ISO 19107, or disagrees with the attributes, in the solids of each building."""
+    points = (
+        np.array(document["vertices"]) * document["transform"]["scale"] + document["transform"]["translate"]
+    )
+    found = {}
+    for name, item in document["CityObjects"].items():
+        for solid in item["geometry"]:
+            if solid["type"] == "Solid":
+                found[name] = set(_solid_faults(solid, points, item["attributes"]))
+    return found
+
+
+def geometries(document: Json) -> Iterator[Json]:
+    for item in document["CityObjects"].values():
+        yield from item["geometry"]
+
+
+def faces_of(item: Json) -> list[list[list[int]]]:
+    faces: list[list[list[int]]] = item["boundaries"][0] if item["type"] == "Solid" else item["boundaries"]
+    return faces
+
+
+def area_vector(face: list[list[int]], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Area times normal of a face with its holes (Newell)."""
+    total = np.zeros(3)
+    for ring in face:
+        corners = points[ring] - points[face[0][0]]
+        total += 0.5 * np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
+    return total
+
+
+def volume(solid: Json, points: NDArray[np.float64]) -> float:
+    """Signed volume within the faces: positive if the normals point outwards (divergence theorem)."""
+    centre = points[faces_of(solid)[0][0][0]]
+    return sum(
+        float(area_vector(face, points) @ (points[face[0][0]] - centre)) / 3 for face in faces_of(solid)
+    )
+
+
+def broken(document: Json, path: list[Any], value: Any) -> Json:
+    """Copy the document with another value at a path."""
+    changed = copy.deepcopy(document)
+    place = changed
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    return changed
+
+
+def _solid_faults(solid: Json, points: NDArray[np.float64], attributes: Json) -> Iterator[str]:
+    faces = faces_of(solid)
+    edges = Counter(edge for face in faces for ring in face for edge in pairwise([*ring, ring[0]]))
+    if any(a == b for a, b in edges):
+        yield "corner repeated"
+    if any(count != 1 or edges[b, a] != 1 for (a, b), count in edges.items()):
+        yield "shell not a closed 2-manifold"
+    kinds = [solid["semantics"]["surfaces"][i]["type"] for i in solid["semantics"]["values"][0]]
+    ground_area = 0.0
+    for kind, face in zip(kinds, faces, strict=True):
+        vector = area_vector(face, points)
+        size = np.linalg.norm(vector)
+        corners = points[[corner for ring in face for corner in ring]]
+        if size < 1e-9:
+            yield "face without area"
+        elif np.abs((corners - corners[0]) @ vector / size).max() > 1e-3:
+            yield "face not planar"
+        if (
+            kind
+            != {-1: "GroundSurface", 0: "WallSurface", 1: "RoofSurface"}[round(vector[2] / max(size, 1e-9))]
+        ):
+            yield "semantics do not fit the normal"
+        ground_area -= vector[2] if kind == "GroundSurface" else 0.0
+        level = {"GroundSurface": "ground_height", "RoofSurface": "roof_height"}.get(kind)
+        if level and np.abs(corners[:, 2] - attributes[level]).max() > 0.0005 + 1e-6:
+            yield "face not at its height"
+    if abs(volume(solid, points) - ground_area * attributes["height"]) > 0.001 * ground_area + 1e-6:
+        yield "volume is not area times height"
