@@ -1,0 +1,250 @@
+"""Point cloud files: find them, read their headers, read their points within a box (step 1.1)."""
+
+import glob
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.pointcloud import HIGH_NOISE, LOW_NOISE, PointCloud
+from tiler.lasheader import AGAIN, LasPromise, read_promise
+
+CHUNK_POINTS = 1_000_000
+CHUNK_BYTES = 64_000_000  # wins over CHUNK_POINTS where a point has many extra bytes
+HEIGHT_LIMIT = 10_000.0  # m; no ground, building or return lies beyond
+HEADER_SLACK = 1.0  # m that a point may lie outside the header's bounds
+
+_SUFFIXES = {".las", ".laz"}
+_GLOB_SIGNS = set("*?[")
+
+# laspy logs what it also raises; without a handler Python would print it over the user's progress.
+logging.getLogger("laspy").addHandler(logging.NullHandler())
+
+
+@dataclass(frozen=True)
+class CloudHeader:
+    """What one point cloud file says about itself.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    n_points : int
+        Number of points.
+    bounds : tuple of 6 floats
+        xmin, ymin, xmax, ymax, zmin, zmax in the file's CRS; all NaN if there are no points.
+    crs : pyproj.CRS or None
+        As stated, compound CRSs included; None if the file states none or one that nobody can parse.
+    """
+
+    path: Path
+    n_points: int
+    bounds: tuple[float, float, float, float, float, float]
+    crs: pyproj.CRS | None
+
+
+def find_clouds(sources: Sequence[str | Path]) -> list[Path]:
+    """Find the point cloud files that files, globs and folders stand for.
+
+    Parameters
+    ----------
+    sources : sequence of str or Path
+        Files of any name, glob patterns (``**`` included), and folders, whose ``.las`` and ``.laz`` files
+        are taken in any case, without their subfolders.
+
+    Returns
+    -------
+    list of Path
+        Sorted, each file once.
+
+    Raises
+    ------
+    InputError
+        If there are no sources, or one of them is missing or stands for no file.
+    """
+    if not sources:
+        raise InputError("no point cloud was given; name a file, a folder or a glob such as 'tiles/*.laz'")
+    files = [path for source in sources for path in _expand(Path(source))]
+    return sorted({path.resolve(): path for path in sorted(files, reverse=True)}.values())
+
+
+def read_header(path: str | Path) -> CloudHeader:
+    """Read the header of a LAS, LAZ or COPC file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    CloudHeader
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is not LAS, is shorter than its header claims, or its header has values that
+        are not finite or absurd (see `tiler.lasheader`).
+
+    Notes
+    -----
+    A CRS that cannot be parsed counts as none: the user must then state it, and is told so.
+    """
+    path = Path(path)
+    promise = read_promise(path)
+    with _laspy_as_input_error(path, promise, [0]), laspy.open(path) as reader:
+        header = reader.header
+    return CloudHeader(path, promise.n_points, promise.bounds, _parse_crs(header))
+
+
+def read_points(
+    path: str | Path, bounds: tuple[float, float, float, float]
+) -> tuple[PointCloud, dict[str, int]]:
+    """Read the usable points of a file within a box (step 1.1).
+
+    Dropped are, in this order: points outside the box, withheld points, the noise classes 7 and 18, and
+    points with a height that is not within ±10 km.
+
+    Parameters
+    ----------
+    path : str or Path
+        LAS, LAZ or COPC file.
+    bounds : tuple of 4 floats
+        xmin, ymin, xmax, ymax in the file's CRS; the borders belong to the box.
+
+    Returns
+    -------
+    PointCloud
+        The kept points in the order of the file; possibly none.
+    dict of str to int
+        ``read`` = ``outside`` + ``withheld`` + ``noise`` + ``absurd`` + ``kept``; each point counts once.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, ends early, is damaged, or has points more than 1 m outside the bounds
+        that its header states: such a file is damaged, or would be missing from the tiles it belongs to.
+
+    Notes
+    -----
+    Memory is that of the kept points (25 bytes each) and one chunk of the file.
+    """
+    path = Path(path)
+    promise = read_promise(path)
+    counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
+    parts = [_select(chunk, xyz, bounds, counts) for chunk, xyz in _chunks(path, promise)]
+    cloud = PointCloud(
+        np.concatenate([np.empty((0, 3)), *(part.xyz for part in parts)]),
+        np.concatenate([np.empty(0, np.uint8), *(part.classification for part in parts)]),
+    )
+    return cloud, counts
+
+
+def _expand(source: Path) -> list[Path]:
+    if source.is_dir():
+        found = [path for path in source.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file()]
+        if not found:
+            raise InputError(f"{source}: the folder holds no .las or .laz file; name the folder of the tiles")
+        return found
+    if source.is_file():
+        return [source]
+    if _GLOB_SIGNS & set(str(source)):
+        found = [Path(name) for name in glob.glob(str(source), recursive=True) if Path(name).is_file()]
+        if not found:
+            raise InputError(f"{source}: the pattern matches no file; check the folder's name")
+        return found
+    raise InputError(f"{source}: no such file or folder; check the path")
+
+
+def _chunks(
+    path: Path, promise: LasPromise
+) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64]]]:
+    """Yield the points and their coordinates by chunks; fail if there are fewer than the header claims."""
+    step = max(1, min(CHUNK_POINTS, CHUNK_BYTES // promise.point_size))
+    n_read = [0]
+    with (
+        _laspy_as_input_error(path, promise, n_read),
+        laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,
+    ):
+        while n_read[0] < promise.n_points:
+            chunk = reader.read_points(step)
+            if len(chunk) == 0:
+                break
+            n_read[0] += len(chunk)
+            xyz = np.column_stack((chunk.x, chunk.y, chunk.z))
+            _check_within_header(path, promise, xyz[:, :2])
+            yield chunk, xyz
+    if n_read[0] != promise.n_points:
+        raise InputError(f"{path}: {n_read[0]} of {promise.n_points} points could be read; {AGAIN}")
+
+
+def _select(
+    chunk: laspy.ScaleAwarePointRecord,
+    xyz: NDArray[np.float64],
+    bounds: tuple[float, float, float, float],
+    counts: dict[str, int],
+) -> PointCloud:
+    """Keep the usable points of a chunk, and add what became of each point to the counts."""
+    classes = np.asarray(chunk.classification, np.uint8)
+    xmin, ymin, xmax, ymax = bounds
+    x, y, z = xyz.T
+    left = np.ones(len(xyz), bool)
+    for reason, keep in (
+        ("outside", (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)),
+        ("withheld", np.asarray(chunk.withheld) == 0),
+        ("noise", (classes != LOW_NOISE) & (classes != HIGH_NOISE)),
+        ("absurd", np.abs(z) <= HEIGHT_LIMIT),
+    ):
+        counts[reason] += int(np.count_nonzero(left & ~keep))
+        left &= keep
+    counts["read"] += len(xyz)
+    counts["kept"] += int(np.count_nonzero(left))
+    return PointCloud(xyz[left], classes[left])
+
+
+def _check_within_header(path: Path, promise: LasPromise, xy: NDArray[np.float64]) -> None:
+    low = np.array(promise.bounds[:2]) - HEADER_SLACK
+    high = np.array(promise.bounds[2:4]) + HEADER_SLACK
+    stray = ((xy < low) | (xy > high)).any(axis=1)
+    if stray.any():
+        x, y = xy[stray][0]
+        raise InputError(
+            f"{path}: {np.count_nonzero(stray)} of {len(xy)} points lie more than {HEADER_SLACK:g} m outside "
+            f"the bounds in its header, the first at ({x:.2f}, {y:.2f}): the points or the header are "
+            f"damaged; {AGAIN}, or rewrite it: pdal translate {path.name} mended.laz"
+        )
+
+
+def _parse_crs(header: laspy.LasHeader) -> pyproj.CRS | None:
+    try:
+        crs: pyproj.CRS | None = header.parse_crs()
+    except (pyproj.exceptions.CRSError, UnicodeDecodeError):
+        return None
+    return crs
+
+
+@contextmanager
+def _laspy_as_input_error(path: Path, promise: LasPromise, n_read: list[int]) -> Iterator[None]:
+    """Turn whatever laspy and lazrs raise on a bad file into an InputError.
+
+    On damaged bytes they raise LaspyException, LazrsError, struct.error, ValueError, IndexError, KeyError,
+    MemoryError and more, and a panic of the Rust side, which is no Exception and cannot be imported.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except BaseException as error:
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise InputError(
+            f"{path}: {n_read[0]} of {promise.n_points} points could be read "
+            f"({type(error).__name__}: {error}); {AGAIN}"
+        ) from error

@@ -1,0 +1,181 @@
+"""What a LAS header promises, checked against the file itself before a library trusts it (step 1.1)."""
+
+import math
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from pipeline.errors import InputError
+
+COORDINATE_LIMIT = 1e8  # m; beyond it no projected CRS has coordinates
+SCALE_LIMIT = 100.0  # units of the file for one step of the stored integers
+AGAIN = "copy the file again or leave it out with --skip-unreadable"
+
+# Byte sizes of ASPRS LAS 1.4 R15, tables 3, 5 and 6.
+_SHORTEST_HEADER = 227
+_LONGEST_HEADER = 375
+_VLR_HEADER = 54
+_EVLR_HEADER = 60
+_COMPRESSED = 0x40  # LASzip sets the upper bits of the point format
+_EMPTY_LAZ = 1000  # what follows the header of a LAZ file without points is shorter than this
+
+
+@dataclass(frozen=True)
+class LasPromise:
+    """The fixed fields of a LAS header that decide what has to be read.
+
+    Attributes
+    ----------
+    n_points : int
+        Number of points that the header claims.
+    point_size : int
+        Bytes of one uncompressed point.
+    compressed : bool
+        Whether the points are LAZ.
+    bounds : tuple of 6 floats
+        xmin, ymin, xmax, ymax, zmin, zmax in the file's CRS; all NaN if there are no points.
+    """
+
+    n_points: int
+    point_size: int
+    compressed: bool
+    bounds: tuple[float, float, float, float, float, float]
+
+
+def read_promise(path: Path) -> LasPromise:
+    """Read a LAS/LAZ header and refuse what the file cannot hold.
+
+    Libraries believe the counts of a header: one wrong field makes them allocate without end. So every
+    count is compared with the size of the file first.
+
+    Parameters
+    ----------
+    path : Path
+        LAS, LAZ or COPC file.
+
+    Returns
+    -------
+    LasPromise
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is not LAS, is shorter than its header claims, or has a scale, an offset or
+        bounds that are not finite or absurd.
+
+    References
+    ----------
+    ASPRS LAS 1.4 R15, section 2.4; LASzip: the point data begin with the byte offset of the chunk table.
+    """
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
+            head = file.read(_LONGEST_HEADER)
+            begin, end = _point_bytes(path, head, size)
+            promise = _parse(path, head)
+            _check_finished(path, promise, end - begin)
+            if promise.compressed and promise.n_points:
+                _check_chunk_table(path, promise, file, begin, size)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"{path}: cannot be read ({reason}); check the path and its permissions") from error
+    return promise
+
+
+def _point_bytes(path: Path, head: bytes, size: int) -> tuple[int, int]:
+    """Give the first byte of the point data and the byte behind the last."""
+    if head[:4] != b"LASF":
+        raise InputError(
+            f"{path}: is no LAS or LAZ file: it begins with {head[:4]!r}, not b'LASF'; leave it out"
+        )
+    shortest = _LONGEST_HEADER if head[25:26] >= b"\4" else _SHORTEST_HEADER
+    if len(head) < shortest:
+        raise InputError(f"{path}: ends at byte {size}, within its {shortest}-byte header; {AGAIN}")
+    header_size, begin, n_vlrs = struct.unpack_from("<HII", head, 94)
+    if not header_size + n_vlrs * _VLR_HEADER <= begin <= size:
+        raise InputError(
+            f"{path}: header of {header_size} bytes, {n_vlrs} records, points from byte {begin}, but it "
+            f"has {size} bytes; {AGAIN}"
+        )
+    first_evlr, n_evlrs = struct.unpack_from("<QI", head, 235) if head[25] >= 4 else (0, 0)
+    if n_evlrs == 0:
+        return begin, size
+    if not begin <= first_evlr <= size - n_evlrs * _EVLR_HEADER:
+        raise InputError(
+            f"{path}: {n_evlrs} extended records from byte {first_evlr}, but the file has {size} bytes; "
+            f"{AGAIN}"
+        )
+    return begin, first_evlr
+
+
+def _parse(path: Path, head: bytes) -> LasPromise:
+    point_format, point_size, n_points = struct.unpack_from("<BHI", head, 104)
+    if head[25] >= 4:
+        n_points = struct.unpack_from("<Q", head, 247)[0]
+    if point_size == 0:
+        raise InputError(f"{path}: the header gives a point 0 bytes; {AGAIN}")
+    return LasPromise(n_points, point_size, point_format >= _COMPRESSED, _bounds(path, head, n_points))
+
+
+def _bounds(path: Path, head: bytes, n_points: int) -> tuple[float, float, float, float, float, float]:
+    scales = struct.unpack_from("<3d", head, 131)
+    offsets = struct.unpack_from("<3d", head, 155)
+    xmax, xmin, ymax, ymin, zmax, zmin = struct.unpack_from("<6d", head, 179)
+    if n_points == 0:
+        return (float("nan"),) * 6
+    for axis, scale, offset in zip("xyz", scales, offsets, strict=True):
+        if not 0 < scale <= SCALE_LIMIT:  # NaN fails too
+            raise InputError(f"{path}: {axis} scale {scale:g} is not within 0 to {SCALE_LIMIT:g}; {AGAIN}")
+        if not abs(offset) <= COORDINATE_LIMIT:
+            raise InputError(
+                f"{path}: {axis} offset {offset:g} is not within ±{COORDINATE_LIMIT:g} m; {AGAIN}"
+            )
+    for axis, low, high in (("x", xmin, xmax), ("y", ymin, ymax)):
+        if not (abs(low) <= COORDINATE_LIMIT and abs(high) <= COORDINATE_LIMIT):
+            raise InputError(
+                f"{path}: header bounds {axis} {low:g} to {high:g} are not within ±{COORDINATE_LIMIT:g} m; "
+                f"{AGAIN}"
+            )
+    for axis, low, high in (("x", xmin, xmax), ("y", ymin, ymax), ("z", zmin, zmax)):
+        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+            raise InputError(
+                f"{path}: header bounds {axis} from {low:g} to {high:g} are no interval; {AGAIN}"
+            )
+    return xmin, ymin, xmax, ymax, zmin, zmax
+
+
+def _check_finished(path: Path, promise: LasPromise, n_bytes: int) -> None:
+    if promise.n_points == 0 and n_bytes >= _EMPTY_LAZ:
+        raise InputError(
+            f"{path}: the header claims 0 points, but {n_bytes} bytes follow it: its writer did not finish; "
+            f"{AGAIN}"
+        )
+    held = n_bytes // promise.point_size
+    if not promise.compressed and held < promise.n_points:
+        raise InputError(
+            f"{path}: {held} of {promise.n_points} points could be read: the file ends early; {AGAIN}"
+        )
+
+
+def _check_chunk_table(path: Path, promise: LasPromise, file: BinaryIO, begin: int, size: int) -> None:
+    """Find the chunk table of a LAZ file: it is written last, so a file that was cut off has none."""
+    table = _read_int64(file, begin)
+    if table == -1:  # the file was written as a stream, and the place is in its last 8 bytes
+        table = _read_int64(file, size - 8)
+    if not begin + 8 < table <= size - 8:
+        raise InputError(
+            f"{path}: 0 of {promise.n_points} points could be read: the file ends at byte {size}, its chunk "
+            f"table should begin at byte {table}; {AGAIN}"
+        )
+    file.seek(table + 4)
+    n_chunks = int.from_bytes(file.read(4), "little")
+    if n_chunks > table - begin:
+        raise InputError(f"{path}: {n_chunks} chunks in {table - begin} bytes of points; {AGAIN}")
+
+
+def _read_int64(file: BinaryIO, place: int) -> int:
+    file.seek(place)
+    return int.from_bytes(file.read(8), "little", signed=True)
