@@ -114,7 +114,7 @@ def merge_footprints(
     members = [[int(i)] for i in order]
     counts = Counter({"hole-filled": n_filled})
     for k in np.flatnonzero(~is_sound(shapes, floor)):
-        shapes[k], method[k] = make_sound(shapes[k], floor)
+        shapes[k], method[k] = _repair(shapes[k], floor, min_hole_area, clearance)
         counts[method[k]] += 1
 
     bins = Bins(shapes, _choose_bin_size(shapes, clearance))
@@ -138,7 +138,7 @@ def merge_footprints(
                 tolerance=tolerance,
             )
             counts[method[i]] += 1
-            shapes[i], rung = make_sound(shape, floor)
+            shapes[i], rung = _repair(shape, floor, min_hole_area, clearance)
             if rung:
                 method[i] = rung
                 counts[rung] += 1
@@ -149,6 +149,17 @@ def merge_footprints(
                 queue.append(i)
                 queued.add(i)
     return _collect(shapes, members, method, counts, clearance=clearance, floor=floor)
+
+
+def _repair(
+    shape: shapely.Polygon, floor: float, min_hole_area: float, clearance: float
+) -> tuple[shapely.Polygon, str]:
+    """Make a polygon sound, and fill the holes that this leaves too small, as a closed gap does."""
+    sound, rung = make_sound(shape, floor)
+    if not rung:
+        return sound, rung
+    filled, _ = fill_small_holes(np.array([sound]), min_hole_area=min_hole_area, clearance=clearance)
+    return filled[0], rung
 
 
 def _choose_bin_size(shapes: NDArray[np.object_], clearance: float) -> float:

@@ -66,6 +66,9 @@ def merge_polygons(
             project_vertices(b, a, clearance * 2**k),
         ]
         patch = shapely.convex_hull(shapely.multipoints(np.concatenate(points)))
+        # A patch that is a point or a line adds nothing to a union that was refused.
+        if shapely.get_dimensions(patch) < 2:
+            continue
         if (accepted := accept(shapely.union(union, patch, grid_size=UNION_GRID))) is not None:
             return accepted, "patch"
     hulls = shapely.union(shapely.convex_hull(a), shapely.convex_hull(b), grid_size=UNION_GRID)
