@@ -1,0 +1,153 @@
+"""GeoParquet by pyarrow, as most builds of GDAL have no driver for it (step 1.2)."""
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+
+Box = tuple[float, float, float, float]
+
+_SUFFIXES = {".parquet", ".geoparquet", ".pq"}
+_BATCH = 50_000  # features in memory beside those that are kept
+
+
+def is_parquet(path: Path) -> bool:
+    """Whether a file is Parquet, by its name.
+
+    Examples
+    --------
+    >>> is_parquet(Path("houses.GeoParquet"))
+    True
+    """
+    return path.suffix.lower() in _SUFFIXES
+
+
+def describe(path: Path) -> tuple[pyproj.CRS | None, tuple[str, ...], int, Box | None]:
+    """Read the metadata of a GeoParquet file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    pyproj.CRS or None
+        None where the file says that the CRS is unknown; longitude and latitude where it says nothing.
+    tuple of str
+        Names of the attributes.
+    int
+        Number of features.
+    tuple of 4 floats, or None
+        xmin, ymin, xmax, ymax as stated.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, is not GeoParquet with geometries as WKB, or if pyarrow is not installed.
+
+    References
+    ----------
+    GeoParquet 1.1, section "Column metadata".
+    """
+    with _arrow_as_input_error(path):
+        table = _open(path)
+        name, column = _geometry(path, table)
+        crs = column.get("crs", "OGC:CRS84")
+        bbox = column.get("bbox")
+        return (
+            None if crs is None else pyproj.CRS.from_user_input(crs),
+            tuple(field for field in table.schema_arrow.names if field != name),
+            table.metadata.num_rows,
+            None if bbox is None else (bbox[0], bbox[1], bbox[len(bbox) // 2], bbox[len(bbox) // 2 + 1]),
+        )
+
+
+def read(path: Path, columns: Sequence[str], box: Box) -> tuple[NDArray[np.object_], dict[str, NDArray[Any]]]:
+    """Read the features whose bounding boxes meet a box.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    columns : sequence of str
+        Attributes to read.
+    box : tuple of 4 floats
+        xmin, ymin, xmax, ymax in the file's CRS.
+
+    Returns
+    -------
+    object, (n,)
+        Geometries as well-known binary (bytes).
+    dict of str to (n,) arrays
+        Values of the attributes.
+
+    Raises
+    ------
+    InputError
+        As `describe`.
+    """
+    wkb: list[bytes] = []
+    values: dict[str, list[Any]] = {name: [] for name in columns}
+    with _arrow_as_input_error(path):
+        table = _open(path)
+        name, _ = _geometry(path, table)
+        for batch in table.iter_batches(_BATCH, columns=[name, *columns]):
+            blobs = _objects(batch.column(name).to_pylist())
+            hits = np.flatnonzero(_meets(blobs, box))
+            wkb.extend(blobs[hits])
+            part = batch.take(hits)
+            for column in columns:
+                values[column].extend(part.column(column).to_pylist())
+    return _objects(wkb), {column: _objects(items) for column, items in values.items()}
+
+
+def _meets(wkb: NDArray[np.object_], box: Box) -> NDArray[np.bool_]:
+    xmin, ymin, xmax, ymax = shapely.bounds(shapely.from_wkb(wkb, on_invalid="fix")).T
+    meets: NDArray[np.bool_] = (xmin <= box[2]) & (xmax >= box[0]) & (ymin <= box[3]) & (ymax >= box[1])
+    return meets
+
+
+def _objects(items: list[Any]) -> NDArray[np.object_]:
+    array = np.empty(len(items), dtype=np.object_)
+    array[:] = items
+    return array
+
+
+def _open(path: Path) -> Any:
+    try:
+        import pyarrow.parquet
+    except ImportError as error:
+        raise InputError(
+            f"{path}: Parquet needs pyarrow; pip install 'citystitch[parquet]', or convert the file to GPKG"
+        ) from error
+    return pyarrow.parquet.ParquetFile(path)
+
+
+def _geometry(path: Path, table: Any) -> tuple[str, dict[str, Any]]:
+    """Give the name and the metadata of the geometry column."""
+    geo = json.loads((table.schema_arrow.metadata or {}).get(b"geo", b"{}"))
+    name = geo.get("primary_column", "")
+    column = geo.get("columns", {}).get(name)
+    if column is None or column.get("encoding") != "WKB":
+        raise InputError(
+            f"{path}: is no GeoParquet file with geometries as WKB (encoding: "
+            f"{None if column is None else column.get('encoding')}); convert it to GPKG"
+        )
+    return name, column
+
+
+@contextmanager
+def _arrow_as_input_error(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, pyproj.exceptions.CRSError) as error:
+        raise InputError(f"{path}: cannot be read as GeoParquet ({error}); copy the file again") from error
