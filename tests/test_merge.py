@@ -376,6 +376,6 @@ def test_amsterdam_keeps_the_promises(shared_data: Path) -> None:
     clean, _ = clean_footprints(rows, min_area=5.0, tolerance=TOLERANCE)
     merged = merge(*clean.polygons)
     assert_promises(merged, len(clean.polygons))
-    # 1.2 to 1.7 s on one shared core; 536 of 1,406 merges end in the hull, which is the paper's way.
+    # About 1.5 s on one shared core; 537 of 1,406 merges end in the hull, which is the paper's way.
     lost = shapely.union_all(clean.polygons).difference(shapely.union_all(merged.polygons))
     assert lost.area < 1e-4 * shapely.area(clean.polygons).sum()
