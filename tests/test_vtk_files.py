@@ -29,6 +29,7 @@ from tiler.vtk_files import (
     write_vtp,
     write_vtu,
 )
+from tiler.vtk_xml import make_stream, write_data_file
 
 
 @pytest.fixture(scope="module")
@@ -339,6 +340,59 @@ def test_every_truncation_is_noticed(tmp_path: Path, city: TinyCity) -> None:
         path.write_bytes(data[:length])
         with pytest.raises(InputError):
             read_vtp(path)
+
+
+# What the table in front of an array's blocks may say wrongly: entry, and the number there.
+TABLES = {
+    "no block": (0, 0),
+    "2**62 blocks": (0, 2**62),
+    "a block more": (0, 2),
+    "blocks of nothing": (1, 0),
+    "blocks of 2**62 bytes": (1, 2**62),
+    "a packed block of 2**62 bytes": (3, 2**62),
+    "a packed block of nothing": (3, 0),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_wrong_block_table_is_an_input_error(tmp_path: Path, city: TinyCity, name: str) -> None:
+    path, (entry, number) = tmp_path / "b.vtp", TABLES[name]
+    write_vtp(path, city.mesh.points, city.boundary)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"_", data.index(b"<AppendedData")) + 1 + 8 * entry
+    data[at : at + 8] = number.to_bytes(8, "little")
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"b\.vtp: not a file of ours or damaged"):
+        read_vtp(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({}, None),
+        ({"types": np.array([10, 14], np.uint8)}, "no tetrahedra"),
+        ({"types": None}, "no tetrahedra"),
+        ({"offsets": np.array([3, 8], np.int32)}, "have not 4 vertices"),
+        ({"offsets": None}, "no connectivity"),
+    ],
+)
+def test_cells_that_are_no_tetrahedra(tmp_path: Path, change: dict[str, Any], message: str | None) -> None:
+    arrays: dict[str, NDArray[Any] | None] = {
+        "connectivity": np.array([0, 1, 2, 3, 1, 2, 3, 4], np.int32),
+        "offsets": np.array([4, 8], np.int32),
+        "types": np.array([10, 10], np.uint8),
+    }
+    arrays |= change
+    cells = [make_stream(name, array, array.dtype) for name, array in arrays.items() if array is not None]
+    points = make_stream("Points", np.random.default_rng(0).random((5, 3)), np.float64)
+    sections = {"Points": [points], "Cells": cells, "PointData": [], "CellData": []}
+    counts = {"NumberOfPoints": 5, "NumberOfCells": 2}
+    write_data_file(tmp_path / "m.vtu", "UnstructuredGrid", counts, sections)
+    if message is None:
+        assert len(read_vtu(tmp_path / "m.vtu").mesh.cells) == 2
+    else:
+        with pytest.raises(InputError, match=message):
+            read_vtu(tmp_path / "m.vtu")
 
 
 def test_vertices_out_of_range_are_input_errors(tmp_path: Path) -> None:

@@ -262,8 +262,6 @@ def _read_array(file: BinaryIO, head: _Head, array: ET.Element, section: str, si
     data = np.empty(n_bytes, np.uint8)
     filled = 0
     for block in _read_blocks(file, name, size):
-        if filled + len(block) > n_bytes:
-            raise ValueError(f"array {name!r} has more than {n_bytes} bytes")
         data[filled : filled + len(block)] = np.frombuffer(block, np.uint8)
         filled += len(block)
     if filled != n_bytes:
