@@ -173,22 +173,16 @@ def blend(share: NDArray[np.float64], colours: tuple[str, ...]) -> NDArray[np.ui
 
 
 def _read(reader: Any, path: Path) -> Any:
-    """Run one of VTK's readers, whose errors are events."""
+    """Run one of VTK's readers, which tell of damage but go on."""
     import pyvista
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; run citystitch first, or name its output folder")
-    faults: list[str] = []
-
-    def listen(*_: object) -> None:
-        faults.append("damaged")
-
     reader.SetFileName(os.fspath(path))
-    reader.AddObserver("ErrorEvent", listen)
-    reader.GetExecutive().AddObserver("ErrorEvent", listen)
-    reader.Update()
+    with pyvista.VtkErrorCatcher(send_to_logging=False) as catcher:
+        reader.Update()
     data = pyvista.wrap(reader.GetOutput())
-    if faults or data is None or data.n_cells == 0:
+    if catcher.events or data is None or data.n_cells == 0:
         raise InputError(f"{path}: it or a piece of it is missing, damaged or empty; run again")
     return data
 
