@@ -7,6 +7,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.errors import InputError
+
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
@@ -71,7 +73,7 @@ def number_ids(ids: NDArray[np.str_]) -> NDArray[np.int64]:
 
     Raises
     ------
-    ValueError
+    InputError
         If two different ids get the same number.
 
     Examples
@@ -80,9 +82,14 @@ def number_ids(ids: NDArray[np.str_]) -> NDArray[np.int64]:
     array([363100012078463])
     """
     numbers = np.fromiter((_number(str(name)) for name in ids), np.int64, len(ids))
-    _, first = np.unique(numbers, return_index=True)
-    if len(first) < len(np.unique(ids)):
-        raise ValueError("two building ids share one number; rename one of them")
+    order = np.lexsort((ids, numbers))
+    clash = np.flatnonzero((np.diff(numbers[order]) == 0) & (ids[order][1:] != ids[order][:-1]))
+    if len(clash):
+        one, two = ids[order][clash[0]], ids[order][clash[0] + 1]
+        raise InputError(
+            f"building ids {str(one)!r} and {str(two)!r} both have the number {numbers[order][clash[0]]}; "
+            "rename one, or name another --id-attribute"
+        )
     return numbers
 
 

@@ -43,9 +43,7 @@ class Solids:
     has_solid: NDArray[np.bool_]
 
 
-def build_solids(
-    model: CityModel, origin: NDArray[np.float64], *, grid: float
-) -> tuple[Solids, tuple[Note, ...]]:
+def build_solids(model: CityModel, origin: NDArray[np.float64], *, grid: float) -> tuple[Solids, tuple[Note, ...]]:
     """Build the solids of a city model, rounded to a grid.
 
     Parameters

@@ -116,14 +116,10 @@ def make_city(*, size: float, buildings: int, density: float, relief: float, see
     spacing = size / max(buildings, 1) ** 0.5
     radius = min(_FILLING * spacing, size / 6, _LARGEST_RADIUS)
     if not (0 < size < 1e6 and buildings >= 0 and density >= 0 and relief >= 0 and seed >= 0):
-        raise ValueError(
-            f"size {size}, buildings {buildings}, density {density}, relief {relief}, seed {seed}"
-        )
+        raise ValueError(f"size {size}, buildings {buildings}, density {density}, relief {relief}, seed {seed}")
     if radius < _LEAST_RADIUS:
         most = int((_FILLING * size / _LEAST_RADIUS) ** 2)
-        raise ValueError(
-            f"{buildings} buildings do not fit on {size:g} m x {size:g} m; ask for at most {most}"
-        )
+        raise ValueError(f"{buildings} buildings do not fit on {size:g} m x {size:g} m; ask for at most {most}")
     rng = np.random.default_rng([seed, 0])
     waves, base = _hills(rng, size, relief)
     n_touching = max(int(_TOUCHING * buildings), int(buildings >= 4))
@@ -143,9 +139,7 @@ def make_city(*, size: float, buildings: int, density: float, relief: float, see
     return SyntheticCity(size, density, seed, waves, base, pond, polygons, ids, ground, roof)
 
 
-def terrain_height(
-    city: SyntheticCity, x: NDArray[np.float64], y: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def terrain_height(city: SyntheticCity, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """Give the true height of the ground.
 
     Parameters
@@ -271,9 +265,7 @@ def _place(
         left = np.union1d(np.where(pending[j], j, i)[close], drowned)
         if len(left) == 0:
             return centres
-    raise GeometryError(
-        f"{len(left)} of {len(radii)} buildings found no room; ask for fewer or a larger size"
-    )
+    raise GeometryError(f"{len(left)} of {len(radii)} buildings found no room; ask for fewer or a larger size")
 
 
 def _draw(

@@ -94,9 +94,7 @@ def file_faults(document: Json) -> set[str]:
     rows = [tuple(row) for row in document["vertices"]]
     if len(set(rows)) < len(rows):
         faults.add("duplicate vertex")
-    used = {
-        corner for item in geometries(document) for face in faces_of(item) for ring in face for corner in ring
-    }
+    used = {corner for item in geometries(document) for face in faces_of(item) for ring in face for corner in ring}
     if used and max(used) >= len(rows):
         faults.add("vertex out of range")
     if used < set(range(len(rows))):
@@ -110,9 +108,7 @@ def file_faults(document: Json) -> set[str]:
 
 def solid_faults(document: Json) -> dict[str, set[str]]:
     """Name what breaks ISO 19107, or disagrees with the attributes, in the solids of each building."""
-    points = (
-        np.array(document["vertices"]) * document["transform"]["scale"] + document["transform"]["translate"]
-    )
+    points = np.array(document["vertices"]) * document["transform"]["scale"] + document["transform"]["translate"]
     found = {}
     for name, item in document["CityObjects"].items():
         for solid in item["geometry"]:
@@ -143,9 +139,7 @@ def area_vector(face: list[list[int]], points: NDArray[np.float64]) -> NDArray[n
 def volume(solid: Json, points: NDArray[np.float64]) -> float:
     """Signed volume within the faces: positive if the normals point outwards (divergence theorem)."""
     centre = points[faces_of(solid)[0][0][0]]
-    return sum(
-        float(area_vector(face, points) @ (points[face[0][0]] - centre)) / 3 for face in faces_of(solid)
-    )
+    return sum(float(area_vector(face, points) @ (points[face[0][0]] - centre)) / 3 for face in faces_of(solid))
 
 
 def broken(document: Json, path: list[Any], value: Any) -> Json:
@@ -175,10 +169,7 @@ def _solid_faults(solid: Json, points: NDArray[np.float64], attributes: Json) ->
             yield "face without area"
         elif np.abs((corners - corners[0]) @ vector / size).max() > 1e-3:
             yield "face not planar"
-        if (
-            kind
-            != {-1: "GroundSurface", 0: "WallSurface", 1: "RoofSurface"}[round(vector[2] / max(size, 1e-9))]
-        ):
+        if kind != {-1: "GroundSurface", 0: "WallSurface", 1: "RoofSurface"}[round(vector[2] / max(size, 1e-9))]:
             yield "semantics do not fit the normal"
         ground_area -= vector[2] if kind == "GroundSurface" else 0.0
         level = {"GroundSurface": "ground_height", "RoofSurface": "roof_height"}.get(kind)

@@ -167,9 +167,7 @@ def with_boundary(city: TinyCity, **arrays: NDArray[Any]) -> TinyCity:
 
 def _make_model(houses: Mapping[str, tuple[tuple[Square, ...], int]], dtm: PlaneDtm) -> CityModel:
     polygons = np.empty(len(houses), np.object_)
-    polygons[:] = [
-        shapely.union_all([_box_of(square) for square in squares]) for squares, _ in houses.values()
-    ]
+    polygons[:] = [shapely.union_all([_box_of(square) for square in squares]) for squares, _ in houses.values()]
     polygons = shapely.orient_polygons(polygons) if len(houses) else polygons
     ids = np.array(list(houses), np.str_)
     ground = np.array([dtm.sample(shapely.get_coordinates(polygon)).min() for polygon in polygons])

@@ -155,9 +155,7 @@ def test_chunks_do_not_change_the_result(laz: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 0.9999])
-def test_a_file_cut_off_anywhere_is_refused(
-    tmp_path: Path, xyz: np.ndarray, share: float, suffix: str
-) -> None:
+def test_a_file_cut_off_anywhere_is_refused(tmp_path: Path, xyz: np.ndarray, share: float, suffix: str) -> None:
     path = write_cloud(tmp_path / f"cut.{suffix}", xyz)
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])

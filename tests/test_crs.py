@@ -15,9 +15,7 @@ DEGREES = (4.88, 52.36, 4.89, 52.37, -5.0, 60.0)
 NEW_YORK_FEET = (980000.0, 195000.0, 985000.0, 200000.0, 0.0, 300.0)
 
 
-def cloud(
-    crs: str | None, name: str = "a.laz", bounds: tuple[float, ...] = AMSTERDAM, n: int = 9
-) -> CloudHeader:
+def cloud(crs: str | None, name: str = "a.laz", bounds: tuple[float, ...] = AMSTERDAM, n: int = 9) -> CloudHeader:
     box = (bounds[0], bounds[1], bounds[2], bounds[3], bounds[4], bounds[5])
     return CloudHeader(Path("in") / name, n, box, None if crs is None else pyproj.CRS(crs))
 
@@ -135,9 +133,7 @@ def test_feet_are_refused_with_the_command() -> None:
 def test_heights_in_feet_are_refused_with_the_command() -> None:
     for asked, stated in ((None, "EPSG:32618+6360"), ("EPSG:32618+6360", None)):
         with pytest.raises(InputError, match="height in US survey foot") as caught:
-            resolve_crs(
-                asked, [cloud(stated, bounds=(585000.0, 4511000.0, 586000.0, 4512000.0, 0.0, 9.0))], None
-            )
+            resolve_crs(asked, [cloud(stated, bounds=(585000.0, 4511000.0, 586000.0, 4512000.0, 0.0, 9.0))], None)
         assert "a_metric.laz" in str(caught.value)
         assert "assign --filters.assign.value" in str(caught.value)
         assert str(caught.value).endswith("--writers.las.a_srs=EPSG:32618")
@@ -164,9 +160,7 @@ def test_degrees_of_footprints_are_never_taken_for_the_cloud() -> None:
 
 def test_a_cloud_far_from_its_crs_is_told() -> None:
     far = cloud(None, bounds=(318000.0, 6399000.0, 319000.0, 6400000.0, 0.0, 9.0))
-    assert (
-        "outside the area of use of EPSG:28992" in resolve_crs("EPSG:28992", [cloud(None), far], None)[1][-1]
-    )
+    assert "outside the area of use of EPSG:28992" in resolve_crs("EPSG:28992", [cloud(None), far], None)[1][-1]
     assert len(resolve_crs("EPSG:3006", [far], None)[1]) == 1
 
 

@@ -62,9 +62,7 @@ def assert_promises(clean: Footprints, merged: MergedFootprints) -> None:
     assert sorted(rows) == list(range(len(clean.ids)))
 
 
-def assert_nothing_lost(
-    given: NDArray[np.object_], notes: tuple[Note, ...], merged: MergedFootprints
-) -> None:
+def assert_nothing_lost(given: NDArray[np.object_], notes: tuple[Note, ...], merged: MergedFootprints) -> None:
     """Check that each footprint, and each part of one, is covered in one place at least or noted."""
     gone = {note.subject for note in notes if note.kind in GONE}
     city = shapely.union_all(merged.polygons)

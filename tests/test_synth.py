@@ -73,9 +73,7 @@ def test_the_readers_get_back_what_was_made(written: tuple[Path, SynthFiles]) ->
         footprints, notes = read_footprints(path, crs=SWEREF, bounds=bounds)
         assert notes == ()
         assert footprints.ids.tolist() == made.ids.tolist()
-        same = shapely.equals_exact(
-            shapely.normalize(footprints.polygons), shapely.normalize(made.polygons), 1e-9
-        )
+        same = shapely.equals_exact(shapely.normalize(footprints.polygons), shapely.normalize(made.polygons), 1e-9)
         assert same.all()
     cloud, counts = read_points(files.clouds[0], bounds)
     part = city_points(made, (X, Y, X + 400, Y + 400), (0, 0))

@@ -1,7 +1,6 @@
 """The city model as a CityJSON 2.0 file, and back (steps 1.7 and 2.4)."""
 
 import json
-import os
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
@@ -18,6 +17,7 @@ from pipeline.citymodel import CityModel
 from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note
 from pipeline.solids import Solids, build_solids
+from tiler.atomic import replacing
 
 # Coordinates are whole multiples of this length (m).
 GRID = 0.001
@@ -66,7 +66,9 @@ def write_city_model(
         If two buildings have one id, a footprint is not a Polygon, a height or bound is not finite,
         or a column of `attributes` has the wrong length or one of our names.
     ConfigError
-        If pyproj does not know the CRS, or the file cannot be written.
+        If pyproj does not know the CRS.
+    OutputError
+        If the file cannot be written.
 
     Notes
     -----
@@ -115,7 +117,8 @@ def write_city_model(
         }
     )
     # Two objects become one, so that the buildings are turned into text only once.
-    _replace(path, f"{head[:-1]},{body[1:]}\n")
+    with replacing(path) as part:
+        part.write_text(f"{head[:-1]},{body[1:]}\n", encoding="ascii")
     return notes
 
 
@@ -235,16 +238,6 @@ def _solid(floor: list[list[int]], roof: list[list[int]], walls: list[list[list[
 
 def _text(document: dict[str, Any]) -> str:
     return json.dumps(document, separators=(",", ":"), allow_nan=False)
-
-
-def _replace(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text, encoding="ascii")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise ConfigError(f"{path}: cannot be written ({error.strerror}); choose another folder") from error
 
 
 def _parse(document: dict[str, Any]) -> CityModel:

@@ -1,6 +1,5 @@
 """Pictures of a run's boundary and volume mesh, drawn off-screen (step 3.6)."""
 
-import os
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError
+from tiler.atomic import replacing
 from tiler.picture_parts import City, add_air, add_houses, add_terrain, load_city, load_volume
 
 # Pictures, and their sizes (pixels) where nothing else is asked for.
@@ -50,7 +50,9 @@ def render_run(
     ValueError
         If `what` is none of these, or `size` is less than 2 x 2.
     ConfigError
-        If pyvista is not installed, or the picture cannot be written.
+        If pyvista is not installed.
+    OutputError
+        If the picture cannot be written.
     InputError
         If a file of the run is missing, damaged, or has no ground.
 
@@ -176,10 +178,5 @@ def _aim(plotter: Any, points: NDArray[np.float64], view: tuple[float, float], s
 def _save(image: NDArray[np.uint8], output: Path) -> None:
     from PIL import Image
 
-    part = output.with_name(output.name + ".part")
-    try:
+    with replacing(output) as part:
         Image.fromarray(image).save(part, format="png", optimize=True)
-        os.replace(part, output)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise ConfigError(f"{output}: cannot be written ({error.strerror}); choose another folder") from error
