@@ -5,10 +5,13 @@ import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import CityError, ConfigError
 from tiler.config import Config, annotated_defaults, load_config, make_config
+
+if TYPE_CHECKING:
+    from tiler.synth import SynthFiles
 
 EXIT_CODES = (
     "Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 3 done but for parts listed in run.json."
@@ -73,7 +76,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_city(synth, size=1000.0, buildings=500)
     demo = command("demo", _demo, "make a synthetic city, mesh it, check it, and draw it")
     demo.add_argument("--out", type=Path, default=Path("demo"), help="folder to write to (default: demo)")
-    _add_city(demo, size=500.0, buildings=150)
+    _add_city(demo, size=600.0, buildings=220)
     render = command("render", _render, "draw a picture of a run")
     render.add_argument("directory", type=Path, help="folder of a run")
     render.add_argument("-o", "--output", type=Path, required=True, help="PNG file to write")
@@ -172,7 +175,7 @@ def _synth(options: argparse.Namespace) -> int:
     return 0
 
 
-def _write_city(directory: Path, options: argparse.Namespace) -> None:
+def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":
     from tiler.synth import write_city
 
     files = write_city(
@@ -183,18 +186,20 @@ def _write_city(directory: Path, options: argparse.Namespace) -> None:
         relief=options.relief,
         seed=options.seed,
     )
-    print(f"{len(files.clouds)} point-cloud files and {files.footprints.name} in {directory}")
+    clouds, shapefile = files.clouds[0].parent, files.shapefile
+    print(f"{len(files.clouds)} LAZ files in {clouds}, footprints in {shapefile} and {files.footprints.name}")
+    return files
 
 
 def _demo(options: argparse.Namespace) -> int:
     from tiler.render import render_run
 
     city, result, picture = options.out / "city", options.out / "result", options.out / "demo.png"
-    _write_city(city, options)
+    files = _write_city(city, options)
     config = make_config(
         {
-            "pointcloud": [str(city)],
-            "footprints": str(city / "footprints.shp"),
+            "pointcloud": [str(path) for path in files.clouds],
+            "footprints": str(files.shapefile),
             "out": str(result),
             "overwrite": True,
         }

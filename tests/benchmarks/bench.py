@@ -35,7 +35,7 @@ def citystitch(*arguments: str) -> None:
 def record_of(city: Path, out: Path, *options: str) -> dict[str, Any]:
     """Mesh the city and return what run.json says."""
     footprints = str(city / "footprints.shp")
-    citystitch("run", str(city), "--footprints", footprints, "--out", str(out), "--overwrite", *options)
+    citystitch("run", str(city / "tiles"), "--footprints", footprints, "--out", str(out), "--overwrite", *options)
     record: dict[str, Any] = json.loads((out / "run.json").read_text())
     return record
 
@@ -76,7 +76,7 @@ def report(coarse: dict[str, Any], fine: dict[str, Any], layers: dict[str, Any])
         "# Benchmarks",
         "",
         "Written by `make bench`; do not edit. Synthetic city of 1 km, 500 buildings (`citystitch synth CITY`);",
-        "`citystitch run CITY --footprints CITY/footprints.shp`, from LAZ to written mesh, in one process on one",
+        "`citystitch run CITY/tiles --footprints CITY/footprints.shp`, LAZ to written mesh, in one process on one",
         f"core with numba's cache warm; medians of {RUNS} runs. The machine is shared: compare within a table.",
         "",
         f"Machine: {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}.",
