@@ -225,6 +225,16 @@ def test_a_chunk_table_beyond_the_file_is_refused(laz: Path) -> None:
         read_header(patch(laz, begin, "q", 7))
 
 
+def test_a_chunk_table_may_be_found_from_the_end(laz: Path) -> None:
+    whole, _ = read_points(laz, EVERYWHERE)
+    begin = struct.unpack_from("<I", laz.read_bytes(), 96)[0]
+    table = laz.read_bytes()[begin : begin + 8]
+    patch(laz, begin, "q", -1)
+    laz.write_bytes(laz.read_bytes() + table)
+    assert read_header(laz).n_points == 5000
+    assert read_points(laz, EVERYWHERE)[0].xyz.tobytes() == whole.xyz.tobytes()
+
+
 def test_points_outside_their_header_are_refused(laz: Path) -> None:
     patch(laz, 179, "d", ORIGIN[0] + 50)
     assert read_header(laz).bounds[2] == ORIGIN[0] + 50

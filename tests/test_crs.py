@@ -1,5 +1,6 @@
 """The region's CRS: who decides, what is refused, and the command that mends it."""
 
+import copy
 from pathlib import Path
 
 import pyproj
@@ -49,6 +50,18 @@ def test_axis_order_does_not_matter_but_the_projection_does() -> None:
         assert horizontal_crs(written) == sweden
     assert not same_crs(RD, pyproj.CRS("EPSG:28991"))
     assert not same_crs(pyproj.CRS("EPSG:32631"), pyproj.CRS("EPSG:25831"))
+
+
+def test_axis_order_does_not_matter_outside_the_register_either() -> None:
+    ours = pyproj.CRS("EPSG:3006").to_json_dict()
+    del ours["id"]
+    ours["conversion"]["parameters"][3]["value"] = 123456.0  # an own false easting
+    theirs = copy.deepcopy(ours)
+    theirs["coordinate_system"]["axis"].reverse()
+    one, other = (pyproj.CRS.from_json_dict(fields) for fields in (ours, theirs))
+    assert horizontal_crs(one) is not None
+    assert same_crs(one, other)
+    assert not same_crs(one, pyproj.CRS("EPSG:3006"))
 
 
 def test_asked_comes_first() -> None:
@@ -173,7 +186,11 @@ def test_utm_zones_at_the_edges() -> None:
 
 
 def test_an_area_across_the_date_line() -> None:
-    chatham = cloud(None, bounds=(3500000.0, 5140000.0, 3501000.0, 5141000.0, 0.0, 9.0))
-    crs = pyproj.CRS("EPSG:3793")
+    crs = pyproj.CRS("EPSG:3851")  # New Zealand's continental shelf, 160 degrees east to 171 west
     assert crs.area_of_use is not None
-    assert resolve_crs("EPSG:3793", [chatham], None)[0] == crs
+    assert crs.area_of_use.east < 0 < crs.area_of_use.west
+    forward = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    for lon, lat, told in ((-176.5, -44.0, 1), (174.8, -41.3, 1), (-150.0, -44.0, 2), (140.0, -44.0, 2)):
+        x, y = forward.transform(lon, lat)
+        where = cloud(None, bounds=(x, y, x + 10, y + 10, 0.0, 9.0))
+        assert len(resolve_crs("EPSG:3851", [where], None)[1]) == told

@@ -3,9 +3,11 @@
 import hashlib
 import json
 import time
+from datetime import date
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import pyproj
 import pytest
@@ -63,6 +65,8 @@ def test_the_readers_get_back_what_was_made(written: tuple[Path, SynthFiles]) ->
     folder, files = written
     made = city(size=800.0, buildings=200, density=0.5)
     assert find_clouds([folder / "tiles"]) == files.clouds
+    with laspy.open(files.clouds[0]) as reader:
+        assert reader.header.creation_date == date(2022, 1, 1)  # not today
     assert [path.name for path in files.clouds] == [
         f"{x}_{y}.laz" for x in (318000, 318400) for y in (6399000, 6399400)
     ]
@@ -123,6 +127,10 @@ def test_heights_and_relief() -> None:
     x, y = (side.ravel() for side in np.meshgrid(*[np.linspace(0, 400, 201)] * 2))
     z = terrain_height(made, x + X, y + Y)
     assert z.max() - z.min() == pytest.approx(35, rel=0.1)
+    angle, (x0, y0, radius, level) = np.linspace(0, 2 * np.pi, 99), made.pond
+    for share, reach in ((0.0, 0.0), (0.9, 0.0), (1.001, 1e-3)):  # of the radius; above the level
+        shore = share * radius * np.column_stack((np.cos(angle), np.sin(angle))) + (x0, y0)
+        assert np.abs(terrain_height(made, *shore.T) - level).max() <= reach
     slope = np.hypot(*np.gradient(z.reshape(201, 201), 2.0))
     assert slope.max() < 1.5  # no cliff, also not at the pond
     assert np.ptp(terrain_height(city(relief=0.0), x + X, y + Y)) < 1e-9
