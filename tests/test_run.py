@@ -23,6 +23,7 @@ from tiler.cli import main
 from tiler.config import make_config
 from tiler.run import run
 from tiler.store import Store, StoredTerrain, read_columns
+from tiler.synth import write_city
 
 BOUNDS: Bounds = (318000.0, 6399000.0, 318100.0, 6399100.0)
 HOUSE = shapely.box(318020, 6399020, 318040, 6399045)
@@ -353,6 +354,70 @@ def test_wrong_usage_ends_with_two(capsys: pytest.CaptureFixture[str]) -> None:
         assert stop.value.code == 2
     assert main(["run"]) == 2
     assert "no point cloud" in capsys.readouterr().err
+
+
+def test_paraviews_readers_find_the_numbers_of_the_record(city: Path, tmp_path: Path) -> None:
+    from vtkmodules.vtkIOXML import vtkXMLPPolyDataReader, vtkXMLPUnstructuredGridReader
+
+    out = tmp_path / "out"
+    counts = run(make_config(values(city, out)))["counts"]
+    for reader, name, cells in (
+        (vtkXMLPUnstructuredGridReader(), "mesh.pvtu", counts["cells"]),
+        (vtkXMLPPolyDataReader(), "boundary.pvtp", counts["facets"]),
+    ):
+        errors: list[str] = []
+        reader.AddObserver("ErrorEvent", lambda *_, errors=errors: errors.append("error"))
+        reader.SetFileName(str(out / name))
+        reader.Update()
+        assert not errors
+        assert reader.GetOutput().GetNumberOfCells() == cells
+        if name == "mesh.pvtu":
+            assert reader.GetOutput().GetNumberOfPoints() == counts["points"]
+        else:
+            arrays = reader.GetOutput().GetCellData()
+            assert [arrays.GetArrayName(k) for k in range(arrays.GetNumberOfArrays())] == ["marker", "building"]
+
+
+@pytest.mark.long
+@pytest.mark.shared
+def test_real_data_with_finite_elements_is_the_same_city(shared_data: Path, tmp_path: Path) -> None:
+    """Amsterdam with `--smoother fem`: proved, and within centimetres of the fast path."""
+    config = {
+        "pointcloud": [str(shared_data / "amsterdam" / "tiles")],
+        "footprints": str(shared_data / "amsterdam" / "footprints.shp"),
+        "bounds": [120700.0, 486000.0, 121000.0, 486300.0],
+    }
+    columns = {}
+    for smoother in ("columns", "fem"):
+        out = tmp_path / smoother
+        run(make_config(config | {"out": str(out), "smoother": smoother}))
+        assert check_run(out, StoredTerrain).ok
+        store = Store(out / "store.zarr")
+        columns[smoother] = read_columns(store, store.tiles("columns")[0])
+    difference = np.abs(columns["columns"].z - columns["fem"].z)
+    assert difference.mean() < 0.05
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(20))
+def test_random_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
+    """Synthetic cities of any density and relief, from files to files."""
+    rng = np.random.default_rng(seed)
+    buildings, relief = int(rng.integers(20, 400)), float(rng.uniform(0, 60))
+    synthetic = write_city(tmp_path / "city", size=500, buildings=buildings, density=1.0, relief=relief, seed=seed)
+    config = {
+        "pointcloud": [str(path) for path in synthetic.clouds],
+        "footprints": str(synthetic.footprints),
+        "out": str(tmp_path / "out"),
+        "domain_height": 160.0,
+        "mesh_size": float(rng.choice([6.0, 10.0, 15.0])),
+        "layer_height": float(rng.choice([4.0, 10.0])),
+        "border": str(rng.choice(["drop", "clip"])),
+    }
+    record = run(make_config(config))
+    report = check_run(tmp_path / "out", StoredTerrain)
+    assert report.ok, report.lines()
+    assert record["counts"]["buildings"] > 0
 
 
 @pytest.mark.shared
