@@ -242,6 +242,13 @@ def truncated(city: Path) -> None:
     (city / "west.laz").write_bytes(data[: len(data) // 2])
 
 
+def without_its_end(city: Path) -> None:
+    """Damage that shows only when the points are decompressed."""
+    data = bytearray((city / "west.laz").read_bytes())
+    data[-2000:-20] = bytes(1980)
+    (city / "west.laz").write_bytes(bytes(data))
+
+
 def absurd_header(city: Path) -> None:
     data = bytearray((city / "west.laz").read_bytes())
     data[131:139] = np.float64(np.nan).tobytes()
@@ -274,6 +281,7 @@ def nothing(_: Path) -> None:
 CASES: list[tuple[str, Callable[[Path], None], list[str], int, str]] = [
     ("missing cloud", lambda city: (city / "west.laz").unlink(), ["{city}/west.laz"], 1, "west.laz"),
     ("truncated", truncated, [], 1, "west.laz"),
+    ("damaged inside", without_its_end, [], 1, "west.laz"),
     ("NaN in header", absurd_header, [], 1, "west.laz"),
     ("no points", no_points, [], 1, "hold no point"),
     ("text for a cloud", text_cloud, [], 1, "west.laz"),
@@ -317,8 +325,11 @@ def test_bad_input_ends_in_one_clear_message(
         assert not (tmp_path / "out" / "mesh.pvtu").exists()
 
 
-def test_skip_unreadable_leaves_a_file_out_and_ends_with_three(city: Path, tmp_path: Path) -> None:
-    truncated(city)
+@pytest.mark.parametrize("damage", [truncated, without_its_end])
+def test_skip_unreadable_leaves_a_file_out_and_ends_with_three(
+    city: Path, tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    damage(city)
     out = tmp_path / "out"
     assert main(arguments(city, out, "--skip-unreadable")) == 3
     record = json.loads((out / "run.json").read_text())
