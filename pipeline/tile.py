@@ -296,6 +296,7 @@ def _assemble(
         heights.ground[kept],
         heights.roof[kept],
         tuple(members[row] for row in kept),
+        ids,
     )
     return City(
         model,

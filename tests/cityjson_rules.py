@@ -45,6 +45,14 @@ ATTRIBUTES = {
     },
     "required": ["number", "ground_height", "roof_height", "height", "members"],
 }
+GEOMETRY = array(
+    {
+        "oneOf": [
+            geometry("MultiSurface", "0", array(FACE, 1)),
+            geometry("Solid", "1.2", array(array(FACE, 5), 1, 1)),
+        ]
+    }
+)
 # Sections 2 to 5 of https://www.cityjson.org/specs/2.0.1/, as far as the model's buildings go.
 SCHEMA = record(
     {
@@ -66,20 +74,20 @@ SCHEMA = record(
         ),
         "CityObjects": {
             "type": "object",
-            "additionalProperties": record(
-                {
-                    "type": {"const": "Building"},
-                    "attributes": ATTRIBUTES,
-                    "geometry": array(
+            "additionalProperties": {
+                "oneOf": [
+                    record({"type": {"const": "Building"}, "attributes": ATTRIBUTES, "geometry": GEOMETRY}),
+                    record(
                         {
-                            "oneOf": [
-                                geometry("MultiSurface", "0", array(FACE, 1)),
-                                geometry("Solid", "1.2", array(array(FACE, 5), 1, 1)),
-                            ]
+                            "type": {"const": "BuildingPart"},
+                            "parents": array({"type": "string"}, 1, 1),
+                            "attributes": ATTRIBUTES,
+                            "geometry": GEOMETRY,
                         }
                     ),
-                }
-            ),
+                    record({"type": {"const": "Building"}, "children": array({"type": "string"}, 1)}),
+                ]
+            },
         },
         "vertices": array(array({"type": "integer"}, 3, 3)),
     }
@@ -103,6 +111,11 @@ def file_faults(document: Json) -> set[str]:
         values = item.get("semantics", {}).get("values", [[]])[0]
         if item["type"] == "Solid" and len(values) != len(faces_of(item)):
             faults.add("semantics do not match the faces")
+    objects = document["CityObjects"]
+    down = {(name, child) for name, item in objects.items() for child in item.get("children", [])}
+    up = {(parent, name) for name, item in objects.items() for parent in item.get("parents", [])}
+    if down != up or not {name for pair in down for name in pair} <= objects.keys():
+        faults.add("parents and children differ")
     return faults
 
 
@@ -111,7 +124,7 @@ def solid_faults(document: Json) -> dict[str, set[str]]:
     points = np.array(document["vertices"]) * document["transform"]["scale"] + document["transform"]["translate"]
     found = {}
     for name, item in document["CityObjects"].items():
-        for solid in item["geometry"]:
+        for solid in item.get("geometry", []):
             if solid["type"] == "Solid":
                 found[name] = set(_solid_faults(solid, points, item["attributes"]))
     return found
@@ -119,7 +132,7 @@ def solid_faults(document: Json) -> dict[str, set[str]]:
 
 def geometries(document: Json) -> Iterator[Json]:
     for item in document["CityObjects"].values():
-        yield from item["geometry"]
+        yield from item.get("geometry", [])
 
 
 def faces_of(item: Json) -> list[list[list[int]]]:

@@ -172,7 +172,7 @@ def _make_model(houses: Mapping[str, tuple[tuple[Square, ...], int]], dtm: Plane
     ids = np.array(list(houses), np.str_)
     ground = np.array([dtm.sample(shapely.get_coordinates(polygon)).min() for polygon in polygons])
     roof = np.array([LEVELS[level - 1] for _, level in houses.values()])
-    return CityModel(polygons, ids, number_ids(ids), ground, roof, tuple((str(name),) for name in ids))
+    return CityModel(polygons, ids, number_ids(ids), ground, roof, tuple((str(name),) for name in ids), ids)
 
 
 def _box_of(square: Square) -> Any:

@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ def make_model(*polygons: Any, ground: Any = 0.7, roof: Any = 12.3456789, ids: A
         ground=np.broadcast_to(np.float64(ground), n).copy(),
         roof=np.broadcast_to(np.float64(roof), n).copy(),
         members=tuple((str(name), f"{name}-annex") for name in names),
+        house=names,
     )
 
 
@@ -125,6 +127,32 @@ def test_attributes_keep_their_precision_and_extra_columns(target: Path) -> None
         "kept": True,
     }
     assert (second["rmse"], second["source"], second["kept"]) == (None, None, False)
+
+
+def test_a_house_of_two_parts_is_a_building_with_two_parts(target: Path) -> None:
+    front, back = shapely.box(121000, 487000, 121010, 487010), shapely.box(121010, 487000, 121020, 487010)
+    alone = shapely.box(121030, 487000, 121040, 487010)
+    model = replace(
+        make_model(front, back, alone, roof=[9.0, 4.0, 6.0], ids=["h-1", "h-2", "k"]),
+        house=np.array(["h", "h", "k"]),
+    )
+    document, _ = write(target, model)
+    assert file_faults(document) == set()
+    assert set().union(*solid_faults(document).values()) == set()
+    objects = document["CityObjects"]
+    assert objects["h"] == {"type": "Building", "children": ["h-1", "h-2"]}
+    assert [objects[name]["type"] for name in ("h-1", "h-2", "k")] == ["BuildingPart", "BuildingPart", "Building"]
+    assert file_faults(broken(document, ["CityObjects", "h", "children"], ["h-1"])) == {
+        "parents and children differ"
+    }
+    assert read_city_model(target).house.tolist() == ["h", "h", "k"]
+
+
+def test_an_id_is_a_row_or_a_house_of_parts(target: Path) -> None:
+    houses = [shapely.box(0, 0, 9, 9), shapely.box(20, 0, 29, 9)]
+    model = replace(make_model(*houses, ids=["h", "h-1"]), house=np.array(["h", "h"]))
+    with pytest.raises(ValueError, match="building h: is a row and has parts"):
+        write(target, model)
 
 
 def test_an_empty_model_is_valid(target: Path) -> None:
