@@ -34,7 +34,8 @@ def mesh_of(city: CityModel, dtm: Dtm, options: LayeredOptions = OPTIONS, bounds
 
 def volumes(mesh: TetMesh) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     corners = mesh.points[mesh.cells]
-    return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    volume: np.ndarray[tuple[int], np.dtype[np.float64]] = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    return volume
 
 
 def test_a_prism_becomes_the_papers_three_tetrahedra() -> None:
