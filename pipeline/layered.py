@@ -137,7 +137,7 @@ def mesh_layers(
     ground_only = np.zeros(z.shape, np.bool_)
     ground_only[:, 0] = True
     z, moved_terrain = repair_columns(z, np.zeros(len(z), np.int32), ground_only, min_gap=min_gap)
-    check_headroom(z, plane, city.roof, city.ids, domain_height=options.domain_height, layer_height=layer_height)
+    check_headroom(z[:, -1], plane, city.roof, city.ids, domain_height=options.domain_height, air=layer_height / 2)
     removed = count_removed_layers(z, plane, city.roof, wall_ground, layer_height=layer_height)
     first = first_levels(plane, removed)
     kept = first_kept(plane, first)

@@ -8,6 +8,7 @@ import triangle
 from numpy.typing import NDArray
 
 from pipeline.errors import GeometryError
+from pipeline.improve_plane import improve_plane
 from pipeline.mesh import PlaneMesh
 
 MIN_ANGLE = 25.0  # degrees; Triangle's quality bound (paper, step 3.1; higher may not terminate)
@@ -123,6 +124,7 @@ def mesh_plane(
     *,
     mesh_size: float,
     min_angle: float = MIN_ANGLE,
+    passes: int = 0,
 ) -> tuple[PlaneMesh, bool]:
     """Mesh the region with all walls as edges (paper, step 3.1).
 
@@ -136,6 +138,8 @@ def mesh_plane(
         Target edge length h (m); no triangle is larger than h**2 / 2.
     min_angle : float
         Bound on the angles (degrees).
+    passes : int
+        Rounds of `improve_plane`. With any, a triangle may be larger than the bound.
 
     Returns
     -------
@@ -151,6 +155,7 @@ def mesh_plane(
     """
     graph = plane_graph(bounds, polygons)
     xy, triangles, label, complete = triangulate_plane(graph, max_area=mesh_size**2 / 2, min_angle=min_angle)
+    xy, triangles = improve_plane(xy, triangles, label, mesh_size=mesh_size, passes=passes)
     used = np.unique(triangles)
     order = used[np.lexsort((xy[used, 1], xy[used, 0]))]
     rank = np.empty(len(xy), np.int32)

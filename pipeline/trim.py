@@ -67,15 +67,30 @@ def first_kept(plane: PlaneMesh, first: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def check_headroom(
-    z: NDArray[np.float64],
+    top: NDArray[np.float64],
     plane: PlaneMesh,
     roof: NDArray[np.float64],
     ids: NDArray[np.str_],
     *,
     domain_height: float,
-    layer_height: float,
+    air: float,
 ) -> None:
-    """Refuse a roof that comes closer than half a layer to the top of the domain.
+    """Refuse a roof that comes too close to the top of the domain.
+
+    Parameters
+    ----------
+    top : float64, (n,)
+        Height of each column's top (m).
+    plane : PlaneMesh
+        Plane mesh; every building has a triangle.
+    roof : float64, (b,)
+        Absolute roof heights (m).
+    ids : str, (b,)
+        Building ids.
+    domain_height : float
+        Height of the domain (m), for the message.
+    air : float
+        Least air above a roof (m).
 
     Raises
     ------
@@ -85,16 +100,16 @@ def check_headroom(
     inside = plane.building >= 0
     label = np.repeat(plane.building[inside], 3)
     corner = plane.triangles[inside].ravel()
-    top = np.full(len(roof), np.inf)
-    np.minimum.at(top, label, z[corner, -1])
-    missing = roof + layer_height / 2 - top
+    lowest = np.full(len(roof), np.inf)
+    np.minimum.at(lowest, label, top[corner])
+    missing = roof + air - lowest
     if len(roof) == 0 or missing.max() <= 0:
         return
     worst = int(missing.argmax())
     x, y = plane.xy[corner[label == worst]].mean(axis=0)
-    enough = np.ceil(domain_height + missing[worst] + layer_height)
+    enough = np.ceil(domain_height + missing[worst] + 2 * air)
     raise GeometryError(
-        f"building {ids[worst]} at ({x:.1f}, {y:.1f}), step 3.4: its roof at {roof[worst]:.1f} m leaves no "
-        f"air below the domain's top at {top[worst]:.1f} m; raise --domain-height to {enough:.0f}, or correct "
-        "the building's height"
+        f"building {ids[worst]} at ({x:.1f}, {y:.1f}), step 3.4: its roof at {roof[worst]:.1f} m leaves "
+        f"{lowest[worst] - roof[worst]:.1f} m of air below the domain's top at {lowest[worst]:.1f} m, less than "
+        f"{air:.1f} m; raise --domain-height to {enough:.0f}, or correct the building's height"
     )
