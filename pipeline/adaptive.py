@@ -24,6 +24,7 @@ from pipeline.levels import (
     triangle_surfaces,
 )
 from pipeline.mesh import ColumnMesh, PlaneMesh
+from pipeline.neighbours import check_groups
 from pipeline.spacing import SpacingLimits, domain_top, mean_edges, vertical_spacing
 from pipeline.terrain import Dtm, sample_dtm
 from pipeline.trim import check_headroom
@@ -122,7 +123,7 @@ def mesh_adaptive(
     ValueError
         If a group has two heights, or the seam lacks a roof that the mesh has there.
     """
-    _check_groups(roof, group)
+    check_groups(roof, group)
     seam = no_seam() if seam is None else seam
     levels, bottom, moves = _fill_columns(plane, dtm, roof, ids, options, seam)
     mesh = ColumnMesh(plane, levels.start, levels.z, bottom, "heights")
@@ -180,15 +181,6 @@ def _fill_columns(
     _check_top(plane, nodes, top, least_gap, options.domain_height)
     levels, bottom = fill_levels(nodes, top, spacing, shift, seam)
     return levels, bottom, moves
-
-
-def _check_groups(roof: NDArray[np.float64], group: NDArray[np.int32]) -> None:
-    order = np.argsort(group, kind="stable")
-    same = group[order[1:]] == group[order[:-1]]
-    differs = np.flatnonzero(same & (roof[order[1:]] != roof[order[:-1]]))
-    if len(differs):
-        first, second = order[differs[0]], order[differs[0] + 1]
-        raise ValueError(f"group {group[first]} has roofs at {roof[first]} m and {roof[second]} m")
 
 
 def _check_top(
