@@ -102,7 +102,7 @@ def _frozen_vertices(
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _ring_cost(ring: NDArray[np.float64], n: int, x: float, y: float, bound: float) -> float:
-    """Sum of (squared edges / area)^2 of the triangles around a place; stops above `bound`."""
+    """Sum of (squared edges / area)^4 of the triangles around a place; infinite from `bound` on."""
     total = 0.0
     for k in range(n):
         px, py = ring[k, 0] - x, ring[k, 1] - y
@@ -111,7 +111,8 @@ def _ring_cost(ring: NDArray[np.float64], n: int, x: float, y: float, bound: flo
         if area2 <= 0:
             return np.inf
         ratio = (px * px + py * py + qx * qx + qy * qy + ring[k, 4]) / area2
-        total += ratio * ratio
+        square = ratio * ratio
+        total += square * square
         if total >= bound:
             return np.inf
     return total

@@ -53,7 +53,9 @@ def mesh_of(
     options: AdaptiveOptions = OPTIONS,
     group: NDArray[np.int32] | None = None,
 ) -> tuple[ColumnMesh, AdaptiveReport]:
-    plane, _ = mesh_plane(bounds, city.polygons, mesh_size=options.mesh_size, min_angle=28, passes=4)
+    plane, _ = mesh_plane(
+        bounds, city.polygons, mesh_size=options.mesh_size, min_angle=28, refinements=1, passes=4
+    )
     group = own_groups(city) if group is None else group
     return mesh_adaptive(plane, dtm, city.roof, group, city.ids, options)
 
