@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import shapely
 
+from pipeline.city import City, CityOptions
 from pipeline.citymodel import Footprints, make_ids, number_ids
 from pipeline.columns import expand_cells, lowest_gap
 from pipeline.errors import InputError
 from pipeline.layered import LayeredOptions
 from pipeline.notes import count_notes
-from pipeline.tile import City, CityOptions, build_city, mesh_city, simplify_city
+from pipeline.simplify import simplify_city
+from pipeline.tile import build_city, mesh_city
 from tests.cities import Bounds, cloud_over, tilted_dtm
 
 BOUNDS: Bounds = (1000.0, 2000.0, 1100.0, 2100.0)
@@ -25,9 +27,13 @@ OPTIONS = CityOptions(
     default_height=6.0,
     roof_clearance=2.0,
     border="drop",
+    simplify="paper",
     clearance=1.0,
     clearance_floor=0.1,
     min_courtyard_area=10.0,
+    split_levels=False,
+    roof_group=2.0,
+    manifold=False,
 )
 LAYERS = LayeredOptions(
     mesh_size=10.0, layer_height=10.0, domain_height=100.0, smoother="columns", tolerance=0.003, fem_tolerance=1e-8
@@ -49,8 +55,8 @@ def city_over(
     slope: float = 0.0,
 ) -> City:
     dtm = tilted_dtm(BOUNDS, slope_x=slope, height=-1000 * slope)
-    city = build_city(cloud_over(BOUNDS, roofs), footprints, dtm, BOUNDS, options)
-    return simplify_city(city, dtm, options)
+    cloud = cloud_over(BOUNDS, roofs)
+    return simplify_city(build_city(cloud, footprints, dtm, BOUNDS, options), cloud, dtm, options)
 
 
 A, B = shapely.box(1020, 2020, 1035, 2040), shapely.box(1035.5, 2020, 1050, 2040)
@@ -138,7 +144,7 @@ def test_the_city_does_not_depend_on_the_order_of_footprints_and_points() -> Non
         footprints = footprints_of(*houses)
         shuffled = Footprints(footprints.polygons[order], footprints.ids[order], footprints.given_height[order])
         points = dataclasses.replace(cloud, xyz=cloud.xyz[rows], classification=cloud.classification[rows])
-        city = simplify_city(build_city(points, shuffled, dtm, BOUNDS, OPTIONS), dtm, OPTIONS)
+        city = simplify_city(build_city(points, shuffled, dtm, BOUNDS, OPTIONS), points, dtm, OPTIONS)
         results.append(
             (city.model.ids.tolist(), city.model.roof.tobytes(), shapely.to_wkb(city.model.polygons).tolist())
         )

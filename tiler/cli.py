@@ -41,10 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("citystitch: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except (OSError, MemoryError) as error:
+    except Exception as error:
         if options.traceback:
             raise
-        print(f"citystitch: {type(error).__name__}: {error}; --traceback tells where", file=sys.stderr)
+        reason = " ".join(str(error).split())
+        print(f"citystitch: {type(error).__name__}: {reason}; --traceback tells where", file=sys.stderr)
         return EXIT_FAILED
 
 

@@ -87,8 +87,12 @@ class Config:
         10.0, "buildings", "ground height of a building, percentile of its ground points", unit="%",
         source="paper, step 1.6", least=0, most=100,
     )  # fmt: skip
+    roof_height: str = _parameter(
+        "median", "buildings", "roof height of a building: the median of its roof points, or roof_percentile (the "
+        "paper's)", choices=("median", "percentile"),
+    )  # fmt: skip
     roof_percentile: float = _parameter(
-        90.0, "buildings", "roof height of a building, percentile of its roof points", unit="%",
+        90.0, "buildings", "percentile of the roof points with roof_height = percentile", unit="%",
         source="paper, step 1.6", least=0, most=100,
     )  # fmt: skip
     default_height: float = _parameter(
@@ -104,8 +108,8 @@ class Config:
         choices=("drop", "clip"),
     )  # fmt: skip
     simplify: str = _parameter(
-        "paper", "simplify", "how close buildings are simplified: the paper's merging", source="paper, step 2.1",
-        choices=("paper",),
+        "clearance", "simplify", "clearance: one planar graph of walls that keeps every house; paper: merging",
+        source="paper, step 2.1", choices=("clearance", "paper"),
     )  # fmt: skip
     clearance: float = _parameter(
         1.0,
@@ -116,29 +120,54 @@ class Config:
         least=0.1,
     )
     clearance_floor: float = _parameter(
-        0.1, "simplify", "details of one building finer than this are repaired", unit="m", above=0
-    )
+        0.1, "simplify", "with simplify = paper: finer details of one building are repaired", unit="m",
+        above=0,
+    )  # fmt: skip
     min_courtyard_area: float = _parameter(10.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
+    split_levels: bool = _parameter(
+        True, "simplify", "divide houses where their roof points show a step, with simplify = clearance"
+    )
+    roof_group: float = _parameter(
+        2.0, "simplify", "adjacent houses closer in height than this get one roof, with simplify = clearance",
+        unit="m", least=0,
+    )  # fmt: skip
+    manifold: bool = _parameter(
+        False, "simplify", "open or close the corners in which houses touch in a point only"
+    )
     mesh_size: float = _parameter(
         10.0, "mesh", "target edge length h; no triangle of the plane mesh is larger than h^2/2", unit="m",
         source="paper, step 3.1", least=0.1,
     )  # fmt: skip
     min_angle: float = _parameter(
-        25.0, "mesh", "smallest angle of the plane mesh, but at sharper corners of buildings", unit="degrees",
-        source="paper, step 3.1", least=5, most=32,
+        0.0, "mesh", "least angle of the plane mesh, but at sharp corners; 0 takes the mesher's own: 28 adaptive, "
+        "25 layered", unit="degrees", source="paper, step 3.1", least=0, most=32,
     )  # fmt: skip
     domain_height: float = _parameter(
         100.0, "mesh", "height of the domain above the terrain", unit="m", source="paper, step 3.2", above=0
     )
-    layer_height: float = _parameter(
-        0.0, "mesh", "height of a layer; 0 takes the mesh size", unit="m", source="paper, step 3.2", least=0
-    )
     mesher: str = _parameter(
-        "layered", "mesh", "how columns are filled: the paper's layers", source="paper, steps 3.2-3.5",
-        choices=("layered",),
+        "adaptive", "mesh", "how columns are filled: each by its own levels, or by the paper's layers",
+        source="paper, steps 3.2-3.5", choices=("adaptive", "layered"),
+    )  # fmt: skip
+    least_spacing: float = _parameter(
+        0.1, "mesh", "least vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=1
+    )
+    most_spacing: float = _parameter(
+        0.8, "mesh", "largest vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=5
+    )
+    stagger: float = _parameter(
+        0.8, "mesh", "shift of neighbouring columns with mesher = adaptive; 0 for none, 1 for thirds of a step",
+        least=0, most=1,
+    )  # fmt: skip
+    improve_passes: int = _parameter(
+        1, "mesh", "rounds of moving levels at the worst cells with mesher = adaptive", least=0, most=20
+    )
+    layer_height: float = _parameter(
+        0.0, "mesh", "height of a layer with mesher = layered; 0 takes the mesh size", unit="m",
+        source="paper, step 3.2", least=0,
     )  # fmt: skip
     smoother: str = _parameter(
-        "columns", "mesh", "columns: fast filter and column solver; fem: finite elements, as in the paper",
+        "columns", "mesh", "with mesher = layered: fast filter and column solver, or the paper's finite elements",
         source="paper, steps 3.3 and 3.5", choices=("columns", "fem"),
     )  # fmt: skip
     smoothing_tolerance: float = _parameter(
@@ -288,6 +317,10 @@ def _check_together(config: Config) -> None:
     if config.clearance_floor > config.clearance:
         raise ConfigError(
             f"clearance_floor = {config.clearance_floor:g} m: must be at most clearance = {config.clearance:g} m"
+        )
+    if config.least_spacing > config.most_spacing:
+        raise ConfigError(
+            f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
         )
     if config.layer_height_or_default > config.domain_height / 2:
         raise ConfigError(

@@ -88,14 +88,14 @@ def write_columns(store: Store, tile: str, mesh: ColumnMesh) -> None:
         "z": mesh.z,
         "bottom": mesh.bottom,
     }
-    store.write("columns", tile, arrays)
+    store.write("columns", tile, arrays, order=mesh.order)
 
 
 def read_columns(store: Store, tile: str) -> ColumnMesh:
     """Read the columns of a tile."""
-    arrays, _ = store.read("columns", tile)
+    arrays, attributes = store.read("columns", tile)
     plane = PlaneMesh(arrays["xy"], arrays["triangles"], arrays["building"])
-    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"])
+    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], attributes["order"])
 
 
 class StoredTerrain:

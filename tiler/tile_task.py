@@ -1,5 +1,6 @@
 """One tile from files to files: what a worker runs."""
 
+import dataclasses
 import resource
 import sys
 import time
@@ -12,7 +13,9 @@ from typing import Any
 import numpy as np
 import pyproj
 
+from pipeline.adaptive import AdaptiveOptions
 from pipeline.building_points import has_building_class
+from pipeline.city import City, CityOptions
 from pipeline.citymodel import Footprints
 from pipeline.columns import expand_cells, extract_boundary, lowest_gap
 from pipeline.errors import GeometryError, InputError
@@ -22,8 +25,10 @@ from pipeline.layered import LayeredOptions
 from pipeline.notes import Note
 from pipeline.pointcloud import GROUND, WATER, PointCloud
 from pipeline.quality import measure_cells, quality_percentiles
+from pipeline.simplify import simplify_city
+from pipeline.spacing import SpacingLimits
 from pipeline.terrain import bin_ground, fill_dtm
-from pipeline.tile import City, CityOptions, TileMesh, build_city, mesh_city, simplify_city
+from pipeline.tile import TileMesh, build_city, mesh_city
 from tiler.cityjson import write_city_model
 from tiler.clouds import read_points
 from tiler.config import Config
@@ -89,7 +94,7 @@ class TileRecord:
     counts: dict[str, int] = field(default_factory=dict)
     quality: dict[str, dict[str, float]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
-    facts: dict[str, float | str] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
     peak_memory: int = 0
@@ -137,13 +142,13 @@ def mesh_tile(job: TileJob, announce: Callable[[str, float], None] | None = None
         )
     with trace("1.7 export city model"):
         record.notes += _export(job, job.out / FULL_CITY_MODEL, full)
-    simple = simplify_city(full, dtm, options, trace)
+    simple = simplify_city(full, cloud, dtm, options, trace)
     with trace("2.4 export city model"):
         record.notes += _export(job, job.out / CITY_MODEL, simple)
     record.counts |= simple.counts
     record.counts |= {"buildings": len(simple.model), "buildings before merging": len(full.model)}
     del cloud, footprints, full
-    mesh = mesh_city(simple, dtm, bounds, _layered_options(config), min_angle=config.min_angle, trace=trace)
+    mesh = mesh_city(simple, dtm, bounds, _mesh_options(config), min_angle=config.min_angle, trace=trace)
     record.notes += [*simple.notes, *mesh.notes]
     with trace("3.6 export mesh"):
         _export_mesh(job, store, simple, mesh, record)
@@ -215,17 +220,29 @@ def _city_options(config: Config) -> CityOptions:
         vertex_tolerance=config.vertex_tolerance,
         ground_margin=config.ground_margin,
         ground_percentile=config.ground_percentile,
-        roof_percentile=config.roof_percentile,
+        roof_percentile=config.roof_percentile if config.roof_height == "percentile" else 50.0,
         default_height=config.default_height,
         roof_clearance=config.roof_clearance,
         border="clip" if config.border == "clip" else "drop",
+        simplify="paper" if config.simplify == "paper" else "clearance",
         clearance=config.clearance,
         clearance_floor=config.clearance_floor,
         min_courtyard_area=config.min_courtyard_area,
+        split_levels=config.split_levels,
+        roof_group=config.roof_group,
+        manifold=config.manifold,
     )
 
 
-def _layered_options(config: Config) -> LayeredOptions:
+def _mesh_options(config: Config) -> LayeredOptions | AdaptiveOptions:
+    if config.mesher == "adaptive":
+        return AdaptiveOptions(
+            mesh_size=config.mesh_size,
+            domain_height=config.domain_height,
+            limits=SpacingLimits(config.least_spacing, config.most_spacing),
+            stagger=config.stagger,
+            passes=config.improve_passes,
+        )
     return LayeredOptions(
         mesh_size=config.mesh_size,
         layer_height=config.layer_height_or_default,
@@ -256,7 +273,7 @@ def _export_mesh(job: TileJob, store: Store, city: City, mesh: TileMesh, record:
     if inverted:
         raise GeometryError(
             f"tile {job.name}, step 3.5: {inverted} levels do not ascend, the worst by {gap:.3g} m; raise "
-            "--layer-height or --roof-clearance"
+            "--roof-clearance"
         )
     write_columns(store, job.name, mesh.columns)
     cells = expand_cells(mesh.columns)
@@ -269,15 +286,8 @@ def _export_mesh(job: TileJob, store: Store, city: City, mesh: TileMesh, record:
         "facets": len(boundary.facets),
         "triangles": len(mesh.columns.plane.triangles),
         "columns": len(mesh.columns.plane.xy),
-        "levels repaired after terrain": mesh.report.repaired_terrain,
-        "levels repaired after roofs": mesh.report.repaired_roofs,
     }
-    record.facts = {
-        "layers": mesh.report.n_layers,
-        "smallest gap (m)": round(gap, 4),
-        "solver iterations": mesh.report.iterations,
-        "solver residual": mesh.report.residual,
-    }
+    record.facts = {"smallest gap (m)": round(gap, 4)} | dataclasses.asdict(mesh.report)
     record.quality = quality_percentiles(measure_cells(cells))
 
 
