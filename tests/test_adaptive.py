@@ -15,19 +15,18 @@ from pipeline.errors import GeometryError
 from pipeline.heights import highest_wall_ground, raise_low_roofs
 from pipeline.improve_columns import improve_columns, radius_ratios
 from pipeline.improve_plane import improve_plane, triangle_neighbours
-from pipeline.levels import (
+from pipeline.levels import fill_levels, stagger_columns
+from pipeline.mesh import ColumnMesh, Marker, MergeOrder, PlaneMesh
+from pipeline.nodes import (
     GROUND_SURFACE,
     TOP_SURFACE,
     Levels,
     SeamColumns,
-    fill_levels,
     no_seam,
     place_nodes,
-    stagger_columns,
     take_columns,
     triangle_surfaces,
 )
-from pipeline.mesh import ColumnMesh, Marker, MergeOrder, PlaneMesh
 from pipeline.plane import mesh_plane, signed_areas
 from pipeline.quality import measure_cells, quality_percentiles
 from pipeline.spacing import SpacingLimits, domain_top, mean_edges, top_reach, vertical_spacing
