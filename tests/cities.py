@@ -43,6 +43,7 @@ def city_of(polygons: list[shapely.Polygon], roofs: list[float], *, ground: floa
         np.full(len(polygons), ground),
         np.array(roofs, dtype=np.float64),
         tuple((str(name),) for name in ids),
+        ids,
     )
 
 

@@ -417,9 +417,7 @@ def drop_all(city: TinyCity, marker: Marker, house: int) -> TinyCity:
 def swallow_walls(city: TinyCity) -> TinyCity:
     """Give all walls of one corner house to the other."""
     building = city.boundary.building.copy()
-    building[(city.boundary.marker == Marker.WALL) & (building == city.model.numbers[4])] = (
-        city.model.numbers[5]
-    )
+    building[(city.boundary.marker == Marker.WALL) & (building == city.model.numbers[4])] = city.model.numbers[5]
     return with_boundary(city, building=building)
 
 

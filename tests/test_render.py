@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.errors import ConfigError, InputError, OutputError
 from tests.scene import write_scene
 from tiler.picture_parts import (
     City,
@@ -127,9 +127,7 @@ def test_a_picture_has_a_size_of_its_own(run: Path, tmp_path: Path, monkeypatch:
 def test_ground_alone_is_a_picture(copy: Path, tmp_path: Path) -> None:
     for piece in (copy / "boundary").iterdir():
         surface = pyvista.read(piece)
-        surface.extract_cells(np.flatnonzero(surface["marker"] == 1)).extract_surface(algorithm=None).save(
-            piece
-        )
+        surface.extract_cells(np.flatnonzero(surface["marker"] == 1)).extract_surface(algorithm=None).save(piece)
     render_run(copy, tmp_path / "ground.png", size=SIZE)
     image = pixels(tmp_path / "ground.png")
     assert green(image).mean() > 0.03
@@ -300,9 +298,7 @@ def test_a_boundary_without_marks_is_named(copy: Path, tmp_path: Path, array: st
         render_run(copy, tmp_path / "out.png", size=SIZE)
 
 
-def test_without_pyvista_the_extra_is_named(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pyvista_the_extra_is_named(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyvista", None)
     with pytest.raises(ConfigError, match=r"pip install citystitch\[pictures\]"):
         render_run(run, tmp_path / "out.png")
@@ -310,6 +306,6 @@ def test_without_pyvista_the_extra_is_named(
 
 def test_a_folder_in_the_way_leaves_nothing_behind(run: Path, tmp_path: Path) -> None:
     (tmp_path / "out.png").mkdir()
-    with pytest.raises(ConfigError, match=r"out.png: cannot be written"):
+    with pytest.raises(OutputError, match=r"out.png: cannot be written"):
         render_run(run, tmp_path / "out.png", size=SIZE)
     assert [path.name for path in tmp_path.iterdir()] == ["out.png"]

@@ -16,7 +16,7 @@ from vtkmodules.vtkIOXML import (
     vtkXMLUnstructuredGridReader,
 )
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, OutputError
 from pipeline.mesh import Boundary, TetMesh
 from tests.meshes import TinyCity, make_city, split_city
 from tiler import vtk_xml
@@ -64,9 +64,7 @@ def arrays_of(data: Any) -> dict[str, NDArray[Any]]:
 
 
 def rows_of(cells: Any, width: int) -> NDArray[Any]:
-    assert np.array_equal(
-        vtk_to_numpy(cells.GetOffsetsArray()), np.arange(cells.GetNumberOfCells() + 1) * width
-    )
+    assert np.array_equal(vtk_to_numpy(cells.GetOffsetsArray()), np.arange(cells.GetNumberOfCells() + 1) * width)
     rows: NDArray[Any] = vtk_to_numpy(cells.GetConnectivityArray()).reshape(-1, width)
     return rows
 
@@ -102,9 +100,7 @@ def test_the_reading_helper_notices_what_vtk_only_prints(tmp_path: Path, city: T
 
 
 @pytest.mark.parametrize("blocks", ["one", "several"])
-def test_vtk_reads_the_volume(
-    tmp_path: Path, city: TinyCity, blocks: str, request: pytest.FixtureRequest
-) -> None:
+def test_vtk_reads_the_volume(tmp_path: Path, city: TinyCity, blocks: str, request: pytest.FixtureRequest) -> None:
     if blocks == "several":
         request.getfixturevalue("small_blocks")
     point_data, cell_data = some_data(city.mesh)
@@ -270,7 +266,7 @@ def test_a_failed_write_leaves_the_old_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(vtk_xml, "_write_blocks", full)
-    with pytest.raises(InputError, match=r"m\.vtu: cannot be written \(No space left on device\)"):
+    with pytest.raises(OutputError, match=r"m\.vtu: cannot be written \(No space left on device\)"):
         write_vtu(path, city.mesh)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -304,16 +300,10 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "huge counts": lambda data: data.replace(b'NumberOfPoints="', b'NumberOfPoints="99999999999', 1),
     "other type": lambda data: data.replace(b'"Float64"', b'"Float99"'),
     "other offset": lambda data: data.replace(b'offset="0"', b'offset="1"'),
-    "one bit": lambda data: (
-        data[: data.index(b"_", 1000) + 200] + b"\xff" + data[data.index(b"_", 1000) + 201 :]
-    ),
+    "one bit": lambda data: data[: data.index(b"_", 1000) + 200] + b"\xff" + data[data.index(b"_", 1000) + 201 :],
     "bad XML": lambda data: data.replace(b"<Piece", b"<Piec<", 1),
-    "other kind": lambda data: data.replace(b"UnstructuredGrid", b"ImageData").replace(
-        b"PolyData", b"ImageData"
-    ),
-    "no marks": lambda data: data.replace(b'"marker"', b'"market"').replace(
-        b'"connectivity"', b'"connections"'
-    ),
+    "other kind": lambda data: data.replace(b"UnstructuredGrid", b"ImageData").replace(b"PolyData", b"ImageData"),
+    "no marks": lambda data: data.replace(b'"marker"', b'"market"').replace(b'"connectivity"', b'"connections"'),
 }
 
 
@@ -405,7 +395,7 @@ def test_vertices_out_of_range_are_input_errors(tmp_path: Path) -> None:
 def test_missing_files_are_input_errors(tmp_path: Path, city: TinyCity) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_vtp(tmp_path / "none.vtp")
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot be written"):
         write_vtu(tmp_path / "no" / "such" / "folder.vtu", city.mesh)
     write_vtu(tmp_path / "a.vtu", city.mesh)
     write_pvtu(tmp_path / "m.pvtu", [tmp_path / "a.vtu"])

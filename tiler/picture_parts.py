@@ -132,9 +132,7 @@ def add_terrain(plotter: Any, city: City, size: tuple[int, int]) -> NDArray[np.f
     import pyvista
 
     edges = _edge_style(len(city.facets), size)
-    ground = pyvista.PolyData.from_regular_faces(
-        city.points, city.facets[city.marker == Marker.GROUND]
-    ).clean()
+    ground = pyvista.PolyData.from_regular_faces(city.points, city.facets[city.marker == Marker.GROUND]).clean()
     z = ground.points[:, 2]
     ground["rgb"] = blend(z / max(float(np.percentile(z, 98)), 1e-9), GROUND_COLOURS)
     plotter.add_mesh(ground, rgb=True, scalars="rgb", smooth_shading=True, **MATT, **edges)
@@ -143,9 +141,7 @@ def add_terrain(plotter: Any, city: City, size: tuple[int, int]) -> NDArray[np.f
     return np.asarray(skirt.points)
 
 
-def add_air(
-    plotter: Any, grid: Any, origin: NDArray[np.float64], size: tuple[int, int]
-) -> NDArray[np.float64]:
+def add_air(plotter: Any, grid: Any, origin: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
     """Add the whole tetrahedra whose middle is in the northern half; returns their points."""
     grid.points = np.asarray(grid.points, dtype=np.float64) - origin
     middle = grid.points[grid.cell_connectivity.reshape(-1, 4), 1].mean(axis=1)
@@ -187,9 +183,7 @@ def _read(reader: Any, path: Path) -> Any:
     return data
 
 
-def _sew(
-    points: NDArray[np.float64], facets: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _sew(points: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Keep the points that facets use, equal ones once."""
     used = np.unique(facets)
     order = used[np.lexsort(points[used].T)]

@@ -1,0 +1,220 @@
+"""How far LiDAR points are from the model: roofs, ground, and each house (measures steps 1.6 and 2.3)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.pointcloud import GROUND, WATER, PointCloud
+from pipeline.roof_points import RoofPoints, locate_points, select_roof
+from pipeline.terrain import Dtm, sample_dtm
+
+COVERAGE_CELL = 1.0  # m, side of the cells in which points are looked for
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Heights of the model minus heights of the points.
+
+    Attributes
+    ----------
+    n : int
+        Number of points; the other values are NaN if there are none.
+    rmse : float
+        Root of the mean square (m).
+    p50, p95 : float
+        Percentiles of the absolute values (m).
+    bias : float
+        Mean (m), positive where the model is too high.
+    """
+
+    n: int
+    rmse: float
+    p50: float
+    p95: float
+    bias: float
+
+
+@dataclass(frozen=True)
+class PointFidelity:
+    """Distance of a point cloud to a city model. The points of the four fields are disjoint.
+
+    Attributes
+    ----------
+    roof : Residuals
+        Roof points inside a building of the model, against its roof.
+    missed : Residuals
+        Roof points inside an original footprint, but outside all buildings of the model, against the terrain
+        that the model has there: houses that were dropped, rims that were cut off.
+    ground : Residuals
+        Ground points outside all buildings of the model, against the terrain.
+    swallowed : Residuals
+        Ground points inside a building of the model, but outside all original footprints, against its roof:
+        streets and courtyards that were built over. (Ground points inside both are floors and passages, which
+        the model does not have; they are not counted.)
+    """
+
+    roof: Residuals
+    missed: Residuals
+    ground: Residuals
+    swallowed: Residuals
+
+
+@dataclass(frozen=True, eq=False)
+class HouseFidelity:
+    """Fidelity of each of ``n`` houses.
+
+    Attributes
+    ----------
+    n_points : int64, (n,)
+        Number of roof points.
+    rmse : float64, (n,)
+        Root of the mean squared height of the roof over its points (m); NaN without points or roof.
+    bias : float64, (n,)
+        Mean of the roof's height over its points (m); NaN likewise.
+    coverage : float64, (n,)
+        Share of the 1 m cells of the footprint that have a roof point, 0 to 1. A cell belongs to it if its
+        centre is inside or a roof point of the house lies in it. 0 without points.
+    """
+
+    n_points: NDArray[np.int64]
+    rmse: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+
+
+def measure_fidelity(
+    cloud: PointCloud,
+    dtm: Dtm,
+    polygons: NDArray[np.object_],
+    roof: NDArray[np.float64],
+    *,
+    footprints: NDArray[np.object_],
+    building_class: bool,
+) -> PointFidelity:
+    """Measure how far the points of a cloud are from a city model.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Points of the region.
+    dtm : Dtm
+        Terrain of the model, without empty nodes.
+    polygons : object, (b,)
+        Buildings of the model.
+    roof : float64, (b,)
+        Their absolute roof heights (m); a building with NaN counts as none of the model.
+    footprints : object, (f,)
+        Clean footprints before simplification, which say what a building is.
+    building_class : bool
+        Whether the cloud marks buildings; see `select_roof`.
+
+    Returns
+    -------
+    PointFidelity
+        Roof points outside all footprints are not counted. A point in several buildings counts once for
+        each; after simplification there are none.
+
+    Notes
+    -----
+    All points count, outliers too. The result does not depend on the order of the points.
+    """
+    built = np.isfinite(roof)
+    polygons, roof = polygons[built], roof[built]
+    roof_xyz = cloud.xyz[select_roof(cloud, building_class=building_class)]
+    building, point = locate_points(roof_xyz, polygons)
+    inside = _mark(len(roof_xyz), point)
+    original = _mark(len(roof_xyz), locate_points(roof_xyz, footprints)[1])
+    missed = roof_xyz[original & ~inside]
+
+    ground_xyz = cloud.xyz[(cloud.classification == GROUND) | (cloud.classification == WATER)]
+    over, below = locate_points(ground_xyz, polygons)
+    open_ground = ground_xyz[~_mark(len(ground_xyz), below)]
+    street = ~_mark(len(ground_xyz), locate_points(ground_xyz, footprints)[1])[below]
+    return PointFidelity(
+        roof=summarise(roof[building] - roof_xyz[point, 2]),
+        missed=summarise(sample_dtm(dtm, missed[:, :2]) - missed[:, 2]),
+        ground=summarise(sample_dtm(dtm, open_ground[:, :2]) - open_ground[:, 2]),
+        swallowed=summarise((roof[over] - ground_xyz[below, 2])[street]),
+    )
+
+
+def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roof: NDArray[np.float64]) -> HouseFidelity:
+    """Measure each house against its own roof points, outliers included.
+
+    Parameters
+    ----------
+    points : RoofPoints
+        Points of the houses, as from `locate_roof_points`.
+    polygons : object, (n,)
+        Houses.
+    roof : float64, (n,)
+        Absolute roof heights (m).
+    """
+    n_points = np.diff(points.start)
+    house = np.repeat(np.arange(len(n_points)), n_points)
+    residual = roof[house] - points.xyz[:, 2]
+    some = np.where(n_points > 0, n_points, np.nan)
+    return HouseFidelity(
+        n_points,
+        np.sqrt(np.bincount(house, residual**2, len(n_points)) / some),
+        np.bincount(house, residual, len(n_points)) / some,
+        _measure_coverage(points, house, polygons),
+    )
+
+
+def summarise(residual: NDArray[np.float64]) -> Residuals:
+    """Summarise residuals (m) in any order.
+
+    Examples
+    --------
+    >>> summarise(np.array([-1.0, 1.0, 3.0, -3.0]))
+    Residuals(n=4, rmse=2.23606797749979, p50=2.0, p95=3.0, bias=0.0)
+    """
+    if not len(residual):
+        nan = float("nan")
+        return Residuals(0, nan, nan, nan, nan)
+    residual = np.sort(residual)
+    p50, p95 = np.percentile(np.abs(residual), [50, 95])
+    return Residuals(
+        len(residual), float(np.sqrt(np.mean(residual**2))), float(p50), float(p95), float(residual.mean())
+    )
+
+
+def _mark(n: int, index: NDArray[np.int64]) -> NDArray[np.bool_]:
+    marked = np.zeros(n, np.bool_)
+    marked[index] = True
+    return marked
+
+
+def _measure_coverage(
+    points: RoofPoints, house: NDArray[np.int64], polygons: NDArray[np.object_]
+) -> NDArray[np.float64]:
+    cells = np.floor(points.xyz[:, :2] / COVERAGE_CELL).astype(np.int64)
+    filled = np.unique(np.column_stack((house, cells)), axis=0)
+    n_filled = np.bincount(filled[:, 0], minlength=len(polygons))
+    # Cells of the footprint by their centres, then those with a point that have their centre outside.
+    box, cell = _list_cells(shapely.bounds(polygons).reshape(-1, 4))
+    inside = _contains_centre(polygons[box], cell)
+    n_cells = np.bincount(box[inside], minlength=len(polygons))
+    rim = ~_contains_centre(polygons[filled[:, 0]], filled[:, 1:])
+    n_cells += np.bincount(filled[rim, 0], minlength=len(polygons))
+    return n_filled / np.maximum(n_cells, 1)
+
+
+def _contains_centre(polygons: NDArray[np.object_], cell: NDArray[np.int64]) -> NDArray[np.bool_]:
+    centre = (cell + 0.5) * COVERAGE_CELL
+    shapely.prepare(polygons)
+    return np.asarray(shapely.contains_xy(polygons, centre[:, 0], centre[:, 1]), dtype=np.bool_)
+
+
+def _list_cells(boxes: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """List the cells under each box: rows of `boxes`, and column and row of the cell, int64 (k, 2)."""
+    low = np.floor(boxes[:, :2] / COVERAGE_CELL).astype(np.int64)
+    size = np.floor(boxes[:, 2:] / COVERAGE_CELL).astype(np.int64) - low + 1
+    count = size[:, 0] * size[:, 1]
+    box = np.repeat(np.arange(len(boxes)), count)
+    index = np.arange(len(box)) - np.repeat(np.cumsum(count) - count, count)
+    row, column = np.divmod(index, size[box, 0])
+    return box, low[box] + np.column_stack((column, row))
