@@ -13,18 +13,10 @@ from numpy.typing import NDArray
 from pipeline.columns import plane_edges
 from pipeline.errors import GeometryError
 from pipeline.improve_columns import improve_columns
-from pipeline.levels import (
-    Levels,
-    Nodes,
-    SeamColumns,
-    fill_levels,
-    no_seam,
-    place_nodes,
-    stagger_columns,
-    triangle_surfaces,
-)
+from pipeline.levels import fill_levels, stagger_columns
 from pipeline.mesh import ColumnMesh, PlaneMesh
 from pipeline.neighbours import check_groups
+from pipeline.nodes import Levels, Nodes, SeamColumns, no_seam, place_nodes, triangle_surfaces
 from pipeline.spacing import SpacingLimits, domain_top, mean_edges, vertical_spacing
 from pipeline.terrain import Dtm, sample_dtm
 from pipeline.trim import check_headroom

@@ -15,18 +15,18 @@ from pipeline.errors import GeometryError
 from pipeline.heights import highest_wall_ground, raise_low_roofs
 from pipeline.improve_columns import improve_columns, radius_ratios
 from pipeline.improve_plane import improve_plane, triangle_neighbours
-from pipeline.levels import (
+from pipeline.levels import fill_levels, stagger_columns
+from pipeline.mesh import ColumnMesh, Marker, MergeOrder, PlaneMesh
+from pipeline.nodes import (
     GROUND_SURFACE,
     TOP_SURFACE,
+    Levels,
     SeamColumns,
-    fill_levels,
     no_seam,
     place_nodes,
-    stagger_columns,
     take_columns,
     triangle_surfaces,
 )
-from pipeline.mesh import ColumnMesh, Marker, MergeOrder, PlaneMesh
 from pipeline.plane import mesh_plane, signed_areas
 from pipeline.quality import measure_cells, quality_percentiles
 from pipeline.spacing import SpacingLimits, domain_top, mean_edges, top_reach, vertical_spacing
@@ -291,11 +291,26 @@ def test_levels_are_even_between_nodes_and_shifted_by_parts_of_a_step() -> None:
     n = len(plane.xy)
     surface = triangle_surfaces(plane, np.array([7.0]))
     nodes, _ = place_nodes(plane, surface, np.ones(n), no_seam(), least_gap=np.ones(n))
-    levels, bottom = fill_levels(nodes, np.full(n, 13.0), np.full(n, 2.9), np.full(n, 0.25), no_seam())
+    levels, bottom = fill_levels(nodes, np.full(n, 13.0), np.full(n, 3.5), np.full(n, 0.25), no_seam())
     first = take_columns(levels, np.array([0], np.int32))
     assert first.z.tolist() == [1.0, 4.75, 7.0, 10.75, 13.0]
     np.testing.assert_array_equal(first.surface, [GROUND_SURFACE, np.nan, 7.0, np.nan, TOP_SURFACE])
     assert bottom[:, 0].tolist() == [0, 2]
+
+
+def test_a_seams_nodes_are_taken_over_where_they_stand() -> None:
+    plane = two_roofs([7.0])
+    n = len(plane.xy)
+    surface, gap = triangle_surfaces(plane, np.array([7.0])), np.ones(n)
+    column = Levels(np.array([0, 4]), np.array([1.0, 7.5, 9.0, 12.0]), np.array([-np.inf, 7.0, 8.0, np.inf]))
+    seam = SeamColumns(np.array([0], np.int32), column)
+    nodes, moves = place_nodes(plane, surface, np.ones(n), seam, least_gap=gap)
+    assert nodes.z[:3].tolist() == [1.0, 7.5, 9.0]
+    assert moves[:3].tolist() == [0.0, 0.5, 1.0]
+    assert nodes.of_corner[:, 0].tolist() == [0, 1]
+    levels, bottom = fill_levels(nodes, np.full(n, 12.0), np.full(n, 2.0), np.zeros(n), seam)
+    assert take_columns(levels, seam.vertex).z.tolist() == column.z.tolist()
+    assert bottom[:, 0].tolist() == [0, 1]
 
 
 def test_a_seam_without_the_roof_that_a_tile_has_there_is_refused() -> None:
@@ -392,6 +407,43 @@ def test_flips_reach_delaunay_and_leave_walls() -> None:
     assert same[1].tolist() == triangles.tolist()
 
 
+def test_flips_and_moves_leave_a_delaunay_mesh_of_the_same_area() -> None:
+    side = np.arange(13.0)
+    xy = np.column_stack((np.repeat(side, 13), np.tile(side, 13)))
+    inner = ((xy > 0) & (xy < 12)).all(axis=1) & (xy[:, 0] != 6)
+    xy[inner] += np.random.default_rng(5).uniform(-0.3, 0.3, (inner.sum(), 2))
+    wall = xy[:, 0] == 6
+    xy[:, 0] += 1.7 * xy[:, 1]  # most edges have to flip, many of them twice
+    corner = (13 * np.arange(12)[:, None] + np.arange(12)).ravel()
+    squares = np.column_stack((corner, corner + 13, corner + 14, corner + 1))
+    triangles = np.concatenate((squares[:, [0, 1, 2]], squares[:, [0, 2, 3]])).astype(np.int32)
+    label = (triangles.max(axis=1) > np.flatnonzero(wall).max()).astype(np.int32)
+    moved, flipped = improve_plane(xy, triangles, label, mesh_size=1.0, passes=3)
+    assert not np.array_equal(np.sort(flipped), np.sort(triangles))
+    assert np.array_equal(moved[~inner], xy[~inner])
+    u, v = moved[flipped[:, 1]] - moved[flipped[:, 0]], moved[flipped[:, 2]] - moved[flipped[:, 0]]
+    area = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
+    assert area.min() > 0.02
+    assert area[label == 0].sum() == pytest.approx(72)
+    neighbour = triangle_neighbours(flipped)
+    angle = opposite_angles(moved, flipped)
+    t, k = np.nonzero((neighbour >= 0) & (label[neighbour] == label[:, None]))
+    twin = neighbour[t, k]
+    back = (neighbour[twin] == t[:, None]).argmax(axis=1)
+    assert (angle[t, k] + angle[twin, back]).max() <= np.pi + 1e-9
+
+
+def opposite_angles(xy: NDArray[np.float64], triangles: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Angle at each corner of each triangle (radians)."""
+    corners = xy[triangles]
+    angles = []
+    for k in range(3):
+        u, v = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
+        cosine = (u * v).sum(axis=1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
+        angles.append(np.arccos(cosine))
+    return np.column_stack(angles)
+
+
 def test_neighbours_lie_across_the_opposite_edge() -> None:
     plane, _ = mesh_plane((0.0, 0.0, 60.0, 60.0), city_of([], []).polygons, mesh_size=10.0)
     neighbour = triangle_neighbours(plane.triangles)
@@ -420,3 +472,18 @@ def test_levels_move_only_where_they_may_and_the_worst_cell_gets_better() -> Non
     np.testing.assert_allclose(
         radius_ratios(explicit.points, explicit.cells), measure_cells(explicit).radius_ratio, rtol=1e-5
     )
+
+
+def test_a_moved_level_ends_where_a_step_either_way_is_worse() -> None:
+    z = np.array([0.0, 4.0, 4.2, 12.0, 0.0, 4.0, 8.0, 12.0, 0.0, 4.0, 8.0, 12.0])
+    mesh = ColumnMesh(TRIANGLE, np.array([0, 4, 8, 12]), z, np.zeros((1, 3), np.int32), "heights")
+    free = np.arange(12) == 2
+    better, _, _ = improve_columns(mesh, free, np.full(3, 4.0), passes=3)
+    cells = expand_cells(better)
+
+    def cost(shift: float) -> float:
+        points = cells.points.copy()
+        points[2, 2] += shift
+        return float((radius_ratios(points, cells.cells) ** -8).sum())
+
+    assert cost(0.0) < min(cost(-0.05), cost(0.05))
