@@ -18,7 +18,7 @@ SHARP = 20.0
 # A cut is this much wider than the clearance, so that rounding to the grid does not spoil it.
 MARGIN = 1.05
 # No cut takes more of a wall than this many times the clearance: at a sharp tip, where houses part.
-LONGEST_TIP = 20.0
+LONGEST_TIP = 40.0
 LONGEST_PART = 4.0
 # A sector wider than this (degrees) has no chord that keeps away from its corner.
 WIDEST_CUT = 140.0
