@@ -72,6 +72,8 @@ def _label_cells(
         i, j = (axis.reshape(-1) for axis in np.mgrid[start[0] : stop[0], start[1] : stop[1]])
         squares = shapely.box(i * size, j * size, (i + 1) * size, (j + 1) * size)
         piece, square = shapely.STRtree(squares).query(pieces, predicate="intersects")
+        order = np.lexsort((piece, square))
+        piece, square = piece[order], square[order]
         covered = shapely.area(shapely.intersection(squares[square], pieces[piece]))
         area = np.bincount(square, covered, len(squares))
         at = (i - low[0], j - low[1])

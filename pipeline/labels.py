@@ -80,6 +80,9 @@ def label_faces(faces: Faces, territories: Territories) -> NDArray[np.int64]:
     at, by = at[same], by[same]
     if not len(at):
         return label
+    # Sums in one order, whatever other clusters are in the tree.
+    order = np.lexsort((by, at))
+    at, by = at[order], by[order]
     area = shapely.area(shapely.intersection(faces.polygons[at], territories.polygons[by]))
     pairs, index = np.unique(np.column_stack((at, territories.house[by])), axis=0, return_inverse=True)
     share = np.bincount(index.reshape(-1), area) / shapely.area(faces.polygons)[pairs[:, 0]]

@@ -14,13 +14,20 @@ from pipeline.graph import MILLIMETRES
 from pipeline.rings import make_canonical, sort_canonically
 from pipeline.shaping import LAST_RUNG, RUNGS, Rules, Shaped, join_shaped, shape_clusters
 
-CHAIN_TOLERANCE = 0.1  # m
+# Metres. On 1,475 houses of Amsterdam 0.5 m changes 0.28 % of the area and 1 m 0.71 %; both keep every house and
+# every angle above 20 degrees, and 0.5 m costs 20 % more triangles at a mesh size of 10 m.
+CLEARANCE = 0.5
+# Metres. 0.2 m saves 1 % of the walls more and costs a tenth of the area error more.
+CHAIN_TOLERANCE = 0.1
 SMALLEST_CLEARANCE = 0.01  # m; ten steps of the grid
-METHODS = (*RUNGS, LAST_RUNG)
 COUNTS = (
-    *("clusters", "clusters-joined", *METHODS),
+    # Clusters: all, those fewer by joining, and how many ended on which rung.
+    *("clusters", "clusters-joined", *RUNGS, LAST_RUNG),
+    # What the rounds did, tries that failed included: the most rounds of a cluster, vertices, edges.
     *("rounds", "straightened", "collapsed", "contracted", "bent", "crossings"),
+    # Faces given to a neighbour; sharp corners cut; touching corners opened or closed.
     *("small-faces", "blunted", "opened", "closed"),
+    # The result: vertices in which houses only touch, houses of several faces, of none, the area of these.
     *("corner-touches", "houses-divided", "houses-lost", "lost-area-m2"),
 )
 
@@ -58,7 +65,7 @@ class PlanarCity:
 def simplify_planar(
     polygons: NDArray[np.object_],
     *,
-    clearance: float,
+    clearance: float = CLEARANCE,
     chain_tolerance: float = CHAIN_TOLERANCE,
     min_area: float,
     min_courtyard_area: float,

@@ -1,5 +1,7 @@
 """The planar city model: hand-worked streets, fallbacks, and promises on random ones, checked by brute force."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 import shapely
@@ -16,7 +18,7 @@ from pipeline.fidelity import FARTHEST, measure_simplification
 from pipeline.graph import WallGraph, make_graph, node_walls, trace_faces
 from pipeline.labels import Territories
 from pipeline.planar import COUNTS, PlanarCity, find_clusters, simplify_planar
-from pipeline.snap import node_crossings
+from pipeline.snap import node_crossings, straighten
 
 EPS, MIN_AREA, MIN_COURTYARD = 0.5, 5.0, 5.0
 
@@ -186,6 +188,20 @@ def test_a_corner_without_room_to_open_it_is_closed() -> None:
     assert_promises(city, EPS)
 
 
+def test_houses_too_blunt_to_part_are_joined_at_their_corner() -> None:
+    # Both have 150 degrees at the origin, too much for a chord across; the open sectors have 30.
+    x, y = 9.659, 2.588
+    upper = Polygon([(0, 0), (x, y), (x, 12), (-x, 12), (-x, y)])
+    lower = Polygon([(0, 0), (-x, -y), (-x, -12), (x, -12), (x, -y)])
+    city = simplify(upper, lower, manifold=True)
+    assert (city.counts["opened"], city.counts["closed"], city.counts["corner-touches"]) == (0, 1, 0)
+    assert set(city.method) == {"snapped"}
+    # The tip that is filled is 1.05 clearances wide; the grid bends walls of 10 m by half a millimetre.
+    filled = shapely.area(city.polygons).sum() - upper.area - lower.area
+    assert filled == pytest.approx(0.25 * (1.05 * EPS) ** 2 / np.tan(np.radians(15)), rel=0.02)
+    assert_promises(city, EPS)
+
+
 def test_a_sharp_corner_is_cut() -> None:
     wedge = Polygon([(0, 0), (30, 0), (30, 4)])
     city = simplify(wedge)
@@ -231,6 +247,32 @@ def test_a_cluster_that_fails_is_tried_with_a_wider_clearance_first(monkeypatch:
     city = simplify(box(0, 0, 4, 4), box(4.4, 0, 9, 4), box(30, 0, 40, 4))
     assert city.method == ("snapped-wider", "snapped-wider", "snapped")
     assert (city.counts["snapped"], city.counts["snapped-wider"], city.counts["cells"]) == (1, 1, 0)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [Polygon([(4.3, 4.2), (9, 4.2), (9, 9), (4.3, 9)]), Polygon([(4.3, 2), (9, 0), (9, 4)])],
+    ids=["two corners", "a corner and a wall"],
+)
+def test_the_check_believes_no_round(other: Polygon, monkeypatch: pytest.MonkeyPatch) -> None:
+    def claim(graph: WallGraph, *, clearance: float, chain_tolerance: float) -> object:
+        assert clearance > chain_tolerance
+        return graph, np.zeros(0, np.int64), Counter({"rounds": 1})
+
+    monkeypatch.setattr(pipeline.shaping, "settle", claim)
+    city = simplify(box(0, 0, 4, 4), other, box(30, 0, 40, 4))
+    assert city.counts["cells"] == city.counts["snapped"] == 1
+    assert_promises(city, EPS)
+
+
+def test_a_vertex_stays_where_the_straight_wall_would_cross_another() -> None:
+    blunt = Polygon([(0, 0), (0, -5000), (10000, -5000), (10000, 0), (5000, 100)])
+    free = straighten(node_walls(np.array([blunt]), np.zeros(1, np.int64)), 200.0)
+    assert (len(free[0].xy), free[1].tolist()) == (4, [0])
+    assert free[0].slack.tolist() == [0, 0, 100, 0]
+    inside = Polygon([(5000, 50), (4000, -3000), (6000, -3000)])
+    blocked = straighten(node_walls(np.array([blunt, inside]), np.zeros(2, np.int64)), 200.0)
+    assert (len(blocked[0].xy), blocked[1].tolist()) == (8, [])
 
 
 def test_cells_that_meet_in_a_corner_get_a_third_one() -> None:
