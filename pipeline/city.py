@@ -62,6 +62,8 @@ class City:
         Where the roof's height comes from: index into `heights.ROOF_SOURCES`.
     wall_ground : float64, (n,)
         Highest terrain at the walls (m).
+    measured_roof : float64, (n,)
+        Roof heights (m) before roofs were grouped and raised.
     group : int32, (n,)
         Buildings of one group have one roof: the same height, and no wall between them.
     notes : tuple of Note
@@ -75,6 +77,7 @@ class City:
     given_height: NDArray[np.float64]
     roof_source: NDArray[np.int8]
     wall_ground: NDArray[np.float64]
+    measured_roof: NDArray[np.float64]
     group: NDArray[np.int32]
     notes: tuple[Note, ...]
     counts: dict[str, int]
@@ -106,10 +109,14 @@ def assemble_city(
     members: tuple[tuple[str, ...], ...],
     wall_ground: NDArray[np.float64],
     *,
+    roof: NDArray[np.float64] | None = None,
     house: NDArray[np.str_] | None = None,
     group: NDArray[np.int32] | None = None,
 ) -> City:
-    """Make the city of all buildings that have a roof; each is a house and a group of its own if not told."""
+    """Make the city of all buildings that have a roof.
+
+    Roofs are those measured, and each building a house and a group of its own, where nothing else is given.
+    """
     kept = np.flatnonzero(~np.isnan(heights.roof))
     ids = footprints.ids[kept]
     model = CityModel(
@@ -117,7 +124,7 @@ def assemble_city(
         ids,
         number_ids(ids),
         heights.ground[kept],
-        heights.roof[kept],
+        (heights.roof if roof is None else roof)[kept],
         tuple(members[row] for row in kept),
         ids if house is None else house[kept],
     )
@@ -127,6 +134,7 @@ def assemble_city(
         footprints.given_height[kept],
         heights.roof_source[kept],
         wall_ground[kept],
+        heights.roof[kept],
         np.arange(len(kept), dtype=np.int32) if group is None else group[kept],
         (),
         {},

@@ -149,7 +149,7 @@ def _planar_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, 
         )
         members = tuple(model.members[k] for k in row)
         settled = assemble_city(
-            footprints, face_points, replace(heights, roof=roof), members, wall_ground, house=house, group=group
+            footprints, face_points, heights, members, wall_ground, roof=roof, house=house, group=group
         )
     raised = wall_ground + options.roof_clearance > heights.roof
     notes = (
@@ -158,7 +158,7 @@ def _planar_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, 
         *_note_raised(footprints, heights, roof, raised),
         *_note_lost(model.ids, model.polygons, row),
     )
-    return replace(settled, notes=notes, counts={**city.counts, **_count(planar, parts, heights.roof, settled)})
+    return replace(settled, notes=notes, counts={**city.counts, **_count(planar, parts, settled)})
 
 
 def _split(polygons: NDArray[np.object_], cloud: PointCloud, options: CityOptions) -> HouseParts:
@@ -197,8 +197,8 @@ def _note_raised(
     ]
 
 
-def _count(planar: PlanarCity, parts: HouseParts, measured: NDArray[np.float64], city: City) -> dict[str, int]:
-    moved = np.abs(city.model.roof - measured) if len(city.model) == len(measured) else np.zeros(0)
+def _count(planar: PlanarCity, parts: HouseParts, city: City) -> dict[str, int]:
+    moved = np.abs(city.model.roof - city.measured_roof)
     return {f"planar {how}": n for how, n in planar.counts.items()} | {
         "houses split": int((np.bincount(parts.house) > 1).sum()) if len(parts.house) else 0,
         "roof groups": len(np.unique(city.group)),
@@ -231,7 +231,7 @@ def _merge_city(city: City, dtm: Dtm, options: CityOptions, trace: Trace) -> Cit
         wall_ground = highest_wall_ground(merged.polygons, dtm)
         roof, raised = raise_low_roofs(heights.roof, wall_ground, clearance=options.roof_clearance)
         members = _join_members(model.members, merged.members)
-        simplified = assemble_city(footprints, points, replace(heights, roof=roof), members, wall_ground)
+        simplified = assemble_city(footprints, points, heights, members, wall_ground, roof=roof)
     counts = {**city.counts, **{f"merge {how}": n for how, n in sorted(merged.counts.items())}}
     notes = (
         *city.notes,

@@ -126,6 +126,7 @@ def _summary(
         "tiles": {tile.name: {"status": "done", "counts": tile.counts, "facts": tile.facts}},
         "counts": counts,
         "quality": tile.quality,
+        "fidelity": tile.fidelity,
         "seconds": tile.seconds,
         "peak_memory_bytes": tile.peak_memory,
         "messages": list(messages),

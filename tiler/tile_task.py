@@ -4,7 +4,7 @@ import dataclasses
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,13 +14,13 @@ import numpy as np
 import pyproj
 
 from pipeline.adaptive import AdaptiveOptions
+from pipeline.building_facts import describe_buildings, measure_model
 from pipeline.building_points import has_building_class
 from pipeline.city import City, CityOptions
 from pipeline.citymodel import Footprints
 from pipeline.columns import expand_cells, extract_boundary, lowest_gap
 from pipeline.errors import GeometryError, InputError
 from pipeline.ground_filter import classify_ground
-from pipeline.heights import ROOF_SOURCES
 from pipeline.layered import LayeredOptions
 from pipeline.notes import Note
 from pipeline.pointcloud import GROUND, WATER, PointCloud
@@ -81,7 +81,9 @@ class TileRecord:
     seconds : dict
         Wall time by step (s).
     facts : dict
-        Further values: layers, solver, smallest gap.
+        Further values: what the mesher did, smallest gap.
+    fidelity : dict
+        Distance of the point cloud to the city model (m), by kind of point.
     notes : list of Note
         What was dropped, repaired or defaulted.
     unreadable : dict
@@ -95,6 +97,7 @@ class TileRecord:
     quality: dict[str, dict[str, float]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
+    fidelity: dict[str, dict[str, float]] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
     peak_memory: int = 0
@@ -141,10 +144,12 @@ def mesh_tile(job: TileJob, announce: Callable[[str, float], None] | None = None
             Note("no-building-class", detail="roof points are those that are not ground, water, plants or noise")
         )
     with trace("1.7 export city model"):
-        record.notes += _export(job, job.out / FULL_CITY_MODEL, full)
+        record.notes += _export(job, job.out / FULL_CITY_MODEL, full, describe_buildings(cloud, full))
     simple = simplify_city(full, cloud, dtm, options, trace)
     with trace("2.4 export city model"):
-        record.notes += _export(job, job.out / CITY_MODEL, simple)
+        record.notes += _export(job, job.out / CITY_MODEL, simple, describe_buildings(cloud, simple))
+    with trace("2.4 fidelity"):
+        record.fidelity = measure_model(cloud, dtm, simple, full.model.polygons)
     record.counts |= simple.counts
     record.counts |= {"buildings": len(simple.model), "buildings before merging": len(full.model)}
     del cloud, footprints, full
@@ -253,19 +258,12 @@ def _mesh_options(config: Config) -> LayeredOptions | AdaptiveOptions:
     )
 
 
-def _export(job: TileJob, path: Path, city: City) -> tuple[Note, ...]:
+def _export(job: TileJob, path: Path, city: City, attributes: dict[str, Sequence[object]]) -> tuple[Note, ...]:
     model = city.model
     low, high = job.region.bounds[:2], job.region.bounds[2:]
     heights = (float(model.ground.min()), float(model.roof.max())) if len(model) else (0.0, 0.0)
-    sources = [ROOF_SOURCES[source] for source in city.roof_source]
-    points = np.diff(city.points.roof_start).tolist()
-    return write_city_model(
-        path,
-        model,
-        crs=job.region.crs,
-        bounds=(*low, heights[0], *high, heights[1]),
-        attributes={"roof_source": sources, "roof_points": points},
-    )
+    bounds = (*low, heights[0], *high, heights[1])
+    return write_city_model(path, model, crs=job.region.crs, bounds=bounds, attributes=attributes)
 
 
 def _export_mesh(job: TileJob, store: Store, city: City, mesh: TileMesh, record: TileRecord) -> None:
