@@ -70,6 +70,9 @@ class City:
         What was dropped, repaired or defaulted on the way.
     counts : dict
         Numbers by name, for the report.
+    outline : dict
+        How the simplified outlines compare with the footprints: ``area_error`` (share of all area that houses
+        lost or gained), ``min_clearance`` (m), ``sharpest`` (degrees); empty before simplification.
     """
 
     model: CityModel
@@ -81,6 +84,7 @@ class City:
     group: NDArray[np.int32]
     notes: tuple[Note, ...]
     counts: dict[str, int]
+    outline: dict[str, float]
 
 
 def measure_heights(
@@ -137,6 +141,7 @@ def assemble_city(
         heights.roof[kept],
         np.arange(len(kept), dtype=np.int32) if group is None else group[kept],
         (),
+        {},
         {},
     )
 

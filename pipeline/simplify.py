@@ -24,6 +24,7 @@ from pipeline.city import (
     note_heights,
 )
 from pipeline.citymodel import Footprints
+from pipeline.fidelity import Fidelity, measure_simplification
 from pipeline.groups import adjacent_houses, group_roofs
 from pipeline.heights import Heights, highest_wall_ground, raise_low_roofs
 from pipeline.house_levels import HouseParts, LevelOptions, split_levels
@@ -151,6 +152,8 @@ def _planar_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, 
         settled = assemble_city(
             footprints, face_points, heights, members, wall_ground, roof=roof, house=house, group=group
         )
+    with trace("2.3 outline errors"):
+        outline = measure_simplification(model.polygons, replace(planar, house=row))
     raised = wall_ground + options.roof_clearance > heights.roof
     notes = (
         *city.notes,
@@ -158,7 +161,8 @@ def _planar_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, 
         *_note_raised(footprints, heights, roof, raised),
         *_note_lost(model.ids, model.polygons, row),
     )
-    return replace(settled, notes=notes, counts={**city.counts, **_count(planar, parts, settled)})
+    counts = {**city.counts, **_count(planar, parts, settled)}
+    return replace(settled, notes=notes, counts=counts, outline=_describe_outline(outline))
 
 
 def _split(polygons: NDArray[np.object_], cloud: PointCloud, options: CityOptions) -> HouseParts:
@@ -204,6 +208,11 @@ def _count(planar: PlanarCity, parts: HouseParts, city: City) -> dict[str, int]:
         "roof groups": len(np.unique(city.group)),
         "roofs moved by more than 1 m": int((moved > 1).sum()),
     }
+
+
+def _describe_outline(found: Fidelity) -> dict[str, float]:
+    values = {"area_error": found.area_error, "min_clearance": found.min_clearance, "sharpest": found.sharpest}
+    return {name: round(value, 6) for name, value in values.items() if np.isfinite(value)}
 
 
 def _merge_city(city: City, dtm: Dtm, options: CityOptions, trace: Trace) -> City:

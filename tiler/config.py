@@ -123,7 +123,7 @@ class Config:
         0.1, "simplify", "with simplify = paper: finer details of one building are repaired", unit="m",
         above=0,
     )  # fmt: skip
-    min_courtyard_area: float = _parameter(10.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
+    min_courtyard_area: float = _parameter(5.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
     split_levels: bool = _parameter(
         True, "simplify", "divide houses where their roof points show a step, with simplify = clearance"
     )

@@ -15,6 +15,7 @@ HEIGHT_TOLERANCE = 1e-6  # m, of a height against the DTM or the city model
 SIDE_TOLERANCE = 1e-6  # m, of a vertex against its side of the box, and of a wall against the vertical
 RELATIVE_TOLERANCE = 1e-9  # of areas and volumes that must be equal
 N_PLACES = 3  # places that a fault names
+N_CORNERS = 20  # corners that the check lists in which houses only touch
 
 Vertices = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -172,7 +173,12 @@ def prove_closed(surface: Surface) -> tuple[Proof, int]:
     middles = surface.points[edges.open].mean(axis=1)
     faults = find_faults("boundary-open", middles, "an edge without a facet in the other direction")
     count = len(edges.non_manifold)
+    corners = np.unique(surface.points[edges.non_manifold].mean(axis=1)[:, :2], axis=0)
     claim = f"the boundary is closed and oriented; {count} edges have more than 2 facets, all of them paired"
+    if count:
+        listed = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in corners[:N_CORNERS])
+        more = f" and {len(corners) - N_CORNERS} more" if len(corners) > N_CORNERS else ""
+        claim += f", where houses touch in a corner: {listed}{more} (--manifold parts them)"
     return Proof(claim, tuple(faults)), count
 
 

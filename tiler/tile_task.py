@@ -150,6 +150,7 @@ def mesh_tile(job: TileJob, announce: Callable[[str, float], None] | None = None
         record.notes += _export(job, job.out / CITY_MODEL, simple, describe_buildings(cloud, simple))
     with trace("2.4 fidelity"):
         record.fidelity = measure_model(cloud, dtm, simple, full.model.polygons)
+        record.fidelity |= {"outline": simple.outline} if simple.outline else {}
     record.counts |= simple.counts
     record.counts |= {"buildings": len(simple.model), "buildings before merging": len(full.model)}
     del cloud, footprints, full

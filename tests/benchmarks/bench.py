@@ -16,7 +16,7 @@ from typing import Any
 
 RUNS = 5
 REPORT = Path(__file__).resolve().parents[2] / "docs" / "benchmarks.md"
-MESHING = ("3.1 plane mesh", "3.2-3.5 layers")
+MESHING = ("3.1 plane mesh", "3.2-3.5 columns")
 COMMAND = [sys.executable, "-m", "tiler.cli"]
 
 
