@@ -134,6 +134,20 @@ def merge_building_points(points: BuildingPoints, members: tuple[NDArray[np.int6
     return BuildingPoints(*roof, *ground)
 
 
+def take_building_points(points: BuildingPoints, rows: NDArray[np.int64]) -> BuildingPoints:
+    """Take the points of some buildings, in the order of `rows`, int64 (k,), which may repeat."""
+    roof = _take(points.roof_start, points.roof_z, rows)
+    return BuildingPoints(*roof, *_take(points.ground_start, points.ground_z, rows))
+
+
+def _take(
+    start: NDArray[np.int64], z: NDArray[np.float64], rows: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    count = np.diff(start)[rows]
+    new_start = np.concatenate(([0], np.cumsum(count)))
+    return new_start, z[np.arange(new_start[-1]) + np.repeat(start[rows] - new_start[:-1], count)]
+
+
 def _points_inside(
     xyz: NDArray[np.float64], polygons: NDArray[np.object_], outside: NDArray[np.object_] | None
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -7,6 +7,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.errors import InputError
+
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
@@ -29,20 +31,24 @@ class Footprints:
 
 @dataclass(frozen=True, eq=False)
 class CityModel:
-    """Buildings as prisms ``polygon x [ground, roof]`` (paper, section 4.2).
+    """Buildings, or parts of them, as prisms ``polygon x [ground, roof]`` (paper, section 4.2).
+
+    A house of several heights has a row for each part; all others have one row.
 
     Attributes
     ----------
     polygons : object, (n,)
         shapely Polygons in the region's CRS (m): oriented (shell counter-clockwise), without Z.
     ids : str, (n,)
-        Building ids; a merged building has the id of its largest member.
+        Ids of the rows, each once; a merged building has the id of its largest member.
     numbers : int64, (n,)
         The same ids as numbers below 2**53, for formats without strings; see `number_ids`.
     ground, roof : float64, (n,)
         Absolute ground and roof height (m).
     members : tuple of n tuples of str
         Ids of the input footprints that each building was made of, ascending, itself included.
+    house : str, (n,)
+        Id of the building that the row is a part of; the row's own id where it is the whole.
     """
 
     polygons: NDArray[np.object_]
@@ -51,6 +57,7 @@ class CityModel:
     ground: NDArray[np.float64]
     roof: NDArray[np.float64]
     members: tuple[tuple[str, ...], ...]
+    house: NDArray[np.str_]
 
     def __len__(self) -> int:
         return len(self.polygons)
@@ -71,7 +78,7 @@ def number_ids(ids: NDArray[np.str_]) -> NDArray[np.int64]:
 
     Raises
     ------
-    ValueError
+    InputError
         If two different ids get the same number.
 
     Examples
@@ -80,9 +87,14 @@ def number_ids(ids: NDArray[np.str_]) -> NDArray[np.int64]:
     array([363100012078463])
     """
     numbers = np.fromiter((_number(str(name)) for name in ids), np.int64, len(ids))
-    _, first = np.unique(numbers, return_index=True)
-    if len(first) < len(np.unique(ids)):
-        raise ValueError("two building ids share one number; rename one of them")
+    order = np.lexsort((ids, numbers))
+    clash = np.flatnonzero((np.diff(numbers[order]) == 0) & (ids[order][1:] != ids[order][:-1]))
+    if len(clash):
+        one, two = ids[order][clash[0]], ids[order][clash[0] + 1]
+        raise InputError(
+            f"building ids {str(one)!r} and {str(two)!r} both have the number {numbers[order][clash[0]]}; "
+            "rename one, or name another --id-attribute"
+        )
     return numbers
 
 

@@ -1,16 +1,15 @@
 """From columns to explicit tetrahedra and to the marked boundary (step 3.6): the merge of columns.
 
-In each triangle the segments of its three columns are merged from below, one tetrahedron a step. The
-next step goes to the column with the most segments left, ties to the highest vertex. For equal counts
-these are the paper's equations 1-3; and because the choice between two columns depends on those two
-alone, the faces over an edge are the same from both of its triangles: the mesh conforms.
+In each triangle the segments of its three columns are merged from below, one tetrahedron a step, in the
+mesh's order (`ColumnMesh.order`). For columns of equal counts, "levels" is the paper's equations 1-3. Either
+order compares two columns by what these two are, so the faces over an edge are the same from both of its
+triangles: the mesh conforms.
 """
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import GeometryError
 from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, TetMesh
 from pipeline.plane import signed_areas
 
@@ -34,7 +33,8 @@ def expand_cells(mesh: ColumnMesh) -> TetMesh:
     points = np.column_stack((mesh.plane.xy[column], mesh.z))
     cells = np.empty((count_cells(mesh), 4), np.int32)
     clockwise = signed_areas(mesh.plane) < 0
-    _merge_columns(mesh.plane.triangles, mesh.bottom, mesh.z_start, clockwise, cells)
+    by_height = mesh.order == "heights"
+    _merge_columns(mesh.plane.triangles, mesh.bottom, mesh.z_start, mesh.z, by_height, clockwise, cells)
     return TetMesh(points, cells)
 
 
@@ -62,7 +62,14 @@ def extract_boundary(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> Boundary:
     Returns
     -------
     Boundary
-        Facets pointing out of the air: ground and roofs downwards. A wall belongs to the higher building.
+        Facets pointing out of the air: ground and roofs downwards. A wall belongs to the higher building;
+        there is none where both sides of an edge begin at the same levels.
+
+    Notes
+    -----
+    Walls are the facets over an edge that one of its two sides alone has. Where a roof is not level along
+    a wall, the merge may pass it by: then the higher side has facets that the lower lacks, and both are
+    written, each seen from its own air. The boundary is closed in any case.
     """
     plane = mesh.plane
     first = mesh.z_start[plane.triangles]
@@ -117,22 +124,19 @@ def _vertical_facets(
     sheet = np.flatnonzero((other[:, 0] < 0) | (air[:, 1:] != other[:, 1:]).any(axis=1))
     air, other, ends = air[sheet], other[sheet], edges[sheet]
     outer = other[:, 0] < 0
-    bottom = mesh.z_start[ends] + air[:, 1:]
-    top = mesh.z_start[ends] + other[:, 1:]
-    top[outer] = mesh.z_start[ends[outer] + 1] - 1
-    count = (top - bottom).sum(axis=1)
+    column_end = mesh.z_start[ends + 1] - 1
+    low = mesh.z_start[ends] + air[:, 1:]
+    high = np.where(outer[:, None], column_end, mesh.z_start[ends] + other[:, 1:])
     # Seen from outside, a facet from vertex to vertex to above runs counter-clockwise if the air lies left.
     opposite = plane.xy[plane.triangles[air[:, 0]].sum(axis=1) - ends.sum(axis=1)]
     start, end = plane.xy[ends[:, 0]], plane.xy[ends[:, 1]]
     along, across = end - start, opposite - start
     air_left = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0] > 0
+    by_height = mesh.order == "heights"
+    count = np.empty(len(ends), np.int64)
+    _merge_edges(low, high, column_end, mesh.z, by_height, air_left, count, np.empty((0, 3), np.int32))
     facets = np.empty((count.sum(), 3), np.int32)
-    column_end = mesh.z_start[ends + 1] - 1
-    if not _merge_edges(bottom, top, column_end, air_left, facets):
-        raise GeometryError(
-            "boundary, step 3.6: a wall's levels do not meet the levels of the roof above it; "
-            "please report this with the city model"
-        )
+    _merge_edges(low, high, column_end, mesh.z, by_height, air_left, count, facets)
     # Of two buildings that share a wall, it is the higher one's: the side that begins higher.
     marker = np.where(outer, _side_marker(plane, start, end), Marker.WALL)
     owner = np.where(outer, -1, building[other[:, 0]])
@@ -146,11 +150,23 @@ def _side_marker(plane: PlaneMesh, start: NDArray[np.float64], end: NDArray[np.f
     return np.select(sides, [Marker.WEST, Marker.EAST, Marker.SOUTH, Marker.NORTH], 0)
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _comes_first(z: NDArray[np.float64], by_height: bool, i: int, end_i: int, j: int, end_j: int) -> bool:
+    """Whether a column's segment over level i is merged before the one over j of a later vertex's column."""
+    if i == end_i or j == end_j:
+        return i < end_i
+    if by_height:
+        return bool(z[i] + z[i + 1] < z[j] + z[j + 1])
+    return end_i - i > end_j - j
+
+
 @numba.njit(cache=True, nogil=True)
 def _merge_columns(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
     z_start: NDArray[np.int64],
+    z: NDArray[np.float64],
+    by_height: bool,
     clockwise: NDArray[np.bool_],
     cells: NDArray[np.int32],
 ) -> None:
@@ -159,52 +175,73 @@ def _merge_columns(
         a = z_start[triangles[t, 0]] + bottom[t, 0]
         b = z_start[triangles[t, 1]] + bottom[t, 1]
         c = z_start[triangles[t, 2]] + bottom[t, 2]
-        left_a = z_start[triangles[t, 0] + 1] - 1 - a
-        left_b = z_start[triangles[t, 1] + 1] - 1 - b
-        left_c = z_start[triangles[t, 2] + 1] - 1 - c
-        while left_a + left_b + left_c > 0:
+        end_a = z_start[triangles[t, 0] + 1] - 1
+        end_b = z_start[triangles[t, 1] + 1] - 1
+        end_c = z_start[triangles[t, 2] + 1] - 1
+        while a < end_a or b < end_b or c < end_c:
             cells[cell, 0] = a
             cells[cell, 1] = c if clockwise[t] else b
             cells[cell, 2] = b if clockwise[t] else c
-            if left_c >= left_a and left_c >= left_b:
-                c += 1
-                left_c -= 1
-                cells[cell, 3] = c
-            elif left_b >= left_a:
+            if _comes_first(z, by_height, a, end_a, b, end_b):
+                if _comes_first(z, by_height, a, end_a, c, end_c):
+                    a += 1
+                    cells[cell, 3] = a
+                else:
+                    c += 1
+                    cells[cell, 3] = c
+            elif _comes_first(z, by_height, b, end_b, c, end_c):
                 b += 1
-                left_b -= 1
                 cells[cell, 3] = b
             else:
-                a += 1
-                left_a -= 1
-                cells[cell, 3] = a
+                c += 1
+                cells[cell, 3] = c
             cell += 1
 
 
 @numba.njit(cache=True, nogil=True)
 def _merge_edges(
-    bottom: NDArray[np.int64],
-    top: NDArray[np.int64],
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
     column_end: NDArray[np.int64],
+    z: NDArray[np.float64],
+    by_height: bool,
     air_left: NDArray[np.bool_],
+    count: NDArray[np.int64],
     facets: NDArray[np.int32],
-) -> bool:
+) -> None:
+    """Count the facets over each edge that one side alone has, and write them where there is room.
+
+    Both sides merge the same segments in the same order, each from its own first levels on: until a column
+    reaches its first level, that is where the column stands. A side's facets differ from the other's where
+    a column stands elsewhere; none differ once both sides have begun in both columns.
+    """
     facet = 0
-    for e in range(len(bottom)):
-        a, b = bottom[e, 0], bottom[e, 1]
-        while a < top[e, 0] or b < top[e, 1]:
-            facets[facet, 0] = a if air_left[e] else b
-            facets[facet, 1] = b if air_left[e] else a
-            if column_end[e, 1] - b >= column_end[e, 0] - a:
-                b += 1
-                facets[facet, 2] = b
-            else:
-                a += 1
-                facets[facet, 2] = a
-            if a > top[e, 0] or b > top[e, 1]:
-                return False
-            facet += 1
-    return True
+    for e in range(len(low)):
+        i, j = min(low[e, 0], high[e, 0]), min(low[e, 1], high[e, 1])
+        both_i, both_j = max(low[e, 0], high[e, 0]), max(low[e, 1], high[e, 1])
+        begin = facet
+        while i < both_i or j < both_j:
+            rising = _comes_first(z, by_height, i, column_end[e, 0], j, column_end[e, 1])
+            in_low = i >= low[e, 0] if rising else j >= low[e, 1]
+            in_high = i >= high[e, 0] if rising else j >= high[e, 1]
+            low_i, low_j = max(i, low[e, 0]), max(j, low[e, 1])
+            high_i, high_j = max(i, high[e, 0]), max(j, high[e, 1])
+            shared = in_low and in_high and low_i == high_i and low_j == high_j
+            i, j = (i + 1, j) if rising else (i, j + 1)
+            top = i if rising else j
+            if in_low and not shared:
+                if len(facets) > 0:
+                    facets[facet, 0] = low_i if air_left[e] else low_j
+                    facets[facet, 1] = low_j if air_left[e] else low_i
+                    facets[facet, 2] = top
+                facet += 1
+            if in_high and not shared:
+                if len(facets) > 0:
+                    facets[facet, 0] = high_j if air_left[e] else high_i
+                    facets[facet, 1] = high_i if air_left[e] else high_j
+                    facets[facet, 2] = top
+                facet += 1
+        count[e] = facet - begin
 
 
 @numba.njit(cache=True, nogil=True)

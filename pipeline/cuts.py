@@ -1,4 +1,4 @@
-"""New walls inside a house, placed along a line and clear of the others (for `levels`)."""
+"""New walls inside a house, placed along a line and clear of the others (for `house_levels`)."""
 
 from dataclasses import dataclass
 

@@ -15,6 +15,10 @@ class InputError(CityError):
     """A file or a value in it cannot be used: mend or leave out the input."""
 
 
+class OutputError(CityError):
+    """A result cannot be written: free space, or choose another folder."""
+
+
 class ConfigError(CityError):
     """The command line or the configuration asks for something impossible: change it."""
 

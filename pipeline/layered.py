@@ -10,6 +10,7 @@ from pipeline.citymodel import CityModel
 from pipeline.columns import expand_cells
 from pipeline.fem import solve_laplace
 from pipeline.mesh import ColumnMesh, PlaneMesh
+from pipeline.neighbours import check_groups, join_equal_roofs, part_neighbours
 from pipeline.relax import guess_displacement, relax_columns
 from pipeline.repair import repair_columns
 from pipeline.slab import smooth_slab
@@ -58,6 +59,8 @@ class LayeredReport:
     ----------
     n_layers : int
         Layers of the slab.
+    parted_groups : int
+        Groups of equal roofs whose layer is not the closest, because of the roofs that they touch.
     repaired_terrain, repaired_roofs : int
         Levels that the repair moved after step 3.3 and after step 3.5.
     iterations : int
@@ -67,6 +70,7 @@ class LayeredReport:
     """
 
     n_layers: int
+    parted_groups: int
     repaired_terrain: int
     repaired_roofs: int
     iterations: int
@@ -105,6 +109,8 @@ def mesh_layers(
     wall_ground: NDArray[np.float64],
     bounds: tuple[float, float, float, float],
     options: LayeredOptions,
+    *,
+    group: NDArray[np.int32] | None = None,
 ) -> tuple[ColumnMesh, LayeredReport]:
     """Fill the columns with layers that follow the terrain and meet every roof (steps 3.2 to 3.5).
 
@@ -122,14 +128,20 @@ def mesh_layers(
         The region (m).
     options : LayeredOptions
         Parameters.
+    group : int32, (b,), optional
+        Buildings of one group have the same roof height; by default each is a group of its own.
 
     Raises
     ------
     GeometryError
-        If a building reaches the top of the domain.
+        If a building reaches the top of the domain, or more roofs rise above each other than there are layers.
     SolverError
         If a linear solve does not converge.
+    ValueError
+        If a group has two heights.
     """
+    group = np.arange(len(city), dtype=np.int32) if group is None else group
+    check_groups(city.roof, group)
     n_layers = count_layers(options)
     layer_height = options.domain_height / n_layers
     min_gap = MIN_GAP * layer_height
@@ -137,8 +149,10 @@ def mesh_layers(
     ground_only = np.zeros(z.shape, np.bool_)
     ground_only[:, 0] = True
     z, moved_terrain = repair_columns(z, np.zeros(len(z), np.int32), ground_only, min_gap=min_gap)
-    check_headroom(z, plane, city.roof, city.ids, domain_height=options.domain_height, layer_height=layer_height)
-    removed = count_removed_layers(z, plane, city.roof, wall_ground, layer_height=layer_height)
+    check_headroom(z[:, -1], plane, city.roof, city.ids, domain_height=options.domain_height, air=layer_height / 2)
+    group = join_equal_roofs(plane, city.roof, group)
+    removed = count_removed_layers(z, plane, city.roof, wall_ground, group, layer_height=layer_height)
+    removed, parted = part_neighbours(plane, city.roof, group, removed, n_layers=n_layers)
     first = first_levels(plane, removed)
     kept = first_kept(plane, first)
     given, target = _given_heights(plane, first, kept, z, city.roof)
@@ -152,7 +166,7 @@ def mesh_layers(
         u, iterations, residual = relax_columns(plane, first, z, fixed, guess, tolerance=options.tolerance)
     z = np.where(given, target, z + u)
     z, moved_roofs = repair_columns(z, kept, given, min_gap=min_gap)
-    report = LayeredReport(n_layers, moved_terrain, moved_roofs, iterations, residual)
+    report = LayeredReport(n_layers, parted, moved_terrain, moved_roofs, iterations, residual)
     return layer_mesh(plane, z, first), report
 
 

@@ -1,4 +1,4 @@
-"""Lines through a house, where its roof points fall best into two heights (for `levels`)."""
+"""Lines through a house, where its roof points fall best into two heights (for `house_levels`)."""
 
 from dataclasses import dataclass
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,10 @@ class PlaneMesh:
     building: NDArray[np.int32]
 
 
+# How the segments of neighbouring columns are merged: see `ColumnMesh.order`.
+MergeOrder = Literal["levels", "heights"]
+
+
 @dataclass(frozen=True, eq=False)
 class ColumnMesh:
     """Columns of vertices over a plane mesh: the volume mesh until a file is written.
@@ -54,12 +59,17 @@ class ColumnMesh:
     bottom : int32, (m, 3)
         For each corner of a triangle, the level of that corner's column where the triangle's cells begin:
         the ground, or the roof in a building.
+    order : "levels" or "heights"
+        Which column's next segment comes first where columns are merged into cells: the one with the most
+        segments left above it (the paper's equations 1-3), or the one whose middle is lowest. Ties go to
+        the highest vertex. Either order is that of two columns alone, so any cells that it makes conform.
     """
 
     plane: PlaneMesh
     z_start: NDArray[np.int64]
     z: NDArray[np.float64]
     bottom: NDArray[np.int32]
+    order: MergeOrder = "levels"
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ import triangle
 from numpy.typing import NDArray
 
 from pipeline.errors import GeometryError
+from pipeline.improve_plane import improve_plane
 from pipeline.mesh import PlaneMesh
 
 MIN_ANGLE = 25.0  # degrees; Triangle's quality bound (paper, step 3.1; higher may not terminate)
@@ -59,7 +60,7 @@ def plane_graph(bounds: tuple[float, float, float, float], polygons: NDArray[np.
 
 
 def triangulate_plane(
-    graph: PlaneGraph, *, max_area: float, min_angle: float = MIN_ANGLE
+    graph: PlaneGraph, *, max_area: float, min_angle: float = MIN_ANGLE, refinements: int = 0
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32], bool]:
     """Triangulate a planar straight-line graph with bounds on area and angle.
 
@@ -73,6 +74,9 @@ def triangulate_plane(
         Largest triangle (m2).
     min_angle : float
         Smallest angle (degrees), but at corners of the input that are sharper.
+    refinements : int
+        Further runs of Triangle on its own result. The first run leaves an angle in some ten thousand below
+        the bound, one more none; a third makes tiny edges at sharp corners of walls.
 
     Returns
     -------
@@ -102,7 +106,11 @@ def triangulate_plane(
         number = np.arange(1.0, len(graph.seeds) + 1)
         data["regions"] = np.column_stack((graph.seeds - origin, number, np.zeros(len(number))))
     try:
-        out = triangle.triangulate(data, f"pq{min_angle:g}a{max_area:.12g}AS{limit}")
+        quality = f"q{min_angle:g}a{max_area:.12g}"
+        out = triangle.triangulate(data, f"p{quality}AS{limit}")
+        for _ in range(refinements):
+            kept = ("vertices", "triangles", "segments", "triangle_attributes")
+            out = triangle.triangulate({name: out[name] for name in kept if name in out}, f"rp{quality}S{limit}")
         triangles = out["triangles"].astype(np.int32)
     except (RuntimeError, KeyError, ValueError) as error:
         place = ", ".join(f"{value:.1f}" for value in graph.xy.mean(axis=0))
@@ -123,6 +131,8 @@ def mesh_plane(
     *,
     mesh_size: float,
     min_angle: float = MIN_ANGLE,
+    refinements: int = 0,
+    passes: int = 0,
 ) -> tuple[PlaneMesh, bool]:
     """Mesh the region with all walls as edges (paper, step 3.1).
 
@@ -136,6 +146,10 @@ def mesh_plane(
         Target edge length h (m); no triangle is larger than h**2 / 2.
     min_angle : float
         Bound on the angles (degrees).
+    refinements : int
+        Further runs of Triangle, as in `triangulate_plane`.
+    passes : int
+        Rounds of `improve_plane`. With any, a triangle may be larger than the bound.
 
     Returns
     -------
@@ -150,7 +164,10 @@ def mesh_plane(
         If the triangles of a building do not cover its footprint.
     """
     graph = plane_graph(bounds, polygons)
-    xy, triangles, label, complete = triangulate_plane(graph, max_area=mesh_size**2 / 2, min_angle=min_angle)
+    xy, triangles, label, complete = triangulate_plane(
+        graph, max_area=mesh_size**2 / 2, min_angle=min_angle, refinements=refinements
+    )
+    xy, triangles = improve_plane(xy, triangles, label, mesh_size=mesh_size, passes=passes)
     used = np.unique(triangles)
     order = used[np.lexsort((xy[used, 1], xy[used, 0]))]
     rank = np.empty(len(xy), np.int32)

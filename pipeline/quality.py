@@ -57,32 +57,42 @@ def quality_percentiles(quality: Quality) -> dict[str, dict[str, float]]:
 
 @numba.njit(cache=True, nogil=True)
 def _measure(points: NDArray[np.float64], cells: NDArray[np.int32], result: NDArray[np.float32]) -> None:
-    normal = np.empty((4, 3))
+    # Twice the area vector of the faces opposite to corners 0, 1, 2, 3, outwards or inwards alike.
+    nx, ny, nz = np.empty(4), np.empty(4), np.empty(4)
     size = np.empty(4)
     for c in range(len(cells)):
-        p0 = points[cells[c, 0]]
-        u = points[cells[c, 1]] - p0
-        v = points[cells[c, 2]] - p0
-        w = points[cells[c, 3]] - p0
-        # Normals of the faces opposite to corners 1, 2, 3, 0, each twice the face's area long.
-        normal[1] = np.cross(v, w)
-        normal[2] = np.cross(w, u)
-        normal[3] = np.cross(u, v)
-        normal[0] = -(normal[1] + normal[2] + normal[3])
-        volume6 = abs(np.dot(u, normal[1]))
-        surface2 = 0.0
+        p = points[cells[c, 0]]
+        ux, uy, uz = points[cells[c, 1], 0] - p[0], points[cells[c, 1], 1] - p[1], points[cells[c, 1], 2] - p[2]
+        vx, vy, vz = points[cells[c, 2], 0] - p[0], points[cells[c, 2], 1] - p[1], points[cells[c, 2], 2] - p[2]
+        wx, wy, wz = points[cells[c, 3], 0] - p[0], points[cells[c, 3], 1] - p[1], points[cells[c, 3], 2] - p[2]
+        nx[1], ny[1], nz[1] = vy * wz - vz * wy, vz * wx - vx * wz, vx * wy - vy * wx
+        nx[2], ny[2], nz[2] = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
+        nx[3], ny[3], nz[3] = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        nx[0], ny[0], nz[0] = -nx[1] - nx[2] - nx[3], -ny[1] - ny[2] - ny[3], -nz[1] - nz[2] - nz[3]
+        surface = 0.0
         for k in range(4):
-            size[k] = np.sqrt(np.dot(normal[k], normal[k]))
-            surface2 += size[k]
-        inner = volume6 / surface2
-        centre = np.dot(u, u) * normal[1] + np.dot(v, v) * normal[2] + np.dot(w, w) * normal[3]
-        outer = np.sqrt(np.dot(centre, centre)) / (2 * volume6)
-        steepest = -1.0
+            size[k] = np.sqrt(nx[k] * nx[k] + ny[k] * ny[k] + nz[k] * nz[k])
+            surface += size[k]
+        volume = abs(ux * nx[1] + uy * ny[1] + uz * nz[1])
+        inner = volume / surface
+        uu, vv, ww = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, wx * wx + wy * wy + wz * wz
+        sx = uu * nx[1] + vv * nx[2] + ww * nx[3]
+        sy = uu * ny[1] + vv * ny[2] + ww * ny[3]
+        sz = uu * nz[1] + vv * nz[2] + ww * nz[3]
+        outer = np.sqrt(sx * sx + sy * sy + sz * sz) / (2 * volume)
+        sharpest = -1.0
         for i in range(4):
             for j in range(i):
-                steepest = max(steepest, -np.dot(normal[i], normal[j]) / (size[i] * size[j]))
-        longest = max(np.dot(u, u), np.dot(v, v), np.dot(w, w))
-        longest = max(longest, np.dot(u - v, u - v), np.dot(v - w, v - w), np.dot(w - u, w - u))
+                cosine = -(nx[i] * nx[j] + ny[i] * ny[j] + nz[i] * nz[j]) / (size[i] * size[j])
+                sharpest = max(sharpest, cosine)
+        longest = max(
+            uu,
+            vv,
+            ww,
+            (ux - vx) ** 2 + (uy - vy) ** 2 + (uz - vz) ** 2,
+            (vx - wx) ** 2 + (vy - wy) ** 2 + (vz - wz) ** 2,
+            (wx - ux) ** 2 + (wy - uy) ** 2 + (wz - uz) ** 2,
+        )
         result[0, c] = 3 * inner / outer
-        result[1, c] = np.degrees(np.arccos(min(steepest, 1.0)))
+        result[1, c] = np.degrees(np.arccos(min(sharpest, 1.0)))
         result[2, c] = np.sqrt(longest) / (2 * np.sqrt(6.0) * inner)

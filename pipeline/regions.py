@@ -1,4 +1,4 @@
-"""Neighbouring cells of a house joined until the roof steps at every wall that is left (for `levels`)."""
+"""Neighbouring cells of a house joined until the roof steps at every wall that is left (for `house_levels`)."""
 
 from dataclasses import dataclass
 

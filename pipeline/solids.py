@@ -43,9 +43,7 @@ class Solids:
     has_solid: NDArray[np.bool_]
 
 
-def build_solids(
-    model: CityModel, origin: NDArray[np.float64], *, grid: float
-) -> tuple[Solids, tuple[Note, ...]]:
+def build_solids(model: CityModel, origin: NDArray[np.float64], *, grid: float) -> tuple[Solids, tuple[Note, ...]]:
     """Build the solids of a city model, rounded to a grid.
 
     Parameters
@@ -81,7 +79,7 @@ def build_solids(
     --------
     >>> one = np.ones(1)
     >>> square = np.array([shapely.box(0, 0, 2, 2)])
-    >>> model = CityModel(square, np.array(["a"]), np.array([1]), 0 * one, 3 * one, (("a",),))
+    >>> model = CityModel(square, np.array(["a"]), np.array([1]), 0 * one, 3 * one, (("a",),), np.array(["a"]))
     >>> solids, _ = build_solids(model, np.zeros(3), grid=1.0)
     >>> len(solids.vertices), len(solids.walls)
     (8, 4)

@@ -14,6 +14,7 @@ def count_removed_layers(
     plane: PlaneMesh,
     roof: NDArray[np.float64],
     wall_ground: NDArray[np.float64],
+    group: NDArray[np.int32],
     *,
     layer_height: float,
 ) -> NDArray[np.int32]:
@@ -29,6 +30,8 @@ def count_removed_layers(
         Absolute roof heights (m).
     wall_ground : float64, (b,)
         Highest terrain at the walls of each building (m).
+    group : int32, (b,)
+        Buildings of one group have one roof, and so one layer.
     layer_height : float
         Height of a layer of the slab (m).
 
@@ -39,19 +42,23 @@ def count_removed_layers(
 
     Notes
     -----
-    The closest level is that of the mean over the building's corners of triangles. No more layers are
-    removed than leave each at least 0.4 of its height between the highest terrain at a wall and the roof.
+    The closest level is that of the mean over the group's corners of triangles. No more layers are removed
+    than leave each at least 0.4 of its height between the highest terrain at a wall and the roof.
     """
-    n_buildings, n_layers = len(roof), z.shape[1] - 1
+    _, first, member = np.unique(group, return_index=True, return_inverse=True)
+    n_groups, n_layers = len(first), z.shape[1] - 1
     inside = plane.building >= 0
-    label = np.repeat(plane.building[inside], 3)
+    label = np.repeat(member[plane.building[inside]], 3)
     corner = plane.triangles[inside].ravel()
-    count = np.bincount(label, minlength=n_buildings)
-    mean = np.column_stack([np.bincount(label, z[corner, k], n_buildings) / count for k in range(n_layers + 1)])
-    closest = np.abs(mean - roof[:, None]).argmin(axis=1)
-    room = np.floor((roof - wall_ground) / (MIN_SQUEEZE * layer_height)).astype(np.int64)
-    removed: NDArray[np.int32] = np.clip(np.minimum(closest, room), 1, n_layers - 1).astype(np.int32)
-    return removed
+    count = np.bincount(label, minlength=n_groups)
+    mean = np.column_stack([np.bincount(label, z[corner, k], n_groups) / count for k in range(n_layers + 1)])
+    closest = np.abs(mean - roof[first, None]).argmin(axis=1)
+    highest_ground = np.full(n_groups, -np.inf)
+    np.maximum.at(highest_ground, member, wall_ground)
+    room = np.floor((roof[first] - highest_ground) / (MIN_SQUEEZE * layer_height)).astype(np.int64)
+    removed = np.clip(np.minimum(closest, room), 1, n_layers - 1).astype(np.int32)
+    of_building: NDArray[np.int32] = removed[member]
+    return of_building
 
 
 def first_levels(plane: PlaneMesh, removed: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -67,15 +74,30 @@ def first_kept(plane: PlaneMesh, first: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def check_headroom(
-    z: NDArray[np.float64],
+    top: NDArray[np.float64],
     plane: PlaneMesh,
     roof: NDArray[np.float64],
     ids: NDArray[np.str_],
     *,
     domain_height: float,
-    layer_height: float,
+    air: float,
 ) -> None:
-    """Refuse a roof that comes closer than half a layer to the top of the domain.
+    """Refuse a roof that comes too close to the top of the domain.
+
+    Parameters
+    ----------
+    top : float64, (n,)
+        Height of each column's top (m).
+    plane : PlaneMesh
+        Plane mesh; every building has a triangle.
+    roof : float64, (b,)
+        Absolute roof heights (m).
+    ids : str, (b,)
+        Building ids.
+    domain_height : float
+        Height of the domain (m), for the message.
+    air : float
+        Least air above a roof (m).
 
     Raises
     ------
@@ -85,16 +107,16 @@ def check_headroom(
     inside = plane.building >= 0
     label = np.repeat(plane.building[inside], 3)
     corner = plane.triangles[inside].ravel()
-    top = np.full(len(roof), np.inf)
-    np.minimum.at(top, label, z[corner, -1])
-    missing = roof + layer_height / 2 - top
+    lowest = np.full(len(roof), np.inf)
+    np.minimum.at(lowest, label, top[corner])
+    missing = roof + air - lowest
     if len(roof) == 0 or missing.max() <= 0:
         return
     worst = int(missing.argmax())
     x, y = plane.xy[corner[label == worst]].mean(axis=0)
-    enough = np.ceil(domain_height + missing[worst] + layer_height)
+    enough = np.ceil(domain_height + missing[worst] + 2 * air)
     raise GeometryError(
-        f"building {ids[worst]} at ({x:.1f}, {y:.1f}), step 3.4: its roof at {roof[worst]:.1f} m leaves no "
-        f"air below the domain's top at {top[worst]:.1f} m; raise --domain-height to {enough:.0f}, or correct "
-        "the building's height"
+        f"building {ids[worst]} at ({x:.1f}, {y:.1f}), step 3.4: its roof at {roof[worst]:.1f} m leaves "
+        f"{lowest[worst] - roof[worst]:.1f} m of air below the domain's top at {lowest[worst]:.1f} m, less than "
+        f"{air:.1f} m; raise --domain-height to {enough:.0f}, or correct the building's height"
     )

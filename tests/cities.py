@@ -43,6 +43,7 @@ def city_of(polygons: list[shapely.Polygon], roofs: list[float], *, ground: floa
         np.full(len(polygons), ground),
         np.array(roofs, dtype=np.float64),
         tuple((str(name),) for name in ids),
+        ids,
     )
 
 
@@ -61,6 +62,39 @@ def random_blocks(
         if all(block.distance(other) > clearance for other in blocks):
             blocks.append(block)
     return blocks
+
+
+def crowded_blocks(bounds: Bounds, n: int, *, seed: int, clearance: float = 1.0) -> list[shapely.Polygon]:
+    """Rectangles and L-shapes of 8 to 32 m, a third of them set close beside another one.
+
+    Farther apart than `clearance` (m) from each other, 5 m from the border.
+    """
+    rng = np.random.default_rng(seed)
+    inner = shapely.box(*bounds).buffer(-5)
+    shapely.prepare(inner)
+    blocks: list[shapely.Polygon] = []
+    while len(blocks) < n:
+        block = _random_block(rng)
+        x, y = rng.uniform(bounds[:2], bounds[2:])
+        if blocks and rng.random() < 1 / 3:
+            other = blocks[rng.integers(len(blocks))]
+            gap = (np.sqrt(other.area) + np.sqrt(block.area)) / 2 * rng.uniform(1.0, 1.4)
+            angle = rng.uniform(0, 2 * np.pi)
+            x, y = other.centroid.x + gap * np.cos(angle), other.centroid.y + gap * np.sin(angle)
+        block = affinity.translate(block, x, y)
+        if inner.contains(block) and not (shapely.distance(np.array(blocks, object), block) < clearance).any():
+            blocks.append(block)
+    return blocks
+
+
+def _random_block(rng: np.random.Generator) -> shapely.Polygon:
+    """Block around the origin, turned by any angle."""
+    width, depth = rng.uniform(8, 32, 2)
+    block = shapely.box(-width / 2, -depth / 2, width / 2, depth / 2)
+    if rng.random() < 0.4:
+        cut = rng.uniform(0.35, 0.65, 2) * (width, depth)
+        block = block.difference(shapely.box(width / 2 - cut[0], depth / 2 - cut[1], width, depth))
+    return affinity.rotate(block, rng.uniform(0, 360), origin=(0, 0))
 
 
 def random_city(

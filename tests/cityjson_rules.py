@@ -45,6 +45,14 @@ ATTRIBUTES = {
     },
     "required": ["number", "ground_height", "roof_height", "height", "members"],
 }
+GEOMETRY = array(
+    {
+        "oneOf": [
+            geometry("MultiSurface", "0", array(FACE, 1)),
+            geometry("Solid", "1.2", array(array(FACE, 5), 1, 1)),
+        ]
+    }
+)
 # Sections 2 to 5 of https://www.cityjson.org/specs/2.0.1/, as far as the model's buildings go.
 SCHEMA = record(
     {
@@ -66,20 +74,20 @@ SCHEMA = record(
         ),
         "CityObjects": {
             "type": "object",
-            "additionalProperties": record(
-                {
-                    "type": {"const": "Building"},
-                    "attributes": ATTRIBUTES,
-                    "geometry": array(
+            "additionalProperties": {
+                "oneOf": [
+                    record({"type": {"const": "Building"}, "attributes": ATTRIBUTES, "geometry": GEOMETRY}),
+                    record(
                         {
-                            "oneOf": [
-                                geometry("MultiSurface", "0", array(FACE, 1)),
-                                geometry("Solid", "1.2", array(array(FACE, 5), 1, 1)),
-                            ]
+                            "type": {"const": "BuildingPart"},
+                            "parents": array({"type": "string"}, 1, 1),
+                            "attributes": ATTRIBUTES,
+                            "geometry": GEOMETRY,
                         }
                     ),
-                }
-            ),
+                    record({"type": {"const": "Building"}, "children": array({"type": "string"}, 1)}),
+                ]
+            },
         },
         "vertices": array(array({"type": "integer"}, 3, 3)),
     }
@@ -94,9 +102,7 @@ def file_faults(document: Json) -> set[str]:
     rows = [tuple(row) for row in document["vertices"]]
     if len(set(rows)) < len(rows):
         faults.add("duplicate vertex")
-    used = {
-        corner for item in geometries(document) for face in faces_of(item) for ring in face for corner in ring
-    }
+    used = {corner for item in geometries(document) for face in faces_of(item) for ring in face for corner in ring}
     if used and max(used) >= len(rows):
         faults.add("vertex out of range")
     if used < set(range(len(rows))):
@@ -105,17 +111,20 @@ def file_faults(document: Json) -> set[str]:
         values = item.get("semantics", {}).get("values", [[]])[0]
         if item["type"] == "Solid" and len(values) != len(faces_of(item)):
             faults.add("semantics do not match the faces")
+    objects = document["CityObjects"]
+    down = {(name, child) for name, item in objects.items() for child in item.get("children", [])}
+    up = {(parent, name) for name, item in objects.items() for parent in item.get("parents", [])}
+    if down != up or not {name for pair in down for name in pair} <= objects.keys():
+        faults.add("parents and children differ")
     return faults
 
 
 def solid_faults(document: Json) -> dict[str, set[str]]:
     """Name what breaks ISO 19107, or disagrees with the attributes, in the solids of each building."""
-    points = (
-        np.array(document["vertices"]) * document["transform"]["scale"] + document["transform"]["translate"]
-    )
+    points = np.array(document["vertices"]) * document["transform"]["scale"] + document["transform"]["translate"]
     found = {}
     for name, item in document["CityObjects"].items():
-        for solid in item["geometry"]:
+        for solid in item.get("geometry", []):
             if solid["type"] == "Solid":
                 found[name] = set(_solid_faults(solid, points, item["attributes"]))
     return found
@@ -123,7 +132,7 @@ def solid_faults(document: Json) -> dict[str, set[str]]:
 
 def geometries(document: Json) -> Iterator[Json]:
     for item in document["CityObjects"].values():
-        yield from item["geometry"]
+        yield from item.get("geometry", [])
 
 
 def faces_of(item: Json) -> list[list[list[int]]]:
@@ -143,9 +152,7 @@ def area_vector(face: list[list[int]], points: NDArray[np.float64]) -> NDArray[n
 def volume(solid: Json, points: NDArray[np.float64]) -> float:
     """Signed volume within the faces: positive if the normals point outwards (divergence theorem)."""
     centre = points[faces_of(solid)[0][0][0]]
-    return sum(
-        float(area_vector(face, points) @ (points[face[0][0]] - centre)) / 3 for face in faces_of(solid)
-    )
+    return sum(float(area_vector(face, points) @ (points[face[0][0]] - centre)) / 3 for face in faces_of(solid))
 
 
 def broken(document: Json, path: list[Any], value: Any) -> Json:
@@ -175,10 +182,7 @@ def _solid_faults(solid: Json, points: NDArray[np.float64], attributes: Json) ->
             yield "face without area"
         elif np.abs((corners - corners[0]) @ vector / size).max() > 1e-3:
             yield "face not planar"
-        if (
-            kind
-            != {-1: "GroundSurface", 0: "WallSurface", 1: "RoofSurface"}[round(vector[2] / max(size, 1e-9))]
-        ):
+        if kind != {-1: "GroundSurface", 0: "WallSurface", 1: "RoofSurface"}[round(vector[2] / max(size, 1e-9))]:
             yield "semantics do not fit the normal"
         ground_area -= vector[2] if kind == "GroundSurface" else 0.0
         level = {"GroundSurface": "ground_height", "RoofSurface": "roof_height"}.get(kind)

@@ -167,14 +167,12 @@ def with_boundary(city: TinyCity, **arrays: NDArray[Any]) -> TinyCity:
 
 def _make_model(houses: Mapping[str, tuple[tuple[Square, ...], int]], dtm: PlaneDtm) -> CityModel:
     polygons = np.empty(len(houses), np.object_)
-    polygons[:] = [
-        shapely.union_all([_box_of(square) for square in squares]) for squares, _ in houses.values()
-    ]
+    polygons[:] = [shapely.union_all([_box_of(square) for square in squares]) for squares, _ in houses.values()]
     polygons = shapely.orient_polygons(polygons) if len(houses) else polygons
     ids = np.array(list(houses), np.str_)
     ground = np.array([dtm.sample(shapely.get_coordinates(polygon)).min() for polygon in polygons])
     roof = np.array([LEVELS[level - 1] for _, level in houses.values()])
-    return CityModel(polygons, ids, number_ids(ids), ground, roof, tuple((str(name),) for name in ids))
+    return CityModel(polygons, ids, number_ids(ids), ground, roof, tuple((str(name),) for name in ids), ids)
 
 
 def _box_of(square: Square) -> Any:

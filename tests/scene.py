@@ -115,14 +115,10 @@ def write_boundary(directory: Path, facets: Array, marker: Array, number: Array,
         surface.cell_data["marker"] = marker[piece == i].astype(np.int32)
         surface.cell_data["building"] = number[piece == i].astype(np.int64)
         surface.save(directory / "boundary" / f"{i}.vtp")
-    write_index(
-        directory, "boundary", "PPolyData", ["boundary/0.vtp", "boundary/1.vtp"], ("marker", "building")
-    )
+    write_index(directory, "boundary", "PPolyData", ["boundary/0.vtp", "boundary/1.vtp"], ("marker", "building"))
 
 
-def volume(
-    xy: Array, corners: Array, owner: Array, roofs: Array, top: float, *, dz: float
-) -> tuple[Array, Array]:
+def volume(xy: Array, corners: Array, owner: Array, roofs: Array, top: float, *, dz: float) -> tuple[Array, Array]:
     """Tetrahedra from the ground up; cells that meet a house are left out."""
     ground = height(xy)
     n_layers = int(np.ceil((top - ground.min()) / dz))

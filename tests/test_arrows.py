@@ -14,7 +14,7 @@ ALLOWED = {
     "tiler": {"tiler", "stitch", "pipeline"},
 }
 # The steps of the pipeline that stitch may not see: it takes data rooms and steps, never the composition.
-COMPOSING = {"pipeline.tile"}
+COMPOSING = {"pipeline.tile", "pipeline.simplify"}
 # Libraries with a clock, a disk or a process, and the only places that may import them.
 HOMES = {
     "dask": ("tiler/",),

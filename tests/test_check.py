@@ -33,8 +33,9 @@ from tests.meshes import (
     write_run,
 )
 from tiler.check import CheckReport, check_run
-from tiler.proofs import Dtm
+from tiler.proofs import Dtm, Fault, merge_faults
 from tiler.vtk_files import write_vtp, write_vtu
+from tiler.vtk_xml import make_stream, write_data_file
 
 Tamper = Callable[[TinyCity], TinyCity]
 N_PROOFS = 13
@@ -416,9 +417,7 @@ def drop_all(city: TinyCity, marker: Marker, house: int) -> TinyCity:
 def swallow_walls(city: TinyCity) -> TinyCity:
     """Give all walls of one corner house to the other."""
     building = city.boundary.building.copy()
-    building[(city.boundary.marker == Marker.WALL) & (building == city.model.numbers[4])] = (
-        city.model.numbers[5]
-    )
+    building[(city.boundary.marker == Marker.WALL) & (building == city.model.numbers[4])] = city.model.numbers[5]
     return with_boundary(city, building=building)
 
 
@@ -524,6 +523,35 @@ def shuffle_vertices(folder: Path) -> None:
     write_vtu(folder / "mesh" / "0_0.vtu", TetMesh(mesh.points[order], cells))
 
 
+def unmerge_boundary(folder: Path) -> None:
+    """Let one facet of the boundary file have its own copy of a vertex."""
+    city = make_city()
+    facets, n = city.boundary.facets.copy(), len(city.mesh.points)
+    points = np.concatenate([city.mesh.points, city.mesh.points[facets[:1, 0]]])
+    facets[0, 0] = n
+    write_vtp(folder / "boundary" / "0_0.vtp", points, replace(city.boundary, facets=facets))
+
+
+def add_unused_boundary_point(folder: Path) -> None:
+    """Write the boundary with all the points of the volume, those inside too."""
+    city = make_city()
+    facets, n_facets, n = city.boundary.facets, len(city.boundary.facets), len(city.mesh.points)
+    sections = {
+        "Points": [make_stream("Points", city.mesh.points, np.float64)],
+        "Polys": [
+            make_stream("connectivity", facets.ravel(), np.int32),
+            make_stream("offsets", 3 * np.arange(1, n_facets + 1), np.int32),
+        ],
+        "PointData": [make_stream("vertex", np.arange(n), np.int64)],
+        "CellData": [
+            make_stream("marker", city.boundary.marker, np.int32),
+            make_stream("building", city.boundary.building, np.int64),
+        ],
+    }
+    counts = {"NumberOfPoints": n, "NumberOfPolys": n_facets}
+    write_data_file(folder / "boundary" / "0_0.vtp", "PolyData", counts, sections)
+
+
 FILES: dict[str, tuple[Callable[[Path], None], set[str]]] = {
     "cells off": (edit_run(lambda run: run["counts"].update(cells=1685)), {"counts"}),
     "points off": (edit_run(lambda run: run["counts"].update(points=490)), {"counts"}),
@@ -548,6 +576,8 @@ FILES: dict[str, tuple[Callable[[Path], None], set[str]]] = {
     ),
     "last bit of a vertex": (nudge_volume, {"facet-missing", "facet-extra", "vertex-link"}),
     "other order of points": (shuffle_vertices, {"vertex-link"}),
+    "boundary vertex twice": (unmerge_boundary, {"vertex-duplicate", "vertex-link"}),
+    "boundary vertex unused": (add_unused_boundary_point, {"vertex-unused"}),
 }
 
 
@@ -633,6 +663,14 @@ def test_faults_of_one_kind_are_counted_and_the_first_places_named(tmp_path: Pat
     assert len(fault.places) == 3
 
 
+def test_faults_of_one_kind_add_up() -> None:
+    one = Fault("a", 2, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), "first")
+    two = Fault("a", 3, ((2.0, 0.0, 0.0), (3.0, 0.0, 0.0)), "second")
+    other = Fault("b", 1, (), "other")
+    joined = Fault("a", 5, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.0)), "first")
+    assert merge_faults([one, other, two]) == (joined, other)
+
+
 def test_the_folder_is_left_alone(tmp_path: Path, city: TinyCity) -> None:
     write_run(tmp_path, city)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -699,6 +737,10 @@ UNUSABLE: dict[str, tuple[Callable[[Path], None], str]] = {
         "building 'corner-a': a field",
     ),
     "no footprint": (edit_house(lambda house: house.update(geometry=[])), "building 'corner-a': a field"),
+    "vertex below range": (
+        edit_house(lambda house: house["geometry"][0].update(boundaries=[[[0, 1, -1]]])),
+        "building 'corner-a': a field",
+    ),
     "vertex out of range": (
         edit_house(lambda house: house["geometry"][0].update(boundaries=[[[0, 1, 999]]])),
         "building 'corner-a': a field",

@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from shapely.affinity import rotate, translate
 
 from pipeline.citymodel import CityModel, number_ids
-from pipeline.errors import ConfigError, InputError
+from pipeline.errors import ConfigError, InputError, OutputError
 from pipeline.notes import Note
 from tests.cityjson_rules import area_vector, broken, file_faults, solid_faults, volume
 from tiler.cityjson import read_city_model, write_city_model
@@ -44,6 +45,7 @@ def make_model(*polygons: Any, ground: Any = 0.7, roof: Any = 12.3456789, ids: A
         ground=np.broadcast_to(np.float64(ground), n).copy(),
         roof=np.broadcast_to(np.float64(roof), n).copy(),
         members=tuple((str(name), f"{name}-annex") for name in names),
+        house=names,
     )
 
 
@@ -127,6 +129,32 @@ def test_attributes_keep_their_precision_and_extra_columns(target: Path) -> None
     assert (second["rmse"], second["source"], second["kept"]) == (None, None, False)
 
 
+def test_a_house_of_two_parts_is_a_building_with_two_parts(target: Path) -> None:
+    front, back = shapely.box(121000, 487000, 121010, 487010), shapely.box(121010, 487000, 121020, 487010)
+    alone = shapely.box(121030, 487000, 121040, 487010)
+    model = replace(
+        make_model(front, back, alone, roof=[9.0, 4.0, 6.0], ids=["h-1", "h-2", "k"]),
+        house=np.array(["h", "h", "k"]),
+    )
+    document, _ = write(target, model)
+    assert file_faults(document) == set()
+    assert set().union(*solid_faults(document).values()) == set()
+    objects = document["CityObjects"]
+    assert objects["h"] == {"type": "Building", "children": ["h-1", "h-2"]}
+    assert [objects[name]["type"] for name in ("h-1", "h-2", "k")] == ["BuildingPart", "BuildingPart", "Building"]
+    assert file_faults(broken(document, ["CityObjects", "h", "children"], ["h-1"])) == {
+        "parents and children differ"
+    }
+    assert read_city_model(target).house.tolist() == ["h", "h", "k"]
+
+
+def test_an_id_is_a_row_or_a_house_of_parts(target: Path) -> None:
+    houses = [shapely.box(0, 0, 9, 9), shapely.box(20, 0, 29, 9)]
+    model = replace(make_model(*houses, ids=["h", "h-1"]), house=np.array(["h", "h"]))
+    with pytest.raises(ValueError, match="building h: is a row and has parts"):
+        write(target, model)
+
+
 def test_an_empty_model_is_valid(target: Path) -> None:
     town, notes = write(target, make_model())
     assert file_faults(town) == set()
@@ -171,9 +199,7 @@ def test_equal_input_gives_equal_bytes_and_is_left_alone(target: Path) -> None:
 def test_orientation_and_z_of_the_input_do_not_matter(target: Path) -> None:
     write(target, make_model(HOUSE, BLOCK))
     first = target.read_bytes()
-    turned = [
-        shapely.force_3d(shapely.orient_polygons(part, exterior_cw=True), 55.0) for part in (HOUSE, BLOCK)
-    ]
+    turned = [shapely.force_3d(shapely.orient_polygons(part, exterior_cw=True), 55.0) for part in (HOUSE, BLOCK)]
     town, _ = write(target, make_model(*turned))
     assert solid_faults(town) == {"b0": set(), "b1": set()}
     assert target.read_bytes() == first
@@ -207,9 +233,7 @@ def test_what_cannot_be_written_as_it_is_gets_a_note(target: Path) -> None:
     neck = shapely.union(shapely.box(20, 0, 30, 10), shapely.box(20, 20, 30, 31))
     neck = shapely.union(neck, shapely.box(25, 9, 25.0002, 21))
     flat = shapely.box(40, 0, 50, 10)
-    pinched = shapely.Polygon(
-        shapely.box(60, 0, 70, 10).exterior.coords, [[(60, 5), (65, 2), (68, 5), (65, 8)]]
-    )
+    pinched = shapely.Polygon(shapely.box(60, 0, 70, 10).exterior.coords, [[(60, 5), (65, 2), (68, 5), (65, 8)]])
     model = make_model(crumb, neck, flat, pinched, roof=[9.0, 9.0, 0.7004, 9.0])
     town, notes = write(target, model, bounds=(0, 0, 0, 100, 100, 20))
     assert [(note.kind, note.subject) for note in notes] == [
@@ -275,7 +299,7 @@ def test_an_unknown_crs_says_what_to_give(target: Path) -> None:
 
 def test_a_folder_in_the_way_leaves_nothing_behind(target: Path) -> None:
     target.mkdir()
-    with pytest.raises(ConfigError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot be written"):
         write(target, make_model(HOUSE))
     assert list(target.parent.iterdir()) == [target]
 
@@ -314,9 +338,7 @@ def turned_over(town: dict[str, Any], face: int) -> list[list[int]]:
         ([*SOLID, "semantics", "values", 0], [0, 1, 2, 2, 2], "semantics do not match the faces"),
     ],
 )
-def test_the_file_rules_see_each_fault(
-    town: dict[str, Any], place: list[Any], value: Any, fault: str
-) -> None:
+def test_the_file_rules_see_each_fault(town: dict[str, Any], place: list[Any], value: Any, fault: str) -> None:
     if fault == "duplicate vertex":
         value = town["vertices"][0]
     assert file_faults(broken(town, place, value)) == {fault}
@@ -335,9 +357,7 @@ def test_the_file_rules_see_each_fault(
         (["CityObjects", "b1", "attributes", "height"], 12.4, "volume is not area times height"),
     ],
 )
-def test_the_solid_rules_see_each_fault(
-    town: dict[str, Any], place: list[Any], value: Any, fault: str
-) -> None:
+def test_the_solid_rules_see_each_fault(town: dict[str, Any], place: list[Any], value: Any, fault: str) -> None:
     if value == "turned":
         value = turned_over(town, place[-1])
     found = solid_faults(broken(town, place, value))

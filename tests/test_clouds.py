@@ -155,9 +155,7 @@ def test_chunks_do_not_change_the_result(laz: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 0.9999])
-def test_a_file_cut_off_anywhere_is_refused(
-    tmp_path: Path, xyz: np.ndarray, share: float, suffix: str
-) -> None:
+def test_a_file_cut_off_anywhere_is_refused(tmp_path: Path, xyz: np.ndarray, share: float, suffix: str) -> None:
     path = write_cloud(tmp_path / f"cut.{suffix}", xyz)
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
@@ -227,6 +225,16 @@ def test_a_chunk_table_beyond_the_file_is_refused(laz: Path) -> None:
         read_header(patch(laz, begin, "q", 7))
 
 
+def test_a_chunk_table_may_be_found_from_the_end(laz: Path) -> None:
+    whole, _ = read_points(laz, EVERYWHERE)
+    begin = struct.unpack_from("<I", laz.read_bytes(), 96)[0]
+    table = laz.read_bytes()[begin : begin + 8]
+    patch(laz, begin, "q", -1)
+    laz.write_bytes(laz.read_bytes() + table)
+    assert read_header(laz).n_points == 5000
+    assert read_points(laz, EVERYWHERE)[0].xyz.tobytes() == whole.xyz.tobytes()
+
+
 def test_points_outside_their_header_are_refused(laz: Path) -> None:
     patch(laz, 179, "d", ORIGIN[0] + 50)
     assert read_header(laz).bounds[2] == ORIGIN[0] + 50
@@ -282,3 +290,29 @@ def test_real_clouds(shared_data: Path) -> None:
     assert (cloud.xyz[:, :2] >= box[:2]).all()
     assert (cloud.xyz[:, :2] <= box[2:]).all()
     assert set(np.unique(cloud.classification)) <= {1, 2, 6, 9, 26}
+
+
+def test_copc_is_read_like_any_laz(tmp_path: Path) -> None:
+    """A COPC file of another writer, its points spread over two levels of its octree."""
+    import copclib as copc
+
+    rng = np.random.default_rng(2)
+    xyz = np.round(rng.uniform((318000, 6399000, 0), (318064, 6399064, 20), (500, 3)), 2)
+    scale, offset = copc.Vector3(0.01, 0.01, 0.01), copc.Vector3(318000, 6399000, 0)
+    writer = copc.FileWriter(str(tmp_path / "a.copc.laz"), copc.CopcConfigWriter(6, scale, offset))
+    writer.copc_config.copc_info.halfsize, writer.copc_config.copc_info.spacing = 64.0, 5.0
+    for key, rows in (((0, 0, 0, 0), slice(0, 200)), ((1, 0, 0, 0), slice(200, 500))):
+        points = copc.Points(writer.copc_config.las_header)
+        for x, y, z in xyz[rows].tolist():
+            point = points.CreatePoint()
+            point.x, point.y, point.z, point.classification = x, y, z, 2
+            points.AddPoint(point)
+        writer.AddNode(copc.VoxelKey(*key), points)
+    header = writer.copc_config.las_header
+    header.min, header.max = copc.Vector3(*xyz.min(axis=0)), copc.Vector3(*xyz.max(axis=0))
+    writer.Close()
+    assert find_clouds([tmp_path]) == [tmp_path / "a.copc.laz"]
+    assert read_header(tmp_path / "a.copc.laz").n_points == 500
+    cloud, counts = read_points(tmp_path / "a.copc.laz", (318000.0, 6399000.0, 318064.0, 6399064.0))
+    assert counts["kept"] == 500
+    np.testing.assert_allclose(np.sort(cloud.xyz, axis=0), np.sort(xyz, axis=0), atol=0.006)

@@ -139,6 +139,12 @@ def test_two_bodies_on_one_edge_are_closed_but_not_manifold() -> None:
     assert edges.non_manifold.tolist() == [[0, 1]]
 
 
+def test_an_open_edge_of_three_facets_is_open_alone() -> None:
+    edges = pair_edges(np.concatenate([SHELL, rows((0, 1, 4))]))
+    assert [0, 1] in edges.open.tolist()
+    assert len(edges.non_manifold) == 0
+
+
 def test_the_same_facets_in_another_order_and_rotation_match() -> None:
     match = match_facets(SHELL, np.roll(SHELL[::-1], 1, axis=1))
     assert [len(part) for part in (match.missing, match.extra, match.flipped, match.duplicate)] == [0] * 4
@@ -174,6 +180,12 @@ def test_flat_is_relative_to_the_longest_edge() -> None:
     points = np.concatenate([lifted, tiny, [[np.nan, 0, 0]]])
     cells = rows((0, 1, 2, 3), (0, 1, 2, 4), (0, 1, 2, 5), (6, 7, 8, 9), (0, 1, 2, 10))
     assert compute_cell_volumes(points, cells)[1].tolist() == [True, True, False, False, True]
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-4, 1.0, 1e4])
+def test_flat_does_not_depend_on_the_unit(scale: float) -> None:
+    points = scale * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1e-10], [1, 1, 1e-12]])
+    assert compute_cell_volumes(points, rows((0, 1, 2, 3), (0, 1, 2, 4)))[1].tolist() == [False, True]
 
 
 def test_volumes_far_from_the_origin() -> None:

@@ -1,5 +1,6 @@
 """The region's CRS: who decides, what is refused, and the command that mends it."""
 
+import copy
 from pathlib import Path
 
 import pyproj
@@ -15,9 +16,7 @@ DEGREES = (4.88, 52.36, 4.89, 52.37, -5.0, 60.0)
 NEW_YORK_FEET = (980000.0, 195000.0, 985000.0, 200000.0, 0.0, 300.0)
 
 
-def cloud(
-    crs: str | None, name: str = "a.laz", bounds: tuple[float, ...] = AMSTERDAM, n: int = 9
-) -> CloudHeader:
+def cloud(crs: str | None, name: str = "a.laz", bounds: tuple[float, ...] = AMSTERDAM, n: int = 9) -> CloudHeader:
     box = (bounds[0], bounds[1], bounds[2], bounds[3], bounds[4], bounds[5])
     return CloudHeader(Path("in") / name, n, box, None if crs is None else pyproj.CRS(crs))
 
@@ -51,6 +50,18 @@ def test_axis_order_does_not_matter_but_the_projection_does() -> None:
         assert horizontal_crs(written) == sweden
     assert not same_crs(RD, pyproj.CRS("EPSG:28991"))
     assert not same_crs(pyproj.CRS("EPSG:32631"), pyproj.CRS("EPSG:25831"))
+
+
+def test_axis_order_does_not_matter_outside_the_register_either() -> None:
+    ours = pyproj.CRS("EPSG:3006").to_json_dict()
+    del ours["id"]
+    ours["conversion"]["parameters"][3]["value"] = 123456.0  # an own false easting
+    theirs = copy.deepcopy(ours)
+    theirs["coordinate_system"]["axis"].reverse()
+    one, other = (pyproj.CRS.from_json_dict(fields) for fields in (ours, theirs))
+    assert horizontal_crs(one) is not None
+    assert same_crs(one, other)
+    assert not same_crs(one, pyproj.CRS("EPSG:3006"))
 
 
 def test_asked_comes_first() -> None:
@@ -135,9 +146,7 @@ def test_feet_are_refused_with_the_command() -> None:
 def test_heights_in_feet_are_refused_with_the_command() -> None:
     for asked, stated in ((None, "EPSG:32618+6360"), ("EPSG:32618+6360", None)):
         with pytest.raises(InputError, match="height in US survey foot") as caught:
-            resolve_crs(
-                asked, [cloud(stated, bounds=(585000.0, 4511000.0, 586000.0, 4512000.0, 0.0, 9.0))], None
-            )
+            resolve_crs(asked, [cloud(stated, bounds=(585000.0, 4511000.0, 586000.0, 4512000.0, 0.0, 9.0))], None)
         assert "a_metric.laz" in str(caught.value)
         assert "assign --filters.assign.value" in str(caught.value)
         assert str(caught.value).endswith("--writers.las.a_srs=EPSG:32618")
@@ -164,9 +173,7 @@ def test_degrees_of_footprints_are_never_taken_for_the_cloud() -> None:
 
 def test_a_cloud_far_from_its_crs_is_told() -> None:
     far = cloud(None, bounds=(318000.0, 6399000.0, 319000.0, 6400000.0, 0.0, 9.0))
-    assert (
-        "outside the area of use of EPSG:28992" in resolve_crs("EPSG:28992", [cloud(None), far], None)[1][-1]
-    )
+    assert "outside the area of use of EPSG:28992" in resolve_crs("EPSG:28992", [cloud(None), far], None)[1][-1]
     assert len(resolve_crs("EPSG:3006", [far], None)[1]) == 1
 
 
@@ -179,7 +186,11 @@ def test_utm_zones_at_the_edges() -> None:
 
 
 def test_an_area_across_the_date_line() -> None:
-    chatham = cloud(None, bounds=(3500000.0, 5140000.0, 3501000.0, 5141000.0, 0.0, 9.0))
-    crs = pyproj.CRS("EPSG:3793")
+    crs = pyproj.CRS("EPSG:3851")  # New Zealand's continental shelf, 160 degrees east to 171 west
     assert crs.area_of_use is not None
-    assert resolve_crs("EPSG:3793", [chatham], None)[0] == crs
+    assert crs.area_of_use.east < 0 < crs.area_of_use.west
+    forward = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    for lon, lat, told in ((-176.5, -44.0, 1), (174.8, -41.3, 1), (-150.0, -44.0, 2), (140.0, -44.0, 2)):
+        x, y = forward.transform(lon, lat)
+        where = cloud(None, bounds=(x, y, x + 10, y + 10, 0.0, 9.0))
+        assert len(resolve_crs("EPSG:3851", [where], None)[1]) == told

@@ -11,8 +11,9 @@ from pipeline.columns import count_cells, expand_cells, extract_boundary, lowest
 from pipeline.errors import GeometryError, SolverError
 from pipeline.fem import solve_laplace, stiffness_matrix
 from pipeline.heights import highest_wall_ground, raise_low_roofs
-from pipeline.layered import LayeredOptions, layer_mesh, mesh_layers
+from pipeline.layered import LayeredOptions, Smoother, layer_mesh, mesh_layers
 from pipeline.mesh import ColumnMesh, Marker, PlaneMesh, TetMesh
+from pipeline.neighbours import join_equal_roofs, part_neighbours, touching_groups
 from pipeline.plane import mesh_plane, signed_areas
 from pipeline.relax import assemble_stencil, relax_columns
 from pipeline.repair import repair_columns
@@ -20,6 +21,7 @@ from pipeline.slab import smooth_slab
 from pipeline.terrain import Dtm, sample_dtm
 from pipeline.trim import count_removed_layers, first_kept, first_levels
 from tests.cities import Bounds, city_of, hilly_dtm, random_blocks, random_city, tilted_dtm
+from tests.terraces import prove_conforming, prove_volume, prove_walls, terrace_town
 
 BOUNDS = (318000.0, 6399000.0, 318250.0, 6399250.0)
 OPTIONS = LayeredOptions(
@@ -34,7 +36,8 @@ def mesh_of(city: CityModel, dtm: Dtm, options: LayeredOptions = OPTIONS, bounds
 
 def volumes(mesh: TetMesh) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     corners = mesh.points[mesh.cells]
-    return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    volume: np.ndarray[tuple[int], np.dtype[np.float64]] = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    return volume
 
 
 def test_a_prism_becomes_the_papers_three_tetrahedra() -> None:
@@ -185,7 +188,9 @@ def test_the_stencil_is_the_stiffness_matrix_of_the_cells() -> None:
     city, dtm, wall_ground = random_city((0.0, 0.0, 120.0, 120.0), 4, seed=5)
     plane, _ = mesh_plane((0.0, 0.0, 120.0, 120.0), city.polygons, mesh_size=15.0)
     z = sample_dtm(dtm, plane.xy)[:, None] + np.linspace(0, 60, 5)
-    removed = count_removed_layers(z, plane, city.roof, wall_ground, layer_height=15.0)
+    removed = count_removed_layers(
+        z, plane, city.roof, wall_ground, np.arange(4, dtype=np.int32), layer_height=15.0
+    )
     first = first_levels(plane, removed)
     edges, of_triangle = plane_edges(plane.triangles)
     stencil = assemble_stencil(plane, of_triangle, len(edges), first, z)
@@ -258,7 +263,9 @@ def test_no_more_layers_are_removed_than_leave_each_two_fifths() -> None:
     plane, _ = mesh_plane(BOUNDS, city.polygons, mesh_size=10.0)
     z = np.tile(np.linspace(0, 100, 11), (len(plane.xy), 1))
     for wall, layers in ((0.0, 5), (40.0, 1), (37.0, 2)):
-        removed = count_removed_layers(z, plane, city.roof, np.array([wall]), layer_height=10.0)
+        removed = count_removed_layers(
+            z, plane, city.roof, np.array([wall]), np.zeros(1, np.int32), layer_height=10.0
+        )
         assert removed.tolist() == [layers]
 
 
@@ -269,3 +276,38 @@ def test_counts_are_those_of_the_cells() -> None:
     inside = mesh.plane.building >= 0
     area = np.abs(signed_areas(mesh.plane))
     assert area[inside].sum() == pytest.approx(sum(p.area for p in city.polygons))
+
+
+@pytest.mark.parametrize("smoother", ["columns", "fem"])
+@pytest.mark.parametrize("layer_height", [3.0, 6.0, 12.0])
+def test_terraces_conform_on_layers_of_their_own(smoother: Smoother, layer_height: float) -> None:
+    town = terrace_town(ground=3.0)
+    city, dtm = town.model, tilted_dtm(town.bounds, height=3.0)
+    options = dataclasses.replace(OPTIONS, domain_height=60.0, layer_height=layer_height, smoother=smoother)
+    plane, _ = mesh_plane(town.bounds, city.polygons, mesh_size=10.0)
+    ground = np.full(len(city), 3.0)
+    mesh, report = mesh_layers(plane, dtm, city, ground, town.bounds, options, group=town.group)
+    assert prove_conforming(mesh, city.numbers) > 0
+    prove_volume(mesh, city, dtm)
+    prove_walls(mesh, town, 3.0)
+    if layer_height > 5:
+        assert report.parted_groups > 0
+
+
+def test_roofs_that_meet_rise_one_layer_each_and_equal_ones_share_theirs() -> None:
+    row = [shapely.box(10 + 10 * k, 30, 20 + 10 * k, 40) for k in range(5)]
+    city = city_of(row, [12.0, 15.0, 15.0, 18.0, 40.0])
+    plane, _ = mesh_plane((0.0, 0.0, 80.0, 80.0), city.polygons, mesh_size=10.0)
+    own = np.arange(5, dtype=np.int32)
+    group = join_equal_roofs(plane, city.roof, own)
+    assert group.tolist() == [0, 1, 1, 2, 3]
+    lower, higher = touching_groups(plane, city.roof, group)
+    assert list(zip(lower.tolist(), higher.tolist(), strict=True)) == [(0, 1), (1, 3), (3, 4)]
+    alone = np.array([1, 1, 1, 2, 4], np.int32)
+    removed, parted = part_neighbours(plane, city.roof, group, alone, n_layers=8)
+    assert (removed.tolist(), parted) == ([1, 2, 2, 3, 4], 2)
+    # Without room above, the lower ones come down.
+    crowded, parted = part_neighbours(plane, city.roof, group, np.full(5, 4, np.int32), n_layers=5)
+    assert (crowded.tolist(), parted) == ([1, 2, 2, 3, 4], 3)
+    with pytest.raises(GeometryError, match=r"roof at 12\.0 m near \(15.*in 4 layers; lower --layer-height"):
+        part_neighbours(plane, city.roof, group, alone, n_layers=4)

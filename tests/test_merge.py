@@ -213,9 +213,7 @@ def test_bad_input_is_refused_with_its_place_in_the_input() -> None:
     with pytest.raises(GeometryError, match=r"footprint 0 .* and 1 others of 2"):
         merge(Polygon(), shapely.MultiPolygon([box(0, 0, 3, 3)]))
     with pytest.raises(ValueError, match="floor"):
-        merge_footprints(
-            np.array([box(0, 0, 3, 3)]), clearance=1.0, min_hole_area=10.0, floor=1.5, tolerance=0.01
-        )
+        merge_footprints(np.array([box(0, 0, 3, 3)]), clearance=1.0, min_hole_area=10.0, floor=1.5, tolerance=0.01)
 
 
 UNSOUND = {
@@ -257,9 +255,7 @@ def test_an_unsound_polygon_is_repaired_close_to_what_it_was(name: str) -> None:
     assert merged.method == (rung,)
 
 
-@pytest.mark.parametrize(
-    ("name", "bounds"), [("thin neck", (0, 0, 21, 9)), ("needle", (-0.1, -0.1, 30.1, 0.18))]
-)
+@pytest.mark.parametrize(("name", "bounds"), [("thin neck", (0, 0, 21, 9)), ("needle", (-0.1, -0.1, 30.1, 0.18))])
 def test_the_last_rungs_are_the_hull_and_a_box(
     name: str, bounds: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -376,6 +372,6 @@ def test_amsterdam_keeps_the_promises(shared_data: Path) -> None:
     clean, _ = clean_footprints(rows, min_area=5.0, tolerance=TOLERANCE)
     merged = merge(*clean.polygons)
     assert_promises(merged, len(clean.polygons))
-    # 1.2 to 1.7 s on one shared core; 536 of 1,406 merges end in the hull, which is the paper's way.
+    # About 1.5 s on one shared core; 537 of 1,406 merges end in the hull, which is the paper's way.
     lost = shapely.union_all(clean.polygons).difference(shapely.union_all(merged.polygons))
     assert lost.area < 1e-4 * shapely.area(clean.polygons).sum()

@@ -1,5 +1,6 @@
-"""Difficult real footprints, group by group through steps 1.4 and 2.1: all sound, nothing lost unsaid."""
+"""Difficult real footprints, group by group through steps 1.4 to 3.5: all sound, nothing lost unsaid."""
 
+import dataclasses
 from functools import cache
 from pathlib import Path
 
@@ -11,9 +12,14 @@ from numpy.typing import NDArray
 
 from pipeline.citymodel import Footprints
 from pipeline.clearance import is_sound
+from pipeline.columns import lowest_gap
 from pipeline.footprints import clean_footprints
+from pipeline.heights import highest_wall_ground
+from pipeline.layered import LayeredOptions, mesh_layers
 from pipeline.merge import MergedFootprints, merge_footprints
 from pipeline.notes import Note
+from pipeline.plane import mesh_plane
+from tests.cities import city_of, hilly_dtm
 
 MIN_AREA, TOLERANCE, CLEARANCE, MIN_HOLE_AREA, FLOOR = 5.0, 0.01, 1.0, 10.0, 0.1
 # The group numbers of the file; gaps in them are as published.
@@ -62,9 +68,7 @@ def assert_promises(clean: Footprints, merged: MergedFootprints) -> None:
     assert sorted(rows) == list(range(len(clean.ids)))
 
 
-def assert_nothing_lost(
-    given: NDArray[np.object_], notes: tuple[Note, ...], merged: MergedFootprints
-) -> None:
+def assert_nothing_lost(given: NDArray[np.object_], notes: tuple[Note, ...], merged: MergedFootprints) -> None:
     """Check that each footprint, and each part of one, is covered in one place at least or noted."""
     gone = {note.subject for note in notes if note.kind in GONE}
     city = shapely.union_all(merged.polygons)
@@ -103,3 +107,22 @@ def test_all_groups_together_merge_as_they_do_alone(
     assert_nothing_lost(nasty[0], notes, merged)
     alone = [simplify(nasty[0][nasty[1] == number])[2].polygons for number in GROUPS]
     assert set(shapely.to_wkb(np.concatenate(alone))) == set(shapely.to_wkb(merged.polygons))
+
+
+@pytest.mark.parametrize("number", GROUPS)
+def test_a_group_is_meshed(number: int, nasty: tuple[NDArray[np.object_], NDArray[np.int32]]) -> None:
+    """Step 3.1 on what 2.1 makes of the group, and the volume over it: nothing is inverted."""
+    _, _, merged = simplify(nasty[0][nasty[1] == number])
+    box = shapely.total_bounds(nasty[0][nasty[1] == number])
+    bounds = (float(box[0]) - 30, float(box[1]) - 30, float(box[2]) + 30, float(box[3]) + 30)
+    plane, complete = mesh_plane(bounds, merged.polygons, mesh_size=10.0)
+    assert complete
+    expected = np.prod(np.subtract(bounds[2:], bounds[:2])) / (10**2 / 2)
+    assert len(plane.triangles) < 20 * expected
+    city = city_of(list(merged.polygons), [12.0 + 3 * k for k in range(len(merged.polygons))])
+    dtm = hilly_dtm(tuple(np.floor(bounds)), relief=6.0)
+    wall_ground = highest_wall_ground(city.polygons, dtm)
+    roofed = dataclasses.replace(city, roof=np.maximum(city.roof, wall_ground + 2.0))
+    options = LayeredOptions(10.0, 10.0, 100.0 + float(roofed.roof.max(initial=0)), "columns", 0.003, 1e-8)
+    columns, _ = mesh_layers(plane, dtm, roofed, wall_ground, bounds, options)
+    assert lowest_gap(columns)[1] == 0

@@ -9,7 +9,7 @@ from pipeline import plane as plane_room
 from pipeline.errors import GeometryError
 from pipeline.mesh import PlaneMesh
 from pipeline.plane import mesh_plane, plane_graph, signed_areas, triangulate_plane
-from tests.cities import city_of, random_blocks
+from tests.cities import city_of, crowded_blocks, random_blocks
 
 BOUNDS = (318000.0, 6399000.0, 318200.0, 6399150.0)
 
@@ -60,6 +60,18 @@ def test_walls_are_edges_and_buildings_are_labelled() -> None:
         assert area[plane.building == row].sum() == pytest.approx(block.area, rel=1e-9)
         union = shapely.union_all(shapely.polygons(plane.xy[plane.triangles[plane.building == row]]))
         assert union.symmetric_difference(block).area < 1e-6
+
+
+def test_a_second_run_leaves_no_angle_below_the_bound() -> None:
+    bounds = (0.0, 0.0, 500.0, 500.0)
+    blocks = shapes(*crowded_blocks(bounds, 125, seed=4))
+    once, _ = mesh_plane(bounds, blocks, mesh_size=10.0, min_angle=28)
+    twice, _ = mesh_plane(bounds, blocks, mesh_size=10.0, min_angle=28, refinements=1)
+    assert smallest_angle(once) < 27.5
+    assert smallest_angle(twice) > 28 - 1e-9
+    for row, block in enumerate(blocks):
+        area = np.abs(signed_areas(twice))[twice.building == row].sum()
+        assert area == pytest.approx(block.area, rel=1e-9)
 
 
 def test_input_vertices_are_kept_bit_for_bit() -> None:

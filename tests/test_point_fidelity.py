@@ -13,7 +13,7 @@ from pipeline.building_points import extract_building_points
 from pipeline.citymodel import Footprints
 from pipeline.footprints import clean_footprints
 from pipeline.heights import percentile_by_group
-from pipeline.levels import LevelOptions, split_levels
+from pipeline.house_levels import LevelOptions, split_levels
 from pipeline.point_fidelity import Residuals, measure_fidelity, measure_houses, summarise
 from pipeline.pointcloud import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER, PointCloud
 from pipeline.roof_points import RoofPoints, locate_points, locate_roof_points

@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.errors import ConfigError, InputError, OutputError
 from tests.scene import write_scene
 from tiler.picture_parts import (
     City,
     _edge_style,
     _skirt,
     add_air,
+    add_houses,
     heights_above_ground,
     load_city,
     load_volume,
@@ -126,9 +127,7 @@ def test_a_picture_has_a_size_of_its_own(run: Path, tmp_path: Path, monkeypatch:
 def test_ground_alone_is_a_picture(copy: Path, tmp_path: Path) -> None:
     for piece in (copy / "boundary").iterdir():
         surface = pyvista.read(piece)
-        surface.extract_cells(np.flatnonzero(surface["marker"] == 1)).extract_surface(algorithm=None).save(
-            piece
-        )
+        surface.extract_cells(np.flatnonzero(surface["marker"] == 1)).extract_surface(algorithm=None).save(piece)
     render_run(copy, tmp_path / "ground.png", size=SIZE)
     image = pixels(tmp_path / "ground.png")
     assert green(image).mean() > 0.03
@@ -176,6 +175,21 @@ def test_heights_above_ground_are_those_of_the_building() -> None:
     np.testing.assert_array_equal(heights_above_ground(city), [8, 8, 0])
 
 
+def test_walls_are_pale_and_roofs_redder_with_height(run: Path) -> None:
+    city = load_city(run)
+    plotter = pyvista.Plotter(off_screen=True)
+    add_houses(plotter, city, SIZE)
+    houses = plotter.meshes[0]
+    plotter.close()
+    marker = city.marker[city.marker != 1]
+    assert np.all(houses["rgb"][marker == 2] == [255, 250, 240])
+    height = heights_above_ground(city)[city.marker == 3]
+    order = np.argsort(height)
+    red, blue = houses["rgb"][marker == 3][order][:, [0, 2]].astype(np.int64).T
+    assert red[0] - red[-1] > 20
+    assert np.all(np.diff(blue[height[order] < 26.6]) <= 0)
+
+
 def test_edges_fade_and_vanish_as_triangles_get_small() -> None:
     few, some, many = (_edge_style(n, (1000, 800)) for n in (5_000, 25_000, 100_000))
     assert few["edge_opacity"] == pytest.approx(0.35)
@@ -184,31 +198,29 @@ def test_edges_fade_and_vanish_as_triangles_get_small() -> None:
 
 
 @given(
-    points=st.lists(st.tuples(*[st.floats(-1e3, 1e3)] * 3), min_size=2, max_size=20, unique=True),
+    box=st.tuples(st.floats(50, 5000), st.floats(50, 5000), st.floats(0, 500)),
+    corner=st.tuples(*[st.floats(-1e4, 1e4)] * 3),
     azimuth=st.floats(0, 360),
-    elevation=st.floats(5, 80),
-    aspect=st.floats(0.3, 3),
+    elevation=st.floats(15, 60),
+    aspect=st.floats(0.5, 3),
 )
 def test_the_camera_just_holds_all_points(
-    points: list[tuple[float, float, float]], azimuth: float, elevation: float, aspect: float
+    box: tuple[float, ...], corner: tuple[float, ...], azimuth: float, elevation: float, aspect: float
 ) -> None:
-    cloud = np.array(points)
+    cloud = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * box + corner
     position, focal = fit_camera(cloud, azimuth=azimuth, elevation=elevation, view_angle=30, aspect=aspect)
-    ahead = focal - position
-    distance = np.linalg.norm(ahead)
-    if distance < 1e-6:  # all points in one place on the picture
-        return
-    ahead /= distance
+    ahead = (focal - position) / np.linalg.norm(focal - position)
+    turn = np.radians(azimuth)
     assert np.degrees(np.arcsin(-ahead[2])) == pytest.approx(elevation)
-    right = np.cross(ahead, [0, 0, 1])
-    right /= np.linalg.norm(right)
+    assert -ahead[:2] @ [np.sin(turn), np.cos(turn)] == pytest.approx(np.cos(np.radians(elevation)))
+    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(ahead[:2])
     away = cloud - position
-    seen = np.column_stack([away @ right, away @ np.cross(right, ahead)])
-    limit = np.tan(np.radians(15)) * np.array([aspect, 1]) * (away @ ahead)[:, None]
-    slack = 1e-9 * (distance + 1e3)
-    assert np.all(np.abs(seen) <= limit + slack)
-    touching = (np.abs(np.abs(seen) - limit) <= slack) & (np.sign(seen) != 0)
-    assert touching.any()
+    share = np.column_stack([away @ right / aspect, away @ np.cross(right, ahead)])
+    share /= np.tan(np.radians(15)) * (away @ ahead)[:, None]
+    # On one axis both sides of the picture are touched, on the other none is passed.
+    reach = np.array([-share.min(axis=0), share.max(axis=0)])
+    assert reach.max() == pytest.approx(1, abs=1e-6)
+    assert np.all(np.isclose(reach, 1, atol=1e-6), axis=0).any()
 
 
 @pytest.mark.parametrize(
@@ -242,10 +254,28 @@ def test_a_lost_file_is_named(
     assert list(tmp_path.iterdir()) == [copy]
 
 
-def test_a_damaged_index_is_named(copy: Path, tmp_path: Path) -> None:
-    (copy / "boundary.pvtp").write_text("<VTKFile")
+@pytest.mark.parametrize("damage", ["index", "cut", "garbage", "array"])
+def test_damage_is_named(
+    copy: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    damage: str,
+) -> None:
+    piece = copy / "boundary" / "1.vtp"
+    blob = piece.read_bytes()
+    if damage == "index":
+        (copy / "boundary.pvtp").write_text("<VTKFile")
+    elif damage == "cut":
+        piece.write_bytes(blob[: len(blob) // 2])
+    elif damage == "garbage":
+        piece.write_bytes(blob[: len(blob) // 2] + b"A" * 50 + blob[len(blob) // 2 + 50 :])
+    else:
+        piece.write_bytes(blob.replace(b'Name="marker"', b'Name="merker"'))
     with pytest.raises(InputError, match=r"boundary.pvtp: it or a piece of it is missing, damaged"):
         render_run(copy, tmp_path / "out.png", size=SIZE)
+    assert capfd.readouterr() == ("", "")
+    assert caplog.records == []
 
 
 @pytest.mark.parametrize(
@@ -268,9 +298,7 @@ def test_a_boundary_without_marks_is_named(copy: Path, tmp_path: Path, array: st
         render_run(copy, tmp_path / "out.png", size=SIZE)
 
 
-def test_without_pyvista_the_extra_is_named(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pyvista_the_extra_is_named(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyvista", None)
     with pytest.raises(ConfigError, match=r"pip install citystitch\[pictures\]"):
         render_run(run, tmp_path / "out.png")
@@ -278,6 +306,6 @@ def test_without_pyvista_the_extra_is_named(
 
 def test_a_folder_in_the_way_leaves_nothing_behind(run: Path, tmp_path: Path) -> None:
     (tmp_path / "out.png").mkdir()
-    with pytest.raises(ConfigError, match=r"out.png: cannot be written"):
+    with pytest.raises(OutputError, match=r"out.png: cannot be written"):
         render_run(run, tmp_path / "out.png", size=SIZE)
     assert [path.name for path in tmp_path.iterdir()] == ["out.png"]

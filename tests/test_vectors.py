@@ -85,13 +85,15 @@ def write_parquet(path: Path, shapes: list[Any], fields: dict[str, Any], **colum
 
 
 def test_geoparquet(tmp_path: Path) -> None:
-    shapes = [square(5, 5), square(500, 5), square(20, 5), None]
-    fields = {"uuid": ["b", "far", "a", "none"], "h": [3.5, 1.0, None, 2.0]}
+    corner = shapely.Polygon([(X - 9, Y + 5), (X + 5, Y - 9), (X - 9, Y - 9)])  # its box meets, it does not
+    shapes = [shapely.force_3d(square(5, 5), 7.0), square(500, 5), square(20, 5), None, corner]
+    fields = {"uuid": ["b", "far", "a", "none", "corner"], "h": [3.5, 1.0, None, 2.0, 3.0]}
     path = write_parquet(tmp_path / "a.parquet", shapes, fields, crs=RD.to_json_dict())
     footprints, notes = read(path, height_attribute="h")
     assert read_footprint_crs(path) == RD
     assert footprints.ids.tolist() == ["a", "b"]
-    assert same_shapes(footprints.polygons, [shapes[2], shapes[0]])
+    assert same_shapes(footprints.polygons, [square(20, 5), square(5, 5)])
+    assert not shapely.has_z(footprints.polygons).any()
     np.testing.assert_array_equal(footprints.given_height, [np.nan, 3.5])
     assert count_notes(notes) == {"footprint-height-missing": 1}
 
@@ -123,7 +125,7 @@ def test_only_what_meets_the_box(tmp_path: Path) -> None:
 
 
 def test_another_crs_is_reprojected(tmp_path: Path) -> None:
-    shapes = [square(10 * i, 90, 5) for i in range(10)] + [square(50, 300), square(-300, 50)]
+    shapes = [square(10 * i, 90, 5) for i in range(10)] + [square(50, 100.5), square(-300, 50)]
     forward = pyproj.Transformer.from_crs(RD, WGS84, always_xy=True)
     there = shapely.transform(np.array(shapes, object), forward.transform, interleaved=False)
     path = write(tmp_path / "a.gpkg", list(there), {"id": [f"{i:02}" for i in range(12)]}, crs="EPSG:4326")

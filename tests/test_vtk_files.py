@@ -16,7 +16,7 @@ from vtkmodules.vtkIOXML import (
     vtkXMLUnstructuredGridReader,
 )
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, OutputError
 from pipeline.mesh import Boundary, TetMesh
 from tests.meshes import TinyCity, make_city, split_city
 from tiler import vtk_xml
@@ -29,6 +29,7 @@ from tiler.vtk_files import (
     write_vtp,
     write_vtu,
 )
+from tiler.vtk_xml import make_stream, write_data_file
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +64,7 @@ def arrays_of(data: Any) -> dict[str, NDArray[Any]]:
 
 
 def rows_of(cells: Any, width: int) -> NDArray[Any]:
-    assert np.array_equal(
-        vtk_to_numpy(cells.GetOffsetsArray()), np.arange(cells.GetNumberOfCells() + 1) * width
-    )
+    assert np.array_equal(vtk_to_numpy(cells.GetOffsetsArray()), np.arange(cells.GetNumberOfCells() + 1) * width)
     rows: NDArray[Any] = vtk_to_numpy(cells.GetConnectivityArray()).reshape(-1, width)
     return rows
 
@@ -101,9 +100,7 @@ def test_the_reading_helper_notices_what_vtk_only_prints(tmp_path: Path, city: T
 
 
 @pytest.mark.parametrize("blocks", ["one", "several"])
-def test_vtk_reads_the_volume(
-    tmp_path: Path, city: TinyCity, blocks: str, request: pytest.FixtureRequest
-) -> None:
+def test_vtk_reads_the_volume(tmp_path: Path, city: TinyCity, blocks: str, request: pytest.FixtureRequest) -> None:
     if blocks == "several":
         request.getfixturevalue("small_blocks")
     point_data, cell_data = some_data(city.mesh)
@@ -269,7 +266,7 @@ def test_a_failed_write_leaves_the_old_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(vtk_xml, "_write_blocks", full)
-    with pytest.raises(InputError, match=r"m\.vtu: cannot be written \(No space left on device\)"):
+    with pytest.raises(OutputError, match=r"m\.vtu: cannot be written \(No space left on device\)"):
         write_vtu(path, city.mesh)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -303,16 +300,10 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "huge counts": lambda data: data.replace(b'NumberOfPoints="', b'NumberOfPoints="99999999999', 1),
     "other type": lambda data: data.replace(b'"Float64"', b'"Float99"'),
     "other offset": lambda data: data.replace(b'offset="0"', b'offset="1"'),
-    "one bit": lambda data: (
-        data[: data.index(b"_", 1000) + 200] + b"\xff" + data[data.index(b"_", 1000) + 201 :]
-    ),
+    "one bit": lambda data: data[: data.index(b"_", 1000) + 200] + b"\xff" + data[data.index(b"_", 1000) + 201 :],
     "bad XML": lambda data: data.replace(b"<Piece", b"<Piec<", 1),
-    "other kind": lambda data: data.replace(b"UnstructuredGrid", b"ImageData").replace(
-        b"PolyData", b"ImageData"
-    ),
-    "no marks": lambda data: data.replace(b'"marker"', b'"market"').replace(
-        b'"connectivity"', b'"connections"'
-    ),
+    "other kind": lambda data: data.replace(b"UnstructuredGrid", b"ImageData").replace(b"PolyData", b"ImageData"),
+    "no marks": lambda data: data.replace(b'"marker"', b'"market"').replace(b'"connectivity"', b'"connections"'),
 }
 
 
@@ -341,6 +332,59 @@ def test_every_truncation_is_noticed(tmp_path: Path, city: TinyCity) -> None:
             read_vtp(path)
 
 
+# What the table in front of an array's blocks may say wrongly: entry, and the number there.
+TABLES = {
+    "no block": (0, 0),
+    "2**62 blocks": (0, 2**62),
+    "a block more": (0, 2),
+    "blocks of nothing": (1, 0),
+    "blocks of 2**62 bytes": (1, 2**62),
+    "a packed block of 2**62 bytes": (3, 2**62),
+    "a packed block of nothing": (3, 0),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_wrong_block_table_is_an_input_error(tmp_path: Path, city: TinyCity, name: str) -> None:
+    path, (entry, number) = tmp_path / "b.vtp", TABLES[name]
+    write_vtp(path, city.mesh.points, city.boundary)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"_", data.index(b"<AppendedData")) + 1 + 8 * entry
+    data[at : at + 8] = number.to_bytes(8, "little")
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"b\.vtp: not a file of ours or damaged"):
+        read_vtp(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({}, None),
+        ({"types": np.array([10, 14], np.uint8)}, "no tetrahedra"),
+        ({"types": None}, "no tetrahedra"),
+        ({"offsets": np.array([3, 8], np.int32)}, "have not 4 vertices"),
+        ({"offsets": None}, "no connectivity"),
+    ],
+)
+def test_cells_that_are_no_tetrahedra(tmp_path: Path, change: dict[str, Any], message: str | None) -> None:
+    arrays: dict[str, NDArray[Any] | None] = {
+        "connectivity": np.array([0, 1, 2, 3, 1, 2, 3, 4], np.int32),
+        "offsets": np.array([4, 8], np.int32),
+        "types": np.array([10, 10], np.uint8),
+    }
+    arrays |= change
+    cells = [make_stream(name, array, array.dtype) for name, array in arrays.items() if array is not None]
+    points = make_stream("Points", np.random.default_rng(0).random((5, 3)), np.float64)
+    sections = {"Points": [points], "Cells": cells, "PointData": [], "CellData": []}
+    counts = {"NumberOfPoints": 5, "NumberOfCells": 2}
+    write_data_file(tmp_path / "m.vtu", "UnstructuredGrid", counts, sections)
+    if message is None:
+        assert len(read_vtu(tmp_path / "m.vtu").mesh.cells) == 2
+    else:
+        with pytest.raises(InputError, match=message):
+            read_vtu(tmp_path / "m.vtu")
+
+
 def test_vertices_out_of_range_are_input_errors(tmp_path: Path) -> None:
     mesh = TetMesh(np.zeros((4, 3)), np.array([[0, 1, 2, 7]], np.int32))
     write_vtu(tmp_path / "m.vtu", mesh)
@@ -351,7 +395,7 @@ def test_vertices_out_of_range_are_input_errors(tmp_path: Path) -> None:
 def test_missing_files_are_input_errors(tmp_path: Path, city: TinyCity) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_vtp(tmp_path / "none.vtp")
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot be written"):
         write_vtu(tmp_path / "no" / "such" / "folder.vtu", city.mesh)
     write_vtu(tmp_path / "a.vtu", city.mesh)
     write_pvtu(tmp_path / "m.pvtu", [tmp_path / "a.vtu"])

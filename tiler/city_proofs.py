@@ -32,9 +32,7 @@ def prove_marks(surface: Surface, buildings: Buildings) -> Proof:
     centres = surface.corners.mean(axis=1)
     counts = ", ".join(f"{np.count_nonzero(marker == mark)} {mark.name.lower()}" for mark in Marker)
     faults = [
-        *find_faults(
-            "marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: 1 to 8"
-        ),
+        *find_faults("marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: 1 to 8"),
         *find_faults(
             "building-unknown",
             centres[unknown],
@@ -60,9 +58,7 @@ def prove_roofs(surface: Surface, buildings: Buildings) -> Proof:
         *find_faults("roof-height", centres[off], f"{worst:.3g} m off; {at_most(HEIGHT_TOLERANCE)}"),
         *find_faults("roof-off-footprint", centres[outside], f"not inside; {at_most(OUTLINE_TOLERANCE)}"),
     ]
-    claim = (
-        f"{len(chosen)} roof facets lie at their building's height and in its footprint, worst {worst:.2g} m"
-    )
+    claim = f"{len(chosen)} roof facets lie at their building's height and in its footprint, worst {worst:.2g} m"
     return Proof(f"{claim}; {at_most(HEIGHT_TOLERANCE)} up, {OUTLINE_TOLERANCE:g} m across", tuple(faults))
 
 
@@ -82,17 +78,13 @@ def prove_walls(surface: Surface, buildings: Buildings) -> Proof:
             centres[astray],
             f"off its building's outline; {at_most(OUTLINE_TOLERANCE)}",
         ),
-        *find_faults(
-            "wall-above-roof", centres[above], f"above its building's roof; {at_most(HEIGHT_TOLERANCE)}"
-        ),
+        *find_faults("wall-above-roof", centres[above], f"above its building's roof; {at_most(HEIGHT_TOLERANCE)}"),
     ]
     claim = f"{len(chosen)} wall facets are vertical, on their building's outline, below its roof"
     return Proof(f"{claim}; {at_most(OUTLINE_TOLERANCE)}", tuple(faults))
 
 
-def prove_buildings(
-    surface: Surface, buildings: Buildings, bounds: tuple[float, float, float, float]
-) -> Proof:
+def prove_buildings(surface: Surface, buildings: Buildings, bounds: tuple[float, float, float, float]) -> Proof:
     """Every building of the city model has its walls, and a roof as large as its footprint.
 
     Notes
@@ -165,9 +157,7 @@ def _plan_widths(corners: Vertices, area: NDArray[np.float64]) -> NDArray[np.flo
     """Return the height of each facet's plan over its longest edge: 0 when the facet is vertical."""
     edges = np.roll(corners, -1, axis=1)[:, :, :2] - corners[:, :, :2]
     longest = np.hypot(edges[:, :, 0], edges[:, :, 1]).max(axis=1, initial=0)
-    width: NDArray[np.float64] = np.divide(
-        2 * np.abs(area), longest, out=np.zeros(len(area)), where=longest > 0
-    )
+    width: NDArray[np.float64] = np.divide(2 * np.abs(area), longest, out=np.zeros(len(area)), where=longest > 0)
     return width
 
 

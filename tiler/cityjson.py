@@ -1,7 +1,6 @@
 """The city model as a CityJSON 2.0 file, and back (steps 1.7 and 2.4)."""
 
 import json
-import os
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
@@ -18,6 +17,7 @@ from pipeline.citymodel import CityModel
 from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note
 from pipeline.solids import Solids, build_solids
+from tiler.atomic import replacing
 
 # Coordinates are whole multiples of this length (m).
 GRID = 0.001
@@ -44,7 +44,8 @@ def write_city_model(
     path : Path
         File to write; it appears whole or not at all.
     model : CityModel
-        The buildings. Each becomes a ``Building`` whose key is its id.
+        The buildings. Each becomes a ``Building`` whose key is its id; the parts of a house become
+        ``BuildingPart`` objects below a ``Building`` that has no geometry of its own.
     crs : str
         The region's CRS in any form that pyproj reads: ``"EPSG:28992"``, WKT.
     bounds : 6 floats
@@ -66,7 +67,9 @@ def write_city_model(
         If two buildings have one id, a footprint is not a Polygon, a height or bound is not finite,
         or a column of `attributes` has the wrong length or one of our names.
     ConfigError
-        If pyproj does not know the CRS, or the file cannot be written.
+        If pyproj does not know the CRS.
+    OutputError
+        If the file cannot be written.
 
     Notes
     -----
@@ -85,14 +88,7 @@ def write_city_model(
     geometry = _geometry(solids)
     body = _text(
         {
-            "CityObjects": {
-                str(name): {
-                    "type": "Building",
-                    "attributes": {key: column[i] for key, column in columns.items()},
-                    "geometry": geometry[i],
-                }
-                for i, name in enumerate(model.ids)
-            },
+            "CityObjects": _objects(model, columns, geometry),
             "vertices": solids.vertices.tolist(),
         }
     )
@@ -115,7 +111,8 @@ def write_city_model(
         }
     )
     # Two objects become one, so that the buildings are turned into text only once.
-    _replace(path, f"{head[:-1]},{body[1:]}\n")
+    with replacing(path) as part:
+        part.write_text(f"{head[:-1]},{body[1:]}\n", encoding="ascii")
     return notes
 
 
@@ -148,11 +145,30 @@ def read_city_model(path: Path) -> CityModel:
         ) from error
 
 
+def _objects(
+    model: CityModel, columns: Mapping[str, Sequence[object]], geometry: Sequence[object]
+) -> dict[str, dict[str, Any]]:
+    """Make the city objects: a building a row, or a part of the house that the row names."""
+    objects: dict[str, dict[str, Any]] = {}
+    for i, (name, house) in enumerate(zip(model.ids.tolist(), model.house.tolist(), strict=True)):
+        row: dict[str, Any] = {"type": "Building" if name == house else "BuildingPart"}
+        row["attributes"] = {key: column[i] for key, column in columns.items()}
+        row["geometry"] = geometry[i]
+        if name != house:
+            row["parents"] = [house]
+            objects.setdefault(house, {"type": "Building", "children": []})["children"].append(name)
+        objects[name] = row
+    return objects
+
+
 def _check(model: CityModel, bounds: Sequence[float]) -> None:
     names, counts = np.unique(model.ids, return_counts=True)
     if np.any(counts > 1):
         i = np.argmax(counts)
         raise ValueError(f"building {names[i]}: {counts[i]} buildings have this id, at most 1 may")
+    mixed = np.intersect1d(model.ids, model.house[model.ids != model.house])
+    if len(mixed):
+        raise ValueError(f"building {mixed[0]}: is a row and has parts, it may be one of these")
     if len(bounds) != 6 or not np.all(np.isfinite(bounds)):
         raise ValueError(f"bounds {tuple(bounds)} must be 6 finite numbers")
 
@@ -237,21 +253,11 @@ def _text(document: dict[str, Any]) -> str:
     return json.dumps(document, separators=(",", ":"), allow_nan=False)
 
 
-def _replace(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text, encoding="ascii")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise ConfigError(f"{path}: cannot be written ({error.strerror}); choose another folder") from error
-
-
 def _parse(document: dict[str, Any]) -> CityModel:
     transform = document["transform"]
     vertices = np.array(document["vertices"], dtype=np.float64).reshape(-1, 3)[:, :2]
     vertices = vertices * transform["scale"][:2] + transform["translate"][:2]
-    objects = document["CityObjects"]
+    objects = {name: item for name, item in document["CityObjects"].items() if "children" not in item}
     rows = [item["attributes"] for item in objects.values()]
     polygons = np.empty(len(objects), dtype=np.object_)
     polygons[:] = [_footprint(item["geometry"], vertices) for item in objects.values()]
@@ -262,6 +268,7 @@ def _parse(document: dict[str, Any]) -> CityModel:
         ground=np.array([row["ground_height"] for row in rows], dtype=np.float64),
         roof=np.array([row["roof_height"] for row in rows], dtype=np.float64),
         members=tuple(tuple(row["members"]) for row in rows),
+        house=np.array([item.get("parents", [name])[0] for name, item in objects.items()], dtype=np.str_),
     )
 
 

@@ -104,9 +104,7 @@ def read_header(path: str | Path) -> CloudHeader:
     return CloudHeader(path, promise.n_points, promise.bounds, _parse_crs(header))
 
 
-def read_points(
-    path: str | Path, bounds: tuple[float, float, float, float]
-) -> tuple[PointCloud, dict[str, int]]:
+def read_points(path: str | Path, bounds: tuple[float, float, float, float]) -> tuple[PointCloud, dict[str, int]]:
     """Read the usable points of a file within a box (step 1.1).
 
     Dropped are, in this order: points outside the box, withheld points, the noise classes 7 and 18, and
@@ -163,9 +161,7 @@ def _expand(source: Path) -> list[Path]:
     raise InputError(f"{source}: no such file or folder; check the path")
 
 
-def _chunks(
-    path: Path, promise: LasPromise
-) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64]]]:
+def _chunks(path: Path, promise: LasPromise) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64]]]:
     """Yield the points and their coordinates by chunks; fail if there are fewer than the header claims."""
     step = max(1, min(CHUNK_POINTS, CHUNK_BYTES // promise.point_size))
     n_read = [0]

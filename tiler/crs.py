@@ -150,9 +150,7 @@ def resolve_crs(
         crs, source = crs_of_footprints, "the footprints"
         _check_metric(crs, filled, source)
     else:
-        raise InputError(
-            "neither point clouds nor footprints state a CRS; give --crs, as in --crs EPSG:28992"
-        )
+        raise InputError("neither point clouds nor footprints state a CRS; give --crs, as in --crs EPSG:28992")
     return crs, _sentences(crs, source, filled, len(stated), footprints)
 
 
@@ -287,9 +285,7 @@ def _check_agreement(stated: Sequence[tuple[CloudHeader, pyproj.CRS]], wish: pyp
 
 
 def _reproject(cloud: CloudHeader, target: str) -> str:
-    return (
-        f"pdal translate {_paths(cloud, 'reprojected')} reprojection --filters.reprojection.out_srs={target}"
-    )
+    return f"pdal translate {_paths(cloud, 'reprojected')} reprojection --filters.reprojection.out_srs={target}"
 
 
 def _paths(cloud: CloudHeader, suffix: str) -> str:

@@ -88,9 +88,7 @@ def read_promise(path: Path) -> LasPromise:
 def _point_bytes(path: Path, head: bytes, size: int) -> tuple[int, int]:
     """Give the first byte of the point data and the byte behind the last."""
     if head[:4] != b"LASF":
-        raise InputError(
-            f"{path}: is no LAS or LAZ file: it begins with {head[:4]!r}, not b'LASF'; leave it out"
-        )
+        raise InputError(f"{path}: is no LAS or LAZ file: it begins with {head[:4]!r}, not b'LASF'; leave it out")
     shortest = _LONGEST_HEADER if head[25:26] >= b"\4" else _SHORTEST_HEADER
     if len(head) < shortest:
         raise InputError(f"{path}: ends at byte {size}, within its {shortest}-byte header; {AGAIN}")
@@ -105,8 +103,7 @@ def _point_bytes(path: Path, head: bytes, size: int) -> tuple[int, int]:
         return begin, size
     if not begin <= first_evlr <= size - n_evlrs * _EVLR_HEADER:
         raise InputError(
-            f"{path}: {n_evlrs} extended records from byte {first_evlr}, but the file has {size} bytes; "
-            f"{AGAIN}"
+            f"{path}: {n_evlrs} extended records from byte {first_evlr}, but the file has {size} bytes; {AGAIN}"
         )
     return begin, first_evlr
 
@@ -130,20 +127,15 @@ def _bounds(path: Path, head: bytes, n_points: int) -> tuple[float, float, float
         if not 0 < scale <= SCALE_LIMIT:  # NaN fails too
             raise InputError(f"{path}: {axis} scale {scale:g} is not within 0 to {SCALE_LIMIT:g}; {AGAIN}")
         if not abs(offset) <= COORDINATE_LIMIT:
-            raise InputError(
-                f"{path}: {axis} offset {offset:g} is not within ±{COORDINATE_LIMIT:g} m; {AGAIN}"
-            )
+            raise InputError(f"{path}: {axis} offset {offset:g} is not within ±{COORDINATE_LIMIT:g} m; {AGAIN}")
     for axis, low, high in (("x", xmin, xmax), ("y", ymin, ymax)):
         if not (abs(low) <= COORDINATE_LIMIT and abs(high) <= COORDINATE_LIMIT):
             raise InputError(
-                f"{path}: header bounds {axis} {low:g} to {high:g} are not within ±{COORDINATE_LIMIT:g} m; "
-                f"{AGAIN}"
+                f"{path}: header bounds {axis} {low:g} to {high:g} are not within ±{COORDINATE_LIMIT:g} m; {AGAIN}"
             )
     for axis, low, high in (("x", xmin, xmax), ("y", ymin, ymax), ("z", zmin, zmax)):
         if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-            raise InputError(
-                f"{path}: header bounds {axis} from {low:g} to {high:g} are no interval; {AGAIN}"
-            )
+            raise InputError(f"{path}: header bounds {axis} from {low:g} to {high:g} are no interval; {AGAIN}")
     return xmin, ymin, xmax, ymax, zmin, zmax
 
 

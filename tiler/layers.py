@@ -93,9 +93,7 @@ def describe_layer(path: Path, layer: str = "") -> Layer:
         raise InputError(f"{path}: no such file; check the path of the footprints")
     if geoparquet.is_parquet(path):
         if layer:
-            raise ConfigError(
-                f"{path}: Parquet has no layers, but layer {layer!r} is asked for; leave it out"
-            )
+            raise ConfigError(f"{path}: Parquet has no layers, but layer {layer!r} is asked for; leave it out")
         return Layer(path, "", *geoparquet.describe(path))
     _check_shapefile(path)
     with _gdal_as_input_error(path, []):
@@ -197,9 +195,7 @@ def _check_shapefile(path: Path) -> None:
     for part, claimed in claims:
         size = part.stat().st_size
         if size < claimed:
-            raise InputError(
-                f"{part}: has {size} of the {claimed} bytes that its header claims; copy it again"
-            )
+            raise InputError(f"{part}: has {size} of the {claimed} bytes that its header claims; copy it again")
 
 
 @contextmanager

@@ -132,9 +132,7 @@ def add_terrain(plotter: Any, city: City, size: tuple[int, int]) -> NDArray[np.f
     import pyvista
 
     edges = _edge_style(len(city.facets), size)
-    ground = pyvista.PolyData.from_regular_faces(
-        city.points, city.facets[city.marker == Marker.GROUND]
-    ).clean()
+    ground = pyvista.PolyData.from_regular_faces(city.points, city.facets[city.marker == Marker.GROUND]).clean()
     z = ground.points[:, 2]
     ground["rgb"] = blend(z / max(float(np.percentile(z, 98)), 1e-9), GROUND_COLOURS)
     plotter.add_mesh(ground, rgb=True, scalars="rgb", smooth_shading=True, **MATT, **edges)
@@ -143,9 +141,7 @@ def add_terrain(plotter: Any, city: City, size: tuple[int, int]) -> NDArray[np.f
     return np.asarray(skirt.points)
 
 
-def add_air(
-    plotter: Any, grid: Any, origin: NDArray[np.float64], size: tuple[int, int]
-) -> NDArray[np.float64]:
+def add_air(plotter: Any, grid: Any, origin: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
     """Add the whole tetrahedra whose middle is in the northern half; returns their points."""
     grid.points = np.asarray(grid.points, dtype=np.float64) - origin
     middle = grid.points[grid.cell_connectivity.reshape(-1, 4), 1].mean(axis=1)
@@ -173,29 +169,21 @@ def blend(share: NDArray[np.float64], colours: tuple[str, ...]) -> NDArray[np.ui
 
 
 def _read(reader: Any, path: Path) -> Any:
-    """Run one of VTK's readers, whose errors are events."""
+    """Run one of VTK's readers, which tell of damage but go on."""
     import pyvista
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; run citystitch first, or name its output folder")
-    faults: list[str] = []
-
-    def listen(*_: object) -> None:
-        faults.append("damaged")
-
     reader.SetFileName(os.fspath(path))
-    reader.AddObserver("ErrorEvent", listen)
-    reader.GetExecutive().AddObserver("ErrorEvent", listen)
-    reader.Update()
+    with pyvista.VtkErrorCatcher(send_to_logging=False) as catcher:
+        reader.Update()
     data = pyvista.wrap(reader.GetOutput())
-    if faults or data is None or data.n_cells == 0:
+    if catcher.events or data is None or data.n_cells == 0:
         raise InputError(f"{path}: it or a piece of it is missing, damaged or empty; run again")
     return data
 
 
-def _sew(
-    points: NDArray[np.float64], facets: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _sew(points: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Keep the points that facets use, equal ones once."""
     used = np.unique(facets)
     order = used[np.lexsort(points[used].T)]

@@ -234,9 +234,7 @@ def prove_ground(surface: Surface, dtm: Dtm) -> Proof:
     worst = error.max(initial=0)
     return Proof(
         f"{len(vertices)} ground vertices lie on the DTM, worst {worst:.2g} m; {at_most(HEIGHT_TOLERANCE)}",
-        tuple(
-            find_faults("ground-off-dtm", vertices[off], f"{worst:.3g} m off; {at_most(HEIGHT_TOLERANCE)}")
-        ),
+        tuple(find_faults("ground-off-dtm", vertices[off], f"{worst:.3g} m off; {at_most(HEIGHT_TOLERANCE)}")),
     )
 
 
@@ -259,9 +257,7 @@ def prove_volume(surface: Surface, cell_volume: float) -> Proof:
 
 def prove_record(record: RunRecord, counts: dict[str, int]) -> Proof:
     """``run.json`` says that the run is done, and has the counts that were found."""
-    wrong = [
-        f"{name} {record.counts[name]}, found {n}" for name, n in counts.items() if record.counts[name] != n
-    ]
+    wrong = [f"{name} {record.counts[name]}, found {n}" for name, n in counts.items() if record.counts[name] != n]
     faults = [Fault("counts", len(wrong), (), "run.json: " + "; ".join(wrong))] if wrong else []
     if record.status != "done":
         faults.append(Fault("not-done", 1, (), f"run.json: status {record.status!r}, expected 'done'"))

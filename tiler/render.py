@@ -1,6 +1,5 @@
 """Pictures of a run's boundary and volume mesh, drawn off-screen (step 3.6)."""
 
-import os
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError
+from tiler.atomic import replacing
 from tiler.picture_parts import City, add_air, add_houses, add_terrain, load_city, load_volume
+from tiler.plain_picture import PlainPlotter, has_graphics
 
 # Pictures, and their sizes (pixels) where nothing else is asked for.
 SIZES = {"boundary": (1600, 1000), "mesh": (1600, 1000), "overview": (2000, 640)}
@@ -50,15 +51,19 @@ def render_run(
     ValueError
         If `what` is none of these, or `size` is less than 2 x 2.
     ConfigError
-        If pyvista is not installed, or the picture cannot be written.
+        If pyvista is not installed.
+    OutputError
+        If the picture cannot be written.
     InputError
         If a file of the run is missing, damaged, or has no ground.
 
     Notes
     -----
-    The camera follows from the region alone. Two pictures of one run may still differ by a grey level here
-    and there: VTK samples the shade between houses at random. Edges fade out as triangles get small on the
-    picture. Everything is moved to the origin first, since graphics cards compute in single precision.
+    The camera follows from the region alone, but VTK samples the shade between houses at random: two
+    pictures of one run differ by more than 3 of 255 grey levels in some 6 % of the pixels, so their bytes
+    differ. Where VTK has no OpenGL to draw with, the same is painted facet by facet (`tiler.plain_picture`).
+    Edges fade out as triangles get small on the picture. Everything is moved to the origin first,
+    since graphics cards compute in single precision.
     """
     if what not in SIZES:
         raise ValueError(f"picture {what!r} must be one of {', '.join(SIZES)}")
@@ -107,13 +112,14 @@ def fit_camera(
     right = np.array([-np.cos(turn), np.sin(turn), 0.0])
     up = np.cross(towards, right)
     slope = np.tan(np.radians(view_angle) / 2) * np.array([aspect, 1.0])
-    depth, seen = points @ towards, points @ np.column_stack([right, up])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    depth, seen = (points - middle) @ towards, (points - middle) @ np.column_stack([right, up])
     # A point is inside if |seen - centre| <= slope * (distance - depth), for both signs and axes.
     least, most = (seen - slope * depth[:, None]), (seen + slope * depth[:, None])
     low, high = least.min(axis=0), most.max(axis=0)
     distance = float(((high - low) / (2 * slope)).max())
     centre = (high + low) / 2
-    focal = centre[0] * right + centre[1] * up
+    focal = middle + centre[0] * right + centre[1] * up
     return focal + distance * towards, focal
 
 
@@ -127,6 +133,8 @@ def _pyvista() -> ModuleType:
 
 
 def _draw(pv: ModuleType, directory: Path, city: City, what: str, size: tuple[int, int]) -> NDArray[np.uint8]:
+    if not has_graphics():
+        return _draw_plainly(directory, city, what, size)
     plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
     try:
         plotter.set_background(SKY[0], top=SKY[1])
@@ -135,7 +143,7 @@ def _draw(pv: ModuleType, directory: Path, city: City, what: str, size: tuple[in
         if what == "mesh":
             shown.append(add_air(plotter, load_volume(directory), city.origin, size))
         _light(pv, plotter)
-        _aim(plotter, np.vstack(shown), CUT_VIEW if what == "mesh" else VIEW, size)
+        _aim(plotter, *_camera(np.vstack(shown), what, size))
         extent = float(np.ptp(city.points[:, :2], axis=0).max())
         plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=128)
         plotter.enable_anti_aliasing("ssaa")
@@ -143,6 +151,16 @@ def _draw(pv: ModuleType, directory: Path, city: City, what: str, size: tuple[in
     finally:
         plotter.close()
     return image
+
+
+def _draw_plainly(directory: Path, city: City, what: str, size: tuple[int, int]) -> NDArray[np.uint8]:
+    plotter = PlainPlotter()
+    add_houses(plotter, city, size)
+    shown = [city.points, add_terrain(plotter, city, size)]
+    if what == "mesh":
+        shown.append(add_air(plotter, load_volume(directory), city.origin, size))
+    position, focal = _camera(np.vstack(shown), what, size)
+    return plotter.paint(position, focal, view_angle=VIEW_ANGLE, size=size, sky=SKY)
 
 
 def _light(pv: ModuleType, plotter: Any) -> None:
@@ -157,14 +175,20 @@ def _light(pv: ModuleType, plotter: Any) -> None:
         plotter.add_light(light)
 
 
-def _aim(plotter: Any, points: NDArray[np.float64], view: tuple[float, float], size: tuple[int, int]) -> None:
-    position, focal = fit_camera(
+def _camera(
+    points: NDArray[np.float64], what: str, size: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    azimuth, elevation = CUT_VIEW if what == "mesh" else VIEW
+    return fit_camera(
         points,
-        azimuth=view[0],
-        elevation=view[1],
+        azimuth=azimuth,
+        elevation=elevation,
         view_angle=VIEW_ANGLE / MARGIN,
         aspect=size[0] / size[1],
     )
+
+
+def _aim(plotter: Any, position: NDArray[np.float64], focal: NDArray[np.float64]) -> None:
     camera = plotter.camera
     camera.view_angle = VIEW_ANGLE
     camera.position, camera.focal_point, camera.up = position, focal, (0.0, 0.0, 1.0)
@@ -174,10 +198,5 @@ def _aim(plotter: Any, points: NDArray[np.float64], view: tuple[float, float], s
 def _save(image: NDArray[np.uint8], output: Path) -> None:
     from PIL import Image
 
-    part = output.with_name(output.name + ".part")
-    try:
+    with replacing(output) as part:
         Image.fromarray(image).save(part, format="png", optimize=True)
-        os.replace(part, output)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise ConfigError(f"{output}: cannot be written ({error.strerror}); choose another folder") from error

@@ -92,7 +92,7 @@ def read_run_record(path: Path) -> RunRecord:
 
 
 def read_buildings(path: Path) -> Buildings:
-    """Read the buildings of a CityJSON file: numbers, heights and LoD 0 footprints.
+    """Read the buildings of a CityJSON file, or their parts: numbers, heights and LoD 0 footprints.
 
     Raises
     ------
@@ -106,9 +106,7 @@ def read_buildings(path: Path) -> Buildings:
         transform = model["transform"]
         vertices = np.array(model["vertices"], np.float64).reshape(-1, 3)
         vertices = vertices * np.array(transform["scale"]) + np.array(transform["translate"])
-        objects = [
-            (name, thing) for name, thing in model["CityObjects"].items() if thing["type"] == "Building"
-        ]
+        objects = [(name, thing) for name, thing in model["CityObjects"].items() if "children" not in thing]
     except WRONG_FIELD as error:
         raise _broken(path, error) from None
     rows = [_read_building(path, name, thing, vertices) for name, thing in objects]

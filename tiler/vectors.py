@@ -140,7 +140,7 @@ def _attribute(info: Layer, asked: str) -> str:
 def _id_attribute(info: Layer, asked: str) -> str:
     if asked:
         return _attribute(info, asked)
-    lower = {field.lower(): field for field in reversed(info.fields)}
+    lower = {field.lower(): field for field in info.fields}
     return next((lower[name] for name in ID_ATTRIBUTES if name in lower), "")
 
 

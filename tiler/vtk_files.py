@@ -71,9 +71,7 @@ class BoundaryPiece:
     point_data: Arrays
 
 
-def write_vtu(
-    path: Path, mesh: TetMesh, *, point_data: Arrays = NO_ARRAYS, cell_data: Arrays = NO_ARRAYS
-) -> None:
+def write_vtu(path: Path, mesh: TetMesh, *, point_data: Arrays = NO_ARRAYS, cell_data: Arrays = NO_ARRAYS) -> None:
     """Write a volume mesh as a VTU file.
 
     Parameters
@@ -87,7 +85,7 @@ def write_vtu(
 
     Raises
     ------
-    InputError
+    OutputError
         If the file cannot be written.
     ValueError
         If an array has another length or type.
@@ -126,7 +124,7 @@ def write_vtp(
 
     Raises
     ------
-    InputError
+    OutputError
         If the file cannot be written.
     ValueError
         If an array has another length or type.

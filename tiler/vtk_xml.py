@@ -4,7 +4,6 @@ Files are little-endian with UInt64 headers. Nothing here knows of meshes: see `
 """
 
 import os
-import threading
 import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from tiler.atomic import replacing
 
 BLOCK_BYTES = 1 << 18  # uncompressed bytes of a zlib block
 ZLIB_LEVEL = 1
@@ -69,11 +69,11 @@ def write_data_file(path: Path, kind: str, counts: Mapping[str, int], sections: 
 
     Raises
     ------
-    InputError
+    OutputError
         If the file cannot be written; then it is not there, or is the old one.
     """
     streams = [stream for streams in sections.values() for stream in streams]
-    with _replacing(path) as file:
+    with replacing(path) as part, part.open("wb") as file:
         file.write(_render(kind, counts, sections, [0] * len(streams)))
         start, offsets = file.tell(), []
         for stream in streams:
@@ -153,7 +153,7 @@ def write_index(path: Path, pieces: Sequence[Path], kind: str) -> None:
         source = PurePath(os.path.relpath(piece, path.parent)).as_posix()
         lines.append(f"    <Piece Source={quoteattr(source)}/>")
     lines += [f"  </P{kind}>", "</VTKFile>", ""]
-    with _replacing(path) as file:
+    with replacing(path) as part, part.open("wb") as file:
         file.write("\n".join(lines).encode())
 
 
@@ -167,23 +167,6 @@ def _declarations(path: Path, kind: str) -> dict[str, list[str]]:
         ]
         for section in ("Points", "PointData", "CellData")
     }
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a file beside `path` that takes its place when all went well, and is gone otherwise."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.part")
-    try:
-        try:
-            with part.open("wb") as file:
-                yield file
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
-        ) from error
 
 
 def damaged(path: Path, why: str) -> InputError:
@@ -236,8 +219,7 @@ def read_data_file(path: Path, kind: str) -> dict[str, dict[str, NDArray[Any]]]:
         try:
             sections = {
                 section.tag: {
-                    array.get("Name", ""): _read_array(file, head, array, section.tag, size)
-                    for array in section
+                    array.get("Name", ""): _read_array(file, head, array, section.tag, size) for array in section
                 }
                 for section in head.piece
             }
@@ -262,8 +244,6 @@ def _read_array(file: BinaryIO, head: _Head, array: ET.Element, section: str, si
     data = np.empty(n_bytes, np.uint8)
     filled = 0
     for block in _read_blocks(file, name, size):
-        if filled + len(block) > n_bytes:
-            raise ValueError(f"array {name!r} has more than {n_bytes} bytes")
         data[filled : filled + len(block)] = np.frombuffer(block, np.uint8)
         filled += len(block)
     if filled != n_bytes:

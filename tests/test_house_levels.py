@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.levels import HouseParts, LevelOptions, split_levels
+from pipeline.house_levels import HouseParts, LevelOptions, split_levels
 from pipeline.pointcloud import BUILDING, PointCloud
 from pipeline.rings import make_canonical
 from pipeline.roof_points import RoofPoints, locate_roof_points

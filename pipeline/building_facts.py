@@ -1,0 +1,105 @@
+"""What is known of each building and of the whole model, for the export and the report (steps 1.7, 2.4)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.building_points import has_building_class
+from pipeline.city import City
+from pipeline.heights import ROOF_SOURCES
+from pipeline.point_fidelity import measure_fidelity, measure_houses
+from pipeline.pointcloud import PointCloud
+from pipeline.roof_points import locate_roof_points
+from pipeline.terrain import Dtm
+
+MOVED = 0.005  # m; a roof that moved less is told as it was measured
+
+
+def describe_buildings(cloud: PointCloud, city: City) -> dict[str, Sequence[object]]:
+    """Attributes of each building: how well its roof fits its points, and what was done to it.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Points of the region.
+    city : City
+        The buildings.
+
+    Returns
+    -------
+    dict of str to a sequence of n values
+        ``roof_points``, ``roof_rmse`` (m), ``roof_coverage`` (0 to 1), ``roof_source``, ``roof_moved`` (m, by
+        grouping and raising) and ``changes``, words out of "merged", "split", "defaulted", "moved".
+    """
+    model = city.model
+    points = locate_roof_points(cloud, model.polygons, building_class=has_building_class(cloud))
+    fidelity = measure_houses(points, model.polygons, model.roof)
+    moved = model.roof - city.measured_roof
+    sources = [ROOF_SOURCES[source] for source in city.roof_source]
+    changes = [
+        [
+            word
+            for word, holds in (
+                ("merged", len(names) > 1),
+                ("split", name != house),
+                ("defaulted", source != "points"),
+                ("moved", abs(by) > MOVED),
+            )
+            if holds
+        ]
+        for names, name, house, source, by in zip(
+            model.members, model.ids, model.house, sources, moved, strict=True
+        )
+    ]
+    return {
+        "roof_source": sources,
+        "roof_points": fidelity.n_points.tolist(),
+        "roof_rmse": _rounded(fidelity.rmse),
+        "roof_coverage": _rounded(fidelity.coverage),
+        "roof_moved": _rounded(moved),
+        "changes": changes,
+    }
+
+
+def measure_model(
+    cloud: PointCloud, dtm: Dtm, city: City, footprints: NDArray[np.object_]
+) -> dict[str, dict[str, float]]:
+    """Distance of the point cloud to the city model, by kind of point.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Points of the region.
+    dtm : Dtm
+        Terrain.
+    city : City
+        The model.
+    footprints : object, (f,)
+        Clean footprints before simplification.
+
+    Returns
+    -------
+    dict
+        ``roof``, ``missed``, ``ground`` and ``swallowed`` as in `point_fidelity.PointFidelity`, each with ``n``,
+        ``rmse``, ``p50``, ``p95`` and ``bias`` (m).
+    """
+    found = measure_fidelity(
+        cloud,
+        dtm,
+        city.model.polygons,
+        city.model.roof,
+        footprints=footprints,
+        building_class=has_building_class(cloud),
+    )
+    table = {}
+    for name in ("roof", "missed", "ground", "swallowed"):
+        residuals = getattr(found, name)
+        values = {key: float(getattr(residuals, key)) for key in ("rmse", "p50", "p95", "bias")}
+        known = {key: round(value, 4) for key, value in values.items() if np.isfinite(value)}
+        table[name] = {"n": residuals.n} | known
+    return table
+
+
+def _rounded(values: NDArray[np.float64]) -> list[object]:
+    return [round(float(value), 3) for value in values]

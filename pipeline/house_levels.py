@@ -1,0 +1,190 @@
+"""Houses divided where their roofs step: a low annex behind a tall front house (after step 1.5, ours)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.cuts import cut_best, share_vertices
+from pipeline.regions import join_cells
+from pipeline.rings import make_canonical
+from pipeline.roof_points import RoofPoints
+
+SPREAD = 0.3  # m², a cell stays whole if its squares are less than this for each point of its house
+STRAIGHT = 1e-3  # m, square root of the area of the triangle at a vertex that is dropped as straight
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LevelOptions:
+    """When a house is divided.
+
+    Attributes
+    ----------
+    clearance : float
+        A new wall passes through a vertex or keeps this distance from it (m).
+    min_step : float
+        Least step of the roof at every new wall (m).
+    min_area : float
+        Least area of a part (m²).
+    min_points : int
+        Least number of roof points of a part.
+    min_explained : float
+        Least share of the squares around the mean height of a house that its division takes away.
+    max_depth : int
+        How often a piece is cut in two: 1 for one cut through a house, 0 for none.
+    """
+
+    clearance: float
+    min_step: float = 2.5
+    min_area: float = 15.0
+    min_points: int = 10
+    min_explained: float = 0.35
+    max_depth: int = 8
+
+
+@dataclass(frozen=True, eq=False)
+class HouseParts:
+    """Houses, some of them divided.
+
+    Attributes
+    ----------
+    polygons : object, (p,)
+        shapely Polygons (m): the parts of each house one after the other, or the house itself.
+    house : int64, (p,)
+        Row of the house that the part belongs to, ascending.
+    """
+
+    polygons: NDArray[np.object_]
+    house: NDArray[np.int64]
+
+
+def split_levels(polygons: NDArray[np.object_], points: RoofPoints, options: LevelOptions) -> HouseParts:
+    """Divide houses along straight cuts, parallel to their walls, where their roofs step.
+
+    Parameters
+    ----------
+    polygons : object, (b,)
+        Valid shapely Polygons (m), courtyards as holes.
+    points : RoofPoints
+        Their roof points, as from `locate_roof_points`.
+    options : LevelOptions
+        Thresholds.
+
+    Returns
+    -------
+    HouseParts
+        Parts in canonical form that cover each house without overlap and share their vertices to the bit; a
+        house that is not divided keeps its polygon, to the bit.
+
+    Raises
+    ------
+    ValueError
+        If the options are out of range, or polygons and points do not match.
+
+    Notes
+    -----
+    A house is cut in two where its points fall best into two heights, its pieces again, down to `max_depth`
+    or until little is left to gain. Then neighbouring pieces are joined, too small ones first, then those
+    with the closest medians, until the roof steps by `min_step` at every wall that is left. The step at a
+    wall is the lesser of two: that between the medians of both parts, and that between the medians of the
+    points within 2 m of the wall. So a gable or a shed roof, which slopes without a step, is not divided, and
+    parts may be L-shaped, in three pieces or around a courtyard without a rule of their own. The house is
+    left whole if all this explains less than `min_explained`.
+
+    One cut alone misses most of what is there in large buildings. Roofs of Amsterdam with the median height
+    have an error (RMSE) of 4.5 m undivided, 4.0 m after one cut, 3.5, 3.2 and 3.0 m after 2, 4 and 8 in depth;
+    squares of 4 m with a height each would have 2.8 m, squares of 1 m 2.0 m.
+
+    A new wall ends on an outer wall within 1 nm of it, at a vertex that only the parts have: the house next
+    door does not, until the walls of both are noded. Houses do not see each other; points count once for
+    each house that contains them. 3 ms a house, 1 ms with one cut.
+    """
+    _check(polygons, points, options)
+    parts: list[shapely.Polygon] = []
+    house: list[int] = []
+    for i, polygon in enumerate(polygons):
+        found = _split(polygon, points.xyz[points.start[i] : points.start[i + 1]], options)
+        parts.extend(found)
+        house.extend([i] * len(found))
+    result = np.empty(len(parts), dtype=object)
+    result[:] = parts
+    return HouseParts(result, np.array(house, dtype=np.int64))
+
+
+def _split(polygon: shapely.Polygon, xyz: Array, options: LevelOptions) -> list[shapely.Polygon]:
+    cells, points = _cut_to_cells(polygon, xyz, options)
+    if len(cells) == 1:
+        return [polygon]
+    regions = join_cells(
+        cells,
+        points,
+        min_step=options.min_step,
+        min_area=options.min_area,
+        min_points=options.min_points,
+    )
+    within = sum(_squares(region.z) for region in regions)
+    if len(regions) == 1 or within > (1 - options.min_explained) * _squares(xyz[:, 2]):
+        return [polygon]
+    dissolved = np.array([shapely.coverage_union_all(cells[region.cells]) for region in regions], dtype=object)
+    return list(make_canonical(shapely.coverage_simplify(dissolved, STRAIGHT)))
+
+
+def _cut_to_cells(
+    polygon: shapely.Polygon, xyz: Array, options: LevelOptions
+) -> tuple[NDArray[np.object_], list[Array]]:
+    """Cut a house into cells that share all vertices, and deal out its points."""
+    todo = [(polygon, xyz, options.max_depth)]
+    cells: list[shapely.Polygon] = []
+    points: list[Array] = []
+    corners = np.empty((0, 2))
+    smallest = len(xyz) * options.min_area / polygon.area  # points of the smallest part
+    least = max(SPREAD * len(xyz), smallest * options.min_step**2)
+    while todo:
+        piece, inside, depth = todo.pop()
+        if depth > 0 and _may_step(piece, inside[:, 2], options) and _squares(inside[:, 2]) >= least:
+            pieces, ends = cut_best(
+                share_vertices(piece, corners),
+                inside,
+                clearance=options.clearance,
+                min_area=options.min_area,
+                min_points=options.min_points,
+            )
+            if len(pieces) > 1:
+                corners = np.unique(np.concatenate((corners, ends)), axis=0)
+                owner = _locate(pieces, inside)
+                todo.extend((part, inside[owner == k], depth - 1) for k, part in enumerate(pieces))
+                continue
+        cells.append(piece)
+        points.append(inside)
+    return np.array([share_vertices(cell, corners) for cell in cells], dtype=object), points
+
+
+def _may_step(polygon: shapely.Polygon, z: Array, options: LevelOptions) -> bool:
+    """Tell whether two parts with medians `min_step` apart are possible; `z` is ascending."""
+    half = max(options.min_points // 2, 1)
+    enough = len(z) >= 2 * options.min_points and polygon.area >= 2 * options.min_area
+    return enough and bool(z[-half] - z[half - 1] >= options.min_step)
+
+
+def _squares(z: Array) -> float:
+    return float(((z - z.mean()) ** 2).sum()) if len(z) else 0.0
+
+
+def _locate(pieces: NDArray[np.object_], xyz: Array) -> NDArray[np.int64]:
+    """Piece of each point; -1 for one exactly on a wall."""
+    owner = np.full(len(xyz), -1)
+    shapely.prepare(pieces)
+    for k, piece in enumerate(pieces):
+        owner[shapely.contains_xy(piece, xyz[:, 0], xyz[:, 1])] = k
+    return owner
+
+
+def _check(polygons: NDArray[np.object_], points: RoofPoints, options: LevelOptions) -> None:
+    if len(points.start) != len(polygons) + 1:
+        raise ValueError(f"{len(polygons)} polygons do not match the points of {len(points.start) - 1}")
+    lengths = (options.clearance, options.min_step, options.min_area)
+    if not (all(length > 0 for length in lengths) and options.min_points >= 1 and options.max_depth >= 0):
+        raise ValueError(f"clearance, min_step and min_points must be positive, max_depth not negative: {options}")

@@ -1,0 +1,146 @@
+"""Roofs that meet in a vertex: which do, and on which layers they can be (step 3.4 with party walls).
+
+In the layered mesh a roof is one layer of each of its columns. Where roofs of different heights meet, they must
+lie on different layers, in the order of their heights; roofs of equal height must share one.
+"""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from pipeline.errors import GeometryError
+from pipeline.mesh import PlaneMesh
+
+
+def check_groups(roof: NDArray[np.float64], group: NDArray[np.int32]) -> None:
+    """Refuse a group of two heights.
+
+    Raises
+    ------
+    ValueError
+        With the group and two of its heights.
+    """
+    order = np.argsort(group, kind="stable")
+    same = group[order[1:]] == group[order[:-1]]
+    differs = np.flatnonzero(same & (roof[order[1:]] != roof[order[:-1]]))
+    if len(differs):
+        first, second = order[differs[0]], order[differs[0] + 1]
+        raise ValueError(f"group {group[first]} has roofs at {roof[first]} m and {roof[second]} m")
+
+
+def touching_groups(
+    plane: PlaneMesh, roof: NDArray[np.float64], group: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find the pairs of groups that are next to each other in height at some vertex.
+
+    Parameters
+    ----------
+    plane : PlaneMesh
+        Plane mesh.
+    roof : float64, (b,)
+        Absolute roof heights (m).
+    group : int32, (b,)
+        Group of each building.
+
+    Returns
+    -------
+    lower, higher : int64, (k,)
+        A building of either group, the first of it; each pair once.
+    """
+    _, first, member = np.unique(group, return_index=True, return_inverse=True)
+    inside = plane.building >= 0
+    leader = np.repeat(first[member][plane.building[inside]], 3)
+    vertex = plane.triangles[inside].ravel()
+    at = np.unique(np.column_stack((vertex, leader)), axis=0)
+    at = at[np.lexsort((at[:, 1], roof[at[:, 1]], at[:, 0]))]
+    meet = at[1:, 0] == at[:-1, 0]
+    pairs = np.unique(np.column_stack((at[:-1, 1], at[1:, 1]))[meet], axis=0)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def join_equal_roofs(plane: PlaneMesh, roof: NDArray[np.float64], group: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Join groups that touch and have the same height: there is no wall between them.
+
+    Parameters and errors as in `touching_groups`; returns a group for each building, int32, (b,).
+    """
+    lower, higher = touching_groups(plane, roof, group)
+    equal = roof[lower] == roof[higher]
+    _, first, member = np.unique(group, return_index=True, return_inverse=True)
+    links = (np.concatenate((lower[equal], first[member])), np.concatenate((higher[equal], np.arange(len(roof)))))
+    graph = sparse.coo_array((np.ones(len(links[0])), links), shape=(len(roof), len(roof)))
+    joined: NDArray[np.int32] = connected_components(graph, directed=False)[1].astype(np.int32)
+    return joined
+
+
+def part_neighbours(
+    plane: PlaneMesh,
+    roof: NDArray[np.float64],
+    group: NDArray[np.int32],
+    removed: NDArray[np.int32],
+    *,
+    n_layers: int,
+) -> tuple[NDArray[np.int32], int]:
+    """Put roofs that meet on different layers, in the order of their heights.
+
+    Parameters
+    ----------
+    plane : PlaneMesh
+        Plane mesh.
+    roof : float64, (b,)
+        Absolute roof heights (m).
+    group : int32, (b,)
+        Groups, those of equal height joined (`join_equal_roofs`).
+    removed : int32, (b,)
+        Layers removed in each building if it stood alone: the same in a group.
+    n_layers : int
+        Layers of the slab.
+
+    Returns
+    -------
+    int32, (b,)
+        Layers removed in each building, from 1 to ``n_layers - 1``.
+    int
+        Groups that are not on the layer that they had.
+
+    Raises
+    ------
+    GeometryError
+        If more roofs follow each other upwards than there are layers.
+
+    Notes
+    -----
+    By ascending height, a roof goes to its own layer or to the one above its highest lower neighbour; then,
+    from the top down, what does not fit comes down again as little as it must. Cost is that of sorting the
+    pairs.
+    """
+    lower, higher = touching_groups(plane, roof, group)
+    _, first, member = np.unique(group, return_index=True, return_inverse=True)
+    layer = removed[first[member]].astype(np.int64)
+    upwards = np.lexsort((higher, roof[higher]))
+    _raise_layers(layer, lower[upwards], higher[upwards])
+    np.minimum(layer, n_layers - 1, out=layer)
+    downwards = np.lexsort((lower, -roof[lower]))
+    _lower_layers(layer, lower[downwards], higher[downwards])
+    if len(layer) and layer[first].min() < 1:
+        worst = first[int(layer[first].argmin())]
+        x, y = plane.xy[plane.triangles[plane.building == worst]].mean(axis=(0, 1))
+        raise GeometryError(
+            f"roof at {roof[worst]:.1f} m near ({x:.1f}, {y:.1f}), step 3.4: more roofs of different heights rise "
+            f"above each other there than fit below the domain's top in {n_layers} layers; lower --layer-height, "
+            "or take --mesher adaptive"
+        )
+    return layer[first[member]].astype(np.int32), int((layer[first] != removed[first]).sum())
+
+
+@numba.njit(cache=True, nogil=True)
+def _raise_layers(layer: NDArray[np.int64], lower: NDArray[np.int64], higher: NDArray[np.int64]) -> None:
+    for k in range(len(lower)):
+        layer[higher[k]] = max(layer[higher[k]], layer[lower[k]] + 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _lower_layers(layer: NDArray[np.int64], lower: NDArray[np.int64], higher: NDArray[np.int64]) -> None:
+    for k in range(len(lower)):
+        layer[lower[k]] = min(layer[lower[k]], layer[higher[k]] - 1)

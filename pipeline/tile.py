@@ -1,0 +1,162 @@
+"""The steps composed: from points and footprints to the city model, and to the columns of one tile."""
+
+from dataclasses import dataclass, replace
+
+import shapely
+
+from pipeline.adaptive import AdaptiveOptions, AdaptiveReport, mesh_adaptive
+from pipeline.building_points import extract_building_points, has_building_class
+from pipeline.city import (
+    Bounds,
+    City,
+    CityOptions,
+    Trace,
+    assemble_city,
+    find_places,
+    measure_heights,
+    no_trace,
+    note_heights,
+)
+from pipeline.citymodel import Footprints
+from pipeline.footprints import clean_footprints
+from pipeline.heights import highest_wall_ground
+from pipeline.layered import LayeredOptions, LayeredReport, mesh_layers
+from pipeline.mesh import ColumnMesh
+from pipeline.notes import Note
+from pipeline.plane import mesh_plane
+from pipeline.pointcloud import PointCloud
+from pipeline.terrain import Dtm
+
+# Plane meshes: the paper's, and ours, which Triangle refines again and vertices are moved in.
+PAPER_ANGLE = 25.0  # degrees
+ADAPTIVE_ANGLE = 28.0  # degrees
+ADAPTIVE_REFINEMENTS = 1
+ADAPTIVE_PASSES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class TileMesh:
+    """The columns of a tile and how they were made."""
+
+    columns: ColumnMesh
+    report: LayeredReport | AdaptiveReport
+    notes: tuple[Note, ...]
+
+
+def build_city(
+    cloud: PointCloud,
+    footprints: Footprints,
+    dtm: Dtm,
+    bounds: Bounds,
+    options: CityOptions,
+    trace: Trace = no_trace,
+) -> City:
+    """Generate the city model (paper, steps 1.4 to 1.6).
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Points of the tile and its halo.
+    footprints : Footprints
+        As read.
+    dtm : Dtm
+        Terrain.
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m); what to do with buildings on its border is an option.
+    options : CityOptions
+        Parameters.
+    trace : callable, optional
+        Context manager around each step.
+    """
+    with trace("1.4 clean footprints"):
+        cleaned, notes = clean_footprints(
+            footprints, min_area=options.min_building_area, tolerance=options.vertex_tolerance
+        )
+        inner, border_notes = _apply_border_rule(cleaned, bounds, options)
+    with trace("1.5 extract building points"):
+        points = extract_building_points(
+            cloud, inner.polygons, margin=options.ground_margin, building_class=has_building_class(cloud)
+        )
+    with trace("1.6 building heights"):
+        heights = measure_heights(points, inner.polygons, dtm, inner.given_height, options)
+        members = tuple((str(name),) for name in inner.ids)
+        notes_of_heights = note_heights("footprint", inner, heights)
+        wall_ground = highest_wall_ground(inner.polygons, dtm)
+        city = assemble_city(inner, points, heights, members, wall_ground)
+    counts = {"footprints read": len(footprints.polygons), "footprints cleaned": len(cleaned.polygons)}
+    return replace(city, notes=(*notes, *border_notes, *notes_of_heights), counts=counts)
+
+
+def mesh_city(
+    city: City,
+    dtm: Dtm,
+    bounds: Bounds,
+    options: LayeredOptions | AdaptiveOptions,
+    *,
+    min_angle: float = 0.0,
+    trace: Trace = no_trace,
+) -> TileMesh:
+    """Mesh the air over the terrain and between the buildings (paper, steps 3.1 to 3.5, or our columns).
+
+    Parameters
+    ----------
+    city : City
+        Result of `simplify_city`.
+    dtm : Dtm
+        Terrain.
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    options : LayeredOptions or AdaptiveOptions
+        Parameters of the mesher, which choose it.
+    min_angle : float
+        Bound on the angles of the plane mesh (degrees); 0 takes the mesher's own.
+    trace : callable, optional
+        Context manager around each step.
+    """
+    adaptive = isinstance(options, AdaptiveOptions)
+    with trace("3.1 plane mesh"):
+        plane, complete = mesh_plane(
+            bounds,
+            city.model.polygons,
+            mesh_size=options.mesh_size,
+            min_angle=min_angle or (ADAPTIVE_ANGLE if adaptive else PAPER_ANGLE),
+            refinements=ADAPTIVE_REFINEMENTS if adaptive else 0,
+            passes=ADAPTIVE_PASSES if adaptive else 0,
+        )
+    columns: ColumnMesh
+    report: LayeredReport | AdaptiveReport
+    with trace("3.2-3.5 columns"):
+        if isinstance(options, AdaptiveOptions):
+            columns, report = mesh_adaptive(plane, dtm, city.model.roof, city.group, city.model.ids, options)
+        else:
+            columns, report = mesh_layers(
+                plane, dtm, city.model, city.wall_ground, bounds, options, group=city.group
+            )
+    notes = [] if complete else [Note("plane-refinement-stopped", detail="limit on added vertices reached")]
+    return TileMesh(columns, report, tuple(notes))
+
+
+def _apply_border_rule(
+    footprints: Footprints, bounds: Bounds, options: CityOptions
+) -> tuple[Footprints, tuple[Note, ...]]:
+    """Keep footprints that lie inside by the clearance; drop or clip those on the border."""
+    margin = options.clearance
+    inner = shapely.box(bounds[0] + margin, bounds[1] + margin, bounds[2] - margin, bounds[3] - margin)
+    shapely.prepare(inner)
+    polygons, ids = footprints.polygons, footprints.ids
+    inside = shapely.contains_properly(inner, polygons)
+    touching = ~inside & shapely.intersects(shapely.box(*bounds), polygons)
+    rule = "dropped" if options.border == "drop" else "clipped"
+    notes = tuple(Note(f"footprint-on-border-{rule}", *place) for _, place in find_places(footprints, touching))
+    if options.border == "drop":
+        return Footprints(polygons[inside], ids[inside], footprints.given_height[inside]), notes
+    kept = inside | touching
+    clipped = polygons[kept].copy()
+    cut = touching[kept]
+    clipped[cut] = shapely.intersection(clipped[cut], inner)
+    cleaned, clip_notes = clean_footprints(
+        Footprints(clipped, ids[kept], footprints.given_height[kept]),
+        min_area=options.min_building_area,
+        tolerance=options.vertex_tolerance,
+    )
+    return cleaned, (*notes, *clip_notes)

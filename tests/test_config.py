@@ -1,0 +1,89 @@
+"""Parameters: file and command line, bounds, messages."""
+
+import dataclasses
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ConfigError
+from tiler.cli import make_parser, with_file
+from tiler.config import Config, annotated_defaults, load_config, make_config
+
+
+def test_the_annotated_defaults_are_the_defaults() -> None:
+    document = tomllib.loads(annotated_defaults())
+    values = {name: value for table in document.values() for name, value in table.items()}
+    assert make_config(values) == Config()
+    assert set(values) == {entry.name for entry in dataclasses.fields(Config)}
+
+
+def test_every_parameter_says_what_it_is() -> None:
+    for entry in dataclasses.fields(Config):
+        assert entry.metadata["text"], entry.name
+        assert f"{entry.name} = " in annotated_defaults()
+
+
+def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "run.toml"
+    file.write_text('[input]\npointcloud = ["a.laz", "/b.laz"]\n[mesh]\nmesh_size = 7\ndomain_height = 80.0\n')
+    options = make_parser().parse_args(["run", str(file), "--mesh-size", "5", "--bounds", "0", "0", "90", "90"])
+    config = make_config(with_file(vars(options)))
+    assert config.mesh_size == 5.0
+    assert config.domain_height == 80.0
+    assert config.bounds == (0.0, 0.0, 90.0, 90.0)
+    assert config.pointcloud == (str(tmp_path / "a.laz"), "/b.laz")
+
+
+def test_every_parameter_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        make_parser().parse_args(["run", "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    for entry in dataclasses.fields(Config):
+        if entry.name != "pointcloud":
+            assert f"--{entry.name.replace('_', '-')}" in text
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"mesh_size": 0.0}, r"mesh_size = 0 m: must be at least 0\.1 m"),
+        ({"domain_height": float("nan")}, "domain_height = nan: must be a finite number"),
+        ({"roof_percentile": 101.0}, "roof_percentile = 101 %: must be at most 100 %"),
+        ({"dtm_spacing": -1.0}, "dtm_spacing = -1 m: must be above 0 m"),
+        ({"smoother": "magic"}, "smoother = 'magic': must be one of columns, fem"),
+        ({"workers": 1.5}, "workers = 1.5: int expected, not float"),
+        ({"mesh_size": "10"}, "mesh_size = '10': float expected, not str"),
+        ({"bounds": (0.0, 1.0)}, "four finite numbers"),
+        ({"bounds": (0.0, 0.0, 5.0, 90.0)}, "smaller than one cell"),
+        ({"clearance_floor": 2.0}, "clearance_floor = 2 m: must be at most clearance = 1 m"),
+        ({"layer_height": 60.0}, "at most half of domain_height"),
+    ],
+)
+def test_bad_values_are_refused_with_value_and_bound(values: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make_config(values)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[mesh\n", "not valid TOML"),
+        ("[mush]\nmesh_size = 1\n", r"unknown section \[mush\]"),
+        ("[mesh]\nmesh_sise = 1\n", r"unknown parameter mesh_sise in \[mesh\]"),
+        ("[run]\nmesh_size = 1\n", r"unknown parameter mesh_size in \[run\]"),
+        ("x = 1\n", r"unknown section \[x\]"),
+        ("#" * 1_000_001, "this is no configuration"),
+    ],
+)
+def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "run.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_config(file)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path / "none.toml")

@@ -1,0 +1,229 @@
+"""The command line: `citystitch run | check | synth | demo | render | config`."""
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
+
+from pipeline.errors import CityError, ConfigError
+from tiler.config import Config, annotated_defaults, load_config, make_config
+
+if TYPE_CHECKING:
+    from tiler.synth import SynthFiles
+
+EXIT_CODES = (
+    "Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 3 done but for parts listed in run.json."
+)
+EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+POSITIONAL = "pointcloud"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Without the program's name; those of the process if not given.
+    """
+    parser = make_parser()
+    options = parser.parse_args(arguments)
+    handler: Callable[[argparse.Namespace], int] = options.handler
+    try:
+        return handler(options)
+    except CityError as error:
+        if options.traceback:
+            raise
+        print(f"citystitch: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("citystitch: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        if options.traceback:
+            raise
+        reason = " ".join(str(error).split())
+        print(f"citystitch: {type(error).__name__}: {reason}; --traceback tells where", file=sys.stderr)
+        return EXIT_FAILED
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of all commands; the parameters of a run come from `Config`."""
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--traceback", action="store_true", help="show where in the code an error arose")
+    parser = argparse.ArgumentParser(
+        prog="citystitch",
+        description="LiDAR point clouds and building footprints in, one conforming tetrahedral city mesh out.",
+        epilog=EXIT_CODES,
+    )
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    def command(name: str, handler: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text, epilog=EXIT_CODES, parents=[common])
+        sub.set_defaults(handler=handler)
+        return sub
+
+    run = command("run", _run, "mesh a region from point clouds and footprints")
+    run.add_argument(
+        POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
+    )
+    _add_parameters(run)
+    check = command("check", _check, "prove from the written files that a mesh is right")
+    check.add_argument("directory", type=Path, help="folder of a run")
+    synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
+    synth.add_argument("directory", type=Path, help="folder to write to")
+    _add_city(synth, size=1000.0, buildings=500)
+    demo = command("demo", _demo, "make a synthetic city, mesh it, check it, and draw it")
+    demo.add_argument("--out", type=Path, default=Path("demo"), help="folder to write to (default: demo)")
+    _add_city(demo, size=600.0, buildings=220)
+    render = command("render", _render, "draw a picture of a run")
+    render.add_argument("directory", type=Path, help="folder of a run")
+    render.add_argument("-o", "--output", type=Path, required=True, help="PNG file to write")
+    render.add_argument(
+        "--what", choices=("boundary", "mesh", "overview"), default="boundary", help="what to draw"
+    )
+    command("config", _config, "print all parameters of a run, annotated, as a configuration file")
+    return parser
+
+
+def _add_parameters(parser: argparse.ArgumentParser) -> None:
+    """Add an option for every parameter of a run; what is not given is left to the file or default."""
+    hints = get_type_hints(Config)
+    groups: dict[str, Any] = {}
+    for entry in dataclasses.fields(Config):
+        if entry.name == POSITIONAL:
+            continue
+        data, wanted = entry.metadata, hints[entry.name]
+        group = groups.setdefault(data["section"], parser.add_argument_group(data["section"]))
+        words: dict[str, Any] = {"dest": entry.name, "default": argparse.SUPPRESS, "help": _help(entry)}
+        if wanted is bool:
+            words["action"] = argparse.BooleanOptionalAction
+        elif get_origin(wanted) is tuple:
+            words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
+        else:
+            words |= {"type": wanted, "metavar": data["unit"].upper() or wanted.__name__.upper()}
+            if data["choices"]:
+                words |= {"choices": data["choices"], "metavar": None}
+        group.add_argument(f"--{entry.name.replace('_', '-')}", **words)
+
+
+def _help(entry: "dataclasses.Field[Any]") -> str:
+    data = entry.metadata
+    shown = isinstance(entry.default, (int, float)) and not isinstance(entry.default, bool)
+    default = f"default: {entry.default:g}" if shown else f"default: {entry.default}" if entry.default else ""
+    facts = ", ".join(fact for fact in (default, data["unit"], data["source"]) if fact)
+    return f"{data['text']} ({facts})".replace("%", "%%") if facts else data["text"]
+
+
+def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int) -> None:
+    parser.add_argument("--size", type=float, default=size, help=f"side of the city in m (default: {size:g})")
+    parser.add_argument("--buildings", type=int, default=buildings, help=f"their number (default: {buildings})")
+    parser.add_argument("--density", type=float, default=1.5, help="points per m2 (default: 1.5)")
+    parser.add_argument("--relief", type=float, default=20.0, help="height of the hills in m (default: 20)")
+    parser.add_argument("--seed", type=int, default=1, help="same seed, same bytes (default: 1)")
+
+
+def _run(options: argparse.Namespace) -> int:
+    return _run_config(make_config(with_file(vars(options))))
+
+
+def with_file(options: dict[str, Any]) -> dict[str, Any]:
+    """Put the parameters of a configuration file below those of the command line.
+
+    Parameters
+    ----------
+    options : dict
+        What the parser found; what is no parameter of a run is passed over.
+    """
+    names = {entry.name for entry in dataclasses.fields(Config)}
+    values = {name: value for name, value in options.items() if name in names}
+    sources: list[str] = values.pop(POSITIONAL)
+    files = [source for source in sources if source.lower().endswith(".toml")]
+    if len(files) > 1:
+        raise ConfigError(f"{len(files)} configuration files given ({', '.join(files)}); give one")
+    clouds = [source for source in sources if source not in files]
+    given = load_config(Path(files[0])) if files else {}
+    return given | ({POSITIONAL: clouds} if clouds else {}) | values
+
+
+def _run_config(config: Config) -> int:
+    from tiler.run import run
+    from tiler.terminal import print_step, print_summary
+
+    record = run(config, announce=print_step, say=print)
+    print_summary(record, Path(config.out))
+    code: int = record["exit_code"]
+    return code
+
+
+def _check(options: argparse.Namespace) -> int:
+    return _check_folder(options.directory)
+
+
+def _check_folder(directory: Path) -> int:
+    from tiler.check import check_run
+    from tiler.store import StoredTerrain
+
+    report = check_run(directory, StoredTerrain)
+    print("\n".join(report.lines()))
+    return 0 if report.ok else EXIT_FAILED
+
+
+def _synth(options: argparse.Namespace) -> int:
+    _write_city(options.directory, options)
+    return 0
+
+
+def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":
+    from tiler.synth import write_city
+
+    files = write_city(
+        directory,
+        size=options.size,
+        buildings=options.buildings,
+        density=options.density,
+        relief=options.relief,
+        seed=options.seed,
+    )
+    clouds, shapefile = files.clouds[0].parent, files.shapefile
+    print(f"{len(files.clouds)} LAZ files in {clouds}, footprints in {shapefile} and {files.footprints.name}")
+    return files
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from tiler.render import render_run
+
+    city, result, picture = options.out / "city", options.out / "result", options.out / "demo.png"
+    files = _write_city(city, options)
+    config = make_config(
+        {
+            "pointcloud": [str(path) for path in files.clouds],
+            "footprints": str(files.shapefile),
+            "out": str(result),
+            "overwrite": True,
+        }
+    )
+    _run_config(config)
+    code = _check_folder(result)
+    render_run(result, picture, what="overview")
+    print(f"picture: {picture}\nmesh:    {result / 'mesh.pvtu'} (open it in ParaView)")
+    return code
+
+
+def _render(options: argparse.Namespace) -> int:
+    from tiler.render import render_run
+
+    render_run(options.directory, options.output, what=options.what)
+    print(options.output)
+    return 0
+
+
+def _config(_: argparse.Namespace) -> int:
+    print(annotated_defaults())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

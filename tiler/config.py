@@ -1,0 +1,337 @@
+"""Every parameter of a run, once: default, unit, meaning, source. The command line and TOML follow it."""
+
+import dataclasses
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+from pipeline.errors import ConfigError
+
+MAX_CONFIG_BYTES = 1_000_000
+UNSET = ""
+
+
+def _parameter(
+    default: Any,
+    section: str,
+    text: str,
+    *,
+    unit: str = "",
+    source: str = "",
+    choices: tuple[str, ...] = (),
+    above: float | None = None,
+    least: float | None = None,
+    most: float | None = None,
+) -> Any:
+    """Declare a parameter: its section in TOML, its bounds, and all that a user should know of it."""
+    metadata = {
+        "section": section, "text": text, "unit": unit, "source": source,
+        "choices": choices, "above": above, "least": least, "most": most,
+    }  # fmt: skip
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Config:
+    """The parameters of a run; the field's metadata says what each means.
+
+    Examples
+    --------
+    >>> Config(pointcloud=("a.laz",), mesh_size=5.0).layer_height_or_default
+    5.0
+    """
+
+    pointcloud: tuple[str, ...] = _parameter(
+        (), "input", "LAS, LAZ or COPC files, globs or folders with such files"
+    )
+    footprints: str = _parameter(
+        UNSET,
+        "input",
+        "SHP, GPKG, GeoJSON or GeoParquet file of building footprints; without it, terrain only",
+    )
+    layer: str = _parameter(UNSET, "input", "layer of the footprint file; empty: its only or first one")
+    id_attribute: str = _parameter(
+        UNSET, "input", "attribute that holds building ids; empty: a well-known name, else ids from geometry"
+    )
+    height_attribute: str = _parameter(
+        UNSET, "input", "attribute with heights above ground, for buildings without roof points", unit="m"
+    )
+    crs: str = _parameter(
+        UNSET, "input", "CRS of the region, as EPSG:NNNN; empty: that of the data, where it states one"
+    )
+    bounds: tuple[float, ...] = _parameter(
+        (), "input", "region as xmin ymin xmax ymax; empty: whole metres within the point clouds", unit="m"
+    )
+    skip_unreadable: bool = _parameter(
+        False, "input", "leave out point-cloud files that cannot be read, list them, and end with exit code 3"
+    )
+    dtm_spacing: float = _parameter(
+        1.0, "terrain", "spacing of the terrain grid", unit="m", source="paper, step 1.3", above=0
+    )
+    ground_filter: bool = _parameter(
+        False, "terrain", "find ground points by an own filter, for clouds without ground classes"
+    )
+    min_building_area: float = _parameter(5.0, "buildings", "smaller footprints are dropped", unit="m2", least=0)
+    vertex_tolerance: float = _parameter(
+        0.01, "buildings", "vertices closer than this are one; also the bound for needless ones", unit="m",
+        source="paper, step 1.4", above=0, most=0.5,
+    )  # fmt: skip
+    ground_margin: float = _parameter(
+        1.0, "buildings", "ground points lie within this distance of a footprint", unit="m",
+        source="paper, step 1.5", above=0,
+    )  # fmt: skip
+    ground_percentile: float = _parameter(
+        10.0, "buildings", "ground height of a building, percentile of its ground points", unit="%",
+        source="paper, step 1.6", least=0, most=100,
+    )  # fmt: skip
+    roof_height: str = _parameter(
+        "median", "buildings", "roof height of a building: the median of its roof points, or roof_percentile (the "
+        "paper's)", choices=("median", "percentile"),
+    )  # fmt: skip
+    roof_percentile: float = _parameter(
+        90.0, "buildings", "percentile of the roof points with roof_height = percentile", unit="%",
+        source="paper, step 1.6", least=0, most=100,
+    )  # fmt: skip
+    default_height: float = _parameter(
+        6.0, "buildings", "height above ground without roof points and attribute; 0 drops the building",
+        unit="m", least=0,
+    )  # fmt: skip
+    roof_clearance: float = _parameter(
+        2.0, "buildings", "roofs are raised to this height above the highest terrain at their walls", unit="m",
+        above=0,
+    )  # fmt: skip
+    border: str = _parameter(
+        "drop", "buildings", "buildings on the region's border are dropped, or clipped to it less the clearance",
+        choices=("drop", "clip"),
+    )  # fmt: skip
+    simplify: str = _parameter(
+        "clearance", "simplify", "clearance: one planar graph of walls that keeps every house; paper: merging",
+        source="paper, step 2.1", choices=("clearance", "paper"),
+    )  # fmt: skip
+    clearance: float = _parameter(
+        1.0,
+        "simplify",
+        "buildings closer than this are merged",
+        unit="m",
+        source="paper, step 2.1",
+        least=0.1,
+    )
+    clearance_floor: float = _parameter(
+        0.1, "simplify", "with simplify = paper: finer details of one building are repaired", unit="m",
+        above=0,
+    )  # fmt: skip
+    min_courtyard_area: float = _parameter(10.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
+    split_levels: bool = _parameter(
+        True, "simplify", "divide houses where their roof points show a step, with simplify = clearance"
+    )
+    roof_group: float = _parameter(
+        2.0, "simplify", "adjacent houses closer in height than this get one roof, with simplify = clearance",
+        unit="m", least=0,
+    )  # fmt: skip
+    manifold: bool = _parameter(
+        False, "simplify", "open or close the corners in which houses touch in a point only"
+    )
+    mesh_size: float = _parameter(
+        10.0, "mesh", "target edge length h; no triangle of the plane mesh is larger than h^2/2", unit="m",
+        source="paper, step 3.1", least=0.1,
+    )  # fmt: skip
+    min_angle: float = _parameter(
+        0.0, "mesh", "least angle of the plane mesh, but at sharp corners; 0 takes the mesher's own: 28 adaptive, "
+        "25 layered", unit="degrees", source="paper, step 3.1", least=0, most=32,
+    )  # fmt: skip
+    domain_height: float = _parameter(
+        100.0, "mesh", "height of the domain above the terrain", unit="m", source="paper, step 3.2", above=0
+    )
+    mesher: str = _parameter(
+        "adaptive", "mesh", "how columns are filled: each by its own levels, or by the paper's layers",
+        source="paper, steps 3.2-3.5", choices=("adaptive", "layered"),
+    )  # fmt: skip
+    least_spacing: float = _parameter(
+        0.1, "mesh", "least vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=1
+    )
+    most_spacing: float = _parameter(
+        0.8, "mesh", "largest vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=5
+    )
+    stagger: float = _parameter(
+        0.8, "mesh", "shift of neighbouring columns with mesher = adaptive; 0 for none, 1 for thirds of a step",
+        least=0, most=1,
+    )  # fmt: skip
+    improve_passes: int = _parameter(
+        1, "mesh", "rounds of moving levels at the worst cells with mesher = adaptive", least=0, most=20
+    )
+    layer_height: float = _parameter(
+        0.0, "mesh", "height of a layer with mesher = layered; 0 takes the mesh size", unit="m",
+        source="paper, step 3.2", least=0,
+    )  # fmt: skip
+    smoother: str = _parameter(
+        "columns", "mesh", "with mesher = layered: fast filter and column solver, or the paper's finite elements",
+        source="paper, steps 3.3 and 3.5", choices=("columns", "fem"),
+    )  # fmt: skip
+    smoothing_tolerance: float = _parameter(
+        0.003,
+        "mesh",
+        "largest residual over the diagonal with smoother = columns; heights are then within about "
+        "ten times this of the exact solution",
+        unit="m",
+        above=0,
+    )
+    fem_tolerance: float = _parameter(
+        1e-8, "mesh", "relative residual of the linear systems with smoother = fem", above=0, most=1e-2
+    )
+    tile_size: float = _parameter(
+        2000.0, "run", "side of a tile; in this version the region must fit into one", unit="m", least=10
+    )
+    workers: int = _parameter(0, "run", "worker processes; 0 runs in this process", least=0, most=1024)
+    out: str = _parameter("out", "run", "folder for the results")
+    overwrite: bool = _parameter(False, "run", "replace the results of an earlier run in that folder")
+
+    @property
+    def layer_height_or_default(self) -> float:
+        """Height of a layer (m): the mesh size where none is given."""
+        return self.layer_height or self.mesh_size
+
+
+def load_config(path: Path) -> dict[str, Any]:
+    """Read the parameters that a TOML file gives.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is no TOML, or has an unknown section or parameter.
+
+    Notes
+    -----
+    Relative paths of inputs and of the output folder are taken from the file's folder.
+    """
+    try:
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise ConfigError(
+                f"{path}: {path.stat().st_size} bytes > {MAX_CONFIG_BYTES}; this is no configuration"
+            )
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML ({error}); see `citystitch config` for a template") from error
+    values: dict[str, Any] = {}
+    sections = {entry.name: entry.metadata["section"] for entry in dataclasses.fields(Config)}
+    for section, table in document.items():
+        if section not in sections.values() or not isinstance(table, dict):
+            raise ConfigError(f"{path}: unknown section [{section}]; `citystitch config` lists all")
+        for name, value in table.items():
+            if sections.get(name) != section:
+                raise ConfigError(
+                    f"{path}: unknown parameter {name} in [{section}]; `citystitch config` lists all"
+                )
+            values[name] = _relative_to(path.parent, name, value)
+    return values
+
+
+def make_config(values: Mapping[str, Any]) -> Config:
+    """Check the values of parameters and fill in defaults.
+
+    Raises
+    ------
+    ConfigError
+        With the parameter, its value against its bound, for a value of the wrong type or out of bounds.
+    """
+    hints = get_type_hints(Config)
+    checked = {}
+    for entry in dataclasses.fields(Config):
+        if entry.name in values:
+            value = _convert(entry.name, values[entry.name], hints[entry.name])
+            _check_bounds(entry.name, value, entry.metadata)
+            checked[entry.name] = value
+    config = Config(**checked)
+    _check_together(config)
+    return config
+
+
+def annotated_defaults() -> str:
+    """Write all parameters with their defaults, meaning, unit and source as TOML."""
+    lines = ["# citystitch configuration: all parameters with their defaults.", ""]
+    section = ""
+    for entry in dataclasses.fields(Config):
+        data = entry.metadata
+        if data["section"] != section:
+            section = data["section"]
+            lines += [f"[{section}]"]
+        facts = [data["text"]]
+        facts += [f"unit: {data['unit']}"] if data["unit"] else []
+        facts += [f"one of: {', '.join(data['choices'])}"] if len(data["choices"]) > 1 else []
+        facts += [f"({data['source']})"] if data["source"] else []
+        lines += [f"# {'; '.join(facts)}", f"{entry.name} = {_toml(entry.default)}", ""]
+    return "\n".join(lines)
+
+
+def _relative_to(folder: Path, name: str, value: Any) -> Any:
+    if name == "pointcloud" and isinstance(value, list):
+        return [str(folder / item) if isinstance(item, str) else item for item in value]
+    if name in ("footprints", "out") and isinstance(value, str) and value:
+        return str(folder / value)
+    return value
+
+
+def _convert(name: str, value: Any, wanted: Any) -> Any:
+    if get_origin(wanted) is tuple:
+        if isinstance(value, str) or not isinstance(value, (list, tuple)):
+            value = [value]
+        return tuple(_convert(name, item, get_args(wanted)[0]) for item in value)
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not wanted:
+        raise ConfigError(f"{name} = {value!r}: {wanted.__name__} expected, not {type(value).__name__}")
+    return value
+
+
+def _check_bounds(name: str, value: Any, data: Mapping[str, Any]) -> None:
+    if data["choices"] and value not in data["choices"]:
+        raise ConfigError(f"{name} = {value!r}: must be one of {', '.join(data['choices'])}")
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return
+    unit = f" {data['unit']}" if data["unit"] else ""
+    above, least, most = data["above"], data["least"], data["most"]
+    if not math.isfinite(value):
+        raise ConfigError(f"{name} = {value}: must be a finite number")
+    if above is not None and not value > above:
+        raise ConfigError(f"{name} = {value:g}{unit}: must be above {above:g}{unit}")
+    if least is not None and not value >= least:
+        raise ConfigError(f"{name} = {value:g}{unit}: must be at least {least:g}{unit}")
+    if most is not None and not value <= most:
+        raise ConfigError(f"{name} = {value:g}{unit}: must be at most {most:g}{unit}")
+
+
+def _check_together(config: Config) -> None:
+    if config.bounds:
+        if len(config.bounds) != 4 or not all(math.isfinite(value) for value in config.bounds):
+            raise ConfigError(f"bounds = {list(config.bounds)}: four finite numbers xmin ymin xmax ymax expected")
+        xmin, ymin, xmax, ymax = config.bounds
+        if xmax - xmin < config.mesh_size or ymax - ymin < config.mesh_size:
+            raise ConfigError(
+                f"bounds = {list(config.bounds)}: {xmax - xmin:g} x {ymax - ymin:g} m is smaller than one cell "
+                f"of {config.mesh_size:g} m; give xmin ymin xmax ymax"
+            )
+    if config.clearance_floor > config.clearance:
+        raise ConfigError(
+            f"clearance_floor = {config.clearance_floor:g} m: must be at most clearance = {config.clearance:g} m"
+        )
+    if config.least_spacing > config.most_spacing:
+        raise ConfigError(
+            f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
+        )
+    if config.layer_height_or_default > config.domain_height / 2:
+        raise ConfigError(
+            f"layer height {config.layer_height_or_default:g} m: at most half of domain_height = "
+            f"{config.domain_height:g} m; lower --layer-height or raise --domain-height"
+        )
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(_toml(item) for item in value)}]"
+    return f'"{value}"' if isinstance(value, str) else repr(value)

@@ -1,0 +1,92 @@
+"""The region to mesh and the tile that it lies in."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipeline.errors import ConfigError, InputError
+from tiler.clouds import CloudHeader
+
+Bounds = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Region:
+    """A box in a metric CRS.
+
+    Attributes
+    ----------
+    bounds : (xmin, ymin, xmax, ymax)
+        The box (m).
+    crs : str
+        The CRS as ``EPSG:NNNN`` where it has a code, else as WKT.
+    tile_size : float
+        Side of a tile (m); tiles are aligned to multiples of it in the CRS.
+    """
+
+    bounds: Bounds
+    crs: str
+    tile_size: float
+
+
+def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Bounds:
+    """Take the bounds asked for, else the whole metres inside the extent of all clouds with points.
+
+    Raises
+    ------
+    InputError
+        If no cloud has a point, or none meets the bounds.
+    """
+    extents = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
+    if not extents:
+        raise InputError(
+            f"point cloud: {len(clouds)} files hold no point at all; nothing can be meshed without ground points"
+        )
+    xmin, ymin = min(e[0] for e in extents), min(e[1] for e in extents)
+    xmax, ymax = max(e[2] for e in extents), max(e[3] for e in extents)
+    if not asked:
+        return float(math.ceil(xmin)), float(math.ceil(ymin)), float(math.floor(xmax)), float(math.floor(ymax))
+    if asked[0] >= xmax or asked[2] <= xmin or asked[1] >= ymax or asked[3] <= ymin:
+        raise InputError(
+            f"bounds {_words(asked)}: no point cloud there, the clouds cover "
+            f"{_words((xmin, ymin, xmax, ymax))}; correct --bounds"
+        )
+    return asked[0], asked[1], asked[2], asked[3]
+
+
+def check_region(region: Region, mesh_size: float) -> None:
+    """Refuse a region that is smaller than a cell or larger than a tile.
+
+    Raises
+    ------
+    ConfigError
+        With the extent against its bound.
+    """
+    width, height = region.bounds[2] - region.bounds[0], region.bounds[3] - region.bounds[1]
+    if min(width, height) < mesh_size:
+        raise ConfigError(
+            f"region {_words(region.bounds)}: {width:g} x {height:g} m is smaller than one cell of "
+            f"{mesh_size:g} m; lower --mesh-size or give larger --bounds"
+        )
+    if max(width, height) > region.tile_size:
+        raise ConfigError(
+            f"region {_words(region.bounds)}: {width:g} x {height:g} m does not fit into one tile of "
+            f"{region.tile_size:g} m; give smaller --bounds, or --tile-size {math.ceil(max(width, height))}"
+        )
+
+
+def tile_name(region: Region) -> str:
+    """Name of the tile that holds the region's centre, by its column and row in the CRS.
+
+    Examples
+    --------
+    >>> tile_name(Region((120625.0, 485937.0, 121250.0, 486523.0), "EPSG:28992", 2000.0))
+    '60_243'
+    """
+    x = (region.bounds[0] + region.bounds[2]) / 2
+    y = (region.bounds[1] + region.bounds[3]) / 2
+    return f"{math.floor(x / region.tile_size)}_{math.floor(y / region.tile_size)}"
+
+
+def _words(bounds: Sequence[float]) -> str:
+    return " ".join(f"{value:.1f}" for value in bounds)

@@ -1,0 +1,173 @@
+"""Write a synthetic city: classified LAZ in several files, footprints as SHP and GPKG, and the truth."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyogrio
+import pyproj
+import shapely
+
+from pipeline.errors import ConfigError
+from pipeline.pointcloud import PointCloud
+from pipeline.synthetic import ORIGIN, SyntheticCity, city_points, make_city
+
+CRS = "EPSG:3006"
+DENSITY = 1.5  # points/m2
+RELIEF = 20.0  # m
+SEED = 1
+
+_TILE_SIZE = 500.0  # m, about: a city is cut into equal squares
+_SCALE = 0.01  # m
+_DAY = date(2022, 1, 1)  # in all files, so that the same seed gives the same bytes
+_GPKG_TIME = {"OGR_CURRENT_DATE": f"{_DAY.isoformat()}T00:00:00.000Z"}
+
+
+@dataclass(frozen=True)
+class SynthFiles:
+    """What `write_city` wrote.
+
+    Attributes
+    ----------
+    clouds : list of Path
+        LAZ files, sorted.
+    footprints, shapefile : Path
+        The same footprints as GPKG and SHP, with the attribute ``id``.
+    truth : Path
+        JSON with the parameters, and ground and roof height of each building (m).
+    """
+
+    clouds: list[Path]
+    footprints: Path
+    shapefile: Path
+    truth: Path
+
+
+def write_city(
+    directory: Path,
+    *,
+    size: float,
+    buildings: int,
+    density: float = DENSITY,
+    relief: float = RELIEF,
+    seed: int = SEED,
+) -> SynthFiles:
+    """Make a synthetic city and write it: the same parameters give the same bytes.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder to write to; made if it is missing.
+    size, buildings, density, relief, seed
+        See `pipeline.synthetic.make_city`.
+
+    Returns
+    -------
+    SynthFiles
+
+    Raises
+    ------
+    ConfigError
+        If a parameter is out of range, the folder cannot be written, or it holds point clouds that this
+        city does not have.
+
+    Notes
+    -----
+    One LAZ file at a time is in memory.
+    """
+    try:
+        city = make_city(size=size, buildings=buildings, density=density, relief=relief, seed=seed)
+    except ValueError as error:
+        raise ConfigError(f"synth: {error}") from error
+    tiles = _tiles(city, directory / "tiles")
+    files = SynthFiles(
+        sorted(tiles), directory / "footprints.gpkg", directory / "footprints.shp", directory / "truth.json"
+    )
+    with _write_errors(directory):
+        (directory / "tiles").mkdir(parents=True, exist_ok=True)
+        strangers = set((directory / "tiles").iterdir()) - set(tiles)
+        if strangers:
+            raise ConfigError(f"{min(strangers)}: is not of this city; give an empty folder or remove it")
+        for path, (part, bounds) in tiles.items():
+            _write_laz(path, city_points(city, bounds, part), bounds)
+        _write_footprints(city, files)
+        files.truth.write_text(json.dumps(_truth(city, buildings, relief), indent=1) + "\n")
+    return files
+
+
+def _tiles(
+    city: SyntheticCity, folder: Path
+) -> dict[Path, tuple[tuple[int, int], tuple[float, float, float, float]]]:
+    """Cut the city into files named by their lower left corner."""
+    n = max(1, round(city.size / _TILE_SIZE))
+    x, y = (corner + np.linspace(0, city.size, n + 1) for corner in ORIGIN)
+    return {
+        folder / f"{x[i]:.0f}_{y[j]:.0f}.laz": (
+            (i, j),
+            (float(x[i]), float(y[j]), float(x[i + 1]), float(y[j + 1])),
+        )
+        for i in range(n)
+        for j in range(n)
+    }
+
+
+def _write_laz(path: Path, cloud: PointCloud, bounds: tuple[float, float, float, float]) -> None:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, _SCALE)
+    header.offsets = np.array([np.floor(bounds[0]), np.floor(bounds[1]), 0.0])
+    header.creation_date = _DAY
+    header.generating_software = "citystitch synth"
+    header.add_crs(pyproj.CRS(CRS))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = cloud.xyz.T
+    las.classification = cloud.classification
+    las.return_number = las.number_of_returns = np.ones(len(cloud.xyz), np.uint8)
+    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
+
+
+def _write_footprints(city: SyntheticCity, files: SynthFiles) -> None:
+    wkb = shapely.to_wkb(city.polygons)
+    ids = city.ids.astype(np.object_)
+    pyogrio.set_gdal_config_options(_GPKG_TIME)
+    try:
+        for path, options in (
+            (files.footprints, {}),
+            (files.shapefile, {"DBF_DATE_LAST_UPDATE": _DAY.isoformat()}),
+        ):
+            path.unlink(missing_ok=True)
+            pyogrio.raw.write(
+                path, wkb, [ids], ["id"], geometry_type="Polygon", crs=CRS, layer="footprints", **options
+            )
+    finally:
+        pyogrio.set_gdal_config_options(dict.fromkeys(_GPKG_TIME))
+
+
+def _truth(city: SyntheticCity, buildings: int, relief: float) -> dict[str, object]:
+    pond = dict(zip(("x", "y", "radius", "level"), city.pond.tolist(), strict=True))
+    return {
+        "crs": CRS,
+        "bounds": [*ORIGIN, ORIGIN[0] + city.size, ORIGIN[1] + city.size],
+        "size": city.size,
+        "n_buildings": buildings,
+        "density": city.density,
+        "relief": relief,
+        "seed": city.seed,
+        "pond": pond,
+        "buildings": [
+            {"id": str(name), "ground": round(ground, 3), "roof": round(roof, 3)}
+            for name, ground, roof in zip(city.ids, city.ground.tolist(), city.roof.tolist(), strict=True)
+        ],
+    }
+
+
+@contextmanager
+def _write_errors(directory: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, pyogrio.errors.DataSourceError) as error:
+        raise ConfigError(f"{directory}: cannot be written ({error}); give a folder that can") from error
