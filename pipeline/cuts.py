@@ -1,4 +1,4 @@
-"""Straight cuts through a house, where its roof points fall best into two heights (for `levels`)."""
+"""New walls inside a house, placed along a line and clear of the others (for `house_levels`)."""
 
 from dataclasses import dataclass
 
@@ -6,31 +6,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-MAX_DIRECTIONS = 4  # directions of walls along which cuts are tried, those with most wall first
-SAME_DIRECTION = 0.0872  # sine of 5 degrees; walls that differ by less count as one direction
-MAX_TRIES = 4  # cuts that are tried on the outline, the best first
-MIN_GAIN = 0.05  # least share of the squares around the mean height that a cut takes away
+from pipeline.lines import Line, rank_lines
+
 BLUNT = 0.866  # cosine of 30 degrees, the least angle between a new wall and another
+AREA_TOLERANCE = 1e-5  # m²; what the pieces of a polygon may lack by rounding
 ON_EDGE = 1e-6  # m; a corner of a neighbour this close to an edge lies on it
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Cut:
-    """The line of the places whose product with ``normal`` is ``offset``.
-
-    Attributes
-    ----------
-    along, normal : float64, (2,)
-        Unit vectors along and across the line.
-    offset : float
-        Distance from the origin (m).
-    """
-
-    along: Array
-    normal: Array
-    offset: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +26,7 @@ class _Outline:
 
 @dataclass(frozen=True, eq=False)
 class _Walls:
-    """The walls that a cut puts into an outline.
+    """The walls that a line puts into an outline.
 
     Attributes
     ----------
@@ -92,67 +74,31 @@ def cut_best(
     the wall ends, if they are close themselves), or where it meets another wall at less than 30 degrees.
     """
     outline = _open_outline(polygon)
-    shapely.prepare(polygon)
     least = max(min_points, int(len(xyz) * min_area / (2 * polygon.area)))  # half of it: points may be sparse
-    for cut in rank_cuts(outline.a, outline.b, xyz, clearance=clearance, min_points=least):
-        walls = _place_walls(outline, cut, clearance)
-        if len(walls.ends):
-            pieces = _divide(outline, walls)
-            if len(pieces) > 1:
-                return pieces, walls.ends.reshape(-1, 2)
+    for line in rank_lines(outline.a, outline.b, xyz, clearance=clearance, min_points=least):
+        pieces, corners = _cut(outline, line, clearance)
+        if len(pieces) > 1:
+            return pieces, corners
     return np.array([polygon], dtype=object), np.empty((0, 2))
 
 
-def rank_cuts(a: Array, b: Array, xyz: Array, *, clearance: float, min_points: int) -> list[Cut]:
-    """Rank the lines along the walls by the squares around the mean height that they take away.
-
-    Parameters
-    ----------
-    a, b : float64, (m, 2)
-        Ends of the walls (m).
-    xyz : float64, (n, 3)
-        Points (m).
-    clearance : float
-        A line passes through a vertex or by it at this distance (m).
-    min_points : int
-        Least number of points on either side.
-
-    Returns
-    -------
-    list of Cut
-        The best line through a vertex and the best between vertices for each direction, the best first;
-        none that takes away less than `MIN_GAIN`.
-    """
-    z = xyz[:, 2] - xyz[:, 2].mean()
-    n, total = len(z), float(z @ z)
-    ranked: list[tuple[float, Cut]] = []
-    for along in _directions(a, b) if total > 0 else ():
-        normal = np.array([-along[1], along[0]])
-        across = xyz[:, :2] @ normal
-        order = np.argsort(across, kind="stable")
-        across = across[order]
-        left = np.arange(min_points, n - min_points + 1)  # points before the line
-        gain = np.zeros(n + 1)
-        gain[left] = np.cumsum(z[order])[left - 1] ** 2 * n / (left * (n - left)) / total
-        vertex = np.unique(a @ normal)
-        for offset, place in (
-            (vertex, np.searchsorted(across, vertex)),
-            _between(across, vertex, clearance),
-        ):
-            if len(offset):
-                best = int(np.argmax(gain[place]))
-                ranked.append((float(gain[place[best]]), Cut(along, normal, float(offset[best]))))
-    ranked = [entry for entry in ranked if entry[0] >= MIN_GAIN]
-    ranked.sort(key=lambda entry: -entry[0])
-    return [cut for _, cut in ranked[:MAX_TRIES]]
+def cut_along(polygon: shapely.Polygon, line: Line, *, clearance: float) -> tuple[NDArray[np.object_], Array]:
+    """Cut a polygon along a line, by the rules and with the results of `cut_best`."""
+    return _cut(_open_outline(polygon), line, clearance)
 
 
 def share_vertices(polygon: shapely.Polygon, corners: Array) -> shapely.Polygon:
     """Give a polygon those of `corners` that lie on its edges as vertices, to the bit."""
+    low_x, low_y, high_x, high_y = polygon.bounds
+    inside = (corners >= [low_x - ON_EDGE, low_y - ON_EDGE]) & (corners <= [high_x + ON_EDGE, high_y + ON_EDGE])
+    corners = corners[inside.all(axis=1)]
     if not len(corners):
         return polygon
-    rings = [_add_vertices(shapely.get_coordinates(ring), corners) for ring in shapely.get_rings(polygon)]
-    return shapely.Polygon(rings[0], rings[1:])
+    old = [shapely.get_coordinates(ring) for ring in shapely.get_rings(polygon)]
+    new = [_add_vertices(ring, corners) for ring in old]
+    if all(len(ring) == len(before) for ring, before in zip(new, old, strict=True)):
+        return polygon
+    return shapely.Polygon(new[0], new[1:])
 
 
 def distances_to_segments(xy: Array, a: Array, b: Array) -> Array:
@@ -164,43 +110,25 @@ def distances_to_segments(xy: Array, a: Array, b: Array) -> Array:
     return np.asarray(np.hypot(off[..., 0], off[..., 1]))
 
 
+def _cut(outline: _Outline, line: Line, clearance: float) -> tuple[NDArray[np.object_], Array]:
+    walls = _place_walls(outline, line, clearance)
+    pieces = _divide(outline, walls) if len(walls.ends) else np.empty(0, dtype=object)
+    # A wall bent across an edge, never seen, would show here: its pieces do not close.
+    if len(pieces) > 1 and abs(shapely.area(pieces).sum() - outline.polygon.area) <= AREA_TOLERANCE:
+        return pieces, walls.ends.reshape(-1, 2)
+    return np.array([outline.polygon], dtype=object), np.empty((0, 2))
+
+
 def _open_outline(polygon: shapely.Polygon) -> _Outline:
     xy, ring = shapely.get_coordinates(shapely.get_rings(polygon), return_index=True)
+    shapely.prepare(polygon)
     edge = (ring[1:] == ring[:-1]) & (xy[1:] != xy[:-1]).any(axis=1)
     return _Outline(polygon, xy[:-1][edge], xy[1:][edge])
 
 
-def _directions(a: Array, b: Array) -> Array:
-    """Unit vectors of the directions with most wall, each that of its longest wall."""
-    d = b - a
-    length = np.hypot(d[:, 0], d[:, 1])
-    d = d / length[:, None]
-    left = np.argsort(-length, kind="stable")
-    found, total = [], []
-    while len(left):
-        along = d[left[0]]
-        same = np.abs(d[left, 0] * along[1] - d[left, 1] * along[0]) <= SAME_DIRECTION
-        found.append(along)
-        total.append(length[left[same]].sum())
-        left = left[~same]
-    order = np.argsort(-np.array(total), kind="stable")[:MAX_DIRECTIONS]
-    return np.array(found)[order]
-
-
-def _between(across: Array, vertex: Array, clearance: float) -> tuple[Array, NDArray[np.int64]]:
-    """Offsets midway between two points and clear of all vertices, and the number of points before them."""
-    middle = (across[1:] + across[:-1]) / 2
-    after = np.searchsorted(vertex, middle)
-    low = vertex[np.maximum(after - 1, 0)]
-    high = vertex[np.minimum(after, len(vertex) - 1)]
-    clear = np.minimum(np.abs(middle - low), np.abs(high - middle)) >= clearance
-    clear &= across[1:] > across[:-1]
-    return middle[clear], np.flatnonzero(clear) + 1
-
-
-def _place_walls(outline: _Outline, cut: Cut, clearance: float) -> _Walls:
+def _place_walls(outline: _Outline, line: Line, clearance: float) -> _Walls:
     """Walls along the line inside the outline, bent through the vertices within `clearance` of it."""
-    side_a, side_b = outline.a @ cut.normal - cut.offset, outline.b @ cut.normal - cut.offset
+    side_a, side_b = outline.a @ line.normal - line.offset, outline.b @ line.normal - line.offset
     crossed = np.flatnonzero(side_a * side_b < 0)
     share = side_a[crossed] / (side_a[crossed] - side_b[crossed])
     places = outline.a[crossed] + share[:, None] * (outline.b[crossed] - outline.a[crossed])
@@ -208,7 +136,7 @@ def _place_walls(outline: _Outline, cut: Cut, clearance: float) -> _Walls:
     near = outline.a[np.abs(side_a) < clearance]
     nodes = np.concatenate((near, places[free]))
     edge = np.concatenate((np.full(len(near), -1), crossed[free]))
-    order = np.argsort(nodes @ cut.along, kind="stable")
+    order = np.argsort(nodes @ line.along, kind="stable")
     nodes, edge = nodes[order], edge[order]
     a, b = nodes[:-1], nodes[1:]
     length = np.hypot(*(b - a).T)
@@ -219,7 +147,7 @@ def _place_walls(outline: _Outline, cut: Cut, clearance: float) -> _Walls:
 
 
 def _is_clear(outline: _Outline, a: Array, b: Array, clearance: float) -> NDArray[np.bool_]:
-    """Tell which walls run inside the outline, clear of the edges and vertices that they do not end at."""
+    """Tell which walls run inside, clear of the edges and vertices that they do not end at, and end bluntly."""
     middle = (a + b) / 2
     inside = shapely.contains_xy(outline.polygon, middle[:, 0], middle[:, 1])
     room = shapely.distance(shapely.points(middle), outline.polygon.boundary)

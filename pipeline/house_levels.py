@@ -11,7 +11,7 @@ from pipeline.regions import join_cells
 from pipeline.rings import make_canonical
 from pipeline.roof_points import RoofPoints
 
-SPREAD = 0.3  # m², a cell stays whole when its squares are less than this for each point of the house
+SPREAD = 0.3  # m², a cell stays whole if its squares are less than this for each point of its house
 STRAIGHT = 1e-3  # m, square root of the area of the triangle at a vertex that is dropped as straight
 
 Array = NDArray[np.float64]
@@ -94,12 +94,13 @@ def split_levels(polygons: NDArray[np.object_], points: RoofPoints, options: Lev
     parts may be L-shaped, in three pieces or around a courtyard without a rule of their own. The house is
     left whole if all this explains less than `min_explained`.
 
-    One cut alone misses most of what is there in large buildings: it gives Amsterdam's roofs an error of
-    3.8 m, eight cuts deep 3.0 m, where squares of 4 m with a height each would have 2.8 m.
+    One cut alone misses most of what is there in large buildings. Roofs of Amsterdam with the median height
+    have an error (RMSE) of 4.5 m undivided, 4.0 m after one cut, 3.5, 3.2 and 3.0 m after 2, 4 and 8 in depth;
+    squares of 4 m with a height each would have 2.8 m, squares of 1 m 2.0 m.
 
     A new wall ends on an outer wall within 1 nm of it, at a vertex that only the parts have: the house next
     door does not, until the walls of both are noded. Houses do not see each other; points count once for
-    each house that contains them. About 2 ms a house.
+    each house that contains them. 3 ms a house, 1 ms with one cut.
     """
     _check(polygons, points, options)
     parts: list[shapely.Polygon] = []
@@ -128,8 +129,7 @@ def _split(polygon: shapely.Polygon, xyz: Array, options: LevelOptions) -> list[
     if len(regions) == 1 or within > (1 - options.min_explained) * _squares(xyz[:, 2]):
         return [polygon]
     dissolved = np.array([shapely.coverage_union_all(cells[region.cells]) for region in regions], dtype=object)
-    parts = make_canonical(shapely.coverage_simplify(dissolved, STRAIGHT))
-    return list(parts[np.lexsort(shapely.bounds(parts).T)])
+    return list(make_canonical(shapely.coverage_simplify(dissolved, STRAIGHT)))
 
 
 def _cut_to_cells(
@@ -140,7 +140,8 @@ def _cut_to_cells(
     cells: list[shapely.Polygon] = []
     points: list[Array] = []
     corners = np.empty((0, 2))
-    least = SPREAD * len(xyz)
+    smallest = len(xyz) * options.min_area / polygon.area  # points of the smallest part
+    least = max(SPREAD * len(xyz), smallest * options.min_step**2)
     while todo:
         piece, inside, depth = todo.pop()
         if depth > 0 and _may_step(piece, inside[:, 2], options) and _squares(inside[:, 2]) >= least:

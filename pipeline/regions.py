@@ -1,4 +1,4 @@
-"""Neighbouring cells of a house joined until the roof steps at every wall that is left (for `levels`)."""
+"""Neighbouring cells of a house joined until the roof steps at every wall that is left (for `house_levels`)."""
 
 from dataclasses import dataclass
 
@@ -105,7 +105,7 @@ def join_cells(
 
 
 def _region(cells: list[int], area: float, z: Array) -> Region:
-    return Region(cells, area, z, float(np.median(z)) if len(z) else float("nan"))
+    return Region(cells, area, z, _median(z) if len(z) else float("nan"))
 
 
 def _rank(
@@ -119,7 +119,7 @@ def _rank(
     step = abs(difference)
     near_one, near_two = borders[pair]
     if min(len(near_one), len(near_two)) >= MIN_NEAR:
-        step = min(step, float(np.median(near_one) - np.median(near_two)) * np.sign(difference))
+        step = min(step, (_median(near_one) - _median(near_two)) * float(np.sign(difference)))
     return APART if step >= limits.min_step else NO_STEP, abs(difference)
 
 
@@ -153,3 +153,10 @@ def _add_border(borders: _Borders, one: int, two: int, near_one: Array, near_two
         one, two, near_one, near_two = two, one, near_two, near_one
     known_one, known_two = borders.get((one, two), (np.empty(0), np.empty(0)))
     borders[one, two] = np.concatenate((known_one, near_one)), np.concatenate((known_two, near_two))
+
+
+def _median(z: Array) -> float:
+    """Median as numpy's, at a quarter of its cost for few values."""
+    half = len(z) // 2
+    z = np.partition(z, (half - 1, half)) if len(z) % 2 == 0 else np.partition(z, half)
+    return float(z[half]) if len(z) % 2 else float((z[half - 1] + z[half]) / 2)

@@ -97,7 +97,7 @@ def test_far_apart_houses_do_not_join_and_those_without_roof_stay_alone() -> Non
 
 
 def test_equal_heights_join_without_a_change_of_bits() -> None:
-    heights, groups = group([0.1 + 0.2] * 3, row(3), area=[0.3, 0.7, 1.1])
+    heights, groups = group([0.1 + 0.2] * 3, row(3), area=[0.1, 1.7, 0.1])
     assert groups == [0, 0, 0]
     assert heights == [0.1 + 0.2] * 3
 

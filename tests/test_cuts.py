@@ -1,0 +1,172 @@
+"""Cuts along a line: through corners, clear of corners, blunt, and through several rings at once."""
+
+import numpy as np
+import pytest
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.cuts import cut_along, cut_best, distances_to_segments, share_vertices
+from pipeline.lines import Line, rank_lines
+
+Array = NDArray[np.float64]
+
+
+def level(y: float) -> Line:
+    """Line of all places at height `y` of the plan."""
+    return Line(np.array([1.0, 0.0]), np.array([0.0, 1.0]), y)
+
+
+def cut(
+    polygon: shapely.Polygon, y: float, *, clearance: float = 0.5
+) -> tuple[list[float], set[tuple[float, ...]]]:
+    """Areas of the pieces, ascending, and the ends of the walls."""
+    pieces, corners = cut_along(polygon, level(y), clearance=clearance)
+    assert shapely.coverage_is_valid(pieces)
+    assert shapely.area(pieces).sum() == pytest.approx(polygon.area, rel=1e-12)
+    return np.sort(shapely.area(pieces)).round(9).tolist(), set(map(tuple, corners.round(9).tolist()))
+
+
+def test_a_line_far_from_all_corners_cuts_straight() -> None:
+    assert cut(shapely.box(0, 0, 10, 20), 12) == ([80, 120], {(0, 12), (10, 12)})
+
+
+def test_a_line_within_the_clearance_bends_through_the_corner() -> None:
+    house = shapely.Polygon([(0, 0), (10, 0), (10, 20), (-4, 20), (-4, 12.3), (0, 12.3)])
+    assert cut(house, 12)[1] == {(0, 12.3), (10, 12)}
+    assert cut(house, 11.5)[1] == {(0, 11.5), (10, 11.5)}
+
+
+def test_a_line_that_meets_a_slanting_wall_close_to_its_end_takes_the_end() -> None:
+    house = shapely.Polygon([(0, 0), (10, 0), (12, 10), (10, 20), (0, 20)])
+    assert cut(house, 9.8)[1] == {(0, 9.8), (12, 10)}
+
+
+def test_a_line_through_a_corner_may_follow_a_wall_no_farther() -> None:
+    corner = shapely.Polygon([(0, 0), (20, 0), (20, 8), (8, 8), (8, 20), (0, 20)])
+    assert cut(corner, 8) == ([96, 160], {(8, 8), (0, 8)})
+
+
+def test_a_wall_too_close_to_another_corner_is_given_up() -> None:
+    # Bent up to (0, 10.4), the wall would pass (2, 10.6), at the tip of a courtyard, at 0.28 m.
+    hole = [(2, 10.6), (3, 14), (1, 14)]
+    house = shapely.Polygon([(0, 0), (10, 0), (10, 20), (-3, 20), (-3, 10.4), (0, 10.4)], [hole])
+    assert cut(house, 10)[0] == [house.area]
+    assert len(cut(shapely.Polygon(house.exterior), 10)[0]) == 2
+
+
+def test_a_wall_at_a_sharp_angle_to_another_is_given_up() -> None:
+    wedge = shapely.Polygon([(0, 0), (30, 0), (0, 10)])  # 18 degrees
+    assert cut(wedge, 5)[0] == [150]
+    blunt = shapely.Polygon([(0, 0), (30, 0), (0, 30)])  # 45 degrees
+    assert cut(blunt, 15)[0] == [112.5, 337.5]
+
+
+def test_walls_on_both_sides_of_a_courtyard_cut_together() -> None:
+    court = shapely.Polygon(shapely.box(0, 0, 40, 40).exterior, [shapely.box(10, 10, 30, 30).exterior])
+    assert cut(court, 20) == ([600, 600], {(0, 20), (10, 20), (30, 20), (40, 20)})
+    assert cut(court, 10)[0] == [400, 800]
+
+
+def test_a_line_beside_the_house_cuts_nothing() -> None:
+    assert cut(shapely.box(0, 0, 10, 20), 20.3)[0] == [200]
+    assert cut(shapely.box(0, 0, 10, 20), 50) == ([200], set())
+
+
+def test_the_teeth_of_a_comb_fall_off_one_by_one() -> None:
+    comb = shapely.Polygon([(0, 0), (15, 0), (15, 20), (10, 20), (10, 8), (5, 8), (5, 20), (0, 20)])
+    assert cut(comb, 14)[0] == [30, 30, comb.area - 60]
+
+
+def test_no_wall_crosses_a_notch_outside_the_house() -> None:
+    house = shapely.Polygon([(0, 0), (15, 0), (15, 10), (11, 10), (10, 6), (9, 10), (5, 10), (5, 20), (0, 20)])
+    assert cut(house, 10) == ([50, house.area - 50], {(0, 10), (5, 10)})
+
+
+def test_a_wall_along_another_within_the_clearance_is_given_up() -> None:
+    # A body that hangs from a strip of 0.3 m: the wall between them would run 0.3 m below the strip's edge.
+    house = shapely.Polygon([(0, 0), (10, 0), (10, -10), (20, -10), (20, 0), (30, 0), (30, 0.3), (0, 0.3)])
+    assert cut(house, 0.1)[0] == [house.area]
+    assert len(cut(house, 0.1, clearance=0.2)[0]) == 2
+
+
+def test_no_wall_is_shorter_than_the_clearance() -> None:
+    waist = [(0, 0), (10, 0), (10, 10), (5.2, 10), (5.2, 14), (10, 14), (10, 24), (0, 24), (0, 14), (4.8, 14)]
+    house = shapely.Polygon([*waist, (4.8, 10), (0, 10)])
+    assert cut(house, 12)[0] == [pytest.approx(house.area)]
+    assert len(cut(house, 12, clearance=0.3)[0]) == 2
+
+
+def test_points_choose_the_line() -> None:
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(0.25, 10, 0.5), np.arange(0.25, 20, 0.5)))
+    xyz = np.column_stack((x, y, np.where(y < 13, 9.0, 3.0)))
+    pieces, corners = cut_best(shapely.box(0, 0, 10, 20), xyz, clearance=0.5, min_area=15, min_points=10)
+    assert np.sort(shapely.area(pieces)).tolist() == [70, 130]
+    assert corners[:, 1].tolist() == [13, 13]
+    alone, corners = cut_best(shapely.box(0, 0, 10, 20), xyz, clearance=0.5, min_area=210, min_points=10)
+    assert shapely.area(alone).tolist() == [200]
+    assert len(corners) == 0
+
+
+def test_lines_leave_enough_points_on_both_sides() -> None:
+    house = shapely.get_coordinates(shapely.box(0, 0, 10, 20))
+    xyz = np.column_stack((np.full(20, 5.0), np.arange(20) + 0.5, np.where(np.arange(20) < 2, 0.0, 9.0)))
+    for least, offset in ((2, 2.0), (3, 3.0)):
+        best = rank_lines(house[:-1], house[1:], xyz, clearance=0.5, min_points=least)[0]
+        assert abs(best.offset * best.normal[1]) == offset
+    assert rank_lines(house[:-1], house[1:], xyz, clearance=0.5, min_points=11) == []
+    flat = xyz * [1, 1, 0]
+    assert rank_lines(house[:-1], house[1:], flat, clearance=0.5, min_points=2) == []
+
+
+def test_a_line_does_not_part_points_of_one_row() -> None:
+    house = shapely.get_coordinates(shapely.box(0, 0, 10, 20))
+    rows = np.repeat([3.0, 5.0, 9.0], [5, 20, 5])
+    xyz = np.column_stack((np.full(30, 5.0), rows, np.arange(30) > 14))
+    offsets = [
+        abs(float(line.offset * line.normal[1]))
+        for line in rank_lines(house[:-1], house[1:], xyz, clearance=0.5, min_points=2)
+    ]
+    assert offsets
+    assert set(offsets) <= {4.0, 7.0}
+
+
+def test_noise_has_no_line() -> None:
+    house = shapely.get_coordinates(shapely.box(0, 0, 10, 20))
+    xyz = np.random.default_rng(0).uniform(0, 10, (2000, 3)) * [1, 2, 1]
+    assert rank_lines(house[:-1], house[1:], xyz, clearance=0.5, min_points=2) == []
+
+
+def test_the_gain_is_that_of_brute_force() -> None:
+    rng = np.random.default_rng(8)
+    xyz = rng.uniform(0, 10, (60, 3)) * [1, 2, 1]
+    house = shapely.get_coordinates(shapely.box(0, 0, 10, 20))
+    best = rank_lines(house[:-1], house[1:], xyz, clearance=0.5, min_points=5)[0]
+
+    def left_over(before: NDArray[np.bool_]) -> float:
+        return float(sum(((z - z.mean()) ** 2).sum() for z in (xyz[before, 2], xyz[~before, 2])))
+
+    tries = []
+    for axis, size in ((0, 10), (1, 20)):
+        middle = np.sort(xyz[:, axis])
+        middle = (middle[1:] + middle[:-1]) / 2
+        places = [at for at in middle if 0.5 <= at <= size - 0.5]
+        sides = [xyz[:, axis] < at for at in places]
+        tries += [left_over(side) for side in sides if 5 <= side.sum() <= 55]
+    assert left_over(xyz[:, :2] @ best.normal < best.offset) == pytest.approx(min(tries), rel=1e-12)
+
+
+def test_corners_of_neighbours_become_vertices_in_order() -> None:
+    ring = shapely.Polygon(shapely.box(0, 0, 9, 9).exterior, [shapely.box(3, 3, 6, 6).exterior])
+    corners = np.array([[7, 0.0], [2, 1e-9], [3, 4.0], [5, 5.0], [9, 9.0], [20, 0.0]])
+    shared = share_vertices(ring, corners)
+    assert shapely.get_num_coordinates(shared) == shapely.get_num_coordinates(ring) + 3
+    assert shapely.equals(shapely.set_precision(shared, 1e-6), ring)
+    assert {(7, 0), (2, 1e-9), (3, 4)} < set(map(tuple, shapely.get_coordinates(shared).tolist()))
+    assert share_vertices(ring, corners[3:]) is ring
+
+
+def test_distances_to_segments_are_shapelys() -> None:
+    rng = np.random.default_rng(1)
+    xy, a, b = rng.uniform(0, 10, (3, 7, 2))
+    expected = shapely.distance(shapely.linestrings(np.stack((a, b), axis=1))[:, None], shapely.points(xy)[None])
+    np.testing.assert_allclose(distances_to_segments(xy, a, b), expected, atol=1e-12)
