@@ -153,7 +153,7 @@ def _points_inside(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Heights of the points in each polygon, and not in its counterpart in `outside` where given."""
     n = len(polygons)
-    polygon, point = _candidates(xyz, shapely.bounds(polygons).reshape(-1, 4))
+    polygon, point = find_candidates(xyz, shapely.bounds(polygons).reshape(-1, 4))
     x, y = xyz[point, 0], xyz[point, 1]
     shapely.prepare(polygons)
     inside = shapely.contains_xy(polygons[polygon], x, y)
@@ -167,10 +167,23 @@ def _points_inside(
     return start, z[order]
 
 
-def _candidates(
+def find_candidates(
     xyz: NDArray[np.float64], boxes: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs (box, point) of the points in the index cells that each box touches, by box."""
+    """Pairs (box, point) of the points in the index cells that each box touches, by box.
+
+    Parameters
+    ----------
+    xyz : float64, (k, 2) or (k, 3)
+        Points (m).
+    boxes : float64, (n, 4)
+        xmin, ymin, xmax, ymax (m).
+
+    Returns
+    -------
+    box, point : int64, (h,)
+        Rows of `boxes` and `xyz`.
+    """
     if len(xyz) == 0 or len(boxes) == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
     cell = np.floor(xyz[:, :2] / INDEX_CELL).astype(np.int64)

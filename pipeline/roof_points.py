@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_points import NEVER_ROOF, _candidates
+from pipeline.building_points import NEVER_ROOF, find_candidates
 from pipeline.pointcloud import BUILDING, PointCloud
 
 
@@ -56,7 +56,7 @@ def locate_points(
     polygon, point : int64, (h,)
         Rows of `polygons` and `xy`, by polygon.
     """
-    polygon, point = _candidates(xy, shapely.bounds(polygons).reshape(-1, 4))
+    polygon, point = find_candidates(xy, shapely.bounds(polygons).reshape(-1, 4))
     shapely.prepare(polygons)
     inside = shapely.contains_xy(polygons[polygon], xy[point, 0], xy[point, 1])
     return polygon[inside], point[inside]

@@ -128,7 +128,7 @@ class Config:
         True, "simplify", "divide houses where their roof points show a step, with simplify = clearance"
     )
     roof_group: float = _parameter(
-        2.0, "simplify", "adjacent houses closer in height than this get one roof, with simplify = clearance",
+        2.5, "simplify", "adjacent houses closer in height than this get one roof, with simplify = clearance",
         unit="m", least=0,
     )  # fmt: skip
     manifold: bool = _parameter(

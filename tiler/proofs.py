@@ -178,7 +178,7 @@ def prove_closed(surface: Surface) -> tuple[Proof, int]:
     if count:
         listed = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in corners[:N_CORNERS])
         more = f" and {len(corners) - N_CORNERS} more" if len(corners) > N_CORNERS else ""
-        claim += f", where houses touch in a corner: {listed}{more} (--manifold parts them)"
+        claim += f", where houses or their roofs touch in a corner only: {listed}{more}"
     return Proof(claim, tuple(faults)), count
 
 
