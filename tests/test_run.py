@@ -475,3 +475,10 @@ def test_real_data_gives_a_mesh_that_its_check_proves(
         assert record["fidelity"]["outline"]["min_clearance"] >= 1.0
         assert record["fidelity"]["outline"]["area_error"] <= 0.008
         assert record["fidelity"]["roof"]["rmse"] < 3.4
+
+
+def test_the_demo_makes_two_meshes_and_two_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--out", str(tmp_path), "--size", "200", "--buildings", "15"]) == 0
+    assert capsys.readouterr().out.count("everything is proved") == 2
+    for picture in ("demo.png", "block.png"):
+        assert (tmp_path / picture).stat().st_size > 50_000

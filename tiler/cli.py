@@ -18,6 +18,7 @@ EXIT_CODES = (
 )
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 POSITIONAL = "pointcloud"
+BLOCK = Path(__file__).with_name("demo_block")  # real data of a few hundred kilobytes
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -75,7 +76,7 @@ def make_parser() -> argparse.ArgumentParser:
     synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
     synth.add_argument("directory", type=Path, help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
-    demo = command("demo", _demo, "make a synthetic city, mesh it, check it, and draw it")
+    demo = command("demo", _demo, "mesh, check and draw a synthetic city and a block of a real one")
     demo.add_argument("--out", type=Path, default=Path("demo"), help="folder to write to (default: demo)")
     _add_city(demo, size=600.0, buildings=220)
     render = command("render", _render, "draw a picture of a run")
@@ -193,22 +194,32 @@ def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":
 
 
 def _demo(options: argparse.Namespace) -> int:
+    out: Path = options.out
+    files = _write_city(out / "city", options)
+    clouds, footprints = [str(path) for path in files.clouds], str(files.shapefile)
+    city = {"pointcloud": clouds, "footprints": footprints}
+    block = {
+        "pointcloud": [str(BLOCK / "cloud.laz")],
+        "footprints": str(BLOCK / "footprints.geojson"),
+        "border": "clip",
+        "mesh_size": 5.0,
+    }
+    codes = [
+        _demonstrate("a synthetic city", city, out / "result", out / "demo.png", "overview"),
+        _demonstrate("a block of Amsterdam", block, out / "block", out / "block.png", "boundary"),
+    ]
+    return max(codes)
+
+
+def _demonstrate(title: str, inputs: dict[str, Any], out: Path, picture: Path, what: str) -> int:
+    """Mesh, check and draw; returns the exit code of the check."""
     from tiler.render import render_run
 
-    city, result, picture = options.out / "city", options.out / "result", options.out / "demo.png"
-    files = _write_city(city, options)
-    config = make_config(
-        {
-            "pointcloud": [str(path) for path in files.clouds],
-            "footprints": str(files.shapefile),
-            "out": str(result),
-            "overwrite": True,
-        }
-    )
-    _run_config(config)
-    code = _check_folder(result)
-    render_run(result, picture, what="overview")
-    print(f"picture: {picture}\nmesh:    {result / 'mesh.pvtu'} (open it in ParaView)")
+    print(f"\n{title}")
+    _run_config(make_config(inputs | {"out": str(out), "overwrite": True}))
+    code = _check_folder(out)
+    render_run(out, picture, what=what)
+    print(f"picture: {picture}\nmesh:    {out / 'mesh.pvtu'} (open it in ParaView)")
     return code
 
 

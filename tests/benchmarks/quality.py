@@ -153,14 +153,12 @@ def quality_tables(folder: Path) -> list[str]:
     out = folder / "quality"
     lines = ["", "### Synthetic cities, relief 20 m", *QUALITY_HEAD]
     meshers: dict[str, dict[str, Any]] = {"adaptive": {}, "layered": {"mesher": "layered"}}
-    for mesher, options in meshers.items():
-        title = f"{mesher}, 10 m"
-        records = [synthetic(folder, out, seed=seed, **options) for seed in SEEDS]
-        lines += [quality_row(f"{title}, seed {seed}", r) for seed, r in zip(SEEDS, records, strict=True)]
-        lines.append(worst_row(f"{title}, worst of six", records))
-    for mesher, options in meshers.items():
-        record = synthetic(folder, out, seed=1, mesh_size=5.0, **options)
-        lines.append(quality_row(f"{mesher}, 5 m, seed 1", record))
+    for size in (10.0, 5.0):
+        for mesher, options in meshers.items():
+            title = f"{mesher}, {size:g} m"
+            records = [synthetic(folder, out, seed=seed, mesh_size=size, **options) for seed in SEEDS]
+            lines += [quality_row(f"{title}, seed {seed}", r) for seed, r in zip(SEEDS, records, strict=True)]
+            lines.append(worst_row(f"{title}, worst of six", records))
     lines += ["", "### Steep terrain, synthetic, 10 m, seed 1, domain height 250 m", *QUALITY_HEAD]
     for relief in (38.0, 76.0, 152.0):
         record = synthetic(folder, out, seed=1, relief=relief, domain_height=250.0)
