@@ -21,6 +21,7 @@ from pipeline.pointcloud import (
 # Where a cloud has no building class, a point of any class but these may lie on a roof.
 NEVER_ROOF = (GROUND, LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION, LOW_NOISE, WATER, HIGH_NOISE)
 OUTLIER_DEVIATIONS = 2.0  # paper, step 1.5
+CHUNK_POINTS = 2**18
 INDEX_CELL = 4.0  # m, side of a cell of the point index; measured best of 2, 4 and 8 on 3.5 points/m2
 
 
@@ -148,42 +149,59 @@ def _take(
     return new_start, z[np.arange(new_start[-1]) + np.repeat(start[rows] - new_start[:-1], count)]
 
 
+def find_inside(
+    xy: NDArray[np.float64], polygons: NDArray[np.object_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find the points inside each polygon, those on its outline left out.
+
+    Parameters
+    ----------
+    xy : float64, (k, 2) or (k, 3)
+        Points (m).
+    polygons : object, (n,)
+        Valid shapely Polygons; a point in several of them is found in each.
+
+    Returns
+    -------
+    polygon, point : int64, (h,)
+        Rows of `polygons` and `xy`, by polygon, then by point.
+
+    Notes
+    -----
+    Points are looked at a quarter of a million at a time, so that memory is that of the result.
+    """
+    boxes = shapely.bounds(polygons).reshape(-1, 4)
+    shapely.prepare(polygons)
+    found = [(np.empty(0, np.int64), np.empty(0, np.int64))]
+    for first in range(0, len(xy), CHUNK_POINTS):
+        chunk = xy[first : first + CHUNK_POINTS]
+        polygon, point = _find_candidates(chunk, boxes)
+        inside = shapely.contains_xy(polygons[polygon], chunk[point, 0], chunk[point, 1])
+        found.append((polygon[inside], point[inside] + first))
+    polygon, point = (np.concatenate(part) for part in zip(*found, strict=True))
+    order = np.lexsort((point, polygon))
+    return polygon[order], point[order]
+
+
 def _points_inside(
     xyz: NDArray[np.float64], polygons: NDArray[np.object_], outside: NDArray[np.object_] | None
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Heights of the points in each polygon, and not in its counterpart in `outside` where given."""
-    n = len(polygons)
-    polygon, point = find_candidates(xyz, shapely.bounds(polygons).reshape(-1, 4))
-    x, y = xyz[point, 0], xyz[point, 1]
-    shapely.prepare(polygons)
-    inside = shapely.contains_xy(polygons[polygon], x, y)
+    polygon, point = find_inside(xyz, polygons)
     if outside is not None:
         shapely.prepare(outside)
-        near = np.flatnonzero(inside)
-        inside[near] = ~shapely.intersects_xy(outside[polygon[near]], x[near], y[near])
-    polygon, z = polygon[inside], xyz[point[inside], 2]
+        apart = ~shapely.intersects_xy(outside[polygon], xyz[point, 0], xyz[point, 1])
+        polygon, point = polygon[apart], point[apart]
+    z = xyz[point, 2]
     order = np.lexsort((z, polygon))
-    start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=n))))
+    start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))
     return start, z[order]
 
 
-def find_candidates(
+def _find_candidates(
     xyz: NDArray[np.float64], boxes: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs (box, point) of the points in the index cells that each box touches, by box.
-
-    Parameters
-    ----------
-    xyz : float64, (k, 2) or (k, 3)
-        Points (m).
-    boxes : float64, (n, 4)
-        xmin, ymin, xmax, ymax (m).
-
-    Returns
-    -------
-    box, point : int64, (h,)
-        Rows of `boxes` and `xyz`.
-    """
+    """Pairs (box, point) of the points in the index cells that each box touches, by box."""
     if len(xyz) == 0 or len(boxes) == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
     cell = np.floor(xyz[:, :2] / INDEX_CELL).astype(np.int64)

@@ -6,8 +6,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.building_points import find_inside
 from pipeline.pointcloud import GROUND, WATER, PointCloud
-from pipeline.roof_points import RoofPoints, locate_points, select_roof
+from pipeline.roof_points import RoofPoints, select_roof
 from pipeline.terrain import Dtm, sample_dtm
 
 COVERAGE_CELL = 1.0  # m, side of the cells in which points are looked for
@@ -123,15 +124,15 @@ def measure_fidelity(
     built = np.isfinite(roof)
     polygons, roof = polygons[built], roof[built]
     roof_xyz = cloud.xyz[select_roof(cloud, building_class=building_class)]
-    building, point = locate_points(roof_xyz, polygons)
+    building, point = find_inside(roof_xyz, polygons)
     inside = _mark(len(roof_xyz), point)
-    original = _mark(len(roof_xyz), locate_points(roof_xyz, footprints)[1])
+    original = _mark(len(roof_xyz), find_inside(roof_xyz, footprints)[1])
     missed = roof_xyz[original & ~inside]
 
     ground_xyz = cloud.xyz[(cloud.classification == GROUND) | (cloud.classification == WATER)]
-    over, below = locate_points(ground_xyz, polygons)
+    over, below = find_inside(ground_xyz, polygons)
     open_ground = ground_xyz[~_mark(len(ground_xyz), below)]
-    street = ~_mark(len(ground_xyz), locate_points(ground_xyz, footprints)[1])[below]
+    street = ~_mark(len(ground_xyz), find_inside(ground_xyz, footprints)[1])[below]
     return PointFidelity(
         roof=summarise(roof[building] - roof_xyz[point, 2]),
         missed=summarise(sample_dtm(dtm, missed[:, :2]) - missed[:, 2]),

@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_points import NEVER_ROOF, find_candidates
+from pipeline.building_points import NEVER_ROOF, find_inside
 from pipeline.pointcloud import BUILDING, PointCloud
 
 
@@ -39,29 +38,6 @@ def select_roof(cloud: PointCloud, *, building_class: bool) -> NDArray[np.bool_]
     return ~np.isin(cloud.classification, NEVER_ROOF)
 
 
-def locate_points(
-    xy: NDArray[np.float64], polygons: NDArray[np.object_]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find the points inside each polygon, those on its outline left out.
-
-    Parameters
-    ----------
-    xy : float64, (k, 2) or (k, 3)
-        Points (m).
-    polygons : object, (n,)
-        Valid shapely Polygons; a point in several of them is found in each.
-
-    Returns
-    -------
-    polygon, point : int64, (h,)
-        Rows of `polygons` and `xy`, by polygon.
-    """
-    polygon, point = find_candidates(xy, shapely.bounds(polygons).reshape(-1, 4))
-    shapely.prepare(polygons)
-    inside = shapely.contains_xy(polygons[polygon], xy[point, 0], xy[point, 1])
-    return polygon[inside], point[inside]
-
-
 def locate_roof_points(cloud: PointCloud, polygons: NDArray[np.object_], *, building_class: bool) -> RoofPoints:
     """Take the roof points inside each polygon, outliers included.
 
@@ -80,7 +56,7 @@ def locate_roof_points(cloud: PointCloud, polygons: NDArray[np.object_], *, buil
     the points: its distance from the mean, ``(1 - p) D``, exceeds ``2 sqrt(p (1 - p)) D`` when ``p < 0.2``.
     """
     xyz = cloud.xyz[select_roof(cloud, building_class=building_class)]
-    polygon, point = locate_points(xyz, polygons)
+    polygon, point = find_inside(xyz, polygons)
     found = xyz[point]
     order = np.lexsort((found[:, 0], found[:, 1], found[:, 2], polygon))
     start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))

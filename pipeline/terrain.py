@@ -127,19 +127,32 @@ def sample_dtm(dtm: Dtm, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     The position in a cell comes from region-wide indices, so two tiles that hold the same nodes get the
     same bits.
     """
-    ny, nx = dtm.z.shape
-    u = np.clip(xy[:, 0] / dtm.spacing, dtm.i0, dtm.i0 + nx - 1)
-    v = np.clip(xy[:, 1] / dtm.spacing, dtm.j0, dtm.j0 + ny - 1)
-    i = np.minimum(np.floor(u).astype(np.int64), dtm.i0 + max(nx - 2, 0))
-    j = np.minimum(np.floor(v).astype(np.int64), dtm.j0 + max(ny - 2, 0))
-    s, t = u - i, v - j
-    i -= dtm.i0
-    j -= dtm.j0
-    right, up = np.minimum(i + 1, nx - 1), np.minimum(j + 1, ny - 1)
-    low = (1 - s) * dtm.z[j, i] + s * dtm.z[j, right]
-    high = (1 - s) * dtm.z[up, i] + s * dtm.z[up, right]
-    height: NDArray[np.float64] = (1 - t) * low + t * high
+    height = np.empty(len(xy))
+    _sample(dtm.z, dtm.i0, dtm.j0, dtm.spacing, xy, height)
     return height
+
+
+@numba.njit(cache=True, nogil=True)
+def _sample(
+    z: NDArray[np.float64],
+    i0: int,
+    j0: int,
+    spacing: float,
+    xy: NDArray[np.float64],
+    height: NDArray[np.float64],
+) -> None:
+    ny, nx = z.shape
+    for k in range(len(xy)):
+        u = min(max(xy[k, 0] / spacing, float(i0)), float(i0 + nx - 1))
+        v = min(max(xy[k, 1] / spacing, float(j0)), float(j0 + ny - 1))
+        i = min(int(np.floor(u)), i0 + max(nx - 2, 0))
+        j = min(int(np.floor(v)), j0 + max(ny - 2, 0))
+        s, t = u - i, v - j
+        left, low = i - i0, j - j0
+        right, high = min(left + 1, nx - 1), min(low + 1, ny - 1)
+        below = (1 - s) * z[low, left] + s * z[low, right]
+        above = (1 - s) * z[high, left] + s * z[high, right]
+        height[k] = (1 - t) * below + t * above
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,14 +9,14 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_points import extract_building_points
+from pipeline.building_points import extract_building_points, find_inside
 from pipeline.citymodel import Footprints
 from pipeline.footprints import clean_footprints
 from pipeline.heights import percentile_by_group
 from pipeline.house_levels import LevelOptions, split_levels
 from pipeline.point_fidelity import Residuals, measure_fidelity, measure_houses, summarise
 from pipeline.pointcloud import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER, PointCloud
-from pipeline.roof_points import RoofPoints, locate_points, locate_roof_points
+from pipeline.roof_points import RoofPoints, locate_roof_points
 from tests.cities import tilted_dtm
 from tiler.clouds import find_clouds, read_points
 
@@ -105,7 +105,7 @@ def test_nothing_to_measure_is_nan() -> None:
 
 def test_points_in_two_polygons_are_located_in_each() -> None:
     xy = np.array([[15.0, 15], [19, 15], [9, 15], [10, 15]])
-    polygon, point = locate_points(xy, polygons(HOUSE, MODEL))
+    polygon, point = find_inside(xy, polygons(HOUSE, MODEL))
     assert sorted(zip(polygon.tolist(), point.tolist(), strict=True)) == [(0, 0), (0, 1), (1, 0), (1, 2), (1, 3)]
 
 

@@ -15,6 +15,7 @@ import pyogrio
 import pytest
 import shapely
 
+from pipeline.columns import expand_cells
 from pipeline.errors import CityError
 from pipeline.pointcloud import BUILDING, GROUND
 from tests.cities import Bounds, cloud_over
@@ -115,6 +116,7 @@ def test_the_files_hold_the_columns_of_the_store(city: Path, tmp_path: Path) -> 
     assert len(mesh.points) == len(columns.z) == record["counts"]["points"]
     assert mesh.points[:, 2].tobytes() == columns.z.tobytes()
     assert len(mesh.cells_dict["tetra"]) == record["counts"]["cells"]
+    assert np.array_equal(mesh.cells_dict["tetra"], expand_cells(columns).cells)
 
 
 def test_same_input_same_bytes_with_and_without_workers_and_in_any_order(city: Path, tmp_path: Path) -> None:

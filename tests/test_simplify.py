@@ -101,6 +101,13 @@ def test_roofs_clear_the_terrain_of_their_whole_group() -> None:
     assert count_notes(city.notes)["building-roof-raised"] == 1
 
 
+def test_a_roof_is_raised_before_it_is_compared_with_its_neighbours() -> None:
+    cloud = cloud_over(BOUNDS, [(FRONT, 6.0), (BACK, 6.5)])
+    city = planar_city(footprints_of(FRONT, BACK), cloud, slope=0.5)
+    # The terrain reaches 16 m at the front house's walls (x = 1032) and 22.5 m at the other's (x = 1045).
+    assert sorted(city.model.roof.tolist()) == pytest.approx([18.0, 24.5])
+
+
 def test_settled_roofs_meet_both_rules() -> None:
     rng = np.random.default_rng(0)
     n = 60
