@@ -223,6 +223,15 @@ def test_reprojected_footprints_give_the_same_buildings(city: Path, tmp_path: Pa
     assert roofs == {10.0, 30.0}
 
 
+def test_parameters_without_effect_are_told(
+    city: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments(city, tmp_path / "out", "--layer-height", "4")) == 0
+    assert "layer_height = 4.0 has no effect: it counts with mesher = layered" in capsys.readouterr().out
+    assert main(arguments(city, tmp_path / "two", "--layer-height", "4", "--mesher", "layered")) == 0
+    assert "no effect" not in capsys.readouterr().out
+
+
 def test_heights_by_attribute(city: Path, tmp_path: Path) -> None:
     cloud = cloud_over(BOUNDS, [], ground=2.0)
     write_las(tmp_path / "bare.laz", cloud.xyz, cloud.classification)

@@ -112,13 +112,9 @@ class Config:
         source="paper, step 2.1", choices=("clearance", "paper"),
     )  # fmt: skip
     clearance: float = _parameter(
-        1.0,
-        "simplify",
-        "buildings closer than this are merged",
-        unit="m",
-        source="paper, step 2.1",
-        least=0.1,
-    )
+        1.0, "simplify", "least distance of walls; with simplify = paper, buildings closer than this are merged",
+        unit="m", source="paper, step 2.1", least=0.1,
+    )  # fmt: skip
     clearance_floor: float = _parameter(
         0.1, "simplify", "with simplify = paper: finer details of one building are repaired", unit="m",
         above=0,
@@ -135,7 +131,7 @@ class Config:
         False, "simplify", "open or close the corners in which houses touch in a point only"
     )
     mesh_size: float = _parameter(
-        10.0, "mesh", "target edge length h; no triangle of the plane mesh is larger than h^2/2", unit="m",
+        10.0, "mesh", "target edge length h: triangles of the plane mesh have about h^2/2 at most", unit="m",
         source="paper, step 3.1", least=0.1,
     )  # fmt: skip
     min_angle: float = _parameter(
@@ -192,6 +188,40 @@ class Config:
     def layer_height_or_default(self) -> float:
         """Height of a layer (m): the mesh size where none is given."""
         return self.layer_height or self.mesh_size
+
+
+# Parameters that count only where another one has a certain value.
+CONDITIONS = {
+    "roof_percentile": ("roof_height", "percentile"),
+    "clearance_floor": ("simplify", "paper"),
+    "split_levels": ("simplify", "clearance"),
+    "roof_group": ("simplify", "clearance"),
+    "manifold": ("simplify", "clearance"),
+    "least_spacing": ("mesher", "adaptive"),
+    "most_spacing": ("mesher", "adaptive"),
+    "stagger": ("mesher", "adaptive"),
+    "improve_passes": ("mesher", "adaptive"),
+    "layer_height": ("mesher", "layered"),
+    "smoother": ("mesher", "layered"),
+    "smoothing_tolerance": ("mesher", "layered"),
+    "fem_tolerance": ("mesher", "layered"),
+}
+
+
+def idle_parameters(config: Config) -> list[str]:
+    """Sentences about the parameters that are not at their default, but have no effect.
+
+    Examples
+    --------
+    >>> idle_parameters(Config(smoother="fem"))
+    ['smoother = fem has no effect: it counts with mesher = layered']
+    """
+    default = Config()
+    return [
+        f"{name} = {getattr(config, name)} has no effect: it counts with {other} = {value}"
+        for name, (other, value) in CONDITIONS.items()
+        if getattr(config, name) != getattr(default, name) and getattr(config, other) != value
+    ]
 
 
 def load_config(path: Path) -> dict[str, Any]:

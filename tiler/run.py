@@ -16,7 +16,7 @@ from pipeline.errors import CityError, ConfigError, InputError
 from pipeline.notes import Note, count_notes
 from tiler.atomic import replacing
 from tiler.clouds import CloudHeader, find_clouds, read_header
-from tiler.config import Config
+from tiler.config import Config, idle_parameters
 from tiler.crs import resolve_crs
 from tiler.engine import run_jobs
 from tiler.region import Region, check_region, choose_bounds, tile_name
@@ -96,6 +96,7 @@ def _mesh_region(
         choose_bounds(config.bounds, headers), f"EPSG:{code}" if code else crs.to_wkt(), config.tile_size
     )
     check_region(region, config.mesh_size)
+    messages += idle_parameters(config)
     if not config.footprints:
         messages.append("no footprints given: the mesh has terrain only")
     for message in messages:
