@@ -58,7 +58,9 @@ def test_every_parameter_is_an_option(capsys: pytest.CaptureFixture[str]) -> Non
         ({"bounds": (0.0, 1.0)}, "four finite numbers"),
         ({"bounds": (0.0, 0.0, 5.0, 90.0)}, "smaller than one cell"),
         ({"clearance_floor": 2.0}, "clearance_floor = 2 m: must be at most clearance = 1 m"),
-        ({"layer_height": 60.0}, "at most half of domain_height"),
+        ({"layer_height": 60.0, "mesher": "layered"}, "layer height 60 m: at most half of domain_height"),
+        ({"mesh_size": 100.0}, "vertical spacing of up to 80 m .*: at most half of domain_height = 100 m"),
+        ({"least_spacing": 0.9}, "least_spacing = 0.9: must be at most most_spacing = 0.8"),
     ],
 )
 def test_bad_values_are_refused_with_value_and_bound(values: dict[str, object], message: str) -> None:

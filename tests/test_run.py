@@ -204,6 +204,8 @@ def test_a_cloud_without_ground_class_needs_the_filter(
     assert main(command) == 1
     assert "--ground-filter" in capsys.readouterr().err
     assert json.loads((out / "run.json").read_text())["status"] == "failed"
+    assert main(["check", str(out)]) == 1
+    assert "the run failed (tile" in capsys.readouterr().err
     assert main([*command, "--ground-filter", "--overwrite"]) == 0
     assert json.loads((out / "run.json").read_text())["notes"]["ground-filter"]["count"] == 1
     assert check_run(out, StoredTerrain).ok
@@ -230,6 +232,15 @@ def test_parameters_without_effect_are_told(
     assert "layer_height = 4.0 has no effect: it counts with mesher = layered" in capsys.readouterr().out
     assert main(arguments(city, tmp_path / "two", "--layer-height", "4", "--mesher", "layered")) == 0
     assert "no effect" not in capsys.readouterr().out
+
+
+def test_a_region_beyond_the_clouds_is_told(city: Path, tmp_path: Path) -> None:
+    bounds = [318050.0, 6399000.5, 318150.0, 6399099.0]
+    record = run(make_config(values(city, tmp_path / "out", bounds=bounds)))
+    (message,) = [text for text in record["messages"] if "beyond" in text]
+    # The easternmost points lie at 318099.75.
+    assert "(50.2 m east)" in message or "(50.3 m east)" in message
+    assert check_run(tmp_path / "out", StoredTerrain).ok
 
 
 def test_heights_by_attribute(city: Path, tmp_path: Path) -> None:

@@ -352,10 +352,16 @@ def _check_together(config: Config) -> None:
         raise ConfigError(
             f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
         )
-    if config.layer_height_or_default > config.domain_height / 2:
+    layer, most = config.layer_height_or_default, config.most_spacing * config.mesh_size
+    if config.mesher == "layered" and layer > config.domain_height / 2:
         raise ConfigError(
-            f"layer height {config.layer_height_or_default:g} m: at most half of domain_height = "
-            f"{config.domain_height:g} m; lower --layer-height or raise --domain-height"
+            f"layer height {layer:g} m: at most half of domain_height = {config.domain_height:g} m; lower "
+            "--layer-height or raise --domain-height"
+        )
+    if config.mesher == "adaptive" and most > config.domain_height / 2:
+        raise ConfigError(
+            f"vertical spacing of up to {most:g} m (most_spacing x mesh_size): at most half of domain_height = "
+            f"{config.domain_height:g} m; lower --most-spacing or --mesh-size, or raise --domain-height"
         )
 
 

@@ -54,6 +54,19 @@ def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Boun
     return asked[0], asked[1], asked[2], asked[3]
 
 
+def describe_overhang(bounds: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
+    """Say by how much the region reaches beyond the point clouds; nothing where it does not."""
+    extents = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
+    beyond = {
+        "west": min(extent[0] for extent in extents) - bounds[0],
+        "south": min(extent[1] for extent in extents) - bounds[1],
+        "east": bounds[2] - max(extent[2] for extent in extents),
+        "north": bounds[3] - max(extent[3] for extent in extents),
+    }
+    sides = ", ".join(f"{by:.1f} m {side}" for side, by in beyond.items() if by > 0)
+    return [f"the region reaches beyond the point clouds ({sides}); terrain is carried on there"] if sides else []
+
+
 def check_region(region: Region, mesh_size: float) -> None:
     """Refuse a region that is smaller than a cell or larger than a tile.
 

@@ -19,7 +19,7 @@ from tiler.clouds import CloudHeader, find_clouds, read_header
 from tiler.config import Config, idle_parameters
 from tiler.crs import resolve_crs
 from tiler.engine import run_jobs
-from tiler.region import Region, check_region, choose_bounds, tile_name
+from tiler.region import Region, check_region, choose_bounds, describe_overhang, tile_name
 from tiler.tile_task import CITY_MODEL, FULL_CITY_MODEL, TileJob, TileRecord, mesh_tile
 from tiler.vectors import read_footprint_crs
 from tiler.vtk_files import write_pvtp, write_pvtu
@@ -96,7 +96,7 @@ def _mesh_region(
         choose_bounds(config.bounds, headers), f"EPSG:{code}" if code else crs.to_wkt(), config.tile_size
     )
     check_region(region, config.mesh_size)
-    messages += idle_parameters(config)
+    messages += [*describe_overhang(region.bounds, headers), *idle_parameters(config)]
     if not config.footprints:
         messages.append("no footprints given: the mesh has terrain only")
     for message in messages:
