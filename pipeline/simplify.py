@@ -35,6 +35,8 @@ from pipeline.pointcloud import PointCloud
 from pipeline.roof_points import locate_roof_points
 from pipeline.terrain import Dtm
 
+COVERED = 0.5  # a house without a face is not lost if others cover this part of it
+CHANGED = 0.3  # of a house's area: an outline that gained and lost more is told
 SETTLE_ROUNDS = 20  # of grouping roofs and raising them over terrain, in turn
 
 
@@ -159,7 +161,7 @@ def _planar_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, 
         *city.notes,
         *note_heights("building", footprints, heights),
         *_note_raised(footprints, heights, roof, raised),
-        *_note_lost(model.ids, model.polygons, row),
+        *_note_outlines(city, planar, row, outline.house_error),
     )
     counts = {**city.counts, **_count(planar, parts, settled)}
     return replace(settled, notes=notes, counts=counts, outline=_describe_outline(outline))
@@ -175,20 +177,40 @@ def _name_parts(ids: NDArray[np.str_], row: NDArray[np.int64]) -> tuple[NDArray[
     house = ids[row]
     count = np.bincount(row, minlength=len(ids))
     seen = np.zeros(len(ids), np.int64)
+    taken = set(ids.tolist())
     names = []
     for k, name in zip(row.tolist(), house.tolist(), strict=True):
         seen[k] += 1
-        names.append(name if count[k] == 1 else f"{name}-part{seen[k]}")
+        part = name if count[k] == 1 else f"{name}-part{seen[k]}"
+        while count[k] > 1 and part in taken:
+            part += "-"
+        taken.add(part)
+        names.append(part)
     return np.array(names, dtype=np.str_), house
 
 
-def _note_lost(ids: NDArray[np.str_], polygons: NDArray[np.object_], row: NDArray[np.int64]) -> list[Note]:
-    """Tell of the houses that have no face any more."""
+def _note_outlines(
+    city: City, planar: PlanarCity, row: NDArray[np.int64], error: NDArray[np.float64]
+) -> list[Note]:
+    """Tell of the houses that have no face any more, and of those whose outline changed much."""
+    polygons, ids = city.model.polygons, city.model.ids
+    area = shapely.area(polygons)
     gone = np.ones(len(ids), np.bool_)
     gone[row] = False
-    area = shapely.area(polygons)
-    places = find_places(Footprints(polygons, ids, area), gone)
-    return [Note("building-lost", *place, f"{area[k]:.1f} m², no room at this clearance") for k, place in places]
+    footprints = Footprints(polygons, ids, area)
+    built = shapely.STRtree(planar.polygons)
+    notes = []
+    for k, place in find_places(footprints, gone):
+        over = planar.polygons[built.query(polygons[k], predicate="intersects")]
+        covered = float(shapely.area(shapely.intersection(over, polygons[k])).sum())
+        if covered >= COVERED * area[k]:
+            notes.append(Note("building-covered-by-others", *place, f"{covered:.1f} of {area[k]:.1f} m2"))
+        else:
+            notes.append(Note("building-lost", *place, f"{area[k]:.1f} m², no room at this clearance"))
+    changed = ~gone & (error > CHANGED * area)
+    for k, place in find_places(footprints, changed):
+        notes.append(Note("building-outline-changed", *place, f"by {error[k]:.1f} m2 of {area[k]:.1f} m2"))
+    return notes
 
 
 def _note_raised(

@@ -35,6 +35,12 @@ def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
     assert config.pointcloud == (str(tmp_path / "a.laz"), "/b.laz")
 
 
+def test_one_cloud_may_stand_without_brackets(tmp_path: Path) -> None:
+    file = tmp_path / "run.toml"
+    file.write_text('[input]\npointcloud = "a.laz"\n')
+    assert make_config(load_config(file)).pointcloud == (str(tmp_path / "a.laz"),)
+
+
 def test_every_parameter_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         make_parser().parse_args(["run", "--help"])

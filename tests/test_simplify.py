@@ -92,6 +92,25 @@ def test_a_house_without_room_is_lost_and_told() -> None:
     assert (note.subject, note.detail.split(",")[0]) == ("house-1", "12.0 m²")
 
 
+def test_a_house_within_another_is_covered_not_lost() -> None:
+    inner = shapely.box(1020.02, 2020.02, 1031.98, 2039.98)
+    cloud = cloud_over(BOUNDS, [(FRONT, 12.0)])
+    city = planar_city(footprints_of(FRONT, inner), cloud)
+    assert len(city.model) == 1
+    assert count_notes(city.notes)["building-covered-by-others"] == 1
+    assert "building-lost" not in count_notes(city.notes)
+
+
+def test_names_of_parts_are_free_names() -> None:
+    house, other = shapely.box(1020, 2020, 1050, 2040), shapely.box(1060, 2060, 1080, 2080)
+    tall, low = shapely.box(1020, 2020, 1038, 2040), shapely.box(1038, 2020, 1050, 2040)
+    cloud = cloud_over(BOUNDS, [(tall, 20.0), (low, 8.0), (other, 9.0)])
+    footprints = footprints_of(house, other)
+    renamed = dataclasses.replace(footprints, ids=np.array(["7", "7-part1"]))
+    city = planar_city(renamed, cloud, options=SPLIT)
+    assert sorted(city.model.ids.tolist()) == ["7-part1", "7-part1-", "7-part2"]
+
+
 def test_roofs_clear_the_terrain_of_their_whole_group() -> None:
     cloud = cloud_over(BOUNDS, [(FRONT, 6.0), (BACK, 6.5)])
     city = planar_city(footprints_of(FRONT, BACK), cloud, slope=0.12)

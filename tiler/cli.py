@@ -2,7 +2,9 @@
 
 import argparse
 import dataclasses
+import os
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
 EXIT_CODES = (
     "Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 3 done but for parts listed in run.json."
 )
+METAVARS = {str: "NAME", float: "NUMBER", int: "NUMBER"}
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 POSITIONAL = "pointcloud"
 BLOCK = Path(__file__).with_name("demo_block")  # real data of a few hundred kilobytes
@@ -29,6 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments : sequence of str, optional
         Without the program's name; those of the process if not given.
     """
+    _find_cache()
     parser = make_parser()
     options = parser.parse_args(arguments)
     handler: Callable[[argparse.Namespace], int] = options.handler
@@ -48,6 +52,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         reason = " ".join(str(error).split())
         print(f"citystitch: {type(error).__name__}: {reason}; --traceback tells where", file=sys.stderr)
         return EXIT_FAILED
+
+
+def _find_cache() -> None:
+    """Let compiled code be cached in the temporary folder where neither package nor home can be written."""
+    places = (Path(__file__).parent, Path.home())
+    if "NUMBA_CACHE_DIR" not in os.environ and not any(os.access(place, os.W_OK) for place in places):
+        os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"citystitch-{os.getuid()}")
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -104,7 +115,8 @@ def _add_parameters(parser: argparse.ArgumentParser) -> None:
         elif get_origin(wanted) is tuple:
             words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
         else:
-            words |= {"type": wanted, "metavar": data["unit"].upper() or wanted.__name__.upper()}
+            unit = "" if wanted is str else data["unit"].upper()
+            words |= {"type": wanted, "metavar": unit or METAVARS[wanted]}
             if data["choices"]:
                 words |= {"choices": data["choices"], "metavar": None}
         group.add_argument(f"--{entry.name.replace('_', '-')}", **words)

@@ -298,7 +298,8 @@ def annotated_defaults() -> str:
 
 
 def _relative_to(folder: Path, name: str, value: Any) -> Any:
-    if name == "pointcloud" and isinstance(value, list):
+    if name == "pointcloud" and isinstance(value, (str, list)):
+        value = [value] if isinstance(value, str) else value
         return [str(folder / item) if isinstance(item, str) else item for item in value]
     if name in ("footprints", "out") and isinstance(value, str) and value:
         return str(folder / value)

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
+from pipeline.errors import CityError
+
 Job = TypeVar("Job")
 Record = TypeVar("Record")
 
@@ -30,7 +32,7 @@ def run_jobs(function: Callable[[Job], Record], jobs: Iterable[Job], *, workers:
     from dask import config
     from distributed import Client, LocalCluster
 
-    # The dashboard is off; a page of the run's own takes its place later.
+    # Everything is bound to this machine, on free ports: two runs do not meet.
     with (
         config.set({"distributed.worker.daemon": False}),
         LocalCluster(
@@ -38,11 +40,22 @@ def run_jobs(function: Callable[[Job], Record], jobs: Iterable[Job], *, workers:
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",
             silence_logs="ERROR",
         ) as cluster,
         Client(cluster) as client,
     ):
-        futures = [client.submit(function, job, pure=False) for job in jobs]
+        futures = [client.submit(_attempt, function, job, pure=False) for job in jobs]
         for future in futures:
-            yield future.result()
+            result, error = future.result()
+            if error is not None:
+                raise error
+            yield result
+
+
+def _attempt(function: Callable[[Job], Record], job: Job) -> tuple[Record | None, CityError | None]:
+    """Give an error that data caused back as a value: Dask would print where in the code it arose."""
+    try:
+        return function(job), None
+    except CityError as error:
+        return None, error

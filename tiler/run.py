@@ -3,10 +3,12 @@
 import dataclasses
 import json
 import math
+import os
 import platform
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -29,6 +31,9 @@ SCHEMA = 1  # version of run.json's layout
 RESULTS = ("run.json", CITY_MODEL, FULL_CITY_MODEL, "mesh.pvtu", "boundary.pvtp", "mesh", "boundary", "store.zarr")
 LIBRARIES = ("citystitch", "numpy", "scipy", "shapely", "numba", "triangle", "laspy", "lazrs", "pyogrio", "pyproj")
 EXIT_DONE, EXIT_INCOMPLETE = 0, 3
+
+# Notes of these kinds say that something is missing which the input has: the exit code tells.
+INCOMPLETE = {"building-lost", "building-points-without-footprints"}
 
 Announce = Callable[[str, float], None]
 
@@ -60,7 +65,7 @@ def run(
     if not config.pointcloud:
         raise ConfigError("no point cloud: give files, globs or folders, as in `citystitch run tiles/*.laz`")
     out = Path(config.out)
-    _claim_folder(out, overwrite=config.overwrite)
+    earlier = _check_folder(out, overwrite=config.overwrite)
     start = time.perf_counter()
     record: dict[str, Any] = {
         "schema": SCHEMA,
@@ -68,9 +73,13 @@ def run(
         "parameters": dataclasses.asdict(config),
         "versions": {"python": platform.python_version()} | {name: _version(name) for name in LIBRARIES},
     }
-    _write_record(out, record)
     try:
-        record |= _mesh_region(config, out, announce, say or _silent)
+        # Nothing of an earlier run is touched before the inputs are known to be there.
+        plan = _plan(config, say or _silent)
+        _clear_folder(out, earlier)
+        earlier = []
+        _write_record(out, record)
+        record |= _mesh_region(config, out, plan, announce)
         record["status"] = "done"
     except CityError as error:
         record |= {"status": "failed", "error": str(error)}
@@ -80,13 +89,22 @@ def run(
         raise
     finally:
         record["seconds_total"] = round(time.perf_counter() - start, 3)
-        _write_record(out, record)
+        if not earlier:
+            _write_record(out, record)
     return record
 
 
-def _mesh_region(
-    config: Config, out: Path, announce: Announce | None, say: Callable[[str], None]
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Plan:
+    """What is known before any point is read."""
+
+    region: Region
+    headers: list[CloudHeader]
+    messages: list[str]
+    unreadable: dict[str, str]
+
+
+def _plan(config: Config, say: Callable[[str], None]) -> _Plan:
     paths = find_clouds(config.pointcloud)
     headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
     footprint_crs = read_footprint_crs(Path(config.footprints)) if config.footprints else None
@@ -101,15 +119,20 @@ def _mesh_region(
         messages.append("no footprints given: the mesh has terrain only")
     for message in messages:
         say(message)
-    clouds = tuple(header.path for header in headers if header.n_points and _meets(header, region))
-    job = TileJob(tile_name(region), region, clouds, config, out)
+    return _Plan(region, headers, messages, unreadable)
+
+
+def _mesh_region(config: Config, out: Path, plan: _Plan, announce: Announce | None) -> dict[str, Any]:
+    clouds = tuple(header.path for header in plan.headers if header.n_points and _meets(header, plan.region))
+    job = TileJob(tile_name(plan.region), plan.region, clouds, config, out)
     task = partial(mesh_tile, announce=announce) if config.workers == 0 else mesh_tile
     tiles = list(run_jobs(task, [job], workers=config.workers))
     write_pvtu(out / "mesh.pvtu", [out / "mesh" / f"{tile.name}.vtu" for tile in tiles])
     write_pvtp(out / "boundary.pvtp", [out / "boundary" / f"{tile.name}.vtp" for tile in tiles])
+    unreadable = dict(plan.unreadable)
     for tile in tiles:
         unreadable |= tile.unreadable
-    return _summary(region, headers, tiles, messages, unreadable)
+    return _summary(plan.region, plan.headers, tiles, plan.messages, unreadable)
 
 
 def _summary(
@@ -122,7 +145,9 @@ def _summary(
     (tile,) = tiles
     counts = {"files": len(headers), "files empty": sum(header.n_points == 0 for header in headers), **tile.counts}
     return {
-        "exit_code": EXIT_INCOMPLETE if unreadable else EXIT_DONE,
+        "exit_code": EXIT_INCOMPLETE
+        if unreadable or INCOMPLETE & {note.kind for note in tile.notes}
+        else EXIT_DONE,
         "region": {"bounds": list(region.bounds), "crs": region.crs, "tile_size": region.tile_size},
         "tiles": {tile.name: {"status": "done", "counts": tile.counts, "facts": tile.facts}},
         "counts": counts,
@@ -169,17 +194,36 @@ def _meets(header: CloudHeader, region: Region) -> bool:
     )
 
 
-def _claim_folder(out: Path, *, overwrite: bool) -> None:
-    """Make the output folder ready, or say why it cannot be."""
+def _check_folder(out: Path, *, overwrite: bool) -> list[str]:
+    """Refuse an output folder that holds something to keep; returns the results that may be replaced."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; give another --out")
     earlier = [name for name in RESULTS if (out / name).exists()]
-    if earlier and not overwrite:
+    if earlier and not (out / "run.json").is_file():
+        raise ConfigError(f"{out}: holds {', '.join(earlier)}, but no run.json of a run; give another --out")
+    if earlier and not overwrite and not _has_failed(out / "run.json"):
         raise ConfigError(
             f"{out}: holds the results of another run ({', '.join(earlier)}); give another --out, or --overwrite"
         )
     try:
         out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written ({error.strerror}); give another --out") from error
+    if not os.access(out, os.W_OK):
+        raise ConfigError(f"{out}: cannot be written; give another --out")
+    return earlier
+
+
+def _has_failed(path: Path) -> bool:
+    try:
+        return bool(json.loads(path.read_text())["status"] == "failed")
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _clear_folder(out: Path, earlier: Sequence[str]) -> None:
+    """Remove the results of an earlier run and make the folders of this one."""
+    try:
         for name in earlier:
             path = out / name
             shutil.rmtree(path) if path.is_dir() else path.unlink()

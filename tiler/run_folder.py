@@ -81,6 +81,8 @@ def read_run_record(path: Path) -> RunRecord:
             raise InputError(f"{path}: schema {record['schema']!r}, expected {SCHEMA}; run again")
         if record["status"] == "failed":
             raise InputError(f"{path}: the run failed ({record['error']}); mend that and run again")
+        if "region" not in record:
+            raise InputError(f"{path}: the run is {record['status']} and has no mesh yet; wait, or run again")
         west, south, east, north = (float(value) for value in record["region"]["bounds"])
         top = float(record["region"].get("top", math.nan))
         names = ("cells", "points", "facets", "buildings")

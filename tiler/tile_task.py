@@ -139,6 +139,14 @@ def mesh_tile(job: TileJob, announce: Callable[[str, float], None] | None = None
         write_dtm(store, job.name, dtm)
     options = _city_options(config)
     full = build_city(cloud, footprints, dtm, bounds, options, trace)
+    if config.footprints and len(footprints.polygons) == 0 and has_building_class(cloud):
+        record.notes.append(
+            Note(
+                "building-points-without-footprints",
+                config.footprints,
+                detail="the cloud has buildings, the file none in the region; check --crs and the files' CRSs",
+            )
+        )
     if len(full.model) and not has_building_class(cloud):
         record.notes.append(
             Note("no-building-class", detail="roof points are those that are not ground, water, plants or noise")
@@ -221,6 +229,8 @@ def _with_ground(cloud: PointCloud, job: TileJob, record: TileRecord) -> PointCl
 
 
 def _city_options(config: Config) -> CityOptions:
+    # Heights closer than the least spacing cannot both be exact in a column.
+    gap = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
     return CityOptions(
         min_building_area=config.min_building_area,
         vertex_tolerance=config.vertex_tolerance,
@@ -228,14 +238,14 @@ def _city_options(config: Config) -> CityOptions:
         ground_percentile=config.ground_percentile,
         roof_percentile=config.roof_percentile if config.roof_height == "percentile" else 50.0,
         default_height=config.default_height,
-        roof_clearance=config.roof_clearance,
+        roof_clearance=max(config.roof_clearance, gap),
         border="clip" if config.border == "clip" else "drop",
         simplify="paper" if config.simplify == "paper" else "clearance",
         clearance=config.clearance,
         clearance_floor=config.clearance_floor,
         min_courtyard_area=config.min_courtyard_area,
         split_levels=config.split_levels,
-        roof_group=config.roof_group,
+        roof_group=max(config.roof_group, gap),
         manifold=config.manifold,
     )
 
