@@ -26,7 +26,7 @@ from stitch.walls import cut_walls
 from tests.cities import Bounds, city_of, crowded_blocks, hilly_dtm
 
 MIN_ANGLE = 28.0
-REFINEMENTS = 2
+REFINEMENTS = 1
 PASSES = 4
 LIMITS = SpacingLimits(least=0.1, most=0.8)
 OPTIONS = AdaptiveOptions(mesh_size=10.0, domain_height=60.0, limits=LIMITS, stagger=0.8, passes=1)
