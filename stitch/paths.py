@@ -13,6 +13,7 @@ from stitch.strips import Strip
 
 SLOPES = (0.7, 0.95)  # of the wedges at both corners; the second where the first has no path
 OFFSET_COST = 0.3  # added cost of an edge at the band's side
+POOR_COST = 2.0  # added cost of an edge at a flat triangle; none where all around are equilateral
 WALL_COST = 1.0  # added cost of an edge for each end on a wall
 INSIDE_COST = 3.0  # added cost of an edge through a building
 
@@ -99,8 +100,20 @@ def _costs(
     inside = (mine == other)[once] & (mine[once] >= 0)
     length = np.sqrt(((strip.xy[edges[:, 0]] - strip.xy[edges[:, 1]]) ** 2).sum(axis=1))
     mean_offset = offset[edges].mean(axis=1)
-    extra = WALL_COST * on_wall[edges].sum(axis=1) + INSIDE_COST * inside
+    poor = 1 - _worst_shape(strip)[edges].min(axis=1)
+    extra = POOR_COST * poor + WALL_COST * on_wall[edges].sum(axis=1) + INSIDE_COST * inside
     return edges, length * (1 + OFFSET_COST * mean_offset**2) * (1 + extra), on_wall | built
+
+
+def _worst_shape(strip: Strip) -> NDArray[np.float64]:
+    """Worst shape of the triangles at each vertex: area over squared edges, 1 if all are equilateral."""
+    corners = strip.xy[strip.triangles]
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    squares = (u**2).sum(axis=1) + (v**2).sum(axis=1) + ((u - v) ** 2).sum(axis=1)
+    shape = 2 * np.sqrt(3) * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / squares
+    worst = np.ones(len(strip.xy))
+    np.minimum.at(worst, strip.triangles.ravel(), np.repeat(shape, 3))
+    return worst
 
 
 def _shortest(

@@ -50,6 +50,7 @@ def trace_seam(
     *,
     mesh_size: float,
     min_angle: float,
+    passes: int,
 ) -> Seam:
     """Find a seam in the triangles of its strip.
 
@@ -59,8 +60,18 @@ def trace_seam(
     -----
     Along the region's border, the seam is all vertices of the strip there. Cost is that of the strip.
     """
-    strip = mesh_strip(grid, key, ends, polygons, walls, mesh_size=mesh_size, min_angle=min_angle)
-    if is_border(grid, key):
+    border = is_border(grid, key)
+    strip = mesh_strip(
+        grid,
+        key,
+        ends,
+        polygons,
+        walls,
+        mesh_size=mesh_size,
+        min_angle=min_angle,
+        passes=0 if border else passes,
+    )
+    if border:
         nothing = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))
         xy = _border_vertices(strip, key.axis, ends)
         return Seam(xy, np.empty((0, 2)), True, nothing, np.empty(0, np.int32))

@@ -6,12 +6,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.improve_plane import improve_plane
 from pipeline.plane import collect_graph, triangulate_plane
 from stitch.corners import Corner
 from stitch.grid import Bounds, SeamKey, TileGrid, band_width, corner_reach, is_border
 from stitch.walls import LONGEST_PIECE, walls_within
 
 RING = 1.5  # mesh sizes; the triangles around a vertex have their centres within that
+SECTORS = 5  # four quadrants around a corner, and elsewhere
 MARGIN = 0.5  # mesh sizes between the last piece of wall and the strip's sides
 
 
@@ -46,6 +48,7 @@ def mesh_strip(
     *,
     mesh_size: float,
     min_angle: float,
+    passes: int,
 ) -> Strip:
     """Triangulate a strip.
 
@@ -65,6 +68,8 @@ def mesh_strip(
         Target edge length h (m).
     min_angle : float
         Bound on the angles (degrees).
+    passes : int
+        Rounds of `improve_plane`, of no use on the region's border, whose vertices stay.
 
     Raises
     ------
@@ -84,7 +89,13 @@ def mesh_strip(
     xy, triangles, _, _ = triangulate_plane(
         collect_graph(edges, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle
     )
-    return Strip(xy, triangles, label_triangles(xy, triangles, polygons), inside)
+    building = label_triangles(xy, triangles, polygons)
+    # Beyond the core, what holds a triangle is a matter of which houses were given.
+    building[~_within(xy, triangles, core)] = -1
+    # Different labels on the two sides of a first edge keep it where it is.
+    label = building * SECTORS + _sectors(xy, triangles, ends)
+    xy, triangles = improve_plane(xy, triangles, label.astype(np.int32), mesh_size=mesh_size, passes=passes)
+    return Strip(xy, triangles, building, inside)
 
 
 def strip_core(grid: TileGrid, seam: SeamKey, *, mesh_size: float) -> Bounds:
@@ -105,11 +116,22 @@ def label_triangles(
     xy: NDArray[np.float64], triangles: NDArray[np.int32], polygons: NDArray[np.object_]
 ) -> NDArray[np.int32]:
     """Row of the building around the centre of each triangle, -1 where none; int32, (m,)."""
-    centre = (xy[triangles[:, 0]] + xy[triangles[:, 1]] + xy[triangles[:, 2]]) / 3
+    centre = _centres(xy, triangles)
     label = np.full(len(triangles), -1, np.int32)
     row, building = shapely.STRtree(polygons).query(shapely.points(centre), predicate="within")
     label[row] = building
     return label
+
+
+def _centres(xy: NDArray[np.float64], triangles: NDArray[np.int32]) -> NDArray[np.float64]:
+    centre: NDArray[np.float64] = (xy[triangles[:, 0]] + xy[triangles[:, 1]] + xy[triangles[:, 2]]) / 3
+    return centre
+
+
+def _within(xy: NDArray[np.float64], triangles: NDArray[np.int32], box: Bounds) -> NDArray[np.bool_]:
+    centre = _centres(xy, triangles)
+    inside: NDArray[np.bool_] = np.all((centre >= box[:2]) & (centre <= box[2:]), axis=1)
+    return inside
 
 
 def _grow(box: Bounds, by: float, within: Bounds) -> Bounds:
@@ -137,3 +159,17 @@ def _spokes(ends: tuple[Corner, Corner], bounds: Bounds) -> NDArray[np.float64]:
     on_side = ((spokes == low) | (spokes == high)).all(axis=1).any(axis=1)
     kept: NDArray[np.float64] = spokes[~on_side & ~np.isnan(tip[:, 0])]
     return kept
+
+
+def _sectors(
+    xy: NDArray[np.float64], triangles: NDArray[np.int32], ends: tuple[Corner, Corner]
+) -> NDArray[np.int32]:
+    """Number the quadrants around the corners, as far as their first edges reach; 0 elsewhere."""
+    centre = _centres(xy, triangles)
+    sector = np.zeros(len(triangles), np.int32)
+    for end in ends:
+        length = np.nanmax(np.abs(end.tips - end.xy))
+        offset = centre - end.xy
+        near = np.abs(offset).sum(axis=1) < length
+        sector[near] = 1 + (offset[near, 0] > 0) + 2 * (offset[near, 1] > 0)
+    return sector

@@ -1,5 +1,7 @@
 """Step 3.1 for one tile: its plane mesh between seams that stay as they are."""
 
+from dataclasses import replace
+
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -12,6 +14,9 @@ from stitch.grid import band_width, corner_reach
 from stitch.seams import ON_WALL, Seam
 from stitch.strips import RING, label_triangles
 from stitch.walls import split_walls, walls_within
+
+CLEAR_OF_SEAMS = 1.2  # mesh sizes; vertices of a strip that the tile begins with are that far from its other seams
+CLEAR_OF_WALLS = 0.3  # mesh sizes; and that far from walls
 
 Sides = tuple[Seam, Seam, Seam, Seam]
 
@@ -50,6 +55,11 @@ def mesh_tile(
     ------
     GeometryError
         If the 2D mesher fails, or the triangles do not cover the tile or a building's part in it.
+
+    Notes
+    -----
+    A frozen border cannot be refined, so triangles beside it may be poor. Those in which the seam was found
+    are good: the tile begins with their vertices, where these are clear of walls and of other seams.
     """
     ring = tile_ring(sides)
     tile = shapely.Polygon(ring)
@@ -58,8 +68,10 @@ def mesh_tile(
     middle = pieces.mean(axis=1)
     inner = pieces[shapely.contains_xy(tile, middle[:, 0], middle[:, 1])]
     border = np.stack((ring, np.roll(ring, -1, axis=0)), axis=1)
+    graph = collect_graph(np.concatenate((border, inner)), np.empty((0, 2)))
+    loose = _strip_vertices(sides, tile, inner, mesh_size)
     xy, triangles, _, complete = triangulate_plane(
-        collect_graph(np.concatenate((border, inner)), np.empty((0, 2))),
+        replace(graph, xy=np.concatenate((graph.xy, loose))),
         max_area=mesh_size**2 / 2,
         min_angle=min_angle,
         refinements=refinements,
@@ -85,3 +97,21 @@ def tile_ring(sides: Sides) -> NDArray[np.float64]:
     """Give the vertices of a tile's border counter-clockwise, float64 (k, 2) (m), each once."""
     south, east, north, west = (side.xy for side in sides)
     return np.concatenate((south[:-1], east[:-1], north[:0:-1], west[:0:-1]))
+
+
+def _strip_vertices(
+    sides: Sides, tile: shapely.Polygon, walls: NDArray[np.float64], mesh_size: float
+) -> NDArray[np.float64]:
+    """Vertices of the strips beside the seams, within the tile."""
+    lines = shapely.linestrings(walls)
+    wall_tree = shapely.STRtree(lines)
+    chosen = [np.empty((0, 2))]
+    for side in sides:
+        xy = np.delete(side.ring.xy, side.vertex, axis=0)
+        xy = xy[shapely.contains_xy(tile, xy[:, 0], xy[:, 1])]
+        points = shapely.points(xy)
+        others = shapely.multilinestrings([shapely.LineString(other.xy) for other in sides if other is not side])
+        clear = shapely.distance(others, points) > CLEAR_OF_SEAMS * mesh_size
+        clear[wall_tree.query(points, predicate="dwithin", distance=CLEAR_OF_WALLS * mesh_size)[0]] = False
+        chosen.append(xy[clear])
+    return np.concatenate(chosen)

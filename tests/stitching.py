@@ -119,7 +119,7 @@ def mesh_alone(
             for at in ends_of_seam(key)
         )
         seams[key] = seam = trace_seam(
-            grid, key, (start, end), model.polygons, walls, mesh_size=size, min_angle=MIN_ANGLE
+            grid, key, (start, end), model.polygons, walls, mesh_size=size, min_angle=MIN_ANGLE, passes=PASSES
         )
         if not seam.border:
             ends = tuple(fill_corner(corner, dtm, model.roof, model.ids, options) for corner in (start, end))
