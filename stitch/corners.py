@@ -6,11 +6,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from stitch.grid import Key, TileGrid, corner_reach, nominal_corner
+from stitch.grid import CORNER_SHARE, Key, TileGrid, closest_line, corner_reach, nominal_corner
 
 SPOKE_OF_CLEARANCE = 0.6  # length of the first edges of seams over the distance to the next wall
 LONGEST_SPOKE = 0.8  # mesh sizes
+SPOKE_OF_DEPTH = 0.25  # of the distance to the next corner
 INSIDE_WORTH = 0.5  # clearance in a building counts for half
+SAME = 0.001  # m; distances that differ by less count as equal, so that rounding settles no tie
 DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])  # east, north, west, south
 
 
@@ -70,13 +72,14 @@ def place_corner(
     """
     reach = corner_reach(grid.tile_size)
     nominal = np.array(nominal_corner(grid, key))
-    offset = _offsets(grid, nominal, reach)
+    depth = closest_line(grid, key)
+    offset = _offsets(grid, nominal, min(reach, CORNER_SHARE * depth))
     xy = nominal + offset
     clear = _clearance(walls, xy, reach)
     building = _building_at(polygons, xy)
-    worth = np.where(building >= 0, INSIDE_WORTH, 1.0) * clear
+    worth = np.rint(np.where(building >= 0, INSIDE_WORTH, 1.0) * clear / SAME)
     best = np.lexsort((offset[:, 1], offset[:, 0], (offset**2).sum(axis=1), -worth))[0]
-    length = min(SPOKE_OF_CLEARANCE * clear[best], LONGEST_SPOKE * mesh_size)
+    length = min(SPOKE_OF_CLEARANCE * clear[best], LONGEST_SPOKE * mesh_size, SPOKE_OF_DEPTH * depth)
     tips = xy[best] + length * DIRECTIONS
     xmin, ymin, xmax, ymax = grid.bounds
     tips[(tips[:, 0] < xmin) | (tips[:, 0] > xmax) | (tips[:, 1] < ymin) | (tips[:, 1] > ymax)] = np.nan

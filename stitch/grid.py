@@ -118,6 +118,19 @@ def nominal_corner(grid: TileGrid, corner: Key) -> tuple[float, float]:
     return float(grid.lines[0][i - grid.first.i]), float(grid.lines[1][j - grid.first.j])
 
 
+def closest_line(grid: TileGrid, corner: Key) -> float:
+    """Distance from a corner to the next one, a tile at most (m).
+
+    Corners within the region do not look at it: they have a tile, so that no border matters to them, and
+    only where outer tiles are narrow, those on the border have less.
+    """
+    at = corner.i - grid.first.i, corner.j - grid.first.j
+    if all(0 < k < len(axis) - 1 for k, axis in zip(at, grid.lines, strict=True)):
+        return grid.tile_size
+    steps = [np.diff(axis)[max(k - 1, 0) : k + 1].min() for k, axis in zip(at, grid.lines, strict=True)]
+    return float(min(*steps, grid.tile_size))
+
+
 def is_border(grid: TileGrid, seam: SeamKey) -> bool:
     """Tell whether a seam is a part of the region's border."""
     across = 1 - seam.axis

@@ -164,12 +164,13 @@ def _spokes(ends: tuple[Corner, Corner], bounds: Bounds) -> NDArray[np.float64]:
 def _sectors(
     xy: NDArray[np.float64], triangles: NDArray[np.int32], ends: tuple[Corner, Corner]
 ) -> NDArray[np.int32]:
-    """Number the quadrants around the corners, as far as their first edges reach; 0 elsewhere."""
+    """Number the quadrants around the corners for triangles beside the first edges there; 0 elsewhere."""
     centre = _centres(xy, triangles)
     sector = np.zeros(len(triangles), np.int32)
     for end in ends:
         length = np.nanmax(np.abs(end.tips - end.xy))
-        offset = centre - end.xy
-        near = np.abs(offset).sum(axis=1) < length
-        sector[near] = 1 + (offset[near, 0] > 0) + 2 * (offset[near, 1] > 0)
+        on_edges = ((xy == end.xy) & (np.abs(xy - end.xy)[:, ::-1] <= length)).any(axis=1)
+        beside = on_edges[triangles].sum(axis=1) > 1
+        offset = centre[beside] - end.xy
+        sector[beside] = 1 + (offset[:, 0] > 0) + 2 * (offset[:, 1] > 0)
     return sector

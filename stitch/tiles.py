@@ -16,6 +16,7 @@ from stitch.strips import RING, label_triangles
 from stitch.walls import split_walls, walls_within
 
 CLEAR_OF_SEAMS = 1.2  # mesh sizes; vertices of a strip that the tile begins with are that far from its other seams
+CLEAR_OF_OTHERS = 0.6  # mesh sizes; that far from those of another strip
 CLEAR_OF_WALLS = 0.3  # mesh sizes; and that far from walls
 
 Sides = tuple[Seam, Seam, Seam, Seam]
@@ -113,5 +114,7 @@ def _strip_vertices(
         others = shapely.multilinestrings([shapely.LineString(other.xy) for other in sides if other is not side])
         clear = shapely.distance(others, points) > CLEAR_OF_SEAMS * mesh_size
         clear[wall_tree.query(points, predicate="dwithin", distance=CLEAR_OF_WALLS * mesh_size)[0]] = False
+        earlier = shapely.STRtree(shapely.points(np.concatenate(chosen)))
+        clear[earlier.query(points, predicate="dwithin", distance=CLEAR_OF_OTHERS * mesh_size)[0]] = False
         chosen.append(xy[clear])
     return np.concatenate(chosen)

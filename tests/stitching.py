@@ -2,20 +2,27 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import pyproj
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
+from pipeline.city import CityOptions
 from pipeline.citymodel import CityModel
 from pipeline.columns import expand_cells
 from pipeline.heights import highest_wall_ground, raise_low_roofs
 from pipeline.mesh import ColumnMesh, TetMesh
 from pipeline.nodes import Levels
 from pipeline.plane import signed_areas
+from pipeline.pointcloud import PointCloud
+from pipeline.simplify import simplify_city
 from pipeline.spacing import SpacingLimits, domain_top, top_reach
-from pipeline.terrain import Dtm, sample_dtm
+from pipeline.terrain import Dtm, compute_dtm, sample_dtm
+from pipeline.tile import build_city
 from stitch.conformity import compute_cell_volumes, pair_cell_faces, pair_edges
 from stitch.corners import Corner, place_corner
 from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile, tile_keys
@@ -24,6 +31,8 @@ from stitch.seams import Seam, trace_seam
 from stitch.tiles import mesh_tile, tile_halo
 from stitch.walls import cut_walls
 from tests.cities import Bounds, city_of, crowded_blocks, hilly_dtm
+from tiler.clouds import find_clouds, read_points
+from tiler.vectors import read_footprints
 
 MIN_ANGLE = 28.0
 REFINEMENTS = 1
@@ -62,6 +71,35 @@ def random_scene(bounds: Bounds, n: int, *, seed: int, relief: float = 0.0) -> S
     """Crowded blocks on hills."""
     roofs = np.random.default_rng(seed).uniform(5, 30, n)
     return scene_of(crowded_blocks(bounds, n, seed=seed), roofs.tolist(), hilly_dtm(bounds, relief=relief))
+
+
+def amsterdam_scene(folder: Path, bounds: Bounds, simplify: Literal["clearance", "paper"]) -> Scene:
+    """Central Amsterdam between bounds (m), its city model made by the one way or the other."""
+    clouds = [read_points(path, bounds)[0] for path in find_clouds([folder / "tiles"])]
+    cloud = PointCloud(
+        np.concatenate([part.xyz for part in clouds]), np.concatenate([part.classification for part in clouds])
+    )
+    footprints, _ = read_footprints(folder / "footprints.shp", crs=pyproj.CRS("EPSG:28992"), bounds=bounds)
+    dtm = compute_dtm(cloud, bounds)
+    options = CityOptions(
+        min_building_area=5.0,
+        vertex_tolerance=0.01,
+        ground_margin=1.0,
+        ground_percentile=10.0,
+        roof_percentile=50.0,
+        default_height=6.0,
+        roof_clearance=2.0,
+        border="drop",
+        simplify=simplify,
+        clearance=1.0,
+        clearance_floor=0.1,
+        min_courtyard_area=10.0,
+        split_levels=True,
+        roof_group=2.5,
+        manifold=False,
+    )
+    city = simplify_city(build_city(cloud, footprints, dtm, bounds, options), cloud, dtm, options)
+    return Scene(city.model, city.group, dtm)
 
 
 def select_houses(scene: Scene, chosen: NDArray[np.integer]) -> Scene:
