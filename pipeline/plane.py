@@ -46,21 +46,46 @@ def plane_graph(bounds: tuple[float, float, float, float], polygons: NDArray[np.
         Footprints strictly inside the region that do not cross each other; they may share vertices and
         walls.
     """
-    corners = shapely.get_coordinates(shapely.box(*bounds).exterior)[:-1]
-    rings = shapely.get_rings(polygons)
-    xy, ring = shapely.get_coordinates(rings, return_index=True)
-    ends = np.flatnonzero(np.diff(ring, append=-1) != 0)
-    from_vertex = np.setdiff1d(np.arange(len(xy)), ends)
-    walls = np.column_stack((from_vertex, from_vertex + 1)) + 4
-    border = np.column_stack((np.arange(4), np.roll(np.arange(4), -1)))
-    unique, index = np.unique(np.concatenate((corners, xy)), axis=0, return_inverse=True)
-    segments = np.sort(index.reshape(-1)[np.concatenate((border, walls))], axis=1)
+    border = ring_edges(shapely.get_rings(np.array([shapely.box(*bounds)])))
+    walls = ring_edges(shapely.get_rings(polygons))
     seeds = shapely.get_coordinates(shapely.point_on_surface(polygons))
+    return collect_graph(np.concatenate((border, walls)), seeds)
+
+
+def ring_edges(rings: NDArray[np.object_]) -> NDArray[np.float64]:
+    """Give the edges of closed rings, float64 (s, 2, 2): their start and end (m)."""
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
+    start = np.flatnonzero(np.diff(ring, append=-1) == 0)
+    return np.stack((xy[start], xy[start + 1]), axis=1)
+
+
+def collect_graph(edges: NDArray[np.float64], seeds: NDArray[np.float64]) -> PlaneGraph:
+    """Number the ends of edges, which meet in their ends only.
+
+    Parameters
+    ----------
+    edges : float64, (s, 2, 2)
+        Start and end of each (m); those that repeat, in either direction, count once.
+    seeds : float64, (b, 2)
+        As in `PlaneGraph`.
+
+    Returns
+    -------
+    PlaneGraph
+        Vertices sorted by (x, y) and segments by their vertices: the same for edges in any order.
+    """
+    unique, index = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+    segments = np.sort(index.reshape(-1, 2), axis=1)
     return PlaneGraph(unique, np.unique(segments, axis=0).astype(np.int32), seeds)
 
 
 def triangulate_plane(
-    graph: PlaneGraph, *, max_area: float, min_angle: float = MIN_ANGLE, refinements: int = 0
+    graph: PlaneGraph,
+    *,
+    max_area: float,
+    min_angle: float = MIN_ANGLE,
+    refinements: int = 0,
+    frozen: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32], bool]:
     """Triangulate a planar straight-line graph with bounds on area and angle.
 
@@ -77,6 +102,8 @@ def triangulate_plane(
     refinements : int
         Further runs of Triangle on its own result. The first run leaves an angle in some ten thousand below
         the bound, one more none; a third makes tiny edges at sharp corners of walls.
+    frozen : bool
+        Keep the outer border as it is: no vertex is added to it.
 
     Returns
     -------
@@ -94,8 +121,7 @@ def triangulate_plane(
     GeometryError
         If Triangle cannot make sense of the graph.
     """
-    # Near the origin the predicates keep all their digits. A whole number close by is taken off and put
-    # back without rounding, so the graph's vertices return bit for bit.
+    # Near the origin the predicates keep all their digits.
     origin = np.floor(graph.xy.min(axis=0))
     local = graph.xy - origin
     width, height = local.max(axis=0)
@@ -106,7 +132,7 @@ def triangulate_plane(
         number = np.arange(1.0, len(graph.seeds) + 1)
         data["regions"] = np.column_stack((graph.seeds - origin, number, np.zeros(len(number))))
     try:
-        quality = f"q{min_angle:g}a{max_area:.12g}"
+        quality = f"q{min_angle:g}a{max_area:.12g}" + "Y" * frozen
         out = triangle.triangulate(data, f"p{quality}AS{limit}")
         for _ in range(refinements):
             kept = ("vertices", "triangles", "segments", "triangle_attributes")
@@ -119,6 +145,7 @@ def triangulate_plane(
             f"{len(graph.segments)} segments ({error}); raise --clearance or mend the footprints there"
         ) from error
     xy = out["vertices"] + origin
+    xy[: len(graph.xy)] = graph.xy
     label = np.full(len(triangles), -1, np.int32)
     if len(graph.seeds):
         label = np.rint(out["triangle_attributes"][:, 0]).astype(np.int32) - 1
@@ -168,15 +195,20 @@ def mesh_plane(
         graph, max_area=mesh_size**2 / 2, min_angle=min_angle, refinements=refinements
     )
     xy, triangles = improve_plane(xy, triangles, label, mesh_size=mesh_size, passes=passes)
+    plane = order_plane(xy, triangles, label)
+    check_areas(plane, float(shapely.box(*bounds).area), shapely.area(polygons), polygons)
+    return plane, complete
+
+
+def order_plane(xy: NDArray[np.float64], triangles: NDArray[np.int32], label: NDArray[np.int32]) -> PlaneMesh:
+    """Sort vertices by (x, y) and triangles by their vertices; vertices that no triangle has are gone."""
     used = np.unique(triangles)
     order = used[np.lexsort((xy[used, 1], xy[used, 0]))]
     rank = np.empty(len(xy), np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
     sorted_triangles = np.sort(rank[triangles], axis=1)
     rows = np.lexsort(sorted_triangles.T[::-1])
-    plane = PlaneMesh(xy[order], sorted_triangles[rows], label[rows])
-    _check_areas(plane, bounds, polygons)
-    return plane, complete
+    return PlaneMesh(xy[order], sorted_triangles[rows], label[rows])
 
 
 def signed_areas(plane: PlaneMesh) -> NDArray[np.float64]:
@@ -187,26 +219,41 @@ def signed_areas(plane: PlaneMesh) -> NDArray[np.float64]:
     return area
 
 
-def _check_areas(
-    plane: PlaneMesh, bounds: tuple[float, float, float, float], polygons: NDArray[np.object_]
-) -> None:
+def check_areas(plane: PlaneMesh, whole: float, built: NDArray[np.float64], polygons: NDArray[np.object_]) -> None:
+    """Refuse a mesh that does not cover its region, or a building.
+
+    Parameters
+    ----------
+    plane : PlaneMesh
+        The mesh.
+    whole : float
+        Area of the region (m2).
+    built : float64, (b,)
+        Area of each building within it (m2).
+    polygons : object, (b,)
+        The buildings, whose size is what the tolerance is relative to.
+
+    Raises
+    ------
+    GeometryError
+        With the building that is worst, and its areas.
+    """
     area = np.abs(signed_areas(plane))
-    region = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
-    if area.min() <= 0 or abs(area.sum() - region) > AREA_TOLERANCE * region:
+    if area.min() <= 0 or abs(area.sum() - whole) > AREA_TOLERANCE * whole:
         raise GeometryError(
-            f"plane mesh, step 3.1: triangles cover {area.sum():.6f} m2 of {region:.6f} m2, the smallest has "
+            f"plane mesh, step 3.1: triangles cover {area.sum():.6f} m2 of {whole:.6f} m2, the smallest has "
             f"{area.min():.3g} m2; raise --clearance"
         )
     if len(polygons) == 0:
         return
     inside = plane.building >= 0
     covered = np.bincount(plane.building[inside], area[inside], len(polygons))
-    wanted = shapely.area(polygons)
-    worst = int(np.argmax(np.abs(covered - wanted) / wanted))
-    if abs(covered[worst] - wanted[worst]) > AREA_TOLERANCE * wanted[worst]:
+    error = np.abs(covered - built) / shapely.area(polygons)
+    worst = int(np.argmax(error))
+    if error[worst] > AREA_TOLERANCE:
         x, y = graph_place(polygons[worst])
         raise GeometryError(
-            f"plane mesh, step 3.1: building at ({x:.1f}, {y:.1f}) has {wanted[worst]:.3f} m2, its triangles "
+            f"plane mesh, step 3.1: building at ({x:.1f}, {y:.1f}) has {built[worst]:.3f} m2, its triangles "
             f"cover {covered[worst]:.3f} m2; its walls cross a neighbour's: raise --clearance"
         )
 

@@ -1,0 +1,119 @@
+"""Corners: where four tiles meet, in the clearest place around the nominal one (before step 3.1, ours)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from stitch.grid import CORNER_SHARE, Key, TileGrid, closest_line, corner_reach, nominal_corner
+
+SPOKE_OF_CLEARANCE = 0.6  # length of the first edges of seams over the distance to the next wall
+LONGEST_SPOKE = 0.8  # mesh sizes
+SPOKE_OF_DEPTH = 0.25  # of the distance to the next corner
+INSIDE_WORTH = 0.5  # clearance in a building counts for half
+SAME = 0.001  # m; distances that differ by less count as equal, so that rounding settles no tie
+DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])  # east, north, west, south
+
+
+@dataclass(frozen=True, eq=False)
+class Corner:
+    """Where four tiles meet, or two and the region's border, or one and two of its sides.
+
+    Attributes
+    ----------
+    xy : float64, (2,)
+        Place (m).
+    tips : float64, (4, 2)
+        Where the first edges of the seams eastwards, northwards, westwards and southwards end (m); NaN where
+        the region does.
+    building : int
+        Row of the building around it, -1 on open ground.
+    """
+
+    xy: NDArray[np.float64]
+    tips: NDArray[np.float64]
+    building: int
+
+
+def place_corner(
+    grid: TileGrid,
+    key: Key,
+    polygons: NDArray[np.object_],
+    walls: NDArray[np.float64],
+    *,
+    mesh_size: float,
+) -> Corner:
+    """Choose a corner's place, far from walls, and the first edges of its seams.
+
+    Parameters
+    ----------
+    grid : TileGrid
+        The tile grid.
+    key : Key
+        The corner.
+    polygons : object, (b,)
+        Footprints, at least those closer to the nominal corner than `corner_sight`.
+    walls : float64, (w, 2, 2)
+        Their walls in pieces (`cut_walls`).
+    mesh_size : float
+        Target edge length (m).
+
+    Returns
+    -------
+    Corner
+        Of the places on a 1 m grid around the nominal corner, on the region's border along it, the one
+        with the largest distance to a wall; distances beyond `corner_reach` count as that.
+
+    Notes
+    -----
+    Between equals, the closest to the nominal corner, then the one at the smallest x, then y. A distance
+    inside a building counts for half (`INSIDE_WORTH`).
+    """
+    reach = corner_reach(grid.tile_size)
+    nominal = np.array(nominal_corner(grid, key))
+    depth = closest_line(grid, key)
+    offset = _offsets(grid, nominal, min(reach, CORNER_SHARE * depth))
+    xy = nominal + offset
+    clear = _clearance(walls, xy, reach)
+    building = _building_at(polygons, xy)
+    worth = np.rint(np.where(building >= 0, INSIDE_WORTH, 1.0) * clear / SAME)
+    best = np.lexsort((offset[:, 1], offset[:, 0], (offset**2).sum(axis=1), -worth))[0]
+    length = min(SPOKE_OF_CLEARANCE * clear[best], LONGEST_SPOKE * mesh_size, SPOKE_OF_DEPTH * depth)
+    tips = xy[best] + length * DIRECTIONS
+    xmin, ymin, xmax, ymax = grid.bounds
+    tips[(tips[:, 0] < xmin) | (tips[:, 0] > xmax) | (tips[:, 1] < ymin) | (tips[:, 1] > ymax)] = np.nan
+    return Corner(xy[best], tips, int(building[best]))
+
+
+def corner_sight(tile_size: float) -> float:
+    """How far from its nominal place a corner sees (m)."""
+    return 2 * corner_reach(tile_size)
+
+
+def _offsets(grid: TileGrid, nominal: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    """Whole metres in a disc; none across the region's border."""
+    steps = np.arange(-np.floor(reach), np.floor(reach) + 1)
+    dx, dy = (
+        np.zeros(1) if nominal[axis] in (grid.bounds[axis], grid.bounds[axis + 2]) else steps for axis in (0, 1)
+    )
+    offset = np.stack(np.meshgrid(dx, dy), axis=-1).reshape(-1, 2)
+    disc: NDArray[np.float64] = offset[(offset**2).sum(axis=1) <= reach**2]
+    return disc
+
+
+def _clearance(walls: NDArray[np.float64], xy: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    clear = np.full(len(xy), reach)
+    tree = shapely.STRtree(shapely.linestrings(walls))
+    (row, _), distance = tree.query_nearest(
+        shapely.points(xy), max_distance=reach, return_distance=True, all_matches=False
+    )
+    clear[row] = np.minimum(distance, reach)
+    return clear
+
+
+def _building_at(polygons: NDArray[np.object_], xy: NDArray[np.float64]) -> NDArray[np.int64]:
+    building = np.full(len(xy), -1)
+    row, inside = shapely.STRtree(polygons).query(shapely.points(xy), predicate="within")
+    building[row] = inside
+    return building

@@ -1,0 +1,156 @@
+"""The tile grid: squares aligned to the CRS, their corners and seams, and how far each of these looks."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bounds = tuple[float, float, float, float]
+
+LEAST_TILE = 14.0  # mesh sizes; below, strips would reach beyond a border tile of half a size
+CORNER_REACH = 25.0  # m; how far a corner may be from its nominal place
+BAND = 35.0  # m; how far a seam may be from its nominal line
+# The same two where tiles are small, in tile sizes.
+CORNER_SHARE = 1 / 6
+BAND_SHARE = 1 / 4
+
+
+class Key(NamedTuple):
+    """Region-wide indices of a tile, or of the corner at its lower left."""
+
+    i: int
+    j: int
+
+
+class SeamKey(NamedTuple):
+    """A seam: it runs from corner (i, j) eastwards (axis 0) or northwards (axis 1)."""
+
+    axis: int
+    i: int
+    j: int
+
+
+@dataclass(frozen=True, eq=False)
+class TileGrid:
+    """Lines between tiles.
+
+    Attributes
+    ----------
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    tile_size : float
+        Side of a tile (m).
+    first : Key
+        Indices of the first lines.
+    lines : two of float64, (nx + 1,) and (ny + 1,)
+        Ascending places of the lines (m): the region's sides, and between them multiples of the tile size,
+        line ``k`` of an axis at ``(first + k) * tile_size``. A line is left out that is closer than half a
+        tile to a side, so tiles are between half and one and a half of their size.
+    """
+
+    bounds: Bounds
+    tile_size: float
+    first: Key
+    lines: tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def make_grid(bounds: Bounds, *, tile_size: float, mesh_size: float) -> TileGrid:
+    """Lay the tile grid over a region.
+
+    Raises
+    ------
+    ValueError
+        If tiles are smaller than `LEAST_TILE` mesh sizes, or the region is empty.
+
+    Examples
+    --------
+    >>> grid = make_grid((90.0, 30.0, 390.0, 130.0), tile_size=100.0, mesh_size=5.0)
+    >>> grid.first, grid.lines[0], grid.lines[1]
+    (Key(i=1, j=0), array([ 90., 200., 300., 390.]), array([ 30., 130.]))
+    """
+    if not tile_size >= LEAST_TILE * mesh_size > 0:
+        raise ValueError(f"tile size {tile_size} m is below {LEAST_TILE:g} mesh sizes of {mesh_size} m")
+    if not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
+        raise ValueError(f"the region {bounds} is empty")
+    i, x = _axis_lines(bounds[0], bounds[2], tile_size)
+    j, y = _axis_lines(bounds[1], bounds[3], tile_size)
+    return TileGrid(bounds, tile_size, Key(i, j), (x, y))
+
+
+def tile_keys(grid: TileGrid) -> list[Key]:
+    """List the tiles, column by column."""
+    i, j = grid.first
+    nx, ny = (len(axis) - 1 for axis in grid.lines)
+    return [Key(i + a, j + b) for a in range(nx) for b in range(ny)]
+
+
+def corner_keys(grid: TileGrid) -> list[Key]:
+    """List the corners, column by column."""
+    i, j = grid.first
+    return [Key(i + a, j + b) for a in range(len(grid.lines[0])) for b in range(len(grid.lines[1]))]
+
+
+def seam_keys(grid: TileGrid) -> list[SeamKey]:
+    """List all seams, those along the region's border included."""
+    last = Key(grid.first.i + len(grid.lines[0]) - 1, grid.first.j + len(grid.lines[1]) - 1)
+    corners = corner_keys(grid)
+    along = [SeamKey(0, i, j) for i, j in corners if i < last.i]
+    return along + [SeamKey(1, i, j) for i, j in corners if j < last.j]
+
+
+def seams_of_tile(tile: Key) -> tuple[SeamKey, SeamKey, SeamKey, SeamKey]:
+    """Seams of a tile: south, east, north, west. Counter-clockwise, the last two are passed backwards."""
+    i, j = tile
+    return SeamKey(0, i, j), SeamKey(1, i + 1, j), SeamKey(0, i, j + 1), SeamKey(1, i, j)
+
+
+def ends_of_seam(seam: SeamKey) -> tuple[Key, Key]:
+    """Corners where a seam starts and ends."""
+    axis, i, j = seam
+    return Key(i, j), Key(i + (axis == 0), j + (axis == 1))
+
+
+def nominal_corner(grid: TileGrid, corner: Key) -> tuple[float, float]:
+    """Place where the lines of a corner cross (m)."""
+    i, j = corner
+    return float(grid.lines[0][i - grid.first.i]), float(grid.lines[1][j - grid.first.j])
+
+
+def closest_line(grid: TileGrid, corner: Key) -> float:
+    """Distance from a corner to the next one, a tile at most (m).
+
+    Corners within the region do not look at it: they have a tile, so that no border matters to them, and
+    only where outer tiles are narrow, those on the border have less.
+    """
+    at = corner.i - grid.first.i, corner.j - grid.first.j
+    if all(0 < k < len(axis) - 1 for k, axis in zip(at, grid.lines, strict=True)):
+        return grid.tile_size
+    steps = [np.diff(axis)[max(k - 1, 0) : k + 1].min() for k, axis in zip(at, grid.lines, strict=True)]
+    return float(min(*steps, grid.tile_size))
+
+
+def is_border(grid: TileGrid, seam: SeamKey) -> bool:
+    """Tell whether a seam is a part of the region's border."""
+    across = 1 - seam.axis
+    line = seam[1 + across] - grid.first[across]
+    return line in (0, len(grid.lines[across]) - 1)
+
+
+def corner_reach(tile_size: float) -> float:
+    """How far a corner may be from its nominal place (m)."""
+    return min(CORNER_REACH, CORNER_SHARE * tile_size)
+
+
+def band_width(tile_size: float) -> float:
+    """How far a seam may be from its nominal line (m)."""
+    return min(BAND, BAND_SHARE * tile_size)
+
+
+def _axis_lines(low: float, high: float, size: float) -> tuple[int, NDArray[np.float64]]:
+    first, last = math.ceil(low / size + 0.5), math.floor(high / size - 0.5)
+    if first > last:
+        return math.floor((low + high) / 2 / size), np.array([low, high])
+    inner = np.arange(first, last + 1) * size
+    return first - 1, np.concatenate(([low], inner, [high]))

@@ -1,0 +1,132 @@
+"""A seam's way: the shortest path along the edges of a strip (before step 3.1, ours)."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+
+from pipeline.errors import GeometryError
+from pipeline.improve_plane import triangle_neighbours
+from stitch.corners import Corner
+from stitch.grid import SeamKey, TileGrid, band_width
+from stitch.strips import Strip
+
+SLOPES = (0.7, 0.95)  # of the wedges at both corners; the second where the first has no path
+OFFSET_COST = 0.3  # added cost of an edge at the band's side
+POOR_COST = 2.0  # added cost of an edge at a flat triangle; none where all around are equilateral
+WALL_COST = 1.0  # added cost of an edge for each end on a wall
+INSIDE_COST = 3.0  # added cost of an edge through a building
+
+
+def find_path(grid: TileGrid, seam: SeamKey, ends: tuple[Corner, Corner], strip: Strip) -> NDArray[np.int64]:
+    """Find the seam between two corners.
+
+    Parameters
+    ----------
+    grid : TileGrid
+        The tile grid.
+    seam : SeamKey
+        The seam, which is not on the region's border.
+    ends : (Corner, Corner)
+        Where it starts and ends.
+    strip : Strip
+        Its strip.
+
+    Returns
+    -------
+    int64, (k,)
+        Vertices of the strip from the first corner to the last.
+
+    Raises
+    ------
+    GeometryError
+        If no path leads through the band.
+
+    Notes
+    -----
+    The path begins and ends with straight first edges along the axis. Between them it stays in the wedge
+    of either corner, where ``|across| <= slope * along``: wedges of seams across each other have only the
+    corner in common, so seams never cross. Vertices on open ground are tried alone first, then walls and
+    buildings at a cost.
+    """
+    axis = seam.axis
+    along, across = strip.xy[:, axis], strip.xy[:, 1 - axis]
+    start, end = ends[0].xy, ends[1].xy
+    band = band_width(grid.tile_size)
+    line = grid.lines[1 - axis][seam[2 - axis] - grid.first[1 - axis]]
+    first = _spoke(strip, ends[0], ends[0].tips[axis], axis)
+    last = _spoke(strip, ends[1], ends[1].tips[2 + axis], axis)[::-1]
+    edges, cost, shut = _costs(strip, np.abs(across - line) / band)
+    for slope in SLOPES:
+        from_start = slope * (along - start[axis]) - np.abs(across - start[1 - axis])
+        from_end = slope * (end[axis] - along) - np.abs(across - end[1 - axis])
+        within = (from_start > 0) & (from_end > 0) & (np.abs(across - line) < band)
+        for open_only in (True, False):
+            usable = within & ~shut if open_only else within
+            usable[[first[-1], last[0]]] = True
+            middle = _shortest(edges, cost, usable, int(first[-1]), int(last[0]))
+            if len(middle):
+                return np.concatenate((first, middle[1:-1], last))
+    raise GeometryError(
+        f"seam from ({start[0]:.1f}, {start[1]:.1f}) to ({end[0]:.1f}, {end[1]:.1f}): no path within "
+        f"{band:.0f} m of its line; choose another --tile-size"
+    )
+
+
+def _spoke(strip: Strip, corner: Corner, tip: NDArray[np.float64], axis: int) -> NDArray[np.int64]:
+    """Vertices from a corner to the tip of its first edge: these two, if the mesher did not split it."""
+    low, high = np.minimum(corner.xy, tip), np.maximum(corner.xy, tip)
+    on = np.flatnonzero(((strip.xy >= low) & (strip.xy <= high)).all(axis=1))
+    return on[np.argsort(np.abs(strip.xy[on, axis] - corner.xy[axis]), kind="stable")]
+
+
+def _costs(
+    strip: Strip, offset: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Edges of a strip, what each costs, and the vertices on walls or in buildings."""
+    triangles = strip.triangles.astype(np.int64)
+    neighbour = triangle_neighbours(strip.triangles)
+    label = np.append(strip.building, -2)
+    other = label[neighbour]
+    mine = np.repeat(strip.building[:, None], 3, axis=1)
+    ends = np.stack((np.roll(triangles, -1, axis=1), np.roll(triangles, -2, axis=1)), axis=2)
+    wall = (other != mine) & (neighbour >= 0)
+    on_wall = np.zeros(len(strip.xy), np.bool_)
+    on_wall[ends[wall]] = True
+    built = np.zeros(len(strip.xy), np.bool_)
+    built[triangles[strip.building >= 0]] = True
+    once = (neighbour < 0) | (np.arange(len(triangles))[:, None] < neighbour)
+    edges = ends[once]
+    inside = (mine == other)[once] & (mine[once] >= 0)
+    length = np.sqrt(((strip.xy[edges[:, 0]] - strip.xy[edges[:, 1]]) ** 2).sum(axis=1))
+    mean_offset = offset[edges].mean(axis=1)
+    poor = 1 - _worst_shape(strip)[edges].min(axis=1)
+    extra = POOR_COST * poor + WALL_COST * on_wall[edges].sum(axis=1) + INSIDE_COST * inside
+    return edges, length * (1 + OFFSET_COST * mean_offset**2) * (1 + extra), on_wall | built
+
+
+def _worst_shape(strip: Strip) -> NDArray[np.float64]:
+    """Worst shape of the triangles at each vertex: area over squared edges, 1 if all are equilateral."""
+    corners = strip.xy[strip.triangles]
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    squares = (u**2).sum(axis=1) + (v**2).sum(axis=1) + ((u - v) ** 2).sum(axis=1)
+    shape = 2 * np.sqrt(3) * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / squares
+    worst = np.ones(len(strip.xy))
+    np.minimum.at(worst, strip.triangles.ravel(), np.repeat(shape, 3))
+    return worst
+
+
+def _shortest(
+    edges: NDArray[np.int64], cost: NDArray[np.float64], usable: NDArray[np.bool_], start: int, end: int
+) -> NDArray[np.int64]:
+    """Vertices of the shortest path, none if there is no path."""
+    kept = usable[edges].all(axis=1)
+    n = len(usable)
+    graph = sparse.csr_array((cost[kept], (edges[kept, 0], edges[kept, 1])), shape=(n, n))
+    before = dijkstra(graph, directed=False, indices=np.array([start]), return_predecessors=True)[1][0]
+    path = [end]
+    while path[-1] != start:
+        if path[-1] < 0:
+            return np.empty(0, np.int64)
+        path.append(int(before[path[-1]]))
+    return np.array(path[::-1])

@@ -1,0 +1,108 @@
+"""Columns of seams and corners from seam data alone (steps 3.2 to 3.4, adaptive), and a tile's share of them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.adaptive import AdaptiveOptions, fill_columns
+from pipeline.mesh import PlaneMesh
+from pipeline.nodes import Levels, SeamColumns, take_columns
+from pipeline.plane import order_plane
+from pipeline.terrain import Dtm
+from stitch.corners import Corner
+from stitch.seams import Seam, find_vertices
+
+
+def fill_corner(
+    corner: Corner, dtm: Dtm, roof: NDArray[np.float64], ids: NDArray[np.str_], options: AdaptiveOptions
+) -> Levels:
+    """Fill the column of a corner: it belongs to the corner, and all its seams take it over.
+
+    Parameters
+    ----------
+    corner : Corner
+        A corner of two tiles or more. No wall is as close to it as the tips of its first edges.
+    dtm : Dtm
+        Terrain as far beyond these as `top_reach` says.
+    roof, ids, options
+        As in `mesh_adaptive`.
+
+    Returns
+    -------
+    Levels
+        One column, with a spacing that follows the length of the first edges.
+    """
+    fan = _fan(corner)
+    return take_columns(fill_columns(fan, dtm, roof, ids, options), find_vertices(fan.xy, corner.xy[None]))
+
+
+def fill_seam(
+    seam: Seam,
+    ends: tuple[Levels, Levels],
+    dtm: Dtm,
+    roof: NDArray[np.float64],
+    ids: NDArray[np.str_],
+    options: AdaptiveOptions,
+) -> Levels:
+    """Fill the columns of a seam within the region from the triangles on both of its sides.
+
+    Parameters
+    ----------
+    seam : Seam
+        The seam.
+    ends : (Levels, Levels)
+        Columns of its first and last corner.
+    dtm : Dtm
+        Terrain as far beyond its triangles as `top_reach` says.
+    roof, ids, options
+        As in `mesh_adaptive`.
+
+    Returns
+    -------
+    Levels
+        A column for each vertex, with a level for every roof on either side.
+    """
+    levels = fill_columns(seam.ring, dtm, roof, ids, options)
+    return join_levels([ends[0], take_columns(levels, seam.vertex[1:-1]), ends[1]])
+
+
+def tile_columns(plane: PlaneMesh, seams: Sequence[tuple[Seam, Levels]]) -> SeamColumns:
+    """Collect the columns that a tile takes over from its seams.
+
+    Parameters
+    ----------
+    plane : PlaneMesh
+        The tile's plane mesh.
+    seams : sequence of (Seam, Levels)
+        Its seams within the region, with their columns.
+
+    Raises
+    ------
+    ValueError
+        If the mesh lacks a vertex of a seam.
+    """
+    if not seams:
+        return SeamColumns(np.empty(0, np.int32), join_levels([]))
+    levels = join_levels([columns for _, columns in seams])
+    vertex = np.concatenate([find_vertices(plane.xy, seam.xy) for seam, _ in seams])
+    vertex, first = np.unique(vertex, return_index=True)
+    return SeamColumns(vertex, take_columns(levels, first.astype(np.int32)))
+
+
+def join_levels(parts: Sequence[Levels]) -> Levels:
+    """Put the columns of several parts one after the other."""
+    count = np.concatenate([np.diff(part.start) for part in parts] or [np.empty(0, np.int64)])
+    return Levels(
+        np.concatenate(([0], np.cumsum(count))).astype(np.int64),
+        np.concatenate([part.z for part in parts] or [np.empty(0)]),
+        np.concatenate([part.surface for part in parts] or [np.empty(0)]),
+    )
+
+
+def _fan(corner: Corner) -> PlaneMesh:
+    """Triangles between a corner and the neighbouring tips."""
+    xy = np.concatenate((corner.xy[None], corner.tips))
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], np.int32)
+    triangles = triangles[~np.isnan(xy[triangles]).any(axis=(1, 2))]
+    return order_plane(xy, triangles, np.full(len(triangles), corner.building, np.int32))

@@ -1,0 +1,118 @@
+"""Seams: the common border of two tiles, its vertices and the triangles that it was found in (before step 3.1)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.mesh import PlaneMesh
+from pipeline.plane import order_plane
+from stitch.corners import Corner
+from stitch.grid import SeamKey, TileGrid, is_border
+from stitch.paths import find_path
+from stitch.strips import Strip, mesh_strip
+from stitch.walls import find_on_walls
+
+ON_WALL = 1e-6  # m; closer than that, a vertex of a strip is on the wall, but for rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Seam:
+    """Border of two tiles, or of one on the region's border.
+
+    Attributes
+    ----------
+    xy : float64, (k, 2)
+        Vertices (m) from the first corner to the last, east- or northwards.
+    wall_nodes : float64, (w, 2)
+        Those of them at which both tiles node a wall that has no vertex there.
+    border : bool
+        Whether it is a part of the region's border: then no other tile has its columns, but for the corners.
+    ring : PlaneMesh
+        The strip's triangles around its vertices; empty on the region's border.
+    vertex : int32, (k,)
+        The seam's vertices in `ring`; empty on the region's border.
+    """
+
+    xy: NDArray[np.float64]
+    wall_nodes: NDArray[np.float64]
+    border: bool
+    ring: PlaneMesh
+    vertex: NDArray[np.int32]
+
+
+def trace_seam(
+    grid: TileGrid,
+    key: SeamKey,
+    ends: tuple[Corner, Corner],
+    polygons: NDArray[np.object_],
+    walls: NDArray[np.float64],
+    *,
+    mesh_size: float,
+    min_angle: float,
+    passes: int,
+) -> Seam:
+    """Find a seam in the triangles of its strip.
+
+    Parameters and errors as in `mesh_strip` and `find_path`.
+
+    Notes
+    -----
+    Along the region's border, the seam is all vertices of the strip there. Cost is that of the strip.
+    """
+    border = is_border(grid, key)
+    strip = mesh_strip(
+        grid,
+        key,
+        ends,
+        polygons,
+        walls,
+        mesh_size=mesh_size,
+        min_angle=min_angle,
+        passes=0 if border else passes,
+    )
+    if border:
+        nothing = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))
+        xy = _border_vertices(strip, key.axis, ends)
+        return Seam(xy, np.empty((0, 2)), True, nothing, np.empty(0, np.int32))
+    path = find_path(grid, key, ends, strip)
+    xy = strip.xy[path]
+    on, _ = find_on_walls(strip.walls, xy, reach=ON_WALL)
+    around = np.isin(strip.triangles, path).any(axis=1)
+    ring = order_plane(strip.xy, strip.triangles[around], strip.building[around])
+    return Seam(xy, xy[np.unique(on)], False, ring, find_vertices(ring.xy, xy))
+
+
+def find_vertices(among: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Find places among vertices that hold each of them once, bit for bit.
+
+    Parameters
+    ----------
+    among : float64, (n, 2)
+        Vertices (m), no two alike.
+    xy : float64, (k, 2)
+        Places.
+
+    Raises
+    ------
+    ValueError
+        If a place is missing.
+
+    Examples
+    --------
+    >>> find_vertices(np.array([[0.0, 1.0], [0.0, 2.0]]), np.array([[0.0, 2.0]]))
+    array([1], dtype=int32)
+    """
+    both = np.concatenate((among, xy))
+    _, first, group = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    row = first[group.reshape(-1)[len(among) :]]
+    if (row >= len(among)).any():
+        x, y = both[row[row >= len(among)][0]]
+        raise ValueError(f"the mesh has no vertex at ({x}, {y})")
+    return row.astype(np.int32)
+
+
+def _border_vertices(strip: Strip, axis: int, ends: tuple[Corner, Corner]) -> NDArray[np.float64]:
+    low, high = ends[0].xy, ends[1].xy
+    on = np.flatnonzero(((strip.xy >= low) & (strip.xy <= high)).all(axis=1))
+    return strip.xy[on[np.argsort(strip.xy[on, axis], kind="stable")]]
