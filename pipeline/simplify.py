@@ -35,6 +35,7 @@ from pipeline.pointcloud import PointCloud
 from pipeline.roof_points import locate_roof_points
 from pipeline.terrain import Dtm
 
+KEPT = 0.5  # a house that keeps less of its area than this is simplified again by its closed outline
 COVERED = 0.5  # a house without a face is not lost if others cover this part of it
 CHANGED = 0.3  # of a house's area: an outline that gained and lost more is told
 SETTLE_ROUNDS = 20  # of grouping roofs and raising them over terrain, in turn
@@ -127,13 +128,7 @@ def _planar_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, 
                 building_class=has_building_class(cloud),
             )
     with trace("2.1 planar city model"):
-        planar = simplify_planar(
-            parts.polygons,
-            clearance=options.clearance,
-            min_area=options.min_building_area,
-            min_courtyard_area=options.min_courtyard_area,
-            manifold=options.manifold,
-        )
+        planar, closed = _simplify_or_close(parts.polygons, options)
     with trace("2.3 building heights"):
         row = parts.house[planar.house]
         ids, house = _name_parts(model.ids, row)
@@ -162,9 +157,63 @@ def _planar_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, 
         *note_heights("building", footprints, heights),
         *_note_raised(footprints, heights, roof, raised),
         *_note_outlines(city, planar, row, outline.house_error),
+        *_note_closed(model.ids, model.polygons, parts.house[closed]),
     )
     counts = {**city.counts, **_count(planar, parts, settled)}
     return replace(settled, notes=notes, counts=counts, outline=_describe_outline(outline))
+
+
+def _simplify_or_close(
+    polygons: NDArray[np.object_], options: CityOptions
+) -> tuple[PlanarCity, NDArray[np.int64]]:
+    """Simplify; where a house loses most of itself, as a comb of thin walls does, take its closed outline.
+
+    Returns the city and the rows of the polygons that were closed. Other clusters come out as before, to the bit.
+    """
+
+    def simplify(shapes: NDArray[np.object_]) -> PlanarCity:
+        return simplify_planar(
+            shapes,
+            clearance=options.clearance,
+            min_area=options.min_building_area,
+            min_courtyard_area=options.min_courtyard_area,
+            manifold=options.manifold,
+        )
+
+    planar = simplify(polygons)
+    area = shapely.area(polygons)
+    kept = shapely.area(shapely.intersection(planar.polygons, polygons[planar.house]))
+    share = np.bincount(planar.house, kept, len(polygons)) / area
+    built = shapely.union_all(planar.polygons)
+    poor = np.flatnonzero(share < KEPT)
+    poor = poor[shapely.area(shapely.intersection(polygons[poor], built)) < KEPT * area[poor]]
+    outlines = close_outlines(polygons[poor], options.clearance)
+    # A wall without width stays one: closing helps only where there is something between the walls.
+    helps = shapely.area(outlines) > 1.2 * area[poor]
+    if not helps.any():
+        return planar, poor[:0]
+    shapes = polygons.copy()
+    shapes[poor[helps]] = outlines[helps]
+    return simplify(shapes), poor[helps]
+
+
+def close_outlines(polygons: NDArray[np.object_], clearance: float) -> NDArray[np.object_]:
+    """Fill the gaps of each polygon that are narrower than twice the clearance.
+
+    Examples
+    --------
+    >>> slot = shapely.box(0, 0, 10, 10) - shapely.box(4, 2, 5, 10)
+    >>> shapely.area(close_outlines(np.array([slot], dtype=object), 1.0))
+    array([100.])
+    """
+    grown = shapely.buffer(polygons, clearance, join_style="mitre")
+    shrunk = shapely.buffer(grown, -clearance, join_style="mitre")
+    closed = polygons.copy()
+    for row, shape in enumerate(shrunk):
+        parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon" and part.area > 0]
+        if parts:
+            closed[row] = shapely.normalize(max(parts, key=lambda part: float(part.area)))
+    return closed
 
 
 def _split(polygons: NDArray[np.object_], cloud: PointCloud, options: CityOptions) -> HouseParts:
@@ -211,6 +260,16 @@ def _note_outlines(
     for k, place in find_places(footprints, changed):
         notes.append(Note("building-outline-changed", *place, f"by {error[k]:.1f} m2 of {area[k]:.1f} m2"))
     return notes
+
+
+def _note_closed(ids: NDArray[np.str_], polygons: NDArray[np.object_], rows: NDArray[np.int64]) -> list[Note]:
+    """Tell of the houses that were simplified by their closed outline."""
+    chosen = np.zeros(len(ids), np.bool_)
+    chosen[rows] = True
+    places = find_places(Footprints(polygons, ids, np.zeros(len(ids))), chosen)
+    return [
+        Note("building-outline-closed", *place, "its walls are closer than the clearance") for _, place in places
+    ]
 
 
 def _note_raised(

@@ -341,6 +341,11 @@ def text_footprints(city: Path) -> None:
     (city / "footprints.gpkg").write_text("hello")
 
 
+def astray_point(city: Path) -> None:
+    cloud = cloud_over(BOUNDS, [(HOUSE, 10.0)], ground=2.0)
+    write_las(city / "west.laz", np.vstack((cloud.xyz, [[918000.0, 6399000.0, 3.0]])), 2)
+
+
 def nothing(_: Path) -> None:
     """Leave the city as it is."""
 
@@ -350,6 +355,7 @@ CASES: list[tuple[str, Callable[[Path], None], list[str], int, str]] = [
     ("truncated", truncated, [], 1, "west.laz"),
     ("damaged inside", without_its_end, [], 1, "west.laz"),
     ("NaN in header", absurd_header, [], 1, "west.laz"),
+    ("a point astray", astray_point, [], 1, "west.laz: its header spans 600 km"),
     ("no points", no_points, [], 1, "hold no point"),
     ("text for a cloud", text_cloud, [], 1, "west.laz"),
     ("missing footprints", lambda city: (city / "footprints.gpkg").unlink(), [], 1, "footprints.gpkg"),

@@ -101,6 +101,18 @@ def test_a_house_within_another_is_covered_not_lost() -> None:
     assert "building-lost" not in count_notes(city.notes)
 
 
+def test_a_comb_of_thin_walls_keeps_its_outline() -> None:
+    back = shapely.box(1020, 2020, 1060, 2021)
+    teeth = [shapely.box(1020 + 1.6 * k, 2020, 1020.8 + 1.6 * k, 2050) for k in range(25)]
+    comb = shapely.union_all([back, *teeth])
+    cloud = cloud_over(BOUNDS, [(comb, 12.0)])
+    city = planar_city(footprints_of(comb), cloud)
+    hull = comb.convex_hull
+    assert shapely.area(city.model.polygons).sum() == pytest.approx(hull.area, rel=0.1)
+    assert count_notes(city.notes)["building-outline-closed"] == 1
+    assert city.outline["min_clearance"] >= 1.0
+
+
 def test_names_of_parts_are_free_names() -> None:
     house, other = shapely.box(1020, 2020, 1050, 2040), shapely.box(1060, 2060, 1080, 2080)
     tall, low = shapely.box(1020, 2020, 1038, 2040), shapely.box(1038, 2020, 1050, 2040)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pipeline.errors import ConfigError, InputError
 from tiler.clouds import CloudHeader
 
+ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray points
+
 Bounds = tuple[float, float, float, float]
 
 
@@ -67,8 +69,10 @@ def describe_overhang(bounds: Bounds, clouds: Sequence[CloudHeader]) -> list[str
     return [f"the region reaches beyond the point clouds ({sides}); terrain is carried on there"] if sides else []
 
 
-def check_region(region: Region, mesh_size: float) -> None:
+def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]) -> None:
     """Refuse a region that is smaller than a cell or larger than a tile.
+
+    A single file that is much larger than a tile is named: a few astray points make its extent absurd.
 
     Raises
     ------
@@ -81,6 +85,13 @@ def check_region(region: Region, mesh_size: float) -> None:
             f"region {_words(region.bounds)}: {width:g} x {height:g} m is smaller than one cell of "
             f"{mesh_size:g} m; lower --mesh-size or give larger --bounds"
         )
+    for cloud in clouds:
+        span = max(cloud.bounds[2] - cloud.bounds[0], cloud.bounds[3] - cloud.bounds[1])
+        if cloud.n_points and span > ASTRAY_TILES * region.tile_size and max(width, height) > region.tile_size:
+            raise InputError(
+                f"{cloud.path}: its header spans {span / 1000:.0f} km, more than {ASTRAY_TILES} tiles of "
+                f"{region.tile_size:g} m; if points lie astray in it, give --bounds around the others"
+            )
     if max(width, height) > region.tile_size:
         raise ConfigError(
             f"region {_words(region.bounds)}: {width:g} x {height:g} m does not fit into one tile of "

@@ -113,7 +113,7 @@ def _plan(config: Config, say: Callable[[str], None]) -> _Plan:
     region = Region(
         choose_bounds(config.bounds, headers), f"EPSG:{code}" if code else crs.to_wkt(), config.tile_size
     )
-    check_region(region, config.mesh_size)
+    check_region(region, config.mesh_size, headers)
     messages += [*describe_overhang(region.bounds, headers), *idle_parameters(config)]
     if not config.footprints:
         messages.append("no footprints given: the mesh has terrain only")
