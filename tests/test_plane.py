@@ -8,7 +8,7 @@ from shapely import affinity
 from pipeline import plane as plane_room
 from pipeline.errors import GeometryError
 from pipeline.mesh import PlaneMesh
-from pipeline.plane import mesh_plane, plane_graph, signed_areas, triangulate_plane
+from pipeline.plane import collect_graph, mesh_plane, plane_graph, signed_areas, triangulate_plane
 from tests.cities import city_of, crowded_blocks, random_blocks
 
 BOUNDS = (318000.0, 6399000.0, 318200.0, 6399150.0)
@@ -116,3 +116,15 @@ def test_what_triangle_cannot_take_is_one_error() -> None:
     graph = plane_room.PlaneGraph(np.zeros((1, 2)), np.zeros((0, 2), np.int32), np.zeros((0, 2)))
     with pytest.raises(GeometryError, match=r"step 3\.1: the 2D mesher failed"):
         triangulate_plane(graph, max_area=1.0)
+
+
+def test_a_graph_across_zero_returns_bit_for_bit_and_a_frozen_border_is_not_split() -> None:
+    ring = np.array([(-1000.3, -0.7), (77.123456789, -0.1), (77.3, 40.000000001), (-1000.1, 40.3)])
+    graph = collect_graph(np.stack((ring, np.roll(ring, -1, axis=0)), axis=1), np.empty((0, 2)))
+    xy, triangles, label, complete = triangulate_plane(graph, max_area=50.0, frozen=True)
+    assert complete
+    assert xy[:4].tobytes() == graph.xy.tobytes()
+    assert (label == -1).all()
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    assert np.array_equal(unique[count == 1], graph.segments)

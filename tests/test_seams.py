@@ -239,3 +239,25 @@ def test_no_way_through_is_an_error_with_its_place(monkeypatch: pytest.MonkeyPat
 def test_what_a_seam_lacks_is_refused() -> None:
     with pytest.raises(ValueError, match=r"no vertex at \(1\.0, 5\.0\)"):
         find_vertices(np.zeros((1, 2)), np.array([[1.0, 5.0]]))
+
+
+def test_corners_on_the_border_of_a_narrow_region_stay_close() -> None:
+    bounds = (0.0, 0.0, 600.0, 24.0)
+    grid = make_grid(bounds, tile_size=140.0, mesh_size=10.0)
+    house = np.array([shapely.box(130, 2, 150, 22)])
+    corner = place_corner(grid, Key(1, 0), house, cut_walls(house, mesh_size=10.0), mesh_size=10.0)
+    # A sixth of the 24 m to the corner across, and a quarter of them for the first edges.
+    assert abs(corner.xy[0] - 140) <= 4
+    none = np.empty(0, object)
+    lone = place_corner(grid, Key(1, 0), none, cut_walls(none, mesh_size=10.0), mesh_size=10.0)
+    assert lone.tips[:3].tolist() == [[146, 0], [140, 6], [134, 0]]
+
+
+def test_a_seam_takes_a_detour_before_it_cuts_a_house() -> None:
+    house = np.array([shapely.box(208, 95, 212, 168)])
+    walls = cut_walls(house, mesh_size=10.0)
+    ends = tuple(place_corner(NINE, key, house, walls, mesh_size=10.0) for key in (Key(1, 1), Key(2, 1)))
+    seam = trace_seam(
+        NINE, SeamKey(0, 1, 1), (ends[0], ends[1]), house, walls, mesh_size=10.0, min_angle=28.0, passes=4
+    )
+    assert not shapely.intersects(shapely.LineString(seam.xy), house[0])
