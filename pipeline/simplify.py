@@ -184,8 +184,10 @@ def _simplify_or_close(
     area = shapely.area(polygons)
     kept = shapely.area(shapely.intersection(planar.polygons, polygons[planar.house]))
     share = np.bincount(planar.house, kept, len(polygons)) / area
-    built = shapely.union_all(planar.polygons)
     poor = np.flatnonzero(share < KEPT)
+    if len(poor) == 0:
+        return planar, poor
+    built = shapely.union_all(planar.polygons)
     poor = poor[shapely.area(shapely.intersection(polygons[poor], built)) < KEPT * area[poor]]
     outlines = close_outlines(polygons[poor], options.clearance)
     # A wall without width stays one: closing helps only where there is something between the walls.
