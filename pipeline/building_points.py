@@ -1,6 +1,8 @@
 """Step 1.5: roof and ground points of each building."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -139,6 +141,18 @@ def take_building_points(points: BuildingPoints, rows: NDArray[np.int64]) -> Bui
     """Take the points of some buildings, in the order of `rows`, int64 (k,), which may repeat."""
     roof = _take(points.roof_start, points.roof_z, rows)
     return BuildingPoints(*roof, *_take(points.ground_start, points.ground_z, rows))
+
+
+def join_building_points(several: Sequence[BuildingPoints]) -> BuildingPoints:
+    """Put the points of the buildings of several lists one after the other."""
+
+    def joined(start: list[NDArray[np.int64]], z: list[NDArray[np.float64]]) -> tuple[Any, Any]:
+        count = np.concatenate([np.empty(0, np.int64), *(np.diff(one) for one in start)])
+        return np.concatenate(([0], np.cumsum(count))), np.concatenate([np.empty(0), *z])
+
+    roof = joined([points.roof_start for points in several], [points.roof_z for points in several])
+    ground = joined([points.ground_start for points in several], [points.ground_z for points in several])
+    return BuildingPoints(*roof, *ground)
 
 
 def _take(

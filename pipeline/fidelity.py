@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipeline.graph import MILLIMETRES, WallGraph, find_close, find_crossings, make_graph
-from pipeline.planar import PlanarCity
 
 # Clearances above this (m) are not measured: walls are as good as apart.
 FARTHEST = 5.0
@@ -46,35 +45,39 @@ class Fidelity:
     sharpest: float
 
 
-def measure_simplification(originals: NDArray[np.object_], city: PlanarCity) -> Fidelity:
+def measure_simplification(
+    originals: NDArray[np.object_], polygons: NDArray[np.object_], house: NDArray[np.int64]
+) -> Fidelity:
     """Measure a simplified city against the footprints that it was made of, from its polygons alone.
 
     Parameters
     ----------
     originals : object, (n,)
         shapely Polygons (m).
-    city : PlanarCity
-        Their simplification.
+    polygons : object, (k,)
+        Their simplification: faces that share walls vertex by vertex (m).
+    house : int64, (k,)
+        Row of the original that each belongs to.
 
     Examples
     --------
     >>> from pipeline.planar import simplify_planar
     >>> pair = np.array([shapely.box(0, 0, 4, 4), shapely.box(4.4, 0, 9, 4)])
     >>> city = simplify_planar(pair, clearance=0.5, min_area=5.0, min_courtyard_area=5.0)
-    >>> found = measure_simplification(pair, city)
+    >>> found = measure_simplification(pair, city.polygons, city.house)
     >>> found.house_error.round(3).tolist(), found.min_clearance, found.n_walls
     ([1.6, 0.0], 4.0, 7)
     """
     area = shapely.area(originals)
-    kept = shapely.area(shapely.intersection(city.polygons, originals[city.house]))
-    change = shapely.area(city.polygons) - 2 * kept
-    error = area + np.bincount(city.house, change, len(originals))
-    walls, outer = _collect_walls(city.polygons)
+    kept = shapely.area(shapely.intersection(polygons, originals[house]))
+    change = shapely.area(polygons) - 2 * kept
+    error = area + np.bincount(house, change, len(originals))
+    walls, outer = _collect_walls(polygons)
     ends = np.bincount(walls.edges[outer].reshape(-1), minlength=len(walls.xy))
     return Fidelity(
         house_error=error,
         area_error=float(error.sum() / area.sum()) if len(area) else 0.0,
-        lost=tuple(np.setdiff1d(np.arange(len(originals)), city.house).tolist()),
+        lost=tuple(np.setdiff1d(np.arange(len(originals)), house).tolist()),
         min_clearance=_measure_clearance(walls) / MILLIMETRES,
         corner_touches=int((ends > 2).sum()),
         n_walls=len(walls.edges),

@@ -128,19 +128,35 @@ def simplify_planar(
     0 POLYGON ((0 0, 4.3 0, 4.3 4, 0 4, 0 0))
     1 POLYGON ((4.3 0, 9 0, 9 4, 4.3 4, 4.3 0))
     """
-    _check(polygons, clearance, chain_tolerance, min_area, min_courtyard_area)
-    canonical = make_canonical(polygons)
-    order = sort_canonically(canonical)
-    rules = Rules(
-        clearance * MILLIMETRES,
-        chain_tolerance * MILLIMETRES,
-        min_area * MILLIMETRES**2,
-        min_courtyard_area * MILLIMETRES**2,
-        manifold,
-    )
-    houses = shapely.transform(canonical[order], lambda xy: xy * MILLIMETRES)
+    houses, order, rules = _prepare(polygons, clearance, chain_tolerance, min_area, min_courtyard_area, manifold)
     shaped, cluster, counts = _shape_all(houses, rules)
     return _finish(shaped, cluster, counts, order, polygons)
+
+
+def shape_planar(
+    polygons: NDArray[np.object_],
+    cluster: NDArray[np.int64],
+    *,
+    clearance: float = CLEARANCE,
+    chain_tolerance: float = CHAIN_TOLERANCE,
+    min_area: float,
+    min_courtyard_area: float,
+    manifold: bool = False,
+) -> PlanarCity:
+    """Give all walls of each cluster a least distance, whatever the distance of clusters.
+
+    Parameters
+    ----------
+    polygons : object, (n,)
+        As in `simplify_planar`.
+    cluster : int64, (n,)
+        Their clusters, numbered from 0 to at most ``n - 1``.
+    clearance, chain_tolerance, min_area, min_courtyard_area, manifold
+        As in `simplify_planar`, and so are errors and the result of each cluster.
+    """
+    houses, order, rules = _prepare(polygons, clearance, chain_tolerance, min_area, min_courtyard_area, manifold)
+    shaped, counts = shape_clusters(houses, cluster[order], rules)
+    return _finish(shaped, cluster[order], counts, order, polygons)
 
 
 def find_clusters(polygons: NDArray[np.object_], clearance: float) -> NDArray[np.int64]:
@@ -160,6 +176,28 @@ def find_clusters(polygons: NDArray[np.object_], clearance: float) -> NDArray[np
     """
     i, j = _find_close_pairs(polygons, clearance)
     return _chain(len(polygons), i, j)
+
+
+def _prepare(
+    polygons: NDArray[np.object_],
+    clearance: float,
+    chain_tolerance: float,
+    min_area: float,
+    min_courtyard_area: float,
+    manifold: bool,
+) -> tuple[NDArray[np.object_], NDArray[np.int64], Rules]:
+    """Check the input; put it in canonical order and into millimetres."""
+    _check(polygons, clearance, chain_tolerance, min_area, min_courtyard_area)
+    canonical = make_canonical(polygons)
+    order = sort_canonically(canonical)
+    rules = Rules(
+        clearance * MILLIMETRES,
+        chain_tolerance * MILLIMETRES,
+        min_area * MILLIMETRES**2,
+        min_courtyard_area * MILLIMETRES**2,
+        manifold,
+    )
+    return shapely.transform(canonical[order], lambda xy: xy * MILLIMETRES), order, rules
 
 
 def _shape_all(houses: NDArray[np.object_], rules: Rules) -> tuple[Shaped, NDArray[np.int64], Counter[str]]:

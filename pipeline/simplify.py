@@ -1,18 +1,13 @@
 """Step 2 composed: the city model simplified, the paper's way or as a planar city model."""
 
-from collections.abc import Sequence
+from collections.abc import Set
 from dataclasses import replace
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_points import (
-    extract_building_points,
-    has_building_class,
-    merge_building_points,
-    take_building_points,
-)
+from pipeline.building_points import merge_building_points, take_building_points
 from pipeline.city import (
     City,
     CityOptions,
@@ -24,42 +19,82 @@ from pipeline.city import (
     note_heights,
 )
 from pipeline.citymodel import Footprints
+from pipeline.clusters import Shapes, simplify_houses
 from pipeline.fidelity import Fidelity, measure_simplification
 from pipeline.groups import adjacent_houses, group_roofs
 from pipeline.heights import Heights, highest_wall_ground, raise_low_roofs
-from pipeline.house_levels import HouseParts, LevelOptions, split_levels
-from pipeline.merge import merge_footprints
+from pipeline.houses import Houses, divide_houses
 from pipeline.notes import Note
-from pipeline.planar import PlanarCity, simplify_planar
 from pipeline.pointcloud import PointCloud
-from pipeline.roof_points import locate_roof_points
 from pipeline.terrain import Dtm
 
-KEPT = 0.5  # a house that keeps less of its area than this is simplified again by its closed outline
 COVERED = 0.5  # a house without a face is not lost if others cover this part of it
 CHANGED = 0.3  # of a house's area: an outline that gained and lost more is told
 SETTLE_ROUNDS = 20  # of grouping roofs and raising them over terrain, in turn
 
 
 def simplify_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, trace: Trace = no_trace) -> City:
-    """Simplify the city model so that it can be meshed (steps 2.1 to 2.3).
+    """Simplify the city model so that it can be meshed (steps 2.1 to 2.3), in memory.
 
     Parameters
     ----------
     city : City
         Result of `build_city`.
     cloud : PointCloud
-        Points of the tile and its halo.
+        Points of the houses and `ground_margin` around them.
     dtm : Dtm
         Terrain.
     options : CityOptions
         Parameters; `simplify` chooses the way.
     trace : callable, optional
         Context manager around each step.
+
+    Notes
+    -----
+    The tiles of a region take the same steps, cluster by cluster, and get the same model.
     """
-    if options.simplify == "paper":
-        return _merge_city(city, dtm, options, trace)
-    return _planar_city(city, cloud, dtm, options, trace)
+    with trace("2.0 split levels"):
+        houses = divide_houses(city, cloud, options)
+    with trace("2.1 simplify"):
+        shapes = simplify_houses(houses.parts, houses.polygons, options)
+    simple = raise_buildings(houses, shapes, dtm, options, reserved=set(city.model.ids.tolist()), trace=trace)
+    return replace(simple, notes=(*city.notes, *simple.notes), counts={**city.counts, **simple.counts})
+
+
+def raise_buildings(
+    houses: Houses,
+    shapes: Shapes,
+    dtm: Dtm,
+    options: CityOptions,
+    *,
+    reserved: Set[str],
+    trace: Trace = no_trace,
+) -> City:
+    """Give the buildings of whole clusters their ids and heights (step 2.3).
+
+    Parameters
+    ----------
+    houses : Houses
+        The houses of these clusters.
+    shapes : Shapes
+        The clusters simplified; members are rows of the houses' parts.
+    dtm : Dtm
+        Terrain.
+    options : CityOptions
+        Parameters.
+    reserved : set of str
+        Ids that no part of a house may get: at least those of all houses that look like one of a part.
+    trace : callable, optional
+        Context manager around each step.
+
+    Notes
+    -----
+    What comes out of a cluster depends on its houses and the terrain at their walls alone.
+    """
+    with trace("2.3 building heights"):
+        if options.simplify == "paper":
+            return _raise_merged(houses, shapes, dtm, options)
+        return _raise_planar(houses, shapes, dtm, options, reserved)
 
 
 def settle_roofs(
@@ -113,146 +148,85 @@ def settle_roofs(
     return roof, group
 
 
-def _planar_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, trace: Trace) -> City:
-    """Simplify as one planar graph of walls; every house keeps its own faces, points and height."""
-    model = city.model
-    parts = HouseParts(model.polygons, np.arange(len(model)))
-    points = city.points
-    if options.split_levels and len(model):
-        with trace("2.0 split levels"):
-            parts = _split(model.polygons, cloud, options)
-            points = extract_building_points(
-                cloud,
-                parts.polygons,
-                margin=options.ground_margin,
-                building_class=has_building_class(cloud),
-            )
-    with trace("2.1 planar city model"):
-        planar, closed = _simplify_or_close(parts.polygons, options)
-    with trace("2.3 building heights"):
-        row = parts.house[planar.house]
-        ids, house = _name_parts(model.ids, row)
-        footprints = Footprints(planar.polygons, ids, city.given_height[row])
-        face_points = take_building_points(points, planar.house)
-        heights = measure_heights(face_points, planar.polygons, dtm, footprints.given_height, options)
-        wall_ground = highest_wall_ground(planar.polygons, dtm)
-        roof, group = settle_roofs(
-            heights.roof,
-            shapely.area(planar.polygons),
-            wall_ground,
-            adjacent_houses(planar.polygons),
-            key=ids,
+def _raise_planar(houses: Houses, shapes: Shapes, dtm: Dtm, options: CityOptions, reserved: Set[str]) -> City:
+    """Every house keeps its own faces, points and height; neighbours of nearly equal height get one roof."""
+    row = houses.parts.house[shapes.member]
+    ids = _name_parts(houses.ids, row, reserved)
+    footprints = Footprints(shapes.polygons, ids, houses.given_height[row])
+    points = take_building_points(houses.points, shapes.member)
+    heights = measure_heights(points, shapes.polygons, dtm, footprints.given_height, options)
+    wall_ground = highest_wall_ground(shapes.polygons, dtm)
+    roof, group = _settle_clusters(shapes, heights, wall_ground, ids, options)
+    members = tuple((str(houses.ids[k]),) for k in row)
+    city = assemble_city(
+        footprints, points, heights, members, wall_ground, roof=roof, house=houses.ids[row], group=group
+    )
+    outline = measure_simplification(houses.polygons, shapes.polygons, row)
+    raised = wall_ground + options.roof_clearance > heights.roof
+    notes = (
+        *note_heights("building", footprints, heights),
+        *_note_raised(footprints, heights, roof, raised),
+        *_note_outlines(houses, shapes.polygons, row, outline.house_error),
+        *_note_closed(houses, houses.parts.house[shapes.closed[:, 0]]),
+    )
+    counts = {**shapes.counts, **_count(houses, city)}
+    return replace(city, notes=notes, counts=counts, outline=_describe_outline(outline, houses))
+
+
+def _settle_clusters(
+    shapes: Shapes, heights: Heights, wall_ground: NDArray[np.float64], ids: NDArray[np.str_], options: CityOptions
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Settle the roofs of each cluster by themselves; groups are numbered through."""
+    pairs = adjacent_houses(shapes.polygons)
+    area = shapely.area(shapes.polygons)
+    roof, group, n_groups = heights.roof.copy(), np.zeros(len(ids), np.int32), 0
+    order = np.argsort(shapes.cluster, kind="stable")
+    number = np.empty(len(order), np.int64)
+    for rows in np.split(order, np.flatnonzero(np.diff(shapes.cluster[order])) + 1) if len(order) else []:
+        number[rows] = np.arange(len(rows))
+        mine = pairs[np.isin(pairs[:, 0], rows)]
+        roof[rows], found = settle_roofs(
+            heights.roof[rows],
+            area[rows],
+            wall_ground[rows],
+            number[mine],
+            key=ids[rows],
             threshold=options.roof_group,
             clearance=options.roof_clearance,
         )
-        members = tuple(model.members[k] for k in row)
-        settled = assemble_city(
-            footprints, face_points, heights, members, wall_ground, roof=roof, house=house, group=group
-        )
-    with trace("2.3 outline errors"):
-        outline = measure_simplification(model.polygons, replace(planar, house=row))
-    raised = wall_ground + options.roof_clearance > heights.roof
-    notes = (
-        *city.notes,
-        *note_heights("building", footprints, heights),
-        *_note_raised(footprints, heights, roof, raised),
-        *_note_outlines(city, planar, row, outline.house_error),
-        *_note_closed(model.ids, model.polygons, parts.house[closed]),
-    )
-    counts = {**city.counts, **_count(planar, parts, settled)}
-    return replace(settled, notes=notes, counts=counts, outline=_describe_outline(outline))
+        group[rows] = found + n_groups
+        n_groups += int(found.max(initial=-1)) + 1
+    return roof, group
 
 
-def _simplify_or_close(
-    polygons: NDArray[np.object_], options: CityOptions
-) -> tuple[PlanarCity, NDArray[np.int64]]:
-    """Simplify; where a house loses most of itself, as a comb of thin walls does, take its closed outline.
-
-    Returns the city and the rows of the polygons that were closed. Other clusters come out as before, to the bit.
-    """
-
-    def simplify(shapes: NDArray[np.object_]) -> PlanarCity:
-        return simplify_planar(
-            shapes,
-            clearance=options.clearance,
-            min_area=options.min_building_area,
-            min_courtyard_area=options.min_courtyard_area,
-            manifold=options.manifold,
-        )
-
-    planar = simplify(polygons)
-    area = shapely.area(polygons)
-    kept = shapely.area(shapely.intersection(planar.polygons, polygons[planar.house]))
-    share = np.bincount(planar.house, kept, len(polygons)) / area
-    poor = np.flatnonzero(share < KEPT)
-    if len(poor) == 0:
-        return planar, poor
-    built = shapely.union_all(planar.polygons)
-    poor = poor[shapely.area(shapely.intersection(polygons[poor], built)) < KEPT * area[poor]]
-    outlines = close_outlines(polygons[poor], options.clearance)
-    # A wall without width stays one: closing helps only where there is something between the walls.
-    helps = shapely.area(outlines) > 1.2 * area[poor]
-    if not helps.any():
-        return planar, poor[:0]
-    shapes = polygons.copy()
-    shapes[poor[helps]] = outlines[helps]
-    return simplify(shapes), poor[helps]
-
-
-def close_outlines(polygons: NDArray[np.object_], clearance: float) -> NDArray[np.object_]:
-    """Fill the gaps of each polygon that are narrower than twice the clearance.
-
-    Examples
-    --------
-    >>> slot = shapely.box(0, 0, 10, 10) - shapely.box(4, 2, 5, 10)
-    >>> shapely.area(close_outlines(np.array([slot], dtype=object), 1.0))
-    array([100.])
-    """
-    grown = shapely.buffer(polygons, clearance, join_style="mitre")
-    shrunk = shapely.buffer(grown, -clearance, join_style="mitre")
-    closed = polygons.copy()
-    for row, shape in enumerate(shrunk):
-        parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon" and part.area > 0]
-        if parts:
-            closed[row] = shapely.normalize(max(parts, key=lambda part: float(part.area)))
-    return closed
-
-
-def _split(polygons: NDArray[np.object_], cloud: PointCloud, options: CityOptions) -> HouseParts:
-    points = locate_roof_points(cloud, polygons, building_class=has_building_class(cloud))
-    return split_levels(polygons, points, LevelOptions(clearance=options.clearance))
-
-
-def _name_parts(ids: NDArray[np.str_], row: NDArray[np.int64]) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
-    """Ids of faces, and the houses that they belong to; a house of several has numbered parts."""
-    house = ids[row]
+def _name_parts(ids: NDArray[np.str_], row: NDArray[np.int64], reserved: Set[str]) -> NDArray[np.str_]:
+    """Ids of faces; those of a house of several are numbered, reserved names left out."""
     count = np.bincount(row, minlength=len(ids))
     seen = np.zeros(len(ids), np.int64)
-    taken = set(ids.tolist())
     names = []
-    for k, name in zip(row.tolist(), house.tolist(), strict=True):
+    for k in row.tolist():
         seen[k] += 1
+        name = str(ids[k])
         part = name if count[k] == 1 else f"{name}-part{seen[k]}"
-        while count[k] > 1 and part in taken:
+        while count[k] > 1 and part in reserved:
             part += "-"
-        taken.add(part)
         names.append(part)
-    return np.array(names, dtype=np.str_), house
+    return np.array(names, dtype=np.str_)
 
 
 def _note_outlines(
-    city: City, planar: PlanarCity, row: NDArray[np.int64], error: NDArray[np.float64]
+    houses: Houses, built: NDArray[np.object_], row: NDArray[np.int64], error: NDArray[np.float64]
 ) -> list[Note]:
     """Tell of the houses that have no face any more, and of those whose outline changed much."""
-    polygons, ids = city.model.polygons, city.model.ids
+    polygons = houses.polygons
     area = shapely.area(polygons)
-    gone = np.ones(len(ids), np.bool_)
+    gone = np.ones(len(houses), np.bool_)
     gone[row] = False
-    footprints = Footprints(polygons, ids, area)
-    built = shapely.STRtree(planar.polygons)
+    footprints = Footprints(polygons, houses.ids, area)
+    tree = shapely.STRtree(built)
     notes = []
     for k, place in find_places(footprints, gone):
-        over = planar.polygons[built.query(polygons[k], predicate="intersects")]
+        over = built[tree.query(polygons[k], predicate="intersects")]
         covered = float(shapely.area(shapely.intersection(over, polygons[k])).sum())
         if covered >= COVERED * area[k]:
             notes.append(Note("building-covered-by-others", *place, f"{covered:.1f} of {area[k]:.1f} m2"))
@@ -264,11 +238,11 @@ def _note_outlines(
     return notes
 
 
-def _note_closed(ids: NDArray[np.str_], polygons: NDArray[np.object_], rows: NDArray[np.int64]) -> list[Note]:
+def _note_closed(houses: Houses, rows: NDArray[np.int64]) -> list[Note]:
     """Tell of the houses that were simplified by their closed outline."""
-    chosen = np.zeros(len(ids), np.bool_)
+    chosen = np.zeros(len(houses), np.bool_)
     chosen[rows] = True
-    places = find_places(Footprints(polygons, ids, np.zeros(len(ids))), chosen)
+    places = find_places(Footprints(houses.polygons, houses.ids, houses.given_height), chosen)
     return [
         Note("building-outline-closed", *place, "its walls are closer than the clearance") for _, place in places
     ]
@@ -284,59 +258,46 @@ def _note_raised(
     ]
 
 
-def _count(planar: PlanarCity, parts: HouseParts, city: City) -> dict[str, int]:
+def _count(houses: Houses, city: City) -> dict[str, int]:
     moved = np.abs(city.model.roof - city.measured_roof)
-    return {f"planar {how}": n for how, n in planar.counts.items()} | {
-        "houses split": int((np.bincount(parts.house) > 1).sum()) if len(parts.house) else 0,
+    return {
+        "houses split": int((np.bincount(houses.parts.house, minlength=1) > 1).sum()),
         "roof groups": len(np.unique(city.group)),
         "roofs moved by more than 1 m": int((moved > 1).sum()),
     }
 
 
-def _describe_outline(found: Fidelity) -> dict[str, float]:
-    values = {"area_error": found.area_error, "min_clearance": found.min_clearance, "sharpest": found.sharpest}
+def _describe_outline(found: Fidelity, houses: Houses) -> dict[str, float]:
+    """Area errors with their sums, so that those of several tiles can be joined."""
+    values = {
+        "area_error": found.area_error,
+        "min_clearance": found.min_clearance,
+        "sharpest": found.sharpest,
+        "area": float(shapely.area(houses.polygons).sum()),
+        "changed_area": float(found.house_error.sum()),
+    }
     return {name: round(value, 6) for name, value in values.items() if np.isfinite(value)}
 
 
-def _merge_city(city: City, dtm: Dtm, options: CityOptions, trace: Trace) -> City:
-    """Merge close buildings (paper, Algorithms 1-3).
+def _raise_merged(houses: Houses, shapes: Shapes, dtm: Dtm, options: CityOptions) -> City:
+    """Heights of merged buildings (paper, step 2.3).
 
     A merged building has the id of its largest member, ties to the smaller id; its points are those of all
     members, its given height the members' mean, weighted by area.
     """
-    model = city.model
-    with trace("2.1 merge footprints"):
-        merged = merge_footprints(
-            model.polygons,
-            clearance=options.clearance,
-            min_hole_area=options.min_courtyard_area,
-            floor=options.clearance_floor,
-            tolerance=options.vertex_tolerance,
-        )
-    with trace("2.3 building heights"):
-        area = shapely.area(model.polygons)
-        leader = np.array([_leader(group, area, model.ids) for group in merged.members], np.int64)
-        given = np.array([_mean_height(city.given_height[group], area[group]) for group in merged.members])
-        footprints = Footprints(merged.polygons, model.ids[leader], given.reshape(-1))
-        points = merge_building_points(city.points, merged.members)
-        heights = measure_heights(points, merged.polygons, dtm, footprints.given_height, options)
-        wall_ground = highest_wall_ground(merged.polygons, dtm)
-        roof, raised = raise_low_roofs(heights.roof, wall_ground, clearance=options.roof_clearance)
-        members = _join_members(model.members, merged.members)
-        simplified = assemble_city(footprints, points, heights, members, wall_ground, roof=roof)
-    counts = {**city.counts, **{f"merge {how}": n for how, n in sorted(merged.counts.items())}}
-    notes = (
-        *city.notes,
-        *note_heights("building", footprints, heights),
-        *_note_raised(footprints, heights, roof, raised),
-    )
-    return replace(simplified, notes=notes, counts=counts)
-
-
-def _join_members(
-    names: Sequence[tuple[str, ...]], groups: Sequence[NDArray[np.int64]]
-) -> tuple[tuple[str, ...], ...]:
-    return tuple(tuple(sorted(name for row in group for name in names[row])) for group in groups)
+    members = tuple(np.split(shapes.member, shapes.member_start[1:-1])) if len(shapes) else ()
+    area = shapely.area(houses.polygons)
+    leader = np.array([_leader(group, area, houses.ids) for group in members], np.int64)
+    given = np.array([_mean_height(houses.given_height[group], area[group]) for group in members])
+    footprints = Footprints(shapes.polygons, houses.ids[leader], given.reshape(-1))
+    points = merge_building_points(houses.points, members)
+    heights = measure_heights(points, shapes.polygons, dtm, footprints.given_height, options)
+    wall_ground = highest_wall_ground(shapes.polygons, dtm)
+    roof, raised = raise_low_roofs(heights.roof, wall_ground, clearance=options.roof_clearance)
+    names = tuple(tuple(sorted(houses.ids[group].tolist())) for group in members)
+    city = assemble_city(footprints, points, heights, names, wall_ground, roof=roof)
+    notes = (*note_heights("building", footprints, heights), *_note_raised(footprints, heights, roof, raised))
+    return replace(city, notes=notes, counts=shapes.counts)
 
 
 def _leader(group: NDArray[np.int64], area: NDArray[np.float64], ids: NDArray[np.str_]) -> int:

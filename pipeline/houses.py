@@ -1,0 +1,120 @@
+"""Houses on their way through step 2: divided in parts, each with its points (after steps 1.6 and 2.0)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.building_points import (
+    BuildingPoints,
+    extract_building_points,
+    has_building_class,
+    join_building_points,
+    take_building_points,
+)
+from pipeline.city import City, CityOptions
+from pipeline.house_levels import HouseParts, LevelOptions, split_levels
+from pipeline.pointcloud import PointCloud
+from pipeline.roof_points import locate_roof_points
+
+
+@dataclass(frozen=True, eq=False)
+class Houses:
+    """Houses before simplification, and the parts that they were divided in.
+
+    Attributes
+    ----------
+    ids : str, (h,)
+        Ids of the houses.
+    polygons : object, (h,)
+        Their outlines (m).
+    given_height : float64, (h,)
+        Height above ground (m) from an attribute, NaN where none.
+    parts : HouseParts
+        Parts of all houses; a house that is not divided is its only part.
+    points : BuildingPoints
+        Roof and ground points of each part.
+    """
+
+    ids: NDArray[np.str_]
+    polygons: NDArray[np.object_]
+    given_height: NDArray[np.float64]
+    parts: HouseParts
+    points: BuildingPoints
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def divide_houses(
+    city: City, cloud: PointCloud, options: CityOptions, *, building_class: bool | None = None
+) -> Houses:
+    """Divide houses where their roofs step (step 2.0, ours); with other options, take each as one part.
+
+    Parameters
+    ----------
+    city : City
+        Result of `build_city`.
+    cloud : PointCloud
+        Points of all houses and `ground_margin` around them.
+    options : CityOptions
+        Parameters.
+    building_class : bool, optional
+        Whether the cloud marks buildings; by default, whether it has a point of that class.
+    """
+    model = city.model
+    marks = has_building_class(cloud) if building_class is None else building_class
+    parts, points = HouseParts(model.polygons, np.arange(len(model))), city.points
+    if options.split_levels and options.simplify == "clearance" and len(model):
+        roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
+        parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
+        points = extract_building_points(cloud, parts.polygons, margin=options.ground_margin, building_class=marks)
+    return Houses(model.ids, model.polygons, city.given_height, parts, points)
+
+
+def take_houses(houses: Houses, rows: NDArray[np.int64]) -> Houses:
+    """Take some houses, in the order of `rows`, int64 (k,), none of them twice."""
+    parts = houses.parts
+    number = np.full(len(houses), -1)
+    number[rows] = np.arange(len(rows))
+    mine = np.flatnonzero(number[parts.house] >= 0)
+    mine = mine[np.argsort(number[parts.house[mine]], kind="stable")]
+    return Houses(
+        houses.ids[rows],
+        houses.polygons[rows],
+        houses.given_height[rows],
+        HouseParts(parts.polygons[mine], number[parts.house[mine]]),
+        take_building_points(houses.points, mine),
+    )
+
+
+def join_houses(several: Sequence[Houses]) -> Houses:
+    """Put the houses of several tiles one after the other; none gives none."""
+    first = np.cumsum([0, *(len(houses) for houses in several)])
+    shift = [houses.parts.house + begin for houses, begin in zip(several, first, strict=False)]
+    nothing = np.empty(0)
+    return Houses(
+        np.concatenate([nothing.astype(np.str_), *(houses.ids for houses in several)]),
+        np.concatenate([nothing.astype(object), *(houses.polygons for houses in several)]),
+        np.concatenate([nothing, *(houses.given_height for houses in several)]),
+        HouseParts(
+            np.concatenate([nothing.astype(object), *(houses.parts.polygons for houses in several)]),
+            np.concatenate([nothing.astype(np.int64), *shift]),
+        ),
+        join_building_points([houses.points for houses in several]),
+    )
+
+
+def sort_houses(houses: Houses) -> Houses:
+    """Sort houses by id, so that what follows does not depend on the tiles that they come from."""
+    return take_houses(houses, np.argsort(houses.ids, kind="stable"))
+
+
+def houses_extent(houses: Houses) -> tuple[float, float, float, float] | None:
+    """Box around all houses (m); None without any."""
+    if len(houses) == 0:
+        return None
+    xmin, ymin, xmax, ymax = shapely.total_bounds(houses.polygons).tolist()
+    return xmin, ymin, xmax, ymax
