@@ -6,7 +6,16 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from stitch.grid import CORNER_SHARE, Key, TileGrid, closest_line, corner_reach, nominal_corner
+from stitch.grid import (
+    CORNER_SHARE,
+    Key,
+    TileGrid,
+    closest_line,
+    corner_reach,
+    has_tile,
+    nominal_corner,
+    tiles_of_corner,
+)
 
 SPOKE_OF_CLEARANCE = 0.6  # length of the first edges of seams over the distance to the next wall
 LONGEST_SPOKE = 0.8  # mesh sizes
@@ -73,7 +82,7 @@ def place_corner(
     reach = corner_reach(grid.tile_size)
     nominal = np.array(nominal_corner(grid, key))
     depth = closest_line(grid, key)
-    offset = _offsets(grid, nominal, min(reach, CORNER_SHARE * depth))
+    offset = _offsets(grid, key, min(reach, CORNER_SHARE * depth))
     xy = nominal + offset
     clear = _clearance(walls, xy, reach)
     building = _building_at(polygons, xy)
@@ -81,8 +90,9 @@ def place_corner(
     best = np.lexsort((offset[:, 1], offset[:, 0], (offset**2).sum(axis=1), -worth))[0]
     length = min(SPOKE_OF_CLEARANCE * clear[best], LONGEST_SPOKE * mesh_size, SPOKE_OF_DEPTH * depth)
     tips = xy[best] + length * DIRECTIONS
-    xmin, ymin, xmax, ymax = grid.bounds
-    tips[(tips[:, 0] < xmin) | (tips[:, 0] > xmax) | (tips[:, 1] < ymin) | (tips[:, 1] > ymax)] = np.nan
+    there = [has_tile(grid, tile) for tile in tiles_of_corner(key)]
+    # Tiles beside the first edges eastwards, northwards, westwards and southwards.
+    tips[[not (a or b) for a, b in zip(there, (there[-1], *there), strict=False)]] = np.nan
     return Corner(xy[best], tips, int(building[best]))
 
 
@@ -91,12 +101,12 @@ def corner_sight(tile_size: float) -> float:
     return 2 * corner_reach(tile_size)
 
 
-def _offsets(grid: TileGrid, nominal: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-    """Whole metres in a disc; none across the region's border."""
+def _offsets(grid: TileGrid, key: Key, reach: float) -> NDArray[np.float64]:
+    """Whole metres in a disc; none across the region's border, and none at all where the border turns."""
+    upper_right, upper_left, lower_left, lower_right = (has_tile(grid, tile) for tile in tiles_of_corner(key))
     steps = np.arange(-np.floor(reach), np.floor(reach) + 1)
-    dx, dy = (
-        np.zeros(1) if nominal[axis] in (grid.bounds[axis], grid.bounds[axis + 2]) else steps for axis in (0, 1)
-    )
+    dx = steps if upper_left == upper_right and lower_left == lower_right else np.zeros(1)
+    dy = steps if upper_left == lower_left and upper_right == lower_right else np.zeros(1)
     offset = np.stack(np.meshgrid(dx, dy), axis=-1).reshape(-1, 2)
     disc: NDArray[np.float64] = offset[(offset**2).sum(axis=1) <= reach**2]
     return disc

@@ -48,12 +48,16 @@ class TileGrid:
         Ascending places of the lines (m): the region's sides, and between them multiples of the tile size,
         line ``k`` of an axis at ``(first + k) * tile_size``. A line is left out that is closer than half a
         tile to a side, so tiles are between half and one and a half of their size.
+    present : bool, (nx, ny), optional
+        Which tiles there are, by column and row; all where it is None. The region is made of these: towards a
+        tile that is absent it has a straight border.
     """
 
     bounds: Bounds
     tile_size: float
     first: Key
     lines: tuple[NDArray[np.float64], NDArray[np.float64]]
+    present: NDArray[np.bool_] | None = None
 
 
 def make_grid(bounds: Bounds, *, tile_size: float, mesh_size: float) -> TileGrid:
@@ -83,7 +87,29 @@ def tile_keys(grid: TileGrid) -> list[Key]:
     """List the tiles, column by column."""
     i, j = grid.first
     nx, ny = (len(axis) - 1 for axis in grid.lines)
-    return [Key(i + a, j + b) for a in range(nx) for b in range(ny)]
+    keys = (Key(i + a, j + b) for a in range(nx) for b in range(ny))
+    return [key for key in keys if has_tile(grid, key)]
+
+
+def has_tile(grid: TileGrid, tile: Key) -> bool:
+    """Tell whether a tile lies in the region and is present."""
+    at = tile.i - grid.first.i, tile.j - grid.first.j
+    if not all(0 <= k < len(axis) - 1 for k, axis in zip(at, grid.lines, strict=True)):
+        return False
+    return grid.present is None or bool(grid.present[at])
+
+
+def tile_box(grid: TileGrid, tile: Key) -> Bounds:
+    """Box between the lines around a tile (m)."""
+    i, j = tile.i - grid.first.i, tile.j - grid.first.j
+    (xmin, xmax), (ymin, ymax) = grid.lines[0][i : i + 2].tolist(), grid.lines[1][j : j + 2].tolist()
+    return xmin, ymin, xmax, ymax
+
+
+def seam_line(grid: TileGrid, seam: SeamKey) -> Bounds:
+    """Box of a seam's nominal line, without width (m)."""
+    (xmin, ymin), (xmax, ymax) = (nominal_corner(grid, corner) for corner in ends_of_seam(seam))
+    return xmin, ymin, xmax, ymax
 
 
 def corner_keys(grid: TileGrid) -> list[Key]:
@@ -93,11 +119,24 @@ def corner_keys(grid: TileGrid) -> list[Key]:
 
 
 def seam_keys(grid: TileGrid) -> list[SeamKey]:
-    """List all seams, those along the region's border included."""
+    """List all seams that a tile has, those along the region's border included."""
     last = Key(grid.first.i + len(grid.lines[0]) - 1, grid.first.j + len(grid.lines[1]) - 1)
     corners = corner_keys(grid)
     along = [SeamKey(0, i, j) for i, j in corners if i < last.i]
-    return along + [SeamKey(1, i, j) for i, j in corners if j < last.j]
+    seams = along + [SeamKey(1, i, j) for i, j in corners if j < last.j]
+    return [seam for seam in seams if any(has_tile(grid, tile) for tile in tiles_of_seam(seam))]
+
+
+def tiles_of_seam(seam: SeamKey) -> tuple[Key, Key]:
+    """Tiles on both sides of a seam: below or left of it, then above or right."""
+    axis, i, j = seam
+    return Key(i - axis, j - (1 - axis)), Key(i, j)
+
+
+def tiles_of_corner(corner: Key) -> tuple[Key, Key, Key, Key]:
+    """Tiles around a corner: upper right, upper left, lower left, lower right."""
+    i, j = corner
+    return Key(i, j), Key(i - 1, j), Key(i - 1, j - 1), Key(i, j - 1)
 
 
 def seams_of_tile(tile: Key) -> tuple[SeamKey, SeamKey, SeamKey, SeamKey]:
@@ -132,10 +171,21 @@ def closest_line(grid: TileGrid, corner: Key) -> float:
 
 
 def is_border(grid: TileGrid, seam: SeamKey) -> bool:
-    """Tell whether a seam is a part of the region's border."""
+    """Tell whether a seam is a part of the region's border: a tile on one side only."""
+    return not all(has_tile(grid, tile) for tile in tiles_of_seam(seam))
+
+
+def seam_bounds(grid: TileGrid, seam: SeamKey) -> Bounds:
+    """Box that the strip of a seam may not leave: the region's, at its border cut along the line (m)."""
+    box = list(grid.bounds)
+    line = seam_line(grid, seam)
     across = 1 - seam.axis
-    line = seam[1 + across] - grid.first[across]
-    return line in (0, len(grid.lines[across]) - 1)
+    before, after = (has_tile(grid, tile) for tile in tiles_of_seam(seam))
+    if not before:
+        box[across] = line[across]
+    if not after:
+        box[across + 2] = line[across]
+    return box[0], box[1], box[2], box[3]
 
 
 def corner_reach(tile_size: float) -> float:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.improve_plane import improve_plane
 from pipeline.plane import collect_graph, triangulate_plane
 from stitch.corners import Corner
-from stitch.grid import Bounds, SeamKey, TileGrid, band_width, corner_reach, is_border
+from stitch.grid import Bounds, SeamKey, TileGrid, band_width, corner_reach, is_border, seam_bounds
 from stitch.walls import LONGEST_PIECE, walls_within
 
 RING = 1.5  # mesh sizes; the triangles around a vertex have their centres within that
@@ -83,8 +83,9 @@ def mesh_strip(
     """
     core = strip_core(grid, seam, mesh_size=mesh_size)
     inside = walls_within(walls, shapely.box(*core))
-    outer = _grow(core, (LONGEST_PIECE + MARGIN) * mesh_size, grid.bounds)
-    spokes = _spokes(ends, grid.bounds)
+    bounds = seam_bounds(grid, seam)
+    outer = _grow(core, (LONGEST_PIECE + MARGIN) * mesh_size, bounds)
+    spokes = _spokes(ends, bounds)
     edges = np.concatenate((_outline(outer, ends), inside, spokes))
     xy, triangles, _, _ = triangulate_plane(
         collect_graph(edges, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle
@@ -109,7 +110,7 @@ def strip_core(grid: TileGrid, seam: SeamKey, *, mesh_size: float) -> Bounds:
     wide = [reach, reach]
     wide[1 - seam.axis] = band + RING * mesh_size
     box = (low[0] - wide[0], low[1] - wide[1], high[0] + wide[0], high[1] + wide[1])
-    return _grow((float(box[0]), float(box[1]), float(box[2]), float(box[3])), 0.0, grid.bounds)
+    return _grow((float(box[0]), float(box[1]), float(box[2]), float(box[3])), 0.0, seam_bounds(grid, seam))
 
 
 def label_triangles(
@@ -151,13 +152,14 @@ def _outline(box: Bounds, ends: tuple[Corner, Corner]) -> NDArray[np.float64]:
 
 
 def _spokes(ends: tuple[Corner, Corner], bounds: Bounds) -> NDArray[np.float64]:
-    """First edges of the seams at both corners, without those on the region's border."""
+    """First edges of the seams at both corners within bounds, without those on their sides."""
     start = np.concatenate([np.repeat(end.xy[None], 4, axis=0) for end in ends])
     tip = np.concatenate([end.tips for end in ends])
     spokes = np.stack((start, tip), axis=1)
     low, high = np.array(bounds[:2]), np.array(bounds[2:])
     on_side = ((spokes == low) | (spokes == high)).all(axis=1).any(axis=1)
-    kept: NDArray[np.float64] = spokes[~on_side & ~np.isnan(tip[:, 0])]
+    inside = ((tip >= low) & (tip <= high)).all(axis=1)  # none is where the region has ended
+    kept: NDArray[np.float64] = spokes[~on_side & inside]
     return kept
 
 
