@@ -51,12 +51,12 @@ def build_city(
     options: CityOptions,
     trace: Trace = no_trace,
 ) -> City:
-    """Generate the city model (paper, steps 1.4 to 1.6).
+    """Generate the city model (paper, steps 1.4 to 1.6), in memory.
 
     Parameters
     ----------
     cloud : PointCloud
-        Points of the tile and its halo.
+        Points of the region.
     footprints : Footprints
         As read.
     dtm : Dtm
@@ -69,22 +69,76 @@ def build_city(
         Context manager around each step.
     """
     with trace("1.4 clean footprints"):
-        cleaned, notes = clean_footprints(
-            footprints, min_area=options.min_building_area, tolerance=options.vertex_tolerance
-        )
-        inner, border_notes = _apply_border_rule(cleaned, bounds, options)
+        inner, notes = prepare_footprints(footprints, shapely.box(*bounds), options)
+    city = measure_city(cloud, inner, dtm, options, building_class=has_building_class(cloud), trace=trace)
+    counts = {"footprints read": len(footprints.polygons)}
+    return replace(city, notes=(*notes, *city.notes), counts=counts)
+
+
+def prepare_footprints(
+    footprints: Footprints, region: shapely.Geometry, options: CityOptions
+) -> tuple[Footprints, tuple[Note, ...]]:
+    """Clean footprints, and drop or clip those on the region's border (step 1.4).
+
+    Parameters
+    ----------
+    footprints : Footprints
+        As read: all that meet some box, so that what becomes of each depends on those around it alone.
+    region : shapely Polygon or MultiPolygon
+        What is meshed (m), at least as far as the footprints reach.
+    options : CityOptions
+        Parameters.
+
+    Returns
+    -------
+    Footprints
+        Those that are inside by the clearance.
+    tuple of Note
+        What was dropped, repaired, split, filled, renamed or clipped.
+    """
+    cleaned, notes = clean_footprints(
+        footprints, min_area=options.min_building_area, tolerance=options.vertex_tolerance
+    )
+    inner, border_notes = _apply_border_rule(cleaned, region, options)
+    return inner, (*notes, *border_notes)
+
+
+def measure_city(
+    cloud: PointCloud,
+    footprints: Footprints,
+    dtm: Dtm,
+    options: CityOptions,
+    *,
+    building_class: bool,
+    trace: Trace = no_trace,
+) -> City:
+    """Give footprints their points and heights (steps 1.5 and 1.6).
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Points of all footprints and `ground_margin` around them.
+    footprints : Footprints
+        Clean footprints.
+    dtm : Dtm
+        Terrain.
+    options : CityOptions
+        Parameters.
+    building_class : bool
+        Whether the cloud marks buildings.
+    trace : callable, optional
+        Context manager around each step.
+    """
     with trace("1.5 extract building points"):
         points = extract_building_points(
-            cloud, inner.polygons, margin=options.ground_margin, building_class=has_building_class(cloud)
+            cloud, footprints.polygons, margin=options.ground_margin, building_class=building_class
         )
     with trace("1.6 building heights"):
-        heights = measure_heights(points, inner.polygons, dtm, inner.given_height, options)
-        members = tuple((str(name),) for name in inner.ids)
-        notes_of_heights = note_heights("footprint", inner, heights)
-        wall_ground = highest_wall_ground(inner.polygons, dtm)
-        city = assemble_city(inner, points, heights, members, wall_ground)
-    counts = {"footprints read": len(footprints.polygons), "footprints cleaned": len(cleaned.polygons)}
-    return replace(city, notes=(*notes, *border_notes, *notes_of_heights), counts=counts)
+        heights = measure_heights(points, footprints.polygons, dtm, footprints.given_height, options)
+        members = tuple((str(name),) for name in footprints.ids)
+        wall_ground = highest_wall_ground(footprints.polygons, dtm)
+        city = assemble_city(footprints, points, heights, members, wall_ground)
+    return replace(city, notes=tuple(note_heights("footprint", footprints, heights)))
 
 
 def mesh_city(
@@ -137,15 +191,14 @@ def mesh_city(
 
 
 def _apply_border_rule(
-    footprints: Footprints, bounds: Bounds, options: CityOptions
+    footprints: Footprints, region: shapely.Geometry, options: CityOptions
 ) -> tuple[Footprints, tuple[Note, ...]]:
     """Keep footprints that lie inside by the clearance; drop or clip those on the border."""
-    margin = options.clearance
-    inner = shapely.box(bounds[0] + margin, bounds[1] + margin, bounds[2] - margin, bounds[3] - margin)
-    shapely.prepare(inner)
+    inner = shapely.buffer(region, -options.clearance, join_style="mitre")
+    shapely.prepare([inner, region])
     polygons, ids = footprints.polygons, footprints.ids
     inside = shapely.contains_properly(inner, polygons)
-    touching = ~inside & shapely.intersects(shapely.box(*bounds), polygons)
+    touching = ~inside & shapely.intersects(region, polygons)
     rule = "dropped" if options.border == "drop" else "clipped"
     notes = tuple(Note(f"footprint-on-border-{rule}", *place) for _, place in find_places(footprints, touching))
     if options.border == "drop":

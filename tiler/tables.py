@@ -1,0 +1,222 @@
+"""Houses and city models as plain arrays for the store, and back."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.building_points import BuildingPoints
+from pipeline.city import City
+from pipeline.citymodel import CityModel, number_ids
+from pipeline.house_levels import HouseParts
+from pipeline.houses import Houses
+from pipeline.point_fidelity import HouseFidelity
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Buildings:
+    """Buildings of a city model as the stages pass them on, ``n`` of them.
+
+    Attributes
+    ----------
+    model : CityModel
+        The buildings.
+    roof_source : int8, (n,)
+        Where the roof's height comes from: index into `heights.ROOF_SOURCES`.
+    measured_roof : float64, (n,)
+        Roof heights (m) before roofs were grouped and raised.
+    wall_ground : float64, (n,)
+        Highest terrain at the walls (m).
+    group : int64, (n,)
+        Buildings of one group have one roof.
+    layers : int32, (n,)
+        Layers that the layered mesher removes; 0 with the other one.
+    fidelity : HouseFidelity
+        How the roof fits its points.
+    """
+
+    model: CityModel
+    roof_source: NDArray[np.int8]
+    measured_roof: NDArray[np.float64]
+    wall_ground: NDArray[np.float64]
+    group: NDArray[np.int64]
+    layers: NDArray[np.int32]
+    fidelity: HouseFidelity
+
+    def __len__(self) -> int:
+        return len(self.model)
+
+
+def pack_polygons(polygons: NDArray[np.object_], name: str) -> Arrays:
+    """Write polygons as well-known binary: bytes one after the other, and where each starts."""
+    blobs = shapely.to_wkb(polygons, byte_order=1)
+    start = np.cumsum([0, *(len(blob) for blob in blobs)], dtype=np.int64)
+    return {name: np.frombuffer(b"".join(blobs), np.uint8), f"{name}_start": start}
+
+
+def unpack_polygons(arrays: Arrays, name: str) -> NDArray[np.object_]:
+    """Read what `pack_polygons` wrote."""
+    data, start = arrays[name].tobytes(), arrays[f"{name}_start"].tolist()
+    blobs = np.empty(len(start) - 1, object)
+    blobs[:] = [data[a:b] for a, b in pairwise(start)]
+    polygons: NDArray[np.object_] = shapely.from_wkb(blobs)
+    return polygons
+
+
+def pack_houses(houses: Houses) -> Arrays:
+    """Write houses, their parts and the points of these as arrays."""
+    return {
+        **pack_polygons(houses.polygons, "outline"),
+        "ids": houses.ids,
+        "given_height": houses.given_height,
+        **pack_polygons(houses.parts.polygons, "part"),
+        "part_house": houses.parts.house,
+        "roof_start": houses.points.roof_start,
+        "roof_z": houses.points.roof_z,
+        "ground_start": houses.points.ground_start,
+        "ground_z": houses.points.ground_z,
+    }
+
+
+HOUSE_ARRAYS = (
+    *("outline", "outline_start", "ids", "given_height", "part", "part_start", "part_house"),
+    *("roof_start", "roof_z", "ground_start", "ground_z"),
+)
+
+
+def unpack_houses(arrays: Arrays) -> Houses:
+    """Read what `pack_houses` wrote."""
+    return Houses(
+        arrays["ids"],
+        unpack_polygons(arrays, "outline"),
+        arrays["given_height"],
+        HouseParts(unpack_polygons(arrays, "part"), arrays["part_house"]),
+        BuildingPoints(*(arrays[name] for name in ("roof_start", "roof_z", "ground_start", "ground_z"))),
+    )
+
+
+def make_buildings(city: City, fidelity: HouseFidelity, layers: NDArray[np.int32]) -> Buildings:
+    """Take from a city what later stages need."""
+    return Buildings(
+        city.model,
+        city.roof_source,
+        city.measured_roof,
+        city.wall_ground,
+        city.group.astype(np.int64),
+        layers,
+        fidelity,
+    )
+
+
+def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
+    """Write buildings as arrays."""
+    model, fidelity = buildings.model, buildings.fidelity
+    members = [name for names in model.members for name in names]
+    arrays: Arrays = {
+        **pack_polygons(model.polygons, "polygon"),
+        "id": model.ids,
+        "house": model.house,
+        "ground": model.ground,
+        "roof": model.roof,
+        "member": np.array(members, dtype=np.str_),
+        "member_start": np.cumsum([0, *(len(names) for names in model.members)], dtype=np.int64),
+        "roof_source": buildings.roof_source,
+        "measured_roof": buildings.measured_roof,
+        "wall_ground": buildings.wall_ground,
+        "group": buildings.group,
+        "layers": buildings.layers,
+        "fidelity_points": fidelity.n_points,
+        "fidelity_rmse": fidelity.rmse,
+        "fidelity_bias": fidelity.bias,
+        "fidelity_coverage": fidelity.coverage,
+    }
+    return {prefix + name: values for name, values in arrays.items()}
+
+
+def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
+    """Read what `pack_buildings` wrote."""
+    arrays = {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+    names, start = arrays["member"].tolist(), arrays["member_start"].tolist()
+    model = CityModel(
+        unpack_polygons(arrays, "polygon"),
+        arrays["id"],
+        number_ids(arrays["id"]),
+        arrays["ground"],
+        arrays["roof"],
+        tuple(tuple(names[a:b]) for a, b in pairwise(start)),
+        arrays["house"],
+    )
+    fidelity = HouseFidelity(*(arrays[f"fidelity_{name}"] for name in ("points", "rmse", "bias", "coverage")))
+    return Buildings(
+        model,
+        arrays["roof_source"],
+        arrays["measured_roof"],
+        arrays["wall_ground"],
+        arrays["group"],
+        arrays["layers"],
+        fidelity,
+    )
+
+
+def take_buildings(buildings: Buildings, rows: NDArray[np.integer[Any]]) -> Buildings:
+    """Take some buildings, in the order of `rows`."""
+    model, fidelity = buildings.model, buildings.fidelity
+    return Buildings(
+        CityModel(
+            model.polygons[rows],
+            model.ids[rows],
+            model.numbers[rows],
+            model.ground[rows],
+            model.roof[rows],
+            tuple(model.members[row] for row in rows.tolist()),
+            model.house[rows],
+        ),
+        buildings.roof_source[rows],
+        buildings.measured_roof[rows],
+        buildings.wall_ground[rows],
+        buildings.group[rows],
+        buildings.layers[rows],
+        HouseFidelity(fidelity.n_points[rows], fidelity.rmse[rows], fidelity.bias[rows], fidelity.coverage[rows]),
+    )
+
+
+def join_buildings(several: Sequence[Buildings]) -> Buildings:
+    """Put the buildings of several tiles together, by ascending id; groups stay apart.
+
+    Parameters
+    ----------
+    several : sequence of at least one Buildings
+        Buildings of different tiles.
+    """
+    models = [each.model for each in several]
+    first = np.cumsum([0, *(int(each.group.max(initial=-1)) + 1 for each in several)])
+    ids = np.concatenate([model.ids for model in models])
+    joined = Buildings(
+        CityModel(
+            np.concatenate([model.polygons for model in models]),
+            ids,
+            np.concatenate([model.numbers for model in models]),
+            np.concatenate([model.ground for model in models]),
+            np.concatenate([model.roof for model in models]),
+            tuple(names for model in models for names in model.members),
+            np.concatenate([model.house for model in models]),
+        ),
+        np.concatenate([each.roof_source for each in several]),
+        np.concatenate([each.measured_roof for each in several]),
+        np.concatenate([each.wall_ground for each in several]),
+        np.concatenate([each.group + begin for each, begin in zip(several, first, strict=False)]),
+        np.concatenate([each.layers for each in several]),
+        HouseFidelity(
+            *(
+                np.concatenate([getattr(each.fidelity, name) for each in several])
+                for name in ("n_points", "rmse", "bias", "coverage")
+            )
+        ),
+    )
+    return take_buildings(joined, np.argsort(ids, kind="stable"))
