@@ -1,24 +1,51 @@
-"""The store: results by stage and tile in zarr (v3), written whole or not at all."""
+"""The store: results by stage and name in zarr (v3), written whole or not at all, verified on every read.
 
+A result is a zarr group ``<stage>/<name>``. Arrays above 32 kB are arrays of their own; smaller ones lie in one
+array of bytes, ``_packed``. The group's attributes hold what the writer gave, ``arrays`` (type and shape of each
+array and the CRC-32 of the raw bytes of each chunk) and ``checksum``, the CRC-32 of all other attributes.
+"""
+
+import errno
+import json
 import os
 import shutil
-from collections.abc import Mapping
+import uuid
+import zlib
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 import zarr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, OutputError
 from pipeline.mesh import ColumnMesh, PlaneMesh
 from pipeline.terrain import Dtm, sample_dtm
+from tiler.packing import (
+    PACKED_BYTES,
+    RowBuffer,
+    Table,
+    as_rows,
+    check_name,
+    checksums,
+    from_rows,
+    pack,
+    plain_array,
+    rows_per_chunk,
+    unpack,
+    verified_chunks,
+)
 
-CHUNK_BYTES = 4 * 2**20  # about what one read or write moves at a time
+PACKED = "_packed"
+RESERVED = ("arrays", "checksum")
+PARTIAL = ".partial"
 
 
 class Store:
-    """Arrays by stage and tile below one folder.
+    """Results by stage and name below one folder.
 
     Parameters
     ----------
@@ -29,41 +56,349 @@ class Store:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def write(self, stage: str, tile: str, arrays: Mapping[str, NDArray[Any]], **attributes: Any) -> None:
-        """Write one result; it becomes visible at once and whole."""
-        target = self.path / stage / tile
-        partial = target.with_name(f".{tile}.partial")
-        shutil.rmtree(partial, ignore_errors=True)
-        group = zarr.open_group(str(partial), mode="w", zarr_format=3, attributes=attributes)
-        for name, values in arrays.items():
-            array = np.ascontiguousarray(values)
-            row_bytes = max(array.dtype.itemsize * int(np.prod(array.shape[1:])), 1)
-            chunks = (min(max(CHUNK_BYTES // row_bytes, 1), max(len(array), 1)), *array.shape[1:])
-            group.create_array(name, data=array, chunks=chunks)
-        shutil.rmtree(target, ignore_errors=True)
-        os.replace(partial, target)
+    def folder(self, stage: str, name: str) -> Path:
+        """Say where a result lies; ValueError for a name that is no plain folder name."""
+        for part in (stage, name):
+            if not part or part[0] == "." or any(sign in part for sign in "/\\\0"):
+                raise ValueError(f"{part!r} cannot name a folder of the store")
+        return self.path / stage / name
 
-    def read(self, stage: str, tile: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    def writer(self, stage: str, name: str) -> "Writer":
+        """Begin a result: a context manager with ``put``, ``append`` and ``commit``."""
+        return Writer(self.folder(stage, name))
+
+    def write(self, stage: str, name: str, arrays: Mapping[str, ArrayLike], **attributes: Any) -> None:
+        """Write one result; it becomes visible at once and whole."""
+        with self.writer(stage, name) as writer:
+            writer.put(**arrays)
+            writer.commit(attributes)
+
+    def read(
+        self, stage: str, name: str, *, names: Collection[str] | None = None
+    ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Read one result: its arrays and its attributes.
+
+        Parameters
+        ----------
+        stage, name : str
+            Which result.
+        names : collection of str, optional
+            Arrays to read; all by default, none for an empty collection.
 
         Raises
         ------
         InputError
-            If it is not there or damaged.
+            If it is not there or damaged; the message names stage, name and array.
+        ValueError
+            If it has no array of such a name.
         """
-        target = self.path / stage / tile
-        try:
-            group = zarr.open_group(str(target), mode="r")
-            return {name: np.asarray(array[...]) for name, array in group.arrays()}, dict(group.attrs)
-        except (OSError, ValueError, KeyError, RuntimeError) as error:
-            raise InputError(
-                f"{target}: cannot be read ({error}); run citystitch again with --overwrite"
-            ) from error
+        folder = self.folder(stage, name)
+        table, attributes = _open(folder, stage, name)
+        wanted = sorted(set(names)) if names is not None else sorted(set(table) - {PACKED})
+        entries = {array: _entry(table, array, stage, name) for array in wanted}
+        packed = None
+        if any("offset" in entry for entry in entries.values()):
+            packed = _read_chunks(folder, stage, name, PACKED, table[PACKED])
+        arrays: dict[str, NDArray[Any]] = {}
+        for array, entry in entries.items():
+            if packed is not None and "offset" in entry:
+                arrays[array] = unpack(packed, entry)
+            else:
+                arrays[array] = _read_chunks(folder, stage, name, array, entry)
+        return arrays, attributes
+
+    def read_rows(self, stage: str, name: str, array: str, start: int, stop: int) -> NDArray[Any]:
+        """Read some rows of one array; only the chunks that hold them are decompressed and verified.
+
+        Raises
+        ------
+        InputError
+            If the result is not there, or a chunk that is needed is damaged.
+        ValueError
+            If there is no such array, or not ``0 <= start <= stop <= n_rows``.
+        """
+        folder = self.folder(stage, name)
+        table, _ = _open(folder, stage, name)
+        entry = _entry(table, array, stage, name)
+        n_rows = entry["shape"][0] if entry["shape"] else 0
+        if not 0 <= start <= stop <= n_rows:
+            raise ValueError(f"stage {stage}, {name}: rows {start} to {stop} of {array}, which has {n_rows}")
+        if "offset" in entry:
+            return unpack(_read_chunks(folder, stage, name, PACKED, table[PACKED]), entry)[start:stop]
+        return _read_chunks(folder, stage, name, array, entry, start, stop)
+
+    def attributes(self, stage: str, name: str) -> dict[str, Any]:
+        """Read the attributes of a result and no array; InputError as for `read`."""
+        return _open(self.folder(stage, name), stage, name)[1]
+
+    def shapes(self, stage: str, name: str) -> dict[str, tuple[int, ...]]:
+        """Tell the shape of every array of a result without reading any; InputError as for `read`."""
+        table, _ = _open(self.folder(stage, name), stage, name)
+        return {array: tuple(entry["shape"]) for array, entry in sorted(table.items()) if array != PACKED}
+
+    def has(self, stage: str, name: str) -> bool:
+        """Whether there is a committed result; its arrays are not looked at."""
+        return (self.folder(stage, name) / "zarr.json").is_file()
+
+    def names(self, stage: str) -> list[str]:
+        """List the names that have a result of the stage, sorted."""
+        folder = self.path / stage
+        return sorted(entry.name for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
 
     def tiles(self, stage: str) -> list[str]:
         """List the tiles that have a result of the stage, sorted."""
-        folder = self.path / stage
-        return sorted(entry.name for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
+        return self.names(stage)
+
+    def sweep(self, stage: str) -> None:
+        """Remove what killed writers of the stage left behind; no writer may be at work."""
+        for folder in (self.path / stage).glob(f".*{PARTIAL}"):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+class Writer:
+    """One result on its way into the store; nothing of it is visible before `commit`.
+
+    Leaving the context without a commit, or by an error, leaves nothing behind. The bytes on disk depend on the
+    arrays and attributes alone: not on their order, nor on how appended rows were cut into pieces.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the result will be.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}{PARTIAL}")
+        self._small: dict[str, NDArray[Any]] = {}
+        self._buffers: dict[str, RowBuffer] = {}
+        self._table: Table = {}
+
+    def __enter__(self) -> Self:
+        with self._disk():
+            self._partial.mkdir(parents=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        shutil.rmtree(self._partial, ignore_errors=True)
+
+    def put(self, **arrays: ArrayLike) -> None:
+        """Write whole arrays, each name once.
+
+        Raises
+        ------
+        ValueError
+            If a name came before, or an array is of a type that cannot be stored (objects, complex numbers).
+        OutputError
+            If the disk refuses.
+        """
+        for name, values in arrays.items():
+            check_name(name)
+            if name in self._small or name in self._table or name in self._buffers:
+                raise ValueError(f"array {name} is written twice")
+            self._put(name, plain_array(name, values))
+
+    def append(self, **arrays: ArrayLike) -> None:
+        """Append rows to arrays, which grow chunk by chunk on disk: about 4 MB of each are held in memory.
+
+        Raises
+        ------
+        ValueError
+            If the rows differ in type or shape from those before, or the array was put.
+        OutputError
+            If the disk refuses.
+        """
+        for name, values in arrays.items():
+            check_name(name)
+            rows = plain_array(name, values)
+            if rows.ndim == 0:
+                raise ValueError(f"array {name}: a single value has no rows to append")
+            if name not in self._buffers:
+                if name in self._small or name in self._table:
+                    raise ValueError(f"array {name} is written twice")
+                self._buffers[name] = RowBuffer(name, rows)
+            self._buffers[name].add(rows)
+            whole = self._buffers[name].whole_chunks()
+            if whole is not None:
+                self._extend(name, whole)
+
+    def commit(self, attributes: Mapping[str, Any] | None = None) -> None:
+        """Make the result visible, in place of an earlier one.
+
+        Parameters
+        ----------
+        attributes : mapping, optional
+            Plain JSON values by name, without NaN.
+
+        Raises
+        ------
+        ValueError
+            If the attributes are no plain JSON, or use the names ``arrays`` or ``checksum``.
+        OutputError
+            If the disk refuses.
+        """
+        kept = plain_json(dict(attributes or {}))
+        if set(kept) & set(RESERVED):
+            raise ValueError(f"attributes may not be named {' or '.join(RESERVED)}")
+        for name, buffer in sorted(self._buffers.items()):
+            rest = buffer.rest()
+            if name not in self._table:
+                self._put(name, rest)
+            elif len(rest):
+                self._extend(name, rest)
+        if self._small:
+            packed, table = pack(self._small)
+            self._create(PACKED, packed)
+            self._table |= table
+        kept["arrays"] = plain_json(self._table)
+        kept["checksum"] = _attributes_checksum(kept)
+        with self._disk():
+            zarr.create_group(str(self._partial), zarr_format=3, attributes=dict(sorted(kept.items())))
+            self._replace()
+
+    def _put(self, name: str, array: NDArray[Any]) -> None:
+        if array.nbytes <= PACKED_BYTES or array.ndim == 0:
+            self._small[name] = array.copy()
+        else:
+            self._create(name, array)
+
+    def _create(self, name: str, array: NDArray[Any]) -> None:
+        rows, chunk = as_rows(array), min(rows_per_chunk(array), max(len(array), 1))
+        self._table[name] = {
+            "dtype": array.dtype.str,
+            "shape": list(array.shape),
+            "chunk": chunk,
+            "crc": checksums(array, chunk),
+        }
+        with self._disk():
+            # Chunks of zeros are written too: one that is -0.0 would come back as 0.0.
+            zarr.create_array(
+                str(self._partial / name),
+                data=rows,
+                chunks=(chunk, *(max(n, 1) for n in rows.shape[1:])),
+                zarr_format=3,
+                config={"write_empty_chunks": True},
+            )
+
+    def _extend(self, name: str, rows: NDArray[Any]) -> None:
+        """Add rows to an array on disk that ends with a whole chunk."""
+        if name not in self._table:
+            self._create(name, rows)
+            return
+        entry = self._table[name]
+        n_old, n_new = entry["shape"][0], entry["shape"][0] + len(rows)
+        with self._disk():
+            array = zarr.open_array(str(self._partial / name), mode="r+", config={"write_empty_chunks": True})
+            array.resize((n_new, *array.shape[1:]))
+            array[n_old:n_new] = as_rows(rows)
+        entry["shape"][0] = n_new
+        entry["crc"] += checksums(rows, entry["chunk"])
+
+    def _replace(self) -> None:
+        """Rename into place; another writer of the same result may do so at the same moment."""
+        old = self._partial.with_name(f".{self._folder.name}.{uuid.uuid4().hex}{PARTIAL}")
+        while True:
+            try:
+                os.replace(self._partial, self._folder)
+                return
+            except OSError as error:
+                if error.errno not in {errno.ENOTEMPTY, errno.EEXIST}:
+                    raise
+            try:
+                os.replace(self._folder, old)
+            except FileNotFoundError:
+                continue
+            shutil.rmtree(old, ignore_errors=True)
+
+    @contextmanager
+    def _disk(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OutputError(
+                f"{self._folder}: cannot be written ({error}); free space there or choose another folder"
+            ) from error
+
+
+def plain_json(value: Any) -> Any:
+    """Bring a value into plain JSON (tuples become lists) with sorted keys.
+
+    Raises
+    ------
+    ValueError
+        If it holds NaN, infinity, or anything but dicts, lists, strings, numbers, booleans and None.
+    """
+    try:
+        return json.loads(json.dumps(value, sort_keys=True, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{error}; give plain JSON values, None for what is not there") from error
+
+
+def _attributes_checksum(attributes: Mapping[str, Any]) -> int:
+    rest = {name: value for name, value in attributes.items() if name != "checksum"}
+    return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
+
+
+def _open(folder: Path, stage: str, name: str) -> tuple[Table, dict[str, Any]]:
+    """Read the table of arrays and the attributes of a result."""
+    with _damage(folder, stage, name, "attributes"):
+        group = zarr.open_group(str(folder), mode="r", zarr_format=3, use_consolidated=False)
+        attributes: dict[str, Any] = dict(group.attrs.asdict())
+        if attributes.pop("checksum") != _attributes_checksum(attributes):
+            raise ValueError("checksum of the attributes differs")
+        table: Any = attributes.pop("arrays")
+        return table, attributes
+
+
+def _entry(table: Table, array: str, stage: str, name: str) -> dict[str, Any]:
+    if array not in table or array == PACKED:
+        names = ", ".join(sorted(set(table) - {PACKED})) or "none"
+        raise ValueError(f"stage {stage}, {name}: no array {array}, it has: {names}")
+    return table[array]
+
+
+def _read_chunks(
+    folder: Path,
+    stage: str,
+    name: str,
+    array: str,
+    entry: Mapping[str, Any],
+    start: int = 0,
+    stop: int | None = None,
+) -> NDArray[Any]:
+    """Read rows of one zarr array and verify every chunk that was read."""
+    n_rows, chunk = entry["shape"][0], entry["chunk"]
+    stop = n_rows if stop is None else stop
+    first, last = start // chunk, max(-(-stop // chunk), start // chunk)
+    low, high = first * chunk, min(last * chunk, n_rows)
+    with _damage(folder, stage, name, array):
+        stored = zarr.open_array(str(folder / array), mode="r", zarr_format=3)
+        if stored.shape[: len(entry["shape"])] != tuple(entry["shape"]):
+            raise ValueError(f"shape {stored.shape} instead of {tuple(entry['shape'])}")
+        rows = np.asarray(stored[low:high])
+        values = from_rows(rows, entry["dtype"])
+        if values.dtype != np.dtype(entry["dtype"]):
+            raise ValueError(f"type {values.dtype} instead of {entry['dtype']}")
+        wrong = [first + k for k in verified_chunks(values, chunk, entry["crc"][first:last])]
+        if wrong:
+            raise ValueError(f"checksum differs in {len(wrong)} chunks, first in chunk {wrong[0]}")
+    return values if (low, high) == (start, stop) else values[start - low : stop - low].copy()
+
+
+@contextmanager
+def _damage(folder: Path, stage: str, name: str, array: str) -> Iterator[None]:
+    """Whatever zarr and its codecs raise on broken files becomes one error that says where."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        state = "is damaged" if (folder / "zarr.json").is_file() else "is not there"
+        raise InputError(
+            f"stage {stage}, {name}: {array} in {folder} {state} ({error}); delete that folder and run again"
+        ) from error
 
 
 def write_dtm(store: Store, tile: str, dtm: Dtm) -> None:

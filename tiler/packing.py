@@ -1,0 +1,152 @@
+"""What the store writes of an array: plain little-endian rows, and a checksum for every chunk of them."""
+
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+CHUNK_BYTES = 4 * 2**20  # about what one read or write moves at a time
+PACKED_BYTES = 32 * 2**10  # smaller arrays share one array of bytes: an array of its own costs 4 ms to write
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+Table = dict[str, dict[str, Any]]
+
+
+def check_name(name: str) -> None:
+    """Raise ValueError unless an array may have this name: letters, digits and underscores."""
+    if not NAME.fullmatch(name):
+        raise ValueError(f"array name {name!r}: letters, digits and underscores only, a letter first")
+
+
+def plain_array(name: str, values: ArrayLike) -> NDArray[Any]:
+    """Bring an array into the form that is stored: contiguous, little-endian, of a fixed size.
+
+    Parameters
+    ----------
+    name : str
+        Its name, for the message.
+    values : array_like
+        Booleans, integers, floats of at most 8 bytes, or strings of a fixed width (``<U``).
+
+    Raises
+    ------
+    ValueError
+        If it is of another type, such as objects.
+    """
+    array = np.asarray(values)
+    kind, size = array.dtype.kind, array.dtype.itemsize
+    if kind not in "biufU" or (kind == "f" and size > 8):
+        raise ValueError(f"array {name}: {array.dtype} cannot be stored; give booleans, numbers or <U strings")
+    dtype = array.dtype.newbyteorder("<") if size else np.dtype("<U1")
+    return np.ascontiguousarray(array, dtype=dtype).reshape(array.shape)
+
+
+def raw_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
+    """View a plain array as its bytes, (n_bytes,)."""
+    return array.reshape(-1).view(np.uint8)
+
+
+def as_rows(array: NDArray[Any]) -> NDArray[Any]:
+    """View strings as rows of bytes, since zarr v3 has no settled type for them; others stay."""
+    if array.dtype.kind != "U":
+        return array
+    return raw_bytes(array).reshape(*array.shape, array.dtype.itemsize)
+
+
+def from_rows(rows: NDArray[Any], dtype: str) -> NDArray[Any]:
+    """Undo `as_rows`."""
+    if np.dtype(dtype).kind != "U":
+        return rows
+    return np.ascontiguousarray(rows).reshape(-1).view(dtype).reshape(rows.shape[:-1])
+
+
+def rows_per_chunk(array: NDArray[Any]) -> int:
+    """Count the rows of a chunk of about `CHUNK_BYTES`; it depends on the width of a row alone."""
+    row_bytes = array.dtype.itemsize * int(np.prod(array.shape[1:]))
+    return max(CHUNK_BYTES // max(row_bytes, 1), 1)
+
+
+def checksums(array: NDArray[Any], rows: int) -> list[int]:
+    """Compute the CRC-32 of every chunk of so many rows."""
+    return [zlib.crc32(raw_bytes(array[start : start + rows]).data) for start in range(0, len(array), rows)]
+
+
+def pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], Table]:
+    """Lay small arrays behind each other, in the order of their names.
+
+    Returns
+    -------
+    bytes : uint8, (n_bytes,)
+        All of them.
+    table : dict
+        ``dtype``, ``shape`` and ``offset`` (bytes) of each.
+    """
+    table: Table = {}
+    offset = 0
+    for name, array in sorted(arrays.items()):
+        table[name] = {"dtype": array.dtype.str, "shape": list(array.shape), "offset": offset}
+        offset += array.nbytes
+    parts = [raw_bytes(array) for _, array in sorted(arrays.items())]
+    return np.concatenate(parts) if parts else np.empty(0, np.uint8), table
+
+
+def unpack(packed: NDArray[np.uint8], entry: Mapping[str, Any]) -> NDArray[Any]:
+    """Take one array out of the packed bytes."""
+    dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
+    size = dtype.itemsize * int(np.prod(shape))
+    part: NDArray[Any] = packed[entry["offset"] : entry["offset"] + size].copy().view(dtype)
+    return part.reshape(shape)
+
+
+class RowBuffer:
+    """Rows appended piece by piece, given out in whole chunks.
+
+    However the rows were cut into pieces, the same chunks come out.
+
+    Parameters
+    ----------
+    name : str
+        Name of the array, for messages.
+    first : array
+        A first piece: it settles the type and the shape of a row.
+    """
+
+    def __init__(self, name: str, first: NDArray[Any]) -> None:
+        self.name = name
+        self.dtype, self.row_shape = first.dtype, first.shape[1:]
+        self.chunk = rows_per_chunk(first)
+        self._pieces: list[NDArray[Any]] = []
+        self._count = 0
+
+    def add(self, piece: NDArray[Any]) -> None:
+        """Take rows of the same type and shape; raises ValueError for others."""
+        if piece.dtype != self.dtype or piece.shape[1:] != self.row_shape:
+            raise ValueError(
+                f"array {self.name}: rows of {piece.dtype} {piece.shape[1:]} appended to rows of {self.dtype} "
+                f"{self.row_shape}; give all pieces one type and width"
+            )
+        self._pieces.append(piece.copy())
+        self._count += len(piece)
+
+    def whole_chunks(self) -> NDArray[Any] | None:
+        """Take out as many whole chunks as there are, or None; rows beyond stay."""
+        if self._count < self.chunk:
+            return None
+        rows = self.rest()
+        whole = len(rows) // self.chunk * self.chunk
+        self._pieces, self._count = [rows[whole:].copy()], len(rows) - whole
+        return rows[:whole]
+
+    def rest(self) -> NDArray[Any]:
+        """Give the rows that are left."""
+        empty = np.empty((0, *self.row_shape), self.dtype)
+        return np.concatenate([empty, *self._pieces])
+
+
+def verified_chunks(rows: NDArray[Any], chunk: int, expected: Sequence[int]) -> Iterator[int]:
+    """Yield the positions of the chunks whose checksum is not what it should be."""
+    found = checksums(rows, chunk)
+    yield from (k for k, pair in enumerate(zip(found, expected, strict=True)) if pair[0] != pair[1])

@@ -1,0 +1,149 @@
+"""What a stage declares, and the layout: the items of every scope with their boxes."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tiler.task import Task
+
+Box = tuple[float, float, float, float]
+Facts = dict[str, Any]
+
+REGION_ITEM = "region"
+
+
+class Scope(Enum):
+    """What a stage is computed for, one result each."""
+
+    FILE = "file"
+    TILE = "tile"
+    SEAM = "seam"
+    REGION = "region"
+
+
+@dataclass(frozen=True)
+class Read:
+    """What a stage reads of another one.
+
+    All items of that stage are read whose box meets the reader's own box grown by the halo; boxes are closed, so
+    touching counts. A stage of the whole region reads all, and is read by all.
+
+    Attributes
+    ----------
+    stage : str
+        Name of the stage that is read.
+    halo : float
+        How far around the reader's box (m).
+    by_extent : bool
+        Use, instead of the box of a read item, the ``"extent"`` among the facts of its result: four numbers, or
+        None for an item that holds nothing and is never read. Such a stage must have run in an earlier call.
+    """
+
+    stage: str
+    halo: float = 0.0
+    by_extent: bool = False
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.halo) and self.halo >= 0):
+            raise ValueError(f"read of {self.stage}: halo {self.halo} m, expected 0 or more")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A step of a run: a pure function, and all that its result depends on.
+
+    Attributes
+    ----------
+    name : str
+        Name, and the folder in the store.
+    scope : Scope
+        What it is computed for.
+    function : callable
+        Top-level function of a `Task`; it gives back facts: a small dict of plain JSON values.
+    reads : tuple of Read
+        The stages whose results it may read.
+    parameters : tuple of str
+        The attributes of the run's parameters that it may use; a change of another one does not touch its results.
+    version : int
+        Raise it when the function computes something else.
+    """
+
+    name: str
+    scope: Scope
+    function: "Callable[[Task], Facts]"
+    reads: tuple[Read, ...] = ()
+    parameters: tuple[str, ...] = ()
+    version: int = 1
+
+
+@dataclass(frozen=True)
+class FileItem:
+    """An input file.
+
+    Attributes
+    ----------
+    path : str
+        Where it is; no part of any key.
+    box : tuple of float
+        xmin, ymin, xmax, ymax of its content (m).
+    identity : str
+        Changes when the content does: path, size and time of change, say.
+    """
+
+    path: str
+    box: Box
+    identity: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The items of every scope, by name.
+
+    Attributes
+    ----------
+    files : mapping of str to FileItem
+        Input files.
+    tiles, seams : mapping of str to tuple of float
+        Boxes of tiles and seams: xmin, ymin, xmax, ymax (m).
+    bounds : tuple of float
+        Box of the region (m), the box of its one item ``"region"``.
+    identity : str
+        What else all results depend on, such as the CRS; part of every key.
+
+    Raises
+    ------
+    ValueError
+        If a box is not finite or upside down.
+    """
+
+    files: Mapping[str, FileItem] = field(default_factory=dict)
+    tiles: Mapping[str, Box] = field(default_factory=dict)
+    seams: Mapping[str, Box] = field(default_factory=dict)
+    bounds: Box = (0.0, 0.0, 0.0, 0.0)
+    identity: str = ""
+
+    def __post_init__(self) -> None:
+        for scope in Scope:
+            for name, box in self.boxes(scope).items():
+                check_box(f"{scope.value} {name}", box)
+
+    def boxes(self, scope: Scope) -> Mapping[str, Box]:
+        """Give the items of a scope with their boxes."""
+        match scope:
+            case Scope.FILE:
+                return {name: item.box for name, item in self.files.items()}
+            case Scope.TILE:
+                return self.tiles
+            case Scope.SEAM:
+                return self.seams
+            case Scope.REGION:
+                return {REGION_ITEM: self.bounds}
+
+
+def check_box(name: str, box: Box) -> None:
+    """Raise ValueError unless a box is four finite numbers, low before high."""
+    if len(box) != 4 or not all(math.isfinite(v) for v in box) or box[0] > box[2] or box[1] > box[3]:
+        raise ValueError(f"{name}: box {tuple(box)}, expected finite xmin, ymin, xmax, ymax")

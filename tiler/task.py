@@ -1,0 +1,286 @@
+"""A task: what a stage's function gets, what becomes of its result, and the record that goes back."""
+
+import math
+import pickle
+import resource
+import sys
+import time
+import traceback
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.errors import CityError
+from pipeline.notes import Note, count_notes
+from tiler.stage import Box, Facts, Scope
+from tiler.store import Store, Writer, plain_json
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """One result of a stage, as a reader gets it.
+
+    Attributes
+    ----------
+    name : str
+        Item that it belongs to.
+    arrays : dict of str to array
+        The arrays that were asked for.
+    facts : dict
+        What the stage's function gave back.
+    notes : tuple of Note
+        What it noted.
+    """
+
+    name: str
+    arrays: dict[str, NDArray[Any]]
+    facts: Facts
+    notes: tuple[Note, ...] = ()
+
+
+@dataclass(frozen=True)
+class Record:
+    """What the driver keeps of a result: small, no arrays.
+
+    Attributes
+    ----------
+    stage, name, key : str
+        Which result, and its content key.
+    facts : dict
+        What the stage's function gave back.
+    notes : dict of str to int
+        Number of notes by kind.
+    seconds : dict of str to float
+        Wall time by step (s), and ``"all"``; empty where an earlier result was taken.
+    peak_memory : int
+        Largest resident memory of the process so far (bytes).
+    reused : bool
+        True if an earlier result with the same key was taken.
+    """
+
+    stage: str
+    name: str
+    key: str
+    facts: Facts
+    notes: dict[str, int]
+    seconds: dict[str, float] = field(default_factory=dict)
+    peak_memory: int = 0
+    reused: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Failure:
+    """An error that came back as a value: raised in a worker, Dask would print where in the code it arose."""
+
+    error: Exception
+
+
+class Declared:
+    """The declared parameters of a stage as attributes; ValueError for one that it does not declare.
+
+    Parameters
+    ----------
+    stage : str
+        Name of the stage.
+    values : mapping
+        Its parameters.
+    """
+
+    def __init__(self, stage: str, values: Mapping[str, Any]) -> None:
+        self._stage = stage
+        self._values = dict(values)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name not in self._values:
+            raise ValueError(f"stage {self._stage} uses parameter {name}, which it does not declare")
+        return self._values[name]
+
+
+@dataclass(eq=False)
+class Task:
+    """One item of one stage: what its function reads through, and writes through.
+
+    Attributes
+    ----------
+    stage, name : str
+        Stage and item.
+    scope : Scope
+        Scope of the stage.
+    box : tuple of float
+        Box of the item (m).
+    parameters : Declared
+        The declared parameters as attributes.
+    context : object
+        What the engine was given, the same for all; not in the key, so it must follow from the layout and the
+        declared parameters.
+    file : str
+        Path of the file, for the scope FILE; else empty.
+    store : Store
+        The store.
+    refs : dict of str to tuple of str
+        Items to read by stage, sorted.
+    key : str
+        Content key of the result.
+    """
+
+    stage: str
+    name: str
+    scope: Scope
+    box: Box
+    parameters: Any
+    context: Any
+    file: str
+    store: Store
+    refs: dict[str, tuple[str, ...]]
+    key: str
+    _writer: Writer | None = None
+    _notes: list[Note] = field(default_factory=list)
+    _seconds: dict[str, float] = field(default_factory=dict)
+
+    def read(self, stage: str, names: Collection[str] | None = None) -> Iterator[Result]:
+        """Read the results of a stage one at a time, in the order of their items' names.
+
+        Parameters
+        ----------
+        stage : str
+            A stage that is declared in ``reads``.
+        names : collection of str, optional
+            Arrays to read; all by default, an empty collection reads facts and notes alone.
+
+        Raises
+        ------
+        ValueError
+            If the stage was not declared.
+        InputError
+            If a result is damaged.
+        """
+        return (self._result(stage, name, names) for name in self._declared(stage))
+
+    def read_rows(self, stage: str, name: str, array: str, start: int, stop: int) -> NDArray[Any]:
+        """Read some rows of one array of one result that is among ``refs``; errors as for `read`."""
+        if name not in self._declared(stage):
+            raise ValueError(f"stage {self.stage}, {self.name}: {name} of {stage} is beyond its reach")
+        return self.store.read_rows(stage, name, array, start, stop)
+
+    def put(self, **arrays: ArrayLike) -> None:
+        """Write whole arrays of the result, each name once."""
+        self._open_writer().put(**arrays)
+
+    def append(self, **arrays: ArrayLike) -> None:
+        """Append rows to arrays of the result, which may become larger than memory."""
+        self._open_writer().append(**arrays)
+
+    def note(self, note: Note) -> None:
+        """Keep a note with the result."""
+        self._notes.append(note)
+
+    def notes(self, notes: Iterable[Note]) -> None:
+        """Keep notes with the result."""
+        self._notes.extend(notes)
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Add the wall time of what is done inside to the record, under a name."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def _declared(self, stage: str) -> tuple[str, ...]:
+        if stage not in self.refs:
+            raise ValueError(f"stage {self.stage} reads stage {stage}, which it does not declare in reads")
+        return self.refs[stage]
+
+    def _result(self, stage: str, name: str, names: Collection[str] | None) -> Result:
+        arrays, attributes = self.store.read(stage, name, names=names)
+        return Result(name, arrays, attributes["facts"], tuple(map(_note_from_json, attributes["notes"])))
+
+    def _open_writer(self) -> Writer:
+        if self._writer is None:
+            raise ValueError(f"stage {self.stage}, {self.name}: written to outside of its run")
+        return self._writer
+
+
+def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
+    """Run a stage's function, commit its result, and say what came of it; an error leaves nothing behind.
+
+    Errors come back as values; one that cannot be pickled as a RuntimeError with its text.
+    """
+    start = time.perf_counter()
+    try:
+        with task.store.writer(task.stage, task.name) as task._writer:
+            facts = _plain_facts(task, function(task))
+            notes = [_note_to_json(note) for note in task._notes]
+            task._writer.commit({"key": task.key, "facts": facts, "notes": notes})
+    except CityError as error:
+        return Failure(error)
+    except Exception as error:
+        return Failure(_portable(error))
+    finally:
+        task._writer = None
+    seconds = {step: round(value, 4) for step, value in task._seconds.items()}
+    seconds["all"] = round(time.perf_counter() - start, 4)
+    return Record(
+        task.stage, task.name, task.key, facts, count_notes(task._notes), seconds, peak_memory=peak_memory()
+    )
+
+
+def reuse(store: Store, stage: str, name: str, key: str) -> Record | None:
+    """Give the record of a committed result if it has this key; a damaged one counts as none."""
+    if not store.has(stage, name):
+        return None
+    try:
+        attributes = store.attributes(stage, name)
+    except CityError:
+        return None
+    if attributes.get("key") != key:
+        return None
+    notes = count_notes(map(_note_from_json, attributes["notes"]))
+    return Record(stage, name, key, attributes["facts"], notes, reused=True)
+
+
+def peak_memory() -> int:
+    """Tell the peak resident memory of this process (bytes)."""
+    try:  # VmHWM where the system tells it, as ru_maxrss survives a fork.
+        status = Path("/proc/self/status").read_text()
+        return int(status.split("VmHWM:")[1].split()[0]) * 1024
+    except (OSError, IndexError, ValueError):
+        peak: Any = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return int(peak) if sys.platform == "darwin" else int(peak) * 1024
+
+
+def _plain_facts(task: Task, facts: Facts) -> Facts:
+    try:
+        plain: Facts = plain_json(dict(facts))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"facts of stage {task.stage}: {error}") from error
+    return plain
+
+
+def _note_to_json(note: Note) -> list[Any]:
+    place = (float(v) if math.isfinite(v) else None for v in (note.x, note.y))
+    return [note.kind, note.subject, *place, note.detail]
+
+
+def _note_from_json(values: list[Any]) -> Note:
+    kind, subject, x, y, detail = values
+    nan = float("nan")
+    return Note(kind, subject, nan if x is None else x, nan if y is None else y, detail)
+
+
+def _portable(error: Exception) -> Exception:
+    """Make an error survive the way back, with the traceback as a note."""
+    text = "".join(traceback.format_exception(error))
+    try:
+        error.add_note(f"where it arose:\n{text}")
+        pickle.loads(pickle.dumps(error))
+        return error
+    except Exception:
+        return RuntimeError(text)
