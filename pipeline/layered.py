@@ -1,19 +1,23 @@
 """Steps 3.2 to 3.5 with the same number of layers everywhere: the paper's mesher on columns."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from pipeline.citymodel import CityModel
 from pipeline.columns import expand_cells
 from pipeline.fem import solve_laplace
+from pipeline.given import GivenLevels, find_given_levels, take_used_levels
+from pipeline.groups import adjacent_houses
 from pipeline.mesh import ColumnMesh, PlaneMesh
 from pipeline.neighbours import check_groups, join_equal_roofs, part_neighbours
+from pipeline.nodes import Levels, SeamColumns, no_seam
 from pipeline.relax import guess_displacement, relax_columns
 from pipeline.repair import repair_columns
-from pipeline.slab import smooth_slab
+from pipeline.slab import Bounds, lift_places, slab_reach, slab_window, smooth_slab
 from pipeline.terrain import Dtm, sample_dtm
 from pipeline.trim import check_headroom, count_removed_layers, first_kept, first_levels
 
@@ -82,7 +86,94 @@ def count_layers(options: LayeredOptions) -> int:
     return max(round(options.domain_height / options.layer_height), 2)
 
 
-def layer_mesh(plane: PlaneMesh, z: NDArray[np.float64], first: NDArray[np.int32]) -> ColumnMesh:
+def terrain_reach(options: LayeredOptions) -> float:
+    """How far beyond a mesh, a seam's triangles or a building's walls terrain counts (m), within the region."""
+    return slab_reach(options.domain_height, grid_spacing=GRID_FACTOR * options.mesh_size)
+
+
+def choose_layers(
+    polygons: NDArray[np.object_],
+    roof: NDArray[np.float64],
+    wall_ground: NDArray[np.float64],
+    group: NDArray[np.int32],
+    pairs: NDArray[np.int64],
+    dtm: Dtm,
+    bounds: Bounds,
+    options: LayeredOptions,
+) -> tuple[NDArray[np.int32], int]:
+    """Choose the layer that becomes the roof of each building (step 3.4), before there is a mesh.
+
+    Parameters
+    ----------
+    polygons : object, (b,)
+        Footprints; those that touch share vertices.
+    roof : float64, (b,)
+        Absolute roof heights (m).
+    wall_ground : float64, (b,)
+        Highest terrain at the walls of each building (m).
+    group : int32, (b,)
+        Buildings of one group have the same roof height.
+    pairs : int64, (p, 2)
+        Buildings that touch, as from `adjacent_houses`.
+    dtm : Dtm
+        Terrain, as far beyond the walls as `terrain_reach` says.
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    options : LayeredOptions
+        Parameters.
+
+    Returns
+    -------
+    int32, (b,)
+        Number of layers removed in each building.
+    int
+        Groups of equal roofs whose layer is not the closest, because of the roofs that they touch.
+
+    Raises
+    ------
+    GeometryError
+        If more roofs rise above each other than there are layers.
+    ValueError
+        If a group has two heights.
+
+    Notes
+    -----
+    What a building gets depends on the buildings of its cluster, which touch each other, and on the terrain in
+    reach alone: every tile that has a part of it may choose for the cluster, or one for all. Levels are looked
+    up along the walls, a mesh size apart at most.
+    """
+    check_groups(roof, group)
+    if len(roof) == 0:
+        return np.empty(0, np.int32), 0
+    n_layers = count_layers(options)
+    xy, building = shapely.get_coordinates(shapely.segmentize(polygons, options.mesh_size), return_index=True)
+    places = np.unique(np.column_stack((building, xy)), axis=0)  # a ring's first vertex is its last as well
+    levels = lift_places(
+        dtm,
+        places[:, 1:],
+        bounds,
+        domain_height=options.domain_height,
+        n_layers=n_layers,
+        grid_spacing=GRID_FACTOR * options.mesh_size,
+    )
+    group = join_equal_roofs(pairs, roof, group)
+    removed = count_removed_layers(
+        levels,
+        places[:, 0].astype(np.int64),
+        roof,
+        wall_ground,
+        group,
+        layer_height=options.domain_height / n_layers,
+    )
+    return part_neighbours(pairs, roof, group, removed, polygons, n_layers=n_layers)
+
+
+def layer_mesh(
+    plane: PlaneMesh,
+    z: NDArray[np.float64],
+    first: NDArray[np.int32],
+    kept: NDArray[np.int32] | None = None,
+) -> ColumnMesh:
     """Make columns of the used levels (steps 3.2 and 3.4).
 
     Parameters
@@ -93,9 +184,11 @@ def layer_mesh(plane: PlaneMesh, z: NDArray[np.float64], first: NDArray[np.int32
         Heights of all levels (m).
     first : int32, (m,)
         First level of the cells over each triangle.
+    kept : int32, (n,), optional
+        First level of each column; by default the first that one of these triangles uses.
     """
     levels = z.shape[1]
-    kept = first_kept(plane, first)
+    kept = first_kept(plane, first) if kept is None else kept
     used = np.arange(levels) >= kept[:, None]
     z_start = np.concatenate(([0], np.cumsum(levels - kept))).astype(np.int64)
     bottom = first[:, None] - kept[plane.triangles]
@@ -107,10 +200,12 @@ def mesh_layers(
     dtm: Dtm,
     city: CityModel,
     wall_ground: NDArray[np.float64],
-    bounds: tuple[float, float, float, float],
+    bounds: Bounds,
     options: LayeredOptions,
     *,
     group: NDArray[np.int32] | None = None,
+    removed: NDArray[np.int32] | None = None,
+    seam: SeamColumns | None = None,
 ) -> tuple[ColumnMesh, LayeredReport]:
     """Fill the columns with layers that follow the terrain and meet every roof (steps 3.2 to 3.5).
 
@@ -119,17 +214,22 @@ def mesh_layers(
     plane : PlaneMesh
         Plane mesh.
     dtm : Dtm
-        Terrain.
+        Terrain, as far beyond the plane mesh as `terrain_reach` says.
     city : CityModel
         Buildings, row by row those of `PlaneMesh.building`.
     wall_ground : float64, (b,)
-        Highest terrain at the walls of each building (m).
+        Highest terrain at the walls of each building (m); of no use if `removed` is given.
     bounds : (xmin, ymin, xmax, ymax)
         The region (m).
     options : LayeredOptions
         Parameters.
     group : int32, (b,), optional
-        Buildings of one group have the same roof height; by default each is a group of its own.
+        Buildings of one group have the same roof height; by default each is a group of its own. Of no use if
+        `removed` is given.
+    removed : int32, (b,), optional
+        Layers removed in each building, as from `choose_layers`, which is asked by default.
+    seam : SeamColumns, optional
+        Columns that are given by a seam: they stay bit for bit.
 
     Raises
     ------
@@ -138,56 +238,88 @@ def mesh_layers(
     SolverError
         If a linear solve does not converge.
     ValueError
-        If a group has two heights.
+        If a group has two heights, two roofs that meet share a layer, the seam lacks a level that the mesh has
+        there, or finite elements are asked for beside a seam.
     """
-    group = np.arange(len(city), dtype=np.int32) if group is None else group
-    check_groups(city.roof, group)
+    parted = 0
+    if removed is None:
+        group = np.arange(len(city), dtype=np.int32) if group is None else group
+        pairs = adjacent_houses(city.polygons)
+        removed, parted = choose_layers(city.polygons, city.roof, wall_ground, group, pairs, dtm, bounds, options)
+    seam = no_seam() if seam is None else seam
+    z, given, report = _settle(plane, dtm, city.roof, city.ids, removed, bounds, options, seam)
+    mesh = layer_mesh(plane, z, first_levels(plane, removed), given.kept)
+    return mesh, replace(report, parted_groups=parted)
+
+
+def fill_layers(
+    plane: PlaneMesh,
+    dtm: Dtm,
+    roof: NDArray[np.float64],
+    ids: NDArray[np.str_],
+    removed: NDArray[np.int32],
+    bounds: Bounds,
+    options: LayeredOptions,
+    *,
+    seam: SeamColumns | None = None,
+) -> Levels:
+    """Fill the columns of a plane mesh, as a seam's are from the mesh of its strip.
+
+    Parameters and errors as in `mesh_layers`; the sides of the mesh are free, wherever they are.
+    """
+    seam = no_seam() if seam is None else seam
+    z, given, _ = _settle(plane, dtm, roof, ids, removed, bounds, options, seam)
+    return take_used_levels(given, z)
+
+
+def _settle(
+    plane: PlaneMesh,
+    dtm: Dtm,
+    roof: NDArray[np.float64],
+    ids: NDArray[np.str_],
+    removed: NDArray[np.int32],
+    bounds: Bounds,
+    options: LayeredOptions,
+    seam: SeamColumns,
+) -> tuple[NDArray[np.float64], GivenLevels, LayeredReport]:
+    """Steps 3.3 to 3.5: heights of all levels."""
     n_layers = count_layers(options)
     layer_height = options.domain_height / n_layers
     min_gap = MIN_GAP * layer_height
+    if options.smoother == "fem" and len(seam.vertex):
+        raise ValueError("finite elements on one tile know nothing of its seams; take smoother columns")
     z, iterations = _follow_terrain(plane, dtm, bounds, n_layers, options)
     ground_only = np.zeros(z.shape, np.bool_)
     ground_only[:, 0] = True
     z, moved_terrain = repair_columns(z, np.zeros(len(z), np.int32), ground_only, min_gap=min_gap)
-    check_headroom(z[:, -1], plane, city.roof, city.ids, domain_height=options.domain_height, air=layer_height / 2)
-    group = join_equal_roofs(plane, city.roof, group)
-    removed = count_removed_layers(z, plane, city.roof, wall_ground, group, layer_height=layer_height)
-    removed, parted = part_neighbours(plane, city.roof, group, removed, n_layers=n_layers)
+    check_headroom(z[:, -1], plane, roof, ids, domain_height=options.domain_height, air=layer_height / 2)
     first = first_levels(plane, removed)
-    kept = first_kept(plane, first)
-    given, target = _given_heights(plane, first, kept, z, city.roof)
-    fixed = given | (np.arange(n_layers + 1) < kept[:, None])
-    displacement = np.where(given, target - z, 0.0)
+    given = find_given_levels(plane, first, z[:, 0], roof, seam, n_layers=n_layers)
+    fixed = given.stays | (np.arange(n_layers + 1) < given.kept[:, None])
+    displacement = np.where(given.stays, given.z - z, 0.0)
     if options.smoother == "fem":
         u, steps, residual = _solve_fem(plane, z, first, fixed, displacement, options)
         iterations += steps
     else:
         guess = guess_displacement(fixed, displacement)
         u, iterations, residual = relax_columns(plane, first, z, fixed, guess, tolerance=options.tolerance)
-    z = np.where(given, target, z + u)
-    z, moved_roofs = repair_columns(z, kept, given, min_gap=min_gap)
-    report = LayeredReport(n_layers, parted, moved_terrain, moved_roofs, iterations, residual)
-    return layer_mesh(plane, z, first), report
+    z = np.where(given.stays, given.z, z + u)
+    z, moved_roofs = repair_columns(z, given.kept, given.stays, min_gap=min_gap)
+    return z, given, LayeredReport(n_layers, 0, moved_terrain, moved_roofs, iterations, residual)
 
 
 def _follow_terrain(
     plane: PlaneMesh,
     dtm: Dtm,
-    bounds: tuple[float, float, float, float],
+    bounds: Bounds,
     n_layers: int,
     options: LayeredOptions,
 ) -> tuple[NDArray[np.float64], int]:
     """Step 3.3: heights of all levels, and the iterations that it took."""
     if options.smoother == "columns":
-        z = smooth_slab(
-            dtm,
-            plane.xy,
-            bounds,
-            domain_height=options.domain_height,
-            n_layers=n_layers,
-            grid_spacing=GRID_FACTOR * options.mesh_size,
-        )
-        return z, 0
+        height, spacing = options.domain_height, GRID_FACTOR * options.mesh_size
+        window = slab_window(plane.xy, bounds, domain_height=height, grid_spacing=spacing)
+        return smooth_slab(dtm, plane.xy, window, domain_height=height, n_layers=n_layers, grid_spacing=spacing), 0
     flat = np.tile(np.linspace(0, options.domain_height, n_layers + 1), (len(plane.xy), 1))
     first = np.zeros(len(plane.triangles), np.int32)
     fixed = np.zeros(flat.shape, np.bool_)
@@ -201,25 +333,6 @@ def _follow_terrain(
         step="3.3",
     )
     return flat + u.reshape(flat.shape), iterations
-
-
-def _given_heights(
-    plane: PlaneMesh,
-    first: NDArray[np.int32],
-    kept: NDArray[np.int32],
-    z: NDArray[np.float64],
-    roof: NDArray[np.float64],
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Levels that step 3.5 keeps, with their heights: the ground under air, and every roof."""
-    given = np.zeros(z.shape, np.bool_)
-    given[kept == 0, 0] = True
-    target = z.copy()
-    inside = plane.building >= 0
-    vertex = plane.triangles[inside].ravel()
-    level = np.repeat(first[inside], 3)
-    given[vertex, level] = True
-    target[vertex, level] = np.repeat(roof[plane.building[inside]], 3)
-    return given, target
 
 
 def _solve_fem(

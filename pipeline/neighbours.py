@@ -11,7 +11,6 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.errors import GeometryError
-from pipeline.mesh import PlaneMesh
 
 
 def check_groups(roof: NDArray[np.float64], group: NDArray[np.int32]) -> None:
@@ -30,15 +29,15 @@ def check_groups(roof: NDArray[np.float64], group: NDArray[np.int32]) -> None:
         raise ValueError(f"group {group[first]} has roofs at {roof[first]} m and {roof[second]} m")
 
 
-def touching_groups(
-    plane: PlaneMesh, roof: NDArray[np.float64], group: NDArray[np.int32]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find the pairs of groups that are next to each other in height at some vertex.
+def join_equal_roofs(
+    pairs: NDArray[np.int64], roof: NDArray[np.float64], group: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    """Join groups that touch and have the same height: there is no wall between them.
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
+    pairs : int64, (p, 2)
+        Buildings that touch, as from `adjacent_houses`.
     roof : float64, (b,)
         Absolute roof heights (m).
     group : int32, (b,)
@@ -46,39 +45,23 @@ def touching_groups(
 
     Returns
     -------
-    lower, higher : int64, (k,)
-        A building of either group, the first of it; each pair once.
+    int32, (b,)
+        A group for each building.
     """
+    equal = pairs[roof[pairs[:, 0]] == roof[pairs[:, 1]]]
     _, first, member = np.unique(group, return_index=True, return_inverse=True)
-    inside = plane.building >= 0
-    leader = np.repeat(first[member][plane.building[inside]], 3)
-    vertex = plane.triangles[inside].ravel()
-    at = np.unique(np.column_stack((vertex, leader)), axis=0)
-    at = at[np.lexsort((at[:, 1], roof[at[:, 1]], at[:, 0]))]
-    meet = at[1:, 0] == at[:-1, 0]
-    pairs = np.unique(np.column_stack((at[:-1, 1], at[1:, 1]))[meet], axis=0)
-    return pairs[:, 0], pairs[:, 1]
-
-
-def join_equal_roofs(plane: PlaneMesh, roof: NDArray[np.float64], group: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Join groups that touch and have the same height: there is no wall between them.
-
-    Parameters and errors as in `touching_groups`; returns a group for each building, int32, (b,).
-    """
-    lower, higher = touching_groups(plane, roof, group)
-    equal = roof[lower] == roof[higher]
-    _, first, member = np.unique(group, return_index=True, return_inverse=True)
-    links = (np.concatenate((lower[equal], first[member])), np.concatenate((higher[equal], np.arange(len(roof)))))
+    links = (np.concatenate((equal[:, 0], first[member])), np.concatenate((equal[:, 1], np.arange(len(roof)))))
     graph = sparse.coo_array((np.ones(len(links[0])), links), shape=(len(roof), len(roof)))
     joined: NDArray[np.int32] = connected_components(graph, directed=False)[1].astype(np.int32)
     return joined
 
 
 def part_neighbours(
-    plane: PlaneMesh,
+    pairs: NDArray[np.int64],
     roof: NDArray[np.float64],
     group: NDArray[np.int32],
     removed: NDArray[np.int32],
+    polygons: NDArray[np.object_],
     *,
     n_layers: int,
 ) -> tuple[NDArray[np.int32], int]:
@@ -86,14 +69,16 @@ def part_neighbours(
 
     Parameters
     ----------
-    plane : PlaneMesh
-        Plane mesh.
+    pairs : int64, (p, 2)
+        Buildings that touch, as from `adjacent_houses`.
     roof : float64, (b,)
         Absolute roof heights (m).
     group : int32, (b,)
         Groups, those of equal height joined (`join_equal_roofs`).
     removed : int32, (b,)
         Layers removed in each building if it stood alone: the same in a group.
+    polygons : object, (b,)
+        Footprints, for the place in a message.
     n_layers : int
         Layers of the slab.
 
@@ -112,12 +97,12 @@ def part_neighbours(
     Notes
     -----
     By ascending height, a roof goes to its own layer or to the one above its highest lower neighbour; then,
-    from the top down, what does not fit comes down again as little as it must. Cost is that of sorting the
-    pairs.
+    from the top down, what does not fit comes down again as little as it must. Chains of neighbours that do not
+    touch do not see each other, and the order of buildings does not matter. Cost is that of sorting the pairs.
     """
-    lower, higher = touching_groups(plane, roof, group)
     _, first, member = np.unique(group, return_index=True, return_inverse=True)
     layer = removed[first[member]].astype(np.int64)
+    lower, higher = _order_pairs(pairs, roof, first[member])
     upwards = np.lexsort((higher, roof[higher]))
     _raise_layers(layer, lower[upwards], higher[upwards])
     np.minimum(layer, n_layers - 1, out=layer)
@@ -125,13 +110,25 @@ def part_neighbours(
     _lower_layers(layer, lower[downwards], higher[downwards])
     if len(layer) and layer[first].min() < 1:
         worst = first[int(layer[first].argmin())]
-        x, y = plane.xy[plane.triangles[plane.building == worst]].mean(axis=(0, 1))
+        place = polygons[worst].representative_point()
         raise GeometryError(
-            f"roof at {roof[worst]:.1f} m near ({x:.1f}, {y:.1f}), step 3.4: more roofs of different heights rise "
-            f"above each other there than fit below the domain's top in {n_layers} layers; lower --layer-height, "
-            "or take --mesher adaptive"
+            f"roof at {roof[worst]:.1f} m near ({place.x:.1f}, {place.y:.1f}), step 3.4: more roofs of different "
+            f"heights rise above each other there than fit below the domain's top in {n_layers} layers; lower "
+            "--layer-height, or take --mesher adaptive"
         )
     return layer[first[member]].astype(np.int32), int((layer[first] != removed[first]).sum())
+
+
+def _order_pairs(
+    pairs: NDArray[np.int64], roof: NDArray[np.float64], leader: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Leaders of the lower and of the higher group of each pair that is not within one; each pair once."""
+    ends = leader[pairs]
+    ends = ends[ends[:, 0] != ends[:, 1]]
+    swapped = roof[ends[:, 0]] > roof[ends[:, 1]]
+    ends[swapped] = ends[swapped][:, ::-1]
+    ends = np.unique(ends, axis=0)
+    return ends[:, 0], ends[:, 1]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -5,13 +5,14 @@ from numpy.typing import NDArray
 
 from pipeline.errors import GeometryError
 from pipeline.mesh import PlaneMesh
+from pipeline.terrain import HEIGHT_UNIT
 
 MIN_SQUEEZE = 0.4  # a layer below a roof is never squeezed under this part of its height
 
 
 def count_removed_layers(
-    z: NDArray[np.float64],
-    plane: PlaneMesh,
+    levels: NDArray[np.float64],
+    building: NDArray[np.int64],
     roof: NDArray[np.float64],
     wall_ground: NDArray[np.float64],
     group: NDArray[np.int32],
@@ -22,10 +23,10 @@ def count_removed_layers(
 
     Parameters
     ----------
-    z : float64, (n, n_layers + 1)
-        Levels after step 3.3 (m).
-    plane : PlaneMesh
-        Plane mesh; every building has a triangle.
+    levels : float64, (p, n_layers + 1)
+        Levels after step 3.3 (m) at places of the buildings, in any order.
+    building : int64, (p,)
+        The building of each place; every one has a place.
     roof : float64, (b,)
         Absolute roof heights (m).
     wall_ground : float64, (b,)
@@ -42,16 +43,17 @@ def count_removed_layers(
 
     Notes
     -----
-    The closest level is that of the mean over the group's corners of triangles. No more layers are removed
-    than leave each at least 0.4 of its height between the highest terrain at a wall and the roof.
+    The closest level is that of the mean over the group's places, summed in whole numbers of `HEIGHT_UNIT`. No
+    more layers are removed than leave each at least 0.4 of its height between the highest terrain at a wall
+    and the roof.
     """
     _, first, member = np.unique(group, return_index=True, return_inverse=True)
-    n_groups, n_layers = len(first), z.shape[1] - 1
-    inside = plane.building >= 0
-    label = np.repeat(member[plane.building[inside]], 3)
-    corner = plane.triangles[inside].ravel()
+    n_groups, n_layers = len(first), levels.shape[1] - 1
+    label = member[building]
     count = np.bincount(label, minlength=n_groups)
-    mean = np.column_stack([np.bincount(label, z[corner, k], n_groups) / count for k in range(n_layers + 1)])
+    units = np.rint(levels / HEIGHT_UNIT)
+    total = np.column_stack([np.bincount(label, units[:, k], n_groups) for k in range(n_layers + 1)])
+    mean = total * HEIGHT_UNIT / count[:, None]
     closest = np.abs(mean - roof[first, None]).argmin(axis=1)
     highest_ground = np.full(n_groups, -np.inf)
     np.maximum.at(highest_ground, member, wall_ground)

@@ -3,16 +3,18 @@
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from pipeline.mesh import PlaneMesh
 from pipeline.plane import order_plane
 from stitch.corners import Corner
-from stitch.grid import SeamKey, TileGrid, is_border
+from stitch.grid import Bounds, SeamKey, TileGrid, is_border
 from stitch.paths import find_path
-from stitch.strips import Strip, mesh_strip
+from stitch.strips import Strip, mesh_strip, strip_core
 from stitch.walls import find_on_walls
 
+SURROUNDINGS = 2.0  # mesh sizes; how far around a seam triangles count for the layers of its columns
 ON_WALL = 1e-6  # m; closer than that, a vertex of a strip is on the wall, but for rounding
 
 
@@ -32,6 +34,8 @@ class Seam:
         The strip's triangles around its vertices; empty on the region's border.
     vertex : int32, (k,)
         The seam's vertices in `ring`; empty on the region's border.
+    surroundings : PlaneMesh
+        The strip's triangles within `SURROUNDINGS` of it, with those of `ring`; empty on the region's border.
     """
 
     xy: NDArray[np.float64]
@@ -39,6 +43,7 @@ class Seam:
     border: bool
     ring: PlaneMesh
     vertex: NDArray[np.int32]
+    surroundings: PlaneMesh
 
 
 def trace_seam(
@@ -74,13 +79,15 @@ def trace_seam(
     if border:
         nothing = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))
         xy = _border_vertices(strip, key.axis, ends)
-        return Seam(xy, np.empty((0, 2)), True, nothing, np.empty(0, np.int32))
+        return Seam(xy, np.empty((0, 2)), True, nothing, np.empty(0, np.int32), nothing)
     path = find_path(grid, key, ends, strip)
     xy = strip.xy[path]
     on, _ = find_on_walls(strip.walls, xy, reach=ON_WALL)
     around = np.isin(strip.triangles, path).any(axis=1)
     ring = order_plane(strip.xy, strip.triangles[around], strip.building[around])
-    return Seam(xy, xy[np.unique(on)], False, ring, find_vertices(ring.xy, xy))
+    near = around | _is_near(strip, xy, strip_core(grid, key, mesh_size=mesh_size), SURROUNDINGS * mesh_size)
+    surroundings = order_plane(strip.xy, strip.triangles[near], strip.building[near])
+    return Seam(xy, xy[np.unique(on)], False, ring, find_vertices(ring.xy, xy), surroundings)
 
 
 def find_vertices(among: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArray[np.int32]:
@@ -110,6 +117,14 @@ def find_vertices(among: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArra
         x, y = both[row[row >= len(among)][0]]
         raise ValueError(f"the mesh has no vertex at ({x}, {y})")
     return row.astype(np.int32)
+
+
+def _is_near(strip: Strip, line: NDArray[np.float64], core: Bounds, reach: float) -> NDArray[np.bool_]:
+    """Whether triangles have their centres close to a line, and where it is known what holds them."""
+    centre = strip.xy[strip.triangles].mean(axis=1)
+    known = ((centre >= core[:2]) & (centre <= core[2:])).all(axis=1)
+    near: NDArray[np.bool_] = known & shapely.dwithin(shapely.LineString(line), shapely.points(centre), reach)
+    return near
 
 
 def _border_vertices(strip: Strip, axis: int, ends: tuple[Corner, Corner]) -> NDArray[np.float64]:

@@ -14,7 +14,9 @@ from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
 from pipeline.city import CityOptions
 from pipeline.citymodel import CityModel
 from pipeline.columns import expand_cells
+from pipeline.groups import adjacent_houses
 from pipeline.heights import highest_wall_ground, raise_low_roofs
+from pipeline.layered import LayeredOptions, choose_layers, mesh_layers, terrain_reach
 from pipeline.mesh import ColumnMesh, TetMesh
 from pipeline.nodes import Levels
 from pipeline.plane import signed_areas
@@ -26,6 +28,7 @@ from pipeline.tile import build_city
 from stitch.conformity import compute_cell_volumes, pair_cell_faces, pair_edges
 from stitch.corners import Corner, place_corner
 from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile, tile_keys
+from stitch.layered_seams import fill_corner_layers, fill_seam_layers
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
 from stitch.seams import Seam, trace_seam
 from stitch.tiles import mesh_tile, tile_halo
@@ -39,6 +42,11 @@ REFINEMENTS = 1
 PASSES = 4
 LIMITS = SpacingLimits(least=0.1, most=0.8)
 OPTIONS = AdaptiveOptions(mesh_size=10.0, domain_height=60.0, limits=LIMITS, stagger=0.8, passes=1)
+LAYERED = LayeredOptions(
+    mesh_size=10.0, layer_height=5.0, domain_height=60.0, smoother="columns", tolerance=0.003, fem_tolerance=1e-8
+)
+
+Options = AdaptiveOptions | LayeredOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,14 +128,29 @@ def select_houses(scene: Scene, chosen: NDArray[np.integer]) -> Scene:
     )
 
 
-def clip_scene(scene: Scene, grid: TileGrid, tile: Key, options: AdaptiveOptions) -> Scene:
+def reach_of(options: Options) -> float:
+    """How far beyond a mesh terrain counts (m)."""
+    return terrain_reach(options) if isinstance(options, LayeredOptions) else top_reach(options.domain_height)
+
+
+def layers_of(scene: Scene, bounds: Bounds, options: LayeredOptions) -> NDArray[np.int32]:
+    """Choose the layers of all houses at once."""
+    model = scene.model
+    wall_ground = highest_wall_ground(model.polygons, scene.dtm)
+    pairs = adjacent_houses(model.polygons)
+    return choose_layers(model.polygons, model.roof, wall_ground, scene.group, pairs, scene.dtm, bounds, options)[
+        0
+    ]
+
+
+def clip_scene(scene: Scene, grid: TileGrid, tile: Key, options: Options) -> Scene:
     """Take what a tile may look at, and nothing else."""
     i, j = tile.i - grid.first.i, tile.j - grid.first.j
     (xmin, xmax), (ymin, ymax) = grid.lines[0][i : i + 2], grid.lines[1][j : j + 2]
     halo = tile_halo(grid.tile_size, options.mesh_size)
     box = shapely.box(xmin - halo, ymin - halo, xmax + halo, ymax + halo)
     near = select_houses(scene, np.flatnonzero(shapely.intersects(scene.model.polygons, box)))
-    dtm, far = scene.dtm, halo + top_reach(options.domain_height) + 2 * scene.dtm.spacing
+    dtm, far = scene.dtm, halo + reach_of(options) + 2 * scene.dtm.spacing
     west, east, south, north = (
         int(np.clip(round(value / dtm.spacing) - first, 0, size))
         for value, first, size in (
@@ -142,11 +165,25 @@ def clip_scene(scene: Scene, grid: TileGrid, tile: Key, options: AdaptiveOptions
 
 
 def mesh_alone(
-    scene: Scene, grid: TileGrid, tile: Key, options: AdaptiveOptions = OPTIONS, *, clip: bool = True
+    scene: Scene,
+    grid: TileGrid,
+    tile: Key,
+    options: Options = OPTIONS,
+    *,
+    clip: bool = True,
+    removed: NDArray[np.int32] | None = None,
 ) -> Tile:
-    """Mesh one tile: its corners and seams first, from what its halo holds, or from the whole scene."""
+    """Mesh one tile: its corners and seams first, from what its halo holds, or from the whole scene.
+
+    With layers, those removed in each house are given, or chosen from the whole scene.
+    """
     near = clip_scene(scene, grid, tile, options) if clip else scene
-    model, dtm, size = near.model, near.dtm, options.mesh_size
+    model, size = near.model, options.mesh_size
+    # Rows of the whole city, so that meshes from halos of any extent compare.
+    order = np.argsort(scene.model.numbers)
+    rows = order[np.searchsorted(scene.model.numbers, model.numbers, sorter=order)]
+    if isinstance(options, LayeredOptions):
+        removed = (layers_of(scene, grid.bounds, options) if removed is None else removed)[rows]
     walls = cut_walls(model.polygons, mesh_size=size)
     corners: dict[Key, Corner] = {}
     seams: dict[SeamKey, Seam] = {}
@@ -160,8 +197,7 @@ def mesh_alone(
             grid, key, (start, end), model.polygons, walls, mesh_size=size, min_angle=MIN_ANGLE, passes=PASSES
         )
         if not seam.border:
-            ends = tuple(fill_corner(corner, dtm, model.roof, model.ids, options) for corner in (start, end))
-            columns[key] = fill_seam(seam, (ends[0], ends[1]), dtm, model.roof, model.ids, options)
+            columns[key] = _seam_levels(seam, (start, end), near, removed, grid, options)
     south, east, north, west = (seams[key] for key in seams_of_tile(tile))
     plane, complete = mesh_tile(
         (south, east, north, west),
@@ -174,17 +210,37 @@ def mesh_alone(
     )
     assert complete
     given = tile_columns(plane, [(seams[key], columns[key]) for key in columns])
-    mesh, _ = mesh_adaptive(plane, dtm, model.roof, near.group, model.ids, options, seam=given)
-    # Rows of the whole city, so that meshes from halos of any extent compare.
-    order = np.argsort(scene.model.numbers)
-    found = order[np.searchsorted(scene.model.numbers, model.numbers, sorter=order)]
-    rows = np.append(found, -1).astype(np.int32)
-    return Tile(replace(mesh, plane=replace(plane, building=rows[plane.building])), seams, columns)
+    if isinstance(options, AdaptiveOptions):
+        mesh, _ = mesh_adaptive(plane, near.dtm, model.roof, near.group, model.ids, options, seam=given)
+    else:
+        none = np.empty(0)
+        mesh, _ = mesh_layers(plane, near.dtm, model, none, grid.bounds, options, removed=removed, seam=given)
+    building = np.append(rows, -1).astype(np.int32)[plane.building]
+    return Tile(replace(mesh, plane=replace(plane, building=building)), seams, columns)
 
 
-def mesh_all(scene: Scene, grid: TileGrid, options: AdaptiveOptions = OPTIONS) -> dict[Key, Tile]:
+def mesh_all(scene: Scene, grid: TileGrid, options: Options = OPTIONS) -> dict[Key, Tile]:
     """Mesh every tile alone."""
-    return {tile: mesh_alone(scene, grid, tile, options) for tile in tile_keys(grid)}
+    removed = layers_of(scene, grid.bounds, options) if isinstance(options, LayeredOptions) else None
+    return {tile: mesh_alone(scene, grid, tile, options, removed=removed) for tile in tile_keys(grid)}
+
+
+def _seam_levels(
+    seam: Seam,
+    ends: tuple[Corner, Corner],
+    near: Scene,
+    removed: NDArray[np.int32] | None,
+    grid: TileGrid,
+    options: Options,
+) -> Levels:
+    """Columns of a seam, those of its corners first."""
+    dtm, roof, ids = near.dtm, near.model.roof, near.model.ids
+    if isinstance(options, AdaptiveOptions):
+        start, end = (fill_corner(corner, dtm, roof, ids, options) for corner in ends)
+        return fill_seam(seam, (start, end), dtm, roof, ids, options)
+    assert removed is not None
+    start, end = (fill_corner_layers(corner, dtm, roof, ids, removed, grid.bounds, options) for corner in ends)
+    return fill_seam_layers(seam, (start, end), dtm, roof, ids, removed, grid.bounds, options)
 
 
 def mesh_bytes(mesh: ColumnMesh) -> bytes:
@@ -203,7 +259,7 @@ def glue(meshes: Sequence[ColumnMesh]) -> TetMesh:
     return TetMesh(points, index.reshape(-1)[cells].astype(np.int32))
 
 
-def prove_glued(mesh: TetMesh, scene: Scene, bounds: Bounds, options: AdaptiveOptions = OPTIONS) -> None:
+def prove_glued(mesh: TetMesh, scene: Scene, bounds: Bounds, options: Options = OPTIONS) -> None:
     """Prove that glued tiles are one mesh with no boundary but ground, roofs, walls, top and sides."""
     volume, flat = compute_cell_volumes(mesh.points, mesh.cells)
     assert volume.min() > 0
@@ -237,12 +293,20 @@ def prove_upright(corners: NDArray[np.float64], scene: Scene, bounds: Bounds) ->
     assert (inner[..., 2].max(axis=1) <= highest).all()
 
 
-def prove_level(
-    corners: NDArray[np.float64], up: NDArray[np.bool_], scene: Scene, options: AdaptiveOptions
-) -> None:
-    """Prove that faces upwards are the top, and faces downwards ground and roofs, bit for bit."""
-    top = domain_top(scene.dtm, corners[up].reshape(-1, 3)[:, :2], domain_height=options.domain_height)
-    assert corners[up].reshape(-1, 3)[:, 2].tobytes() == top.tobytes()
+def prove_level(corners: NDArray[np.float64], up: NDArray[np.bool_], scene: Scene, options: Options) -> None:
+    """Prove that faces upwards are the top, and faces downwards ground and roofs, bit for bit.
+
+    The top of layers gives way to high roofs, so of these only that it is whole and far above the ground.
+    """
+    ceiling = corners[up].reshape(-1, 3)
+    if isinstance(options, AdaptiveOptions):
+        top = domain_top(scene.dtm, ceiling[:, :2], domain_height=options.domain_height)
+        assert ceiling[:, 2].tobytes() == top.tobytes()
+    else:
+        air = ceiling[:, 2] - sample_dtm(scene.dtm, ceiling[:, :2])
+        assert air.min() > options.domain_height / 2
+        whole = np.prod(ceiling[:, :2].max(axis=0) - ceiling[:, :2].min(axis=0))
+        np.testing.assert_allclose(_areas(corners[up]).sum(), whole, rtol=1e-9)
     floor = corners[~up]
     house = np.full(len(floor), -1)
     centre = shapely.points(floor[..., :2].mean(axis=1))
@@ -271,7 +335,7 @@ def prove_seams(tiles: dict[Key, Tile]) -> int:
     return len(found)
 
 
-def prove_volume(tiles: dict[Key, Tile], scene: Scene, bounds: Bounds, options: AdaptiveOptions = OPTIONS) -> None:
+def prove_volume(tiles: dict[Key, Tile], scene: Scene, bounds: Bounds, options: Options = OPTIONS) -> None:
     """Prove on level ground that the cells of all tiles fill the box less the buildings."""
     area = sum(np.abs(signed_areas(tile.mesh.plane)).sum() for tile in tiles.values())
     whole = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
@@ -280,7 +344,16 @@ def prove_volume(tiles: dict[Key, Tile], scene: Scene, bounds: Bounds, options: 
     volume = sum(compute_cell_volumes(part.points, part.cells)[0].sum() for part in cells)
     ground = float(scene.dtm.z[0, 0])
     built = (shapely.area(scene.model.polygons) * (scene.model.roof - ground)).sum()
-    np.testing.assert_allclose(volume, whole * options.domain_height - built, rtol=1e-10)
+    box = whole * options.domain_height
+    if isinstance(options, LayeredOptions):
+        box = sum(_volume_to_top(tile.mesh, ground) for tile in tiles.values())
+    np.testing.assert_allclose(volume, box - built, rtol=1e-10)
+
+
+def _volume_to_top(mesh: ColumnMesh, ground: float) -> float:
+    """Volume between level ground and the tops of the columns (m3)."""
+    top = mesh.z[mesh.z_start[1:] - 1][mesh.plane.triangles].mean(axis=1)
+    return float((np.abs(signed_areas(mesh.plane)) * (top - ground)).sum())
 
 
 def _areas(corners: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,10 +10,11 @@ from pipeline.citymodel import CityModel
 from pipeline.columns import count_cells, expand_cells, extract_boundary, lowest_gap, plane_edges
 from pipeline.errors import GeometryError, SolverError
 from pipeline.fem import solve_laplace, stiffness_matrix
+from pipeline.groups import adjacent_houses
 from pipeline.heights import highest_wall_ground, raise_low_roofs
 from pipeline.layered import LayeredOptions, Smoother, layer_mesh, mesh_layers
 from pipeline.mesh import ColumnMesh, Marker, PlaneMesh, TetMesh
-from pipeline.neighbours import join_equal_roofs, part_neighbours, touching_groups
+from pipeline.neighbours import join_equal_roofs, part_neighbours
 from pipeline.plane import mesh_plane, signed_areas
 from pipeline.relax import assemble_stencil, relax_columns
 from pipeline.repair import repair_columns
@@ -185,12 +186,10 @@ def test_linear_displacement_is_reproduced_exactly() -> None:
 
 
 def test_the_stencil_is_the_stiffness_matrix_of_the_cells() -> None:
-    city, dtm, wall_ground = random_city((0.0, 0.0, 120.0, 120.0), 4, seed=5)
+    city, dtm, _ = random_city((0.0, 0.0, 120.0, 120.0), 4, seed=5)
     plane, _ = mesh_plane((0.0, 0.0, 120.0, 120.0), city.polygons, mesh_size=15.0)
     z = sample_dtm(dtm, plane.xy)[:, None] + np.linspace(0, 60, 5)
-    removed = count_removed_layers(
-        z, plane, city.roof, wall_ground, np.arange(4, dtype=np.int32), layer_height=15.0
-    )
+    removed = np.array([1, 2, 3, 1], np.int32)
     first = first_levels(plane, removed)
     edges, of_triangle = plane_edges(plane.triangles)
     stencil = assemble_stencil(plane, of_triangle, len(edges), first, z)
@@ -259,12 +258,11 @@ def test_repair_refuses_given_levels_that_do_not_ascend() -> None:
 
 
 def test_no_more_layers_are_removed_than_leave_each_two_fifths() -> None:
-    city = city_of([shapely.box(318100, 6399100, 318130, 6399130)], [46.0])
-    plane, _ = mesh_plane(BOUNDS, city.polygons, mesh_size=10.0)
-    z = np.tile(np.linspace(0, 100, 11), (len(plane.xy), 1))
+    levels = np.array([[-10.0], [10.0]]) + np.linspace(0, 100, 11)
+    building = np.zeros(2, np.int64)
     for wall, layers in ((0.0, 5), (40.0, 1), (37.0, 2)):
         removed = count_removed_layers(
-            z, plane, city.roof, np.array([wall]), np.zeros(1, np.int32), layer_height=10.0
+            levels, building, np.array([46.0]), np.array([wall]), np.zeros(1, np.int32), layer_height=10.0
         )
         assert removed.tolist() == [layers]
 
@@ -297,17 +295,16 @@ def test_terraces_conform_on_layers_of_their_own(smoother: Smoother, layer_heigh
 def test_roofs_that_meet_rise_one_layer_each_and_equal_ones_share_theirs() -> None:
     row = [shapely.box(10 + 10 * k, 30, 20 + 10 * k, 40) for k in range(5)]
     city = city_of(row, [12.0, 15.0, 15.0, 18.0, 40.0])
-    plane, _ = mesh_plane((0.0, 0.0, 80.0, 80.0), city.polygons, mesh_size=10.0)
     own = np.arange(5, dtype=np.int32)
-    group = join_equal_roofs(plane, city.roof, own)
+    pairs = adjacent_houses(city.polygons)
+    group = join_equal_roofs(pairs, city.roof, own)
     assert group.tolist() == [0, 1, 1, 2, 3]
-    lower, higher = touching_groups(plane, city.roof, group)
-    assert list(zip(lower.tolist(), higher.tolist(), strict=True)) == [(0, 1), (1, 3), (3, 4)]
     alone = np.array([1, 1, 1, 2, 4], np.int32)
-    removed, parted = part_neighbours(plane, city.roof, group, alone, n_layers=8)
+    removed, parted = part_neighbours(pairs, city.roof, group, alone, city.polygons, n_layers=8)
     assert (removed.tolist(), parted) == ([1, 2, 2, 3, 4], 2)
     # Without room above, the lower ones come down.
-    crowded, parted = part_neighbours(plane, city.roof, group, np.full(5, 4, np.int32), n_layers=5)
+    full = np.full(5, 4, np.int32)
+    crowded, parted = part_neighbours(pairs, city.roof, group, full, city.polygons, n_layers=5)
     assert (crowded.tolist(), parted) == ([1, 2, 2, 3, 4], 3)
     with pytest.raises(GeometryError, match=r"roof at 12\.0 m near \(15.*in 4 layers; lower --layer-height"):
-        part_neighbours(plane, city.roof, group, alone, n_layers=4)
+        part_neighbours(pairs, city.roof, group, alone, city.polygons, n_layers=4)

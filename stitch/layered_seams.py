@@ -1,0 +1,79 @@
+"""Columns of seams and corners from seam data alone (steps 3.2 to 3.5, layered)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.layered import LayeredOptions, fill_layers
+from pipeline.nodes import Levels, SeamColumns, take_columns
+from pipeline.terrain import Dtm
+from stitch.corners import Corner
+from stitch.grid import Bounds
+from stitch.seam_columns import corner_fan, join_levels
+from stitch.seams import Seam, find_vertices
+
+
+def fill_corner_layers(
+    corner: Corner,
+    dtm: Dtm,
+    roof: NDArray[np.float64],
+    ids: NDArray[np.str_],
+    removed: NDArray[np.int32],
+    bounds: Bounds,
+    options: LayeredOptions,
+) -> Levels:
+    """Fill the column of a corner: it belongs to the corner, and all its seams take it over.
+
+    Parameters
+    ----------
+    corner : Corner
+        A corner of two tiles or more. No wall is as close to it as the tips of its first edges.
+    dtm : Dtm
+        Terrain as far beyond these as `terrain_reach` says.
+    roof, ids, bounds, options
+        As in `mesh_layers`, with `bounds` the region.
+    removed : int32, (b,)
+        Layers removed in each building (`choose_layers`).
+
+    Returns
+    -------
+    Levels
+        One column, from the ground or the roof around it up to the domain's top.
+    """
+    fan = corner_fan(corner)
+    levels = fill_layers(fan, dtm, roof, ids, removed, bounds, options)
+    return take_columns(levels, find_vertices(fan.xy, corner.xy[None]))
+
+
+def fill_seam_layers(
+    seam: Seam,
+    ends: tuple[Levels, Levels],
+    dtm: Dtm,
+    roof: NDArray[np.float64],
+    ids: NDArray[np.str_],
+    removed: NDArray[np.int32],
+    bounds: Bounds,
+    options: LayeredOptions,
+) -> Levels:
+    """Fill the columns of a seam within the region: step 3.5 on the triangles around it, free where these end.
+
+    Parameters
+    ----------
+    seam : Seam
+        The seam.
+    ends : (Levels, Levels)
+        Columns of its first and last corner.
+    dtm : Dtm
+        Terrain as far beyond its surroundings as `terrain_reach` says.
+    roof, ids, removed, bounds, options
+        As in `fill_corner_layers`.
+
+    Returns
+    -------
+    Levels
+        A column for each vertex, from the lowest level that either side uses up to the domain's top.
+    """
+    plane = seam.surroundings
+    vertex = find_vertices(plane.xy, seam.xy)
+    given = SeamColumns(vertex[[0, -1]], join_levels(ends))
+    levels = fill_layers(plane, dtm, roof, ids, removed, bounds, options, seam=given)
+    return take_columns(levels, vertex)
