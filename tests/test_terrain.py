@@ -1,4 +1,6 @@
-"""Step 1.3: bin means, filling, sampling."""
+"""Step 1.3: bin means, filling, sampling, and the same bytes from any tiles."""
+
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -7,7 +9,20 @@ from hypothesis import strategies as st
 
 from pipeline.errors import InputError
 from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
-from pipeline.terrain import Dtm, bin_ground, compute_dtm, fill_dtm, sample_dtm
+from pipeline.raster import NodeWindow, cut_nodes, grow_window, join_dtm, node_window, window_of
+from pipeline.terrain import Dtm, bin_ground, bin_nodes, compute_dtm, fill_dtm, sample_dtm
+from pipeline.terrain_fill import (
+    COARSE,
+    DEEPER,
+    FILL_RINGS,
+    RIM,
+    FillCounts,
+    coarse_terrain,
+    coarsen,
+    fill_terrain,
+    flood_terrain,
+    merge_coarse,
+)
 from tests.cities import tilted_dtm
 
 
@@ -79,3 +94,201 @@ def test_sampling_has_the_same_bits_from_any_cut_of_the_raster() -> None:
 def test_sampling_beyond_the_raster_takes_its_border() -> None:
     dtm = tilted_dtm((0.0, 0.0, 4.0, 4.0), slope_x=1.0)
     assert sample_dtm(dtm, np.array([[-3.0, 2.0], [9.0, 2.0]])).tolist() == [0.0, 4.0]
+
+
+Box = tuple[float, float, float, float]
+REGION: Box = (1000.4, -501.7, 1470.0, -120.3)
+
+
+def tile_boxes(region: Box, size: float) -> Iterator[tuple[Box, tuple[bool, bool], tuple[bool, bool]]]:
+    """Tiles of the region, aligned to multiples of their size, and which of their sides are its border."""
+    lines = []
+    for low, high in ((region[0], region[2]), (region[1], region[3])):
+        inner = np.arange(np.floor(low / size) + 1, np.ceil(high / size)) * size
+        lines.append([low, *inner.tolist(), high])
+    for x0, x1 in zip(lines[0][:-1], lines[0][1:], strict=True):
+        for y0, y1 in zip(lines[1][:-1], lines[1][1:], strict=True):
+            yield (x0, y0, x1, y1), (x0 == region[0], y0 == region[1]), (x1 == region[2], y1 == region[3])
+
+
+def tile_windows(region: Box, size: float, spacing: float) -> list[NodeWindow]:
+    return [
+        node_window(box, spacing, low_border=low, high_border=high) for box, low, high in tile_boxes(region, size)
+    ]
+
+
+@pytest.mark.parametrize(("size", "spacing"), [(77.3, 1.0), (90.0, 0.7), (0.4, 1.0), (100.0, 2.0), (1e4, 0.5)])
+def test_every_node_belongs_to_one_tile(size: float, spacing: float) -> None:
+    region = (1000.4, -501.7, 1010.0, -489.3) if size < 1 else REGION
+    whole = node_window(region, spacing)
+    owners = np.zeros((whole.ny, whole.nx), int)
+    for window in tile_windows(region, size, spacing):
+        assert grow_window(window, 0, within=whole) == window
+        cut_nodes(owners, whole, window)[...] += 1
+    assert (owners == 1).all()
+
+
+def test_the_whole_region_has_the_nodes_just_outside() -> None:
+    assert node_window((0.1, 2.0, 3.9, 4.0), 1.0) == NodeWindow(0, 2, 5, 3)
+    with pytest.raises(ValueError, match="no nodes"):
+        node_window((1.0, 0.0, 0.0, 1.0), 1.0)
+
+
+def test_bins_of_tiles_are_those_of_the_region_from_points_half_a_spacing_beyond() -> None:
+    rng = np.random.default_rng(5)
+    spacing, n = 0.8, 40_000
+    xyz = np.column_stack((rng.uniform(1000, 1100, n), rng.uniform(-80, 0, n), rng.uniform(0, 500, n).round(3)))
+    xyz[::50, :2] = (np.rint(xyz[::50, :2] / spacing) + 0.5) * spacing  # between two nodes
+    points = PointCloud(xyz, np.full(n, GROUND, np.uint8))
+    region = (1000.0, -80.0, 1100.0, 0.0)
+    whole, count = bin_ground(points, region, spacing=spacing)
+    parts, n_points = [], 0
+    for window in tile_windows(region, 33.3, spacing):
+        low = (np.array([window.i0, window.j0]) - 0.5) * spacing - 1e-9
+        high = low + np.array([window.nx, window.ny]) * spacing + 2e-9
+        near = ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)
+        part, found = bin_nodes(PointCloud(xyz[near], points.classification[near]), window, spacing=spacing)
+        parts.append(part)
+        n_points += int(found.sum())
+    assert join_dtm(parts[::-1], window_of(whole)).z.tobytes() == whole.z.tobytes()
+    assert n_points == count.sum()
+
+
+def raster_with_lakes(seed: int, nx: int, ny: int) -> Dtm:
+    """Rough terrain with single empty nodes, a long gap, and lakes that are not flooded wholly."""
+    rng = np.random.default_rng(seed)
+    x, y = np.arange(nx), np.arange(ny)[:, None]
+    z = (20 * np.sin(x / 90) * np.cos(y / 70) + rng.normal(0, 1, (ny, nx))).round(4)
+    z[rng.random((ny, nx)) < 0.3] = np.nan
+    for cx, cy, r in ((0.3, 0.35, 0.22), (1.0, 0.6, 0.25), (0.6, 0.9, 0.1), (0.75, 0.15, 0.07)):
+        z[np.hypot(x - cx * nx, 1.3 * (y - cy * ny)) < r * nx] = np.nan
+    z[ny // 2 : ny // 2 + 9, :] = np.nan
+    return Dtm(z, 999, -502, 1.0)
+
+
+def fill_by_tiles(raw: Dtm, windows: list[NodeWindow]) -> tuple[Dtm, FillCounts]:
+    """Fill each tile from what it may read only, and join all."""
+    region = window_of(raw)
+    halos = [grow_window(window, FILL_RINGS, within=region) for window in windows]
+    flooded = [flood_terrain(join_dtm([raw], h), w) for h, w in zip(halos, windows, strict=True)]
+    coarse = coarse_terrain(merge_coarse([coarsen(part) for part in flooded[::-1]]))
+    filled = [fill_terrain(part, coarse) for part in flooded]
+    counts = FillCounts(sum(c.filled for _, c in filled), sum(c.coarse for _, c in filled))
+    return join_dtm([dtm for dtm, _ in filled], region), counts
+
+
+@pytest.mark.parametrize(("seed", "size"), [(0, 150.0), (1, 97.3), (2, 311.9), (3, 41.0)])
+def test_filling_by_tiles_gives_the_bytes_of_the_region(seed: int, size: float) -> None:
+    raw = raster_with_lakes(seed, 700, 520)
+    region = (999.0, -502.0, 999.0 + 699, -502.0 + 519)
+    tiled, counts = fill_by_tiles(raw, tile_windows(region, size, 1.0))
+    whole = fill_dtm(raw)
+    assert not np.isnan(whole.z).any()
+    assert tiled.z.tobytes() == whole.z.tobytes()
+    flooded = flood_terrain(raw, window_of(raw))
+    assert (flooded.ring == DEEPER).sum() > 5000
+    assert counts == FillCounts(int(np.isnan(raw.z).sum()), int((flooded.ring > RIM).sum()))
+
+
+def test_a_flooded_tile_depends_on_its_halo_only_and_needs_all_of_it() -> None:
+    raw = raster_with_lakes(4, 700, 520)
+    window = NodeWindow(raw.i0 + 150, raw.j0 + 120, 200, 180)
+    whole = flood_terrain(raw, window_of(raw))
+    expected = cut_nodes(whole.dtm.z, window_of(raw), window)
+    ring = cut_nodes(whole.ring, window_of(raw), window)
+    assert (ring == FILL_RINGS).any()
+    equal = []
+    for reach in (FILL_RINGS, FILL_RINGS // 3):
+        halo = grow_window(window, reach, within=window_of(raw))
+        part = flood_terrain(join_dtm([raw], halo), window)
+        equal.append(part.dtm.z.tobytes() == expected.tobytes() and part.ring.tobytes() == ring.tobytes())
+    assert equal == [True, False]
+
+
+def test_rings_count_nodes_along_the_larger_axis() -> None:
+    z = np.full((4, FILL_RINGS + 4), np.nan)
+    z[1, 0] = 2.0
+    ring = flood_terrain(Dtm(z, 0, 0, 1.0), NodeWindow(0, 0, FILL_RINGS + 4, 4)).ring
+    assert ring[:, :3].tolist() == [[1, 1, 2], [0, 1, 2], [1, 1, 2], [2, 2, 2]]
+    assert ring[0, -5:].tolist() == [FILL_RINGS - 1, FILL_RINGS, DEEPER, DEEPER, DEEPER]
+
+
+def test_the_coarse_level_is_the_mean_of_the_rim_by_hand() -> None:
+    # A shore of 3 m on the left: rings 33 to 64 are rim; nodes 33 to 64 of the row. Coarse node 1 is node 64.
+    z = np.full((1, 300), np.nan)
+    z[0, 0] = 3.0
+    raw = Dtm(z, 0, 0, 1.0)
+    sums = coarsen(flood_terrain(raw, window_of(raw)))
+    assert sums.node.tolist() == [[1, 0]]
+    assert (sums.count.tolist(), sums.total.tolist(), sums.n_known) == ([32], [32 * 30_000], 1)
+    coarse = coarse_terrain(sums)
+    assert (coarse.i0, coarse.j0, coarse.spacing, coarse.z.tolist()) == (0, 0, COARSE, [[3.0] * 6])
+
+
+def test_a_lake_is_as_flat_as_its_shore_and_its_hills_do_not_lift_it() -> None:
+    x, y = np.arange(600), np.arange(500)[:, None]
+    off_shore = np.hypot(x - 300, y - 250) - 200
+    z = np.where(off_shore < 0, np.nan, 7.0 + 0.3 * np.maximum(off_shore - 3, 0))
+    filled = fill_dtm(Dtm(z, 50, 17, 0.5))
+    np.testing.assert_allclose(filled.z[off_shore < 0], 7.0, atol=1e-9)
+
+
+def test_the_blend_has_no_step() -> None:
+    # Shores of 0 m and 12 m, 500 nodes apart: the flood alone has a step of 12 m in the middle.
+    z = np.full((3, 502), np.nan)
+    z[:, 0], z[:, -1] = 0.0, 12.0
+    row = fill_dtm(Dtm(z, 0, 0, 1.0)).z[1]
+    assert np.abs(np.diff(row)).max() <= 12 / COARSE + 1e-9
+    assert row[RIM] == 0.0
+    assert row[501 - RIM] == 12.0
+
+
+def test_a_tile_without_ground_takes_the_coarse_level_alone() -> None:
+    raw = raster_with_lakes(0, 700, 520)
+    window = NodeWindow(raw.i0 + 190, raw.j0 + 160, 30, 30)
+    halo = join_dtm([raw], grow_window(window, FILL_RINGS, within=window_of(raw)))
+    assert np.isnan(halo.z).all()
+    flooded = flood_terrain(halo, window)
+    assert coarsen(flooded).n_known == len(coarsen(flooded).node) == 0
+    coarse = coarse_terrain(coarsen(flood_terrain(raw, window_of(raw))))
+    dtm, counts = fill_terrain(flooded, coarse)
+    assert counts == FillCounts(900, 900)
+    x, y = np.meshgrid(window.i0 + np.arange(30.0), window.j0 + np.arange(30.0))
+    np.testing.assert_allclose(dtm.z.ravel(), sample_dtm(coarse, np.column_stack((x.ravel(), y.ravel()))))
+
+
+def test_ground_away_from_large_lakes_leaves_the_coarse_level_alone() -> None:
+    raw = raster_with_lakes(0, 700, 520)
+    known = raw.z.copy()
+    known[np.isnan(known)] = 0.0
+    dry = coarsen(flood_terrain(Dtm(known, 0, 0, 1.0), NodeWindow(0, 0, 700, 520)))
+    assert len(dry.node) == 0
+    assert fill_dtm(Dtm(known, 0, 0, 1.0)).z.tobytes() == known.tobytes()
+
+
+def test_a_region_without_ground_in_any_tile_is_an_error() -> None:
+    empty = flood_terrain(Dtm(np.full((4, 5), np.nan), 0, 0, 1.0), NodeWindow(0, 0, 5, 4))
+    none = flood_terrain(Dtm(np.full((4, 0), np.nan), 5, 0, 1.0), NodeWindow(5, 0, 0, 4))
+    with pytest.raises(InputError, match="none of the 20 nodes"):
+        coarse_terrain(merge_coarse([coarsen(none), coarsen(empty)]))
+
+
+def test_joining_checks_its_parts() -> None:
+    one = Dtm(np.array([[1.0, 2.0]]), 0, 0, 1.0)
+    joined = join_dtm([one, Dtm(np.array([[2.0, 3.0]]), 1, 0, 1.0)], NodeWindow(-1, 0, 5, 1))
+    np.testing.assert_array_equal(joined.z, [[np.nan, 1.0, 2.0, 3.0, np.nan]])
+    with pytest.raises(ValueError, match="different heights"):
+        join_dtm([one, Dtm(np.array([[2.5, 3.0]]), 1, 0, 1.0)], NodeWindow(0, 0, 3, 1))
+    with pytest.raises(ValueError, match="spacings"):
+        join_dtm([one, Dtm(one.z, 0, 0, 0.5)], NodeWindow(0, 0, 3, 1))
+
+
+def test_windows_that_do_not_fit_are_refused() -> None:
+    raw = raster_with_lakes(0, 300, 300)
+    with pytest.raises(ValueError, match="not inside"):
+        flood_terrain(raw, NodeWindow(raw.i0 - 1, raw.j0, 10, 10))
+    flooded = flood_terrain(Dtm(np.full((9, 9), np.nan), 0, 0, 1.0), NodeWindow(0, 0, 9, 9))
+    with pytest.raises(ValueError, match="not 64 times"):
+        fill_terrain(flooded, Dtm(np.zeros((2, 2)), 0, 0, 1.0))
+    with pytest.raises(ValueError, match="do not reach"):
+        fill_terrain(flooded, Dtm(np.zeros((2, 1)), 0, 0, 64.0))

@@ -1,0 +1,212 @@
+"""The terrain's raster: nodes aligned with the CRS, the windows of tiles, joining and sampling (step 1.3)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+# Heights are summed as whole numbers of this unit, so that a mean does not depend on the order of what
+# is summed: sums of whole numbers below 2**53 are exact in float64.
+HEIGHT_UNIT = 1e-4  # m
+
+Value = TypeVar("Value", bound=np.generic)
+
+
+@dataclass(frozen=True, eq=False)
+class Dtm:
+    """Ground heights at the nodes of a grid that is aligned with the CRS.
+
+    Attributes
+    ----------
+    z : float64, (ny, nx)
+        Height (m) at node ``(x, y) = ((i0 + i) * spacing, (j0 + j) * spacing)``, row ``j``, column ``i``.
+    i0, j0 : int
+        Region-wide index of the first column and row: the same node has the same index in every tile.
+    spacing : float
+        Distance between nodes (m).
+    """
+
+    z: NDArray[np.float64]
+    i0: int
+    j0: int
+    spacing: float
+
+
+@dataclass(frozen=True)
+class NodeWindow:
+    """A rectangle of nodes.
+
+    Attributes
+    ----------
+    i0, j0 : int
+        Region-wide index of the first column and row.
+    nx, ny : int
+        Columns and rows, 0 or more.
+    """
+
+    i0: int
+    j0: int
+    nx: int
+    ny: int
+
+
+def node_window(
+    box: tuple[float, float, float, float],
+    spacing: float,
+    *,
+    low_border: tuple[bool, bool] = (True, True),
+    high_border: tuple[bool, bool] = (True, True),
+) -> NodeWindow:
+    """Find the nodes that a tile owns.
+
+    Parameters
+    ----------
+    box : (xmin, ymin, xmax, ymax)
+        The tile (m).
+    spacing : float
+        Distance between nodes (m).
+    low_border, high_border : (bool, bool)
+        Whether the low and the high side in x and in y are the region's border. By default all are: the box
+        is the region.
+
+    Returns
+    -------
+    NodeWindow
+        Nodes in the half-open box; at the region's border up to the first node on or beyond it.
+
+    Raises
+    ------
+    ValueError
+        If the box is inside out or the spacing not positive.
+
+    Notes
+    -----
+    Tiles that share a line as the same floats share no node and leave none out, wherever the line lies.
+
+    Examples
+    --------
+    >>> west, east = (0.3, 0.0, 2.5, 4.0), (2.5, 0.0, 5.2, 4.0)
+    >>> node_window(west, 1.0, high_border=(False, True))
+    NodeWindow(i0=0, j0=0, nx=3, ny=5)
+    >>> node_window(east, 1.0, low_border=(False, True))
+    NodeWindow(i0=3, j0=0, nx=4, ny=5)
+    """
+    if not (spacing > 0 and box[0] <= box[2] and box[1] <= box[3]):
+        raise ValueError(f"no nodes in box {box} at spacing {spacing}")
+    low, high = [0, 0], [0, 0]
+    for k in range(2):
+        first, last = box[k] / spacing, box[k + 2] / spacing
+        low[k] = math.floor(first) if low_border[k] else math.ceil(first)
+        high[k] = math.ceil(last) + 1 if high_border[k] else math.ceil(last)
+    return NodeWindow(low[0], low[1], high[0] - low[0], high[1] - low[1])
+
+
+def window_of(dtm: Dtm) -> NodeWindow:
+    """Nodes of a raster."""
+    ny, nx = dtm.z.shape
+    return NodeWindow(dtm.i0, dtm.j0, nx, ny)
+
+
+def grow_window(window: NodeWindow, by: int, *, within: NodeWindow) -> NodeWindow:
+    """Grow a window by a number of nodes on each side, but not beyond another one (the region's).
+
+    Examples
+    --------
+    >>> grow_window(NodeWindow(0, 10, 5, 5), 3, within=NodeWindow(0, 0, 100, 100))
+    NodeWindow(i0=0, j0=7, nx=8, ny=11)
+    """
+    i0, j0 = max(window.i0 - by, within.i0), max(window.j0 - by, within.j0)
+    i1 = min(window.i0 + window.nx + by, within.i0 + within.nx)
+    j1 = min(window.j0 + window.ny + by, within.j0 + within.ny)
+    return NodeWindow(i0, j0, max(i1 - i0, 0), max(j1 - j0, 0))
+
+
+def join_dtm(parts: Sequence[Dtm], window: NodeWindow) -> Dtm:
+    """Put the rasters of neighbouring tiles together.
+
+    Parameters
+    ----------
+    parts : sequence of Dtm, at least one
+        Rasters of one spacing, in any order. Where they overlap, they agree or one of them has NaN.
+    window : NodeWindow
+        Nodes to return; parts may reach beyond it or miss it.
+
+    Returns
+    -------
+    Dtm
+        Heights of the window, NaN where no part has any.
+
+    Raises
+    ------
+    ValueError
+        If there are no parts, or they differ in spacing or in the height of a node.
+    """
+    if not parts or any(part.spacing != parts[0].spacing for part in parts):
+        raise ValueError(f"cannot join {len(parts)} rasters of spacings {sorted({p.spacing for p in parts})}")
+    z = np.full((window.ny, window.nx), np.nan)
+    for part in parts:
+        common = grow_window(window_of(part), 0, within=window)
+        target = cut_nodes(z, window, common)
+        source = cut_nodes(part.z, window_of(part), common)
+        if ((target != source) & ~np.isnan(target) & ~np.isnan(source)).any():
+            raise ValueError(f"rasters to join have different heights at nodes of {common}")
+        np.copyto(target, source, where=~np.isnan(source))
+    return Dtm(z, window.i0, window.j0, parts[0].spacing)
+
+
+def cut_nodes(values: NDArray[Value], window: NodeWindow, inner: NodeWindow) -> NDArray[Value]:
+    """View of the values (ny, nx) of a window at the nodes of a window inside it."""
+    i, j = max(inner.i0 - window.i0, 0), max(inner.j0 - window.j0, 0)
+    return values[j : j + inner.ny, i : i + inner.nx]
+
+
+def sample_dtm(dtm: Dtm, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sample ground heights bilinearly.
+
+    Parameters
+    ----------
+    dtm : Dtm
+        Terrain without empty nodes.
+    xy : float64, (n, 2)
+        Places (m). Beyond the grid, the closest place on its border is sampled.
+
+    Returns
+    -------
+    float64, (n,)
+        Heights (m).
+
+    Notes
+    -----
+    The position in a cell comes from region-wide indices, so two tiles that hold the same nodes get the
+    same bits.
+    """
+    height = np.empty(len(xy))
+    _sample(dtm.z, dtm.i0, dtm.j0, dtm.spacing, xy, height)
+    return height
+
+
+@numba.njit(cache=True, nogil=True)
+def _sample(
+    z: NDArray[np.float64],
+    i0: int,
+    j0: int,
+    spacing: float,
+    xy: NDArray[np.float64],
+    height: NDArray[np.float64],
+) -> None:
+    ny, nx = z.shape
+    for k in range(len(xy)):
+        u = min(max(xy[k, 0] / spacing, float(i0)), float(i0 + nx - 1))
+        v = min(max(xy[k, 1] / spacing, float(j0)), float(j0 + ny - 1))
+        i = min(int(np.floor(u)), i0 + max(nx - 2, 0))
+        j = min(int(np.floor(v)), j0 + max(ny - 2, 0))
+        s, t = u - i, v - j
+        left, low = i - i0, j - j0
+        right, high = min(left + 1, nx - 1), min(low + 1, ny - 1)
+        below = (1 - s) * z[low, left] + s * z[low, right]
+        above = (1 - s) * z[high, left] + s * z[high, right]
+        height[k] = (1 - t) * below + t * above
