@@ -10,8 +10,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, TetMesh
+from pipeline.mesh import Boundary, ColumnMesh, Marker, SeamEdges, TetMesh
 from pipeline.plane import signed_areas
+
+Bounds = tuple[float, float, float, float]
 
 
 def count_cells(mesh: ColumnMesh) -> int:
@@ -71,20 +73,47 @@ def extract_boundary(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> Boundary:
     a wall, the merge may pass it by: then the higher side has facets that the lower lacks, and both are
     written, each seen from its own air. The boundary is closed in any case.
     """
-    plane = mesh.plane
-    first = mesh.z_start[plane.triangles]
-    last = mesh.z_start[plane.triangles + 1] - 1
-    clockwise = signed_areas(plane) < 0
-    floor = _oriented((first + mesh.bottom).astype(np.int32), ~clockwise)
-    ceiling = _oriented(last.astype(np.int32), clockwise)
-    building = np.where(plane.building >= 0, np.append(numbers, -1)[plane.building], -1)
-    floor_marker = np.where(plane.building >= 0, Marker.ROOF, Marker.GROUND)
-    sheets, sheet_marker, sheet_building = _vertical_facets(mesh, building)
-    return Boundary(
-        np.concatenate((floor, ceiling, sheets)),
-        np.concatenate((floor_marker, np.full(len(ceiling), Marker.TOP), sheet_marker)).astype(np.int32),
-        np.concatenate((building, np.full(len(ceiling), -1), sheet_building)),
-    )
+    low, high = mesh.plane.xy.min(axis=0), mesh.plane.xy.max(axis=0)
+    return _extract_boundary(mesh, numbers, (*low, *high), _no_seams())[0]
+
+
+def split_boundary(
+    mesh: ColumnMesh, numbers: NDArray[np.int64], bounds: Bounds, seams: SeamEdges
+) -> tuple[Boundary, NDArray[np.int32]]:
+    """Extract the boundary of one tile of a region (step 3.6), without the faces that it shares with others.
+
+    Parameters
+    ----------
+    mesh : ColumnMesh
+        The tile's mesh.
+    numbers : int64, (b,)
+        Number of each building, row by row those of `PlaneMesh.building`.
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    seams : SeamEdges
+        All outer edges of the tile that are not on the region's border.
+
+    Returns
+    -------
+    Boundary
+        As from `extract_boundary`, of this tile's air alone. Over a seam, these are the walls that only this
+        side has: the one beyond begins higher. If the tile beyond is missing, all facets are MISSING.
+    int32, (s, 3)
+        The other facets over seams, pointing out of this tile's air. The tile beyond has each of them, bit for
+        bit, in the opposite orientation.
+
+    Raises
+    ------
+    ValueError
+        If a seam is no outer edge of the mesh or begins at a level that its columns lack, or an outer edge is
+        neither on the region's border nor a seam.
+
+    Notes
+    -----
+    A wall on a seam is found like any other: from the levels at which the two sides begin. Both tiles have the
+    same columns there, so what one leaves out the other does not have.
+    """
+    return _extract_boundary(mesh, numbers, bounds, seams, strict=True)
 
 
 def plane_edges(triangles: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -114,38 +143,96 @@ def _oriented(facets: NDArray[np.int32], swap: NDArray[np.bool_]) -> NDArray[np.
     return facets
 
 
-def _vertical_facets(
-    mesh: ColumnMesh, building: NDArray[np.int64]
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-    """Facets over edges: walls where the two sides begin at different levels, and the region's sides."""
+def _no_seams() -> SeamEdges:
+    pairs = np.empty((0, 2), np.int32)
+    return SeamEdges(pairs, pairs, np.empty(0, np.int64), np.empty(0, np.bool_))
+
+
+def _extract_boundary(
+    mesh: ColumnMesh, numbers: NDArray[np.int64], bounds: Bounds, seams: SeamEdges, *, strict: bool = False
+) -> tuple[Boundary, NDArray[np.int32]]:
+    plane = mesh.plane
+    first = mesh.z_start[plane.triangles]
+    last = mesh.z_start[plane.triangles + 1] - 1
+    clockwise = signed_areas(plane) < 0
+    floor = _oriented((first + mesh.bottom).astype(np.int32), ~clockwise)
+    ceiling = _oriented(last.astype(np.int32), clockwise)
+    building = np.where(plane.building >= 0, np.append(numbers, -1)[plane.building], -1)
+    floor_marker = np.where(plane.building >= 0, Marker.ROOF, Marker.GROUND)
+    upright, shared = _upright_facets(mesh, building, bounds, seams, strict)
+    boundary = Boundary(
+        np.concatenate((floor, ceiling, upright.facets)),
+        np.concatenate((floor_marker, np.full(len(ceiling), Marker.TOP), upright.marker)).astype(np.int32),
+        np.concatenate((building, np.full(len(ceiling), -1), upright.building)),
+    )
+    return boundary, shared
+
+
+def _upright_facets(
+    mesh: ColumnMesh, building: NDArray[np.int64], bounds: Bounds, seams: SeamEdges, strict: bool
+) -> tuple[Boundary, NDArray[np.int32]]:
+    """Facets over edges: walls where the two sides begin at different levels, and sides; and the shared ones."""
     plane = mesh.plane
     edges, of_triangle = plane_edges(plane.triangles)
     air, other = _edge_sides(of_triangle, mesh.bottom, len(edges))
-    sheet = np.flatnonzero((other[:, 0] < 0) | (air[:, 1:] != other[:, 1:]).any(axis=1))
-    air, other, ends = air[sheet], other[sheet], edges[sheet]
     outer = other[:, 0] < 0
+    seam = np.full(len(edges), -1)
+    seam[_find_seams(mesh, edges, outer, seams)] = np.arange(len(seams.vertices))
+    sheet = np.flatnonzero(outer | (air[:, 1:] != other[:, 1:]).any(axis=1))
+    air, other, ends, outer, seam = air[sheet], other[sheet], edges[sheet], outer[sheet], seam[sheet]
+    on_seam = seam >= 0
+    on_seam[on_seam] = ~seams.missing[seam[on_seam]]
     column_end = mesh.z_start[ends + 1] - 1
     low = mesh.z_start[ends] + air[:, 1:]
     high = np.where(outer[:, None], column_end, mesh.z_start[ends] + other[:, 1:])
+    high[on_seam] = mesh.z_start[ends[on_seam]] + seams.bottom[seam[on_seam]]
+    until = np.where(outer[:, None], column_end, np.maximum(low, high))
     # Seen from outside, a facet from vertex to vertex to above runs counter-clockwise if the air lies left.
     opposite = plane.xy[plane.triangles[air[:, 0]].sum(axis=1) - ends.sum(axis=1)]
     start, end = plane.xy[ends[:, 0]], plane.xy[ends[:, 1]]
     along, across = end - start, opposite - start
     air_left = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0] > 0
-    by_height = mesh.order == "heights"
+    sides = (low, high, until, column_end, mesh.z, mesh.order == "heights", air_left, on_seam)
     count = np.empty(len(ends), np.int64)
-    _merge_edges(low, high, column_end, mesh.z, by_height, air_left, count, np.empty((0, 3), np.int32))
-    facets = np.empty((count.sum(), 3), np.int32)
-    _merge_edges(low, high, column_end, mesh.z, by_height, air_left, count, facets)
+    _merge_edges(*sides, count, np.empty((0, 3), np.int32), np.empty(0, np.bool_))
+    facets, shared = np.empty((count.sum(), 3), np.int32), np.empty(count.sum(), np.bool_)
+    _merge_edges(*sides, count, facets, shared)
+    marker = np.where(outer, _side_marker(start, end, bounds), Marker.WALL)
+    if strict and (marker[seam < 0] == 0).any():
+        x, y = (start + end)[(marker == 0) & (seam < 0)][0] / 2
+        raise ValueError(f"the outer edge at ({x}, {y}) is neither on the region's border nor a seam")
+    marker[seam >= 0] = Marker.MISSING
+    marker[on_seam] = Marker.WALL
     # Of two buildings that share a wall, it is the higher one's: the side that begins higher.
-    marker = np.where(outer, _side_marker(plane, start, end), Marker.WALL)
     owner = np.where(outer, -1, building[other[:, 0]])
-    return facets, np.repeat(marker, count).astype(np.int32), np.repeat(owner, count)
+    own, beyond = building[air[on_seam, 0]], seams.building[seam[on_seam]]
+    higher = np.sign((high - low)[on_seam].sum(axis=1))
+    owner[on_seam] = np.select([higher > 0, higher < 0], [beyond, own], np.maximum(own, beyond))
+    alone = ~shared
+    walls = Boundary(
+        facets[alone], np.repeat(marker, count)[alone].astype(np.int32), np.repeat(owner, count)[alone]
+    )
+    return walls, facets[shared]
 
 
-def _side_marker(plane: PlaneMesh, start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.int64]:
-    low, high = plane.xy.min(axis=0), plane.xy.max(axis=0)
-    on = [(start == low) & (end == low), (start == high) & (end == high)]
+def _find_seams(
+    mesh: ColumnMesh, edges: NDArray[np.int32], outer: NDArray[np.bool_], seams: SeamEdges
+) -> NDArray[np.int64]:
+    """Rows of the seams among the edges."""
+    n = len(mesh.plane.xy)
+    key = edges[:, 0].astype(np.int64) * n + edges[:, 1]
+    wanted = seams.vertices[:, 0].astype(np.int64) * n + seams.vertices[:, 1]
+    row = np.searchsorted(key, wanted).clip(max=len(key) - 1)
+    if (key[row] != wanted).any() or not outer[row].all() or len(np.unique(row)) != len(row):
+        raise ValueError("a seam is no outer edge of the mesh, or is given twice")
+    last = np.diff(mesh.z_start)[seams.vertices] - 1
+    if not (((seams.bottom >= 0) & (seams.bottom <= last)) | seams.missing[:, None]).all():
+        raise ValueError("a tile beyond a seam begins at a level that the seam's columns lack")
+    return row
+
+
+def _side_marker(start: NDArray[np.float64], end: NDArray[np.float64], bounds: Bounds) -> NDArray[np.int64]:
+    on = [(start == corner) & (end == corner) for corner in (bounds[:2], bounds[2:])]
     sides = [on[0][:, 0], on[1][:, 0], on[0][:, 1], on[1][:, 1]]
     return np.select(sides, [Marker.WEST, Marker.EAST, Marker.SOUTH, Marker.NORTH], 0)
 
@@ -202,14 +289,20 @@ def _merge_columns(
 def _merge_edges(
     low: NDArray[np.int64],
     high: NDArray[np.int64],
+    until: NDArray[np.int64],
     column_end: NDArray[np.int64],
     z: NDArray[np.float64],
     by_height: bool,
     air_left: NDArray[np.bool_],
+    on_seam: NDArray[np.bool_],
     count: NDArray[np.int64],
     facets: NDArray[np.int32],
+    is_shared: NDArray[np.bool_],
 ) -> None:
     """Count the facets over each edge that one side alone has, and write them where there is room.
+
+    Over a seam, `low` is this tile's side, whatever its height: all facets of it are written, with a mark on
+    those that the other has too, and none that the other has alone.
 
     Both sides merge the same segments in the same order, each from its own first levels on: until a column
     reaches its first level, that is where the column stands. A side's facets differ from the other's where
@@ -218,9 +311,8 @@ def _merge_edges(
     facet = 0
     for e in range(len(low)):
         i, j = min(low[e, 0], high[e, 0]), min(low[e, 1], high[e, 1])
-        both_i, both_j = max(low[e, 0], high[e, 0]), max(low[e, 1], high[e, 1])
         begin = facet
-        while i < both_i or j < both_j:
+        while i < until[e, 0] or j < until[e, 1]:
             rising = _comes_first(z, by_height, i, column_end[e, 0], j, column_end[e, 1])
             in_low = i >= low[e, 0] if rising else j >= low[e, 1]
             in_high = i >= high[e, 0] if rising else j >= high[e, 1]
@@ -229,14 +321,16 @@ def _merge_edges(
             shared = in_low and in_high and low_i == high_i and low_j == high_j
             i, j = (i + 1, j) if rising else (i, j + 1)
             top = i if rising else j
-            if in_low and not shared:
+            if in_low and (on_seam[e] or not shared):
                 if len(facets) > 0:
+                    is_shared[facet] = shared
                     facets[facet, 0] = low_i if air_left[e] else low_j
                     facets[facet, 1] = low_j if air_left[e] else low_i
                     facets[facet, 2] = top
                 facet += 1
-            if in_high and not shared:
+            if in_high and not (on_seam[e] or shared):
                 if len(facets) > 0:
+                    is_shared[facet] = False
                     facets[facet, 0] = high_j if air_left[e] else high_i
                     facets[facet, 1] = high_i if air_left[e] else high_j
                     facets[facet, 2] = top

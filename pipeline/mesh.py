@@ -19,6 +19,7 @@ class Marker(IntEnum):
     EAST = 6
     SOUTH = 7
     NORTH = 8
+    MISSING = 9  # a seam whose other tile is not there
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +71,29 @@ class ColumnMesh:
     z: NDArray[np.float64]
     bottom: NDArray[np.int32]
     order: MergeOrder = "levels"
+
+
+@dataclass(frozen=True, eq=False)
+class SeamEdges:
+    """Outer edges of a tile's plane mesh that are seams, and what lies beyond them.
+
+    Attributes
+    ----------
+    vertices : int32, (k, 2)
+        Vertices of each edge, ascending.
+    bottom : int32, (k, 2)
+        For each of the two, the level of its column where the cells beyond the edge begin. Not read where
+        `missing`.
+    building : int64, (k,)
+        Number of the building beyond, -1 on open ground.
+    missing : bool, (k,)
+        Whether there is no tile beyond.
+    """
+
+    vertices: NDArray[np.int32]
+    bottom: NDArray[np.int32]
+    building: NDArray[np.int64]
+    missing: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -466,7 +466,7 @@ FACETS: dict[str, tuple[Tamper, set[str]]] = {
     ),
     "side as wall of the house below": (side_as_wall, {"facet-on-side", "wall-above-roof"}),
     "marker 0": (partial(mark, marker=Marker.WALL, to=0), {"marker-unknown"}),
-    "marker 9": (partial(mark, marker=Marker.TOP, to=9), {"marker-unknown", "plan-area", "volume"}),
+    "marker 10": (partial(mark, marker=Marker.TOP, to=10), {"marker-unknown", "plan-area", "volume"}),
     "marker -3": (partial(mark, marker=Marker.WALL, to=-3), {"marker-unknown"}),
     "wall of another house": (give_wall_away, {"wall-off-outline"}),
     "party wall of the lower house": (give_party_wall_to_lower_house, {"wall-above-roof"}),

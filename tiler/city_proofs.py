@@ -32,7 +32,7 @@ def prove_marks(surface: Surface, buildings: Buildings) -> Proof:
     centres = surface.corners.mean(axis=1)
     counts = ", ".join(f"{np.count_nonzero(marker == mark)} {mark.name.lower()}" for mark in Marker)
     faults = [
-        *find_faults("marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: 1 to 8"),
+        *find_faults("marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: 1 to 9"),
         *find_faults(
             "building-unknown",
             centres[unknown],
