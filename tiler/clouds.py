@@ -14,12 +14,16 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.pointcloud import HIGH_NOISE, LOW_NOISE, PointCloud
+from tiler.copc import NODE_SLACK, CopcIndex, read_index, read_nodes
 from tiler.lasheader import AGAIN, LasPromise, read_promise
 
 CHUNK_POINTS = 1_000_000
 CHUNK_BYTES = 64_000_000  # wins over CHUNK_POINTS where a point has many extra bytes
 HEIGHT_LIMIT = 10_000.0  # m; no ground, building or return lies beyond
 HEADER_SLACK = 1.0  # m that a point may lie outside the header's bounds
+QUERY_SHARE = 0.5  # a COPC file is read by its octree where less than this share of its box is wanted
+
+Box = tuple[float, float, float, float]
 
 _SUFFIXES = {".las", ".laz"}
 _GLOB_SIGNS = set("*?[")
@@ -104,7 +108,7 @@ def read_header(path: str | Path) -> CloudHeader:
     return CloudHeader(path, promise.n_points, promise.bounds, _parse_crs(header))
 
 
-def read_points(path: str | Path, bounds: tuple[float, float, float, float]) -> tuple[PointCloud, dict[str, int]]:
+def read_points(path: str | Path, bounds: Box) -> tuple[PointCloud, dict[str, int]]:
     """Read the usable points of a file within a box (step 1.1).
 
     Dropped are, in this order: points outside the box, withheld points, the noise classes 7 and 18, and
@@ -137,12 +141,95 @@ def read_points(path: str | Path, bounds: tuple[float, float, float, float]) -> 
     path = Path(path)
     promise = read_promise(path)
     counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
-    parts = [_select(chunk, xyz, bounds, counts) for chunk, xyz in _chunks(path, promise)]
+    parts = [select_usable(chunk, xyz, bounds, counts) for chunk, xyz in _chunks(path, promise)]
     cloud = PointCloud(
         np.concatenate([np.empty((0, 3)), *(part.xyz for part in parts)]),
         np.concatenate([np.empty(0, np.uint8), *(part.classification for part in parts)]),
     )
     return cloud, counts
+
+
+def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64], int]]:
+    """Read a file by chunks, without those parts of a COPC file that are away from a box.
+
+    Parameters
+    ----------
+    path : Path
+        LAS, LAZ or COPC file.
+    bounds : tuple of 4 floats
+        xmin, ymin, xmax, ymax in the file's CRS (m).
+
+    Yields
+    ------
+    laspy.ScaleAwarePointRecord
+        Some million points, in the order of the file; the first chunk may be empty, others are not.
+    float64, (n, 3)
+        Their coordinates (m).
+    int
+        Points that are not read, all of them outside the box; not 0 in the first chunk only.
+
+    Raises
+    ------
+    InputError
+        As `read_points`.
+
+    Notes
+    -----
+    A COPC file is read by its octree where the box covers less than half of the box in its header.
+    """
+    promise = read_promise(path)
+    index = read_index(path, promise) if _share(promise, bounds) < QUERY_SHARE else None
+    n_skipped, chunks = 0, _chunks(path, promise)
+    if index is not None:
+        near = _near(index.box, bounds)
+        n_skipped, chunks = int(index.count[~near].sum()), _query(path, promise, index, near)
+    first = next(chunks, None)
+    if first is None:
+        with _laspy_as_input_error(path, promise, [0]), laspy.open(path) as reader:
+            empty = laspy.ScaleAwarePointRecord.zeros(0, header=reader.header)
+        yield empty, np.empty((0, 3)), n_skipped
+        return
+    yield *first, n_skipped
+    for chunk, xyz in chunks:
+        yield chunk, xyz, 0
+
+
+def select_usable(
+    chunk: laspy.ScaleAwarePointRecord, xyz: NDArray[np.float64], bounds: Box, counts: dict[str, int]
+) -> PointCloud:
+    """Keep the usable points of a chunk, and count what became of each.
+
+    Parameters
+    ----------
+    chunk : laspy.ScaleAwarePointRecord
+        Points of a file, n of them.
+    xyz : float64, (n, 3)
+        Their coordinates (m).
+    bounds : tuple of 4 floats
+        xmin, ymin, xmax, ymax; the borders belong to the box.
+    counts : dict of str to int
+        The counts of `read_points`; this chunk's are added.
+
+    Returns
+    -------
+    PointCloud
+        The kept points in their old order.
+    """
+    classes = np.asarray(chunk.classification, np.uint8)
+    xmin, ymin, xmax, ymax = bounds
+    x, y, z = xyz.T
+    left = np.ones(len(xyz), bool)
+    for reason, keep in (
+        ("outside", (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)),
+        ("withheld", np.asarray(chunk.withheld) == 0),
+        ("noise", (classes != LOW_NOISE) & (classes != HIGH_NOISE)),
+        ("absurd", np.abs(z) <= HEIGHT_LIMIT),
+    ):
+        counts[reason] += int(np.count_nonzero(left & ~keep))
+        left &= keep
+    counts["read"] += len(xyz)
+    counts["kept"] += int(np.count_nonzero(left))
+    return PointCloud(xyz[left], classes[left])
 
 
 def _expand(source: Path) -> list[Path]:
@@ -163,7 +250,7 @@ def _expand(source: Path) -> list[Path]:
 
 def _chunks(path: Path, promise: LasPromise) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64]]]:
     """Yield the points and their coordinates by chunks; fail if there are fewer than the header claims."""
-    step = max(1, min(CHUNK_POINTS, CHUNK_BYTES // promise.point_size))
+    step = _step(promise)
     n_read = [0]
     with (
         _laspy_as_input_error(path, promise, n_read),
@@ -181,28 +268,35 @@ def _chunks(path: Path, promise: LasPromise) -> Iterator[tuple[laspy.ScaleAwareP
         raise InputError(f"{path}: {n_read[0]} of {promise.n_points} points could be read; {AGAIN}")
 
 
-def _select(
-    chunk: laspy.ScaleAwarePointRecord,
-    xyz: NDArray[np.float64],
-    bounds: tuple[float, float, float, float],
-    counts: dict[str, int],
-) -> PointCloud:
-    """Keep the usable points of a chunk, and add what became of each point to the counts."""
-    classes = np.asarray(chunk.classification, np.uint8)
-    xmin, ymin, xmax, ymax = bounds
-    x, y, z = xyz.T
-    left = np.ones(len(xyz), bool)
-    for reason, keep in (
-        ("outside", (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)),
-        ("withheld", np.asarray(chunk.withheld) == 0),
-        ("noise", (classes != LOW_NOISE) & (classes != HIGH_NOISE)),
-        ("absurd", np.abs(z) <= HEIGHT_LIMIT),
-    ):
-        counts[reason] += int(np.count_nonzero(left & ~keep))
-        left &= keep
-    counts["read"] += len(xyz)
-    counts["kept"] += int(np.count_nonzero(left))
-    return PointCloud(xyz[left], classes[left])
+def _share(promise: LasPromise, bounds: Box) -> float:
+    """Give the share of the header's box that a box covers; 1 for a file without area or points."""
+    xmin, ymin, xmax, ymax, _, _ = promise.bounds
+    width = min(xmax, bounds[2]) - max(xmin, bounds[0])
+    height = min(ymax, bounds[3]) - max(ymin, bounds[1])
+    area = (xmax - xmin) * (ymax - ymin)
+    return max(width, 0.0) * max(height, 0.0) / area if area > 0 else 1.0
+
+
+def _near(box: NDArray[np.float64], bounds: Box) -> NDArray[np.bool_]:
+    xmin, ymin, xmax, ymax = box.T
+    near: NDArray[np.bool_] = (xmin <= bounds[2] + NODE_SLACK) & (xmax >= bounds[0] - NODE_SLACK)
+    near &= (ymin <= bounds[3] + NODE_SLACK) & (ymax >= bounds[1] - NODE_SLACK)
+    return near
+
+
+def _query(
+    path: Path, promise: LasPromise, index: CopcIndex, near: NDArray[np.bool_]
+) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64]]]:
+    n_read = [0]
+    with _laspy_as_input_error(path, promise, n_read):
+        for chunk, xyz in read_nodes(path, index, near, step=_step(promise)):
+            n_read[0] += len(chunk)
+            _check_within_header(path, promise, xyz[:, :2])
+            yield chunk, xyz
+
+
+def _step(promise: LasPromise) -> int:
+    return max(1, min(CHUNK_POINTS, CHUNK_BYTES // promise.point_size))
 
 
 def _check_within_header(path: Path, promise: LasPromise, xy: NDArray[np.float64]) -> None:

@@ -1,0 +1,115 @@
+"""Point cloud files read once, and dealt out to the cells of a fixed grid (step 1.1)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.pointcloud import PointCloud
+from tiler.cells import Box, order_by_cell
+from tiler.clouds import read_chunks, select_usable
+
+# Side of a cell (m). A power of two, so that cells of other sizes could be made of these.
+CELL = 64.0
+
+
+@dataclass(frozen=True, eq=False)
+class PointBlock:
+    """Usable points of a part of a file, sorted by cell.
+
+    Attributes
+    ----------
+    xyz : float64, (n, 3)
+        Coordinates in the file's CRS (m), by ascending cell (j, then i); in a cell in the order of the file.
+    classification : uint8, (n,)
+        ASPRS class of each point.
+    cell : int64, (c, 2)
+        Cells (i, j) that have points, ascending by j, then i.
+    start : int64, (c + 1,)
+        The points of cell k are the rows ``start[k]`` to ``start[k + 1]``.
+    classes : uint8, (k,)
+        Classes that occur among all points that were looked at, inside the box or not, usable or not.
+    counts : dict of str to int
+        As `read_points` gives them; they add up over the blocks of a file.
+    """
+
+    xyz: NDArray[np.float64]
+    classification: NDArray[np.uint8]
+    cell: NDArray[np.int64]
+    start: NDArray[np.int64]
+    classes: NDArray[np.uint8]
+    counts: dict[str, int]
+
+
+def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator[PointBlock]:
+    """Read the usable points of a file within a box, dealt out to cells (step 1.1).
+
+    Parameters
+    ----------
+    path : str or Path
+        LAS, LAZ or COPC file.
+    bounds : tuple of 4 floats
+        xmin, ymin, xmax, ymax in the file's CRS (m); the borders belong to the box.
+    size : float
+        Side of a cell (m); cells have their corners at multiples of it.
+
+    Yields
+    ------
+    PointBlock
+        One for each million points that are read, also where none of them is kept; at least one a file.
+
+    Raises
+    ------
+    InputError
+        As `read_points`.
+    ValueError
+        If the size is not positive.
+
+    Notes
+    -----
+    The points and the counts are those of `read_points`. A COPC file is read by its octree where the box
+    covers less than half of the file: nodes away from the box are not read, and their points count as
+    outside. `PointBlock.classes` is then of the nodes that were read. The octree's upper nodes, a thinned
+    copy of the whole file, are always among them, so that a class missing there is rare in the file.
+
+    Memory is that of one chunk, some 60 bytes a point, whatever the size of the file.
+    """
+    if not size > 0:
+        raise ValueError(f"size of cells {size} m must be positive")
+    for chunk, xyz, n_skipped in read_chunks(Path(path), bounds):
+        counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
+        cloud = select_usable(chunk, xyz, bounds, counts)
+        counts["read"] += n_skipped
+        counts["outside"] += n_skipped
+        found = order_by_cell(cloud.xyz[:, :2], size)
+        classes = np.flatnonzero(np.bincount(np.asarray(chunk.classification, np.uint8), minlength=1))
+        yield PointBlock(
+            cloud.xyz[found.order],
+            cloud.classification[found.order],
+            found.cell,
+            found.start,
+            classes.astype(np.uint8),
+            counts,
+        )
+
+
+def crop_cloud(cloud: PointCloud, box: Box) -> PointCloud:
+    """Keep the points within a box.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Any points.
+    box : tuple of 4 floats
+        xmin, ymin, xmax, ymax (m); the borders belong to the box.
+
+    Returns
+    -------
+    PointCloud
+        In their old order.
+    """
+    x, y = cloud.xyz[:, 0], cloud.xyz[:, 1]
+    inside = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
+    return PointCloud(cloud.xyz[inside], cloud.classification[inside])
