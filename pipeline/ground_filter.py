@@ -13,52 +13,85 @@ from scipy import ndimage
 
 from pipeline.pointcloud import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED, PointCloud
 
-CELL = 1.0  # m, side of a cell of the lowest surface
+CELL = 1.0  # m, side of a cell of the lowest surface; cells are aligned with the CRS
 WINDOWS = (2, 4, 8, 16, 32)  # m, half-widths of the openings: the last must exceed the widest roof's half
 SLOPE = 0.15  # terrain rises no more than this over a window
 STEP = 0.5  # m, allowed above the opened surface whatever the window
+GAP = 16  # cells as far as this from a point get a height; farther ones are as good as outside the cloud
+
+# An opening looks twice as far as its half-width, and each looks at the result of the one before. One cell
+# more, because the cloud may end within a cell.
+FILTER_REACH = CELL * (2 * sum(math.ceil(width / CELL) for width in WINDOWS) + GAP + 1)  # m
 
 
-def classify_ground(cloud: PointCloud) -> PointCloud:
+def classify_ground(cloud: PointCloud, *, bounds: tuple[float, float, float, float] | None = None) -> PointCloud:
     """Classify as ground (2) what lies within half a metre of the opened lowest surface.
 
     Parameters
     ----------
     cloud : PointCloud
         Points of any class; noise (7, 18) is passed over.
+    bounds : (xmin, ymin, xmax, ymax), optional
+        Area that the points were taken from (m), all of them inside. A tile gives its box grown by `FILTER_REACH`
+        and clipped to the region. Without it, the points' own bounding box.
 
     Returns
     -------
     PointCloud
         The same points; ground has class 2, what had class 2 and is not ground has class 1.
+
+    Raises
+    ------
+    ValueError
+        If a point that is not noise lies outside `bounds`.
+
+    Notes
+    -----
+    The classes of points farther than `FILTER_REACH` inside `bounds` do not depend on what is beyond, bit for
+    bit; a side of `bounds` that is the region's is the end of the data for every tile alike. Empty cells are
+    filled ring by ring with the lowest height beside them, `GAP` rings deep; the rest of a larger gap takes no
+    part, like the outside of the cloud. The order of the points does not matter. Cost is linear in points and
+    cells.
     """
     usable = ~np.isin(cloud.classification, (LOW_NOISE, HIGH_NOISE))
     if not usable.any():
         return cloud
-    cell = np.floor(cloud.xyz[:, :2] / CELL).astype(np.int64)
-    low_corner = cell[usable].min(axis=0)
-    nx, ny = (cell[usable].max(axis=0) - low_corner + 1).tolist()
-    column, row = np.clip(cell - low_corner, 0, [nx - 1, ny - 1]).T
+    xyz = cloud.xyz[usable]
+    cell = np.floor(xyz[:, :2] / CELL).astype(np.int64)
+    if bounds is None:
+        low, high = cell.min(axis=0), cell.max(axis=0)
+    else:
+        box = np.floor(np.array(bounds) / CELL).astype(np.int64)
+        low, high = box[:2], box[2:]
+        if (cell < low).any() or (cell > high).any():
+            raise ValueError(f"points outside {bounds}")
+    nx, ny = (high - low + 1).tolist()
+    column, row = (cell - low).T
     lowest = np.full((ny, nx), np.inf)
-    np.minimum.at(lowest, (row[usable], column[usable]), cloud.xyz[usable, 2])
-    terrain = _open_progressively(_fill_nearest(lowest))
-    is_ground = usable & (cloud.xyz[:, 2] <= terrain[row, column] + STEP)
+    np.minimum.at(lowest, (row, column), xyz[:, 2])
+    terrain = _open_progressively(_fill_gaps(lowest))
+    is_ground = np.zeros(len(usable), np.bool_)
+    is_ground[usable] = xyz[:, 2] <= terrain[row, column] + STEP
     classes = np.where(cloud.classification == GROUND, UNCLASSIFIED, cloud.classification)
     return PointCloud(cloud.xyz, np.where(is_ground, GROUND, classes).astype(np.uint8))
 
 
-def _fill_nearest(surface: NDArray[np.float64]) -> NDArray[np.float64]:
-    index = ndimage.distance_transform_edt(np.isinf(surface), return_distances=False, return_indices=True)
-    filled: NDArray[np.float64] = surface[tuple(index)]
-    return filled
+def _fill_gaps(surface: NDArray[np.float64]) -> NDArray[np.float64]:
+    for _ in range(GAP):
+        beside = ndimage.minimum_filter(surface, size=3, mode="constant", cval=np.inf)
+        surface = np.where(np.isinf(surface), beside, surface)
+    return surface
 
 
 def _open_progressively(surface: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lower each cell that rises above the opening by more than the window allows."""
+    """Lower each cell that rises above the opening by more than the window allows; infinite cells take no part."""
+    gap = np.isinf(surface)
     terrain = surface.copy()
     for half_width in WINDOWS:
         size = 2 * math.ceil(half_width / CELL) + 1
-        opened = ndimage.grey_opening(terrain, size=(size, size), mode="nearest")
-        object_cells = terrain - opened > SLOPE * half_width + STEP
+        eroded = ndimage.minimum_filter(terrain, size=size, mode="constant", cval=np.inf)
+        eroded[gap] = -np.inf
+        opened = ndimage.maximum_filter(eroded, size=size, mode="constant", cval=-np.inf)
+        object_cells = ~gap & (terrain > opened + (SLOPE * half_width + STEP))
         terrain = np.where(object_cells, opened, terrain)
     return terrain

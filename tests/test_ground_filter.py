@@ -1,8 +1,12 @@
-"""The ground filter on request: terrain stays, buildings and trees go."""
+"""The ground filter on request: terrain stays, buildings and trees go, and tiles get what the region gets."""
+
+import functools
 
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 
-from pipeline.ground_filter import classify_ground
+from pipeline.ground_filter import FILTER_REACH, GAP, classify_ground
 from pipeline.pointcloud import GROUND, LOW_NOISE, UNCLASSIFIED, PointCloud
 
 
@@ -36,3 +40,110 @@ def test_an_earlier_ground_class_is_not_trusted() -> None:
 def test_no_points_are_no_ground() -> None:
     empty = PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
     assert len(classify_ground(empty).classification) == 0
+
+
+Box = tuple[float, float, float, float]
+REGION: Box = (2000.3, -800.0, 2560.0, -290.8)
+
+
+def rough_town(seed: int) -> PointCloud:
+    """Hills under roofs of all sizes, many touching, and gaps narrower and wider than what is filled."""
+    rng = np.random.default_rng(seed)
+    n = 60_000
+    xy = rng.uniform(REGION[:2], REGION[2:], (n, 2))
+    z = 6 * np.sin(xy[:, 0] / 60) * np.cos(xy[:, 1] / 50) + rng.normal(0, 0.3, n)
+    middle = rng.uniform(REGION[:2], REGION[2:], (300, 2))
+    half, top = rng.uniform(2, 30, (300, 2)), rng.uniform(3, 25, 300)
+    for k in range(300):
+        z[(np.abs(xy - middle[k]) < half[k]).all(axis=1)] = top[k]
+    dry = np.ones(n, np.bool_)
+    for x, y, r in ((2250, -560, 70), (2150, -500, 12), (2380, -420, 40), (2440, -520, 25)):
+        dry &= np.hypot(xy[:, 0] - x, 1.5 * (xy[:, 1] - y)) > r
+    classes = rng.choice([UNCLASSIFIED, GROUND, LOW_NOISE], n, p=[0.7, 0.29, 0.01])
+    return PointCloud(np.column_stack((xy, z))[dry], classes[dry].astype(np.uint8))
+
+
+@functools.cache
+def classified_town(seed: int) -> PointCloud:
+    return classify_ground(rough_town(seed), bounds=REGION)
+
+
+def select(cloud: PointCloud, box: Box) -> NDArray[np.bool_]:
+    xy = cloud.xyz[:, :2]
+    inside: NDArray[np.bool_] = np.all((xy >= box[:2]) & (xy <= box[2:]), axis=1)
+    return inside
+
+
+def classify_tile(cloud: PointCloud, tile: Box, reach: float) -> PointCloud:
+    """Classes of the tile's points from those that it may read only."""
+    x0, y0, x1, y1 = tile
+    bounds = (
+        max(x0 - reach, REGION[0]),
+        max(y0 - reach, REGION[1]),
+        min(x1 + reach, REGION[2]),
+        min(y1 + reach, REGION[3]),
+    )
+    near = select(cloud, bounds)
+    found = classify_ground(PointCloud(cloud.xyz[near], cloud.classification[near]), bounds=bounds)
+    own = select(found, tile)
+    return PointCloud(found.xyz[own], found.classification[own])
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    "tile",
+    [
+        (2200.4, -600.2, 2350.7, -480.9),  # beside and in the largest gap
+        (2000.3, -800.0, 2180.0, -640.0),  # at the region's border
+        (2231.1, -575.0, 2262.0, -549.0),  # in the gap alone
+        (2300.0, -460.5, 2560.0, -290.8),
+    ],
+)
+def test_a_tile_and_its_reach_get_the_classes_of_the_region(seed: int, tile: Box) -> None:
+    cloud = rough_town(seed)
+    whole = classified_town(seed)
+    own = select(whole, tile)
+    part = classify_tile(cloud, tile, FILTER_REACH)
+    assert part.xyz.tobytes() == whole.xyz[own].tobytes()
+    assert part.classification.tobytes() == whole.classification[own].tobytes()
+
+
+@pytest.mark.parametrize(("reach", "cut_off"), [(20.0, False), (FILTER_REACH, True)])
+def test_a_tile_on_a_wide_roof_needs_the_reach(reach: float, cut_off: bool) -> None:
+    rng = np.random.default_rng(3)
+    xy = rng.uniform((2150, -700), (2450, -400), (45_000, 2))
+    on_roof = (np.abs(xy - [2300, -550]) < 28).all(axis=1)
+    cloud = PointCloud(np.column_stack((xy, 20.0 * on_roof)), np.full(len(xy), UNCLASSIFIED, np.uint8))
+    found = classify_tile(cloud, (2292.0, -558.0, 2308.0, -542.0), reach)
+    assert len(found.xyz) > 50
+    assert (found.classification == (UNCLASSIFIED if cut_off else GROUND)).all()
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    cloud = rough_town(9)
+    order = np.random.default_rng(0).permutation(len(cloud.xyz))
+    shuffled = classify_ground(PointCloud(cloud.xyz[order], cloud.classification[order]))
+    assert shuffled.classification.tobytes() == classify_ground(cloud).classification[order].tobytes()
+
+
+def test_a_wide_gap_is_as_good_as_the_end_of_the_cloud() -> None:
+    # A roof of 11 x 11 m stands on the shore: ground on one side alone, a gap as wide as can be filled, or wider.
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(0, 100, (40_000, 2))
+    xy = xy[xy[:, 0] < 60]
+    on_roof = (abs(xy[:, 0] - 54) < 5.5) & (abs(xy[:, 1] - 50) < 5.5)
+    shore = np.column_stack((xy, np.where(on_roof, 12.0, 0.0)))
+    far = shore[~on_roof] + [100.0 + 2 * GAP, 0.0, 3.0]
+    classes = []
+    for points in (shore, np.concatenate((shore, far))):
+        cloud = PointCloud(points, np.full(len(points), UNCLASSIFIED, np.uint8))
+        classes.append(classify_ground(cloud).classification[: len(shore)])
+    assert classes[0].tobytes() == classes[1].tobytes()
+    assert (classes[0][on_roof] == UNCLASSIFIED).all()
+    assert (classes[0][~on_roof] == GROUND).all()
+
+
+def test_points_outside_the_bounds_are_refused() -> None:
+    cloud = PointCloud(np.array([[5.0, 5.0, 0.0]]), np.array([UNCLASSIFIED], np.uint8))
+    with pytest.raises(ValueError, match="outside"):
+        classify_ground(cloud, bounds=(0.0, 0.0, 4.0, 9.0))

@@ -4,17 +4,35 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import pyogrio
+import pyproj
 import pytest
+import shapely
 
+from pipeline.citymodel import Footprints, make_ids
 from pipeline.errors import InputError
+from pipeline.notes import Note, count_notes
 from pipeline.pointcloud import PointCloud
 from tests.test_clouds import EVERYWHERE, ORIGIN, patch, write_cloud
-from tiler import clouds
+from tests.test_vectors import RD, square, write, write_parquet
+from tiler import clouds, layers
 from tiler.cells import Box, select_cells
 from tiler.clouds import find_clouds, read_points
 from tiler.copc import read_index
+from tiler.footprint_index import (
+    FOOTPRINT_CELL,
+    FootprintBlock,
+    join_footprints,
+    largest_extent,
+    scan_footprints,
+    select_footprints,
+    take_rows,
+)
 from tiler.ingest import CELL, PointBlock, crop_cloud, read_cells
 from tiler.lasheader import read_promise
+from tiler.layers import describe_layer, scan_layer
+from tiler.repeated_ids import find_repeated_ids
+from tiler.vectors import read_footprints
 
 SIDE = 1000.0
 
@@ -258,3 +276,223 @@ def test_real_clouds_come_back(shared_data: Path) -> None:
         np.testing.assert_array_equal(sorted_rows(found(blocks, box)), sorted_rows(kept))
         n_found += len(kept.xyz)
     assert n_found > 30000
+
+
+X, Y = 120000.0, 486000.0
+REGION = (X - 3000, Y - 3000, X + 3000, Y + 3000)
+FORMATS = ["a.shp", "a.gpkg", "a.geojson", "a.fgb", "a.parquet"]
+
+
+def houses(n: int = 400) -> tuple[list[shapely.Polygon], dict[str, np.ndarray]]:
+    """Houses over a few cells of the grid, in no order; one is larger than a cell, one far away."""
+    rng = np.random.default_rng(7)
+    place = rng.integers(-10000, 10000, (n, 2)) / 4  # exact in every format
+    size = rng.integers(20, 240, n) / 4
+    size[3], place[5] = 1500.0, (9000, 9000)
+    shapes = [square(x, y, side) for (x, y), side in zip(place, size, strict=True)]
+    heights = np.where(rng.random(n) < 0.1, -1.0, rng.uniform(3, 30, n).round(3))
+    return shapes, {"id": np.array([f"h{k:04}" for k in rng.permutation(n)], object), "h": heights}
+
+
+def write_any(path: Path, shapes: list[shapely.Polygon], fields: dict[str, np.ndarray]) -> Path:
+    if path.suffix != ".parquet":
+        return write(path, shapes, fields, geometry_type="Polygon")
+    return write_parquet(path, shapes, {k: list(v) for k, v in fields.items()}, crs=RD.to_json_dict())
+
+
+def scan(path: Path, bounds: Box = REGION, *, batch: int = 1000) -> list[FootprintBlock]:
+    height = "h" if "h" in describe_layer(path).fields else ""
+    return list(scan_footprints(path, crs=RD, bounds=bounds, height_attribute=height, batch=batch))
+
+
+def in_box(blocks: list[FootprintBlock], box: Box) -> Footprints:
+    """Read a box back as a reader of the store does: ranges of rows, then the join."""
+    ranges = [(block, select_footprints(block.cell_box, block.start, box)) for block in blocks]
+    return join_footprints([take_rows(block.rows, *pair) for block, pairs in ranges for pair in pairs], box)
+
+
+def notes_of(blocks: list[FootprintBlock]) -> list[Note]:
+    return [note for block in blocks for note in block.notes]
+
+
+def assert_same(one: Footprints, two: Footprints) -> None:
+    assert one.ids.tolist() == two.ids.tolist()
+    np.testing.assert_array_equal(one.given_height, two.given_height)
+    assert shapely.equals_identical(shapely.normalize(one.polygons), shapely.normalize(two.polygons)).all()
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_footprints_of_a_box_are_those_that_meet_it(tmp_path: Path, name: str) -> None:
+    shapes, fields = houses()
+    path = write_any(tmp_path / name, shapes, fields)
+    blocks = scan(path, batch=150)
+    assert len(blocks) == 3
+    assert sum(len(block.rows) for block in blocks) == 399
+    order = np.argsort(fields["id"].astype(str))
+    heights = np.where(fields["h"] > 0, fields["h"], np.nan)
+    for box in (REGION, (X - 100, Y - 100, X + 200, Y + 300), (X, Y, X, Y), (X - 2600, Y, X, Y + 1)):
+        meets = order[shapely.intersects(np.array(shapes, object)[order], shapely.box(*box))]
+        expected = Footprints(np.array(shapes, object)[meets], fields["id"][meets].astype(str), heights[meets])
+        assert_same(in_box(blocks, box), expected)
+        assert_same(read_footprints(path, crs=RD, bounds=box, height_attribute="h")[0], expected)
+    assert len(in_box(blocks, (X + 2900, Y + 2900, X + 3000, Y + 3000)).ids) == 0
+    assert count_notes(notes_of(blocks)) == {"footprint-height-missing": int(np.isnan(heights).sum())}
+
+
+def test_rows_are_sorted_by_cell_and_id(tmp_path: Path) -> None:
+    shapes, fields = houses()
+    (block,) = scan(write_any(tmp_path / "a.gpkg", shapes, fields))
+    rows = block.rows
+    centre = (rows.box[:, :2] + rows.box[:, 2:]) / 2
+    cell = np.repeat(block.cell, np.diff(block.start), axis=0)
+    np.testing.assert_array_equal(cell, np.floor(centre / FOOTPRINT_CELL))
+    keys = [(int(j), int(i), str(name)) for (i, j), name in zip(cell, rows.ids, strict=True)]
+    assert keys == sorted(keys)
+    assert len(block.cell) > 10
+    for k, box in enumerate(block.cell_box):
+        mine = rows.box[block.start[k] : block.start[k + 1]]
+        assert box.tolist() == [*mine[:, :2].min(axis=0), *mine[:, 2:].max(axis=0)]
+    pieces = np.split(rows.wkb, rows.wkb_start[1:-1])
+    polygons = shapely.from_wkb([piece.tobytes() for piece in pieces])
+    np.testing.assert_array_equal(shapely.bounds(polygons), rows.box)
+    assert largest_extent(rows.box) == 1500.0
+    assert largest_extent(np.empty((0, 4))) == 0.0
+
+
+def test_batches_and_the_order_of_the_file_change_nothing(tmp_path: Path) -> None:
+    shapes, fields = houses(200)
+    fields["id"][10] = fields["id"][9]
+    shapes[10] = shapely.Polygon(
+        [*shapes[9].exterior.coords[1:], shapes[9].exterior.coords[1]]
+    )  # the same, turned
+    fields["h"][[9, 10]] = 8.0, 5.0
+    one = in_box(scan(write_any(tmp_path / "a.gpkg", shapes, fields)), REGION)
+    back = {key: values[::-1] for key, values in fields.items()}
+    for batch in (7, 1000):
+        two = in_box(scan(write_any(tmp_path / f"b{batch}.gpkg", shapes[::-1], back), batch=batch), REGION)
+        assert shapely.to_wkb(one.polygons).tolist() == shapely.to_wkb(two.polygons).tolist()
+        assert_same(one, two)
+    assert (one.ids[1:] == one.ids[:-1]).sum() == 1
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_repeated_ids_are_a_fact_of_the_whole_file(tmp_path: Path, name: str) -> None:
+    shapes = [square(5, 5), square(900, 5), square(35, 5), square(35, 5), square(50, 5), square(5, 900)]
+    fields = {"id": np.array(["a", "a", "twin", "twin", None, None], object)}
+    path = write_any(tmp_path / name, shapes, fields)
+    assert find_repeated_ids(describe_layer(path), "id", batch=2) == {"a"}
+    assert find_repeated_ids(describe_layer(path), "") == set()
+    made = make_ids(np.array(shapes, object))
+    small = (X, Y, X + 100, Y + 100)
+    expected = sorted(["a-" + made[0], "twin", "twin", made[4]])
+    assert read_footprints(path, crs=RD, bounds=small)[0].ids.tolist() == expected  # though one "a" is there
+    assert in_box(scan(path, batch=2), small).ids.tolist() == expected
+    assert count_notes(notes_of(scan(path, small))) == {"footprint-id-missing": 1, "footprint-id-repeated": 1}
+
+
+def test_ids_of_what_is_no_polygon_do_not_count(tmp_path: Path) -> None:
+    shapes = [square(5, 5), shapely.Point(X + 1, Y + 2), None, square(20, 5)]
+    path = write(tmp_path / "a.gpkg", shapes, {"id": [7, 7, 7, 2**60 + 1]})
+    assert find_repeated_ids(describe_layer(path), "id") == set()
+    assert in_box(scan(path), REGION).ids.tolist() == [str(2**60 + 1), "7"]
+
+
+def test_without_pyarrow_the_same_comes_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes, fields = houses(50)
+    fields["id"][7] = None
+    fields["n"] = np.array([k if k % 3 else np.nan for k in range(50)])
+    path = write_any(tmp_path / "a.gpkg", shapes, fields)
+    streamed = {
+        name: list(scan_footprints(path, crs=RD, bounds=REGION, id_attribute=name)) for name in ("id", "n")
+    }
+    monkeypatch.setattr(layers, "find_spec", lambda _name: None)
+    for name, blocks in streamed.items():
+        (block,) = scan_footprints(path, crs=RD, bounds=REGION, id_attribute=name, batch=10)
+        assert_same(in_box([block], REGION), in_box(blocks, REGION))
+        assert block.notes == tuple(notes_of(blocks))
+
+
+def test_notes_of_the_file_come_once(tmp_path: Path) -> None:
+    shapes, fields = houses(30)
+    forward = pyproj.Transformer.from_crs(RD, "EPSG:4326", always_xy=True)
+    there = list(shapely.transform(np.array(shapes, object), forward.transform, interleaved=False))
+    path = write(tmp_path / "a.gpkg", there, {"id": fields["id"]}, crs="EPSG:4326")
+    assert count_notes(notes_of(scan(path, batch=7))) == {"footprints-reprojected": 1}
+    far = scan(path, (X + 90000, Y, X + 90010, Y + 10), batch=7)
+    assert count_notes(notes_of(far)) == {"footprints-reprojected": 1, "footprints-outside": 1}
+    assert [len(block.rows) for block in far] == [0]
+    assert len(in_box(far, REGION).ids) == 0
+    assert far[0].cell_box.shape == (0, 4)
+
+
+def test_a_damaged_page_is_no_end_of_the_file(tmp_path: Path) -> None:
+    shapes, fields = houses(3000)
+    path = write_any(tmp_path / "a.gpkg", shapes, fields)
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 3 // 4096 * 4096
+    data[middle : middle + 4096] = bytes(4096)
+    path.write_bytes(data)
+    for box in ((X - 9e4, Y - 9e4, X + 9e4, Y + 9e4), REGION, (X - 2000, Y - 2000, X + 2000, Y + 2000)):
+        with pytest.raises(InputError, match="cannot be read"):
+            list(scan_layer(describe_layer(path), ["id"], box))
+        with pytest.raises(InputError, match="cannot be read"):
+            scan(path, box)
+
+
+def test_a_stale_number_of_features_is_no_damage(tmp_path: Path) -> None:
+    import sqlite3
+
+    shapes, fields = houses(20)
+    path = write_any(tmp_path / "a.gpkg", shapes, fields)
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE gpkg_ogr_contents SET feature_count = 99")
+    database.close()
+    assert describe_layer(path).n_features == 99
+    assert sum(len(block.rows) for block in scan(path)) == 19
+
+
+def test_row_groups_away_from_the_box_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import json
+
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    shapes = np.array([square(100 * k, 5) for k in range(20)], object)
+    names = ("xmin", "ymin", "xmax", "ymax")
+    box = pa.StructArray.from_arrays([pa.array(side) for side in shapely.bounds(shapes).T], names)
+    column = {"encoding": "WKB", "crs": RD.to_json_dict(), "covering": {"bbox": {k: ["bbox", k] for k in names}}}
+    table = pa.table(
+        {"id": [f"{k:02}" for k in range(20)], "geometry": shapely.to_wkb(shapes).tolist(), "bbox": box}
+    )
+    meta = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}}
+    path = tmp_path / "a.parquet"
+    pq.write_table(table.replace_schema_metadata({"geo": json.dumps(meta)}), path, row_group_size=4)
+    asked = []
+    true = pq.ParquetFile.iter_batches
+
+    def watch(self: object, batch: int, *, row_groups: list[int], columns: list[str]) -> object:
+        asked.append((tuple(columns), row_groups))
+        return true(self, batch, row_groups=row_groups, columns=columns)
+
+    monkeypatch.setattr(pq.ParquetFile, "iter_batches", watch)
+    footprints, _ = read_footprints(path, crs=RD, bounds=(X + 710, Y, X + 800, Y + 100))
+    assert footprints.ids.tolist() == ["07", "08"]
+    assert asked == [(("id",), [0, 1, 2, 3, 4]), (("geometry", "id"), [1, 2])]
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["footprints.shp", "footprints.gpkg"])
+def test_real_footprints_come_back(shared_data: Path, name: str) -> None:
+    path = shared_data / "amsterdam" / name
+    blocks = scan(path, (120500.0, 485800.0, 121400.0, 486700.0), batch=500)
+    _, _, wkb, _ = pyogrio.raw.read(path, force_2d=True)
+    whole_file = shapely.from_wkb(wkb)
+    for box, n in (
+        ((120625.0, 485936.8, 121250.46, 486523.26), 1128),
+        ((120900.0, 486100.0, 121000.0, 486200.0), 0),
+    ):
+        footprints = in_box(blocks, box)
+        meets = whole_file[shapely.intersects(whole_file, shapely.box(*box))]
+        assert len(footprints.ids) == (n or len(meets)) == len(meets) > 20
+        assert_same(footprints, read_footprints(path, crs=RD, bounds=box)[0])
+        assert set(shapely.to_wkb(footprints.polygons)) == set(shapely.to_wkb(meets))

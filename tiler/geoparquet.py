@@ -16,7 +16,6 @@ from pipeline.errors import InputError
 Box = tuple[float, float, float, float]
 
 _SUFFIXES = {".parquet", ".geoparquet", ".pq"}
-_BATCH = 50_000  # features in memory beside those that are kept
 
 
 def is_parquet(path: Path) -> bool:
@@ -71,8 +70,10 @@ def describe(path: Path) -> tuple[pyproj.CRS | None, tuple[str, ...], int, Box |
         )
 
 
-def read(path: Path, columns: Sequence[str], box: Box) -> tuple[NDArray[np.object_], dict[str, NDArray[Any]]]:
-    """Read the features whose bounding boxes meet a box.
+def scan(
+    path: Path, columns: Sequence[str], box: Box | None, *, geometry: bool, batch: int
+) -> Iterator[tuple[NDArray[np.object_], dict[str, NDArray[Any]]]]:
+    """Read the features whose bounding boxes meet a box, by batches.
 
     Parameters
     ----------
@@ -80,11 +81,15 @@ def read(path: Path, columns: Sequence[str], box: Box) -> tuple[NDArray[np.objec
         The file.
     columns : sequence of str
         Attributes to read.
-    box : tuple of 4 floats
-        xmin, ymin, xmax, ymax in the file's CRS.
+    box : tuple of 4 floats, or None
+        xmin, ymin, xmax, ymax in the file's CRS; None for all features.
+    geometry : bool
+        False leaves the geometries out: None in every row; the box must be None then.
+    batch : int
+        Features in memory at once, beside those that are kept.
 
-    Returns
-    -------
+    Yields
+    ------
     object, (n,)
         Geometries as well-known binary (bytes).
     dict of str to (n,) arrays
@@ -94,20 +99,51 @@ def read(path: Path, columns: Sequence[str], box: Box) -> tuple[NDArray[np.objec
     ------
     InputError
         As `describe`.
+    ValueError
+        If a box is asked for without geometries.
+
+    Notes
+    -----
+    Row groups are left out where the file has a bounding box column, and its statistics say that the group
+    is away from the box.
     """
-    wkb: list[bytes] = []
-    values: dict[str, list[Any]] = {name: [] for name in columns}
+    if box is not None and not geometry:
+        raise ValueError("a box needs the geometries")
     with _arrow_as_input_error(path):
         table = _open(path)
-        name, _ = _geometry(path, table)
-        for batch in table.iter_batches(_BATCH, columns=[name, *columns]):
-            blobs = _objects(batch.column(name).to_pylist())
-            hits = np.flatnonzero(_meets(blobs, box))
-            wkb.extend(blobs[hits])
-            part = batch.take(hits)
-            for column in columns:
-                values[column].extend(part.column(column).to_pylist())
-    return _objects(wkb), {column: _objects(items) for column, items in values.items()}
+        name, column = _geometry(path, table)
+        groups = [group for group in range(table.num_row_groups) if _near(table, group, column, box)]
+        parts = table.iter_batches(
+            batch, row_groups=groups, columns=[name, *columns] if geometry else list(columns)
+        )
+    while True:
+        with _arrow_as_input_error(path):
+            part = next(parts, None)
+            if part is None:
+                return
+            blobs = to_objects(part.column(name).to_pylist() if geometry else [None] * part.num_rows)
+            if box is not None:
+                hits = np.flatnonzero(_meets(blobs, box))
+                blobs, part = blobs[hits], part.take(hits)
+            values = {field: to_objects(part.column(field).to_pylist()) for field in columns}
+        yield blobs, values
+
+
+def to_objects(items: list[Any]) -> NDArray[np.object_]:
+    """Put values into an array of objects, each as it is.
+
+    Parameters
+    ----------
+    items : list
+        Anything, lists and None included.
+
+    Returns
+    -------
+    object, (n,)
+    """
+    array = np.empty(len(items), dtype=np.object_)
+    array[:] = items
+    return array
 
 
 def _meets(wkb: NDArray[np.object_], box: Box) -> NDArray[np.bool_]:
@@ -116,10 +152,19 @@ def _meets(wkb: NDArray[np.object_], box: Box) -> NDArray[np.bool_]:
     return meets
 
 
-def _objects(items: list[Any]) -> NDArray[np.object_]:
-    array = np.empty(len(items), dtype=np.object_)
-    array[:] = items
-    return array
+def _near(table: Any, group: int, column: dict[str, Any], box: Box | None) -> bool:
+    """Whether a row group may hold features that meet a box, by the statistics of its bounding box column."""
+    covering = column.get("covering", {}).get("bbox")
+    if box is None or covering is None:
+        return True
+    rows = table.metadata.row_group(group)
+    by_path = {rows.column(k).path_in_schema: rows.column(k).statistics for k in range(rows.num_columns)}
+    found: list[Any] = [by_path.get(".".join(covering[side])) for side in ("xmin", "ymin", "xmax", "ymax")]
+    if any(each is None or not each.has_min_max for each in found):
+        return True
+    west, south, east, north = found
+    low = west.min <= box[2] and south.min <= box[3]
+    return bool(low and east.max >= box[0] and north.max >= box[1])
 
 
 def _open(path: Path) -> Any:

@@ -3,8 +3,9 @@
 import struct
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from pipeline.errors import ConfigError, InputError
 from tiler import geoparquet
 
 Box = tuple[float, float, float, float]
+
+BATCH = 50_000  # features in memory at once
 
 _NAMED = 20  # layers or fields that a message lists
 
@@ -110,8 +113,10 @@ def describe_layer(path: Path, layer: str = "") -> Layer:
     )
 
 
-def read_layer(layer: Layer, columns: Sequence[str], box: Box) -> Features:
-    """Read the features of a layer whose bounding boxes meet a box.
+def scan_layer(
+    layer: Layer, columns: Sequence[str], box: Box | None, *, geometry: bool = True, batch: int = BATCH
+) -> Iterator[Features]:
+    """Read the features of a layer whose bounding boxes meet a box, once, by batches.
 
     Parameters
     ----------
@@ -119,11 +124,15 @@ def read_layer(layer: Layer, columns: Sequence[str], box: Box) -> Features:
         From `describe_layer`.
     columns : sequence of str
         Attributes to read.
-    box : tuple of 4 floats
-        xmin, ymin, xmax, ymax in the file's CRS.
+    box : tuple of 4 floats, or None
+        xmin, ymin, xmax, ymax in the file's CRS; None for all features.
+    geometry : bool
+        False leaves the geometries out: None in every row.
+    batch : int
+        Features in memory at once.
 
-    Returns
-    -------
+    Yields
+    ------
     Features
         In the order of the file. Features without geometry have no place and may be absent.
 
@@ -131,22 +140,94 @@ def read_layer(layer: Layer, columns: Sequence[str], box: Box) -> Features:
     ------
     InputError
         If the file is damaged.
+
+    Notes
+    -----
+    A file with a spatial index is read by query, another from end to end. Batches are streamed by Arrow.
+    Without pyarrow the features come as one batch: the same ones, with the memory of all of them.
     """
     if geoparquet.is_parquet(layer.path):
-        return Features(*geoparquet.read(layer.path, columns, box), ())
-    warned: list[str] = []
-    with _gdal_as_input_error(layer.path, warned):
-        meta, _, wkb, values = pyogrio.raw.read(
-            layer.path, layer=layer.name, columns=list(columns), bbox=box, force_2d=True
-        )
-    found = dict(zip((str(name) for name in meta["fields"]), values, strict=True))
-    return Features(wkb, found, tuple(dict.fromkeys(warned)))
+        for wkb, values in geoparquet.scan(layer.path, columns, box, geometry=geometry, batch=batch):
+            yield Features(wkb, values, ())
+        return
+    if box is not None and layer.extent is not None and _holds(box, layer.extent):
+        box = None  # all features: then their number is known, and can be checked
+    n_read = 0
+    read = _read_at_once if find_spec("pyarrow") is None else _stream
+    for features in read(layer, columns, box, geometry, batch):
+        n_read += len(features.wkb)
+        yield features
+    if box is None and n_read < layer.n_features:
+        _check_readable(layer)
 
 
 def list_some(names: Sequence[str]) -> str:
     """List names for a message: the first twenty, and how many more."""
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return (", ".join(names[:_NAMED]) or "none") + more
+
+
+def _stream(
+    layer: Layer, columns: Sequence[str], box: Box | None, geometry: bool, batch: int
+) -> Iterator[Features]:
+    with ExitStack() as stack:
+        warned: list[str] = []
+        with _gdal_as_input_error(layer.path, warned):
+            stream = pyogrio.raw.open_arrow(
+                layer.path,
+                layer=layer.name,
+                columns=list(columns),
+                bbox=box,
+                read_geometry=geometry,
+                batch_size=batch,
+                use_pyarrow=True,
+            )
+            meta, reader = stack.enter_context(stream)
+        while True:
+            with _gdal_as_input_error(layer.path, warned):
+                part = next(reader, None)  # no warning may be caught, and no error be turned, across a yield
+            if part is None:
+                break
+            lists = [geoparquet.to_objects(column.to_pylist()) for column in part.columns]
+            names = [str(name) for name in meta["fields"]]  # in the order of the stream, the geometry behind them
+            wkb = lists[-1] if geometry else np.full(part.num_rows, None, np.object_)
+            yield Features(wkb, dict(zip(names, lists, strict=False)), tuple(dict.fromkeys(warned)))
+            warned.clear()
+    if warned:
+        yield Features(np.empty(0, np.object_), {name: np.empty(0, np.object_) for name in columns}, tuple(warned))
+
+
+def _read_at_once(
+    layer: Layer, columns: Sequence[str], box: Box | None, geometry: bool, _batch: int
+) -> Iterator[Features]:
+    warned: list[str] = []
+    with _gdal_as_input_error(layer.path, warned):
+        meta, fids, wkb, values = pyogrio.raw.read(
+            layer.path,
+            layer=layer.name,
+            columns=list(columns),
+            bbox=box,
+            read_geometry=geometry,
+            return_fids=True,
+            force_2d=True,
+        )
+    found = dict(zip((str(name) for name in meta["fields"]), values, strict=True))
+    yield Features(wkb if geometry else np.full(len(fids), None, np.object_), found, tuple(dict.fromkeys(warned)))
+
+
+def _check_readable(layer: Layer) -> None:
+    """Read a layer that gave fewer features than it claims in the slow way, which tells of damage.
+
+    A stream of GDAL ends at a damaged page of a GPKG without a word. The number that a layer claims may be
+    stale too, and that is no damage.
+    """
+    with _gdal_as_input_error(layer.path, []):
+        pyogrio.raw.read(layer.path, layer=layer.name, columns=[], read_geometry=False, return_fids=True)
+
+
+def _holds(box: Box, extent: Box) -> bool:
+    low = box[0] <= extent[0] and box[1] <= extent[1]
+    return low and box[2] >= extent[2] and box[3] >= extent[3]
 
 
 def _choose(path: Path, spatial: list[str], asked: str) -> str:

@@ -1,0 +1,289 @@
+"""A footprint file opened: which attributes, which CRS, and features made footprints (step 1.2)."""
+
+from collections.abc import Set
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.citymodel import Footprints, make_ids
+from pipeline.errors import ConfigError, InputError
+from pipeline.notes import Note
+from tiler.crs import crs_name, horizontal_crs, same_crs
+from tiler.layers import Box, Features, Layer, describe_layer, list_some
+
+# Attributes that hold a building's own id, first found first taken, in any case: Dutch BAG (and its
+# ten letters in SHP), INSPIRE and GML, OpenStreetMap, then names in general use.
+ID_ATTRIBUTES = (
+    *("identificatie", "identifica", "gml_id", "inspireid", "localid", "uuid", "osm_id", "@id"),
+    *("building_id", "buildingid", "bldg_id", "id", "gid", "fid", "objectid"),
+)
+
+_BOX_MARGIN = 0.01  # share of the box's size added after reprojection, whose straight edges bend
+_POLYGONAL = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)
+
+
+@dataclass(frozen=True, eq=False)
+class FootprintSource:
+    """How footprints are read from one layer.
+
+    Attributes
+    ----------
+    layer : Layer
+        The layer.
+    id_name, height_name : str
+        Attributes with the id and with the height above ground, ``""`` for none.
+    forward : pyproj.Transformer or None
+        From the file's CRS to the region's; None where they are the same.
+    bounds : tuple of 4 floats
+        The region (m), in its own CRS.
+    box : tuple of 4 floats
+        The region in the file's CRS.
+    notes : tuple of Note
+        What was assumed about the CRS.
+    """
+
+    layer: Layer
+    id_name: str
+    height_name: str
+    forward: pyproj.Transformer | None
+    bounds: Box
+    box: Box
+    notes: tuple[Note, ...]
+
+
+def open_source(
+    path: Path, *, crs: pyproj.CRS, bounds: Box, layer: str, id_attribute: str, height_attribute: str
+) -> FootprintSource:
+    """Decide how footprints are read from a file.
+
+    Parameters
+    ----------
+    path, crs, bounds, layer, id_attribute, height_attribute
+        As `read_footprints` has them.
+
+    Returns
+    -------
+    FootprintSource
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or its coordinates do not fit its CRS.
+    ConfigError
+        If the layer or an attribute does not exist.
+    """
+    info = describe_layer(path, layer)
+    id_name, height_name = _id_attribute(info, id_attribute), _attribute(info, height_attribute)
+    own = horizontal_crs(info.crs)
+    notes = tuple(_crs_notes(info, own, crs))
+    source = crs if own is None or same_crs(own, crs) else own
+    _check_extent(info, source)
+    if source is crs:
+        return FootprintSource(info, id_name, height_name, None, bounds, bounds, notes)
+    forward = pyproj.Transformer.from_crs(source, crs, always_xy=True)
+    box = _reproject_box(info, source, crs, bounds)
+    return FootprintSource(info, id_name, height_name, forward, bounds, box, notes)
+
+
+def make_footprints(
+    source: FootprintSource, features: Features, repeated: Set[str]
+) -> tuple[Footprints, list[Note]]:
+    """Make footprints of features.
+
+    Parameters
+    ----------
+    source : FootprintSource
+        Where they come from.
+    features : Features
+        Any of its features, with the attributes of its id and height.
+    repeated : set of str
+        Ids that several different geometries of the file carry: they are completed by the geometry.
+
+    Returns
+    -------
+    Footprints
+        Those that meet the region, in the order of the features.
+    list of Note
+        As `read_footprints` gives them.
+    """
+    geometry, rows, notes = parse_polygons(features.wkb)
+    if source.forward is not None:
+        geometry = shapely.transform(geometry, source.forward.transform, interleaved=False)
+    keep, found = _finite_within(geometry, source.bounds)
+    notes += found
+    geometry, rows = geometry[keep], rows[keep]
+    ids, found = _ids(geometry, features.columns[source.id_name][rows] if source.id_name else None, repeated)
+    notes += found
+    given = features.columns[source.height_name][rows] if source.height_name else None
+    heights, found = _heights(geometry, ids, given)
+    return Footprints(geometry, ids, heights), notes + found
+
+
+def _attribute(info: Layer, asked: str) -> str:
+    """Check that an attribute exists; a GeoJSON file without features has none, and needs none."""
+    if asked and asked not in info.fields:
+        if info.n_features == 0:
+            return ""
+        raise ConfigError(f"{info.path}: has no attribute {asked!r}; it has: {list_some(info.fields)}")
+    return asked
+
+
+def _id_attribute(info: Layer, asked: str) -> str:
+    if asked:
+        return _attribute(info, asked)
+    lower = {field.lower(): field for field in info.fields}
+    return next((lower[name] for name in ID_ATTRIBUTES if name in lower), "")
+
+
+def _crs_notes(info: Layer, own: pyproj.CRS | None, crs: pyproj.CRS) -> list[Note]:
+    name = info.path.name
+    if own is None:
+        return [Note("footprints-without-crs", name, detail=f"taken as {crs_name(crs)}, the region's CRS")]
+    if not same_crs(own, crs):
+        return [Note("footprints-reprojected", name, detail=f"from {crs_name(own)} to {crs_name(crs)}")]
+    return []
+
+
+def _check_extent(info: Layer, crs: pyproj.CRS) -> None:
+    """Refuse degrees beyond the pole: GeoJSON without a CRS means degrees, whatever its author meant."""
+    if crs.is_geographic and info.extent is not None and max(abs(v) for v in info.extent) > 360:
+        raise InputError(
+            f"{info.path}: states {crs_name(crs)} (degrees), but its coordinates reach "
+            f"{max(info.extent, key=abs):g}; GeoJSON without a CRS means degrees: state the true one, "
+            f'ogr2ogr -a_srs EPSG:<code> mended.gpkg "{info.path}"'
+        )
+
+
+def _reproject_box(info: Layer, source: pyproj.CRS, crs: pyproj.CRS, bounds: Box) -> Box:
+    transformer = pyproj.Transformer.from_crs(crs, source, always_xy=True)
+    xmin, ymin, xmax, ymax = transformer.transform_bounds(*bounds, densify_pts=21)
+    margin = _BOX_MARGIN * max(xmax - xmin, ymax - ymin)
+    box = (xmin - margin, ymin - margin, xmax + margin, ymax + margin)
+    if not np.isfinite(box).all() or xmin > xmax:
+        raise InputError(
+            f"{info.path}: the region {bounds} of {crs_name(crs)} has no place in {crs_name(source)}, "
+            "the CRS of the footprints; check --crs and --bounds"
+        )
+    return box
+
+
+def parse_polygons(wkb: NDArray[np.object_]) -> tuple[NDArray[np.object_], NDArray[np.int64], list[Note]]:
+    """Parse geometries, and give the polygonal ones with their rows.
+
+    Parameters
+    ----------
+    wkb : object, (n,)
+        Well-known binary, None where there is none.
+
+    Returns
+    -------
+    geometry : object, (m,)
+        Polygons and multipolygons without Z, valid or not.
+    rows : int64, (m,)
+        Their rows.
+    notes : list of Note
+        What cannot be parsed, and what is something else.
+    """
+    with np.errstate(invalid="ignore"):  # GEOS compares NaN coordinates
+        geometry = shapely.force_2d(shapely.from_wkb(wkb, on_invalid="fix"))
+    stored = np.array([blob is not None for blob in wkb], bool)
+    kinds = shapely.get_type_id(geometry)
+    polygonal = np.isin(kinds, _POLYGONAL) & ~shapely.is_empty(geometry)
+    other = ~np.isin(kinds, _POLYGONAL) & (kinds >= 0)
+    notes = _notes("footprint-unreadable", geometry[stored & (kinds < 0)], "the geometry cannot be parsed")
+    for kind in np.unique(kinds[other]):
+        name = shapely.GeometryType(kind).name.lower()
+        notes += _notes("footprint-not-polygon", geometry[kinds == kind], f"is a {name}")
+    rows = np.flatnonzero(polygonal)
+    return geometry[rows], rows, notes
+
+
+def _finite_within(geometry: NDArray[np.object_], bounds: Box) -> tuple[NDArray[np.bool_], list[Note]]:
+    coordinates, owner = shapely.get_coordinates(geometry, return_index=True)
+    finite = np.ones(len(geometry), bool)
+    finite[owner[~np.isfinite(coordinates).all(axis=1)]] = False
+    notes = _notes("footprint-not-finite", geometry[~finite], "a coordinate is NaN or infinite")
+    keep = finite.copy()
+    keep[finite] = shapely.intersects(geometry[finite], shapely.box(*bounds))
+    return keep, notes
+
+
+def _ids(
+    geometry: NDArray[np.object_], values: NDArray[Any] | None, repeated: Set[str]
+) -> tuple[NDArray[np.str_], list[Note]]:
+    """Give each footprint its id, see `read_footprints`."""
+    made = make_ids(geometry) if len(geometry) else np.empty(0, np.str_)
+    if values is None:
+        return made, []
+    given = np.array([id_text(value) for value in values], dtype=np.str_)
+    missing = given == ""
+    notes = _notes("footprint-id-missing", geometry[missing], "named by its geometry", made[missing])
+    ids = np.where(missing, made, given)
+    again = np.fromiter((str(name) in repeated for name in given), bool, len(given))
+    ids = np.where(again, np.char.add(np.char.add(ids, "-"), made), ids)
+    notes += _notes("footprint-id-repeated", geometry[again], "completed by its geometry", ids[again])
+    return ids, notes
+
+
+def id_text(value: Any) -> str:
+    """Write an id as text, whole floats as integers (a column with nulls may be read as float).
+
+    Parameters
+    ----------
+    value : Any
+        As the file has it.
+
+    Returns
+    -------
+    str
+        ``""`` where there is none.
+
+    Examples
+    --------
+    >>> id_text(12.0), id_text(" a1 "), id_text(None), id_text(float("nan"))
+    ('12', 'a1', '', '')
+    """
+    if isinstance(value, float | np.floating):
+        return f"{value:.17g}" if np.isfinite(value) else ""
+    return "" if value is None else str(value).strip()
+
+
+def _heights(
+    geometry: NDArray[np.object_], ids: NDArray[np.str_], values: NDArray[Any] | None
+) -> tuple[NDArray[np.float64], list[Note]]:
+    if values is None:
+        return np.full(len(geometry), np.nan), []
+    heights = np.array([_number(value) for value in values], dtype=np.float64)
+    bad = ~(heights > 0) | ~np.isfinite(heights)
+    heights[bad] = np.nan
+    details = [f"{value!r} is no height above 0 m" for value in values[bad]]
+    return heights, _notes("footprint-height-missing", geometry[bad], details, ids[bad])
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")
+
+
+def _notes(
+    kind: str,
+    geometry: NDArray[np.object_],
+    detail: str | list[str],
+    subjects: NDArray[np.str_] | None = None,
+) -> list[Note]:
+    """Make one note a geometry, at the middle of its bounding box."""
+    boxes = shapely.bounds(geometry)
+    x, y = (boxes[:, 0] + boxes[:, 2]) / 2, (boxes[:, 1] + boxes[:, 3]) / 2
+    details = [detail] * len(geometry) if isinstance(detail, str) else detail
+    names = [""] * len(geometry) if subjects is None else [str(name) for name in subjects]
+    return [
+        Note(kind, name, float(px), float(py), text)
+        for name, px, py, text in zip(names, x, y, details, strict=True)
+    ]
