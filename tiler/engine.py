@@ -24,10 +24,11 @@ from tiler.plan import (
     invert,
     joined_reads,
     list_items,
+    list_refs,
     order_stages,
     reads_everything,
 )
-from tiler.stage import Layout, Scope, Stage
+from tiler.stage import Facts, Layout, Scope, Stage
 from tiler.store import Store
 from tiler.task import Declared, Failure, Record, Task, reuse
 
@@ -160,6 +161,9 @@ class Engine:
         earlier = set(self._items[stage.name][1].names) if stage.name in self._items else set()
         return None if only is None else earlier.union(only)
 
+    def _facts(self, stage: str, names: Iterable[str]) -> dict[str, Facts]:
+        return {name: self.records[stage, name].facts for name in names}
+
     def _refs(self, stage: Stage, here: Items, source: str, known: Mapping[str, tuple[Scope, Items]]) -> Refs:
         """Find refs among all items of the layout first: one that is read but not run is an error, not a gap."""
         scope, run = known[source]
@@ -167,9 +171,18 @@ class Engine:
         if len(by_extent) > 1:
             raise ValueError(f"stage {stage.name} reads {source} both by box and by extent")
         everything = reads_everything(stage.scope, scope)
+        (first, *_) = (read for read in stage.reads if read.stage == source)
+        if first.own or first.named_by:
+            listed = {
+                name: (name,) if first.own else self.records[first.named_by, name].facts["names"]
+                for name in here.names
+            }
+            return list_refs(here, source, run, listed)
+        if first.around:
+            here = extents(here, self._facts(first.around, here.names), first.around)
         if True in by_extent:
-            facts = {name: self.records[source, name].facts for name in run.names}
-            return find_refs(stage, here, source, extents(run, facts, source), everything=everything)
+            reached = extents(run, self._facts(source, run.names), source)
+            return find_refs(stage, here, source, reached, everything=everything)
         boxes = self.layout.boxes(scope)
         names = tuple(sorted(boxes))
         reach = run

@@ -68,10 +68,12 @@ def order_stages(stages: Sequence[Stage], earlier: Collection[str]) -> list[Stag
                 raise ValueError(
                     f"stage {stage.name} reads stage {read.stage}, which was not run and is not given"
                 )
-            if read.by_extent and read.stage in names:
-                raise ValueError(
-                    f"stage {stage.name} reads {read.stage} by extent: run {read.stage} in an earlier call"
-                )
+            early = [read.stage] * read.by_extent + [name for name in (read.around, read.named_by) if name]
+            for name in early:
+                if name in names or name not in earlier:
+                    raise ValueError(
+                        f"stage {stage.name} reads {read.stage} by facts of {name}: run {name} in an earlier call"
+                    )
     done: list[Stage] = []
     left = list(stages)
     while left:
@@ -123,6 +125,20 @@ def find_refs(stage: Stage, items: Items, source: str, reach: Items, *, everythi
         found = [_query(tree, items.boxes, read.halo) for read in stage.reads if read.stage == source]
         pairs = np.concatenate([np.empty((2, 0), np.int64), *found], axis=1)
         pairs[1] = there[pairs[1]] if len(there) else pairs[1]
+    return _make_refs(source, pairs, n_items, n_source)
+
+
+def list_refs(items: Items, source: str, reach: Items, listed: Mapping[str, Sequence[str]]) -> Refs:
+    """Make the refs of items that name what they read; ValueError for a name that is not among `reach`."""
+    place = {name: k for k, name in enumerate(reach.names)}
+    unknown = sorted({name for names in listed.values() for name in names} - set(place))
+    if unknown:
+        raise ValueError(f"stage {source} has no item {', '.join(unknown)}")
+    pairs = [(row, place[name]) for row, item in enumerate(items.names) for name in listed[item]]
+    return _make_refs(source, np.array(pairs, np.int64).reshape(-1, 2).T, len(items.names), len(reach.names))
+
+
+def _make_refs(source: str, pairs: NDArray[np.int64], n_items: int, n_source: int) -> Refs:
     flat = np.unique(pairs[0] * max(n_source, 1) + pairs[1])
     reader, index = flat // max(n_source, 1), flat % max(n_source, 1)
     start = np.searchsorted(reader, np.arange(n_items + 1)).astype(np.int64)
@@ -186,8 +202,10 @@ def joined_reads(stage: Stage) -> list[tuple[str, list[Read]]]:
 
 
 def _query(tree: shapely.STRtree, boxes: NDArray[np.float64], halo: float) -> NDArray[np.int64]:
-    grown = boxes + np.array([-halo, -halo, halo, halo])
+    some = np.flatnonzero(~np.isnan(boxes[:, 0]))
+    grown = boxes[some] + np.array([-halo, -halo, halo, halo])
     pairs: NDArray[np.int64] = np.asarray(tree.query(shapely.box(*grown.T)), dtype=np.int64)
+    pairs[0] = some[pairs[0]] if len(some) else pairs[0]
     return pairs
 
 

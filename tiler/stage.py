@@ -40,11 +40,22 @@ class Read:
     by_extent : bool
         Use, instead of the box of a read item, the ``"extent"`` among the facts of its result: four numbers, or
         None for an item that holds nothing and is never read. Such a stage must have run in an earlier call.
+    around : str
+        A stage of an earlier call: the ``"extent"`` that its result for the same item states takes the place of
+        the reader's box; nothing is read where it is None.
+    own : bool
+        Read the item of the reader's own name alone.
+    named_by : str
+        A stage of an earlier call: read the items listed as ``"names"`` among the facts of its result for the
+        same item.
     """
 
     stage: str
     halo: float = 0.0
     by_extent: bool = False
+    around: str = ""
+    own: bool = False
+    named_by: str = ""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.halo) and self.halo >= 0):

@@ -224,6 +224,12 @@ class Writer:
             if whole is not None:
                 self._extend(name, whole)
 
+    def discard(self) -> None:
+        """Forget all arrays that were written so far."""
+        for name in self._table:
+            shutil.rmtree(self._partial / name, ignore_errors=True)
+        self._small, self._buffers, self._table = {}, {}, {}
+
     def commit(self, attributes: Mapping[str, Any] | None = None) -> None:
         """Make the result visible, in place of an earlier one.
 

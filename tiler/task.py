@@ -176,6 +176,10 @@ class Task:
         """Append rows to arrays of the result, which may become larger than memory."""
         self._open_writer().append(**arrays)
 
+    def discard(self) -> None:
+        """Forget all arrays that were written so far."""
+        self._open_writer().discard()
+
     def note(self, note: Note) -> None:
         """Keep a note with the result."""
         self._notes.append(note)

@@ -13,25 +13,23 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from pipeline.adaptive import AdaptiveOptions
 from pipeline.building_facts import describe_buildings, measure_model
 from pipeline.building_points import has_building_class
-from pipeline.city import City, CityOptions
+from pipeline.city import City
 from pipeline.citymodel import Footprints
 from pipeline.columns import expand_cells, extract_boundary, lowest_gap
 from pipeline.errors import GeometryError, InputError
 from pipeline.ground_filter import classify_ground
-from pipeline.layered import LayeredOptions
 from pipeline.notes import Note
 from pipeline.pointcloud import GROUND, WATER, PointCloud
 from pipeline.quality import measure_cells, quality_percentiles
 from pipeline.simplify import simplify_city
-from pipeline.spacing import SpacingLimits
 from pipeline.terrain import bin_ground, fill_dtm
 from pipeline.tile import TileMesh, build_city, mesh_city
 from tiler.cityjson import write_city_model
 from tiler.clouds import read_points
 from tiler.config import Config
+from tiler.options import city_options, mesh_options
 from tiler.region import Region
 from tiler.store import Store, write_columns, write_dtm
 from tiler.vectors import read_footprints
@@ -137,7 +135,7 @@ def mesh_tile(job: TileJob, announce: Callable[[str, float], None] | None = None
         record.counts["terrain nodes filled"] = int((count == 0).sum())
         dtm = fill_dtm(binned)
         write_dtm(store, job.name, dtm)
-    options = _city_options(config)
+    options = city_options(config)
     full = build_city(cloud, footprints, dtm, bounds, options, trace)
     if config.footprints and len(footprints.polygons) == 0 and has_building_class(cloud):
         record.notes.append(
@@ -162,7 +160,7 @@ def mesh_tile(job: TileJob, announce: Callable[[str, float], None] | None = None
     record.counts |= simple.counts
     record.counts |= {"buildings": len(simple.model), "buildings before merging": len(full.model)}
     del cloud, footprints, full
-    mesh = mesh_city(simple, dtm, bounds, _mesh_options(config), min_angle=config.min_angle, trace=trace)
+    mesh = mesh_city(simple, dtm, bounds, mesh_options(config), min_angle=config.min_angle, trace=trace)
     record.notes += [*simple.notes, *mesh.notes]
     with trace("3.6 export mesh"):
         _export_mesh(job, store, simple, mesh, record)
@@ -226,47 +224,6 @@ def _with_ground(cloud: PointCloud, job: TileJob, record: TileRecord) -> PointCl
             "classify the cloud, or give --ground-filter"
         )
     return cloud
-
-
-def _city_options(config: Config) -> CityOptions:
-    # Heights closer than the least spacing cannot both be exact in a column.
-    gap = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
-    return CityOptions(
-        min_building_area=config.min_building_area,
-        vertex_tolerance=config.vertex_tolerance,
-        ground_margin=config.ground_margin,
-        ground_percentile=config.ground_percentile,
-        roof_percentile=config.roof_percentile if config.roof_height == "percentile" else 50.0,
-        default_height=config.default_height,
-        roof_clearance=max(config.roof_clearance, gap),
-        border="clip" if config.border == "clip" else "drop",
-        simplify="paper" if config.simplify == "paper" else "clearance",
-        clearance=config.clearance,
-        clearance_floor=config.clearance_floor,
-        min_courtyard_area=config.min_courtyard_area,
-        split_levels=config.split_levels,
-        roof_group=max(config.roof_group, gap),
-        manifold=config.manifold,
-    )
-
-
-def _mesh_options(config: Config) -> LayeredOptions | AdaptiveOptions:
-    if config.mesher == "adaptive":
-        return AdaptiveOptions(
-            mesh_size=config.mesh_size,
-            domain_height=config.domain_height,
-            limits=SpacingLimits(config.least_spacing, config.most_spacing),
-            stagger=config.stagger,
-            passes=config.improve_passes,
-        )
-    return LayeredOptions(
-        mesh_size=config.mesh_size,
-        layer_height=config.layer_height_or_default,
-        domain_height=config.domain_height,
-        smoother="fem" if config.smoother == "fem" else "columns",
-        tolerance=config.smoothing_tolerance,
-        fem_tolerance=config.fem_tolerance,
-    )
 
 
 def _export(job: TileJob, path: Path, city: City, attributes: dict[str, Sequence[object]]) -> tuple[Note, ...]:

@@ -1,0 +1,153 @@
+"""What every task of a run knows besides its own item: region, CRS, tile grid; and the names of items."""
+
+import zlib
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import shapely
+
+from stitch.grid import (
+    Bounds,
+    Key,
+    SeamKey,
+    TileGrid,
+    has_tile,
+    make_grid,
+    seam_keys,
+    seam_line,
+    tile_box,
+    tile_keys,
+)
+from tiler.stage import Box, FileItem, Layout
+
+AXES = "xy"  # first letter of a seam's name: along which axis it runs
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """The region of a run: small, and the same for all tasks.
+
+    Attributes
+    ----------
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    crs : str
+        Its CRS as ``EPSG:NNNN`` where it has a code, else as WKT.
+    tile_size, mesh_size : float
+        Side of a tile and target edge length (m).
+    present : bytes
+        Which tiles there are, see `pack_tiles`.
+    out : str
+        Folder of the run's files.
+    """
+
+    bounds: Bounds
+    crs: str
+    tile_size: float
+    mesh_size: float
+    present: bytes
+    out: str
+
+    @property
+    def grid(self) -> TileGrid:
+        """The tile grid."""
+        return _grid(self.bounds, self.tile_size, self.mesh_size, self.present)
+
+
+def choose_tiles(grid: TileGrid, boxes: list[Box]) -> TileGrid:
+    """Leave out the tiles that share no area with any of the boxes of point clouds."""
+    tree = shapely.STRtree([shapely.box(*box) for box in boxes])
+    keys = tile_keys(grid)
+    tiles = np.array([shapely.box(*tile_box(grid, key)) for key in keys])
+    there = np.unique(tree.query(shapely.buffer(tiles, -1e-6, join_style="mitre"), predicate="intersects")[0])
+    present = np.zeros([len(axis) - 1 for axis in grid.lines], np.bool_)
+    for row in there.tolist():
+        present[keys[row].i - grid.first.i, keys[row].j - grid.first.j] = True
+    return replace(grid, present=None if present.all() else present)
+
+
+def pack_tiles(grid: TileGrid) -> bytes:
+    """Write which tiles are present in few bytes; none where all are."""
+    return b"" if grid.present is None else zlib.compress(np.packbits(grid.present).tobytes())
+
+
+def make_layout(grid: TileGrid, files: dict[str, FileItem], *, identity: str) -> Layout:
+    """List the items of a run: files, tiles, and seams with the box of their nominal line."""
+    return Layout(
+        files=files,
+        tiles={tile_name(key): tile_box(grid, key) for key in tile_keys(grid)},
+        seams={seam_name(key): seam_line(grid, key) for key in seam_keys(grid)},
+        bounds=grid.bounds,
+        identity=identity,
+    )
+
+
+def tile_name(key: Key) -> str:
+    """Name of a tile: its column and row in the CRS.
+
+    Examples
+    --------
+    >>> tile_name(Key(60, -3)), tile_key("60_-3")
+    ('60_-3', Key(i=60, j=-3))
+    """
+    return f"{key.i}_{key.j}"
+
+
+def tile_key(name: str) -> Key:
+    """Key of a tile's name."""
+    i, j = name.split("_")
+    return Key(int(i), int(j))
+
+
+def seam_name(key: SeamKey) -> str:
+    """Name of a seam: the axis along which it runs, and its first corner.
+
+    Examples
+    --------
+    >>> seam_name(SeamKey(1, 3, 4)), seam_key("y3_4")
+    ('y3_4', SeamKey(axis=1, i=3, j=4))
+    """
+    return f"{AXES[key.axis]}{key.i}_{key.j}"
+
+
+def seam_key(name: str) -> SeamKey:
+    """Key of a seam's name."""
+    i, j = name[1:].split("_")
+    return SeamKey(AXES.index(name[0]), int(i), int(j))
+
+
+def owns(box: Box, bounds: Bounds, xy: tuple[float, float]) -> bool:
+    """Tell whether a place is a tile's own: in its half-open box, places beyond the region taken to its border.
+
+    Examples
+    --------
+    >>> owns((0, 0, 1, 1), (0, 0, 2, 1), (1.0, 0.5)), owns((1, 0, 2, 1), (0, 0, 2, 1), (7.0, 1.0))
+    (False, True)
+    """
+    for k in range(2):
+        place = min(max(xy[k], bounds[k]), bounds[k + 2])
+        last = box[k + 2] >= bounds[k + 2]
+        if not (box[k] <= place < box[k + 2] or (last and place == box[k + 2])):
+            return False
+    return True
+
+
+def region_around(grid: TileGrid, box: Box) -> shapely.Geometry:
+    """Polygon of the tiles that are present in a box, and a tile beyond it (m)."""
+    far = 1.5 * grid.tile_size
+    x, y = grid.lines
+    columns = np.flatnonzero((x[1:] >= box[0] - far) & (x[:-1] <= box[2] + far))
+    rows = np.flatnonzero((y[1:] >= box[1] - far) & (y[:-1] <= box[3] + far))
+    keys = [Key(grid.first.i + int(i), grid.first.j + int(j)) for i in columns for j in rows]
+    return shapely.union_all([shapely.box(*tile_box(grid, key)) for key in keys if has_tile(grid, key)])
+
+
+@lru_cache(maxsize=8)
+def _grid(bounds: Bounds, tile_size: float, mesh_size: float, present: bytes) -> TileGrid:
+    grid = make_grid(bounds, tile_size=tile_size, mesh_size=mesh_size)
+    if not present:
+        return grid
+    shape = tuple(len(axis) - 1 for axis in grid.lines)
+    bits = np.unpackbits(np.frombuffer(zlib.decompress(present), np.uint8), count=shape[0] * shape[1])
+    return replace(grid, present=bits.astype(np.bool_).reshape(shape))

@@ -1,0 +1,76 @@
+"""From the parameters of a run to the options of the steps, and which parameters each of these needs."""
+
+from typing import Any
+
+from pipeline.adaptive import AdaptiveOptions
+from pipeline.city import CityOptions
+from pipeline.layered import LayeredOptions
+from pipeline.spacing import SpacingLimits
+from pipeline.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
+
+# Parameters of the city model; two of the mesh are among them, as roofs that meet must differ enough for it.
+CITY_PARAMETERS = (
+    *("min_building_area", "vertex_tolerance", "ground_margin", "ground_percentile", "roof_height"),
+    *("roof_percentile", "default_height", "roof_clearance", "border", "simplify", "clearance", "clearance_floor"),
+    *("min_courtyard_area", "split_levels", "roof_group", "manifold", "least_spacing", "mesh_size", "mesher"),
+)
+# Parameters of seams and plane meshes.
+PLANE_PARAMETERS = ("mesh_size", "min_angle", "mesher")
+# Parameters of the columns.
+LAYER_PARAMETERS = (
+    *("mesh_size", "mesher", "domain_height", "least_spacing", "most_spacing", "stagger", "improve_passes"),
+    *("layer_height", "layer_height_or_default", "smoother", "smoothing_tolerance", "fem_tolerance"),
+)
+
+
+def city_options(given: Any) -> CityOptions:
+    """Options of steps 1.4 to 2.3; `given` has the parameters as attributes."""
+    # Heights closer than the least spacing cannot both be exact in a column.
+    gap = given.least_spacing * given.mesh_size if given.mesher == "adaptive" else 0.0
+    return CityOptions(
+        min_building_area=given.min_building_area,
+        vertex_tolerance=given.vertex_tolerance,
+        ground_margin=given.ground_margin,
+        ground_percentile=given.ground_percentile,
+        roof_percentile=given.roof_percentile if given.roof_height == "percentile" else 50.0,
+        default_height=given.default_height,
+        roof_clearance=max(given.roof_clearance, gap),
+        border="clip" if given.border == "clip" else "drop",
+        simplify="paper" if given.simplify == "paper" else "clearance",
+        clearance=given.clearance,
+        clearance_floor=given.clearance_floor,
+        min_courtyard_area=given.min_courtyard_area,
+        split_levels=given.split_levels,
+        roof_group=max(given.roof_group, gap),
+        manifold=given.manifold,
+    )
+
+
+def mesh_options(given: Any) -> LayeredOptions | AdaptiveOptions:
+    """Options of steps 3.2 to 3.5, of the mesher that is chosen."""
+    if given.mesher == "adaptive":
+        return AdaptiveOptions(
+            mesh_size=given.mesh_size,
+            domain_height=given.domain_height,
+            limits=SpacingLimits(given.least_spacing, given.most_spacing),
+            stagger=given.stagger,
+            passes=given.improve_passes,
+        )
+    return LayeredOptions(
+        mesh_size=given.mesh_size,
+        layer_height=given.layer_height_or_default,
+        domain_height=given.domain_height,
+        smoother="fem" if given.smoother == "fem" else "columns",
+        tolerance=given.smoothing_tolerance,
+        fem_tolerance=given.fem_tolerance,
+    )
+
+
+def plane_options(given: Any) -> dict[str, Any]:
+    """Options of step 3.1: ``min_angle``, ``refinements`` and ``passes``."""
+    adaptive = given.mesher == "adaptive"
+    return {
+        "min_angle": given.min_angle or (ADAPTIVE_ANGLE if adaptive else PAPER_ANGLE),
+        "refinements": ADAPTIVE_REFINEMENTS if adaptive else 0,
+        "passes": ADAPTIVE_PASSES if adaptive else 0,
+    }

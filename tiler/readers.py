@@ -1,0 +1,146 @@
+"""What stages read of each other's results: points, terrain, houses and buildings in a box."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.building_points import NEVER_ROOF
+from pipeline.ground_filter import FILTER_REACH, classify_ground
+from pipeline.houses import Houses, join_houses
+from pipeline.pointcloud import BUILDING, PointCloud
+from pipeline.raster import Dtm, NodeWindow, grow_window, join_dtm, node_window
+from pipeline.terrain import fill_dtm
+from stitch.grid import Bounds
+from tiler.cells import select_cells
+from tiler.ingest import CELL, crop_cloud
+from tiler.stage import Box
+from tiler.tables import Buildings, join_buildings, take_buildings, unpack_buildings, unpack_houses
+from tiler.task import Task
+
+GAP_ROWS = 50_000  # ranges of points closer than this are read as one
+
+
+def grow(box: Box, by: float) -> Box:
+    """Grow a box on all sides (m)."""
+    return box[0] - by, box[1] - by, box[2] + by, box[3] + by
+
+
+def clip(box: Box, bounds: Box) -> Box:
+    """Cut a box to another one."""
+    return max(box[0], bounds[0]), max(box[1], bounds[1]), min(box[2], bounds[2]), min(box[3], bounds[3])
+
+
+def read_cloud(task: Task, box: Box, *, ground_filter: bool = False) -> PointCloud:
+    """Read the points within a box, from the stage ``points``.
+
+    Parameters
+    ----------
+    task : Task
+        A task that reads that stage.
+    box : (xmin, ymin, xmax, ymax)
+        Box (m); its borders belong to it.
+    ground_filter : bool
+        Find ground by our own filter.
+
+    Returns
+    -------
+    PointCloud
+        Points that may lie on a roof have class 6: in a file that marks no building at all, these are all that
+        are not ground, water, vegetation or noise.
+    """
+    wide = clip(grow(box, FILTER_REACH), task.context.bounds) if ground_filter else box
+    parts = [PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))]
+    marks = [True]
+    for name in task.refs["points"]:
+        facts = task.store.attributes("points", name)["facts"]
+        parts += list(_read_ranges(task, name, wide))
+        marks += [facts["marks_buildings"]] * (len(parts) - len(marks))
+    cloud = PointCloud(
+        np.concatenate([part.xyz for part in parts]), np.concatenate([part.classification for part in parts])
+    )
+    marked = np.repeat(marks, [len(part.xyz) for part in parts])
+    if ground_filter:
+        cloud = classify_ground(cloud, bounds=wide)
+    roof = ~marked & ~np.isin(cloud.classification, NEVER_ROOF)
+    classes = np.where(roof, BUILDING, cloud.classification).astype(np.uint8)
+    return crop_cloud(PointCloud(cloud.xyz, classes), box)
+
+
+def read_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm:
+    """Read the terrain of a box within the region, from the stage ``terrain``.
+
+    Nodes of tiles that are absent are filled from those around.
+    """
+    window = region_window(box, spacing, bounds)
+    parts = [part for part in _read_rasters(task, "terrain") if _meet(part, window)]
+    dtm = join_dtm(parts, window)
+    return fill_dtm(dtm) if np.isnan(dtm.z).any() else dtm
+
+
+def region_window(box: Box, spacing: float, bounds: Bounds) -> NodeWindow:
+    """Nodes of a box, and the next ones around it, within the region."""
+    return grow_window(node_window(box, spacing), 0, within=node_window(bounds, spacing))
+
+
+def read_houses(task: Task, stage: str = "houses") -> Iterator[tuple[str, Houses]]:
+    """Read the houses of each tile."""
+    for result in task.read(stage):
+        yield result.name, unpack_houses(result.arrays)
+
+
+def read_all_houses(task: Task) -> Houses:
+    """Read the houses of all tiles that the task may read, by tile."""
+    return join_houses([houses for _, houses in read_houses(task)])
+
+
+def read_buildings(task: Task, box: Box) -> Buildings:
+    """Read the buildings of the simplified city model that meet a box, by ascending id."""
+    near = []
+    for result in task.read("model"):
+        buildings = unpack_buildings(result.arrays)
+        rows = np.flatnonzero(shapely.intersects(shapely.box(*box), buildings.model.polygons))
+        near.append(take_buildings(buildings, rows))
+    return join_buildings(near)
+
+
+def _read_ranges(task: Task, name: str, box: Box) -> Iterator[PointCloud]:
+    """Read the points of a file in cells that meet a box, cropped to it."""
+    arrays, _ = task.store.read("points", name, names=("cell", "cell_row", "block", "end"))
+    row = np.append(arrays["cell_row"], arrays["end"])
+    for first, last in _ranges_of_blocks(arrays["cell"], row, arrays["block"], box):
+        xyz = task.read_rows("points", name, "xyz", first, last)
+        classification = task.read_rows("points", name, "classification", first, last)
+        yield crop_cloud(PointCloud(xyz, classification), box)
+
+
+def _ranges_of_blocks(
+    cell: NDArray[np.int64], row: NDArray[np.int64], block: NDArray[np.int64], box: Box
+) -> Iterator[tuple[int, int]]:
+    """Ranges of rows to read; close ones are joined, as whole chunks are read anyway."""
+    ranges: list[tuple[int, int]] = []
+    for first, last in zip(block[:-1].tolist(), block[1:].tolist(), strict=True):
+        start = row[first : last + 1]
+        for begin, end in select_cells(cell[first:last], start, box, size=CELL):
+            if ranges and begin - ranges[-1][1] < GAP_ROWS:
+                ranges[-1] = (ranges[-1][0], end)
+            else:
+                ranges.append((begin, end))
+    yield from ranges
+
+
+def _read_rasters(task: Task, stage: str) -> Iterator[Dtm]:
+    for result in task.read(stage, ("z",)):
+        facts = result.facts
+        yield Dtm(result.arrays["z"], facts["i0"], facts["j0"], facts["spacing"])
+
+
+def _meet(part: Dtm, window: NodeWindow) -> bool:
+    ny, nx = part.z.shape
+    return (
+        part.i0 < window.i0 + window.nx
+        and window.i0 < part.i0 + nx
+        and part.j0 < window.j0 + window.ny
+        and window.j0 < part.j0 + ny
+    )

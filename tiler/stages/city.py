@@ -1,0 +1,397 @@
+"""Stages 1.4 to 2.3: houses of each tile, clusters of close ones across tiles, and the simplified city model."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.city import City
+from pipeline.citymodel import Footprints
+from pipeline.clusters import Shapes, find_close, join_pairs, join_shapes, leave_out, shape_clusters
+from pipeline.groups import adjacent_houses
+from pipeline.houses import Houses, divide_houses, houses_extent, join_houses, take_houses
+from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
+from pipeline.point_fidelity import HouseFidelity, measure_houses
+from pipeline.pointcloud import PointCloud
+from pipeline.raster import Dtm
+from pipeline.roof_points import locate_roof_points
+from pipeline.simplify import raise_buildings
+from pipeline.tile import measure_city, prepare_footprints
+from stitch.grid import Key
+from tiler.config import Config
+from tiler.context import owns, region_around, tile_key
+from tiler.footprint_index import FootprintRows, join_footprints, select_footprints
+from tiler.options import CITY_PARAMETERS, LAYER_PARAMETERS, city_options, mesh_options
+from tiler.readers import grow, read_cloud, read_terrain
+from tiler.stage import Box, Facts, Read, Scope, Stage
+from tiler.stages.inputs import halo_of_points
+from tiler.tables import (
+    HOUSE_ARRAYS,
+    make_buildings,
+    pack_buildings,
+    pack_houses,
+    pack_polygons,
+    unpack_houses,
+    unpack_polygons,
+)
+from tiler.task import Result, Task
+
+GROUND = ("dtm_spacing", "ground_filter")
+
+
+def house_stage(config: Config, largest: float) -> Stage:
+    """Stage of the houses of each tile; `largest` is the longest side of any footprint's box (m)."""
+    reads = (
+        Read("footprints"),
+        Read("points", halo_of_points(config, largest + config.ground_margin)),
+        Read("terrain", largest + 2 * config.dtm_spacing),
+    )
+    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *GROUND))
+
+
+def first_round(config: Config) -> list[Stage]:
+    """Stages that find the clusters of close houses, and simplify each by itself."""
+    return [
+        Stage(
+            "near-0",
+            Scope.TILE,
+            find_near_houses,
+            (Read("houses", config.clearance, by_extent=True),),
+            CITY_PARAMETERS,
+        ),
+        Stage("join-0", Scope.REGION, join_houses_in_clusters, (Read("houses"), Read("near-0"))),
+        Stage("members-0", Scope.TILE, list_members, (Read("join-0"),)),
+    ]
+
+
+def shape_stage(number: int) -> Stage:
+    """Stage that simplifies the clusters of a round, each in the tile that owns it."""
+    reads = [Read(f"members-{number}", own=True), Read("houses", named_by=f"members-{number}")]
+    reads += [Read(f"shapes-{number - 1}", own=True)] if number else []
+    return Stage(f"shapes-{number}", Scope.TILE, shape_members, tuple(reads), CITY_PARAMETERS)
+
+
+def later_round(config: Config, number: int) -> list[Stage]:
+    """Stages that join the clusters whose results came too close in the round before."""
+    before, after = number - 1, number
+    return [
+        Stage(
+            f"near-{after}",
+            Scope.TILE,
+            find_near_shapes,
+            (Read(f"shapes-{before}", config.clearance, by_extent=True),),
+            CITY_PARAMETERS,
+        ),
+        Stage(f"join-{after}", Scope.REGION, join_close_clusters, (Read(f"join-{before}"), Read(f"near-{after}"))),
+        Stage(f"members-{after}", Scope.TILE, list_members, (Read(f"join-{after}"),)),
+    ]
+
+
+def model_stage(config: Config, last: int) -> Stage:
+    """Stage of the buildings of the clusters that a tile owns, with their heights."""
+    shapes, members = f"shapes-{last}", f"members-{last}"
+    options = mesh_options(config)
+    reach = terrain_reach(options) if isinstance(options, LayeredOptions) else 0.0
+    reads = (
+        Read("footprints"),
+        Read(shapes, own=True),
+        Read(members, own=True),
+        Read("houses", named_by=members),
+        Read("points", halo_of_points(config, 2 * config.ground_margin), around=shapes),
+        Read("terrain", reach + 2 * config.dtm_spacing, around=shapes),
+    )
+    return Stage("model", Scope.TILE, make_model, reads, (*CITY_PARAMETERS, *GROUND, *LAYER_PARAMETERS))
+
+
+def make_houses(task: Task) -> Facts:
+    """Clean the footprints of a tile, and give its houses their points, heights and parts (steps 1.4 to 2.0)."""
+    options, spacing = city_options(task.parameters), task.parameters.dtm_spacing
+    grid, bounds = task.context.grid, task.context.bounds
+    with task.step("1.4 clean footprints"):
+        read = _read_footprints(task)
+        around = tuple(shapely.total_bounds(read.polygons).tolist()) if len(read.polygons) else task.box
+        inner, notes = prepare_footprints(read, region_around(grid, _hull(task.box, around)), options)
+        own = _owned(task, inner)
+    task.notes(note for note in notes if owns(task.box, bounds, (note.x, note.y)))
+    extent = _extent(own.polygons)
+    cloud, dtm = _surroundings(task, extent, options.ground_margin, 2 * spacing)
+    city = measure_city(cloud, own, dtm, options, building_class=True, trace=task.step)
+    task.notes(city.notes)
+    with task.step("2.0 split levels"):
+        houses = divide_houses(city, cloud, options, building_class=True)
+    with task.step("1.7 fit of roofs"):
+        full = make_buildings(city, _fit(cloud, city), np.zeros(len(city.model), np.int32))
+    task.put(**pack_houses(houses), **pack_buildings(full, "full_"))
+    return {
+        "n": len(houses),
+        "extent": houses_extent(houses),
+        "counts": {"buildings before merging": len(houses), **_count_parts(houses)},
+    }
+
+
+def find_near_houses(task: Task) -> Facts:
+    """Find the pairs of houses that are close in a tile (step 2.1)."""
+    polygons, owner = [np.empty(0, object)], [np.empty((0, 3), np.int64)]
+    for result in task.read("houses", ("outline", "outline_start")):
+        outlines = unpack_polygons(result.arrays, "outline")
+        rows = _near_rows(task, outlines)
+        polygons.append(outlines[rows])
+        owner.append(np.column_stack((np.tile(tile_key(result.name), (len(rows), 1)), rows)))
+    close = find_close(np.concatenate(polygons), task.parameters.clearance)
+    task.put(pairs=np.concatenate(owner)[close].reshape(-1, 6))
+    return {"n": len(close)}
+
+
+def join_houses_in_clusters(task: Task) -> Facts:
+    """Chain close houses to clusters, over the whole region (step 2.1)."""
+    tiles = [(tile_key(result.name), result.facts["n"]) for result in task.read("houses", ())]
+    tiles.sort()
+    first = {
+        key: begin for (key, _), begin in zip(tiles, np.cumsum([0, *(n for _, n in tiles)]).tolist(), strict=False)
+    }
+    house = np.concatenate(
+        [np.empty((0, 3), np.int64)] + [np.column_stack((np.tile(key, (n, 1)), np.arange(n))) for key, n in tiles]
+    )
+    pairs = np.concatenate([np.empty((0, 6), np.int64)] + [r.arrays["pairs"] for r in task.read("near-0")])
+    begin = np.array([[first[Key(i, j)] for i, j in pairs[:, [a, a + 1]].tolist()] for a in (0, 3)], np.int64)
+    index = np.column_stack((begin[0] + pairs[:, 2], begin[1] + pairs[:, 5])) if len(pairs) else pairs[:, :2]
+    cluster = join_pairs(len(house), index)
+    _put_clusters(task, house, cluster, np.ones(len(house), np.bool_))
+    return {"joined": 0, "clusters": len(np.unique(cluster))}
+
+
+def find_near_shapes(task: Task) -> Facts:
+    """Find the clusters whose results came close in a tile (step 2.1)."""
+    (stage,) = task.refs
+    polygons, cluster = [np.empty(0, object)], [np.empty(0, np.int64)]
+    for result in task.read(stage, ("polygon", "polygon_start", "cluster")):
+        shapes = unpack_polygons(result.arrays, "polygon")
+        rows = _near_rows(task, shapes)
+        polygons.append(shapes[rows])
+        cluster.append(result.arrays["cluster"][rows])
+    label = np.concatenate(cluster)
+    close = label[find_close(np.concatenate(polygons), task.parameters.clearance)].reshape(-1, 2)
+    task.put(pairs=np.unique(close[close[:, 0] != close[:, 1]], axis=0))
+    return {"n": len(close)}
+
+
+def join_close_clusters(task: Task) -> Facts:
+    """Join the clusters whose results came close, over the whole region (step 2.1)."""
+    before, near = sorted(task.refs)
+    (clusters,) = task.read(before, ("house", "cluster"))
+    house, cluster = clusters.arrays["house"], clusters.arrays["cluster"]
+    pairs = np.concatenate([np.empty((0, 2), np.int64)] + [result.arrays["pairs"] for result in task.read(near)])
+    joined = join_pairs(len(cluster), pairs)[cluster]
+    touched = np.isin(joined, joined[joined != cluster])
+    _put_clusters(task, house, joined, touched)
+    fewer = len(np.unique(cluster)) - len(np.unique(joined))
+    return {"joined": fewer, "clusters": len(np.unique(joined))}
+
+
+def list_members(task: Task) -> Facts:
+    """List the houses of the clusters that a tile owns: those whose first house is the tile's."""
+    (stage,) = task.refs
+    (clusters,) = task.read(stage, ("house", "cluster", "changed"))
+    house, cluster = clusters.arrays["house"], clusters.arrays["cluster"]
+    mine = (house[cluster, :2] == tile_key(task.name)).all(axis=1)
+    task.put(house=house[mine], cluster=cluster[mine], changed=clusters.arrays["changed"][mine])
+    tiles = np.unique(house[mine, :2], axis=0).tolist()
+    return {"n": int(mine.sum()), "names": sorted(f"{i}_{j}" for i, j in tiles)}
+
+
+def shape_members(task: Task) -> Facts:
+    """Simplify the clusters that a tile owns and that are new (step 2.1)."""
+    gathered = _gather(task, _members(task))
+    fresh = np.where(gathered.changed, gathered.cluster, -1)
+    with task.step("2.1 simplify"):
+        shapes = shape_clusters(gathered.houses.parts, fresh, city_options(task.parameters))
+    counts = shapes.counts
+    shapes = join_shapes([_earlier_shapes(task, gathered), shapes])
+    task.put(
+        **pack_polygons(shapes.polygons, "polygon"),
+        cluster=shapes.cluster,
+        member_start=shapes.member_start,
+        member=gathered.place[shapes.member],
+        closed=gathered.place[shapes.closed[:, 0]],
+        closed_cluster=shapes.closed[:, 1],
+    )
+    return {"n": len(shapes), "extent": _extent(shapes.polygons), "counts": dict(sorted(counts.items()))}
+
+
+def make_model(task: Task) -> Facts:
+    """Give the buildings of the clusters that a tile owns their ids, heights and layers (steps 2.3 and 3.4)."""
+    given, bounds = task.parameters, task.context.bounds
+    options, mesh = city_options(given), mesh_options(given)
+    gathered = _gather(task, _members(task))
+    shapes = _earlier_shapes(task, replace(gathered, changed=np.zeros(len(gathered.houses), np.bool_)))
+    reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0
+    extent = _extent(shapes.polygons)
+    cloud, dtm = _surroundings(task, extent, options.ground_margin, reach + 2 * given.dtm_spacing)
+    reserved = {name for result in task.read("footprints", ()) for name in result.facts["part_like"]}
+    city = raise_buildings(gathered.houses, shapes, dtm, options, reserved=reserved, trace=task.step)
+    task.notes(city.notes)
+    model = city.model
+    layers, parted = np.zeros(len(model), np.int32), 0
+    if isinstance(mesh, LayeredOptions):
+        pairs = adjacent_houses(model.polygons)
+        layers, parted = choose_layers(
+            model.polygons, model.roof, city.wall_ground, city.group, pairs, dtm, bounds, mesh
+        )
+    with task.step("2.4 fit of roofs"):
+        fidelity = _fit(cloud, city)
+    task.put(**pack_buildings(make_buildings(city, fidelity, layers)))
+    counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
+    counts |= {"roofs on another layer": parted} if parted else {}
+    return {"n": len(model), "extent": extent, "counts": counts, "outline": city.outline}
+
+
+def _read_footprints(task: Task) -> Footprints:
+    """Footprints that meet the tile."""
+    parts = []
+    for result in task.read("footprints", ("block", "cell_box", "cell_start", "end") if _has_rows(task) else ()):
+        if result.facts["n"] == 0:
+            break
+        arrays = result.arrays
+        start = np.append(arrays["cell_start"], arrays["end"])
+        size = task.read_rows("footprints", result.name, "wkb_size", 0, result.facts["n"])
+        id_size = task.read_rows("footprints", result.name, "id_size", 0, result.facts["n"])
+        byte, letter = np.cumsum([0, *size]), np.cumsum([0, *id_size])
+        for first, last in select_footprints(arrays["cell_box"], start, task.box):
+            text = task.read_rows("footprints", result.name, "id", letter[first], letter[last]).tobytes()
+            cuts = (letter[first : last + 1] - letter[first]).tolist()
+            ids = [text[a:b].decode() for a, b in pairwise(cuts)]
+            parts.append(
+                FootprintRows(
+                    task.read_rows("footprints", result.name, "wkb", byte[first], byte[last]),
+                    byte[first : last + 1],
+                    np.array(ids, np.str_),
+                    task.read_rows("footprints", result.name, "given_height", first, last),
+                    task.read_rows("footprints", result.name, "box", first, last),
+                )
+            )
+    return join_footprints(parts, task.box)
+
+
+def _has_rows(task: Task) -> bool:
+    return any(result.facts["n"] > 0 for result in task.read("footprints", ()))
+
+
+def _owned(task: Task, footprints: Footprints) -> Footprints:
+    """Take the footprints whose representative point is the tile's."""
+    xy = shapely.get_coordinates(shapely.point_on_surface(footprints.polygons))
+    mine = np.array([owns(task.box, task.context.bounds, (x, y)) for x, y in xy.tolist()], np.bool_)
+    return Footprints(footprints.polygons[mine], footprints.ids[mine], footprints.given_height[mine])
+
+
+def _surroundings(task: Task, extent: Box | None, margin: float, reach: float) -> tuple[PointCloud, Dtm]:
+    """Points and terrain of a box; of one corner of the tile where there is none."""
+    given, bounds = task.parameters, task.context.bounds
+    if extent is None:
+        corner = (*task.box[:2], *task.box[:2])
+        nothing = PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
+        return nothing, read_terrain(
+            task, grow(corner, given.dtm_spacing), spacing=given.dtm_spacing, bounds=bounds
+        )
+    with task.step("1.1 points of houses"):
+        cloud = read_cloud(task, grow(extent, margin), ground_filter=given.ground_filter)
+    return cloud, read_terrain(task, grow(extent, reach), spacing=given.dtm_spacing, bounds=bounds)
+
+
+def _fit(cloud: PointCloud, city: City) -> HouseFidelity:
+    points = locate_roof_points(cloud, city.model.polygons, building_class=True)
+    return measure_houses(points, city.model.polygons, city.model.roof)
+
+
+def _near_rows(task: Task, polygons: NDArray[np.object_]) -> NDArray[np.int64]:
+    """Polygons that meet the tile, or are closer to it than the clearance: each close pair is so in some tile."""
+    box = shapely.box(*grow(task.box, task.parameters.clearance))
+    return np.flatnonzero(shapely.intersects(box, polygons))
+
+
+def _put_clusters(
+    task: Task, house: NDArray[np.int64], cluster: NDArray[np.int64], changed: NDArray[np.bool_]
+) -> None:
+    """Write houses as column and row of their tile and their place in it, and the first house of their cluster."""
+    task.put(house=house, cluster=cluster, changed=changed)
+
+
+def _members(task: Task) -> Result:
+    (stage,) = (name for name in task.refs if name.startswith("members-"))
+    (members,) = task.read(stage)
+    return members
+
+
+def _gather(task: Task, members: Result) -> "_Gathered":
+    """Read the houses of the tile's clusters, by ascending id."""
+    house, cluster, changed = (members.arrays[name] for name in ("house", "cluster", "changed"))
+    several, order = [], []
+    for result in task.read("houses", HOUSE_ARRAYS):
+        mine = np.flatnonzero((house[:, :2] == tile_key(result.name)).all(axis=1))
+        several.append(take_houses(unpack_houses(result.arrays), house[mine, 2]))
+        order.append(mine)
+    rows = np.concatenate([np.empty(0, np.int64), *order])
+    joined = join_houses(several)
+    by_id = np.argsort(joined.ids, kind="stable")
+    houses, rows = take_houses(joined, by_id), rows[by_id]
+    of_part = houses.parts.house
+    number = np.arange(len(of_part)) - np.searchsorted(of_part, of_part)
+    place = np.column_stack((house[rows].reshape(-1, 3)[of_part], number)).astype(np.int64)
+    return _Gathered(houses, cluster[rows], changed[rows], place.reshape(-1, 4))
+
+
+@dataclass(frozen=True, eq=False)
+class _Gathered:
+    """Houses of a tile's clusters; ``place`` (p, 4) tells of each part its house's tile, row there, and number."""
+
+    houses: Houses
+    cluster: NDArray[np.int64]
+    changed: NDArray[np.bool_]
+    place: NDArray[np.int64]
+
+
+def _earlier_shapes(task: Task, gathered: _Gathered) -> Shapes:
+    """Read the shapes of the clusters that are as they were before; none in the first round."""
+    names = [name for name in task.refs if name.startswith("shapes-")]
+    if not names:
+        return join_shapes([])
+    (result,) = task.read(names[0])
+    arrays = result.arrays
+    found = Shapes(
+        unpack_polygons(arrays, "polygon"),
+        arrays["member_start"],
+        np.arange(len(arrays["member"])),
+        arrays["cluster"],
+        np.column_stack((np.arange(len(arrays["closed"])), arrays["closed_cluster"])),
+        {},
+    )
+    kept = leave_out(found, np.setdiff1d(arrays["cluster"], gathered.cluster[~gathered.changed]))
+    member = _find_rows(gathered.place, arrays["member"][kept.member])
+    closed = _find_rows(gathered.place, arrays["closed"][kept.closed[:, 0]])
+    return replace(kept, member=member, closed=np.column_stack((closed, kept.closed[:, 1])))
+
+
+def _find_rows(among: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Find rows (k, c) among the rows (n, c), which hold each of them once."""
+    _, index = np.unique(np.concatenate((among, rows)), axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    position = np.full(len(among) + len(rows), -1)
+    position[index[: len(among)]] = np.arange(len(among))
+    found: NDArray[np.int64] = position[index[len(among) :]]
+    return found
+
+
+def _extent(polygons: NDArray[np.object_]) -> Box | None:
+    if len(polygons) == 0:
+        return None
+    xmin, ymin, xmax, ymax = shapely.total_bounds(polygons).tolist()
+    return xmin, ymin, xmax, ymax
+
+
+def _hull(one: Box, other: Box) -> Box:
+    return min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
+
+
+def _count_parts(houses: Houses) -> dict[str, int]:
+    return {"house parts": len(houses.parts.polygons)}

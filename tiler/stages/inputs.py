@@ -1,0 +1,208 @@
+"""Stages 1.1 to 1.3: points of each file, footprints, and the terrain of each tile."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+
+from pipeline.errors import InputError
+from pipeline.notes import Note
+from pipeline.pointcloud import BUILDING
+from pipeline.raster import Dtm, NodeWindow, grow_window, join_dtm, node_window
+from pipeline.terrain import bin_nodes
+from pipeline.terrain_fill import (
+    FILL_RINGS,
+    CoarseSums,
+    FloodedDtm,
+    coarse_terrain,
+    coarsen,
+    fill_terrain,
+    flood_terrain,
+    merge_coarse,
+)
+from stitch.grid import Key, has_tile
+from tiler.config import Config
+from tiler.context import tile_key
+from tiler.footprint_index import largest_extent, scan_footprints
+from tiler.ingest import read_cells
+from tiler.readers import grow, read_cloud
+from tiler.stage import Facts, Read, Scope, Stage
+from tiler.task import Task
+
+
+def input_stages(config: Config) -> list[Stage]:
+    """Stages from the files to the terrain."""
+    spacing = config.dtm_spacing
+    ground = ("dtm_spacing", "ground_filter")
+    return [
+        Stage("points", Scope.FILE, read_point_file, parameters=("skip_unreadable",)),
+        Stage(
+            "footprints",
+            Scope.REGION,
+            read_footprint_file,
+            parameters=("footprints", "footprints_identity", "layer", "id_attribute", "height_attribute"),
+        ),
+        Stage("ground", Scope.TILE, bin_tile, (Read("points", halo_of_points(config, spacing)),), ground),
+        Stage("flooded", Scope.TILE, flood_tile, (Read("ground", (FILL_RINGS + 2) * spacing),), ("dtm_spacing",)),
+        Stage("coarse", Scope.REGION, join_coarse, (Read("flooded"),), ("dtm_spacing",)),
+        Stage("terrain", Scope.TILE, fill_tile, (Read("flooded"), Read("coarse")), ("dtm_spacing",)),
+    ]
+
+
+def halo_of_points(config: Config, reach: float) -> float:
+    """How far around a tile files are read for points within `reach` (m)."""
+    from pipeline.ground_filter import FILTER_REACH
+
+    return reach + (FILTER_REACH if config.ground_filter else 0.0)
+
+
+def read_point_file(task: Task) -> Facts:
+    """Read a point cloud file and deal its points out to cells (step 1.1)."""
+    counts: Counter[str] = Counter()
+    classes: set[int] = set()
+    row = n_cells = 0
+    blocks = [0]
+    try:
+        for block in read_cells(task.file, task.context.bounds):
+            task.append(
+                xyz=block.xyz,
+                classification=block.classification,
+                cell=block.cell,
+                cell_row=block.start[:-1] + row,
+            )
+            counts.update(block.counts)
+            classes |= set(block.classes.tolist())
+            row += len(block.xyz)
+            n_cells += len(block.cell)
+            blocks.append(n_cells)
+    except InputError as error:
+        if not task.parameters.skip_unreadable:
+            raise
+        task.discard()
+        return {"counts": {}, "classes": [], "marks_buildings": True, "unreadable": str(error)}
+    task.put(block=np.array(blocks), end=np.array([row]))
+    return {
+        "counts": dict(counts),
+        "classes": sorted(classes),
+        "marks_buildings": BUILDING in classes,
+        "unreadable": None,
+    }
+
+
+def read_footprint_file(task: Task) -> Facts:
+    """Read the footprints of the region and deal them out to cells (step 1.2)."""
+    given = task.parameters
+    if not given.footprints:
+        return {"n": 0, "largest": 0.0, "part_like": []}
+    n, largest, first = 0, 0.0, 0
+    blocks, part_like = [0], set[str]()
+    for block in scan_footprints(
+        Path(given.footprints),
+        crs=pyproj.CRS.from_user_input(task.context.crs),
+        bounds=task.context.bounds,
+        layer=given.layer,
+        id_attribute=given.id_attribute,
+        height_attribute=given.height_attribute,
+    ):
+        task.notes(block.notes)
+        rows = block.rows
+        names = [name.encode() for name in rows.ids.tolist()]
+        task.append(
+            wkb=rows.wkb,
+            wkb_size=np.diff(rows.wkb_start),
+            id=np.frombuffer(b"".join(names), np.uint8),
+            id_size=np.array([len(name) for name in names], np.int64),
+            given_height=rows.given_height,
+            box=rows.box.reshape(-1, 4),
+            cell_box=block.cell_box.reshape(-1, 4),
+            cell_start=block.start[:-1] + n,
+        )
+        n += len(rows)
+        first += len(block.cell)
+        blocks.append(first)
+        largest = max(largest, largest_extent(rows.box))
+        part_like |= {name for name in rows.ids.tolist() if "-part" in name}
+    if n == 0:
+        task.note(Note("no-footprints-in-region", given.footprints, detail="terrain only"))
+    task.put(block=np.array(blocks), end=np.array([n]))
+    return {"n": n, "largest": largest, "part_like": sorted(part_like)}
+
+
+def own_window(task: Task) -> NodeWindow:
+    """Nodes that a tile owns."""
+    grid, (i, j) = task.context.grid, tile_key(task.name)
+    return node_window(
+        task.box,
+        task.parameters.dtm_spacing,
+        low_border=(not has_tile(grid, Key(i - 1, j)), not has_tile(grid, Key(i, j - 1))),
+        high_border=(not has_tile(grid, Key(i + 1, j)), not has_tile(grid, Key(i, j + 1))),
+    )
+
+
+def bin_tile(task: Task) -> Facts:
+    """Average the ground points around the nodes of a tile (step 1.3)."""
+    spacing = task.parameters.dtm_spacing
+    window = own_window(task)
+    box = (
+        window.i0 * spacing,
+        window.j0 * spacing,
+        (window.i0 + window.nx - 1) * spacing,
+        (window.j0 + window.ny - 1) * spacing,
+    )
+    cloud = read_cloud(task, grow(box, spacing / 2), ground_filter=task.parameters.ground_filter)
+    raster, _ = bin_nodes(cloud, window, spacing=spacing)
+    task.put(z=raster.z)
+    return _raster_facts(raster)
+
+
+def flood_tile(task: Task) -> Facts:
+    """Fill the small empty areas of a tile's terrain (step 1.3)."""
+    spacing = task.parameters.dtm_spacing
+    own = own_window(task)
+    within = node_window(task.context.bounds, spacing)
+    parts = [_raster(result.arrays["z"], result.facts) for result in task.read("ground")]
+    flooded = flood_terrain(join_dtm(parts, grow_window(own, FILL_RINGS, within=within)), own)
+    sums = coarsen(flooded)
+    task.put(z=flooded.dtm.z, ring=flooded.ring, node=sums.node.reshape(-1, 2), total=sums.total, count=sums.count)
+    return _raster_facts(flooded.dtm) | {"known": sums.n_known}
+
+
+def join_coarse(task: Task) -> Facts:
+    """Make the coarse level that the middles of large empty areas take (step 1.3)."""
+    sums = []
+    for result in task.read("flooded", ("node", "total", "count")):
+        facts, arrays = result.facts, result.arrays
+        window = NodeWindow(facts["i0"], facts["j0"], facts["nx"], facts["ny"])
+        sums.append(
+            CoarseSums(arrays["node"], arrays["total"], arrays["count"], window, facts["known"], facts["spacing"])
+        )
+    raster = coarse_terrain(merge_coarse(sums))
+    task.put(z=raster.z)
+    return _raster_facts(raster)
+
+
+def fill_tile(task: Task) -> Facts:
+    """Fill the large empty areas of a tile's terrain (step 1.3)."""
+    (own,) = (result for result in task.read("flooded", ("z", "ring")) if result.name == task.name)
+    flooded = FloodedDtm(_raster(own.arrays["z"], own.facts), own.arrays["ring"])
+    (coarse,) = (_raster(result.arrays["z"], result.facts) for result in task.read("coarse"))
+    filled, counts = fill_terrain(flooded, coarse)
+    task.put(z=filled.z)
+    return _raster_facts(filled) | {
+        "counts": {
+            "terrain nodes": filled.z.size,
+            "terrain nodes filled": counts.filled,
+            "terrain nodes from coarse level": counts.coarse,
+        }
+    }
+
+
+def _raster(z: Any, facts: Facts) -> Dtm:
+    return Dtm(z, facts["i0"], facts["j0"], facts["spacing"])
+
+
+def _raster_facts(raster: Dtm) -> Facts:
+    ny, nx = raster.z.shape
+    return {"i0": raster.i0, "j0": raster.j0, "nx": nx, "ny": ny, "spacing": raster.spacing}

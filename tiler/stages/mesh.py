@@ -1,0 +1,225 @@
+"""Stages 3.1 to 3.5: the seams between tiles, and the columns of each tile between its seams."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
+from pipeline.columns import count_cells, lowest_gap
+from pipeline.errors import GeometryError
+from pipeline.layered import mesh_layers, terrain_reach
+from pipeline.mesh import ColumnMesh, PlaneMesh
+from pipeline.nodes import Levels
+from pipeline.notes import Note
+from pipeline.raster import Dtm
+from pipeline.spacing import top_reach
+from stitch.corners import Corner, place_corner
+from stitch.facets import Side, find_seam_edges
+from stitch.grid import ends_of_seam, seams_of_tile
+from stitch.layered_seams import fill_corner_layers, fill_seam_layers
+from stitch.seam_columns import fill_corner, fill_seam, tile_columns
+from stitch.seams import Seam, trace_seam
+from stitch.tiles import Sides, mesh_tile, tile_halo
+from stitch.walls import cut_walls
+from tiler.config import Config
+from tiler.context import seam_key, seam_name, tile_key
+from tiler.options import LAYER_PARAMETERS, PLANE_PARAMETERS, mesh_options, plane_options
+from tiler.readers import grow, read_buildings, read_terrain
+from tiler.stage import Facts, Read, Scope, Stage
+from tiler.tables import Buildings
+from tiler.task import Task
+
+NO_PLANE = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))
+PARAMETERS = (*PLANE_PARAMETERS, *LAYER_PARAMETERS, "dtm_spacing", "tile_size")
+
+
+def mesh_stages(config: Config) -> list[Stage]:
+    """Stages of seams and columns."""
+    halo = tile_halo(config.tile_size, config.mesh_size)
+    reads = (Read("model", halo, by_extent=True), Read("terrain", halo + terrain_halo(config)))
+    return [
+        Stage("seams", Scope.SEAM, make_seam, reads, PARAMETERS),
+        Stage("columns", Scope.TILE, make_columns, (*reads, Read("seams")), PARAMETERS),
+    ]
+
+
+def terrain_halo(given: Any) -> float:
+    """How far beyond the buildings that count terrain does (m)."""
+    options = mesh_options(given)
+    if isinstance(options, AdaptiveOptions):
+        return top_reach(options.domain_height) + 2 * float(given.dtm_spacing)
+    return terrain_reach(options) + 2 * float(given.dtm_spacing)
+
+
+def make_seam(task: Task) -> Facts:
+    """Find a seam and fill its columns."""
+    given, grid = task.parameters, task.context.grid
+    key = seam_key(task.name)
+    buildings, dtm = _surroundings(task)
+    polygons = buildings.model.polygons
+    walls = cut_walls(polygons, mesh_size=given.mesh_size)
+    with task.step("3.1 seams"):
+        start, end = (
+            place_corner(grid, corner, polygons, walls, mesh_size=given.mesh_size) for corner in ends_of_seam(key)
+        )
+        plane = plane_options(given)
+        seam = trace_seam(
+            grid,
+            key,
+            (start, end),
+            polygons,
+            walls,
+            mesh_size=given.mesh_size,
+            min_angle=plane["min_angle"],
+            passes=plane["passes"],
+        )
+    task.put(**pack_seam(seam, buildings.model.numbers))
+    facts = {"border": seam.border, "vertices": len(seam.xy)}
+    if seam.border:
+        return facts
+    with task.step("3.2-3.5 columns of seams"):
+        levels = _fill(seam, (start, end), dtm, buildings, task)
+    task.put(level_start=levels.start, level_z=levels.z, level_surface=levels.surface)
+    return facts | {"levels": len(levels.z)}
+
+
+def make_columns(task: Task) -> Facts:
+    """Mesh a tile between its seams, and fill its columns (steps 3.1 to 3.5)."""
+    given = task.parameters
+    options = mesh_options(given)
+    buildings, dtm = _surroundings(task)
+    model = buildings.model
+    walls = cut_walls(model.polygons, mesh_size=given.mesh_size)
+    names = [seam_name(key) for key in seams_of_tile(tile_key(task.name))]
+    found = {result.name: result for result in task.read("seams") if result.name in names}
+    sides = tuple(unpack_seam(found[name].arrays, model.numbers) for name in names)
+    with task.step("3.1 plane mesh"):
+        plane, complete = mesh_tile(
+            _four(sides), model.polygons, walls, mesh_size=given.mesh_size, **plane_options(given)
+        )
+    inner = [k for k, seam in enumerate(sides) if not seam.border]
+    seam_columns = tile_columns(plane, [(sides[k], unpack_levels(found[names[k]].arrays)) for k in inner])
+    # A tile is on the left of its southern and its eastern seam.
+    edges = find_seam_edges(
+        plane, [Side(sides[k], left=k < 2) for k in inner], seam_columns, model.roof, model.numbers
+    )
+    with task.step("3.2-3.5 columns"):
+        columns, report = _mesh(plane, dtm, buildings, options, seam_columns, task)
+    _check(columns)
+    if not complete:
+        x, y = (task.box[0] + task.box[2]) / 2, (task.box[1] + task.box[3]) / 2
+        task.note(Note("plane-refinement-stopped", task.name, x, y, "limit on added vertices reached"))
+    task.put(
+        **pack_columns(columns, model.numbers),
+        edge=edges.vertices,
+        edge_bottom=edges.bottom,
+        edge_building=edges.building,
+        edge_seam=np.repeat(inner, [len(sides[k].xy) - 1 for k in inner]).astype(np.int32),
+    )
+    gap, _ = lowest_gap(columns)
+    return {
+        "order": columns.order,
+        "facts": {"smallest gap (m)": round(gap, 4)} | dataclasses.asdict(report),
+        "counts": {
+            "cells": count_cells(columns),
+            "triangles": len(plane.triangles),
+            "columns": len(plane.xy),
+        },
+    }
+
+
+def pack_seam(seam: Seam, numbers: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+    """Write a seam as arrays; buildings go by their numbers."""
+    return {
+        "xy": seam.xy,
+        "wall_nodes": seam.wall_nodes,
+        "border": np.array([seam.border]),
+        "ring_xy": seam.ring.xy,
+        "ring_triangles": seam.ring.triangles,
+        "ring_building": np.append(numbers, -1)[seam.ring.building],
+        "vertex": seam.vertex,
+    }
+
+
+def unpack_seam(arrays: dict[str, NDArray[Any]], numbers: NDArray[np.int64]) -> Seam:
+    """Read what `pack_seam` wrote, for a city model with these numbers; its surroundings are not kept."""
+    order = np.argsort(numbers)
+    building = arrays["ring_building"]
+    row = np.full(len(building), -1, np.int32)
+    inside = building >= 0
+    row[inside] = order[np.searchsorted(numbers, building[inside], sorter=order)]
+    ring = PlaneMesh(arrays["ring_xy"], arrays["ring_triangles"], row)
+    return Seam(arrays["xy"], arrays["wall_nodes"], bool(arrays["border"][0]), ring, arrays["vertex"], NO_PLANE)
+
+
+def unpack_levels(arrays: dict[str, NDArray[Any]]) -> Levels:
+    """Read the columns of a seam within the region."""
+    return Levels(arrays["level_start"], arrays["level_z"], arrays["level_surface"])
+
+
+def pack_columns(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+    """Write columns as arrays; buildings go by their numbers."""
+    plane = mesh.plane
+    return {
+        "xy": plane.xy,
+        "triangles": plane.triangles,
+        "building": np.append(numbers, -1)[plane.building],
+        "z_start": mesh.z_start,
+        "z": mesh.z,
+        "bottom": mesh.bottom,
+    }
+
+
+def _surroundings(task: Task) -> tuple[Buildings, Dtm]:
+    given = task.parameters
+    halo = tile_halo(given.tile_size, given.mesh_size)
+    buildings = read_buildings(task, grow(task.box, halo))
+    reach = grow(task.box, halo + terrain_halo(given))
+    return buildings, read_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
+
+
+def _fill(seam: Seam, ends: tuple[Corner, Corner], dtm: Dtm, buildings: Buildings, task: Task) -> Levels:
+    """Columns of a seam within the region, of the mesher that is chosen."""
+    options, bounds = mesh_options(task.parameters), task.context.bounds
+    roof, ids = buildings.model.roof, buildings.model.ids
+    if isinstance(options, AdaptiveOptions):
+        first, last = (fill_corner(corner, dtm, roof, ids, options) for corner in ends)
+        return fill_seam(seam, (first, last), dtm, roof, ids, options)
+    layers = buildings.layers
+    first, last = (fill_corner_layers(corner, dtm, roof, ids, layers, bounds, options) for corner in ends)
+    return fill_seam_layers(seam, (first, last), dtm, roof, ids, layers, bounds, options)
+
+
+def _mesh(
+    plane: PlaneMesh, dtm: Dtm, buildings: Buildings, options: Any, seam: Any, task: Task
+) -> tuple[ColumnMesh, Any]:
+    model = buildings.model
+    group: NDArray[np.int32] = np.unique(buildings.group, return_inverse=True)[1].reshape(-1).astype(np.int32)
+    if isinstance(options, AdaptiveOptions):
+        return mesh_adaptive(plane, dtm, model.roof, group, model.ids, options, seam=seam)
+    return mesh_layers(
+        plane,
+        dtm,
+        model,
+        buildings.wall_ground,
+        task.context.bounds,
+        options,
+        group=group,
+        removed=buildings.layers,
+        seam=seam,
+    )
+
+
+def _check(columns: ColumnMesh) -> None:
+    gap, inverted = lowest_gap(columns)
+    if inverted:
+        raise GeometryError(
+            f"step 3.5: {inverted} levels do not ascend, the worst by {gap:.3g} m; raise --roof-clearance"
+        )
+
+
+def _four(sides: tuple[Seam, ...]) -> Sides:
+    south, east, north, west = sides
+    return south, east, north, west
