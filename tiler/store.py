@@ -1,10 +1,12 @@
 """The store: results by stage and name in zarr (v3), written whole or not at all, verified on every read.
 
 A result is a zarr group ``<stage>/<name>``. Arrays above 32 kB are arrays of their own; smaller ones lie in one
-array of bytes, ``_packed``. The group's attributes hold what the writer gave, ``arrays`` (type and shape of each
-array and the CRC-32 of the raw bytes of each chunk) and ``checksum``, the CRC-32 of all other attributes.
+array of bytes, ``_packed``, and if all of them are less than 16 kB, in the group's attributes. These hold what the
+writer gave, ``arrays`` (type and shape of each array and the CRC-32 of the raw bytes of each chunk) and
+``checksum``, the CRC-32 of all other attributes.
 """
 
+import base64
 import errno
 import json
 import os
@@ -25,6 +27,7 @@ from pipeline.errors import InputError, OutputError
 from pipeline.mesh import ColumnMesh, PlaneMesh
 from pipeline.terrain import Dtm, sample_dtm
 from tiler.packing import (
+    INLINE_BYTES,
     PACKED_BYTES,
     RowBuffer,
     Table,
@@ -98,7 +101,7 @@ class Store:
         entries = {array: _entry(table, array, stage, name) for array in wanted}
         packed = None
         if any("offset" in entry for entry in entries.values()):
-            packed = _read_chunks(folder, stage, name, PACKED, table[PACKED])
+            packed = _read_packed(folder, stage, name, table[PACKED])
         arrays: dict[str, NDArray[Any]] = {}
         for array, entry in entries.items():
             if packed is not None and "offset" in entry:
@@ -124,7 +127,7 @@ class Store:
         if not 0 <= start <= stop <= n_rows:
             raise ValueError(f"stage {stage}, {name}: rows {start} to {stop} of {array}, which has {n_rows}")
         if "offset" in entry:
-            return unpack(_read_chunks(folder, stage, name, PACKED, table[PACKED]), entry)[start:stop]
+            return unpack(_read_packed(folder, stage, name, table[PACKED]), entry)[start:stop]
         return _read_chunks(folder, stage, name, array, entry, start, stop)
 
     def attributes(self, stage: str, name: str) -> dict[str, Any]:
@@ -256,7 +259,10 @@ class Writer:
                 self._extend(name, rest)
         if self._small:
             packed, table = pack(self._small)
-            self._create(PACKED, packed)
+            if len(packed) <= INLINE_BYTES:
+                self._table[PACKED] = {"base64": base64.b64encode(packed.data).decode()}
+            else:
+                self._create(PACKED, packed)
             self._table |= table
         kept["arrays"] = plain_json(self._table)
         kept["checksum"] = _attributes_checksum(kept)
@@ -363,6 +369,12 @@ def _entry(table: Table, array: str, stage: str, name: str) -> dict[str, Any]:
         names = ", ".join(sorted(set(table) - {PACKED})) or "none"
         raise ValueError(f"stage {stage}, {name}: no array {array}, it has: {names}")
     return table[array]
+
+
+def _read_packed(folder: Path, stage: str, name: str, entry: Mapping[str, Any]) -> NDArray[Any]:
+    if "base64" in entry:  # under the checksum of the attributes
+        return np.frombuffer(base64.b64decode(entry["base64"]), dtype=np.uint8)
+    return _read_chunks(folder, stage, name, PACKED, entry)
 
 
 def _read_chunks(

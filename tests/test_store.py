@@ -1,0 +1,255 @@
+"""The store: whole or not at all, any plain array, every damage found, the same bytes for the same result."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError, OutputError
+from tiler.packing import CHUNK_BYTES, INLINE_BYTES, PACKED_BYTES
+from tiler.store import Store
+
+RNG = np.random.default_rng(7)
+N_CHUNK = CHUNK_BYTES // 24  # rows of three float64 in a chunk
+BIG = RNG.normal(size=(2 * N_CHUNK + 5, 3))  # three chunks, the last one short
+DTYPES = ["f8", "f4", "i8", "i4", "u1", "?", "<U7"]
+SIZES = [0, 1, 3, PACKED_BYTES]  # in rows: inline, and an array of its own
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store.zarr")
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(path)): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
+
+
+def sample(dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    return RNG.integers(-3, 100, shape).astype(dtype)
+
+
+def chunk_files(store: Store, array: str) -> list[Path]:
+    return sorted(p for p in (store.path / "s" / "n" / array / "c").rglob("*") if p.is_file())
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("n_rows", SIZES)
+def test_every_type_comes_back_as_it_was(store: Store, dtype: str, n_rows: int) -> None:
+    flat, table, none = sample(dtype, (n_rows,)), sample(dtype, (n_rows, 3)), sample(dtype, (n_rows, 0))
+    store.write("s", "n", {"flat": flat, "table": table, "none": none}, size=1.5)
+    arrays, attributes = store.read("s", "n")
+    assert attributes == {"size": 1.5}
+    assert list(arrays) == ["flat", "none", "table"]
+    for name, values in {"flat": flat, "table": table, "none": none}.items():
+        assert arrays[name].dtype == values.dtype
+        np.testing.assert_array_equal(arrays[name], values)
+    assert store.shapes("s", "n") == {"flat": (n_rows,), "none": (n_rows, 0), "table": (n_rows, 3)}
+
+
+def test_bits_come_back_as_they_were(store: Store) -> None:
+    odd = np.array([-0.0, np.nan, np.inf, 5e-324])
+    negative_zeros = np.full(PACKED_BYTES, -0.0)
+    store.write("s", "n", {"odd": odd, "zeros": negative_zeros, "single": np.float64(2.5)})
+    arrays, _ = store.read("s", "n")
+    assert arrays["odd"].tobytes() == odd.tobytes()
+    assert arrays["zeros"].tobytes() == negative_zeros.tobytes()
+    assert arrays["single"].shape == ()
+    assert arrays["single"] == 2.5
+
+
+def test_views_and_foreign_byte_order_are_stored_by_value(store: Store) -> None:
+    grid = np.arange(12.0).reshape(3, 4)
+    store.write("s", "n", {"turned": grid.T, "strided": grid[:, ::2], "big_endian": grid.astype(">f8")})
+    arrays, _ = store.read("s", "n")
+    np.testing.assert_array_equal(arrays["turned"], grid.T)
+    np.testing.assert_array_equal(arrays["strided"], grid[:, ::2])
+    np.testing.assert_array_equal(arrays["big_endian"], grid)
+
+
+@pytest.mark.parametrize("n_small", [10, 400, 3000])
+def test_small_arrays_share_one(store: Store, n_small: int) -> None:
+    arrays: dict[str, Any] = {f"a{k}": np.arange(n_small) + k for k in range(5)}
+    store.write("s", "n", arrays)
+    n_files = len(contents(store.path))
+    assert n_files == (1 if 40 * n_small <= INLINE_BYTES else 3)
+    read, _ = store.read("s", "n", names=["a3"])
+    assert list(read) == ["a3"]
+    np.testing.assert_array_equal(read["a3"], arrays["a3"])
+
+
+def test_only_named_arrays_are_read(store: Store) -> None:
+    store.write("s", "n", {"big": BIG, "small": np.arange(3)})
+    shutil.rmtree(store.path / "s" / "n" / "big" / "c")
+    assert list(store.read("s", "n", names=["small"])[0]) == ["small"]
+    assert store.read("s", "n", names=[])[0] == {}
+    with pytest.raises(ValueError, match="no array huge, it has: big, small"):
+        store.read("s", "n", names=["huge"])
+
+
+def test_appended_rows_are_the_bytes_of_one_put(store: Store) -> None:
+    ids = np.array([f"b{k}" for k in range(len(BIG))], dtype="<U9")
+    store.write("put", "n", {"big": BIG, "ids": ids, "few": BIG[:7]}, a=1)
+    for case, cuts in enumerate([[1], [N_CHUNK], [5, 5, N_CHUNK + 1, 2 * N_CHUNK], range(0, len(BIG), 40_000)]):
+        with store.writer(f"append{case}", "n") as writer:
+            for piece, names in zip(np.split(BIG, cuts), np.split(ids, cuts), strict=True):
+                writer.append(big=piece, ids=names)
+            writer.append(few=BIG[:0])
+            writer.append(few=BIG[:7])
+            writer.commit({"a": 1})
+        assert contents(store.path / f"append{case}") == contents(store.path / "put")
+
+
+def test_rows_of_a_part(store: Store) -> None:
+    store.write("s", "n", {"big": BIG, "small": BIG[:9], "ids": np.array(["a", "bcd"] * 40_000)})
+    for start, stop in [
+        (0, 0),
+        (0, 1),
+        (N_CHUNK - 1, N_CHUNK + 1),
+        (2 * N_CHUNK, len(BIG)),
+        (0, len(BIG)),
+        (7, 7),
+    ]:
+        np.testing.assert_array_equal(store.read_rows("s", "n", "big", start, stop), BIG[start:stop])
+    np.testing.assert_array_equal(store.read_rows("s", "n", "small", 2, 9), BIG[2:9])
+    assert store.read_rows("s", "n", "ids", 1, 3).tolist() == ["bcd", "a"]
+    for start, stop in [(-1, 2), (3, 2), (0, len(BIG) + 1)]:
+        with pytest.raises(ValueError, match="rows"):
+            store.read_rows("s", "n", "big", start, stop)
+
+
+def test_a_damaged_chunk_is_found_where_it_is_read_and_only_there(store: Store) -> None:
+    ends = [(0, 1), (N_CHUNK, N_CHUNK + 1), (2 * N_CHUNK, len(BIG))]
+    store.write("s", "n", {"big": BIG})
+    for chunk, file in enumerate(chunk_files(store, "big")):
+        whole = file.read_bytes()
+        k = len(whole) // 2
+        for damage in (None, b"", whole[:-9], whole[:k] + bytes([whole[k] ^ 1]) + whole[k + 1 :]):
+            file.unlink() if damage is None else file.write_bytes(damage)
+            for other, (start, stop) in enumerate(ends):
+                if other == chunk:
+                    with pytest.raises(InputError, match=r"stage s, n: big in .* is damaged"):
+                        store.read_rows("s", "n", "big", start, stop)
+                else:
+                    store.read_rows("s", "n", "big", start, stop)
+        with pytest.raises(InputError, match="big"):
+            store.read("s", "n")
+        file.write_bytes(whole)
+    np.testing.assert_array_equal(store.read("s", "n")[0]["big"], BIG)
+
+
+def test_damaged_attributes_are_found(store: Store) -> None:
+    store.write("s", "n", {"small": np.arange(5)}, height=3.5)
+    file = store.path / "s" / "n" / "zarr.json"
+    whole = file.read_text()
+    for damage in (whole[:-20], "", whole.replace("3.5", "3.6"), whole.replace('"base64": "A', '"base64": "B')):
+        assert damage != whole
+        file.write_text(damage)
+        with pytest.raises(InputError, match=r"stage s, n: attributes .*damaged"):
+            store.attributes("s", "n")
+    file.write_text(whole)
+    assert store.attributes("s", "n") == {"height": 3.5}
+
+
+def test_an_array_that_is_gone_or_changed_its_shape_is_found(store: Store) -> None:
+    store.write("s", "n", {"big": BIG})
+    file = store.path / "s" / "n" / "big" / "zarr.json"
+    metadata = json.loads(file.read_text())
+    metadata["shape"][0] -= 1
+    file.write_text(json.dumps(metadata))
+    with pytest.raises(InputError, match="shape"):
+        store.read("s", "n")
+    shutil.rmtree(file.parent)
+    with pytest.raises(InputError, match="big"):
+        store.read("s", "n")
+
+
+def test_what_is_not_there(store: Store) -> None:
+    assert store.names("s") == []
+    assert not store.has("s", "n")
+    with pytest.raises(InputError, match="is not there"):
+        store.read("s", "n")
+    for name in ("", "..", ".x", "a/b"):
+        with pytest.raises(ValueError, match="cannot name"):
+            store.has("s", name)
+
+
+def test_nothing_is_seen_before_commit_nor_left_without(store: Store) -> None:
+    with store.writer("s", "n") as writer:
+        writer.put(big=BIG)
+        assert store.names("s") == []
+        assert not store.has("s", "n")
+    assert list((store.path / "s").iterdir()) == []
+    with pytest.raises(ValueError, match="cannot be stored"), store.writer("s", "n") as writer:
+        writer.put(big=BIG, bad=np.array([None]))
+    assert list((store.path / "s").iterdir()) == []
+
+
+def test_an_error_keeps_the_earlier_result_and_a_commit_replaces_it(store: Store) -> None:
+    store.write("s", "n", {"a": np.arange(3), "old": BIG})
+    before = contents(store.path)
+    with pytest.raises(ValueError, match="cannot be stored"), store.writer("s", "n") as writer:
+        writer.put(a=BIG, bad=np.array([None]))
+    assert contents(store.path) == before
+    store.write("s", "n", {"a": np.arange(4)})
+    assert list(store.read("s", "n")[0]) == ["a"]
+    assert [p.name for p in (store.path / "s").iterdir()] == ["n"]
+
+
+def test_two_writers_of_one_result(store: Store) -> None:
+    with store.writer("s", "n") as first, store.writer("s", "n") as second:
+        first.put(a=np.arange(3))
+        second.put(a=np.arange(3))
+        first.commit()
+        second.commit()
+    assert store.read("s", "n")[0]["a"].tolist() == [0, 1, 2]
+    assert [p.name for p in (store.path / "s").iterdir()] == ["n"]
+
+
+def test_what_killed_writers_left_is_swept(store: Store) -> None:
+    store.write("s", "n", {})
+    writer = store.writer("s", "m").__enter__()
+    writer.put(big=BIG)
+    store.sweep("s")
+    assert [p.name for p in (store.path / "s").iterdir()] == ["n"]
+
+
+def test_the_order_of_arrays_and_attributes_does_not_show(store: Store) -> None:
+    arrays: dict[str, Any] = {"b": np.arange(3), "a": BIG, "c": np.arange(5000)}
+    store.write("s", "n", arrays, x=1, y={"q": 1, "p": (2, 3)})
+    store.write("t", "n", dict(reversed(arrays.items())), y={"p": [2, 3], "q": 1}, x=1)
+    assert contents(store.path / "s") == contents(store.path / "t")
+
+
+def test_wrong_arguments(store: Store) -> None:
+    with store.writer("s", "n") as writer:
+        writer.put(a=np.arange(3))
+        for name, values, message in [
+            ("a", np.arange(3), "twice"),
+            ("o", np.array([None]), "cannot be stored"),
+            ("z", np.array([1j]), "cannot be stored"),
+            ("_packed", np.arange(3), "letters"),
+        ]:
+            with pytest.raises(ValueError, match=message):
+                writer.put(**{name: values})
+        writer.append(b=np.zeros((2, 3)))
+        for rows in (np.zeros((2, 2)), np.zeros((2, 3), dtype=np.float32), np.array(1.0)):
+            with pytest.raises(ValueError, match="append"):
+                writer.append(b=rows)
+        with pytest.raises(ValueError, match="twice"):
+            writer.append(a=np.arange(3))
+        with pytest.raises(ValueError, match="may not be named"):
+            writer.commit({"checksum": 1})
+        for bad in (float("nan"), {1, 2}, np.arange(3)):
+            with pytest.raises(ValueError, match="plain JSON"):
+                writer.commit({"x": bad})
+
+
+def test_a_disk_that_refuses(tmp_path: Path) -> None:
+    (tmp_path / "store.zarr").write_text("a file where the folder should be")
+    with pytest.raises(OutputError, match="cannot be written"):
+        Store(tmp_path / "store.zarr").write("s", "n", {})
