@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pipeline.building_points import has_building_class
 from pipeline.city import City
 from pipeline.heights import ROOF_SOURCES
-from pipeline.point_fidelity import measure_fidelity, measure_houses
+from pipeline.point_fidelity import KINDS, PointFidelity, measure_fidelity, measure_houses
 from pipeline.pointcloud import PointCloud
 from pipeline.roof_points import locate_roof_points
 from pipeline.terrain import Dtm
@@ -84,16 +84,22 @@ def measure_model(
         ``roof``, ``missed``, ``ground`` and ``swallowed`` as in `point_fidelity.PointFidelity`, each with ``n``,
         ``rmse``, ``p50``, ``p95`` and ``bias`` (m).
     """
-    found = measure_fidelity(
-        cloud,
-        dtm,
-        city.model.polygons,
-        city.model.roof,
-        footprints=footprints,
-        building_class=has_building_class(cloud),
+    return fidelity_table(
+        measure_fidelity(
+            cloud,
+            dtm,
+            city.model.polygons,
+            city.model.roof,
+            footprints=footprints,
+            building_class=has_building_class(cloud),
+        )
     )
+
+
+def fidelity_table(found: PointFidelity) -> dict[str, dict[str, float]]:
+    """Table of the fidelity for the report, as `measure_model` returns it; values without points are left out."""
     table = {}
-    for name in ("roof", "missed", "ground", "swallowed"):
+    for name in KINDS:
         residuals = getattr(found, name)
         values = {key: float(getattr(residuals, key)) for key in ("rmse", "p50", "p95", "bias")}
         known = {key: round(value, 4) for key, value in values.items() if np.isfinite(value)}

@@ -1,5 +1,6 @@
 """How far LiDAR points are from the model: roofs, ground, and each house (measures steps 1.6 and 2.3)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,33 +9,26 @@ from numpy.typing import NDArray
 
 from pipeline.building_points import find_inside
 from pipeline.pointcloud import GROUND, WATER, PointCloud
+from pipeline.residuals import Residuals, ResidualSums, conclude, merge_residuals, sum_residuals, summarise
 from pipeline.roof_points import RoofPoints, select_roof
 from pipeline.terrain import Dtm, sample_dtm
 
+__all__ = [
+    "KINDS",
+    "FidelitySums",
+    "HouseFidelity",
+    "PointFidelity",
+    "Residuals",
+    "conclude_fidelity",
+    "measure_fidelity",
+    "measure_houses",
+    "merge_fidelity",
+    "sum_fidelity",
+    "summarise",
+]
+
+KINDS = ("roof", "missed", "ground", "swallowed")  # of points
 COVERAGE_CELL = 1.0  # m, side of the cells in which points are looked for
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """Heights of the model minus heights of the points.
-
-    Attributes
-    ----------
-    n : int
-        Number of points; the other values are NaN if there are none.
-    rmse : float
-        Root of the mean square (m).
-    p50, p95 : float
-        Percentiles of the absolute values (m).
-    bias : float
-        Mean (m), positive where the model is too high.
-    """
-
-    n: int
-    rmse: float
-    p50: float
-    p95: float
-    bias: float
 
 
 @dataclass(frozen=True)
@@ -60,6 +54,22 @@ class PointFidelity:
     missed: Residuals
     ground: Residuals
     swallowed: Residuals
+
+
+@dataclass(frozen=True, eq=False)
+class FidelitySums:
+    """Sums of a tile's points from which the fidelity of a region is made.
+
+    Attributes
+    ----------
+    roof, missed, ground, swallowed : ResidualSums
+        Of the points that `PointFidelity` describes.
+    """
+
+    roof: ResidualSums
+    missed: ResidualSums
+    ground: ResidualSums
+    swallowed: ResidualSums
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,24 +131,41 @@ def measure_fidelity(
     -----
     All points count, outliers too. The result does not depend on the order of the points.
     """
-    built = np.isfinite(roof)
-    polygons, roof = polygons[built], roof[built]
-    roof_xyz = cloud.xyz[select_roof(cloud, building_class=building_class)]
-    building, point = find_inside(roof_xyz, polygons)
-    inside = _mark(len(roof_xyz), point)
-    original = _mark(len(roof_xyz), find_inside(roof_xyz, footprints)[1])
-    missed = roof_xyz[original & ~inside]
+    found = _find_residuals(cloud, dtm, polygons, roof, footprints, building_class)
+    return PointFidelity(**{kind: summarise(residual) for kind, residual in found.items()})
 
-    ground_xyz = cloud.xyz[(cloud.classification == GROUND) | (cloud.classification == WATER)]
-    over, below = find_inside(ground_xyz, polygons)
-    open_ground = ground_xyz[~_mark(len(ground_xyz), below)]
-    street = ~_mark(len(ground_xyz), find_inside(ground_xyz, footprints)[1])[below]
-    return PointFidelity(
-        roof=summarise(roof[building] - roof_xyz[point, 2]),
-        missed=summarise(sample_dtm(dtm, missed[:, :2]) - missed[:, 2]),
-        ground=summarise(sample_dtm(dtm, open_ground[:, :2]) - open_ground[:, 2]),
-        swallowed=summarise((roof[over] - ground_xyz[below, 2])[street]),
-    )
+
+def sum_fidelity(
+    cloud: PointCloud,
+    dtm: Dtm,
+    polygons: NDArray[np.object_],
+    roof: NDArray[np.float64],
+    *,
+    footprints: NDArray[np.object_],
+    building_class: bool,
+) -> FidelitySums:
+    """Measure a tile's points as `measure_fidelity` does, for adding up.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        The tile's own points: each point of the region in one tile.
+    dtm, polygons, roof, footprints, building_class
+        As in `measure_fidelity`: all that touch the tile, also those that its neighbours own. Whether there is a
+        building class is a question to the whole region.
+    """
+    found = _find_residuals(cloud, dtm, polygons, roof, footprints, building_class)
+    return FidelitySums(**{kind: sum_residuals(residual) for kind, residual in found.items()})
+
+
+def merge_fidelity(parts: Sequence[FidelitySums]) -> FidelitySums:
+    """Add up the sums of tiles, at least one, in any order."""
+    return FidelitySums(**{kind: merge_residuals([getattr(part, kind) for part in parts]) for kind in KINDS})
+
+
+def conclude_fidelity(sums: FidelitySums) -> PointFidelity:
+    """Say what the sums tell; percentiles are known to 1 cm (see `residuals.conclude`)."""
+    return PointFidelity(**{kind: conclude(getattr(sums, kind)) for kind in KINDS})
 
 
 def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roof: NDArray[np.float64]) -> HouseFidelity:
@@ -165,22 +192,33 @@ def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roof: NDAr
     )
 
 
-def summarise(residual: NDArray[np.float64]) -> Residuals:
-    """Summarise residuals (m) in any order.
+def _find_residuals(
+    cloud: PointCloud,
+    dtm: Dtm,
+    polygons: NDArray[np.object_],
+    roof: NDArray[np.float64],
+    footprints: NDArray[np.object_],
+    building_class: bool,
+) -> dict[str, NDArray[np.float64]]:
+    """Find the residuals (m) of the points of each kind."""
+    built = np.isfinite(roof)
+    polygons, roof = polygons[built], roof[built]
+    roof_xyz = cloud.xyz[select_roof(cloud, building_class=building_class)]
+    building, point = find_inside(roof_xyz, polygons)
+    inside = _mark(len(roof_xyz), point)
+    original = _mark(len(roof_xyz), find_inside(roof_xyz, footprints)[1])
+    missed = roof_xyz[original & ~inside]
 
-    Examples
-    --------
-    >>> summarise(np.array([-1.0, 1.0, 3.0, -3.0]))
-    Residuals(n=4, rmse=2.23606797749979, p50=2.0, p95=3.0, bias=0.0)
-    """
-    if not len(residual):
-        nan = float("nan")
-        return Residuals(0, nan, nan, nan, nan)
-    residual = np.sort(residual)
-    p50, p95 = np.percentile(np.abs(residual), [50, 95])
-    return Residuals(
-        len(residual), float(np.sqrt(np.mean(residual**2))), float(p50), float(p95), float(residual.mean())
-    )
+    ground_xyz = cloud.xyz[(cloud.classification == GROUND) | (cloud.classification == WATER)]
+    over, below = find_inside(ground_xyz, polygons)
+    open_ground = ground_xyz[~_mark(len(ground_xyz), below)]
+    street = ~_mark(len(ground_xyz), find_inside(ground_xyz, footprints)[1])[below]
+    return {
+        "roof": roof[building] - roof_xyz[point, 2],
+        "missed": sample_dtm(dtm, missed[:, :2]) - missed[:, 2],
+        "ground": sample_dtm(dtm, open_ground[:, :2]) - open_ground[:, 2],
+        "swallowed": (roof[over] - ground_xyz[below, 2])[street],
+    }
 
 
 def _mark(n: int, index: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -126,21 +126,32 @@ def test_the_order_of_the_points_does_not_matter() -> None:
     assert shuffled.classification.tobytes() == classify_ground(cloud).classification[order].tobytes()
 
 
-def test_a_wide_gap_is_as_good_as_the_end_of_the_cloud() -> None:
-    # A roof of 11 x 11 m stands on the shore: ground on one side alone, a gap as wide as can be filled, or wider.
-    rng = np.random.default_rng(1)
-    xy = rng.uniform(0, 100, (40_000, 2))
-    xy = xy[xy[:, 0] < 60]
-    on_roof = (abs(xy[:, 0] - 54) < 5.5) & (abs(xy[:, 1] - 50) < 5.5)
-    shore = np.column_stack((xy, np.where(on_roof, 12.0, 0.0)))
-    far = shore[~on_roof] + [100.0 + 2 * GAP, 0.0, 3.0]
-    classes = []
-    for points in (shore, np.concatenate((shore, far))):
-        cloud = PointCloud(points, np.full(len(points), UNCLASSIFIED, np.uint8))
-        classes.append(classify_ground(cloud).classification[: len(shore)])
-    assert classes[0].tobytes() == classes[1].tobytes()
-    assert (classes[0][on_roof] == UNCLASSIFIED).all()
-    assert (classes[0][~on_roof] == GROUND).all()
+def classes_of(xyz: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return classify_ground(PointCloud(xyz, np.full(len(xyz), UNCLASSIFIED, np.uint8))).classification
+
+
+def pave(x0: int, x1: int, y0: int, y1: int, height: float) -> NDArray[np.float64]:
+    """One point in the middle of each cell."""
+    x, y = np.meshgrid(np.arange(x0, x1) + 0.5, np.arange(y0, y1) + 0.5)
+    return np.column_stack((x.ravel(), y.ravel(), np.full(x.size, height)))
+
+
+@pytest.mark.parametrize(("gap", "is_ground"), [(2 * GAP - 2, False), (2 * GAP + 14, True)])
+def test_shores_beyond_a_wide_gap_do_not_count(gap: int, is_ground: bool) -> None:
+    # Filled throughout, the gap would show that the island stands 8 m above the shores.
+    island = pave(100, 110, 45, 55, 8.0)
+    found = classes_of(
+        np.concatenate((island, pave(0, 100 - gap, 0, 100, 0.0), pave(110 + gap, 210, 0, 100, 0.0)))
+    )
+    assert (found[: len(island)] == (GROUND if is_ground else UNCLASSIFIED)).all()
+    assert (found[len(island) :] == GROUND).all()
+
+
+def test_no_window_lies_in_a_wide_gap() -> None:
+    # A window there would see nothing but the long roof on the shore.
+    ground, roof, far = pave(0, 90, 0, 200, 0.0), pave(90, 100, 50, 150, 12.0), pave(200, 220, 0, 200, 0.0)
+    found = classes_of(np.concatenate((ground, roof, far)))
+    assert (found == GROUND).tolist() == [True] * len(ground) + [False] * len(roof) + [True] * len(far)
 
 
 def test_points_outside_the_bounds_are_refused() -> None:

@@ -243,6 +243,14 @@ def test_the_blend_has_no_step() -> None:
     assert row[501 - RIM] == 12.0
 
 
+def test_the_blend_by_hand() -> None:
+    # The flood is 0 m on the left and 12 m on the right, the mean of the rim 6 m. Ring 40 takes a quarter of it.
+    z = np.full((1, 101), np.nan)
+    z[0, 0], z[0, 100] = 0.0, 12.0
+    row = fill_dtm(Dtm(z, 0, 0, 1.0)).z[0]
+    assert row[[32, 40, 48, 50, 52, 60, 68]].tolist() == [0.0, 1.5, 3.0, 6.0, 9.0, 10.5, 12.0]
+
+
 def test_a_tile_without_ground_takes_the_coarse_level_alone() -> None:
     raw = raster_with_lakes(0, 700, 520)
     window = NodeWindow(raw.i0 + 190, raw.j0 + 160, 30, 30)
@@ -277,6 +285,8 @@ def test_joining_checks_its_parts() -> None:
     one = Dtm(np.array([[1.0, 2.0]]), 0, 0, 1.0)
     joined = join_dtm([one, Dtm(np.array([[2.0, 3.0]]), 1, 0, 1.0)], NodeWindow(-1, 0, 5, 1))
     np.testing.assert_array_equal(joined.z, [[np.nan, 1.0, 2.0, 3.0, np.nan]])
+    hole = Dtm(np.array([[np.nan, 3.0]]), 1, 0, 1.0)
+    assert join_dtm([one, hole], NodeWindow(0, 0, 3, 1)).z.tolist() == [[1.0, 2.0, 3.0]]
     with pytest.raises(ValueError, match="different heights"):
         join_dtm([one, Dtm(np.array([[2.5, 3.0]]), 1, 0, 1.0)], NodeWindow(0, 0, 3, 1))
     with pytest.raises(ValueError, match="spacings"):
