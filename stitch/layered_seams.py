@@ -4,16 +4,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.layered import LayeredOptions, fill_layers
+from pipeline.mesh import PlaneMesh
 from pipeline.nodes import Levels, SeamColumns, take_columns
 from pipeline.terrain import Dtm
 from stitch.corners import Corner
 from stitch.grid import Bounds
-from stitch.seam_columns import corner_fan, join_levels
+from stitch.seam_columns import join_levels
 from stitch.seams import Seam, find_vertices
 
 
 def fill_corner_layers(
     corner: Corner,
+    patch: PlaneMesh,
     dtm: Dtm,
     roof: NDArray[np.float64],
     ids: NDArray[np.str_],
@@ -26,7 +28,9 @@ def fill_corner_layers(
     Parameters
     ----------
     corner : Corner
-        A corner of two tiles or more. No wall is as close to it as the tips of its first edges.
+        A corner of two tiles or more.
+    patch : PlaneMesh
+        Triangles around it (`mesh_patch`).
     dtm : Dtm
         Terrain as far beyond these as `terrain_reach` says.
     roof, ids, bounds, options
@@ -39,9 +43,8 @@ def fill_corner_layers(
     Levels
         One column, from the ground or the roof around it up to the domain's top.
     """
-    fan = corner_fan(corner)
-    levels = fill_layers(fan, dtm, roof, ids, removed, bounds, options)
-    return take_columns(levels, find_vertices(fan.xy, corner.xy[None]))
+    levels = fill_layers(patch, dtm, roof, ids, removed, bounds, options)
+    return take_columns(levels, find_vertices(patch.xy, corner.xy[None]))
 
 
 def fill_seam_layers(

@@ -33,7 +33,7 @@ def fill_corner(
     Levels
         One column, with a spacing that follows the length of the first edges.
     """
-    fan = corner_fan(corner)
+    fan = _fan(corner)
     return take_columns(fill_columns(fan, dtm, roof, ids, options), find_vertices(fan.xy, corner.xy[None]))
 
 
@@ -100,8 +100,8 @@ def join_levels(parts: Sequence[Levels]) -> Levels:
     )
 
 
-def corner_fan(corner: Corner) -> PlaneMesh:
-    """Make the triangles between a corner and the neighbouring tips."""
+def _fan(corner: Corner) -> PlaneMesh:
+    """Triangles between a corner and the neighbouring tips."""
     xy = np.concatenate((corner.xy[None], corner.tips))
     triangles = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], np.int32)
     triangles = triangles[~np.isnan(xy[triangles]).any(axis=(1, 2))]

@@ -29,6 +29,7 @@ from stitch.conformity import compute_cell_volumes, pair_cell_faces, pair_edges
 from stitch.corners import Corner, place_corner
 from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile, tile_keys
 from stitch.layered_seams import fill_corner_layers, fill_seam_layers
+from stitch.patches import mesh_patch
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
 from stitch.seams import Seam, trace_seam
 from stitch.tiles import mesh_tile, tile_halo
@@ -197,7 +198,7 @@ def mesh_alone(
             grid, key, (start, end), model.polygons, walls, mesh_size=size, min_angle=MIN_ANGLE, passes=PASSES
         )
         if not seam.border:
-            columns[key] = _seam_levels(seam, (start, end), near, removed, grid, options)
+            columns[key] = _seam_levels(seam, (start, end), near, walls, removed, grid, options)
     south, east, north, west = (seams[key] for key in seams_of_tile(tile))
     plane, complete = mesh_tile(
         (south, east, north, west),
@@ -229,6 +230,7 @@ def _seam_levels(
     seam: Seam,
     ends: tuple[Corner, Corner],
     near: Scene,
+    walls: NDArray[np.float64],
     removed: NDArray[np.int32] | None,
     grid: TileGrid,
     options: Options,
@@ -239,7 +241,26 @@ def _seam_levels(
         start, end = (fill_corner(corner, dtm, roof, ids, options) for corner in ends)
         return fill_seam(seam, (start, end), dtm, roof, ids, options)
     assert removed is not None
-    start, end = (fill_corner_layers(corner, dtm, roof, ids, removed, grid.bounds, options) for corner in ends)
+    start, end = (
+        fill_corner_layers(
+            corner,
+            mesh_patch(
+                corner,
+                near.model.polygons,
+                walls,
+                grid.bounds,
+                mesh_size=options.mesh_size,
+                min_angle=MIN_ANGLE,
+            ),
+            dtm,
+            roof,
+            ids,
+            removed,
+            grid.bounds,
+            options,
+        )
+        for corner in ends
+    )
     return fill_seam_layers(seam, (start, end), dtm, roof, ids, removed, grid.bounds, options)
 
 

@@ -1,0 +1,89 @@
+"""The patch around a corner: the triangles that the layers of its column are found in (before step 3.5, ours)."""
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.mesh import PlaneMesh
+from pipeline.plane import collect_graph, order_plane, triangulate_plane
+from stitch.corners import Corner
+from stitch.grid import Bounds
+from stitch.strips import MARGIN, label_triangles
+from stitch.walls import LONGEST_PIECE, walls_within
+
+PATCH = 2.0  # mesh sizes; how far around a corner its column sees houses
+
+
+def mesh_patch(
+    corner: Corner,
+    polygons: NDArray[np.object_],
+    walls: NDArray[np.float64],
+    bounds: Bounds,
+    *,
+    mesh_size: float,
+    min_angle: float,
+) -> PlaneMesh:
+    """Triangulate the surroundings of a corner.
+
+    Parameters
+    ----------
+    corner : Corner
+        A corner of two tiles or more.
+    polygons : object, (b,)
+        Footprints, at least those closer than `PATCH` mesh sizes in x and in y.
+    walls : float64, (w, 2, 2)
+        Their walls in pieces (`cut_walls`).
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    mesh_size : float
+        Target edge length h (m).
+    min_angle : float
+        Bound on the angles (degrees).
+
+    Returns
+    -------
+    PlaneMesh
+        Triangles whose centres are in a square around the corner, with the corner as a vertex and the first edges
+        of its seams within the region as edges.
+
+    Raises
+    ------
+    GeometryError
+        As from `triangulate_plane`.
+
+    Notes
+    -----
+    As in a strip, pieces of wall that meet the square are taken whole, and what lies beyond makes no difference.
+    """
+    core = _square(corner.xy, PATCH * mesh_size, bounds)
+    outer = _square(corner.xy, (PATCH + LONGEST_PIECE + MARGIN) * mesh_size, bounds)
+    spokes = _first_edges(corner, bounds)
+    edges = np.concatenate((_outline(outer, corner.xy), walls_within(walls, shapely.box(*core)), spokes))
+    xy, triangles, _, _ = triangulate_plane(
+        collect_graph(edges, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle
+    )
+    centre = xy[triangles].mean(axis=1)
+    triangles = triangles[((centre >= core[:2]) & (centre <= core[2:])).all(axis=1)]
+    return order_plane(xy, triangles, label_triangles(xy, triangles, polygons))
+
+
+def _square(xy: NDArray[np.float64], half: float, bounds: Bounds) -> Bounds:
+    low, high = np.maximum(xy - half, bounds[:2]), np.minimum(xy + half, bounds[2:])
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _outline(box: Bounds, node: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sides of a box, one of them noded where the corner is on it."""
+    ring = shapely.get_coordinates(shapely.box(*box))[:-1]
+    after = np.roll(ring, -1, axis=0)
+    side = np.flatnonzero(((ring == node) & (after == node)).any(axis=1))
+    ring = np.insert(ring, side + 1, node, axis=0)
+    return np.stack((ring, np.roll(ring, -1, axis=0)), axis=1)
+
+
+def _first_edges(corner: Corner, bounds: Bounds) -> NDArray[np.float64]:
+    """First edges of the corner's seams, without those on the region's border."""
+    tips = corner.tips[~np.isnan(corner.tips[:, 0])]
+    on_side = (((tips == bounds[:2]) | (tips == bounds[2:])) & (tips == corner.xy)).any(axis=1)
+    tips = tips[~on_side]
+    return np.stack((np.broadcast_to(corner.xy, tips.shape), tips), axis=1)
