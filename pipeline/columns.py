@@ -40,6 +40,28 @@ def expand_cells(mesh: ColumnMesh) -> TetMesh:
     return TetMesh(points, cells)
 
 
+def find_used_points(mesh: ColumnMesh) -> NDArray[np.bool_]:
+    """Tell which points of `expand_cells` belong to a cell, bool (n_points,).
+
+    Notes
+    -----
+    A column of a seam has a level for the ground or roof of every tile, also where this tile begins higher.
+    """
+    n = len(mesh.plane.xy)
+    lowest = np.full(n, np.iinfo(np.int32).max)
+    np.minimum.at(lowest, mesh.plane.triangles, mesh.bottom)
+    column = np.repeat(np.arange(n), np.diff(mesh.z_start))
+    used: NDArray[np.bool_] = np.arange(len(mesh.z)) - mesh.z_start[column] >= lowest[column]
+    return used
+
+
+def drop_points(mesh: TetMesh, boundary: Boundary, used: NDArray[np.bool_]) -> tuple[TetMesh, Boundary]:
+    """Take out the points that no cell uses; the others keep their order."""
+    index = (np.cumsum(used) - 1).astype(np.int32)
+    cells = TetMesh(mesh.points[used], index[mesh.cells])
+    return cells, Boundary(index[boundary.facets], boundary.marker, boundary.building)
+
+
 def lowest_gap(mesh: ColumnMesh) -> tuple[float, int]:
     """Smallest step between two levels of a column (m), and the number of steps that do not ascend.
 

@@ -1,7 +1,8 @@
 """Pieces of a tiled mesh: boundaries and numbers that fit together, and the files that are made of them."""
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,56 +10,33 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
+from pipeline.adaptive import mesh_adaptive
 from pipeline.columns import expand_cells, extract_boundary, split_boundary
-from pipeline.mesh import Boundary, ColumnMesh, Marker, SeamEdges
+from pipeline.mesh import Boundary, Marker, SeamEdges, TetMesh
 from pipeline.plane import mesh_plane
 from stitch.conformity import match_facets, pair_cell_faces, pair_edges, pair_faces
-from stitch.facets import Side, find_seam_edges, label_beyond
-from stitch.grid import Key, SeamKey, TileGrid, make_grid, seams_of_tile
-from stitch.seam_columns import tile_columns
-from tests.cities import Bounds, tilted_dtm
-from tests.stitching import OPTIONS, Scene, Tile, clip_scene, glue, mesh_all, random_scene, scene_of
+from stitch.facets import label_beyond
+from stitch.frontier import find_edges_below
+from stitch.grid import Key, SeamKey, make_grid
+from tests.cities import Bounds, hilly_dtm, tilted_dtm
+from tests.stitching import OPTIONS, Scene, glue, random_scene, scene_of
 from tests.terraces import terrace_town
+from tests.tiled_runs import (
+    City,
+    Pieces,
+    SampledDtm,
+    Split,
+    cut_city,
+    mesh_city,
+    seam_edges,
+    split_all,
+    write_tiled_run,
+)
+from tiler.check import CheckReport, check_run
 
 SQUARE: Bounds = (0.0, 0.0, 420.0, 420.0)
 FOUR = make_grid(SQUARE, tile_size=210.0, mesh_size=10.0)
 SIDES = (Marker.WEST, Marker.EAST, Marker.SOUTH, Marker.NORTH)
-
-
-Split = tuple[ColumnMesh, Boundary, NDArray[np.int32]]
-
-
-@dataclass(frozen=True, eq=False)
-class City:
-    """A scene meshed in tiles, with all that these were made from."""
-
-    scene: Scene
-    grid: TileGrid
-    options: AdaptiveOptions
-    tiles: dict[Key, Tile]
-
-
-def mesh_city(scene: Scene, grid: TileGrid, options: AdaptiveOptions = OPTIONS) -> City:
-    return City(scene, grid, options, mesh_all(scene, grid, options))
-
-
-def seam_edges(city: City, key: Key, missing: Collection[SeamKey] = ()) -> SeamEdges:
-    """What a tile knows of its neighbours: its own seams, labelled with the houses of its halo."""
-    tile, near = city.tiles[key], clip_scene(city.scene, city.grid, key, city.options).model
-    south, east, _, _ = seams_of_tile(key)
-    inner = [seam for seam in seams_of_tile(key) if seam in tile.columns]
-    sides = [Side(tile.seams[seam], seam in (south, east), seam in missing) for seam in inner]
-    columns = tile_columns(tile.mesh.plane, [(tile.seams[seam], tile.columns[seam]) for seam in inner])
-    return find_seam_edges(tile.mesh.plane, sides, columns, near.roof, near.numbers)
-
-
-def split_all(city: City) -> dict[Key, Split]:
-    numbers, bounds = city.scene.model.numbers, city.grid.bounds
-    return {
-        key: (tile.mesh, *split_boundary(tile.mesh, numbers, bounds, seam_edges(city, key)))
-        for key, tile in city.tiles.items()
-    }
 
 
 def prove_split(pieces: dict[Key, Split]) -> Boundary:
@@ -111,10 +89,8 @@ def count_seam_walls(pieces: dict[Key, Split], city: City) -> int:
     """Count the walls over seams."""
     count = 0
     for key, (mesh, boundary, _) in pieces.items():
-        ends = {tuple(pair) for pair in seam_edges(city, key).vertices.tolist()}
-        column = np.repeat(np.arange(len(mesh.plane.xy)), np.diff(mesh.z_start))
-        walls = column[boundary.facets[boundary.marker == Marker.WALL]]
-        count += sum((low, high) in ends for low, high in zip(walls.min(axis=1), walls.max(axis=1), strict=True))
+        corners = expand_cells(mesh).points[boundary.facets[boundary.marker == Marker.WALL]]
+        count += int((find_edges_below(corners, mesh.plane.xy[seam_edges(city, key).vertices]) >= 0).sum())
     return count
 
 
@@ -214,3 +190,162 @@ def test_seams_that_do_not_fit_the_mesh_are_refused(crowded: City) -> None:
     )
     with pytest.raises(ValueError, match="lack one beside an edge"):
         label_beyond(cut, left=True)
+
+
+# --- many pieces, checked --------------------------------------------------------------------------
+
+WIDE: Bounds = (0.0, 0.0, 840.0, 840.0)
+COARSE = replace(OPTIONS, mesh_size=20.0)
+CENTRE = Key(1, 1)
+
+
+@pytest.fixture(scope="module")
+def nine() -> City:
+    houses = [shapely.box(x, y, x + 25, y + 25) for x in range(210, 410, 25) for y in range(210, 410, 25)]
+    houses += [affinity.rotate(shapely.box(520, 500, 600, 620), 20.0), shapely.Point(280, 560).buffer(30)]
+    scene = scene_of(houses, [12.0 + 4 * (k % 5) for k in range(len(houses))], hilly_dtm(WIDE, relief=15.0))
+    return mesh_city(scene, make_grid(WIDE, tile_size=280.0, mesh_size=20.0), COARSE)
+
+
+@pytest.fixture(scope="module")
+def pieces(nine: City) -> Pieces:
+    return cut_city(nine)
+
+
+def check(folder: Path, city: City) -> CheckReport:
+    return check_run(folder, lambda path: SampledDtm(city.scene.dtm))
+
+
+def kinds(report: CheckReport) -> set[str]:
+    return {fault.kind for fault in report.faults}
+
+
+def test_many_pieces_are_proved_in_any_order(tmp_path: Path, nine: City, pieces: Pieces) -> None:
+    write_tiled_run(tmp_path / "a", nine, pieces)
+    report = check(tmp_path / "a", nine)
+    assert report.ok, report.lines()
+    n_shared = sum(len(shared) for _, _, shared in split_all(nine).values())
+    assert (
+        report.lines()[1]
+        == f"ok    {n_shared // 2} faces on 12 seams of 9 pieces are bitwise equal from both sides"
+    )
+    keys = np.random.default_rng(1).permutation(list(pieces))
+    write_tiled_run(tmp_path / "b", nine, {Key(i, j): pieces[Key(i, j)] for i, j in keys.tolist()})
+    again = check(tmp_path / "b", nine)
+    assert again.ok, again.lines()
+    assert {name: round(value, 3) for name, value in again.facts.items()} == {
+        name: round(value, 3) for name, value in report.facts.items()
+    }
+
+
+def seam_face(pieces: Pieces, key: Key) -> NDArray[np.int32]:
+    """An exterior face of a piece that is not in its boundary."""
+    mesh, boundary = pieces[key]
+    exterior = pair_cell_faces(mesh.cells, len(mesh.points)).exterior
+    face: NDArray[np.int32] = exterior[match_facets(exterior, boundary.facets).missing[0]]
+    return face
+
+
+def with_facet(pieces: Pieces, key: Key, face: NDArray[np.int32], marker: Marker, building: int) -> Pieces:
+    mesh, old = pieces[key]
+    boundary = Boundary(
+        np.concatenate((old.facets, face[None])),
+        np.append(old.marker, np.int32(marker)),
+        np.append(old.building, np.int64(building)),
+    )
+    return {**pieces, key: (mesh, boundary)}
+
+
+def twin_of(pieces: Pieces, key: Key, face: NDArray[np.int32], other: Key) -> NDArray[np.int32]:
+    """The same face in another piece, turned over."""
+    corners, points = pieces[key][0].points[face], pieces[other][0].points
+    found = [np.flatnonzero((points == corner).all(axis=1)) for corner in corners]
+    return np.array([int(row[0]) for row in found[::-1]], np.int32)
+
+
+def shift_vertex(pieces: Pieces, nine: City) -> Pieces:
+    mesh, boundary = pieces[CENTRE]
+    points = mesh.points.copy()
+    points[seam_face(pieces, CENTRE)[0], 0] += 1e-9
+    return {**pieces, CENTRE: (TetMesh(points, mesh.cells), boundary)}
+
+
+def lift_vertex(pieces: Pieces, nine: City) -> Pieces:
+    mesh, boundary = pieces[CENTRE]
+    free = np.setdiff1d(seam_face(pieces, CENTRE), boundary.facets)
+    points = mesh.points.copy()
+    points[free[0], 2] = np.nextafter(points[free[0], 2], np.inf)
+    return {**pieces, CENTRE: (TetMesh(points, mesh.cells), boundary)}
+
+
+def drop_piece(pieces: Pieces, nine: City) -> Pieces:
+    return {key: piece for key, piece in pieces.items() if key != CENTRE}
+
+
+def stray_facet(pieces: Pieces, nine: City) -> Pieces:
+    mesh, _ = pieces[CENTRE]
+    faces = mesh.cells[:, [0, 2, 1]]
+    exterior = np.unique(pair_cell_faces(mesh.cells, len(mesh.points)).exterior)
+    inner = faces[~np.isin(faces, exterior).any(axis=1)][0]
+    return with_facet(pieces, CENTRE, inner, Marker.WALL, int(nine.scene.model.numbers[0]))
+
+
+def seam_as_wall(pieces: Pieces, nine: City) -> Pieces:
+    """A face of a seam, written as a wall by both of its pieces: each boundary alone is as good as before."""
+    number = int(nine.scene.model.numbers[0])
+    face = seam_face(pieces, Key(0, 0))
+    corners = pieces[Key(0, 0)][0].points[face]
+    others = [
+        key
+        for key in (Key(0, 1), Key(1, 0))
+        if all((pieces[key][0].points == corner).all(axis=1).any() for corner in corners)
+    ]
+    twin = twin_of(pieces, Key(0, 0), face, others[0])
+    once = with_facet(pieces, Key(0, 0), face, Marker.WALL, number)
+    return with_facet(once, others[0], twin, Marker.WALL, number)
+
+
+def seam_wall_left_out(pieces: Pieces, nine: City) -> Pieces:
+    """A wall over a seam that its piece leaves to the neighbour, who has no such face."""
+    mesh, old = pieces[CENTRE]
+    edges = nine.tiles[CENTRE].mesh.plane.xy[seam_edges(nine, CENTRE).vertices]
+    over = find_edges_below(mesh.points[old.facets], edges) >= 0
+    row = int(np.flatnonzero(over & (old.marker == Marker.WALL))[0])
+    kept = np.arange(len(old.facets)) != row
+    return {**pieces, CENTRE: (mesh, Boundary(old.facets[kept], old.marker[kept], old.building[kept]))}
+
+
+def seam_as_missing(pieces: Pieces, nine: City) -> Pieces:
+    return with_facet(pieces, CENTRE, seam_face(pieces, CENTRE), Marker.MISSING, -1)
+
+
+FAULTS: dict[str, tuple[Callable[[Pieces, City], Pieces], set[str]]] = {
+    "seam vertex shifted": (shift_vertex, {"seam-open"}),
+    "seam vertex lifted by a bit": (lift_vertex, {"seam-open"}),
+    "piece dropped": (drop_piece, {"seam-open", "plan-area", "boundary-open", "roof-area"}),
+    "stray facet": (stray_facet, {"facet-extra", "boundary-open", "wall-off-outline"}),
+    "seam as wall on both sides": (seam_as_wall, {"facet-extra", "wall-off-outline"}),
+    "wall over a seam left out": (seam_wall_left_out, {"seam-open", "boundary-open"}),
+    "seam as missing on one side": (seam_as_missing, {"facet-extra", "boundary-open"}),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_of_many_pieces_are_found(tmp_path: Path, nine: City, pieces: Pieces, name: str) -> None:
+    tamper, expected = FAULTS[name]
+    write_tiled_run(tmp_path, nine, tamper(pieces, nine))
+    found = check(tmp_path, nine)
+    assert kinds(found) >= expected, found.lines()
+    for fault in found.faults:
+        assert fault.places or fault.kind in ("plan-area", "volume", "counts")
+
+
+def test_missing_pieces_are_told_and_the_rest_is_proved(tmp_path: Path, nine: City) -> None:
+    gone = (Key(1, 1), Key(0, 2), Key(1, 0))
+    write_tiled_run(tmp_path, nine, cut_city(nine, gone))
+    report = check(tmp_path, nine)
+    assert report.ok, report.lines()
+    assert report.facts["missing_facets"] > 0
+    assert any(
+        f"{report.facts['missing_facets']} facets bound pieces that are missing" in line for line in report.lines()
+    )

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.mesh import Boundary, TetMesh
-from stitch import conformity
+from pipeline.mesh import Marker
+from stitch.frontier import Settled, add_rim, close_frontier, start_frontier
 from tiler import city_proofs, proofs
-from tiler.proofs import Dtm, Fault, Proof, Surface
-from tiler.run_folder import read_buildings, read_run_record, read_volume
-from tiler.vtk_files import BoundaryPiece, read_piece_paths, read_vtp
+from tiler.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
+from tiler.proofs import Dtm, Fault, Finding, Proof, Vertices
+from tiler.run_folder import Buildings, RunRecord, read_buildings, read_run_record
+from tiler.vtk_files import read_piece_paths
 
 RUN_RECORD = "run.json"
 STORE = "store.zarr"
@@ -34,7 +35,7 @@ class CheckReport:
         All claims, in a fixed order, with the faults of each.
     facts : mapping of str to float
         Numbers read on the way: ``cells``, ``points``, ``facets``, ``buildings``, ``non_manifold_edges``,
-        ``volume`` and ``smallest_cell`` (m³).
+        ``volume`` and ``smallest_cell`` (m³), ``seam_faces``, ``missing_facets``.
     """
 
     directory: Path
@@ -62,19 +63,6 @@ class CheckReport:
         return [*lines, f"{self.directory}: {verdict}"]
 
 
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """What the proofs need of one tile once its cells are let go."""
-
-    n_cells: int
-    n_hidden: int  # points inside the piece
-    volume: float
-    smallest: float
-    exterior: NDArray[np.float64]  # (k, 3, 3): the vertices of the exterior faces
-    boundary: BoundaryPiece
-    faults: list[Fault]
-
-
 def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
     """Prove that the mesh in a run folder is conforming, watertight, and that of its city model and DTM.
 
@@ -97,43 +85,113 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
 
     Notes
     -----
-    Pieces are read one after the other: memory holds the cells of one piece, and the boundaries of all.
+    Pieces are read one after the other: memory holds one piece, what waits for a neighbour on the frontier
+    (`stitch.frontier`), and the city model.
     """
     record = read_run_record(directory / RUN_RECORD)
     buildings = read_buildings(directory / CITY_MODEL)
-    pieces = [_read_piece(volume, boundary) for volume, boundary in _pair_pieces(directory)]
-    surface, exterior = _merge(pieces)
-    pairs = conformity.pair_faces(exterior)
+    files = _pair_pieces(directory)
     dtm = load_dtm(directory / STORE)
-    closed, n_non_manifold = proofs.prove_closed(surface)
-    volume = sum(piece.volume for piece in pieces)
-    counts = {
-        "cells": sum(piece.n_cells for piece in pieces),
-        "points": sum(piece.n_hidden for piece in pieces) + len(np.unique(exterior)),
-        "facets": len(surface.boundary.facets),
-        "buildings": len(buildings),
+    sums = _Sums.start(len(buildings))
+    frontier = start_frontier()
+    for number, (volume, boundary) in enumerate(files):
+        piece = read_piece(volume, boundary, record.bounds)
+        frontier, settled, fresh = add_rim(frontier, piece.rim, number)
+        sums.add_piece(piece, fresh, record, buildings, dtm)
+        sums.add_settled(settled)
+    sums.add_settled(close_frontier(frontier))
+    return CheckReport(directory, *_conclude(sums, len(files), record, buildings))
+
+
+@dataclass(eq=False)
+class _Sums:
+    """What has been found so far: by claim, by building, and in numbers."""
+
+    found: dict[str, Finding]
+    built: city_proofs.Built
+    counts: dict[str, int]
+    smallest: float
+    faults: tuple[Fault, ...]
+    crowded: Vertices  # (c, 2): where edges have more than two facets
+    seams: set[tuple[int, int]]
+
+    @classmethod
+    def start(cls, n_buildings: int) -> "_Sums":
+        none = np.zeros(n_buildings)
+        built = city_proofs.Built(none, none.astype(np.int64), none.astype(np.int64), none)
+        counts = {"cells": 0, "points": 0, "facets": 0, "buildings": n_buildings}
+        return cls({}, built, counts, np.inf, (), np.empty((0, 2)), set())
+
+    def add_piece(
+        self, piece: Piece, fresh: NDArray[np.bool_], record: RunRecord, buildings: Buildings, dtm: Dtm
+    ) -> None:
+        """Add what a piece says; `fresh` are the points of its rim that no earlier piece had."""
+        surface = piece.surface
+        found = {
+            "same": piece.same_boundary,
+            "closed": piece.closed,
+            "marks": city_proofs.check_marks(surface, buildings),
+            "box": proofs.check_box(surface, record.bounds, piece.rim.edges),
+            "top": proofs.check_top(take_vertices(piece, Marker.TOP, TOP, fresh), record.top),
+            "ground": proofs.check_ground(take_vertices(piece, Marker.GROUND, GROUND, fresh), dtm),
+            "roofs": city_proofs.check_roofs(surface, buildings),
+            "walls": city_proofs.check_walls(surface, buildings),
+            "sizes": proofs.check_sizes(surface, piece.outline, piece.volume),
+        }
+        for name, finding in found.items():
+            self._join(name, finding)
+        self.built = city_proofs.add_built(self.built, city_proofs.find_built(surface, buildings, piece.outline))
+        self.counts["cells"] += piece.n_cells
+        self.counts["points"] += piece.n_points + int((piece.rim.points[fresh, 3] == ANY).sum())
+        self.counts["facets"] += len(surface.boundary.facets)
+        self.smallest = min(self.smallest, piece.smallest)
+        self.faults = proofs.merge_faults((*self.faults, *piece.faults))
+        self._add_crowded(piece.crowded)
+
+    def add_settled(self, settled: Settled) -> None:
+        """Add what is settled between pieces."""
+        self._join("seams", proofs.check_seams(settled))
+        self._join("closed", proofs.check_closed(settled.open_lines, settled.crowded_lines))
+        self._add_crowded(settled.crowded_lines)
+        self.seams.update((int(one), int(two)) for one, two in settled.seams)
+
+    def _join(self, name: str, finding: Finding) -> None:
+        self.found[name] = proofs.join_findings(self.found.get(name, Finding()), finding)
+
+    def _add_crowded(self, edges: Vertices) -> None:
+        self.crowded = np.unique(np.concatenate((self.crowded, edges.mean(axis=1)[:, :2])), axis=0)
+
+
+def _conclude(
+    sums: _Sums, n_pieces: int, record: RunRecord, buildings: Buildings
+) -> tuple[tuple[Proof, ...], Mapping[str, float]]:
+    """Make the claims and the facts of what was found."""
+    found, bounds = sums.found, record.bounds
+    partial = found["box"].sums["missing"] > 0
+    facts = sums.counts | {
+        "non_manifold_edges": int(found["closed"].sums["crowded"]),
+        "volume": found["sizes"].sums["cells"],
+        "smallest_cell": sums.smallest,
+        "seam_faces": int(found["seams"].sums["faces"]),
+        "missing_facets": int(found["box"].sums["missing"]),
     }
-    facts = counts | {
-        "non_manifold_edges": n_non_manifold,
-        "volume": volume,
-        "smallest_cell": min(piece.smallest for piece in pieces),
-    }
-    found = [
-        _prove_cells(pieces, proofs.find_face_faults(surface.points, pairs), facts),
-        proofs.prove_same_boundary(surface, pairs.exterior),
-        closed,
-        city_proofs.prove_marks(surface, buildings),
-        proofs.prove_box(surface, record.bounds),
-        proofs.prove_top(surface, record.top),
-        proofs.prove_ground(surface, dtm),
-        city_proofs.prove_roofs(surface, buildings),
-        city_proofs.prove_walls(surface, buildings),
-        city_proofs.prove_buildings(surface, buildings, record.bounds),
-        proofs.prove_plan(surface, record.bounds),
-        proofs.prove_volume(surface, volume),
-        proofs.prove_record(record, counts),
-    ]
-    return CheckReport(directory, tuple(found), facts)
+    claims = (
+        _prove_cells(sums, n_pieces),
+        proofs.prove_seams(found["seams"], len(sums.seams), n_pieces),
+        proofs.prove_same_boundary(found["same"]),
+        proofs.prove_closed(found["closed"], sums.crowded),
+        city_proofs.prove_marks(found["marks"]),
+        proofs.prove_box(found["box"], bounds),
+        proofs.prove_top(found["top"], record.top),
+        proofs.prove_ground(found["ground"]),
+        city_proofs.prove_roofs(found["roofs"]),
+        city_proofs.prove_walls(found["walls"]),
+        city_proofs.prove_buildings(sums.built, buildings, bounds, partial=partial),
+        proofs.prove_plan(found["sizes"], bounds, partial=partial),
+        proofs.prove_volume(found["sizes"]),
+        proofs.prove_record(record, sums.counts, partial=partial),
+    )
+    return claims, facts
 
 
 def _tell(fault: Fault) -> str:
@@ -152,60 +210,9 @@ def _pair_pieces(directory: Path) -> list[tuple[Path, Path]]:
     return [(path, boundaries[name]) for name, path in volumes.items()]
 
 
-def _read_piece(volume_path: Path, boundary_path: Path) -> _Piece:
-    mesh, boundary = read_volume(volume_path), read_vtp(boundary_path)
-    pairs = conformity.pair_cell_faces(mesh.cells, len(mesh.points))
-    volumes, flat = conformity.compute_cell_volumes(mesh.points, mesh.cells)
-    faults = [
-        *proofs.find_face_faults(mesh.points, pairs),
-        *proofs.find_cell_faults(mesh, volumes, flat),
-        *_find_link_faults(mesh, boundary),
-    ]
-    return _Piece(
-        n_cells=len(mesh.cells),
-        n_hidden=len(mesh.points) - len(np.unique(pairs.exterior)),
-        volume=float(volumes.sum()),
-        smallest=float(volumes.min(initial=np.inf)),
-        exterior=mesh.points[pairs.exterior],
-        boundary=boundary,
-        faults=faults,
-    )
-
-
-def _find_link_faults(mesh: TetMesh, piece: BoundaryPiece) -> list[Fault]:
-    """Find boundary points whose `vertex` is not the volume's point in the same place, or that repeat."""
-    known = (piece.vertex >= 0) & (piece.vertex < len(mesh.points))
-    linked = known.copy()
-    linked[known] = np.all(mesh.points[piece.vertex[known]] == piece.points[known], axis=1)
-    unused = conformity.find_unused_points(piece.boundary.facets, len(piece.points))
-    duplicate = conformity.find_duplicate_points(piece.points)
-    return [
-        *proofs.find_faults("vertex-link", piece.points[~linked], "`vertex` is another point of the volume"),
-        *proofs.find_faults("vertex-unused", piece.points[unused], "no facet uses it"),
-        *proofs.find_faults("vertex-duplicate", piece.points[duplicate], "a boundary vertex is there twice"),
-    ]
-
-
-def _merge(pieces: list[_Piece]) -> tuple[Surface, NDArray[np.int32]]:
-    """Join the pieces where coordinates are equal: the surface, and all exterior faces on its points."""
-    files = [piece.boundary for piece in pieces]
-    faces = np.concatenate([piece.exterior for piece in pieces])
-    corners = np.concatenate([file.points[file.boundary.facets] for file in files])
-    rows = np.concatenate([faces, corners]).reshape(-1, 3)
-    group, n_groups = conformity.group_rows(rows)
-    points = np.empty((n_groups, 3))
-    points[group] = rows
-    index = group.astype(np.int32).reshape(-1, 3)
-    marker = np.concatenate([file.boundary.marker for file in files])
-    building = np.concatenate([file.boundary.building for file in files])
-    boundary = Boundary(index[len(faces) :], marker, building)
-    return proofs.make_surface(points, boundary), index[: len(faces)]
-
-
-def _prove_cells(pieces: list[_Piece], seams: list[Fault], facts: Mapping[str, float]) -> Proof:
-    faults = [fault for piece in pieces for fault in piece.faults]
+def _prove_cells(sums: _Sums, n_pieces: int) -> Proof:
     claim = (
-        f"{facts['cells']} cells in {len(pieces)} pieces: every face in one or two of them,"
-        f" none inverted or flat (smallest {facts['smallest_cell']:.3g} m³), no vertex unused or duplicate"
+        f"{sums.counts['cells']} cells in {n_pieces} pieces: every face in one or two of them,"
+        f" none inverted or flat (smallest {sums.smallest:.3g} m³), no vertex unused or duplicate"
     )
-    return Proof(claim, proofs.merge_faults([*faults, *seams]))
+    return Proof(claim, sums.faults)

@@ -1,5 +1,6 @@
 """The proofs of `citystitch check` that hold the mesh against its city model: marks, walls, roofs."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,19 +11,22 @@ from pipeline.mesh import Marker
 from tiler.proofs import (
     HEIGHT_TOLERANCE,
     SIDE_TOLERANCE,
+    Bounds,
+    Finding,
     Mask,
     Proof,
     Surface,
     Vertices,
     at_most,
     find_faults,
+    measure_plan_widths,
 )
 from tiler.run_folder import Buildings
 
 OUTLINE_TOLERANCE = 2e-3  # m, in the plane: CityJSON rounds coordinates to 1 mm
 
 
-def prove_marks(surface: Surface, buildings: Buildings) -> Proof:
+def check_marks(surface: Surface, buildings: Buildings) -> Finding:
     """Every facet has one marker, and walls and roofs alone have a building, a known one."""
     marker, owner = surface.boundary.marker, surface.boundary.building
     unmarked = ~surface.marked(*Marker)
@@ -30,7 +34,6 @@ def prove_marks(surface: Surface, buildings: Buildings) -> Proof:
     unknown = built & (_rows_of(owner, buildings) < 0)
     astray = ~built & (owner != -1)
     centres = surface.corners.mean(axis=1)
-    counts = ", ".join(f"{np.count_nonzero(marker == mark)} {mark.name.lower()}" for mark in Marker)
     faults = [
         *find_faults("marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: 1 to 9"),
         *find_faults(
@@ -44,10 +47,18 @@ def prove_marks(surface: Surface, buildings: Buildings) -> Proof:
             f"building {_first(owner[astray])} on a facet that is no wall or roof; expected -1",
         ),
     ]
-    return Proof(f"every facet has one marker: {counts}", tuple(faults))
+    counts = {mark.name.lower(): int(np.count_nonzero(marker == mark)) for mark in Marker}
+    return Finding(tuple(faults), counts)
 
 
-def prove_roofs(surface: Surface, buildings: Buildings) -> Proof:
+def prove_marks(found: Finding) -> Proof:
+    """Tell how many facets have which marker."""
+    names = [mark.name.lower() for mark in Marker]
+    counts = ", ".join(f"{found.sums[name]} {name}" for name in names if name != "missing" or found.sums[name])
+    return Proof(f"every facet has one marker: {counts}", found.faults)
+
+
+def check_roofs(surface: Surface, buildings: Buildings) -> Finding:
     """Roofs lie at the height of their building and inside its footprint."""
     chosen, row, corners = _facets_of(surface, buildings, Marker.ROOF)
     error = np.abs(corners[:, :, 2] - buildings.roof[row][:, None]).max(axis=1)
@@ -58,16 +69,23 @@ def prove_roofs(surface: Surface, buildings: Buildings) -> Proof:
         *find_faults("roof-height", centres[off], f"{worst:.3g} m off; {at_most(HEIGHT_TOLERANCE)}"),
         *find_faults("roof-off-footprint", centres[outside], f"not inside; {at_most(OUTLINE_TOLERANCE)}"),
     ]
-    claim = f"{len(chosen)} roof facets lie at their building's height and in its footprint, worst {worst:.2g} m"
-    return Proof(f"{claim}; {at_most(HEIGHT_TOLERANCE)} up, {OUTLINE_TOLERANCE:g} m across", tuple(faults))
+    return Finding(tuple(faults), {"facets": len(chosen)}, {"worst": float(worst)})
 
 
-def prove_walls(surface: Surface, buildings: Buildings) -> Proof:
+def prove_roofs(found: Finding) -> Proof:
+    """Tell how far roofs are off at most."""
+    count, worst = found.sums["facets"], found.largest["worst"]
+    claim = f"{count} roof facets lie at their building's height and in its footprint, worst {worst:.2g} m"
+    return Proof(f"{claim}; {at_most(HEIGHT_TOLERANCE)} up, {OUTLINE_TOLERANCE:g} m across", found.faults)
+
+
+def check_walls(surface: Surface, buildings: Buildings) -> Finding:
     """Walls are vertical, on the outline of their building and not above its roof."""
     chosen, row, corners = _facets_of(surface, buildings, Marker.WALL)
-    width = _plan_widths(corners, surface.area[chosen])
+    width = measure_plan_widths(corners, surface.area[chosen])
     leaning = ~(width <= SIDE_TOLERANCE)
-    astray = ~_all_near(shapely.boundary(buildings.footprints), row, corners)
+    used, index = np.unique(row, return_inverse=True)
+    astray = ~_all_near(shapely.boundary(buildings.footprints[used]), index, corners)
     above = ~(corners[:, :, 2].max(axis=1) <= buildings.roof[row] + HEIGHT_TOLERANCE)
     centres = corners.mean(axis=1)
     lean = f"{width.max(initial=0):.3g} m wide in plan; {at_most(SIDE_TOLERANCE)}"
@@ -80,47 +98,100 @@ def prove_walls(surface: Surface, buildings: Buildings) -> Proof:
         ),
         *find_faults("wall-above-roof", centres[above], f"above its building's roof; {at_most(HEIGHT_TOLERANCE)}"),
     ]
-    claim = f"{len(chosen)} wall facets are vertical, on their building's outline, below its roof"
-    return Proof(f"{claim}; {at_most(OUTLINE_TOLERANCE)}", tuple(faults))
+    return Finding(tuple(faults), {"facets": len(chosen)})
 
 
-def prove_buildings(surface: Surface, buildings: Buildings, bounds: tuple[float, float, float, float]) -> Proof:
+def prove_walls(found: Finding) -> Proof:
+    """Tell how many wall facets are right."""
+    claim = f"{found.sums['facets']} wall facets are vertical, on their building's outline, below its roof"
+    return Proof(f"{claim}; {at_most(OUTLINE_TOLERANCE)}", found.faults)
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """What pieces have of each building of the city model.
+
+    Attributes
+    ----------
+    roof_area : float64, (n,)
+        Plan area of its roof facets (m²).
+    n_roofs, n_walls : int64, (n,)
+        Roof and wall facets.
+    plan_area : float64, (n,)
+        How much of its footprint lies in the plan of the pieces (m²).
+    """
+
+    roof_area: NDArray[np.float64]
+    n_roofs: NDArray[np.int64]
+    n_walls: NDArray[np.int64]
+    plan_area: NDArray[np.float64]
+
+
+def find_built(surface: Surface, buildings: Buildings, outline: Vertices) -> Built:
+    """Measure what a piece has of each building; `outline` (k, 2, 2) is the edges of its plan."""
+    n = len(buildings)
+    roofs, roof_row, _ = _facets_of(surface, buildings, Marker.ROOF)
+    _, wall_row, _ = _facets_of(surface, buildings, Marker.WALL)
+    plan_area = np.zeros(n)
+    for face in shapely.polygonize(shapely.linestrings(outline)).geoms:
+        near = buildings.tree.query(face, predicate="intersects")
+        plan_area[near] += shapely.area(shapely.intersection(buildings.footprints[near], face))
+    return Built(
+        np.bincount(roof_row, -surface.area[roofs], n).astype(np.float64),
+        np.bincount(roof_row, minlength=n),
+        np.bincount(wall_row, minlength=n),
+        plan_area,
+    )
+
+
+def add_built(one: Built, two: Built) -> Built:
+    """Add what two pieces have."""
+    return Built(
+        one.roof_area + two.roof_area,
+        one.n_roofs + two.n_roofs,
+        one.n_walls + two.n_walls,
+        one.plan_area + two.plan_area,
+    )
+
+
+def prove_buildings(built: Built, buildings: Buildings, bounds: Bounds, *, partial: bool) -> Proof:
     """Every building of the city model has its walls, and a roof as large as its footprint.
 
     Notes
     -----
     A roof may differ from the footprint by `OUTLINE_TOLERANCE` along its whole outline. A building
     needs no wall of its own where its outline runs along the region's border or a house that is as high.
+    If pieces are missing (`partial`), what counts of a footprint is what lies in the others' plan.
     """
-    n = len(buildings)
-    roofs, roof_row, _ = _facets_of(surface, buildings, Marker.ROOF)
-    _, wall_row, _ = _facets_of(surface, buildings, Marker.WALL)
-    roof_area = np.bincount(roof_row, -surface.area[roofs], n)
-    has_roof, has_wall = np.bincount(roof_row, minlength=n) > 0, np.bincount(wall_row, minlength=n) > 0
-    footprint_area, perimeter = shapely.area(buildings.footprints), shapely.length(buildings.footprints)
-    error = np.abs(roof_area - footprint_area)
-    uneven = has_roof & ~(error <= OUTLINE_TOLERANCE * perimeter)
-    bare = ~has_wall & has_roof
+    n, footprints = len(buildings), buildings.footprints
+    full_area, slack = shapely.area(footprints), OUTLINE_TOLERANCE * shapely.length(footprints)
+    wanted = built.plan_area if partial else full_area
+    whole = wanted >= full_area - slack
+    has_roof, has_wall = built.n_roofs > 0, built.n_walls > 0
+    error = np.abs(built.roof_area - wanted)
+    uneven = has_roof & ~(error <= slack)
+    bare = ~has_wall & has_roof & whole
     bare[bare] = [_needs_wall(i, buildings, bounds) for i in np.flatnonzero(bare).tolist()]
+    expected = wanted > (slack if partial else -1)
     places = np.column_stack(
-        [
-            shapely.get_coordinates(shapely.point_on_surface(buildings.footprints)).reshape(n, 2),
-            buildings.roof,
-        ]
+        [shapely.get_coordinates(shapely.point_on_surface(footprints)).reshape(n, 2), buildings.roof]
     )
-    worst = error[uneven].max(initial=0)
     faults = [
-        *find_faults("building-missing", places[~has_roof & ~has_wall], "in the city model, not in the mesh"),
-        *find_faults("building-without-roof", places[~has_roof & has_wall], "it has walls but no roof"),
+        *find_faults(
+            "building-missing", places[expected & ~has_roof & ~has_wall], "in the city model, not in the mesh"
+        ),
+        *find_faults("building-without-roof", places[expected & ~has_roof & has_wall], "it has walls but no roof"),
         *find_faults("building-without-wall", places[bare], "it has a roof but no wall"),
         *find_faults(
             "roof-area",
             places[uneven],
-            f"{worst:.3g} m² off its footprint; bound: {OUTLINE_TOLERANCE:g} m along its outline",
+            f"{error[uneven].max(initial=0):.3g} m² off its footprint; bound: {OUTLINE_TOLERANCE:g} m along its"
+            " outline",
         ),
     ]
-    total = f"roofs {roof_area.sum():.2f} m², footprints {footprint_area.sum():.2f} m²"
-    return Proof(f"the {n} buildings of the city model have their walls and roofs; {total}", tuple(faults))
+    total = f"roofs {built.roof_area.sum():.2f} m², footprints {wanted.sum():.2f} m²"
+    n_whole = f"{n}" if not partial else f"{np.count_nonzero(whole)} whole and {np.count_nonzero(~whole)} other"
+    return Proof(f"the {n_whole} buildings of the city model have their walls and roofs; {total}", tuple(faults))
 
 
 def _first(values: NDArray[Any]) -> str:
@@ -146,27 +217,18 @@ def _facets_of(
 
 def _all_near(shapes: NDArray[np.object_], row: NDArray[np.int64], corners: Vertices) -> Mask:
     """Tell whether a facet's vertices and centre are within `OUTLINE_TOLERANCE` of its building's shape."""
-    shapely.prepare(shapes)
+    shapely.prepare(shapes[np.unique(row)])
     places = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)
     points = shapely.points(places[:, :, 0], places[:, :, 1])
     near: Mask = shapely.dwithin(shapes[row][:, None], points, OUTLINE_TOLERANCE).all(axis=1)
     return near
 
 
-def _plan_widths(corners: Vertices, area: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the height of each facet's plan over its longest edge: 0 when the facet is vertical."""
-    edges = np.roll(corners, -1, axis=1)[:, :, :2] - corners[:, :, :2]
-    longest = np.hypot(edges[:, :, 0], edges[:, :, 1]).max(axis=1, initial=0)
-    width: NDArray[np.float64] = np.divide(2 * np.abs(area), longest, out=np.zeros(len(area)), where=longest > 0)
-    return width
-
-
-def _needs_wall(i: int, buildings: Buildings, bounds: tuple[float, float, float, float]) -> bool:
+def _needs_wall(i: int, buildings: Buildings, bounds: Bounds) -> bool:
     """Tell whether air must touch the outline of building `i` below its roof."""
     outline = shapely.boundary(buildings.footprints[i])
-    near = shapely.dwithin(buildings.footprints, outline, OUTLINE_TOLERANCE)
-    near &= buildings.roof >= buildings.roof[i] - HEIGHT_TOLERANCE
-    near[i] = False
+    near = buildings.tree.query(outline, predicate="dwithin", distance=OUTLINE_TOLERANCE)
+    near = near[(buildings.roof[near] >= buildings.roof[i] - HEIGHT_TOLERANCE) & (near != i)]
     hidden = [*buildings.footprints[near], shapely.boundary(shapely.box(*bounds))]
     cover = shapely.union_all(shapely.buffer(hidden, OUTLINE_TOLERANCE))
     return bool(shapely.length(shapely.difference(outline, cover)) > OUTLINE_TOLERANCE)

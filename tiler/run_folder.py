@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,11 @@ class Buildings:
 
     def __len__(self) -> int:
         return len(self.numbers)
+
+    @cached_property
+    def tree(self) -> shapely.STRtree:
+        """Footprints by place."""
+        return shapely.STRtree(self.footprints)
 
 
 def read_run_record(path: Path) -> RunRecord:

@@ -1,0 +1,104 @@
+"""Run folders of tiled cities, written from tiles that were meshed alone."""
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.adaptive import AdaptiveOptions
+from pipeline.columns import drop_points, expand_cells, find_used_points, split_boundary
+from pipeline.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
+from pipeline.terrain import Dtm, sample_dtm
+from stitch.facets import Side, find_seam_edges
+from stitch.grid import Key, SeamKey, TileGrid, seams_of_tile
+from stitch.seam_columns import tile_columns
+from tests.stitching import OPTIONS, Scene, Tile, clip_scene, mesh_all
+from tiler.cityjson import write_city_model
+from tiler.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
+
+Split = tuple[ColumnMesh, Boundary, NDArray[np.int32]]
+Pieces = dict[Key, tuple[TetMesh, Boundary]]
+
+
+@dataclass(frozen=True, eq=False)
+class City:
+    """A scene meshed in tiles, with all that these were made from."""
+
+    scene: Scene
+    grid: TileGrid
+    options: AdaptiveOptions
+    tiles: dict[Key, Tile]
+
+
+@dataclass(frozen=True, eq=False)
+class SampledDtm:
+    """The terrain of a scene as the check wants it."""
+
+    dtm: Dtm
+
+    def sample(self, xy: NDArray[np.float64], /) -> NDArray[np.float64]:
+        """Return the height (m) at points (n, 2)."""
+        return sample_dtm(self.dtm, xy)
+
+
+def mesh_city(scene: Scene, grid: TileGrid, options: AdaptiveOptions = OPTIONS) -> City:
+    """Mesh all tiles."""
+    return City(scene, grid, options, mesh_all(scene, grid, options))
+
+
+def seam_edges(city: City, key: Key, missing: Collection[SeamKey] = ()) -> SeamEdges:
+    """What a tile knows of its neighbours: its own seams, labelled with the houses of its halo."""
+    tile, near = city.tiles[key], clip_scene(city.scene, city.grid, key, city.options).model
+    south, east, _, _ = seams_of_tile(key)
+    inner = [seam for seam in seams_of_tile(key) if seam in tile.columns]
+    sides = [Side(tile.seams[seam], seam in (south, east), seam in missing) for seam in inner]
+    columns = tile_columns(tile.mesh.plane, [(tile.seams[seam], tile.columns[seam]) for seam in inner])
+    return find_seam_edges(tile.mesh.plane, sides, columns, near.roof, near.numbers)
+
+
+def split_all(city: City, gone: Collection[Key] = ()) -> dict[Key, Split]:
+    """Split the boundaries of all tiles but those that are gone."""
+    numbers, bounds = city.scene.model.numbers, city.grid.bounds
+    lost = {seam for key in gone for seam in seams_of_tile(key)}
+    return {
+        key: (tile.mesh, *split_boundary(tile.mesh, numbers, bounds, seam_edges(city, key, lost)))
+        for key, tile in city.tiles.items()
+        if key not in gone
+    }
+
+
+def cut_city(city: City, gone: Collection[Key] = ()) -> Pieces:
+    """Make the pieces that are written: cells and boundary of each tile."""
+    return {
+        key: drop_points(expand_cells(mesh), boundary, find_used_points(mesh))
+        for key, (mesh, boundary, _) in split_all(city, gone).items()
+    }
+
+
+def write_tiled_run(folder: Path, city: City, pieces: Mapping[Key, tuple[TetMesh, Boundary]]) -> None:
+    """Write a run folder of some pieces, its record with what these have."""
+    volumes, boundaries = [], []
+    for name in ("mesh", "boundary"):
+        (folder / name).mkdir(parents=True)
+    for key, (mesh, boundary) in pieces.items():
+        name = f"{key.i}_{key.j}"
+        volumes.append(folder / "mesh" / f"{name}.vtu")
+        boundaries.append(folder / "boundary" / f"{name}.vtp")
+        write_vtu(volumes[-1], mesh)
+        write_vtp(boundaries[-1], mesh.points, boundary)
+    write_pvtu(folder / "mesh.pvtu", volumes)
+    write_pvtp(folder / "boundary.pvtp", boundaries)
+    model, (west, south, east, north) = city.scene.model, city.grid.bounds
+    box = (west, south, 0.0, east, north, 100.0)
+    write_city_model(folder / "citymodel.city.json", model, crs="EPSG:28992", bounds=box)
+    counts = {
+        "cells": sum(len(mesh.cells) for mesh, _ in pieces.values()),
+        "points": len(np.unique(np.concatenate([mesh.points for mesh, _ in pieces.values()]), axis=0)),
+        "facets": sum(len(boundary.facets) for _, boundary in pieces.values()),
+        "buildings": len(model),
+    }
+    record = {"schema": 1, "status": "done", "region": {"bounds": city.grid.bounds}, "counts": counts}
+    (folder / "run.json").write_text(json.dumps(record))

@@ -1,0 +1,175 @@
+"""One piece of a run folder, read for `citystitch check`: its boundary, its rim, and what its cells say."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.mesh import Boundary, Marker, TetMesh
+from stitch import conformity
+from stitch.frontier import Rim, as_places, find_border, find_edges_below, find_outline
+from tiler import proofs
+from tiler.proofs import Bounds, Fault, Finding, Mask, Surface, Vertices
+from tiler.run_folder import read_volume
+from tiler.vtk_files import BoundaryPiece, read_vtp
+
+# Kinds of points over the rim, each counted once: any, of the ground, of the top.
+ANY, GROUND, TOP = range(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """What the proofs need of one piece once its cells are let go.
+
+    Attributes
+    ----------
+    n_cells, n_points : int
+        Cells, and points that are not over the rim.
+    volume, smallest : float
+        Volume of all cells and of the smallest (m³).
+    surface : Surface
+        Its boundary file, on the distinct vertices of this and of the exterior faces.
+    outline : float64, (k, 2, 2)
+        Edges of its plan.
+    rim : Rim
+        What it has over those of them that are not on the region's border.
+    on_rim : bool, (n,)
+        Which of the surface's points are over the rim.
+    same_boundary, closed : Finding
+        What the piece alone says of these claims.
+    crowded : float64, (c, 2, 3)
+        Boundary edges of more than two facets, paired, not over the rim.
+    faults : tuple of Fault
+        Of its cells.
+    """
+
+    n_cells: int
+    n_points: int
+    volume: float
+    smallest: float
+    surface: Surface
+    outline: Vertices
+    rim: Rim
+    on_rim: Mask
+    same_boundary: Finding
+    closed: Finding
+    crowded: Vertices
+    faults: tuple[Fault, ...]
+
+
+def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds) -> Piece:
+    """Read the two files of a piece of the region with these bounds (m).
+
+    Raises
+    ------
+    InputError
+        If one is missing or damaged.
+    """
+    mesh, file = read_volume(volume_path), read_vtp(boundary_path)
+    pairs = conformity.pair_cell_faces(mesh.cells, len(mesh.points))
+    volumes, flat = conformity.compute_cell_volumes(mesh.points, mesh.cells)
+    surface, faces = _join(mesh.points[pairs.exterior], file)
+    # Faces of cells whose vertices are there twice meet where coordinates are equal.
+    joined = conformity.pair_faces(faces)
+    exterior = joined.exterior
+    match = conformity.match_facets(exterior, surface.boundary.facets)
+    known = np.ones(len(exterior), np.bool_)
+    known[match.missing] = False
+    outline = find_outline(surface.points, _facing_up(surface.points, exterior[known]))
+    edges = outline[~find_border(outline, bounds, tolerance=proofs.SIDE_TOLERANCE)]
+    over = find_edges_below(surface.points[exterior], edges) >= 0
+    rim, on_rim = _find_rim(surface, edges, exterior[over], known[over], faces)
+    open_edges, crowded = _pair_edges(surface, on_rim)
+    return Piece(
+        n_cells=len(mesh.cells),
+        n_points=len(mesh.points) - len(np.unique(pairs.exterior)) + int((~on_rim[np.unique(faces)]).sum()),
+        volume=float(volumes.sum()),
+        smallest=float(volumes.min(initial=np.inf)),
+        surface=surface,
+        outline=outline,
+        rim=rim,
+        on_rim=on_rim,
+        same_boundary=proofs.check_same_boundary(surface, exterior, match, over),
+        closed=proofs.check_closed(open_edges, crowded),
+        crowded=crowded,
+        faults=proofs.merge_faults(
+            [
+                *proofs.find_face_faults(mesh.points, pairs),
+                *proofs.find_cell_faults(mesh, volumes, flat),
+                *_find_link_faults(mesh, file),
+                *proofs.find_face_faults(surface.points, joined),
+            ]
+        ),
+    )
+
+
+def take_vertices(piece: Piece, marker: Marker, kind: int, fresh: Mask) -> Vertices:
+    """Return the vertices with a marker (n, 3), but for those over the rim that an earlier piece had."""
+    row = np.unique(piece.surface.boundary.facets[piece.surface.marked(marker)])
+    rest = piece.rim.points[fresh & (piece.rim.points[:, 3] == kind), :3]
+    return np.concatenate((piece.surface.points[row[~piece.on_rim[row]]], rest))
+
+
+def _join(exterior: Vertices, file: BoundaryPiece) -> tuple[Surface, NDArray[np.int32]]:
+    """Put the boundary and the exterior faces (k, 3, 3) on common points, equal where coordinates are."""
+    corners = file.points[file.boundary.facets]
+    rows = np.concatenate([exterior, corners]).reshape(-1, 3)
+    group, n_groups = conformity.group_rows(rows)
+    points = np.empty((n_groups, 3))
+    points[group] = rows
+    index = group.astype(np.int32).reshape(-1, 3)
+    boundary = Boundary(index[len(exterior) :], file.boundary.marker, file.boundary.building)
+    return proofs.make_surface(points, boundary), index[: len(exterior)]
+
+
+def _facing_up(points: Vertices, faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    area, _ = conformity.compute_facet_areas(points, faces)
+    return faces[(area > 0) & (proofs.measure_plan_widths(points[faces], area) > proofs.SIDE_TOLERANCE)]
+
+
+def _find_rim(
+    surface: Surface, edges: Vertices, over: NDArray[np.int32], known: Mask, faces: NDArray[np.int32]
+) -> tuple[Rim, Mask]:
+    """Gather what stands over the rim's edges: exterior faces `over` them, some `known` to the boundary file."""
+    boundary, points = surface.boundary, surface.points
+    on_rim = np.isin(as_places(points), as_places(edges))
+    below = find_edges_below(surface.corners[surface.marked(Marker.MISSING)], edges)
+    start, end = boundary.facets.ravel(), np.roll(boundary.facets, -1, axis=1).ravel()
+    both = on_rim[start] & on_rim[end]
+    kinds = [
+        np.unique(faces),
+        *(np.unique(boundary.facets[surface.marked(m)]) for m in (Marker.GROUND, Marker.TOP)),
+    ]
+    chosen = [row[on_rim[row]] for row in kinds]
+    rows = np.concatenate(chosen)
+    rim = Rim(
+        edges=edges,
+        held=np.isin(np.arange(len(edges)), below),
+        faces=points[over],
+        is_boundary=known,
+        lines=points[np.stack((start[both], end[both]), axis=1)],
+        points=np.column_stack((points[rows], np.repeat((ANY, GROUND, TOP), [len(row) for row in chosen]))),
+    )
+    return rim, on_rim
+
+
+def _pair_edges(surface: Surface, on_rim: Mask) -> tuple[Vertices, Vertices]:
+    """Pair the boundary's edges that are not over the rim: those left open, and those of many facets."""
+    edges = conformity.pair_edges(surface.boundary.facets)
+    kept = [rows[~on_rim[rows].all(axis=1)] for rows in (edges.open, edges.non_manifold)]
+    return surface.points[kept[0]], surface.points[kept[1]]
+
+
+def _find_link_faults(mesh: TetMesh, piece: BoundaryPiece) -> list[Fault]:
+    """Find boundary points whose `vertex` is not the volume's point in the same place, or that repeat."""
+    known = (piece.vertex >= 0) & (piece.vertex < len(mesh.points))
+    linked = known.copy()
+    linked[known] = np.all(mesh.points[piece.vertex[known]] == piece.points[known], axis=1)
+    unused = conformity.find_unused_points(piece.boundary.facets, len(piece.points))
+    duplicate = conformity.find_duplicate_points(piece.points)
+    return [
+        *proofs.find_faults("vertex-link", piece.points[~linked], "`vertex` is another point of the volume"),
+        *proofs.find_faults("vertex-unused", piece.points[unused], "no facet uses it"),
+        *proofs.find_faults("vertex-duplicate", piece.points[duplicate], "a boundary vertex is there twice"),
+    ]
