@@ -1,6 +1,7 @@
 """Inputs are read once: points dealt out to cells, footprints to a grid, both found again by box."""
 
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -291,6 +292,7 @@ def houses(n: int = 400) -> tuple[list[shapely.Polygon], dict[str, np.ndarray]]:
     size[3], place[5] = 1500.0, (9000, 9000)
     shapes = [square(x, y, side) for (x, y), side in zip(place, size, strict=True)]
     heights = np.where(rng.random(n) < 0.1, -1.0, rng.uniform(3, 30, n).round(3))
+    shapes[4] = shapely.Polygon([(X - 90, Y + 50), (X + 50, Y - 90), (X - 90, Y - 90)])  # beside its box's corner
     return shapes, {"id": np.array([f"h{k:04}" for k in rng.permutation(n)], object), "h": heights}
 
 
@@ -330,7 +332,7 @@ def test_footprints_of_a_box_are_those_that_meet_it(tmp_path: Path, name: str) -
     assert sum(len(block.rows) for block in blocks) == 399
     order = np.argsort(fields["id"].astype(str))
     heights = np.where(fields["h"] > 0, fields["h"], np.nan)
-    for box in (REGION, (X - 100, Y - 100, X + 200, Y + 300), (X, Y, X, Y), (X - 2600, Y, X, Y + 1)):
+    for box in (REGION, (X - 100, Y - 100, X + 200, Y + 300), (X, Y, X + 9, Y + 9), (X - 2600, Y, X, Y + 1)):
         meets = order[shapely.intersects(np.array(shapes, object)[order], shapely.box(*box))]
         expected = Footprints(np.array(shapes, object)[meets], fields["id"][meets].astype(str), heights[meets])
         assert_same(in_box(blocks, box), expected)
@@ -373,6 +375,11 @@ def test_batches_and_the_order_of_the_file_change_nothing(tmp_path: Path) -> Non
         assert shapely.to_wkb(one.polygons).tolist() == shapely.to_wkb(two.polygons).tolist()
         assert_same(one, two)
     assert (one.ids[1:] == one.ids[:-1]).sum() == 1
+    (block,) = scan(tmp_path / "a.gpkg")
+    single = [take_rows(block.rows, row, row + 1) for row in range(len(block.rows))]
+    three, four = join_footprints(single, REGION), join_footprints(single[::-1], REGION)
+    assert shapely.to_wkb(three.polygons).tolist() == shapely.to_wkb(four.polygons).tolist()
+    assert_same(three, four)
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -423,6 +430,32 @@ def test_notes_of_the_file_come_once(tmp_path: Path) -> None:
     assert [len(block.rows) for block in far] == [0]
     assert len(in_box(far, REGION).ids) == 0
     assert far[0].cell_box.shape == (0, 4)
+
+
+def test_warnings_come_once_a_file(tmp_path: Path) -> None:
+    ring = f"[[{X},{Y}],[{X + 9},{Y + 9}],[{X + 9},{Y}]]"
+    shape = f'{{"type":"Feature","properties":{{}},"geometry":{{"type":"Polygon","coordinates":[{ring}]}}}}'
+    crs = '"crs":{"type":"name","properties":{"name":"EPSG:28992"}}'
+    path = tmp_path / "a.geojson"
+    path.write_text(f'{{"type":"FeatureCollection",{crs},"features":[{",".join([shape] * 9)}]}}')
+    blocks = scan(path, batch=2)
+    assert len(blocks) == 5
+    assert count_notes(notes_of(blocks)) == {"footprints-reader-warning": 1}
+
+
+def test_a_region_around_the_file_asks_for_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    true = pyogrio.raw.open_arrow
+
+    def watch(path: Path, **options: Any) -> Any:
+        asked.append(options["bbox"])
+        return true(path, **options)
+
+    monkeypatch.setattr(pyogrio.raw, "open_arrow", watch)
+    layer = describe_layer(write_any(tmp_path / "a.gpkg", *houses(20)))
+    for box in (REGION, (X - 9e4, Y - 9e4, X + 9e4, Y + 9e4)):
+        list(scan_layer(layer, ["id"], box))
+    assert asked == [REGION, None]
 
 
 def test_a_damaged_page_is_no_end_of_the_file(tmp_path: Path) -> None:

@@ -207,9 +207,8 @@ def join_footprints(parts: Sequence[FootprintRows], box: Box) -> Footprints:
         ids.append(part.ids[near])
         heights.append(part.given_height[near])
     names, given = np.concatenate(ids), np.concatenate(heights)
-    order = np.array(
-        sorted(range(len(blobs)), key=lambda row: (names[row], blobs[row], str(given[row]))), np.int64
-    )
+    keys = list(zip(names.tolist(), blobs, map(str, given.tolist()), strict=True))
+    order = np.array(sorted(range(len(keys)), key=keys.__getitem__), np.int64)
     geometry = shapely.from_wkb([blobs[row] for row in order], on_invalid="fix").astype(np.object_)
     kept = shapely.intersects(geometry, shapely.box(*box))
     return Footprints(geometry[kept], names[order[kept]], given[order[kept]])

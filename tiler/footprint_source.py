@@ -217,15 +217,18 @@ def _ids(
     geometry: NDArray[np.object_], values: NDArray[Any] | None, repeated: Set[str]
 ) -> tuple[NDArray[np.str_], list[Note]]:
     """Give each footprint its id, see `read_footprints`."""
-    made = make_ids(geometry) if len(geometry) else np.empty(0, np.str_)
-    if values is None:
-        return made, []
-    given = np.array([id_text(value) for value in values], dtype=np.str_)
+    given = (
+        np.full(len(geometry), "") if values is None else np.array([id_text(value) for value in values], np.str_)
+    )
     missing = given == ""
-    notes = _notes("footprint-id-missing", geometry[missing], "named by its geometry", made[missing])
+    again = np.fromiter((name in repeated for name in given.tolist()), bool, len(given)) & ~missing
+    made = np.full(len(given), "", dtype="<U14")
+    made[missing | again] = make_ids(geometry[missing | again])
     ids = np.where(missing, made, given)
-    again = np.fromiter((str(name) in repeated for name in given), bool, len(given))
-    ids = np.where(again, np.char.add(np.char.add(ids, "-"), made), ids)
+    ids = np.where(again, np.char.add(np.char.add(given, "-"), made), ids)
+    if values is None:
+        return ids, []
+    notes = _notes("footprint-id-missing", geometry[missing], "named by its geometry", made[missing])
     notes += _notes("footprint-id-repeated", geometry[again], "completed by its geometry", ids[again])
     return ids, notes
 
@@ -248,6 +251,8 @@ def id_text(value: Any) -> str:
     >>> id_text(12.0), id_text(" a1 "), id_text(None), id_text(float("nan"))
     ('12', 'a1', '', '')
     """
+    if isinstance(value, str):
+        return value.strip()
     if isinstance(value, float | np.floating):
         return f"{value:.17g}" if np.isfinite(value) else ""
     return "" if value is None else str(value).strip()

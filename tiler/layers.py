@@ -134,7 +134,8 @@ def scan_layer(
     Yields
     ------
     Features
-        In the order of the file. Features without geometry have no place and may be absent.
+        In the order of the file or of its spatial index. Features without geometry have no place and may be
+        absent.
 
     Raises
     ------
