@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.adaptive import mesh_adaptive
-from pipeline.columns import expand_cells, extract_boundary, split_boundary
+from pipeline.columns import expand_cells, extract_boundary, find_used_points, split_boundary
 from pipeline.mesh import Boundary, Marker, SeamEdges, TetMesh
 from pipeline.plane import mesh_plane
 from stitch.conformity import match_facets, pair_cell_faces, pair_edges, pair_faces
 from stitch.facets import label_beyond
 from stitch.frontier import find_edges_below
 from stitch.grid import Key, SeamKey, make_grid
+from stitch.numbering import SeamNumbers, list_parts, number_points
 from tests.cities import Bounds, hilly_dtm, tilted_dtm
 from tests.stitching import OPTIONS, Scene, glue, random_scene, scene_of
 from tests.terraces import terrace_town
@@ -28,6 +29,7 @@ from tests.tiled_runs import (
     Split,
     cut_city,
     mesh_city,
+    number_city,
     seam_edges,
     split_all,
     write_tiled_run,
@@ -192,8 +194,6 @@ def test_seams_that_do_not_fit_the_mesh_are_refused(crowded: City) -> None:
         label_beyond(cut, left=True)
 
 
-# --- many pieces, checked --------------------------------------------------------------------------
-
 WIDE: Bounds = (0.0, 0.0, 840.0, 840.0)
 COARSE = replace(OPTIONS, mesh_size=20.0)
 CENTRE = Key(1, 1)
@@ -205,6 +205,36 @@ def nine() -> City:
     houses += [affinity.rotate(shapely.box(520, 500, 600, 620), 20.0), shapely.Point(280, 560).buffer(30)]
     scene = scene_of(houses, [12.0 + 4 * (k % 5) for k in range(len(houses))], hilly_dtm(WIDE, relief=15.0))
     return mesh_city(scene, make_grid(WIDE, tile_size=280.0, mesh_size=20.0), COARSE)
+
+
+# --- numbers ---------------------------------------------------------------------------------------
+
+
+def test_a_point_has_one_number_in_all_tiles_and_none_is_left_out(crowded: City, nine: City) -> None:
+    for city in (crowded, nine):
+        numbers, total = number_city(city)
+        kept = {key: find_used_points(tile.mesh) for key, tile in city.tiles.items()}
+        ids = np.concatenate([numbers[key][used] for key, used in kept.items()])
+        points = np.concatenate([expand_cells(city.tiles[key].mesh).points[used] for key, used in kept.items()])
+        assert np.unique(ids).tolist() == list(range(total))
+        assert len(np.unique(points, axis=0)) == total
+        assert len(np.unique(np.column_stack((ids, points)), axis=0)) == total
+
+
+def test_parts_follow_each_other() -> None:
+    parts = list_parts(make_grid(SQUARE, tile_size=140.0, mesh_size=10.0))
+    assert (len(parts.corners), len(parts.seams), len(parts.tiles), len(parts)) == (12, 12, 9, 33)
+    assert len(list_parts(make_grid(SQUARE, tile_size=420.0, mesh_size=10.0))) == 1
+
+
+def test_corners_with_two_numbers_are_refused(crowded: City) -> None:
+    mesh = crowded.tiles[Key(0, 0)].mesh
+    one, two = (SeamNumbers(np.array([0, k, 5], np.int32), (first, 40, 90)) for k, first in ((1, 0), (2, 7)))
+    with pytest.raises(ValueError, match="number a corner differently"):
+        number_points(mesh, [one, two], 100)
+
+
+# --- many pieces, checked --------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

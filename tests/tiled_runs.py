@@ -13,8 +13,10 @@ from pipeline.columns import drop_points, expand_cells, find_used_points, split_
 from pipeline.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
 from pipeline.terrain import Dtm, sample_dtm
 from stitch.facets import Side, find_seam_edges
-from stitch.grid import Key, SeamKey, TileGrid, seams_of_tile
+from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile
+from stitch.numbering import SeamNumbers, count_inner_points, count_points, list_parts, make_offsets, number_points
 from stitch.seam_columns import tile_columns
+from stitch.seams import find_vertices
 from tests.stitching import OPTIONS, Scene, Tile, clip_scene, mesh_all
 from tiler.cityjson import write_city_model
 from tiler.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
@@ -76,6 +78,35 @@ def cut_city(city: City, gone: Collection[Key] = ()) -> Pieces:
         key: drop_points(expand_cells(mesh), boundary, find_used_points(mesh))
         for key, (mesh, boundary, _) in split_all(city, gone).items()
     }
+
+
+def number_city(city: City) -> tuple[dict[Key, NDArray[np.int64]], int]:
+    """Number the points of all tiles; also tell how many there are."""
+    parts = list_parts(city.grid)
+    of_corner: dict[Key, int] = {}
+    of_seam: dict[SeamKey, int] = {}
+    vertex: dict[tuple[Key, SeamKey], NDArray[np.int32]] = {}
+    for key, tile in city.tiles.items():
+        for seam, levels in tile.columns.items():
+            vertex[key, seam] = find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy)
+            start, of_seam[seam], end = count_points(levels)
+            of_corner |= dict(zip(ends_of_seam(seam), (start, end), strict=True))
+    counts = [of_corner[corner] for corner in parts.corners] + [of_seam[seam] for seam in parts.seams]
+    for key in parts.tiles:
+        tile = city.tiles[key]
+        counts.append(count_inner_points(tile.mesh, [vertex[key, seam] for seam in tile.columns]))
+    offsets = make_offsets(counts).tolist()
+    n_corners, n_shared = len(parts.corners), len(parts.corners) + len(parts.seams)
+    corners = dict(zip(parts.corners, offsets[:n_corners], strict=True))
+    seams = dict(zip(parts.seams, offsets[n_corners:n_shared], strict=True))
+    numbers = {}
+    for key, first in zip(parts.tiles, offsets[n_shared:-1], strict=True):
+        own = []
+        for seam in city.tiles[key].columns:
+            low, high = ends_of_seam(seam)
+            own.append(SeamNumbers(vertex[key, seam], (corners[low], seams[seam], corners[high])))
+        numbers[key] = number_points(city.tiles[key].mesh, own, first)
+    return numbers, offsets[-1]
 
 
 def write_tiled_run(folder: Path, city: City, pieces: Mapping[Key, tuple[TetMesh, Boundary]]) -> None:
