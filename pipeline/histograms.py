@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from pipeline.quality import PERCENTILES, Quality
 
-# Range and number of bins of each measure of quality: none is wider than 5e-4. The last one of the aspect ratio
-# reaches to the greatest.
+# Range and number of bins of each measure of quality: steps of 0.0005, 0.01 degrees and 0.01. The last of the
+# aspect ratio reaches to the greatest.
 QUALITY_BINS = {
-    "radius_ratio": ((0.0, 1.0), 4_000),
-    "min_dihedral": ((0.0, 90.0), 180_000),
-    "aspect_ratio": ((1.0, 11.0), 20_000),
+    "radius_ratio": ((0.0, 1.0), 2_000),
+    "min_dihedral": ((0.0, 90.0), 9_000),
+    "aspect_ratio": ((1.0, 11.0), 1_000),
 }
 
 

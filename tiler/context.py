@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from stitch.grid import (
     Bounds,
@@ -117,20 +118,26 @@ def seam_key(name: str) -> SeamKey:
     return SeamKey(AXES.index(name[0]), int(i), int(j))
 
 
-def owns(box: Box, bounds: Bounds, xy: tuple[float, float]) -> bool:
-    """Tell whether a place is a tile's own: in its half-open box, places beyond the region taken to its border.
+def find_owned(box: Box, bounds: Bounds, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which places are a tile's own: in its half-open box, places beyond the region taken to its border.
+
+    Parameters
+    ----------
+    box, bounds : (xmin, ymin, xmax, ymax)
+        The tile and the region (m).
+    xy : float64, (n, 2)
+        Places (m); one that is NaN is nobody's.
 
     Examples
     --------
-    >>> owns((0, 0, 1, 1), (0, 0, 2, 1), (1.0, 0.5)), owns((1, 0, 2, 1), (0, 0, 2, 1), (7.0, 1.0))
-    (False, True)
+    >>> find_owned((1.0, 0.0, 2.0, 1.0), (0.0, 0.0, 2.0, 1.0), np.array([[0.9, 0.5], [1.0, 0.5], [7.0, 1.0]]))
+    array([False,  True,  True])
     """
-    for k in range(2):
-        place = min(max(xy[k], bounds[k]), bounds[k + 2])
-        last = box[k + 2] >= bounds[k + 2]
-        if not (box[k] <= place < box[k + 2] or (last and place == box[k + 2])):
-            return False
-    return True
+    low, high = np.array(box[:2]), np.array(box[2:])
+    place = np.clip(xy, bounds[:2], bounds[2:])
+    last = high >= np.array(bounds[2:])
+    own: NDArray[np.bool_] = ((place >= low) & ((place < high) | (last & (place == high)))).all(axis=1)
+    return own
 
 
 def region_around(grid: TileGrid, box: Box) -> shapely.Geometry:

@@ -21,7 +21,7 @@ from pipeline.simplify import raise_buildings
 from pipeline.tile import measure_city, prepare_footprints
 from stitch.grid import Key
 from tiler.config import Config
-from tiler.context import owns, region_around, tile_key
+from tiler.context import find_owned, region_around, tile_key
 from tiler.footprint_index import FootprintRows, join_footprints, select_footprints
 from tiler.options import CITY_PARAMETERS, LAYER_PARAMETERS, city_options, mesh_options
 from tiler.readers import grow, read_cloud, read_terrain
@@ -114,7 +114,8 @@ def make_houses(task: Task) -> Facts:
         around = tuple(shapely.total_bounds(read.polygons).tolist()) if len(read.polygons) else task.box
         inner, notes = prepare_footprints(read, region_around(grid, _hull(task.box, around)), options)
         own = _owned(task, inner)
-    task.notes(note for note in notes if owns(task.box, bounds, (note.x, note.y)))
+    places = np.array([(note.x, note.y) for note in notes]).reshape(-1, 2)
+    task.notes(note for note, mine in zip(notes, find_owned(task.box, bounds, places), strict=True) if mine)
     extent = _extent(own.polygons)
     cloud, dtm = _surroundings(task, extent, options.ground_margin, 2 * spacing)
     city = measure_city(cloud, own, dtm, options, building_class=True, trace=task.step)
@@ -281,7 +282,7 @@ def _has_rows(task: Task) -> bool:
 def _owned(task: Task, footprints: Footprints) -> Footprints:
     """Take the footprints whose representative point is the tile's."""
     xy = shapely.get_coordinates(shapely.point_on_surface(footprints.polygons))
-    mine = np.array([owns(task.box, task.context.bounds, (x, y)) for x, y in xy.tolist()], np.bool_)
+    mine = find_owned(task.box, task.context.bounds, xy.reshape(-1, 2))
     return Footprints(footprints.polygons[mine], footprints.ids[mine], footprints.given_height[mine])
 
 

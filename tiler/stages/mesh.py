@@ -1,6 +1,7 @@
 """Stages 3.1 to 3.5: the seams between tiles, and the columns of each tile between its seams."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,17 +11,19 @@ from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
 from pipeline.columns import count_cells, lowest_gap
 from pipeline.errors import GeometryError
 from pipeline.layered import mesh_layers, terrain_reach
-from pipeline.mesh import ColumnMesh, PlaneMesh
+from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.nodes import Levels
 from pipeline.notes import Note
 from pipeline.raster import Dtm
 from pipeline.spacing import top_reach
 from stitch.corners import Corner, place_corner
 from stitch.facets import Side, find_seam_edges
-from stitch.grid import ends_of_seam, seams_of_tile
+from stitch.grid import Bounds, ends_of_seam, seams_of_tile
 from stitch.layered_seams import fill_corner_layers, fill_seam_layers
+from stitch.numbering import count_inner_points, count_points
+from stitch.patches import mesh_patch
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
-from stitch.seams import Seam, trace_seam
+from stitch.seams import Seam, find_vertices, trace_seam
 from stitch.tiles import Sides, mesh_tile, tile_halo
 from stitch.walls import cut_walls
 from tiler.config import Config
@@ -80,9 +83,9 @@ def make_seam(task: Task) -> Facts:
     if seam.border:
         return facts
     with task.step("3.2-3.5 columns of seams"):
-        levels = _fill(seam, (start, end), dtm, buildings, task)
+        levels = _fill(seam, (start, end), dtm, buildings, walls, task)
     task.put(level_start=levels.start, level_z=levels.z, level_surface=levels.surface)
-    return facts | {"levels": len(levels.z)}
+    return facts | {"points": count_points(levels)}
 
 
 def make_columns(task: Task) -> Facts:
@@ -108,6 +111,7 @@ def make_columns(task: Task) -> Facts:
     with task.step("3.2-3.5 columns"):
         columns, report = _mesh(plane, dtm, buildings, options, seam_columns, task)
     _check(columns)
+    edges, edge_seam = _add_straight_borders(plane, edges, sides, inner, task)
     if not complete:
         x, y = (task.box[0] + task.box[2]) / 2, (task.box[1] + task.box[3]) / 2
         task.note(Note("plane-refinement-stopped", task.name, x, y, "limit on added vertices reached"))
@@ -116,10 +120,13 @@ def make_columns(task: Task) -> Facts:
         edge=edges.vertices,
         edge_bottom=edges.bottom,
         edge_building=edges.building,
-        edge_seam=np.repeat(inner, [len(sides[k].xy) - 1 for k in inner]).astype(np.int32),
+        edge_missing=edges.missing,
+        edge_seam=edge_seam,
     )
     gap, _ = lowest_gap(columns)
+    inner_points = count_inner_points(columns, [find_vertices(plane.xy, sides[k].xy) for k in inner])
     return {
+        "inner_points": inner_points,
         "order": columns.order,
         "facts": {"smallest gap (m)": round(gap, 4)} | dataclasses.asdict(report),
         "counts": {
@@ -180,16 +187,33 @@ def _surroundings(task: Task) -> tuple[Buildings, Dtm]:
     return buildings, read_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
 
 
-def _fill(seam: Seam, ends: tuple[Corner, Corner], dtm: Dtm, buildings: Buildings, task: Task) -> Levels:
+def _fill(
+    seam: Seam,
+    ends: tuple[Corner, Corner],
+    dtm: Dtm,
+    buildings: Buildings,
+    walls: NDArray[np.float64],
+    task: Task,
+) -> Levels:
     """Columns of a seam within the region, of the mesher that is chosen."""
-    options, bounds = mesh_options(task.parameters), task.context.bounds
-    roof, ids = buildings.model.roof, buildings.model.ids
+    given, bounds = task.parameters, task.context.bounds
+    options, model = mesh_options(given), buildings.model
     if isinstance(options, AdaptiveOptions):
-        first, last = (fill_corner(corner, dtm, roof, ids, options) for corner in ends)
-        return fill_seam(seam, (first, last), dtm, roof, ids, options)
-    layers = buildings.layers
-    first, last = (fill_corner_layers(corner, dtm, roof, ids, layers, bounds, options) for corner in ends)
-    return fill_seam_layers(seam, (first, last), dtm, roof, ids, layers, bounds, options)
+        first, last = (fill_corner(corner, dtm, model.roof, model.ids, options) for corner in ends)
+        return fill_seam(seam, (first, last), dtm, model.roof, model.ids, options)
+    angle, city = (
+        plane_options(given)["min_angle"],
+        (dtm, model.roof, model.ids, buildings.layers, bounds, options),
+    )
+    first, last = (
+        fill_corner_layers(
+            corner,
+            mesh_patch(corner, model.polygons, walls, bounds, mesh_size=given.mesh_size, min_angle=angle),
+            *city,
+        )
+        for corner in ends
+    )
+    return fill_seam_layers(seam, (first, last), *city)
 
 
 def _mesh(
@@ -210,6 +234,34 @@ def _mesh(
         removed=buildings.layers,
         seam=seam,
     )
+
+
+def _add_straight_borders(
+    plane: PlaneMesh, edges: SeamEdges, sides: Sequence[Seam], inner: Sequence[int], task: Task
+) -> tuple[SeamEdges, NDArray[np.int32]]:
+    """Add the borders towards tiles that are absent; also tell which side of the tile each edge is on."""
+    bounds = task.context.bounds
+    side = [np.repeat(inner, [len(sides[k].xy) - 1 for k in inner])]
+    vertices = [edges.vertices]
+    for k, seam in enumerate(sides):
+        if seam.border and not _on_sides(seam.xy, bounds):
+            at = find_vertices(plane.xy, seam.xy)
+            vertices.append(np.sort(np.stack((at[:-1], at[1:]), axis=1), axis=1))
+            side.append(np.full(len(at) - 1, k))
+    pairs = np.concatenate(vertices)
+    more = len(pairs) - len(edges.vertices)
+    added = SeamEdges(
+        pairs,
+        np.concatenate((edges.bottom, np.zeros((more, 2), np.int32))),
+        np.concatenate((edges.building, np.full(more, -1))),
+        np.concatenate((edges.missing, np.ones(more, np.bool_))),
+    )
+    return added, np.concatenate(side).astype(np.int32)
+
+
+def _on_sides(xy: NDArray[np.float64], bounds: Bounds) -> bool:
+    """Tell whether all places are on one side of the region's box."""
+    return any(bool((xy[:, k % 2] == bounds[k]).all()) for k in range(4))
 
 
 def _check(columns: ColumnMesh) -> None:

@@ -1,0 +1,279 @@
+"""Stage 3.6: a piece of the mesh and of its boundary a tile, numbers for the whole region, proof of the seams."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.building_facts import fidelity_table
+from pipeline.columns import expand_cells, split_boundary
+from pipeline.errors import GeometryError
+from pipeline.histograms import (
+    QUALITY_BINS,
+    Histogram,
+    histogram_percentiles,
+    merge_histograms,
+    quality_histograms,
+)
+from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
+from pipeline.point_fidelity import KINDS, FidelitySums, conclude_fidelity, merge_fidelity, sum_fidelity
+from pipeline.pointcloud import PointCloud
+from pipeline.quality import measure_cells
+from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
+from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
+from stitch.numbering import SeamNumbers, make_offsets, number_points
+from stitch.seams import find_vertices
+from tiler.config import Config
+from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
+from tiler.readers import read_buildings, read_cloud, read_terrain
+from tiler.stage import REGION_ITEM, Facts, Read, Scope, Stage
+from tiler.stages.inputs import halo_of_points
+from tiler.tables import unpack_polygons
+from tiler.task import Result, Task
+from tiler.vtk_files import write_vtp, write_vtu
+
+COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom")
+EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
+
+
+def piece_stages(config: Config) -> list[Stage]:
+    """Stages from columns to files."""
+    fit = (
+        Read("points", halo_of_points(config, 0.0)),
+        Read("terrain", 2 * config.dtm_spacing),
+        Read("model", by_extent=True),
+        Read("houses", by_extent=True),
+    )
+    return [
+        Stage("numbers", Scope.REGION, number_parts, (Read("seams"), Read("columns"))),
+        Stage("pieces", Scope.TILE, write_piece, (Read("columns"), Read("seams"), Read("numbers"))),
+        Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces"),)),
+        Stage("fit", Scope.TILE, measure_fit, fit, ("dtm_spacing", "ground_filter")),
+        Stage("report", Scope.REGION, sum_up, (Read("pieces"), Read("fit"))),
+    ]
+
+
+def number_parts(task: Task) -> Facts:
+    """Find where the numbers of the points of each corner, seam and tile begin, over the whole region."""
+    grid = task.context.grid
+    counts = np.zeros(_n_parts(grid), np.int64)
+    for result in task.read("seams", ()):
+        if not result.facts["border"]:
+            key = seam_key(result.name)
+            first, inner, last = result.facts["points"]
+            start, end = ends_of_seam(key)
+            counts[[_corner_part(grid, start), _seam_part(grid, key), _corner_part(grid, end)]] = (
+                first,
+                inner,
+                last,
+            )
+    for result in task.read("columns", ()):
+        counts[_tile_part(grid, tile_key(result.name))] = result.facts["inner_points"]
+    offsets = make_offsets(counts.tolist())
+    task.put(offset=offsets)
+    return {"points": int(offsets[-1])}
+
+
+def write_piece(task: Task) -> Facts:
+    """Write a tile's cells and its boundary as files, and measure the cells (step 3.6)."""
+    grid, key = task.context.grid, tile_key(task.name)
+    (own,) = (result for result in task.read("columns", ()) if result.name == task.name)
+    arrays, _ = task.store.read("columns", task.name, names=(*COLUMN_ARRAYS, *EDGE_ARRAYS))
+    mesh, numbers = unpack_columns(arrays, own.facts["order"])
+    edges = SeamEdges(
+        arrays["edge"],
+        arrays["edge_bottom"],
+        arrays["edge_building"],
+        arrays["edge_missing"] | ~_there(task, key)[arrays["edge_seam"]],
+    )
+    cells = expand_cells(mesh)
+    boundary, shared = split_boundary(mesh, numbers, task.context.bounds, edges)
+    point_number = _number_points(task, mesh, grid, key)
+    out = Path(task.context.out)
+    with task.step("3.6 write pieces"):
+        number = {"vertex_id": point_number}
+        write_vtu(out / "mesh" / f"{task.name}.vtu", cells, point_data=number)
+        write_vtp(out / "boundary" / f"{task.name}.vtp", cells.points, boundary, point_data=number)
+    with task.step("3.6 measure cells"):
+        histograms = quality_histograms(measure_cells(cells))
+    for name, histogram in histograms.items():
+        task.put(**{name: histogram.counts, f"{name}_range": _range(histogram)})
+    return {
+        "counts": {"cells": len(cells.cells), "facets": len(boundary.facets), "seam faces": len(shared)},
+        "seams": _digest_seams(mesh, cells.points, shared, arrays["edge"], arrays["edge_seam"], key),
+    }
+
+
+def prove_seam(task: Task) -> Facts:
+    """Prove that both tiles of a seam have the same faces on it, bit for bit.
+
+    Raises
+    ------
+    GeometryError
+        If they do not.
+    """
+    key = seam_key(task.name)
+    names = [tile_name(tile) for tile in tiles_of_seam(key)]
+    found = [result.facts["seams"].get(task.name) for result in task.read("pieces", ()) if result.name in names]
+    if is_border(task.context.grid, key) or len(found) < 2:
+        return {"faces": 0, "proved": False}
+    one, other = found
+    if one is None or one != other:
+        raise GeometryError(
+            f"its two tiles have other faces on it: {one} and {other}; this is a fault of citystitch"
+        )
+    return {"faces": one["faces"], "proved": True}
+
+
+def measure_fit(task: Task) -> Facts:
+    """Measure how far the points of a tile are from the city model (step 2.4)."""
+    given, bounds = task.parameters, task.context.bounds
+    cloud = read_cloud(task, task.box, ground_filter=given.ground_filter)
+    own = find_owned(task.box, bounds, cloud.xyz[:, :2])
+    cloud = PointCloud(cloud.xyz[own], cloud.classification[own])
+    dtm = read_terrain(task, task.box, spacing=given.dtm_spacing, bounds=bounds)
+    buildings = read_buildings(task, task.box)
+    outlines = [np.empty(0, object)]
+    for result in task.read("houses", ("outline", "outline_start")):
+        polygons = unpack_polygons(result.arrays, "outline")
+        outlines.append(polygons[shapely.intersects(shapely.box(*task.box), polygons)])
+    sums = sum_fidelity(
+        cloud,
+        dtm,
+        buildings.model.polygons,
+        buildings.model.roof,
+        footprints=np.concatenate(outlines),
+        building_class=True,
+    )
+    facts = {}
+    for kind in KINDS:
+        residual: ResidualSums = getattr(sums, kind)
+        facts[kind] = {"n": residual.n, "total": residual.total, "squares": str(residual.squares)}
+        task.put(**{kind: residual.absolute.counts, f"{kind}_range": _range(residual.absolute)})
+    return {"fit": facts}
+
+
+def sum_up(task: Task) -> Facts:
+    """Add up the quality of all cells and the fit of all points, over the whole region."""
+    quality: dict[str, Histogram] = {}
+    for result in task.read("pieces"):
+        for name, (limits, _) in QUALITY_BINS.items():
+            part = _histogram(result.arrays, name, limits)
+            quality[name] = merge_histograms([quality[name], part]) if name in quality else part
+    total: FidelitySums | None = None
+    for result in task.read("fit"):
+        sums = FidelitySums(**{kind: _residuals(result, kind) for kind in KINDS})
+        total = merge_fidelity([total, sums]) if total is not None else sums
+    facts: Facts = {"quality": histogram_percentiles(quality)}
+    return facts | {"fidelity": fidelity_table(conclude_fidelity(total)) if total is not None else {}}
+
+
+def unpack_columns(arrays: dict[str, NDArray[Any]], order: Any) -> tuple[ColumnMesh, NDArray[np.int64]]:
+    """Read columns from the store: the mesh, with rows of buildings, and the numbers of these rows."""
+    numbers, row = np.unique(arrays["building"], return_inverse=True)
+    outside = int(len(numbers) > 0 and numbers[0] < 0)
+    numbers, row = numbers[outside:], (row.reshape(-1) - outside).astype(np.int32)
+    plane = PlaneMesh(arrays["xy"], arrays["triangles"], row)
+    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], order), numbers
+
+
+def _range(histogram: Histogram) -> NDArray[np.float64]:
+    return np.array([histogram.minimum, histogram.maximum])
+
+
+def _histogram(arrays: dict[str, NDArray[Any]], name: str, limits: tuple[float, float]) -> Histogram:
+    low, high = arrays[f"{name}_range"].tolist()
+    return Histogram(*limits, arrays[name], low, high)
+
+
+def _residuals(result: Result, kind: str) -> ResidualSums:
+    facts = result.facts["fit"][kind]
+    absolute = _histogram(result.arrays, kind, HISTOGRAM_LIMITS)
+    return ResidualSums(facts["n"], facts["total"], int(facts["squares"]), absolute)
+
+
+def _there(task: Task, key: Key) -> NDArray[np.bool_]:
+    """Tell beyond which sides of a tile there is another one: south, east, north, west."""
+    around = set(task.refs["columns"])
+    i, j = key
+    return np.array(
+        [tile_name(tile) in around for tile in (Key(i, j - 1), Key(i + 1, j), Key(i, j + 1), Key(i - 1, j))]
+    )
+
+
+def _number_points(task: Task, mesh: ColumnMesh, grid: TileGrid, key: Key) -> NDArray[np.int64]:
+    """Region-wide numbers of a tile's points."""
+
+    def offset(part: int) -> int:
+        return int(task.read_rows("numbers", REGION_ITEM, "offset", part, part + 1)[0])
+
+    seams = []
+    for seam in seams_of_tile(key):
+        if not is_border(grid, seam):
+            xy = task.store.read("seams", seam_name(seam), names=("xy",))[0]["xy"]
+            start, end = (offset(_corner_part(grid, corner)) for corner in ends_of_seam(seam))
+            seams.append(
+                SeamNumbers(find_vertices(mesh.plane.xy, xy), (start, offset(_seam_part(grid, seam)), end))
+            )
+    return number_points(mesh, seams, offset(_tile_part(grid, key)))
+
+
+def _digest_seams(
+    mesh: ColumnMesh,
+    points: NDArray[np.float64],
+    shared: NDArray[np.int32],
+    edge: NDArray[np.int32],
+    edge_seam: NDArray[np.int32],
+    key: Key,
+) -> Facts:
+    """Number and hash of the faces that a tile has on each of its seams, whatever their order and orientation."""
+    column = np.searchsorted(mesh.z_start, shared, side="right") - 1
+    n = len(mesh.plane.xy)
+    code = column.min(axis=1) * n + column.max(axis=1)
+    wanted = edge[:, 0].astype(np.int64) * n + edge[:, 1]
+    order = np.argsort(wanted)
+    side = edge_seam[order[np.searchsorted(wanted, code, sorter=order)]]
+    found = {}
+    for k, seam in enumerate(seams_of_tile(key)):
+        corners = points[shared[side == k]]
+        if len(corners):
+            found[seam_name(seam)] = {"faces": len(corners), "hash": _hash_faces(corners)}
+    return found
+
+
+def _hash_faces(corners: NDArray[np.float64]) -> str:
+    """Hash faces (f, 3, 3) by their coordinates: their corners sorted, then they themselves."""
+    rows = corners.reshape(-1, 3)
+    face = np.repeat(np.arange(len(corners)), 3)
+    flat = rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0], face))].reshape(-1, 9)
+    return hashlib.blake2b(flat[np.lexsort(flat.T[::-1])].tobytes(), digest_size=16).hexdigest()
+
+
+def _size(grid: TileGrid) -> tuple[int, int]:
+    return len(grid.lines[0]) - 1, len(grid.lines[1]) - 1
+
+
+def _n_parts(grid: TileGrid) -> int:
+    """Parts of a region, absent ones included: a part's place follows from its key alone."""
+    nx, ny = _size(grid)
+    return (nx + 1) * (ny + 1) + nx * (ny + 1) + (nx + 1) * ny + nx * ny
+
+
+def _corner_part(grid: TileGrid, key: Key) -> int:
+    _, ny = _size(grid)
+    return (key.i - grid.first.i) * (ny + 1) + key.j - grid.first.j
+
+
+def _seam_part(grid: TileGrid, key: SeamKey) -> int:
+    nx, ny = _size(grid)
+    i, j = key.i - grid.first.i, key.j - grid.first.j
+    before = (nx + 1) * (ny + 1)
+    return before + i * (ny + 1) + j if key.axis == 0 else before + nx * (ny + 1) + i * ny + j
+
+
+def _tile_part(grid: TileGrid, key: Key) -> int:
+    nx, ny = _size(grid)
+    return _n_parts(grid) - nx * ny + (key.i - grid.first.i) * ny + key.j - grid.first.j
