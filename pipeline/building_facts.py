@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from pipeline.building_points import has_building_class
 from pipeline.city import City
+from pipeline.citymodel import CityModel
 from pipeline.heights import ROOF_SOURCES
-from pipeline.point_fidelity import KINDS, PointFidelity, measure_fidelity, measure_houses
+from pipeline.point_fidelity import KINDS, HouseFidelity, PointFidelity, measure_fidelity, measure_houses
 from pipeline.pointcloud import PointCloud
 from pipeline.roof_points import locate_roof_points
 from pipeline.terrain import Dtm
@@ -35,8 +36,30 @@ def describe_buildings(cloud: PointCloud, city: City) -> dict[str, Sequence[obje
     model = city.model
     points = locate_roof_points(cloud, model.polygons, building_class=has_building_class(cloud))
     fidelity = measure_houses(points, model.polygons, model.roof)
-    moved = model.roof - city.measured_roof
-    sources = [ROOF_SOURCES[source] for source in city.roof_source]
+    return tell_buildings(model, city.roof_source, city.measured_roof, fidelity)
+
+
+def tell_buildings(
+    model: CityModel,
+    roof_source: NDArray[np.int8],
+    measured_roof: NDArray[np.float64],
+    fidelity: HouseFidelity,
+) -> dict[str, Sequence[object]]:
+    """Attributes of each building, as `describe_buildings` gives them, of what was measured before.
+
+    Parameters
+    ----------
+    model : CityModel
+        The buildings.
+    roof_source : int8, (n,)
+        Index into `heights.ROOF_SOURCES`.
+    measured_roof : float64, (n,)
+        Roof heights (m) before roofs were grouped and raised.
+    fidelity : HouseFidelity
+        How the roofs fit their points.
+    """
+    moved = model.roof - measured_roof
+    sources = [ROOF_SOURCES[source] for source in roof_source]
     changes = [
         [
             word

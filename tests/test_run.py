@@ -22,8 +22,9 @@ from tests.cities import Bounds, cloud_over
 from tiler.check import check_run
 from tiler.cli import main
 from tiler.config import make_config
+from tiler.results import StoredTerrain, read_columns
 from tiler.run import run
-from tiler.store import Store, StoredTerrain, read_columns
+from tiler.store import Store
 from tiler.synth import write_city
 
 BOUNDS: Bounds = (318000.0, 6399000.0, 318100.0, 6399100.0)
@@ -110,8 +111,8 @@ def test_a_run_leaves_a_mesh_that_its_check_proves(city: Path, tmp_path: Path) -
 def test_the_files_hold_the_columns_of_the_store(city: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     record = run(make_config(values(city, out)))
-    (tile,) = Store(out / "store.zarr").tiles("columns")
-    columns = read_columns(Store(out / "store.zarr"), tile)
+    (tile,) = Store(out / "store.zarr").names("columns")
+    columns, _ = read_columns(Store(out / "store.zarr"), tile)
     mesh = meshio.read(out / "mesh" / f"{tile}.vtu")
     assert len(mesh.points) == len(columns.z) == record["counts"]["points"]
     assert mesh.points[:, 2].tobytes() == columns.z.tobytes()
@@ -364,7 +365,7 @@ CASES: list[tuple[str, Callable[[Path], None], list[str], int, str]] = [
     ("geographic CRS", nothing, ["--crs", "EPSG:4326"], 1, "4326"),
     ("no CRS at all", nothing, ["--crs", "EPSG:99999999"], 2, "99999999"),
     ("bounds elsewhere", nothing, ["--bounds", "0", "0", "100", "100"], 1, "no point cloud there"),
-    ("region over a tile", nothing, ["--tile-size", "50"], 2, "--tile-size 98"),
+    ("tiles of a few cells", nothing, ["--tile-size", "50"], 2, "--tile-size 140"),
     ("tower over the domain", tall_tower, [], 1, "--domain-height"),
     ("unknown attribute", nothing, ["--id-attribute", "nope"], 2, "nope"),
     ("mesh size 0", nothing, ["--mesh-size", "0"], 2, "must be at least"),
@@ -477,7 +478,7 @@ def test_real_data_with_finite_elements_is_the_same_city(shared_data: Path, tmp_
         run(make_config(config | {"out": str(out), "smoother": smoother}))
         assert check_run(out, StoredTerrain).ok
         store = Store(out / "store.zarr")
-        columns[smoother] = read_columns(store, store.tiles("columns")[0])
+        columns[smoother] = read_columns(store, store.names("columns")[0])[0]
     difference = np.abs(columns["columns"].z - columns["fem"].z)
     assert difference.mean() < 0.05
 

@@ -177,7 +177,7 @@ def _check(options: argparse.Namespace) -> int:
 
 def _check_folder(directory: Path) -> int:
     from tiler.check import check_run
-    from tiler.store import StoredTerrain
+    from tiler.results import StoredTerrain
 
     report = check_run(directory, StoredTerrain)
     print("\n".join(report.lines()))

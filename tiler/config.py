@@ -178,9 +178,15 @@ class Config:
         1e-8, "mesh", "relative residual of the linear systems with smoother = fem", above=0, most=1e-2
     )
     tile_size: float = _parameter(
-        2000.0, "run", "side of a tile; in this version the region must fit into one", unit="m", least=10
+        1000.0, "run", "side of a tile, at least 14 mesh sizes; tiles are aligned to multiples of it in the CRS",
+        unit="m", least=10,
+    )  # fmt: skip
+    workers: int = _parameter(
+        0, "run", "worker processes on this machine; 0 runs in this process", least=0, most=1024
     )
-    workers: int = _parameter(0, "run", "worker processes; 0 runs in this process", least=0, most=1024)
+    scheduler: str = _parameter(
+        UNSET, "run", "address of a running Dask scheduler, whose workers see the same files; instead of workers"
+    )
     out: str = _parameter("out", "run", "folder for the results")
     overwrite: bool = _parameter(False, "run", "replace the results of an earlier run in that folder")
 

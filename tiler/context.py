@@ -68,6 +68,12 @@ def choose_tiles(grid: TileGrid, boxes: list[Box]) -> TileGrid:
     return replace(grid, present=None if present.all() else present)
 
 
+def absent_tiles(grid: TileGrid) -> list[Key]:
+    """List the tiles of the region's box that are absent."""
+    every = tile_keys(replace(grid, present=None))
+    return [key for key in every if not has_tile(grid, key)]
+
+
 def pack_tiles(grid: TileGrid) -> bytes:
     """Write which tiles are present in few bytes; none where all are."""
     return b"" if grid.present is None else zlib.compress(np.packbits(grid.present).tobytes())

@@ -5,10 +5,10 @@ knows Dask: see `tiler.executors`.
 """
 
 import heapq
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,6 @@ from tiler.stage import Facts, Layout, Scope, Stage
 from tiler.store import Store
 from tiler.task import Declared, Failure, Record, Task, reuse
 
-Job = TypeVar("Job")
-Outcome = TypeVar("Outcome")
 Progress = Callable[[str, int, int, Record], None]
 PER_WORKER, LEAST_WINDOW = 4, 8  # tasks in flight
 
@@ -296,55 +294,3 @@ def _named(error: Exception, stage: Stage, name: str) -> Exception:
         return type(error)(f"{place}: {error}")
     error.add_note(place)
     return error
-
-
-def run_jobs(function: Callable[[Job], Outcome], jobs: Iterable[Job], *, workers: int) -> Iterator[Outcome]:
-    """Apply a function to every job, in this process or in worker processes.
-
-    Parameters
-    ----------
-    function : callable
-        Top-level function; it returns a small record, arrays go to the store.
-    jobs : iterable
-        Its arguments, picklable.
-    workers : int
-        Number of worker processes of one thread each; 0 for none.
-
-    Yields
-    ------
-    Outcome
-        Results in the order of the jobs.
-    """
-    if workers == 0:
-        yield from map(function, jobs)
-        return
-    from dask import config
-    from distributed import Client, LocalCluster
-
-    # Everything is bound to this machine, on free ports: two runs do not meet.
-    with (
-        config.set({"distributed.worker.daemon": False}),
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            silence_logs="ERROR",
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        futures = [client.submit(_attempt, function, job, pure=False) for job in jobs]
-        for future in futures:
-            result, error = future.result()
-            if error is not None:
-                raise error
-            yield result
-
-
-def _attempt(function: Callable[[Job], Outcome], job: Job) -> tuple[Outcome | None, CityError | None]:
-    """Give an error that data caused back as a value: Dask would print where in the code it arose."""
-    try:
-        return function(job), None
-    except CityError as error:
-        return None, error

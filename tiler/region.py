@@ -1,13 +1,15 @@
-"""The region to mesh and the tile that it lies in."""
+"""The region to mesh: chosen, and checked against its tiles."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.errors import ConfigError, InputError
+from stitch.grid import LEAST_TILE
 from tiler.clouds import CloudHeader
 
-ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray points
+ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray points ...
+SPARSEST = 100.0  # m2; ... where it has fewer points than one in this area
 
 Bounds = tuple[float, float, float, float]
 
@@ -70,7 +72,7 @@ def describe_overhang(bounds: Bounds, clouds: Sequence[CloudHeader]) -> list[str
 
 
 def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]) -> None:
-    """Refuse a region that is smaller than a cell or larger than a tile.
+    """Refuse a region that is smaller than a cell, or tiles that are too small for the cells.
 
     A single file that is much larger than a tile is named: a few astray points make its extent absurd.
 
@@ -85,31 +87,20 @@ def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]
             f"region {_words(region.bounds)}: {width:g} x {height:g} m is smaller than one cell of "
             f"{mesh_size:g} m; lower --mesh-size or give larger --bounds"
         )
+    if region.tile_size < LEAST_TILE * mesh_size:
+        raise ConfigError(
+            f"tile size {region.tile_size:g} m is below {LEAST_TILE:g} mesh sizes of {mesh_size:g} m; give "
+            f"--tile-size {math.ceil(LEAST_TILE * mesh_size)} or more, or lower --mesh-size"
+        )
     for cloud in clouds:
         span = max(cloud.bounds[2] - cloud.bounds[0], cloud.bounds[3] - cloud.bounds[1])
-        if cloud.n_points and span > ASTRAY_TILES * region.tile_size and max(width, height) > region.tile_size:
+        sparse = cloud.n_points and span**2 > cloud.n_points * SPARSEST
+        if sparse and span > ASTRAY_TILES * region.tile_size and max(width, height) > region.tile_size:
             raise InputError(
                 f"{cloud.path}: its header spans {span / 1000:.0f} km, more than {ASTRAY_TILES} tiles of "
-                f"{region.tile_size:g} m; if points lie astray in it, give --bounds around the others"
+                f"{region.tile_size:g} m, with {cloud.n_points} points; if points lie astray in it, give --bounds "
+                "around the others"
             )
-    if max(width, height) > region.tile_size:
-        raise ConfigError(
-            f"region {_words(region.bounds)}: {width:g} x {height:g} m does not fit into one tile of "
-            f"{region.tile_size:g} m; give smaller --bounds, or --tile-size {math.ceil(max(width, height))}"
-        )
-
-
-def tile_name(region: Region) -> str:
-    """Name of the tile that holds the region's centre, by its column and row in the CRS.
-
-    Examples
-    --------
-    >>> tile_name(Region((120625.0, 485937.0, 121250.0, 486523.0), "EPSG:28992", 2000.0))
-    '60_243'
-    """
-    x = (region.bounds[0] + region.bounds[2]) / 2
-    y = (region.bounds[1] + region.bounds[3]) / 2
-    return f"{math.floor(x / region.tile_size)}_{math.floor(y / region.tile_size)}"
 
 
 def _words(bounds: Sequence[float]) -> str:

@@ -2,39 +2,39 @@
 
 import dataclasses
 import json
-import math
 import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-from pipeline.errors import CityError, ConfigError, InputError
-from pipeline.notes import Note, count_notes
+from pipeline.errors import CityError, ConfigError
 from tiler.atomic import replacing
-from tiler.clouds import CloudHeader, find_clouds, read_header
-from tiler.config import Config, idle_parameters
-from tiler.crs import resolve_crs
-from tiler.engine import run_jobs
-from tiler.region import Region, check_region, choose_bounds, describe_overhang, tile_name
-from tiler.tile_task import CITY_MODEL, FULL_CITY_MODEL, TileJob, TileRecord, mesh_tile
-from tiler.vectors import read_footprint_crs
+from tiler.config import Config
+from tiler.context import RunContext, pack_tiles
+from tiler.engine import Engine
+from tiler.executors import Executor, connect, local, serial
+from tiler.planning import Plan, identify, make_plan
+from tiler.stage import REGION_ITEM
+from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
+from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL, city_model_stages
+from tiler.stages.inputs import input_stages
+from tiler.stages.mesh import mesh_stages
+from tiler.stages.pieces import piece_stages
+from tiler.summary import summarise_run
+from tiler.task import Record
 from tiler.vtk_files import write_pvtp, write_pvtu
 
 SCHEMA = 1  # version of run.json's layout
 # What a run writes, and all that --overwrite removes.
 RESULTS = ("run.json", CITY_MODEL, FULL_CITY_MODEL, "mesh.pvtu", "boundary.pvtp", "mesh", "boundary", "store.zarr")
 LIBRARIES = ("citystitch", "numpy", "scipy", "shapely", "numba", "triangle", "laspy", "lazrs", "pyogrio", "pyproj")
-EXIT_DONE, EXIT_INCOMPLETE = 0, 3
-
-# Notes of these kinds say that something is missing which the input has: the exit code tells.
-INCOMPLETE = {"building-lost", "building-points-without-footprints"}
-
 Announce = Callable[[str, float], None]
 
 
@@ -48,7 +48,7 @@ def run(
     config : Config
         Parameters of the run.
     announce : callable, optional
-        Called with name and seconds of each step when it is done (with ``workers = 0``).
+        Called with the name of each stage and the seconds of all its items when it is done.
     say : callable, optional
         Called with sentences that the user should read.
 
@@ -75,7 +75,7 @@ def run(
     }
     try:
         # Nothing of an earlier run is touched before the inputs are known to be there.
-        plan = _plan(config, say or _silent)
+        plan = make_plan(config, say or _silent)
         _clear_folder(out, earlier)
         earlier = []
         _write_record(out, record)
@@ -94,104 +94,85 @@ def run(
     return record
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """What is known before any point is read."""
-
-    region: Region
-    headers: list[CloudHeader]
-    messages: list[str]
-    unreadable: dict[str, str]
-
-
-def _plan(config: Config, say: Callable[[str], None]) -> _Plan:
-    paths = find_clouds(config.pointcloud)
-    headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
-    footprint_crs = read_footprint_crs(Path(config.footprints)) if config.footprints else None
-    crs, messages = resolve_crs(config.crs or None, headers, footprint_crs)
-    code = crs.to_epsg()
-    region = Region(
-        choose_bounds(config.bounds, headers), f"EPSG:{code}" if code else crs.to_wkt(), config.tile_size
+def _mesh_region(config: Config, out: Path, plan: Plan, announce: Announce | None) -> dict[str, Any]:
+    """Run all stages, and write the indexes of their pieces."""
+    context = RunContext(
+        plan.region.bounds, plan.region.crs, config.tile_size, config.mesh_size, pack_tiles(plan.grid), str(out)
     )
-    check_region(region, config.mesh_size, headers)
-    messages += [*describe_overhang(region.bounds, headers), *idle_parameters(config)]
-    if not config.footprints:
-        messages.append("no footprints given: the mesh has terrain only")
-    for message in messages:
-        say(message)
-    return _Plan(region, headers, messages, unreadable)
-
-
-def _mesh_region(config: Config, out: Path, plan: _Plan, announce: Announce | None) -> dict[str, Any]:
-    clouds = tuple(header.path for header in plan.headers if header.n_points and _meets(header, plan.region))
-    job = TileJob(tile_name(plan.region), plan.region, clouds, config, out)
-    task = partial(mesh_tile, announce=announce) if config.workers == 0 else mesh_tile
-    tiles = list(run_jobs(task, [job], workers=config.workers))
-    write_pvtu(out / "mesh.pvtu", [out / "mesh" / f"{tile.name}.vtu" for tile in tiles])
-    write_pvtp(out / "boundary.pvtp", [out / "boundary" / f"{tile.name}.vtp" for tile in tiles])
-    unreadable = dict(plan.unreadable)
-    for tile in tiles:
-        unreadable |= tile.unreadable
-    return _summary(plan.region, plan.headers, tiles, plan.messages, unreadable)
-
-
-def _summary(
-    region: Region,
-    headers: Sequence[CloudHeader],
-    tiles: Sequence[TileRecord],
-    messages: Sequence[str],
-    unreadable: dict[str, str],
-) -> dict[str, Any]:
-    (tile,) = tiles
-    counts = {"files": len(headers), "files empty": sum(header.n_points == 0 for header in headers), **tile.counts}
-    return {
-        "exit_code": EXIT_INCOMPLETE
-        if unreadable or INCOMPLETE & {note.kind for note in tile.notes}
-        else EXIT_DONE,
-        "region": {"bounds": list(region.bounds), "crs": region.crs, "tile_size": region.tile_size},
-        "tiles": {tile.name: {"status": "done", "counts": tile.counts, "facts": tile.facts}},
-        "counts": counts,
-        "quality": tile.quality,
-        "fidelity": tile.fidelity,
-        "seconds": tile.seconds,
-        "peak_memory_bytes": tile.peak_memory,
-        "messages": list(messages),
-        "unreadable": unreadable,
-        "notes": group_notes(tile.notes),
-    }
-
-
-def group_notes(notes: Sequence[Note]) -> dict[str, dict[str, Any]]:
-    """Group notes by kind, with their number and their places, for the record."""
-    kinds: dict[str, dict[str, Any]] = {
-        kind: {"count": number, "items": []} for kind, number in count_notes(notes).items()
-    }
-    for note in notes:
-        item: dict[str, Any] = {"subject": note.subject, "detail": note.detail}
-        if not math.isnan(note.x):
-            item |= {"x": round(note.x, 3), "y": round(note.y, 3)}
-        kinds[note.kind]["items"].append(item)
-    return kinds
-
-
-def _read_headers(paths: Sequence[Path], *, skip: bool) -> tuple[list[CloudHeader], dict[str, str]]:
-    headers: list[CloudHeader] = []
-    unreadable: dict[str, str] = {}
-    for path in paths:
-        try:
-            headers.append(read_header(path))
-        except InputError as error:
-            if not skip:
-                raise
-            unreadable[str(path)] = str(error)
-    return headers, unreadable
-
-
-def _meets(header: CloudHeader, region: Region) -> bool:
-    xmin, ymin, xmax, ymax = region.bounds
-    return not (
-        header.bounds[0] > xmax or header.bounds[2] < xmin or header.bounds[1] > ymax or header.bounds[3] < ymin
+    footprints = Path(config.footprints) if config.footprints else None
+    parameters = SimpleNamespace(
+        **dataclasses.asdict(config),
+        layer_height_or_default=config.layer_height_or_default,
+        footprints_identity=identify(footprints) if footprints else "",
     )
+    with _executor(config) as executor:
+        engine = Engine(
+            out / "store.zarr",
+            plan.layout,
+            parameters=parameters,
+            context=context,
+            executor=executor,
+            progress=_Steps(announce),
+        )
+        rounds = run_stages(engine, config)
+    tiles = sorted(plan.layout.tiles)
+    write_pvtu(out / "mesh.pvtu", [out / "mesh" / f"{tile}.vtu" for tile in tiles])
+    write_pvtp(out / "boundary.pvtp", [out / "boundary" / f"{tile}.vtp" for tile in tiles])
+    return summarise_run(engine, plan, config, rounds)
+
+
+def run_stages(engine: Engine, config: Config) -> int:
+    """Run all stages in their order; returns how often clusters of houses were simplified.
+
+    Parameters
+    ----------
+    engine : Engine
+        Engine over the region's items.
+    config : Config
+        Parameters of the run.
+    """
+    engine.run(*input_stages(config))
+    largest = engine.records["footprints", REGION_ITEM].facts["largest"]
+    engine.run(house_stage(config, largest))
+    engine.run(*first_round(config))
+    engine.run(shape_stage(0))
+    last = 0
+    while True:
+        engine.run(*later_round(config, last + 1))
+        if not engine.records[f"join-{last + 1}", REGION_ITEM].facts["joined"]:
+            break
+        last += 1
+        engine.run(shape_stage(last))
+    engine.run(model_stage(config, last))
+    engine.run(*city_model_stages(), *mesh_stages(config))
+    engine.run(*piece_stages(config))
+    return last + 1
+
+
+@contextmanager
+def _executor(config: Config) -> Iterator[Executor]:
+    if config.scheduler:
+        with connect(config.scheduler) as executor:
+            yield executor
+    elif config.workers:
+        with local(config.workers) as executor:
+            yield executor
+    else:
+        with serial() as executor:
+            yield executor
+
+
+class _Steps:
+    """Announces each stage when its last item is done, with the seconds of all."""
+
+    def __init__(self, announce: Announce | None) -> None:
+        self._announce = announce
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+
+    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
+        self._seconds[stage] += record.seconds.get("all", 0.0)
+        if done == total and self._announce is not None:
+            self._announce(f"{stage} ({total})", self._seconds[stage])
 
 
 def _check_folder(out: Path, *, overwrite: bool) -> list[str]:

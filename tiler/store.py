@@ -24,8 +24,6 @@ import zarr
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import InputError, OutputError
-from pipeline.mesh import ColumnMesh, PlaneMesh
-from pipeline.terrain import Dtm, sample_dtm
 from tiler.packing import (
     INLINE_BYTES,
     PACKED_BYTES,
@@ -147,10 +145,6 @@ class Store:
         """List the names that have a result of the stage, sorted."""
         folder = self.path / stage
         return sorted(entry.name for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
-
-    def tiles(self, stage: str) -> list[str]:
-        """List the tiles that have a result of the stage, sorted."""
-        return self.names(stage)
 
     def sweep(self, stage: str) -> None:
         """Remove what killed writers of the stage left behind; no writer may be at work."""
@@ -417,61 +411,3 @@ def _damage(folder: Path, stage: str, name: str, array: str) -> Iterator[None]:
         raise InputError(
             f"stage {stage}, {name}: {array} in {folder} {state} ({error}); delete that folder and run again"
         ) from error
-
-
-def write_dtm(store: Store, tile: str, dtm: Dtm) -> None:
-    """Store the terrain of a tile."""
-    store.write("terrain", tile, {"z": dtm.z}, i0=dtm.i0, j0=dtm.j0, spacing=dtm.spacing)
-
-
-def read_dtm(store: Store, tile: str) -> Dtm:
-    """Read the terrain of a tile."""
-    arrays, attributes = store.read("terrain", tile)
-    return Dtm(arrays["z"], int(attributes["i0"]), int(attributes["j0"]), float(attributes["spacing"]))
-
-
-def write_columns(store: Store, tile: str, mesh: ColumnMesh) -> None:
-    """Store the columns of a tile."""
-    plane = mesh.plane
-    arrays: dict[str, NDArray[Any]] = {
-        "xy": plane.xy,
-        "triangles": plane.triangles,
-        "building": plane.building,
-        "z_start": mesh.z_start,
-        "z": mesh.z,
-        "bottom": mesh.bottom,
-    }
-    store.write("columns", tile, arrays, order=mesh.order)
-
-
-def read_columns(store: Store, tile: str) -> ColumnMesh:
-    """Read the columns of a tile."""
-    arrays, attributes = store.read("columns", tile)
-    plane = PlaneMesh(arrays["xy"], arrays["triangles"], arrays["building"])
-    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], attributes["order"])
-
-
-class StoredTerrain:
-    """The terrain of a run, read from its store.
-
-    Parameters
-    ----------
-    path : Path
-        Folder of the store.
-
-    Raises
-    ------
-    InputError
-        If it holds no terrain.
-    """
-
-    def __init__(self, path: Path) -> None:
-        store = Store(path)
-        tiles = store.tiles("terrain")
-        if len(tiles) != 1:
-            raise InputError(f"{path}: terrain of {len(tiles)} tiles, expected one; run citystitch again")
-        self._dtm = read_dtm(store, tiles[0])
-
-    def sample(self, xy: NDArray[np.float64], /) -> NDArray[np.float64]:
-        """Ground height (m) at each place, (n, 2) to (n,)."""
-        return sample_dtm(self._dtm, xy)

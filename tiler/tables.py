@@ -139,6 +139,13 @@ def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
     return {prefix + name: values for name, values in arrays.items()}
 
 
+BUILDING_ARRAYS = (
+    *("polygon", "polygon_start", "id", "house", "ground", "roof", "member", "member_start", "roof_source"),
+    *("measured_roof", "wall_ground", "group", "layers"),
+    *("fidelity_points", "fidelity_rmse", "fidelity_bias", "fidelity_coverage"),
+)
+
+
 def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
     """Read what `pack_buildings` wrote."""
     arrays = {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}

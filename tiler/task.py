@@ -250,6 +250,11 @@ def reuse(store: Store, stage: str, name: str, key: str) -> Record | None:
     return Record(stage, name, key, attributes["facts"], notes, reused=True)
 
 
+def read_notes(store: Store, stage: str, name: str) -> list[Note]:
+    """Read the notes of a result."""
+    return [_note_from_json(values) for values in store.attributes(stage, name)["notes"]]
+
+
 def peak_memory() -> int:
     """Tell the peak resident memory of this process (bytes)."""
     try:  # VmHWM where the system tells it, as ru_maxrss survives a fork.

@@ -18,7 +18,7 @@ from pipeline.histograms import (
     merge_histograms,
     quality_histograms,
 )
-from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
+from pipeline.mesh import ColumnMesh, SeamEdges
 from pipeline.point_fidelity import KINDS, FidelitySums, conclude_fidelity, merge_fidelity, sum_fidelity
 from pipeline.pointcloud import PointCloud
 from pipeline.quality import measure_cells
@@ -29,13 +29,13 @@ from stitch.seams import find_vertices
 from tiler.config import Config
 from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
 from tiler.readers import read_buildings, read_cloud, read_terrain
+from tiler.results import COLUMN_ARRAYS, unpack_columns
 from tiler.stage import REGION_ITEM, Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import unpack_polygons
 from tiler.task import Result, Task
 from tiler.vtk_files import write_vtp, write_vtu
 
-COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom")
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
 
 
@@ -169,15 +169,6 @@ def sum_up(task: Task) -> Facts:
         total = merge_fidelity([total, sums]) if total is not None else sums
     facts: Facts = {"quality": histogram_percentiles(quality)}
     return facts | {"fidelity": fidelity_table(conclude_fidelity(total)) if total is not None else {}}
-
-
-def unpack_columns(arrays: dict[str, NDArray[Any]], order: Any) -> tuple[ColumnMesh, NDArray[np.int64]]:
-    """Read columns from the store: the mesh, with rows of buildings, and the numbers of these rows."""
-    numbers, row = np.unique(arrays["building"], return_inverse=True)
-    outside = int(len(numbers) > 0 and numbers[0] < 0)
-    numbers, row = numbers[outside:], (row.reshape(-1) - outside).astype(np.int32)
-    plane = PlaneMesh(arrays["xy"], arrays["triangles"], row)
-    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], order), numbers
 
 
 def _range(histogram: Histogram) -> NDArray[np.float64]:

@@ -1,0 +1,127 @@
+"""The plan of a run: region, tiles and files, from headers alone."""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+from pipeline.errors import ConfigError, InputError
+from stitch.grid import TileGrid, make_grid, tile_keys
+from tiler.clouds import CloudHeader, find_clouds, read_header
+from tiler.config import Config, idle_parameters
+from tiler.context import choose_tiles, make_layout
+from tiler.crs import resolve_crs
+from tiler.region import Region, check_region, choose_bounds, describe_overhang
+from tiler.stage import FileItem, Layout
+from tiler.vectors import read_footprint_crs
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is known before any point is read.
+
+    Attributes
+    ----------
+    region : Region
+        What is meshed.
+    headers : list of CloudHeader
+        All point-cloud files that can be read.
+    messages : list of str
+        Sentences that the user should read.
+    unreadable : dict
+        Files left out, with the reason.
+    grid : TileGrid
+        Tiles, those without any point cloud left out.
+    layout : Layout
+        Items of every scope.
+    """
+
+    region: Region
+    headers: list[CloudHeader]
+    messages: list[str]
+    unreadable: dict[str, str]
+    grid: TileGrid
+    layout: Layout
+
+
+def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
+    """Find out what a run has to do, from headers alone.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the run.
+    say : callable
+        Called with sentences that the user should read.
+
+    Raises
+    ------
+    CityError
+        If an input is missing or unreadable, or does not fit the others.
+    """
+    paths = find_clouds(config.pointcloud)
+    headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
+    footprint_crs = read_footprint_crs(Path(config.footprints), config.layer) if config.footprints else None
+    crs, messages = resolve_crs(config.crs or None, headers, footprint_crs)
+    code = crs.to_epsg()
+    region = Region(
+        choose_bounds(config.bounds, headers), f"EPSG:{code}" if code else crs.to_wkt(), config.tile_size
+    )
+    check_region(region, config.mesh_size, headers)
+    clouds = [header for header in headers if header.n_points and _meets(header, region)]
+    whole = make_grid(region.bounds, tile_size=config.tile_size, mesh_size=config.mesh_size)
+    grid = choose_tiles(whole, [header.bounds[:4] for header in clouds])
+    n_tiles, n_absent = len(tile_keys(grid)), len(tile_keys(whole)) - len(tile_keys(grid))
+    if config.smoother == "fem" and config.mesher == "layered" and n_tiles > 1:
+        side = math.ceil(max(region.bounds[2] - region.bounds[0], region.bounds[3] - region.bounds[1]))
+        raise ConfigError(
+            f"smoother = fem knows nothing of seams, and the region has {n_tiles} tiles; take smoother = columns, "
+            f"or --tile-size {2 * side}"
+        )
+    messages += [*describe_overhang(region.bounds, headers), *idle_parameters(config)]
+    if n_absent:
+        messages.append(f"{n_absent} of {n_absent + n_tiles} tiles have no point cloud and are left out")
+    if not config.footprints:
+        messages.append("no footprints given: the mesh has terrain only")
+    for message in messages:
+        say(message)
+    layout = make_layout(grid, file_items(clouds), identity=region.crs)
+    return Plan(region, headers, messages, unreadable, grid, layout)
+
+
+def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:
+    """Name files by their stem, those of one stem by a number behind it."""
+    items: dict[str, FileItem] = {}
+    for header in clouds:
+        stem = re.sub(r"[^\w-]", "_", header.path.stem)
+        name = next(name for k in count(1) if (name := f"{stem}-{k}" if k > 1 else stem) not in items)
+        items[name] = FileItem(str(header.path), header.bounds[:4], identify(header.path))
+    return items
+
+
+def identify(path: Path) -> str:
+    """Change when a file does: its size and the time of its last change."""
+    state = path.stat()
+    return f"{state.st_size} {state.st_mtime_ns}"
+
+
+def _read_headers(paths: Sequence[Path], *, skip: bool) -> tuple[list[CloudHeader], dict[str, str]]:
+    headers: list[CloudHeader] = []
+    unreadable: dict[str, str] = {}
+    for path in paths:
+        try:
+            headers.append(read_header(path))
+        except InputError as error:
+            if not skip:
+                raise
+            unreadable[str(path)] = str(error)
+    return headers, unreadable
+
+
+def _meets(header: CloudHeader, region: Region) -> bool:
+    xmin, ymin, xmax, ymax = region.bounds
+    return not (
+        header.bounds[0] > xmax or header.bounds[2] < xmin or header.bounds[1] > ymax or header.bounds[3] < ymin
+    )

@@ -1,0 +1,104 @@
+"""Results of a run, read from its store: columns of a tile, terrain of the region."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.mesh import ColumnMesh, PlaneMesh
+from pipeline.raster import Dtm, NodeWindow, join_dtm, node_window, sample_dtm
+from pipeline.terrain import fill_dtm
+from tiler.store import Store
+
+COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom")
+KEPT_CHUNKS = 9  # tiles of terrain that stay in memory
+
+
+def read_columns(store: Store, tile: str) -> tuple[ColumnMesh, NDArray[np.int64]]:
+    """Read the columns of a tile.
+
+    Returns
+    -------
+    ColumnMesh
+        The mesh; `PlaneMesh.building` has rows of the second result.
+    int64, (b,)
+        Numbers of the buildings that the tile meets, ascending.
+    """
+    arrays, attributes = store.read("columns", tile, names=COLUMN_ARRAYS)
+    return unpack_columns(arrays, attributes["facts"]["order"])
+
+
+def unpack_columns(arrays: Mapping[str, NDArray[Any]], order: Any) -> tuple[ColumnMesh, NDArray[np.int64]]:
+    """Make columns of the arrays of the stage ``columns``, as `read_columns` does."""
+    numbers, row = np.unique(arrays["building"], return_inverse=True)
+    outside = int(len(numbers) > 0 and numbers[0] < 0)
+    rows: NDArray[np.int32] = (row.reshape(-1) - outside).astype(np.int32)
+    plane = PlaneMesh(arrays["xy"], arrays["triangles"], rows)
+    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], order), numbers[outside:]
+
+
+class StoredTerrain:
+    """The terrain of a run, read from its store tile by tile.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the store.
+
+    Raises
+    ------
+    InputError
+        If it holds no terrain.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._store = Store(path)
+        facts = {name: self._store.attributes("terrain", name)["facts"] for name in self._store.names("terrain")}
+        if not facts:
+            raise InputError(f"{path}: holds no terrain; run citystitch again")
+        self._windows = {
+            name: NodeWindow(fact["i0"], fact["j0"], fact["nx"], fact["ny"]) for name, fact in facts.items()
+        }
+        self._spacing = float(next(iter(facts.values()))["spacing"])
+        self._chunks: dict[str, Dtm] = {}
+
+    def sample(self, xy: NDArray[np.float64], /) -> NDArray[np.float64]:
+        """Ground height (m) at each place, (n, 2) to (n,). Memory is that of the terrain around them."""
+        if len(xy) == 0:
+            return np.empty(0)
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        window = node_window(box, self._spacing)
+        parts = [self._chunk(name) for name, own in self._windows.items() if _meet(own, window)]
+        dtm = join_dtm(parts, _hull(window, [self._windows[name] for name in self._windows]))
+        return sample_dtm(fill_dtm(dtm) if np.isnan(dtm.z).any() else dtm, xy)
+
+    def _chunk(self, name: str) -> Dtm:
+        if name not in self._chunks:
+            while len(self._chunks) >= KEPT_CHUNKS:
+                del self._chunks[next(iter(self._chunks))]
+            window = self._windows[name]
+            z = self._store.read("terrain", name)[0]["z"]
+            self._chunks[name] = Dtm(z, window.i0, window.j0, self._spacing)
+        return self._chunks[name]
+
+
+def _meet(one: NodeWindow, other: NodeWindow) -> bool:
+    return (
+        one.i0 < other.i0 + other.nx
+        and other.i0 < one.i0 + one.nx
+        and one.j0 < other.j0 + other.ny
+        and other.j0 < one.j0 + one.ny
+    )
+
+
+def _hull(window: NodeWindow, tiles: list[NodeWindow]) -> NodeWindow:
+    """Cut a window to the region's nodes."""
+    i0, j0 = min(tile.i0 for tile in tiles), min(tile.j0 for tile in tiles)
+    i1, j1 = max(tile.i0 + tile.nx for tile in tiles), max(tile.j0 + tile.ny for tile in tiles)
+    left, low = max(window.i0, i0), max(window.j0, j0)
+    right, high = min(window.i0 + window.nx, i1), min(window.j0 + window.ny, j1)
+    return NodeWindow(left, low, right - left, high - low)
