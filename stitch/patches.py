@@ -5,7 +5,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.mesh import PlaneMesh
-from pipeline.plane import collect_graph, order_plane, triangulate_plane
+from pipeline.plane import collect_graph, order_plane, ring_edges, triangulate_plane
 from stitch.corners import Corner
 from stitch.grid import Bounds
 from stitch.strips import MARGIN, label_triangles
@@ -57,8 +57,8 @@ def mesh_patch(
     """
     core = _square(corner.xy, PATCH * mesh_size, bounds)
     outer = _square(corner.xy, (PATCH + LONGEST_PIECE + MARGIN) * mesh_size, bounds)
-    spokes = _first_edges(corner, bounds)
-    edges = np.concatenate((_outline(outer, corner.xy), walls_within(walls, shapely.box(*core)), spokes))
+    outline = ring_edges(shapely.get_rings(shapely.box(*outer)))
+    edges = np.concatenate((outline, walls_within(walls, shapely.box(*core)), _first_edges(corner, bounds)))
     xy, triangles, _, _ = triangulate_plane(
         collect_graph(edges, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle
     )
@@ -70,15 +70,6 @@ def mesh_patch(
 def _square(xy: NDArray[np.float64], half: float, bounds: Bounds) -> Bounds:
     low, high = np.maximum(xy - half, bounds[:2]), np.minimum(xy + half, bounds[2:])
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def _outline(box: Bounds, node: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sides of a box, one of them noded where the corner is on it."""
-    ring = shapely.get_coordinates(shapely.box(*box))[:-1]
-    after = np.roll(ring, -1, axis=0)
-    side = np.flatnonzero(((ring == node) & (after == node)).any(axis=1))
-    ring = np.insert(ring, side + 1, node, axis=0)
-    return np.stack((ring, np.roll(ring, -1, axis=0)), axis=1)
 
 
 def _first_edges(corner: Corner, bounds: Bounds) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import shapely
 from numpy.typing import NDArray
+from shapely import affinity
 
 from pipeline.columns import expand_cells
 from pipeline.groups import adjacent_houses
@@ -15,9 +16,14 @@ from pipeline.layered import LayeredOptions, choose_layers, fill_layers, mesh_la
 from pipeline.nodes import SeamColumns, take_columns
 from pipeline.plane import mesh_plane
 from pipeline.quality import measure_cells
-from pipeline.slab import lift_places, slab_window, smooth_slab
+from pipeline.slab import lift_places, slab_reach, slab_window, smooth_slab
 from pipeline.terrain import Dtm
-from stitch.grid import Key, is_border, make_grid, seam_keys
+from stitch.corners import place_corner
+from stitch.grid import Key, SeamKey, is_border, make_grid, seam_keys
+from stitch.layered_seams import fill_corner_layers
+from stitch.patches import mesh_patch
+from stitch.seams import find_vertices
+from stitch.walls import cut_walls
 from tests.cities import Bounds, city_of, hilly_dtm, tilted_dtm
 from tests.stitching import (
     LAYERED,
@@ -185,12 +191,52 @@ def test_windows_differ_by_little_from_the_region() -> None:
     assert np.abs(placed - whole).max() < 0.045 * 40
     alone = lift_places(dtm, xy[7:8], bounds, domain_height=60.0, n_layers=12, grid_spacing=10.0)
     assert alone.tobytes() == placed[7:8].tobytes()
+    reach = int(slab_reach(60.0, grid_spacing=10.0)) + 1
+    west, south = np.floor(xy[7]).astype(int) - reach
+    clipped = Dtm(dtm.z[south : south + 2 * reach, west : west + 2 * reach].copy(), int(west), int(south), 1.0)
+    near = lift_places(clipped, xy[7:8], bounds, domain_height=60.0, n_layers=12, grid_spacing=10.0)
+    assert near.tobytes() == alone.tobytes()
+
+
+STREET = [shapely.box(100, 90, 130, 180), shapely.box(152, 90, 180, 180), shapely.box(300, 300, 310, 310)]
+
+
+@pytest.mark.parametrize("key", [Key(1, 1), Key(1, 0)])
+def test_a_corner_sees_the_houses_around_it(key: Key) -> None:
+    moved = [affinity.translate(house, 0, -85 * (key.j == 0)) for house in STREET]
+    scene = scene_of(moved, [13.0, 13.0, 13.0], tilted_dtm(SQUARE))
+    model = scene.model
+    walls = cut_walls(model.polygons, mesh_size=10.0)
+    corner = place_corner(NINE, key, model.polygons, walls, mesh_size=10.0)
+    patch, fewer = (
+        mesh_patch(corner, houses, cut_walls(houses, mesh_size=10.0), SQUARE, mesh_size=10.0, min_angle=28.0)
+        for houses in (model.polygons, model.polygons[:2])
+    )
+    assert patch.xy.tobytes() == fewer.xy.tobytes()
+    assert patch.triangles.tobytes() == fewer.triangles.tobytes()
+    assert set(patch.building) == {-1, 0, 1}
+    ends = corner.tips[~np.isnan(corner.tips[:, 0])]
+    find_vertices(patch.xy, np.concatenate((corner.xy[None], ends[ends[:, 1] > 0])))
+    removed = layers_of(scene, SQUARE, LAYERED)
+    levels = fill_corner_layers(corner, patch, scene.dtm, model.roof, model.ids, removed, SQUARE, LAYERED)
+    # Roofs at 13 m are layer 3, at 15 m without them: the layers sink between the houses, not at the ground.
+    assert levels.z[0] == 0
+    assert (levels.z[3:6] < 5.0 * np.arange(3, 6) - 0.2).all()
+
+
+def test_a_seam_keeps_the_triangles_around_it() -> None:
+    seam = mesh_alone(random_scene(SQUARE, 60, seed=1), NINE, Key(1, 1), LAYERED).seams[SeamKey(0, 1, 1)]
+    plane, line = seam.surroundings, shapely.LineString(seam.xy)
+    distance = shapely.distance(line, shapely.points(plane.xy[plane.triangles].mean(axis=1)))
+    assert 18 < distance.max() <= 20
+    rings = {xy.tobytes() for xy in seam.ring.xy[seam.ring.triangles]}
+    assert rings < {xy.tobytes() for xy in plane.xy[plane.triangles]}
 
 
 def test_seams_cost_little_quality() -> None:
-    bounds = (0.0, 0.0, 600.0, 600.0)
-    scene = random_scene(bounds, 270, seed=8, relief=20.0)
-    grid = make_grid(bounds, tile_size=200.0, mesh_size=10.0)
+    bounds = SQUARE
+    scene = random_scene(bounds, 130, seed=8, relief=20.0)
+    grid = NINE
     tiles = mesh_all(scene, grid, LAYERED)
     tiled = measure_cells(glue([tile.mesh for tile in tiles.values()])).radius_ratio
     plane, _ = mesh_plane(bounds, scene.model.polygons, mesh_size=10.0, min_angle=28, refinements=1, passes=4)
