@@ -287,14 +287,11 @@ def _owned(task: Task, footprints: Footprints) -> Footprints:
 
 
 def _surroundings(task: Task, extent: Box | None, margin: float, reach: float) -> tuple[PointCloud, Dtm]:
-    """Points and terrain of a box; of one corner of the tile where there is none."""
+    """Points and terrain of a box; none and any where there is no house to ask for them."""
     given, bounds = task.parameters, task.context.bounds
     if extent is None:
-        corner = (*task.box[:2], *task.box[:2])
         nothing = PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
-        return nothing, read_terrain(
-            task, grow(corner, given.dtm_spacing), spacing=given.dtm_spacing, bounds=bounds
-        )
+        return nothing, Dtm(np.zeros((1, 1)), 0, 0, given.dtm_spacing)
     with task.step("1.1 points of houses"):
         cloud = read_cloud(task, grow(extent, margin), ground_filter=given.ground_filter)
     return cloud, read_terrain(task, grow(extent, reach), spacing=given.dtm_spacing, bounds=bounds)
