@@ -266,7 +266,7 @@ class _Run:
                 heapq.heappush(self.ready, (-int(self.rank[task]), task))
 
     def _settle(self) -> None:
-        """After an error: forget what has not begun, wait for the rest, and keep no record of either."""
+        """After an error: give up what has not begun, wait for the rest, and keep no record of either."""
         self.in_flight -= self.engine._executor.drop_waiting()
         while self.in_flight:
             ticket, _ = self.engine._executor.wait()

@@ -1,5 +1,6 @@
 """Where tasks run: in this process, in worker processes of this machine, or in a Dask cluster anywhere."""
 
+import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ class Executor(Protocol):
         """Wait until any task is done; give its ticket and what came of it."""
 
     def drop_waiting(self) -> set[int]:
-        """Forget the tasks that no worker has begun; give their tickets."""
+        """Give up what is not done; what runs has ended on return. Gives the tickets of all that was given up."""
 
 
 class Serial:
@@ -87,12 +88,18 @@ class Dask:
                 return ticket, _outcome(future)
 
     def drop_waiting(self) -> set[int]:
-        """Cancel what no worker has begun."""
-        begun = set().union(*self._client.run(_executing).values())
-        futures = [future for future in self._completed.futures if future.key in self._tickets]
-        waiting = [future for future in futures if future.key not in begun and not future.done()]
-        self._client.cancel(waiting)
-        return {self._tickets.pop(future.key) for future in waiting}
+        """Cancel all that is not done, and wait until no worker holds or runs any of it."""
+        futures = [
+            future for future in self._completed.futures if future.key in self._tickets and not future.done()
+        ]
+        keys = {future.key for future in futures}
+        self._client.cancel(futures)
+        clean = 0
+        while clean < 2:  # twice, as a task may be on its way to a worker
+            time.sleep(0.05)
+            held = set().union(*self._client.run(_held, on_error="ignore").values())
+            clean = 0 if held & keys else clean + 1
+        return {self._tickets.pop(key) for key in keys}
 
 
 @contextmanager
@@ -183,5 +190,5 @@ def _outcome(future: Any) -> Record | Failure:
         future.release()
 
 
-def _executing(dask_worker: Any) -> list[str]:
-    return [task.key for task in dask_worker.state.executing]
+def _held(dask_worker: Any) -> list[str]:
+    return list(dask_worker.state.tasks)

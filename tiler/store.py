@@ -279,7 +279,7 @@ class Writer:
             "crc": checksums(array, chunk),
         }
         with self._disk():
-            # Chunks of zeros are written too: one that is -0.0 would come back as 0.0.
+            # Chunks of zeros are written too: how zarr tells -0.0 from 0.0 is its versions' own affair.
             zarr.create_array(
                 str(self._partial / name),
                 data=rows,
