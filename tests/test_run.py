@@ -206,7 +206,7 @@ def test_a_cloud_without_ground_class_needs_the_filter(
     assert "--ground-filter" in capsys.readouterr().err
     assert json.loads((out / "run.json").read_text())["status"] == "failed"
     assert main(["check", str(out)]) == 1
-    assert "the run failed (tile" in capsys.readouterr().err
+    assert "the run failed (stage coarse" in capsys.readouterr().err
     assert main([*command, "--ground-filter", "--overwrite"]) == 0
     assert json.loads((out / "run.json").read_text())["notes"]["ground-filter"]["count"] == 1
     assert check_run(out, StoredTerrain).ok
@@ -369,7 +369,7 @@ CASES: list[tuple[str, Callable[[Path], None], list[str], int, str]] = [
     ("tower over the domain", tall_tower, [], 1, "--domain-height"),
     ("unknown attribute", nothing, ["--id-attribute", "nope"], 2, "nope"),
     ("mesh size 0", nothing, ["--mesh-size", "0"], 2, "must be at least"),
-    ("clearance of a kilometre", nothing, ["--clearance", "1000"], 3, ""),
+    ("clearance of a kilometre", nothing, ["--clearance", "1000"], 0, ""),
 ]
 
 
@@ -392,7 +392,7 @@ def test_bad_input_ends_in_one_clear_message(
     assert main([command, *clouds, *others]) == code
     captured = capsys.readouterr()
     assert "Traceback" not in captured.err
-    if code != 3:
+    if code:
         assert text in captured.err
         assert captured.err.startswith("citystitch: ")
         assert len(captured.err.strip().splitlines()) == 1

@@ -193,14 +193,24 @@ def take_buildings(buildings: Buildings, rows: NDArray[np.integer[Any]]) -> Buil
     )
 
 
+def no_buildings() -> Buildings:
+    """Make an empty city model."""
+    text, number, rows = np.empty(0, np.str_), np.empty(0), np.empty(0, np.int64)
+    model = CityModel(np.empty(0, object), text, rows, number, number, (), text)
+    layers = np.empty(0, np.int32)
+    fidelity = HouseFidelity(rows, number, number, number)
+    return Buildings(model, np.empty(0, np.int8), number, number, rows, layers, fidelity)
+
+
 def join_buildings(several: Sequence[Buildings]) -> Buildings:
     """Put the buildings of several tiles together, by ascending id; groups stay apart.
 
     Parameters
     ----------
-    several : sequence of at least one Buildings
-        Buildings of different tiles.
+    several : sequence of Buildings
+        Buildings of different tiles; none gives none.
     """
+    several = [no_buildings(), *several]
     models = [each.model for each in several]
     first = np.cumsum([0, *(int(each.group.max(initial=-1)) + 1 for each in several)])
     ids = np.concatenate([model.ids for model in models])
