@@ -210,7 +210,9 @@ def cut_blocks(model: CityModel, ends: list[int]) -> list[tuple[CityModel, dict[
 
 def test_blocks_of_any_size_give_the_same_bytes(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cityjson, "RUN", 4)
-    model = make_model(*(translate(HOUSE, 40 * (7 * i % 11), 3 * i) for i in range(11)), ids=[f"h{i}" for i in range(11)])
+    model = make_model(
+        *(translate(HOUSE, 40 * (7 * i % 11), 3 * i) for i in range(11)), ids=[f"h{i}" for i in range(11)]
+    )
     model = replace(model, house=np.array(["x", *model.ids[1:6], "x", "y", "y", *model.ids[9:]]))
     written = []
     for ends in ([], [3], [4, 8], list(range(1, 11)), [0, 11]):
