@@ -26,8 +26,6 @@ class Rim:
     ----------
     edges : float64, (k, 2, 2)
         Plan edges (m), from start to end with the piece on the left.
-    held : bool, (k,)
-        Whether no piece is expected on the other side.
     faces : float64, (f, 3, 3)
         Exterior faces of the piece over these edges, pointing out of it.
     is_boundary : bool, (f,)
@@ -39,7 +37,6 @@ class Rim:
     """
 
     edges: Vertices
-    held: Mask
     faces: Vertices
     is_boundary: Mask
     lines: Vertices
@@ -91,7 +88,7 @@ class Frontier:
 def start_frontier() -> Frontier:
     """Return the frontier before the first piece."""
     none = np.empty(0, np.bool_)
-    rim = Rim(np.empty((0, 2, 2)), none, np.empty((0, 3, 3)), none, np.empty((0, 2, 3)), np.empty((0, 4)))
+    rim = Rim(np.empty((0, 2, 2)), np.empty((0, 3, 3)), none, np.empty((0, 2, 3)), np.empty((0, 4)))
     return Frontier(rim, np.empty(0, np.int64))
 
 
@@ -188,7 +185,7 @@ def add_rim(frontier: Frontier, rim: Rim, piece: int) -> tuple[Frontier, Settled
     comparison a number, and a sort of its plan edges.
     """
     old = frontier.rim
-    edges, held = _pair_edges(np.concatenate((old.edges, rim.edges)), np.concatenate((old.held, rim.held)))
+    edges = _pair_edges(np.concatenate((old.edges, rim.edges)))
     open_places = np.unique(as_places(edges))
     low, high = rim.edges.min(axis=(0, 1), initial=np.inf), rim.edges.max(axis=(0, 1), initial=-np.inf)
 
@@ -211,7 +208,7 @@ def add_rim(frontier: Frontier, rim: Rim, piece: int) -> tuple[Frontier, Settled
     points = np.concatenate((old.points, rim.points[fresh]))
     point_done = is_done(old.points[:, None], rim.points[fresh][:, None])
     settled = _settle(faces[face_done], is_boundary[face_done], pieces[face_done], lines[line_done])
-    waiting = Rim(edges, held, faces[~face_done], is_boundary[~face_done], lines[~line_done], points[~point_done])
+    waiting = Rim(edges, faces[~face_done], is_boundary[~face_done], lines[~line_done], points[~point_done])
     return Frontier(waiting, pieces[~face_done]), settled, fresh
 
 
@@ -221,16 +218,15 @@ def close_frontier(frontier: Frontier) -> Settled:
     return _settle(rim.faces, rim.is_boundary, frontier.piece, rim.lines)
 
 
-def _pair_edges(edges: Vertices, held: Mask) -> tuple[Vertices, Mask]:
+def _pair_edges(edges: Vertices) -> Vertices:
     """Take out the plan edges that have come from both sides."""
     ends = as_places(edges)
     forward = ends[:, 0] < ends[:, 1]
     low, high = np.where(forward[:, None], ends, ends[:, ::-1]).T
     group, n_groups = group_rows(np.column_stack((low.real, low.imag, high.real, high.imag)))
     n_forward, count = np.bincount(group, forward, n_groups), np.bincount(group, minlength=n_groups)
-    n_held = np.bincount(group, held, n_groups)
-    kept = ((n_forward != 1) | (count != 2) | (n_held > 0))[group]
-    return edges[kept], held[kept]
+    left: Vertices = edges[((n_forward != 1) | (count != 2))[group]]
+    return left
 
 
 def _find_fresh(old: Vertices, new: Vertices, low: Vertices, high: Vertices) -> Mask:

@@ -3,6 +3,7 @@
 import json
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from pipeline.citymodel import CityModel, number_ids
 from pipeline.errors import ConfigError, InputError, OutputError
 from pipeline.notes import Note
 from tests.cityjson_rules import area_vector, broken, file_faults, solid_faults, volume
-from tiler.cityjson import read_city_model, write_city_model
+from tiler import cityjson
+from tiler.cityjson import read_city_model, write_city_blocks, write_city_model
 
 BOUNDS = (120999.5, 486999.5, -2.5, 121200.0, 487200.0, 100.0)
 HOUSE = shapely.box(121000, 487000, 121010, 487008)
@@ -194,6 +196,55 @@ def test_equal_input_gives_equal_bytes_and_is_left_alone(target: Path) -> None:
     assert before == [shapely.to_wkb(model.polygons).tolist(), model.ground.tobytes(), model.roof.tobytes()]
     other, _ = write(target, make_model(HOUSE, BLOCK, INNER, roof=12.4))
     assert other["metadata"]["identifier"] != json.loads(first)["metadata"]["identifier"]
+
+
+def cut_blocks(model: CityModel, ends: list[int]) -> list[tuple[CityModel, dict[str, list[int]]]]:
+    """Cut a model with one attribute column into blocks."""
+    names = ("polygons", "ids", "numbers", "ground", "roof", "members", "house")
+    parts = [slice(a, b) for a, b in pairwise([0, *ends, len(model)])]
+    return [
+        (CityModel(*(getattr(model, name)[rows] for name in names)), {"row": list(range(len(model)))[rows]})
+        for rows in parts
+    ]
+
+
+def test_blocks_of_any_size_give_the_same_bytes(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cityjson, "RUN", 4)
+    model = make_model(
+        *(translate(HOUSE, 40 * (7 * i % 11), 3 * i) for i in range(11)), ids=[f"h{i}" for i in range(11)]
+    )
+    model = replace(model, house=np.array(["x", *model.ids[1:6], "x", "y", "y", *model.ids[9:]]))
+    written = []
+    for ends in ([], [3], [4, 8], list(range(1, 11)), [0, 11]):
+        notes = write_city_blocks(target, iter(cut_blocks(model, ends)), crs="EPSG:28992", bounds=BOUNDS)
+        assert notes == ()
+        written.append(target.read_bytes())
+    assert len(set(written)) == 1
+    document = json.loads(written[0])
+    assert file_faults(document) == set()
+    assert set().union(*solid_faults(document).values()) == set()
+    assert document["CityObjects"]["x"]["children"] == ["h0", "h6"]
+    assert [document["CityObjects"][name]["attributes"]["row"] for name in model.ids] == list(range(11))
+    back = read_city_model(target)
+    assert shapely.equals_exact(back.polygons, model.polygons, 0.001).all()
+    # One line an object and one a vertex; the identifier is that of all of it.
+    assert written[0].count(b"\n") == 13 + len(document["vertices"]) + 6
+    write_city_model(target, model, crs="EPSG:28992", bounds=BOUNDS, attributes={"row": list(range(11))})
+    assert target.read_bytes() == written[0]
+
+
+def test_blocks_that_do_not_fit_together_leave_no_file(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cityjson, "RUN", 2)
+    model = make_model(*(translate(HOUSE, 40 * i, 0) for i in range(5)), ids=["a", "b", "c", "d", "a"])
+    with pytest.raises(ValueError, match="building a: 2 buildings have this id"):
+        write_city_blocks(target, cut_blocks(model, [2]), crs="EPSG:28992", bounds=BOUNDS)
+    model = replace(make_model(*model.polygons, ids=["a", "b", "c", "d", "e"]), house=np.array(list("abcda")))
+    with pytest.raises(ValueError, match="building a: is a row and has parts"):
+        write_city_blocks(target, cut_blocks(model, [2]), crs="EPSG:28992", bounds=BOUNDS)
+    other = [(part, {"other": [0] * len(part)}) for part, _ in cut_blocks(model, [])]
+    with pytest.raises(ValueError, match="blocks with the attributes"):
+        write_city_blocks(target, [*cut_blocks(model, []), *other], crs="EPSG:28992", bounds=BOUNDS)
+    assert list(target.parent.iterdir()) == []
 
 
 def test_orientation_and_z_of_the_input_do_not_matter(target: Path) -> None:

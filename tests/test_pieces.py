@@ -3,15 +3,19 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import meshio
 import numpy as np
 import pytest
+import pyvista
 import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.adaptive import mesh_adaptive
 from pipeline.columns import expand_cells, extract_boundary, find_used_points, split_boundary
+from pipeline.errors import InputError, OutputError
 from pipeline.mesh import Boundary, Marker, SeamEdges, TetMesh
 from pipeline.plane import mesh_plane
 from stitch.conformity import match_facets, pair_cell_faces, pair_edges, pair_faces
@@ -32,9 +36,12 @@ from tests.tiled_runs import (
     number_city,
     seam_edges,
     split_all,
+    write_numbered,
     write_tiled_run,
 )
 from tiler.check import CheckReport, check_run
+from tiler.merged import VERTEX_ID, write_merged_boundary, write_merged_volume
+from tiler.vtk_files import read_vtp, read_vtu, write_vtu
 
 SQUARE: Bounds = (0.0, 0.0, 420.0, 420.0)
 FOUR = make_grid(SQUARE, tile_size=210.0, mesh_size=10.0)
@@ -207,6 +214,11 @@ def nine() -> City:
     return mesh_city(scene, make_grid(WIDE, tile_size=280.0, mesh_size=20.0), COARSE)
 
 
+@pytest.fixture(scope="module")
+def pieces(nine: City) -> Pieces:
+    return cut_city(nine)
+
+
 # --- numbers ---------------------------------------------------------------------------------------
 
 
@@ -234,12 +246,57 @@ def test_corners_with_two_numbers_are_refused(crowded: City) -> None:
         number_points(mesh, [one, two], 100)
 
 
+# --- one file of all pieces ------------------------------------------------------------------------
+
+
+def test_one_file_has_all_pieces_and_each_vertex_once(tmp_path: Path, nine: City, pieces: Pieces) -> None:
+    volumes, boundaries = write_numbered(tmp_path, nine)
+    before = sorted(tmp_path.iterdir())
+    write_merged_volume(tmp_path / "all.vtu", volumes)
+    write_merged_boundary(tmp_path / "all.vtp", boundaries)
+    assert sorted(tmp_path.iterdir()) == sorted([*before, tmp_path / "all.vtu", tmp_path / "all.vtp"])
+    mesh = meshio.vtu.read(str(tmp_path / "all.vtu"))
+    cells = mesh.cells[0].data
+    corners = np.concatenate([piece.points[piece.cells] for piece, _ in pieces.values()])
+    assert mesh.points[cells].tobytes() == corners.tobytes()
+    assert len(np.unique(mesh.points, axis=0)) == len(mesh.points)
+    tiles = np.repeat([10 * key.i + key.j for key in pieces], [len(piece.cells) for piece, _ in pieces.values()])
+    assert (mesh.cell_data["tile"][0] == tiles).all()
+    assert len(pair_edges(pair_cell_faces(cells.astype(np.int32), len(mesh.points)).exterior).open) == 0
+    merged = read_vtp(tmp_path / "all.vtp")
+    facets = np.concatenate([piece.points[boundary.facets] for piece, boundary in pieces.values()])
+    assert merged.points[merged.boundary.facets].tobytes() == facets.tobytes()
+    assert (mesh.points[merged.vertex] == merged.points).all()
+    assert (merged.boundary.marker == np.concatenate([part.marker for _, part in pieces.values()])).all()
+    surface = pyvista.read(tmp_path / "all.vtp")
+    assert (surface.points == merged.points).all()
+    assert (surface.regular_faces == merged.boundary.facets).all()
+    assert (surface.cell_data["building"] == merged.boundary.building).all()
+
+
+def test_pieces_that_cannot_be_merged_leave_no_file(tmp_path: Path, nine: City, pieces: Pieces) -> None:
+    volumes, _ = write_numbered(tmp_path, nine)
+    target = tmp_path / "all.vtu"
+    mesh, ids = pieces[CENTRE][0], read_vtu(tmp_path / "1_1.vtu").point_data[VERTEX_ID]
+    tile = np.zeros(len(mesh.cells), np.int32)
+    lists: list[tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]], str]] = [
+        ({}, {"tile": tile}, "has no point array vertex_id"),
+        ({VERTEX_ID: ids[::-1].copy()}, {"tile": tile}, "stands for two places"),
+        ({VERTEX_ID: ids}, {"tile": tile.astype(np.float64)}, "has no array 'tile' like the first piece's"),
+    ]
+    for point_data, cell_data, message in lists:
+        write_vtu(tmp_path / "1_1.vtu", mesh, point_data=point_data, cell_data=cell_data)
+        with pytest.raises(InputError, match=message):
+            write_merged_volume(target, volumes)
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_merged_volume(tmp_path / "none" / "all.vtu", volumes)
+    with pytest.raises(ValueError, match="at least one piece"):
+        write_merged_volume(target, [])
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".vtp"] * 9 + [".vtu"] * 9
+    assert not target.exists()
+
+
 # --- many pieces, checked --------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def pieces(nine: City) -> Pieces:
-    return cut_city(nine)
 
 
 def check(folder: Path, city: City) -> CheckReport:

@@ -19,6 +19,7 @@ from stitch.seam_columns import tile_columns
 from stitch.seams import find_vertices
 from tests.stitching import OPTIONS, Scene, Tile, clip_scene, mesh_all
 from tiler.cityjson import write_city_model
+from tiler.merged import VERTEX_ID
 from tiler.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
 
 Split = tuple[ColumnMesh, Boundary, NDArray[np.int32]]
@@ -107,6 +108,20 @@ def number_city(city: City) -> tuple[dict[Key, NDArray[np.int64]], int]:
             own.append(SeamNumbers(vertex[key, seam], (corners[low], seams[seam], corners[high])))
         numbers[key] = number_points(city.tiles[key].mesh, own, first)
     return numbers, offsets[-1]
+
+
+def write_numbered(folder: Path, city: City) -> tuple[list[Path], list[Path]]:
+    """Write the pieces of a city with the numbers of their points."""
+    numbers, _ = number_city(city)
+    volumes, boundaries = [], []
+    for key, (mesh, boundary) in cut_city(city).items():
+        ids = {VERTEX_ID: numbers[key][find_used_points(city.tiles[key].mesh)]}
+        volumes.append(folder / f"{key.i}_{key.j}.vtu")
+        boundaries.append(folder / f"{key.i}_{key.j}.vtp")
+        tile = {"tile": np.full(len(mesh.cells), 10 * key.i + key.j, np.int32)}
+        write_vtu(volumes[-1], mesh, point_data=ids, cell_data=tile)
+        write_vtp(boundaries[-1], mesh.points, boundary, point_data=ids)
+    return volumes, boundaries
 
 
 def write_tiled_run(folder: Path, city: City, pieces: Mapping[Key, tuple[TetMesh, Boundary]]) -> None:

@@ -134,7 +134,6 @@ def _find_rim(
     """Gather what stands over the rim's edges: exterior faces `over` them, some `known` to the boundary file."""
     boundary, points = surface.boundary, surface.points
     on_rim = np.isin(as_places(points), as_places(edges))
-    below = find_edges_below(surface.corners[surface.marked(Marker.MISSING)], edges)
     start, end = boundary.facets.ravel(), np.roll(boundary.facets, -1, axis=1).ravel()
     both = on_rim[start] & on_rim[end]
     kinds = [
@@ -145,7 +144,6 @@ def _find_rim(
     rows = np.concatenate(chosen)
     rim = Rim(
         edges=edges,
-        held=np.isin(np.arange(len(edges)), below),
         faces=points[over],
         is_boundary=known,
         lines=points[np.stack((start[both], end[both]), axis=1)],

@@ -1,11 +1,13 @@
 """The city model as a CityJSON 2.0 file, and back (steps 1.7 and 2.4)."""
 
+import hashlib
 import json
 import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 import pyproj
@@ -23,9 +25,12 @@ from tiler.atomic import replacing
 GRID = 0.001
 # Attributes of every building; further columns may not take their names.
 ATTRIBUTES = ("number", "ground_height", "roof_height", "height", "members")
+RUN = 4096  # buildings that are written at once, and share their vertices
+COPY_BYTES = 1 << 20
 GROUND, ROOF, WALL = range(3)
 # Semantic surfaces of every solid, by the numbers above.
 SURFACES = ("GroundSurface", "RoofSurface", "WallSurface")
+Attributes = Mapping[str, Sequence[object]]
 
 
 def write_city_model(
@@ -35,7 +40,7 @@ def write_city_model(
     crs: str,
     bounds: Sequence[float],
     title: str = "",
-    attributes: Mapping[str, Sequence[object]] | None = None,
+    attributes: Attributes | None = None,
 ) -> tuple[Note, ...]:
     """Write the buildings as CityJSON 2.0: LoD0 footprints and LoD1.2 solids.
 
@@ -80,40 +85,133 @@ def write_city_model(
     ----------
     CityJSON 2.0.1, https://www.cityjson.org/specs/2.0.1/
     """
-    _check(model, bounds)
-    columns = _columns(model, attributes or {})
+    return write_city_blocks(path, [(model, attributes or {})], crs=crs, bounds=bounds, title=title)
+
+
+def write_city_blocks(
+    path: Path,
+    blocks: Iterable[tuple[CityModel, Attributes]],
+    *,
+    crs: str,
+    bounds: Sequence[float],
+    title: str = "",
+) -> tuple[Note, ...]:
+    """Write buildings that come in blocks, as `write_city_model` does, without ever holding all of them.
+
+    Parameters
+    ----------
+    path, crs, bounds, title
+        As in `write_city_model`.
+    blocks : iterable of (CityModel, attributes)
+        The buildings and their further attributes, the same columns in every block.
+
+    Returns
+    -------
+    tuple of Note
+        As from `write_city_model`.
+
+    Raises
+    ------
+    ValueError
+        As from `write_city_model`; or if blocks have different columns.
+    ConfigError, OutputError
+        As from `write_city_model`.
+
+    Notes
+    -----
+    The bytes do not depend on how the buildings are cut into blocks. One object a line, then one vertex a line,
+    then what is known only then: extent and identifier. Memory holds a block and `RUN` buildings, the numbers of
+    all, and the ids of those that are parts; vertices wait in a temporary file beside `path`. Buildings of one
+    run share their vertices.
+    """
+    if len(bounds) != 6 or not np.all(np.isfinite(bounds)):
+        raise ValueError(f"bounds {tuple(bounds)} must be 6 finite numbers")
     system = _reference_system(crs)
     origin = np.floor(np.asarray(bounds[:3], dtype=np.float64))
-    solids, notes = build_solids(model, origin, grid=GRID)
-    geometry = _geometry(solids)
-    body = _text(
-        {
-            "CityObjects": _objects(model, columns, geometry),
-            "vertices": solids.vertices.tolist(),
+    head = {"type": "CityJSON", "version": "2.0", "transform": {"scale": [GRID] * 3, "translate": origin.tolist()}}
+    with replacing(path) as part, part.open("wb") as file, TemporaryFile(dir=path.parent) as spool:
+        file.write(f"{_text(head)[:-1]},\n".encode("ascii"))
+        writer = _Writer(file, spool, origin)
+        for model, columns in _cut_runs(blocks):
+            writer.add(model, columns)
+        writer.finish()
+        metadata: dict[str, Any] = {
+            "geographicalExtent": _extent(bounds, writer.box),
+            "identifier": str(uuid.UUID(bytes=writer.digest.digest()[:16], version=5)),
         }
-    )
-    metadata: dict[str, Any] = {
-        "geographicalExtent": _extent(bounds, solids.vertices * GRID + origin),
-        "identifier": str(uuid.uuid5(uuid.NAMESPACE_URL, body)),
-    }
-    if system is not None:
-        metadata["referenceSystem"] = system
-    else:
+        if system is not None:
+            metadata["referenceSystem"] = system
+        if title:
+            metadata["title"] = title
+        file.write(f',\n"metadata":{_text(metadata)}}}\n'.encode("ascii"))
+    notes = tuple(writer.notes)
+    if system is None:
         notes = (*notes, Note("crs-without-epsg", detail=f"{crs}: the city model names no reference system"))
-    if title:
-        metadata["title"] = title
-    head = _text(
-        {
-            "type": "CityJSON",
-            "version": "2.0",
-            "transform": {"scale": [GRID] * 3, "translate": origin.tolist()},
-            "metadata": metadata,
-        }
-    )
-    # Two objects become one, so that the buildings are turned into text only once.
-    with replacing(path) as part:
-        part.write_text(f"{head[:-1]},{body[1:]}\n", encoding="ascii")
     return notes
+
+
+class _Writer:
+    """Writes objects to a file and vertices to another, and keeps what must be known at the end."""
+
+    def __init__(self, file: BinaryIO, spool: IO[bytes], origin: NDArray[np.float64]) -> None:
+        self.file, self.spool, self.origin = file, spool, origin
+        # A version 5 identifier is this hash of a name space and a name: the name is all that we write.
+        self.digest = hashlib.sha1(uuid.NAMESPACE_URL.bytes, usedforsecurity=False)
+        self.box = np.empty((0, 3))
+        self.notes: list[Note] = []
+        self.children: dict[str, list[str]] = {}
+        self.seen = np.empty(0, np.int64)
+        self.n_objects = self.n_vertices = 0
+        self._write(b'"CityObjects":{')
+
+    def add(self, model: CityModel, extra: Attributes) -> None:
+        """Write the objects of a run."""
+        columns = _columns(model, extra)
+        self._check_ids(model.ids)
+        solids, notes = build_solids(model, self.origin, grid=GRID)
+        self.notes += notes
+        for name, row in _objects(model, columns, _geometry(solids, self.n_vertices)):
+            self._object(name, row)
+            for house in row.get("parents", ()):
+                self.children.setdefault(house, []).append(name)
+        if len(solids.vertices):
+            places = solids.vertices * GRID + self.origin
+            self.box = np.vstack((self.box, places.min(axis=0), places.max(axis=0)))
+            self.box = np.stack((self.box.min(axis=0), self.box.max(axis=0)))
+            text = ",\n".join(_text(row) for row in solids.vertices.tolist())
+            self.spool.write(f"{',' if self.n_vertices else ''}\n{text}".encode("ascii"))
+            self.n_vertices += len(solids.vertices)
+
+    def finish(self) -> None:
+        """Write the houses that have parts, and the vertices."""
+        mixed = np.isin(_hash_names(self.children), self.seen)
+        for is_row, (house, children) in zip(mixed.tolist(), self.children.items(), strict=True):
+            if is_row:
+                raise ValueError(f"building {house}: is a row and has parts, it may be one of these")
+            self._object(house, {"type": "Building", "children": children})
+        self._write(b'\n},\n"vertices":[')
+        self.spool.seek(0)
+        while piece := self.spool.read(COPY_BYTES):
+            self._write(piece)
+        self._write(b"\n]")
+
+    def _check_ids(self, ids: NDArray[np.str_]) -> None:
+        """Refuse two rows of one id."""
+        new = _hash_names(ids.tolist())
+        again = np.isin(new, self.seen)
+        again[np.argsort(new, kind="stable")[1:]] |= np.diff(np.sort(new)) == 0
+        if again.any():
+            raise ValueError(f"building {ids[again][0]}: 2 buildings have this id, at most 1 may")
+        self.seen = np.concatenate((self.seen, new))
+
+    def _object(self, name: str, content: Mapping[str, Any]) -> None:
+        comma = "," if self.n_objects else ""
+        self._write(f"{comma}\n{json.dumps(name)}:{_text(content)}".encode("ascii"))
+        self.n_objects += 1
+
+    def _write(self, data: bytes) -> None:
+        self.digest.update(data)
+        self.file.write(data)
 
 
 def read_city_model(path: Path) -> CityModel:
@@ -145,41 +243,77 @@ def read_city_model(path: Path) -> CityModel:
         ) from error
 
 
+def _hash_names(names: Collection[str]) -> NDArray[np.int64]:
+    hashes = (hashlib.blake2b(name.encode(), digest_size=8).digest() for name in names)
+    return np.frombuffer(b"".join(hashes), np.int64)
+
+
+def _cut_runs(blocks: Iterable[tuple[CityModel, Attributes]]) -> Iterator[tuple[CityModel, Attributes]]:
+    """Put blocks together and cut them anew, into runs of `RUN` buildings."""
+    waiting: list[tuple[CityModel, Attributes]] = []
+    for model, columns in blocks:
+        waiting.append((model, columns))
+        while (n_rows := sum(len(part) for part, _ in waiting)) >= RUN:
+            joined = _join_blocks(waiting)
+            yield _take_rows(joined, slice(0, RUN))
+            waiting = [_take_rows(joined, slice(RUN, n_rows))]
+    yield from [_join_blocks(waiting)] if waiting else []
+
+
+def _join_blocks(blocks: Sequence[tuple[CityModel, Attributes]]) -> tuple[CityModel, Attributes]:
+    models, names = [model for model, _ in blocks], blocks[0][1].keys()
+    for model, columns in blocks:
+        if columns.keys() != names:
+            raise ValueError(
+                f"blocks with the attributes {sorted(names)} and {sorted(columns)}; expected equal ones"
+            )
+        for name, column in columns.items():
+            if len(column) != len(model):
+                raise ValueError(f"attribute {name!r} has {len(column)} values for {len(model)} buildings")
+    joined = CityModel(
+        polygons=np.concatenate([model.polygons for model in models]),
+        ids=np.concatenate([model.ids for model in models]),
+        numbers=np.concatenate([model.numbers for model in models]),
+        ground=np.concatenate([model.ground for model in models]),
+        roof=np.concatenate([model.roof for model in models]),
+        members=tuple(names for model in models for names in model.members),
+        house=np.concatenate([model.house for model in models]),
+    )
+    return joined, {name: [value for _, columns in blocks for value in columns[name]] for name in names}
+
+
+def _take_rows(block: tuple[CityModel, Attributes], rows: slice) -> tuple[CityModel, Attributes]:
+    model, columns = block
+    taken = CityModel(
+        model.polygons[rows],
+        model.ids[rows],
+        model.numbers[rows],
+        model.ground[rows],
+        model.roof[rows],
+        model.members[rows],
+        model.house[rows],
+    )
+    return taken, {name: column[rows] for name, column in columns.items()}
+
+
 def _objects(
     model: CityModel, columns: Mapping[str, Sequence[object]], geometry: Sequence[object]
-) -> dict[str, dict[str, Any]]:
+) -> Iterator[tuple[str, dict[str, Any]]]:
     """Make the city objects: a building a row, or a part of the house that the row names."""
-    objects: dict[str, dict[str, Any]] = {}
     for i, (name, house) in enumerate(zip(model.ids.tolist(), model.house.tolist(), strict=True)):
         row: dict[str, Any] = {"type": "Building" if name == house else "BuildingPart"}
         row["attributes"] = {key: column[i] for key, column in columns.items()}
         row["geometry"] = geometry[i]
         if name != house:
             row["parents"] = [house]
-            objects.setdefault(house, {"type": "Building", "children": []})["children"].append(name)
-        objects[name] = row
-    return objects
-
-
-def _check(model: CityModel, bounds: Sequence[float]) -> None:
-    names, counts = np.unique(model.ids, return_counts=True)
-    if np.any(counts > 1):
-        i = np.argmax(counts)
-        raise ValueError(f"building {names[i]}: {counts[i]} buildings have this id, at most 1 may")
-    mixed = np.intersect1d(model.ids, model.house[model.ids != model.house])
-    if len(mixed):
-        raise ValueError(f"building {mixed[0]}: is a row and has parts, it may be one of these")
-    if len(bounds) != 6 or not np.all(np.isfinite(bounds)):
-        raise ValueError(f"bounds {tuple(bounds)} must be 6 finite numbers")
+        yield name, row
 
 
 def _columns(model: CityModel, extra: Mapping[str, Sequence[object]]) -> dict[str, list[object]]:
     """Gather the attributes by name, as values that JSON knows."""
-    for name, column in extra.items():
+    for name in extra:
         if name in ATTRIBUTES:
             raise ValueError(f"attribute {name!r} is one of ours; rename the column")
-        if len(column) != len(model):
-            raise ValueError(f"attribute {name!r} has {len(column)} values for {len(model)} buildings")
     own: tuple[Iterable[object], ...] = (
         model.numbers,
         model.ground,
@@ -213,10 +347,10 @@ def _extent(bounds: Sequence[float], points: NDArray[np.floating]) -> list[float
     return [round(float(value), 3) for value in (*low, *high)]
 
 
-def _geometry(solids: Solids) -> list[list[dict[str, Any]]]:
-    """Give the geometry objects of each building: its LoD0 and, if it has a solid, its LoD1.2."""
-    floors, roofs = _surfaces(solids, solids.low), _surfaces(solids, solids.high)
-    walls = solids.walls[:, None].tolist()
+def _geometry(solids: Solids, first: int) -> list[list[dict[str, Any]]]:
+    """Give the geometry of each building, LoD0 and LoD1.2 if it has a solid, on vertices from `first` on."""
+    floors, roofs = _surfaces(solids, solids.low + first), _surfaces(solids, solids.high + first)
+    walls = (solids.walls[:, None] + first).tolist()
     wall_start = solids.ring_start[solids.building_start]
     geometry: list[list[dict[str, Any]]] = []
     for i, (floor, roof) in enumerate(zip(floors, roofs, strict=True)):
@@ -249,7 +383,7 @@ def _solid(floor: list[list[int]], roof: list[list[int]], walls: list[list[list[
     }
 
 
-def _text(document: dict[str, Any]) -> str:
+def _text(document: object) -> str:
     return json.dumps(document, separators=(",", ":"), allow_nan=False)
 
 

@@ -1,0 +1,208 @@
+"""One file of all pieces: the volume mesh and its boundary of a whole region, streamed (step 3.6).
+
+Pieces are files already. Each has a point array of region-wide numbers, by which a vertex that several pieces have
+is written once.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError, OutputError
+from tiler.vtk_files import TETRA
+from tiler.vtk_xml import Sections, Stream, read_data_file, write_data_file
+
+VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide numbers
+CHUNK = 1 << 20  # vertices that are moved at once
+Reader = Callable[[int], dict[str, dict[str, NDArray[Any]]]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """The pieces, one at a time."""
+
+    paths: Sequence[Path]
+    read: Reader
+    width: int
+    n_rows: NDArray[np.int64]  # cells or facets of each
+    n_points: int
+
+
+def write_merged_volume(path: Path, pieces: Sequence[Path]) -> None:
+    """Write one VTU file of many.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it appears whole or not at all. While it is written, coordinates wait in a file beside it.
+    pieces : sequence of at least one Path
+        VTU pieces (`write_vtu`) with the int64 point array `VERTEX_ID`: each number for one place.
+
+    Raises
+    ------
+    InputError
+        If a piece is missing or damaged, lacks the array or a cell array that the first has, or if a number
+        stands for two places.
+    OutputError
+        If the file cannot be written.
+    ValueError
+        If there is no piece.
+
+    Notes
+    -----
+    Vertices are in the order of their numbers, cells piece by piece with their arrays. Memory holds one piece and
+    9 bytes a vertex; coordinates are in a file that the system maps. Each piece is read twice, and again for each
+    of its arrays.
+    """
+    _write(path, pieces, "UnstructuredGrid")
+
+
+def write_merged_boundary(path: Path, pieces: Sequence[Path]) -> None:
+    """Write one VTP file of many; see `write_merged_volume`.
+
+    Notes
+    -----
+    Only the vertices of facets are written, in the order of their numbers, which become the array ``vertex``: the
+    vertices of the merged volume.
+    """
+    _write(path, pieces, "PolyData")
+
+
+def _write(path: Path, pieces: Sequence[Path], kind: str) -> None:
+    if not pieces:
+        raise ValueError("a merged file needs at least one piece")
+    try:
+        with TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
+            _write_file(path, kind, *_gather(pieces, kind, Path(folder)))
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
+        ) from error
+
+
+def _write_file(
+    path: Path, kind: str, source: _Source, numbers: NDArray[np.int64], xyz: NDArray[np.float64]
+) -> None:
+    rows = [_connectivity(source, kind, numbers), _offsets(source)]
+    arrays = source.read(0)["CellData"]
+    n_rows = int(source.n_rows.sum())
+    sections: Sections = {
+        "Points": [_flat("Points", xyz.reshape(-1), 3)],
+        "Cells" if kind == "UnstructuredGrid" else "Polys": rows,
+        "PointData": [],
+        "CellData": [_cell_array(source, name, array) for name, array in arrays.items()],
+    }
+    if kind == "UnstructuredGrid":
+        rows.append(Stream("types", np.dtype(np.uint8), 1, n_rows, lambda i, j: np.full(j - i, TETRA, np.uint8)))
+        counts = {"NumberOfPoints": len(xyz), "NumberOfCells": n_rows}
+    else:
+        sections["PointData"].append(_flat("vertex", numbers, 1))
+        counts = {"NumberOfPoints": len(xyz), "NumberOfVerts": 0, "NumberOfLines": 0}
+        counts |= {"NumberOfStrips": 0, "NumberOfPolys": n_rows}
+    write_data_file(path, kind, counts, sections)
+
+
+def _gather(
+    pieces: Sequence[Path], kind: str, folder: Path
+) -> tuple[_Source, NDArray[np.int64], NDArray[np.float64]]:
+    """Read all pieces once: how many rows each has, which numbers there are, and where these are."""
+    read = _reader(pieces, kind)
+    n_rows, highest = np.empty(len(pieces), np.int64), -1
+    section, width = ("Cells", 4) if kind == "UnstructuredGrid" else ("Polys", 3)
+    for k, piece in enumerate(pieces):
+        sections = read(k)
+        n_rows[k] = len(sections[section]["connectivity"]) // width
+        highest = max(highest, int(_numbers(piece, sections).max(initial=-1)))
+    xyz = np.memmap(folder / "points", np.float64, "w+", shape=(max(highest + 1, 1), 3))
+    seen = np.zeros(highest + 1, np.bool_)
+    for k, piece in enumerate(pieces):
+        sections = read(k)
+        number, points = _numbers(piece, sections), sections["Points"]["Points"]
+        known = seen[number]
+        if (xyz[number[known]] != points[known]).any():
+            raise InputError(f"{piece}: a {VERTEX_ID} stands for two places; run the tile again")
+        xyz[number], seen[number] = points, True
+    numbers = np.flatnonzero(seen)
+    if len(numbers) < len(seen):
+        for i in range(0, len(numbers), CHUNK):
+            chosen = numbers[i : i + CHUNK]
+            xyz[i : i + len(chosen)] = xyz[chosen]
+    return _Source(pieces, read, width, n_rows, len(numbers)), numbers, xyz[: len(numbers)]
+
+
+def _reader(pieces: Sequence[Path], kind: str) -> Reader:
+    @lru_cache(maxsize=1)
+    def read(k: int) -> dict[str, dict[str, NDArray[Any]]]:
+        return read_data_file(pieces[k], kind)
+
+    return read
+
+
+def _numbers(piece: Path, sections: dict[str, dict[str, NDArray[Any]]]) -> NDArray[np.int64]:
+    numbers = sections["PointData"].get(VERTEX_ID)
+    if numbers is None or numbers.dtype != np.int64 or (numbers < 0).any():
+        raise InputError(f"{piece}: has no point array {VERTEX_ID} of numbers from 0 on; run the tile again")
+    return numbers
+
+
+def _flat(name: str, values: NDArray[Any], components: int) -> Stream:
+    return Stream(name, values.dtype, components, len(values), lambda i, j: np.asarray(values[i:j]))
+
+
+def _connectivity(source: _Source, kind: str, numbers: NDArray[np.int64]) -> Stream:
+    section = "Cells" if kind == "UnstructuredGrid" else "Polys"
+
+    def of_piece(k: int) -> NDArray[Any]:
+        sections = source.read(k)
+        number = _numbers(source.paths[k], sections)
+        place = number if len(numbers) == numbers[-1] + 1 else np.searchsorted(numbers, number)
+        flat: NDArray[Any] = place[sections[section]["connectivity"]]
+        return flat
+
+    dtype = np.dtype(np.int32 if source.n_points < 2**31 else np.int64)
+    return _joined("connectivity", dtype, source.n_rows * source.width, of_piece, components=1)
+
+
+def _offsets(source: _Source) -> Stream:
+    n_rows, width = int(source.n_rows.sum()), source.width
+    dtype = np.dtype(np.int32 if n_rows * width < 2**31 else np.int64)
+    return Stream("offsets", dtype, 1, n_rows, lambda i, j: np.arange(i + 1, j + 1) * width)
+
+
+def _cell_array(source: _Source, name: str, first: NDArray[Any]) -> Stream:
+    def of_piece(k: int) -> NDArray[Any]:
+        array = source.read(k)["CellData"].get(name)
+        if array is None or array.dtype != first.dtype or array.shape[1:] != first.shape[1:]:
+            raise InputError(
+                f"{source.paths[k]}: has no array {name!r} like the first piece's; run the tile again"
+            )
+        return array.reshape(-1)
+
+    components = first.shape[1] if first.ndim == 2 else 1
+    return _joined(name, first.dtype, source.n_rows * components, of_piece, components=components)
+
+
+def _joined(
+    name: str,
+    dtype: np.dtype[Any],
+    n_items: NDArray[np.int64],
+    of_piece: Callable[[int], NDArray[Any]],
+    *,
+    components: int,
+) -> Stream:
+    """Make a stream of the numbers of all pieces, one piece in memory."""
+    start = np.concatenate(([0], np.cumsum(n_items)))
+    cached = lru_cache(maxsize=1)(of_piece)
+
+    def items(i: int, j: int) -> NDArray[Any]:
+        low, high = np.searchsorted(start, i, "right") - 1, np.searchsorted(start, j, "left")
+        parts = [cached(k)[max(i - start[k], 0) : j - start[k]] for k in range(int(low), int(high))]
+        return np.concatenate(parts) if parts else np.empty(0, dtype)
+
+    return Stream(name, dtype, components, int(start[-1]), items)
