@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.building_facts import fidelity_table
-from pipeline.columns import expand_cells, split_boundary
+from pipeline.columns import drop_points, expand_cells, find_used_points, split_boundary
 from pipeline.errors import GeometryError
 from pipeline.histograms import (
     QUALITY_BINS,
@@ -91,10 +91,13 @@ def write_piece(task: Task) -> Facts:
     )
     cells = expand_cells(mesh)
     boundary, shared = split_boundary(mesh, numbers, task.context.bounds, edges)
-    point_number = _number_points(task, mesh, grid, key)
+    seams = _digest_seams(mesh, cells.points, shared, arrays["edge"], arrays["edge_seam"], key)
+    # A column of a seam has levels that only the tile beyond uses, below a roof whose wall is the seam.
+    used = find_used_points(mesh)
+    cells, boundary = drop_points(cells, boundary, used)
     out = Path(task.context.out)
     with task.step("3.6 write pieces"):
-        number = {"vertex_id": point_number}
+        number = {"vertex_id": _number_points(task, mesh, grid, key)[used]}
         write_vtu(out / "mesh" / f"{task.name}.vtu", cells, point_data=number)
         write_vtp(out / "boundary" / f"{task.name}.vtp", cells.points, boundary, point_data=number)
     with task.step("3.6 measure cells"):
@@ -103,7 +106,7 @@ def write_piece(task: Task) -> Facts:
         task.put(**{name: histogram.counts, f"{name}_range": _range(histogram)})
     return {
         "counts": {"cells": len(cells.cells), "facets": len(boundary.facets), "seam faces": len(shared)},
-        "seams": _digest_seams(mesh, cells.points, shared, arrays["edge"], arrays["edge_seam"], key),
+        "seams": seams,
     }
 
 
