@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-long lint bench quality clean
+.PHONY: demo test test-long lint bench bench-tiles quality clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("citystitch needs Python 3.11 or newer, this is " + sys.version) if sys.version_info < (3, 11) else None'
@@ -29,6 +29,9 @@ lint: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.bench
+
+bench-tiles: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.tiles
 
 quality: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.quality

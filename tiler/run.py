@@ -28,7 +28,7 @@ from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
 from tiler.summary import summarise_run
-from tiler.task import Record
+from tiler.task import Record, peak_memory
 from tiler.vtk_files import write_pvtp, write_pvtu
 
 SCHEMA = 1  # version of run.json's layout
@@ -105,6 +105,7 @@ def _mesh_region(config: Config, out: Path, plan: Plan, announce: Announce | Non
         layer_height_or_default=config.layer_height_or_default,
         footprints_identity=identify(footprints) if footprints else "",
     )
+    steps = _Steps(announce)
     with _executor(config) as executor:
         engine = Engine(
             out / "store.zarr",
@@ -112,13 +113,14 @@ def _mesh_region(config: Config, out: Path, plan: Plan, announce: Announce | Non
             parameters=parameters,
             context=context,
             executor=executor,
-            progress=_Steps(announce),
+            progress=steps,
         )
         rounds = run_stages(engine, config)
     tiles = sorted(plan.layout.tiles)
     write_pvtu(out / "mesh.pvtu", [out / "mesh" / f"{tile}.vtu" for tile in tiles])
     write_pvtp(out / "boundary.pvtp", [out / "boundary" / f"{tile}.vtp" for tile in tiles])
-    return summarise_run(engine, plan, config, rounds)
+    summary = summarise_run(engine, plan, config, rounds)
+    return summary | {"finished": steps.finished, "driver_memory_bytes": peak_memory()}
 
 
 def run_stages(engine: Engine, config: Config) -> int:
@@ -168,11 +170,15 @@ class _Steps:
     def __init__(self, announce: Announce | None) -> None:
         self._announce = announce
         self._seconds: defaultdict[str, float] = defaultdict(float)
+        self._begin = time.perf_counter()
+        self.finished: dict[str, float] = {}
 
     def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
         self._seconds[stage] += record.seconds.get("all", 0.0)
-        if done == total and self._announce is not None:
-            self._announce(f"{stage} ({total})", self._seconds[stage])
+        if done == total:
+            self.finished[stage] = round(time.perf_counter() - self._begin, 3)
+            if self._announce is not None:
+                self._announce(f"{stage} ({total})", self._seconds[stage])
 
 
 def _check_folder(out: Path, *, overwrite: bool) -> list[str]:
