@@ -17,7 +17,7 @@ from tiler.task import Record, read_notes
 EXIT_DONE, EXIT_INCOMPLETE = 0, 3
 # Notes of these kinds say that something is missing which the input has: the exit code tells.
 INCOMPLETE = {"building-lost", "building-points-without-footprints"}
-LISTED = 1000  # notes of a kind that the record lists; the store has all
+LISTED = 10_000  # notes of a kind that the record lists; the store has all
 
 
 def summarise_run(engine: Engine, plan: Plan, config: Config, rounds: int) -> dict[str, Any]:
@@ -147,11 +147,13 @@ def _join_seconds(records: Iterable[Record]) -> dict[str, float]:
 
 
 def group_notes(notes: Sequence[Note]) -> dict[str, dict[str, Any]]:
-    """Group notes by kind, with their number and their places, for the record."""
+    """Group notes by kind, with their number and the places of the first `LISTED` of each, for the record."""
     kinds: dict[str, dict[str, Any]] = {
         kind: {"count": number, "items": []} for kind, number in count_notes(notes).items()
     }
     for note in notes:
+        if len(kinds[note.kind]["items"]) == LISTED:
+            continue
         item: dict[str, Any] = {"subject": note.subject, "detail": note.detail}
         if not math.isnan(note.x):
             item |= {"x": round(note.x, 3), "y": round(note.y, 3)}
