@@ -108,7 +108,7 @@ def fidelity_row(title: str, record: dict[str, Any], out: Path) -> str:
 def quality_row(title: str, record: dict[str, Any]) -> str:
     """One line of a quality table."""
     ratio, angle = (record["quality"][name] for name in ("radius_ratio", "min_dihedral"))
-    seconds = record["seconds"]["3.1 plane mesh"] + record["seconds"]["3.2-3.5 columns"]
+    seconds = record["seconds"]["seams"] + record["seconds"]["columns"]
     cells = record["counts"]["cells"]
     return (
         f"| {title} | {cells / 1e6:.2f} M | {' / '.join(f'{ratio[p]:.3f}' for p in PERCENTILES)} "
