@@ -128,9 +128,7 @@ def test_a_region_without_buildings_has_a_valid_model(tmp_path: Path) -> None:
     assert len(read_city_model(tmp_path / "o" / CITY_MODEL)) == 0
 
 
-def test_buildings_of_few_tiles_are_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No read of buildings keeps more than the tiles of a cell; most tiles are read once for that."""
-    town = make_town(180)
+def test_a_tile_stays_while_the_next_cell_needs_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reads: list[str] = []
     plain = Store.read
 
@@ -139,9 +137,8 @@ def test_buildings_of_few_tiles_are_held(tmp_path: Path, monkeypatch: pytest.Mon
         return plain(store, stage, name, names=names)
 
     monkeypatch.setattr(Store, "read", count)
-    write_tiled(tmp_path / "o", town, 700.0)
-    occupied = len(set(reads))
-    assert 40 < occupied <= len(reads) < 2.5 * occupied
+    write_tiled(tmp_path / "o", make_town(90), 6000.0)
+    assert reads == ["0_0"]
 
 
 def rename(town: Buildings, old: str, new: str) -> Buildings:
