@@ -23,6 +23,7 @@ from tiler.tables import (
     unpack_polygons,
 )
 from tiler.task import Task
+from tiler.written import FILES, file_sizes
 
 FULL_CITY_MODEL = "citymodel-full.city.json"
 CITY_MODEL = "citymodel.city.json"
@@ -32,8 +33,8 @@ CELL = 1024.0  # side of the cells that buildings are sorted by (m), in the CRS
 def city_model_stages() -> list[Stage]:
     """Stages that write the city models."""
     return [
-        Stage("citymodel-full", Scope.REGION, write_full_model, (Read("houses"),), version=2),
-        Stage("citymodel", Scope.REGION, write_simple_model, (Read("model"),), version=2),
+        Stage("citymodel-full", Scope.REGION, write_full_model, (Read("houses"),)),
+        Stage("citymodel", Scope.REGION, write_simple_model, (Read("model"),)),
     ]
 
 
@@ -103,9 +104,10 @@ def _write(task: Task, stage: str, prefix: str, file: str) -> Facts:
     xmin, ymin, xmax, ymax = task.context.bounds
     blocks = ((part.model, _tell(part)) for part in _by_cell(task, stage, prefix, survey))
     bounds = (xmin, ymin, survey.low, xmax, ymax, survey.high)
+    out = Path(task.context.out)
     with task.step("write"):
-        task.notes(write_city_blocks(Path(task.context.out) / file, blocks, crs=task.context.crs, bounds=bounds))
-    return {"n": len(survey.number)}
+        task.notes(write_city_blocks(out / file, blocks, crs=task.context.crs, bounds=bounds))
+    return {"n": len(survey.number), FILES: file_sizes(out, [out / file])}
 
 
 def _survey(task: Task, stage: str, prefix: str) -> _Survey:
