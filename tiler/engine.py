@@ -65,6 +65,8 @@ class Engine:
         Where tasks run, see `tiler.executors`.
     window : int, optional
         Largest number of tasks in flight; 4 a worker and at least 8 by default.
+    folder : Path, optional
+        Where the files are that results state as the fact ``"files"``, sizes by path; beside the store by default.
     progress : callable, optional
         Called with stage, number of items done, number of items in all, and the record of each item.
 
@@ -83,6 +85,7 @@ class Engine:
         context: Any = None,
         executor: Executor,
         window: int | None = None,
+        folder: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
         self.store = Store(store_path)
@@ -90,6 +93,7 @@ class Engine:
         self.records: dict[tuple[str, str], Record] = {}
         self._parameters, self._context = parameters, context
         self._executor, self._progress = executor, progress
+        self._folder = store_path.parent if folder is None else folder
         self._window = max(PER_WORKER * executor.workers, LEAST_WINDOW) if window is None else window
         if self._window < 1:
             raise ValueError(f"window {self._window}, expected 1 or more")
@@ -133,6 +137,16 @@ class Engine:
         finally:
             for planned in plan:
                 self._items[planned.stage.name] = (planned.stage.scope, self._recorded(planned))
+
+    def prune(self) -> None:
+        """Remove from the store what this engine has no record of: results of stages and items of another run."""
+        kept = {stage for stage, _ in self.records}
+        for stage in self.store.stages():
+            if stage not in kept:
+                self.store.remove(stage)
+            for name in self.store.names(stage):
+                if (stage, name) not in self.records:
+                    self.store.remove(stage, name)
 
     def _recorded(self, planned: "_Planned") -> Items:
         """Keep of the items those that have a record, which are all unless the run failed."""
@@ -225,7 +239,7 @@ class _Run:
             raise
 
     def _begin(self, ticket: int) -> None:
-        """Take an earlier result with the same key, or submit the task."""
+        """Take an earlier result with the same key, or submit the task; what it reads counts by its content."""
         engine, planned = self.engine, self.plan[self.rank[ticket]]
         stage, item = planned.stage, ticket - planned.first
         name = planned.items.names[item]
@@ -233,9 +247,11 @@ class _Run:
         path, identity = file_identity(engine.layout, stage.scope, name)
         xmin, ymin, xmax, ymax = planned.items.boxes[item].tolist()
         box = (xmin, ymin, xmax, ymax)
-        keys = ((source, [(n, engine.records[source, n].key) for n in names]) for source, names in refs.items())
-        key = item_key(planned.digest, name, box, identity, keys)
-        record = reuse(engine.store, stage.name, name, key)
+        found = (
+            (source, [(n, engine.records[source, n].digest) for n in names]) for source, names in refs.items()
+        )
+        key = item_key(planned.digest, name, box, identity, found)
+        record = reuse(engine.store, stage.name, name, key, folder=engine._folder)
         if record is not None:
             self._end(ticket, record)
             return

@@ -1,4 +1,4 @@
-"""Content keys: a hash of all that a result depends on, so that resume and partial rebuild are one mechanism."""
+"""Keys: a hash of all that a result depends on, so that resume and partial rebuild are one mechanism."""
 
 import dataclasses
 import hashlib
@@ -60,7 +60,8 @@ def item_key(
     identity : str
         Identity of the file, for the scope FILE; else empty.
     refs : iterable
-        For each stage that is read, in a fixed order, its name, and name and key of each result, in a fixed order.
+        For each stage that is read, in a fixed order, its name, and name and digest of each result, in a fixed
+        order. A result that was computed anew and came out the same changes no key.
 
     Returns
     -------

@@ -11,7 +11,7 @@ from pipeline.errors import ConfigError, InputError
 from stitch.grid import TileGrid, make_grid, tile_keys
 from tiler.clouds import CloudHeader, find_clouds, read_header
 from tiler.config import Config, idle_parameters
-from tiler.context import choose_tiles, make_layout
+from tiler.context import choose_tiles, make_layout, pack_tiles
 from tiler.crs import resolve_crs
 from tiler.region import Region, check_region, choose_bounds, describe_overhang
 from tiler.stage import FileItem, Layout
@@ -87,7 +87,9 @@ def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
         messages.append("no footprints given: the mesh has terrain only")
     for message in messages:
         say(message)
-    layout = make_layout(grid, file_items(clouds), identity=region.crs)
+    # Which tiles are absent shows in the results of those beside them.
+    identity = f"{region.crs} {pack_tiles(grid).hex()}"
+    layout = make_layout(grid, file_items(clouds), identity=identity)
     return Plan(region, headers, messages, unreadable, grid, layout)
 
 

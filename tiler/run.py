@@ -2,12 +2,10 @@
 
 import dataclasses
 import json
-import os
 import platform
-import shutil
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,10 +18,12 @@ from tiler.config import Config
 from tiler.context import RunContext, pack_tiles
 from tiler.engine import Engine
 from tiler.executors import Executor, connect, local, serial
+from tiler.out_folder import check_folder, clear_folder, only_run, remove_strangers
+from tiler.own_stages import OwnStages, check_own, run_own_stages
 from tiler.planning import Plan, identify, make_plan
-from tiler.stage import REGION_ITEM
+from tiler.stage import REGION_ITEM, Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
-from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL, city_model_stages
+from tiler.stages.citymodel import city_model_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
@@ -32,14 +32,17 @@ from tiler.task import Record, peak_memory
 from tiler.vtk_files import write_pvtp, write_pvtu
 
 SCHEMA = 1  # version of run.json's layout
-# What a run writes, and all that --overwrite removes.
-RESULTS = ("run.json", CITY_MODEL, FULL_CITY_MODEL, "mesh.pvtu", "boundary.pvtp", "mesh", "boundary", "store.zarr")
 LIBRARIES = ("citystitch", "numpy", "scipy", "shapely", "numba", "triangle", "laspy", "lazrs", "pyogrio", "pyproj")
 Announce = Callable[[str, float], None]
 
 
 def run(
-    config: Config, *, announce: Announce | None = None, say: Callable[[str], None] | None = None
+    config: Config,
+    *,
+    announce: Announce | None = None,
+    say: Callable[[str], None] | None = None,
+    stages: Sequence[Stage] = (),
+    parameters: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -51,6 +54,10 @@ def run(
         Called with the name of each stage and the seconds of all its items when it is done.
     say : callable, optional
         Called with sentences that the user should read.
+    stages : sequence of Stage, optional
+        Further stages, run after ours; they may read these and each other.
+    parameters : mapping, optional
+        Parameters that further stages declare, besides those of `config`.
 
     Returns
     -------
@@ -61,11 +68,32 @@ def run(
     ------
     CityError
         If nothing could be made of the input; ``run.json`` then says so.
+    ValueError
+        If a further stage has the name of one of ours, or a further parameter that of one of `config`.
+
+    Notes
+    -----
+    A folder that holds an unfinished run is gone on with: what is in its store already, and has the same key, is
+    not computed again. Results are the same as without the interruption, byte for byte.
     """
     if not config.pointcloud:
         raise ConfigError("no point cloud: give files, globs or folders, as in `citystitch run tiles/*.laz`")
     out = Path(config.out)
-    earlier = _check_folder(out, overwrite=config.overwrite)
+    own = check_own(config, stages, parameters)
+    check_folder(out, overwrite=config.overwrite)
+    with only_run(out):
+        earlier = check_folder(out, overwrite=config.overwrite)
+        return _run(config, out, earlier, own, announce, say or _silent)
+
+
+def _run(
+    config: Config,
+    out: Path,
+    earlier: list[str],
+    own: OwnStages,
+    announce: Announce | None,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
     start = time.perf_counter()
     record: dict[str, Any] = {
         "schema": SCHEMA,
@@ -75,11 +103,11 @@ def run(
     }
     try:
         # Nothing of an earlier run is touched before the inputs are known to be there.
-        plan = make_plan(config, say or _silent)
-        _clear_folder(out, earlier)
+        plan = make_plan(config, say)
+        clear_folder(out, earlier, overwrite=config.overwrite)
         earlier = []
         _write_record(out, record)
-        record |= _mesh_region(config, out, plan, announce)
+        record |= _mesh_region(config, out, plan, own, announce)
         record["status"] = "done"
     except CityError as error:
         record |= {"status": "failed", "error": str(error)}
@@ -94,7 +122,9 @@ def run(
     return record
 
 
-def _mesh_region(config: Config, out: Path, plan: Plan, announce: Announce | None) -> dict[str, Any]:
+def _mesh_region(
+    config: Config, out: Path, plan: Plan, own: OwnStages, announce: Announce | None
+) -> dict[str, Any]:
     """Run all stages, and write the indexes of their pieces."""
     context = RunContext(
         plan.region.bounds, plan.region.crs, config.tile_size, config.mesh_size, pack_tiles(plan.grid), str(out)
@@ -102,6 +132,7 @@ def _mesh_region(config: Config, out: Path, plan: Plan, announce: Announce | Non
     footprints = Path(config.footprints) if config.footprints else None
     parameters = SimpleNamespace(
         **dataclasses.asdict(config),
+        **own.parameters,
         layer_height_or_default=config.layer_height_or_default,
         footprints_identity=identify(footprints) if footprints else "",
     )
@@ -116,6 +147,9 @@ def _mesh_region(config: Config, out: Path, plan: Plan, announce: Announce | Non
             progress=steps,
         )
         rounds = run_stages(engine, config)
+        run_own_stages(engine, own)
+    engine.prune()
+    remove_strangers(out, plan.layout.tiles)
     tiles = sorted(plan.layout.tiles)
     write_pvtu(out / "mesh.pvtu", [out / "mesh" / f"{tile}.vtu" for tile in tiles])
     write_pvtp(out / "boundary.pvtp", [out / "boundary" / f"{tile}.vtp" for tile in tiles])
@@ -179,45 +213,6 @@ class _Steps:
             self.finished[stage] = round(time.perf_counter() - self._begin, 3)
             if self._announce is not None:
                 self._announce(f"{stage} ({total})", self._seconds[stage])
-
-
-def _check_folder(out: Path, *, overwrite: bool) -> list[str]:
-    """Refuse an output folder that holds something to keep; returns the results that may be replaced."""
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"{out}: is a file; give another --out")
-    earlier = [name for name in RESULTS if (out / name).exists()]
-    if earlier and not (out / "run.json").is_file():
-        raise ConfigError(f"{out}: holds {', '.join(earlier)}, but no run.json of a run; give another --out")
-    if earlier and not overwrite and not _has_failed(out / "run.json"):
-        raise ConfigError(
-            f"{out}: holds the results of another run ({', '.join(earlier)}); give another --out, or --overwrite"
-        )
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror}); give another --out") from error
-    if not os.access(out, os.W_OK):
-        raise ConfigError(f"{out}: cannot be written; give another --out")
-    return earlier
-
-
-def _has_failed(path: Path) -> bool:
-    try:
-        return bool(json.loads(path.read_text())["status"] == "failed")
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-
-
-def _clear_folder(out: Path, earlier: Sequence[str]) -> None:
-    """Remove the results of an earlier run and make the folders of this one."""
-    try:
-        for name in earlier:
-            path = out / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-        for folder in ("mesh", "boundary"):
-            (out / folder).mkdir()
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror}); give another --out") from error
 
 
 def _write_record(out: Path, record: dict[str, Any]) -> None:

@@ -2,12 +2,13 @@
 
 A result is a zarr group ``<stage>/<name>``. Arrays above 32 kB are arrays of their own; smaller ones lie in one
 array of bytes, ``_packed``, and if all of them are less than 16 kB, in the group's attributes. These hold what the
-writer gave, ``arrays`` (type and shape of each array and the CRC-32 of the raw bytes of each chunk) and
-``checksum``, the CRC-32 of all other attributes.
+writer gave, ``arrays`` (type and shape of each array and the CRC-32 of the raw bytes of each chunk), ``digest``, a
+hash of the content, and ``checksum``, the CRC-32 of all other attributes.
 """
 
 import base64
 import errno
+import hashlib
 import json
 import os
 import shutil
@@ -35,13 +36,14 @@ from tiler.packing import (
     from_rows,
     pack,
     plain_array,
+    raw_bytes,
     rows_per_chunk,
     unpack,
     verified_chunks,
 )
 
 PACKED = "_packed"
-RESERVED = ("arrays", "checksum")
+RESERVED = ("arrays", "checksum", "digest")
 PARTIAL = ".partial"
 
 
@@ -94,7 +96,7 @@ class Store:
             If it has no array of such a name.
         """
         folder = self.folder(stage, name)
-        table, attributes = _open(folder, stage, name)
+        table, attributes, _ = _open(folder, stage, name)
         wanted = sorted(set(names)) if names is not None else sorted(set(table) - {PACKED})
         entries = {array: _entry(table, array, stage, name) for array in wanted}
         packed = None
@@ -119,7 +121,7 @@ class Store:
             If there is no such array, or not ``0 <= start <= stop <= n_rows``.
         """
         folder = self.folder(stage, name)
-        table, _ = _open(folder, stage, name)
+        table, _, _ = _open(folder, stage, name)
         entry = _entry(table, array, stage, name)
         n_rows = entry["shape"][0] if entry["shape"] else 0
         if not 0 <= start <= stop <= n_rows:
@@ -132,9 +134,14 @@ class Store:
         """Read the attributes of a result and no array; InputError as for `read`."""
         return _open(self.folder(stage, name), stage, name)[1]
 
+    def describe(self, stage: str, name: str) -> tuple[dict[str, Any], str]:
+        """Read the attributes of a result and the digest of its content; InputError as for `read`."""
+        _, attributes, digest = _open(self.folder(stage, name), stage, name)
+        return attributes, digest
+
     def shapes(self, stage: str, name: str) -> dict[str, tuple[int, ...]]:
         """Tell the shape of every array of a result without reading any; InputError as for `read`."""
-        table, _ = _open(self.folder(stage, name), stage, name)
+        table, _, _ = _open(self.folder(stage, name), stage, name)
         return {array: tuple(entry["shape"]) for array, entry in sorted(table.items()) if array != PACKED}
 
     def has(self, stage: str, name: str) -> bool:
@@ -145,6 +152,22 @@ class Store:
         """List the names that have a result of the stage, sorted."""
         folder = self.path / stage
         return sorted(entry.name for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
+
+    def stages(self) -> list[str]:
+        """List the stages that have a folder, sorted."""
+        return sorted(entry.name for entry in self.path.iterdir() if entry.is_dir()) if self.path.is_dir() else []
+
+    def remove(self, stage: str, name: str | None = None) -> None:
+        """Remove a result, or all of a stage; it is gone at once and whole. Nothing happens if it is not there."""
+        folder = self.path / stage if name is None else self.folder(stage, name)
+        gone = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}{PARTIAL}")
+        try:
+            os.replace(folder, gone)
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be removed ({error}); check its permissions") from error
+        shutil.rmtree(gone, ignore_errors=True)
 
     def sweep(self, stage: str) -> None:
         """Remove what killed writers of the stage left behind; no writer may be at work."""
@@ -170,6 +193,7 @@ class Writer:
         self._small: dict[str, NDArray[Any]] = {}
         self._buffers: dict[str, RowBuffer] = {}
         self._table: Table = {}
+        self._hashes: dict[str, hashlib.blake2b] = {}
 
     def __enter__(self) -> Self:
         with self._disk():
@@ -195,7 +219,9 @@ class Writer:
             check_name(name)
             if name in self._small or name in self._table or name in self._buffers:
                 raise ValueError(f"array {name} is written twice")
-            self._put(name, plain_array(name, values))
+            array = plain_array(name, values)
+            self._hash(name, array)
+            self._put(name, array)
 
     def append(self, **arrays: ArrayLike) -> None:
         """Append rows to arrays, which grow chunk by chunk on disk: about 4 MB of each are held in memory.
@@ -217,6 +243,7 @@ class Writer:
                     raise ValueError(f"array {name} is written twice")
                 self._buffers[name] = RowBuffer(name, rows)
             self._buffers[name].add(rows)
+            self._hash(name, rows)
             whole = self._buffers[name].whole_chunks()
             if whole is not None:
                 self._extend(name, whole)
@@ -225,20 +252,28 @@ class Writer:
         """Forget all arrays that were written so far."""
         for name in self._table:
             shutil.rmtree(self._partial / name, ignore_errors=True)
-        self._small, self._buffers, self._table = {}, {}, {}
+        self._small, self._buffers, self._table, self._hashes = {}, {}, {}, {}
 
-    def commit(self, attributes: Mapping[str, Any] | None = None) -> None:
+    def commit(self, attributes: Mapping[str, Any] | None = None, *, apart: Collection[str] = ()) -> str:
         """Make the result visible, in place of an earlier one.
 
         Parameters
         ----------
         attributes : mapping, optional
             Plain JSON values by name, without NaN.
+        apart : collection of str
+            Attributes that are no content: they do not count for the digest.
+
+        Returns
+        -------
+        str
+            Digest of the content, 32 hexadecimal digits: BLAKE2b of name, type, shape and raw bytes of every array
+            and of the attributes. Equal content has equal digests, however it was put.
 
         Raises
         ------
         ValueError
-            If the attributes are no plain JSON, or use the names ``arrays`` or ``checksum``.
+            If the attributes are no plain JSON, or use the names ``arrays``, ``checksum`` or ``digest``.
         OutputError
             If the disk refuses.
         """
@@ -258,11 +293,28 @@ class Writer:
             else:
                 self._create(PACKED, packed)
             self._table |= table
+        digest = self._digest({name: value for name, value in kept.items() if name not in apart})
+        kept["digest"] = digest
         kept["arrays"] = plain_json(self._table)
         kept["checksum"] = _attributes_checksum(kept)
         with self._disk():
             zarr.create_group(str(self._partial), zarr_format=3, attributes=dict(sorted(kept.items())))
             self._replace()
+        return digest
+
+    def _hash(self, name: str, rows: NDArray[Any]) -> None:
+        """Hash the bytes of an array as they come: how rows were cut does not show in them."""
+        if name not in self._hashes:
+            self._hashes[name] = hashlib.blake2b(digest_size=16)
+        self._hashes[name].update(raw_bytes(rows).data)
+
+    def _digest(self, attributes: Mapping[str, Any]) -> str:
+        arrays = [
+            [name, self._table[name]["dtype"], self._table[name]["shape"], found.hexdigest()]
+            for name, found in sorted(self._hashes.items())
+        ]
+        text = json.dumps([arrays, attributes], sort_keys=True)
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def _put(self, name: str, array: NDArray[Any]) -> None:
         if array.nbytes <= PACKED_BYTES or array.ndim == 0:
@@ -347,15 +399,16 @@ def _attributes_checksum(attributes: Mapping[str, Any]) -> int:
     return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
 
 
-def _open(folder: Path, stage: str, name: str) -> tuple[Table, dict[str, Any]]:
-    """Read the table of arrays and the attributes of a result."""
+def _open(folder: Path, stage: str, name: str) -> tuple[Table, dict[str, Any], str]:
+    """Read the table of arrays, the attributes and the digest of a result."""
     with _damage(folder, stage, name, "attributes"):
         group = zarr.open_group(str(folder), mode="r", zarr_format=3, use_consolidated=False)
         attributes: dict[str, Any] = dict(group.attrs.asdict())
         if attributes.pop("checksum") != _attributes_checksum(attributes):
             raise ValueError("checksum of the attributes differs")
         table: Any = attributes.pop("arrays")
-        return table, attributes
+        digest: Any = attributes.pop("digest")
+        return table, attributes, digest
 
 
 def _entry(table: Table, array: str, stage: str, name: str) -> dict[str, Any]:

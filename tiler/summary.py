@@ -67,6 +67,7 @@ def summarise_run(engine: Engine, plan: Plan, config: Config, rounds: int) -> di
         "counts": _join_counts(engine, plan, rounds),
         "quality": report["quality"],
         "fidelity": report["fidelity"] | ({"outline": outline} if outline else {}),
+        "reused": dict(sorted(Counter(record.stage for record in records.values() if record.reused).items())),
         "seconds": _join_seconds(records.values()),
         "peak_memory_bytes": max(record.peak_memory for record in records.values()),
         "messages": list(plan.messages),

@@ -18,6 +18,7 @@ from pipeline.errors import CityError
 from pipeline.notes import Note, count_notes
 from tiler.stage import Box, Facts, Scope
 from tiler.store import Store, Writer, plain_json
+from tiler.written import FILES, check_files, files_are_there
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,9 @@ class Record:
     Attributes
     ----------
     stage, name, key : str
-        Which result, and its content key.
+        Which result, and the key of all that it depends on.
+    digest : str
+        Digest of its content: arrays, facts and notes.
     facts : dict
         What the stage's function gave back.
     notes : dict of str to int
@@ -65,6 +68,7 @@ class Record:
     stage: str
     name: str
     key: str
+    digest: str
     facts: Facts
     notes: dict[str, int]
     seconds: dict[str, float] = field(default_factory=dict)
@@ -126,7 +130,7 @@ class Task:
     refs : dict of str to tuple of str
         Items to read by stage, sorted.
     key : str
-        Content key of the result.
+        Key of all that the result depends on.
     """
 
     stage: str
@@ -219,10 +223,11 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
     """
     start = time.perf_counter()
     try:
+        _drop_stale(task)
         with task.store.writer(task.stage, task.name) as task._writer:
             facts = _plain_facts(task, function(task))
             notes = [_note_to_json(note) for note in task._notes]
-            task._writer.commit({"key": task.key, "facts": facts, "notes": notes})
+            digest = task._writer.commit({"key": task.key, "facts": facts, "notes": notes}, apart=("key",))
     except CityError as error:
         return Failure(error)
     except Exception as error:
@@ -231,23 +236,27 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
         task._writer = None
     seconds = {step: round(value, 4) for step, value in task._seconds.items()}
     seconds["all"] = round(time.perf_counter() - start, 4)
+    notes_by_kind = count_notes(task._notes)
     return Record(
-        task.stage, task.name, task.key, facts, count_notes(task._notes), seconds, peak_memory=peak_memory()
+        task.stage, task.name, task.key, digest, facts, notes_by_kind, seconds, peak_memory=peak_memory()
     )
 
 
-def reuse(store: Store, stage: str, name: str, key: str) -> Record | None:
-    """Give the record of a committed result if it has this key; a damaged one counts as none."""
+def reuse(store: Store, stage: str, name: str, key: str, *, folder: Path) -> Record | None:
+    """Give the record of a committed result if it has this key, and its files are below `folder` as it states.
+
+    A damaged result counts as none.
+    """
     if not store.has(stage, name):
         return None
     try:
-        attributes = store.attributes(stage, name)
+        attributes, digest = store.describe(stage, name)
     except CityError:
         return None
-    if attributes.get("key") != key:
+    if attributes.get("key") != key or not files_are_there(folder, attributes["facts"]):
         return None
     notes = count_notes(map(_note_from_json, attributes["notes"]))
-    return Record(stage, name, key, attributes["facts"], notes, reused=True)
+    return Record(stage, name, key, digest, attributes["facts"], notes, reused=True)
 
 
 def read_notes(store: Store, stage: str, name: str) -> list[Note]:
@@ -265,11 +274,27 @@ def peak_memory() -> int:
         return int(peak) if sys.platform == "darwin" else int(peak) * 1024
 
 
+def _drop_stale(task: Task) -> None:
+    """Remove an earlier result that states files before others are written in their place.
+
+    Killed between the files and the commit, a run would otherwise leave a result that states files of another one.
+    """
+    if not task.store.has(task.stage, task.name):
+        return
+    try:
+        stale = FILES in task.store.attributes(task.stage, task.name)["facts"]
+    except CityError:
+        stale = True
+    if stale:
+        task.store.remove(task.stage, task.name)
+
+
 def _plain_facts(task: Task, facts: Facts) -> Facts:
     try:
         plain: Facts = plain_json(dict(facts))
     except (TypeError, ValueError) as error:
         raise ValueError(f"facts of stage {task.stage}: {error}") from error
+    check_files(task.stage, plain)
     return plain
 
 

@@ -35,6 +35,7 @@ from tiler.stages.inputs import halo_of_points
 from tiler.tables import unpack_polygons
 from tiler.task import Result, Task
 from tiler.vtk_files import write_vtp, write_vtu
+from tiler.written import FILES, file_sizes
 
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
 
@@ -98,8 +99,9 @@ def write_piece(task: Task) -> Facts:
     out = Path(task.context.out)
     with task.step("3.6 write pieces"):
         number = {"vertex_id": _number_points(task, mesh, grid, key)[used]}
-        write_vtu(out / "mesh" / f"{task.name}.vtu", cells, point_data=number)
-        write_vtp(out / "boundary" / f"{task.name}.vtp", cells.points, boundary, point_data=number)
+        files = out / "mesh" / f"{task.name}.vtu", out / "boundary" / f"{task.name}.vtp"
+        write_vtu(files[0], cells, point_data=number)
+        write_vtp(files[1], cells.points, boundary, point_data=number)
     with task.step("3.6 measure cells"):
         histograms = quality_histograms(measure_cells(cells))
     for name, histogram in histograms.items():
@@ -107,6 +109,7 @@ def write_piece(task: Task) -> Facts:
     return {
         "counts": {"cells": len(cells.cells), "facets": len(boundary.facets), "seam faces": len(shared)},
         "seams": seams,
+        FILES: file_sizes(out, files),
     }
 
 

@@ -1,0 +1,62 @@
+"""Stages of the user's own in a run: what they may be called, and what they may declare."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tiler.config import Config
+from tiler.engine import Engine
+from tiler.stage import Stage
+from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
+from tiler.stages.citymodel import city_model_stages
+from tiler.stages.inputs import input_stages
+from tiler.stages.mesh import mesh_stages
+from tiler.stages.pieces import piece_stages
+
+DERIVED = ("layer_height_or_default", "footprints_identity")  # parameters that a run adds to those of its Config
+
+
+@dataclass(frozen=True)
+class OwnStages:
+    """Stages and parameters that a run has besides ours.
+
+    Attributes
+    ----------
+    stages : tuple of Stage
+        Run after ours.
+    parameters : mapping
+        What they may declare besides the parameters of the run.
+    """
+
+    stages: tuple[Stage, ...] = ()
+    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, Any] | None) -> OwnStages:
+    """Take stages and parameters of the user's own.
+
+    Raises
+    ------
+    ValueError
+        If a stage has the name of one of ours, or a parameter that of one of the run.
+    """
+    own = OwnStages(tuple(stages), dict(parameters or {}))
+    ours = [*input_stages(config), house_stage(config, 0.0), *first_round(config), shape_stage(0)]
+    ours += [*later_round(config, 1), model_stage(config, 0), *city_model_stages(), *mesh_stages(config)]
+    ours += piece_stages(config)
+    # Rounds of simplification are numbered: near-0, near-1, and so on.
+    names = {stage.name.rstrip("0123456789") for stage in ours}
+    taken = sorted(stage.name for stage in own.stages if stage.name.rstrip("0123456789") in names)
+    if taken:
+        raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")
+    given = {*dataclasses.asdict(config), *DERIVED}
+    clash = sorted(own.parameters.keys() & given)
+    if clash:
+        raise ValueError(f"parameter {', '.join(clash)}: the run has one of this name; name yours otherwise")
+    return own
+
+
+def run_own_stages(engine: Engine, own: OwnStages) -> None:
+    """Run them; all of ours were run."""
+    engine.run(*own.stages)
