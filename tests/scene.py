@@ -4,19 +4,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyvista
 import shapely
 import triangle
 from numpy.typing import NDArray
 from shapely.affinity import rotate, translate
 
+from pipeline.mesh import Boundary, TetMesh
+from tiler.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
+
 # Far from zero, as in a national CRS: single precision has steps of 0.03 m here.
 ORIGIN = np.array([121000.0, 487000.0, 0.0])
+PIECES = ("0_0", "1_0")
 Array = NDArray[Any]
 
 
 def write_scene(directory: Path, *, side: float, n_buildings: int, mesh_size: float) -> None:
-    """Write ``boundary.pvtp`` in two pieces and ``mesh.pvtu`` in one.
+    """Write ``boundary.pvtp`` and ``mesh.pvtu`` in two pieces: a western and an eastern tile's boundary.
 
     Parameters
     ----------
@@ -103,19 +106,19 @@ def boundary(
     facets = np.concatenate([floor, walls, ceiling])
     marker = np.concatenate([np.where(owner < 0, 1, 3), np.full(len(walls), 2), np.full(len(ceiling), 4)])
     number = np.concatenate([owner, house, house, np.full(len(ceiling), -1)])
-    return facets, marker, number, np.arange(len(facets)) % 2
+    east = facets[..., 0].mean(axis=1) > np.ptp(xy[:, 0]) / 2
+    return facets, marker, number, east.astype(np.int64)
 
 
 def write_boundary(directory: Path, facets: Array, marker: Array, number: Array, piece: Array) -> None:
     (directory / "boundary").mkdir()
-    for i in range(2):
+    paths = [directory / "boundary" / f"{name}.vtp" for name in PIECES]
+    for i, path in enumerate(paths):
         mine = facets[piece == i].reshape(-1, 3) + ORIGIN
         points, index = np.unique(mine, axis=0, return_inverse=True)
-        surface = pyvista.PolyData.from_regular_faces(points, index.reshape(-1, 3))
-        surface.cell_data["marker"] = marker[piece == i].astype(np.int32)
-        surface.cell_data["building"] = number[piece == i].astype(np.int64)
-        surface.save(directory / "boundary" / f"{i}.vtp")
-    write_index(directory, "boundary", "PPolyData", ["boundary/0.vtp", "boundary/1.vtp"], ("marker", "building"))
+        marks = marker[piece == i].astype(np.int32), number[piece == i].astype(np.int64)
+        write_vtp(path, points, Boundary(index.reshape(-1, 3).astype(np.int32), *marks))
+    write_pvtp(directory / "boundary.pvtp", paths)
 
 
 def volume(xy: Array, corners: Array, owner: Array, roofs: Array, top: float, *, dz: float) -> tuple[Array, Array]:
@@ -149,26 +152,10 @@ def volume(xy: Array, corners: Array, owner: Array, roofs: Array, top: float, *,
 
 
 def write_volume(directory: Path, points: Array, cells: Array) -> None:
+    """Write two pieces, cells alternately in one and the other: almost every face is one of both."""
     (directory / "mesh").mkdir()
-    grid = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: cells}, points + ORIGIN)
-    grid.save(directory / "mesh" / "0.vtu")
-    write_index(directory, "mesh", "PUnstructuredGrid", ["mesh/0.vtu"], ())
-
-
-def write_index(directory: Path, name: str, kind: str, pieces: list[str], arrays: tuple[str, ...]) -> None:
-    types = {"marker": "Int32", "building": "Int64"}
-    lines = [
-        '<?xml version="1.0"?>',
-        f'<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
-        f'<{kind} GhostLevel="0">',
-        "<PPointData/>",
-        "<PCellData>",
-        *(f'<PDataArray type="{types[array]}" Name="{array}"/>' for array in arrays),
-        "</PCellData>",
-        '<PPoints><PDataArray type="Float64" Name="Points" NumberOfComponents="3"/></PPoints>',
-        *(f'<Piece Source="{piece}"/>' for piece in pieces),
-        f"</{kind}>",
-        "</VTKFile>",
-    ]
-    suffix = {"PPolyData": "pvtp", "PUnstructuredGrid": "pvtu"}[kind]
-    (directory / f"{name}.{suffix}").write_text("\n".join(lines))
+    paths = [directory / "mesh" / f"{name}.vtu" for name in PIECES]
+    for i, path in enumerate(paths):
+        used, index = np.unique(cells[i::2], return_inverse=True)
+        write_vtu(path, TetMesh(points[used] + ORIGIN, index.reshape(-1, 4).astype(np.int32)))
+    write_pvtu(directory / "mesh.pvtu", paths)

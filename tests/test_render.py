@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +15,20 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import ConfigError, InputError, OutputError
-from tests.scene import write_scene
+from pipeline.mesh import Boundary, Marker
+from tests.scene import PIECES, write_scene
+from tiler.picture_data import City, load_air, load_city
 from tiler.picture_parts import (
-    City,
+    TILE_COLOURS,
     _edge_style,
     _skirt,
     add_air,
     add_houses,
     heights_above_ground,
-    load_city,
-    load_volume,
+    tile_colours,
 )
 from tiler.render import SIZES, fit_camera, render_run
+from tiler.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
 
 SIDE = 240.0
 SIZE = (400, 250)
@@ -41,9 +44,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def pictures(run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, NDArray[np.int64]]:
     folder = tmp_path_factory.mktemp("pictures")
-    for what in ("boundary", "mesh"):
+    for what in ("boundary", "mesh", "tiles"):
         render_run(run, folder / f"{what}.png", what=what, size=SIZE)
-    assert sorted(path.name for path in folder.iterdir()) == ["boundary.png", "mesh.png"]
+    assert sorted(path.name for path in folder.iterdir()) == ["boundary.png", "mesh.png", "tiles.png"]
     return {path.stem: pixels(path) for path in folder.iterdir()}
 
 
@@ -56,6 +59,10 @@ def pixels(path: Path) -> NDArray[np.int64]:
     with Image.open(path) as image:
         assert (image.format, image.mode) == ("PNG", "RGB")
         return np.asarray(image).astype(np.int64)
+
+
+def take_facets(boundary: Boundary, kept: NDArray[np.bool_]) -> Boundary:
+    return Boundary(boundary.facets[kept], boundary.marker[kept], boundary.building[kept])
 
 
 def warm(image: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -93,6 +100,17 @@ def test_only_the_mesh_shows_air(pictures: dict[str, NDArray[np.int64]]) -> None
     assert blue(pictures["boundary"]).mean() < 0.002
 
 
+def test_tiles_have_the_same_outlines_in_other_colours(pictures: dict[str, NDArray[np.int64]]) -> None:
+    plain, tiles = pictures["boundary"], pictures["tiles"]
+    skies = [np.abs(image - image[:, :1]).max(axis=2) < 3 for image in (plain, tiles)]
+    assert (skies[0] != skies[1]).mean() < 0.01
+    red, _, blue_ = np.moveaxis(tiles, -1, 0)
+    western, eastern = ~skies[1] & (blue_ > red + 20), ~skies[1] & (red > blue_ + 20)
+    assert min(western.mean(), eastern.mean()) > 0.1
+    # From the south-west, west is left.
+    assert np.nonzero(western)[1].mean() < np.nonzero(eastern)[1].mean() - 0.2 * SIZE[0]
+
+
 def test_the_sky_gets_bluer_upwards_and_nothing_touches_the_frame(
     pictures: dict[str, NDArray[np.int64]],
 ) -> None:
@@ -125,9 +143,9 @@ def test_a_picture_has_a_size_of_its_own(run: Path, tmp_path: Path, monkeypatch:
 
 
 def test_ground_alone_is_a_picture(copy: Path, tmp_path: Path) -> None:
-    for piece in (copy / "boundary").iterdir():
-        surface = pyvista.read(piece)
-        surface.extract_cells(np.flatnonzero(surface["marker"] == 1)).extract_surface(algorithm=None).save(piece)
+    for path in (copy / "boundary").iterdir():
+        part = read_vtp(path)
+        write_vtp(path, part.points, take_facets(part.boundary, part.boundary.marker == Marker.GROUND))
     render_run(copy, tmp_path / "ground.png", size=SIZE)
     image = pixels(tmp_path / "ground.png")
     assert green(image).mean() > 0.03
@@ -158,20 +176,117 @@ def test_the_skirt_hangs_from_the_rim_alone(run: Path) -> None:
     assert skirt.area > 4 * SIDE * 0.015 * SIDE
 
 
+def test_pieces_make_no_difference_but_in_their_names(run: Path, copy: Path) -> None:
+    """A seam leaves no trace in what is drawn: the same vertices and facets as of one piece."""
+    parts = [read_vtp(run / "boundary" / f"{name}.vtp") for name in PIECES]
+    starts = (0, len(parts[0].points))
+    whole = Boundary(
+        np.concatenate([part.boundary.facets + start for part, start in zip(parts, starts, strict=True)]),
+        *(np.concatenate([getattr(part.boundary, name) for part in parts]) for name in ("marker", "building")),
+    )
+    one = copy / "boundary" / "7_7.vtp"
+    write_vtp(one, np.concatenate([part.points for part in parts]), whole)
+    write_pvtp(copy / "boundary.pvtp", [one])
+    city, joined = load_city(run), load_city(copy)
+    assert (city.names, joined.names) == (PIECES, ("7_7",))
+    assert np.bincount(city.piece).min() > 0.3 * len(city.piece)
+    for name in ("points", "facets", "marker", "building", "origin"):
+        assert getattr(city, name).tobytes() == getattr(joined, name).tobytes()
+
+
+def test_more_facets_than_the_bound_are_refused(run: Path) -> None:
+    n = len(load_city(run).facets)
+    assert len(load_city(run, most=n).facets) == n
+    with pytest.raises(InputError, match=rf"after 2 of 2 pieces there are {n} facets to draw, more than {n - 1}"):
+        load_city(run, most=n - 1)
+    with pytest.raises(InputError, match="after 1 of 2 pieces"):
+        load_city(run, most=9)
+
+
+def test_walls_and_ground_of_a_tile_are_paler_than_its_roofs(run: Path) -> None:
+    city = load_city(run)
+    rgb = tile_colours(city)
+    for piece, colour in ((0, "6699cc"), (1, "994455")):
+        full = np.array(list(bytes.fromhex(colour)))
+        for marker, white in ((1, 0.3), (2, 0.6), (3, 0.0)):
+            mine = rgb[(city.piece == piece) & (city.marker == marker)]
+            assert np.all(mine == np.rint(full + white * (255 - full)))
+
+
+def test_tiles_differ_from_the_eight_around_them() -> None:
+    names = [f"{i}_{j}" for i in range(-2, 2) for j in range(3, 6)]
+    n = len(names)
+    facets, marker = np.zeros((n, 3), np.int64), np.full(n, 3, np.int32)
+    rows = np.arange(n)
+    city = City(np.zeros((1, 3)), facets, marker, rows, rows.astype(np.int32), tuple(names), np.zeros(3))
+    rgb = tile_colours(city).reshape(4, 3, 3)
+    for i, j in np.ndindex(4, 3):
+        around = rgb[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2].reshape(-1, 3)
+        assert np.all(around == rgb[i, j], axis=1).sum() == 1
+
+
+@pytest.mark.parametrize("missing", ["none", "red", "green", "blue"])
+def test_tile_colours_are_apart_for_all_eyes(missing: str) -> None:
+    """Machado, Oliveira and Fernandes (2009), full severity: at least 20 steps of CIELAB between any two."""
+    eyes = {
+        "none": np.eye(3).tolist(),
+        "red": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+        "green": [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+        "blue": [[1.256, -0.077, -0.179], [-0.078, 0.931, 0.148], [0.005, 0.691, 0.304]],
+    }
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    srgb = np.array([list(bytes.fromhex(colour[1:])) for row in TILE_COLOURS for colour in row]) / 255
+    linear = ((srgb + 0.055) / 1.055) ** 2.4
+    seen = np.clip(linear @ np.array(eyes[missing]).T, 0, 1)
+    x, y, z = np.cbrt(seen @ to_xyz.T / (to_xyz.sum(axis=1))).T
+    lab = np.column_stack((116 * y, 500 * (x - y), 200 * (y - z)))
+    apart = np.linalg.norm(lab[:, None] - lab, axis=2)[np.triu_indices(len(lab), 1)]
+    assert apart.min() > 20
+
+
+def test_pieces_that_are_no_tiles_are_named(run: Path) -> None:
+    city = replace(load_city(run), names=("west", "1_0"))
+    with pytest.raises(InputError, match="the piece 'west' is not named after a tile"):
+        tile_colours(city)
+
+
 def test_the_cut_keeps_whole_cells_of_the_northern_half(run: Path) -> None:
     city = load_city(run)
     plotter = pyvista.Plotter(off_screen=True)
-    points = add_air(plotter, load_volume(run), city.origin, SIZE)
+    points = add_air(plotter, load_air(run, city.origin), SIZE)
     plotter.close()
     assert -12 < points[:, 1].min() < 0
     assert points[:, 1].max() == pytest.approx(SIDE / 2)
     assert np.ptp(points[:, 0]) == pytest.approx(SIDE)
 
 
+def test_faces_between_pieces_are_not_on_the_cut(run: Path) -> None:
+    """Cells are in one piece and the other in turn: the surface is that of all of them, and closed."""
+    origin = load_city(run).origin
+    air = load_air(run, origin)
+    parts = [read_vtu(run / "mesh" / f"{name}.vtu").mesh for name in PIECES]
+    corners = np.concatenate([part.points[part.cells] for part in parts]) - origin
+    corners = corners[corners[..., 1].mean(axis=1) > 0]
+    faces = np.sort(np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 4), axis=1)
+    faces = np.concatenate([np.delete(faces, k, axis=1) for k in range(4)])
+    assert len(air.facets) == (np.unique(faces, axis=0, return_counts=True)[1] == 1).sum()
+    a, b, c = np.moveaxis(air.points[air.facets], 1, 0)
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])).sum() / 6
+    assert (a * np.cross(b, c)).sum() / 6 == pytest.approx(volume)
+
+
 def test_heights_above_ground_are_those_of_the_building() -> None:
     points = np.array([[0, 0, 1.0], [1, 0, 2.0], [0, 1, 9.0], [1, 1, 9.0], [2, 2, 9.0]])
     facets = np.array([[0, 1, 2], [2, 3, 4], [0, 1, 1]])
-    city = City(points, facets, np.array([2, 3, 1], np.int32), np.array([7, 7, -1]), np.zeros(3))
+    city = City(
+        points,
+        facets,
+        np.array([2, 3, 1], np.int32),
+        np.array([7, 7, -1]),
+        np.zeros(3, np.int32),
+        ("0_0",),
+        np.zeros(3),
+    )
     np.testing.assert_array_equal(heights_above_ground(city), [8, 8, 0])
 
 
@@ -226,7 +341,7 @@ def test_the_camera_just_holds_all_points(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"what": "sunset"}, "picture 'sunset' must be one of boundary, mesh, overview"),
+        ({"what": "sunset"}, "picture 'sunset' must be one of boundary, mesh, overview, tiles"),
         ({"size": (0, 100)}, "size 0 x 100 must be at least 2 x 2"),
     ],
 )
@@ -239,9 +354,9 @@ def test_wrong_arguments(run: Path, tmp_path: Path, options: dict[str, Any], mes
     ("lost", "what", "named"),
     [
         ("boundary.pvtp", "boundary", "boundary.pvtp: no such file"),
-        ("boundary/1.vtp", "boundary", "boundary.pvtp: it or a piece of it is missing"),
+        ("boundary/1_0.vtp", "boundary", r"boundary.pvtp: the piece .*1_0.vtp is missing"),
         ("mesh.pvtu", "mesh", "mesh.pvtu: no such file"),
-        ("mesh/0.vtu", "mesh", "mesh.pvtu: it or a piece of it is missing"),
+        ("mesh/0_0.vtu", "mesh", r"mesh.pvtu: the piece .*0_0.vtu is missing"),
     ],
 )
 def test_a_lost_file_is_named(
@@ -262,7 +377,7 @@ def test_damage_is_named(
     caplog: pytest.LogCaptureFixture,
     damage: str,
 ) -> None:
-    piece = copy / "boundary" / "1.vtp"
+    piece = copy / "boundary" / "1_0.vtp"
     blob = piece.read_bytes()
     if damage == "index":
         (copy / "boundary.pvtp").write_text("<VTKFile")
@@ -272,29 +387,20 @@ def test_damage_is_named(
         piece.write_bytes(blob[: len(blob) // 2] + b"A" * 50 + blob[len(blob) // 2 + 50 :])
     else:
         piece.write_bytes(blob.replace(b'Name="marker"', b'Name="merker"'))
-    with pytest.raises(InputError, match=r"boundary.pvtp: it or a piece of it is missing, damaged"):
+    named = "boundary.pvtp" if damage == "index" else "1_0.vtp"
+    with pytest.raises(InputError, match=rf"{named}: not a file of ours or damaged"):
         render_run(copy, tmp_path / "out.png", size=SIZE)
     assert capfd.readouterr() == ("", "")
     assert caplog.records == []
 
 
-@pytest.mark.parametrize(
-    ("array", "message"),
-    [("building", "need marker and building"), ("marker", "none of [0-9]+ facets is marked as ground")],
-)
-def test_a_boundary_without_marks_is_named(copy: Path, tmp_path: Path, array: str, message: str) -> None:
-    for piece in (copy / "boundary").iterdir():
-        surface = pyvista.read(piece)
-        if array == "building":
-            del surface.cell_data["building"]
-        else:
-            surface["marker"][:] = 3
-        surface.save(piece)
-    if array == "building":
-        index = copy / "boundary.pvtp"
-        lines = index.read_text().splitlines()
-        index.write_text("\n".join(line for line in lines if 'Name="building"' not in line))
-    with pytest.raises(InputError, match=message):
+def test_a_boundary_without_ground_is_named(copy: Path, tmp_path: Path) -> None:
+    for path in (copy / "boundary").iterdir():
+        part = read_vtp(path)
+        write_vtp(
+            path, part.points, replace(part.boundary, marker=part.boundary.marker * 0 + np.int32(Marker.ROOF))
+        )
+    with pytest.raises(InputError, match=r"none of [0-9]+ facets is marked as ground"):
         render_run(copy, tmp_path / "out.png", size=SIZE)
 
 

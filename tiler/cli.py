@@ -1,4 +1,4 @@
-"""The command line: `citystitch run | check | synth | demo | render | config`."""
+"""The command line: `citystitch run | check | synth | demo | render | export | config`."""
 
 import argparse
 import dataclasses
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import CityError, ConfigError
 from tiler.config import Config, annotated_defaults, load_config, make_config
+from tiler.export import FORMATS
 
 if TYPE_CHECKING:
     from tiler.synth import SynthFiles
@@ -94,8 +95,14 @@ def make_parser() -> argparse.ArgumentParser:
     render.add_argument("directory", type=Path, help="folder of a run")
     render.add_argument("-o", "--output", type=Path, required=True, help="PNG file to write")
     render.add_argument(
-        "--what", choices=("boundary", "mesh", "overview"), default="boundary", help="what to draw"
+        "--what", choices=("boundary", "mesh", "overview", "tiles"), default="boundary", help="what to draw"
     )
+    export = command("export", _export, "write the mesh of a run as one file, each vertex once")
+    export.add_argument("directory", type=Path, help="folder of a run")
+    kinds = "; ".join(f"{name}: {kind.description}" for name, kind in FORMATS.items())
+    export.add_argument("--format", choices=tuple(FORMATS), required=True, help=kinds)
+    export.add_argument("-o", "--output", type=Path, required=True, help="file to write")
+    export.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
     command("config", _config, "print all parameters of a run, annotated, as a configuration file")
     return parser
 
@@ -239,6 +246,14 @@ def _render(options: argparse.Namespace) -> int:
     from tiler.render import render_run
 
     render_run(options.directory, options.output, what=options.what)
+    print(options.output)
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    from tiler.export import export_run
+
+    export_run(options.directory, options.output, name=options.format, overwrite=options.overwrite)
     print(options.output)
     return 0
 

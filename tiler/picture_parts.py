@@ -1,8 +1,5 @@
 """What a picture of a run shows: terrain, houses, and the air above them."""
 
-import os
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +7,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.mesh import Marker
+from stitch.grid import Key
+from tiler.context import tile_key
+from tiler.picture_data import Air, City
 
 # Edges are drawn while a triangle has this many pixels in the mean, strongest from four times as many.
 EDGE_PIXELS = 8.0
@@ -27,76 +27,13 @@ GROUND_COLOURS = ("#93ab86", "#b4c3a0", "#d3d3b6", "#e6dfca")
 ROOF_COLOURS = ("#efc294", "#e2935f", "#c9583c", "#93303a")
 AIR_COLOURS = ("#8db8d8", "#b9d4e6", "#e6eff4")
 WALL_COLOURS = ("#fffaf0", "#fffaf0")
+# Neighbouring tiles differ in colour: by odd and even column, then by odd and even row. The four are of Tol's
+# medium contrast; any two of them are apart for eyes that miss one kind of cone too.
+TILE_COLOURS = (("#6699cc", "#eecc66"), ("#994455", "#ee99aa"))
+# How much white is mixed into a tile's colour, so that houses stand out from the ground.
+TILE_WHITE = {Marker.GROUND: 0.3, Marker.WALL: 0.6, Marker.ROOF: 0.0}
 SKIRT_COLOUR = "#c9bfae"
 LINE_COLOUR = "#3c3530"
-
-
-@dataclass(frozen=True, eq=False)
-class City:
-    """The boundary, moved to the origin.
-
-    Attributes
-    ----------
-    points : float64, (n, 3)
-        Vertices (m) from `origin`, each once.
-    facets : int64, (k, 3)
-        Ground, walls and roofs, counter-clockwise seen from the air.
-    marker : int32, (k,)
-        `Marker` of each facet.
-    building : int64, (k,)
-        Number of the building of each facet, -1 on the ground.
-    origin : float64, (3,)
-        Middle of the region, at the height of the lowest ground.
-    """
-
-    points: NDArray[np.float64]
-    facets: NDArray[np.int64]
-    marker: NDArray[np.int32]
-    building: NDArray[np.int64]
-    origin: NDArray[np.float64]
-
-
-def load_city(directory: Path) -> City:
-    """Read ground, walls and roofs from ``boundary.pvtp``; the pieces of tiles are sewn together.
-
-    Raises
-    ------
-    InputError
-        If the file or a piece of it is missing or damaged, or has no ground.
-    """
-    from vtkmodules.vtkIOXML import vtkXMLPPolyDataReader
-
-    path = directory / "boundary.pvtp"
-    surface = _read(vtkXMLPPolyDataReader(), path)
-    if not {"marker", "building"} <= set(surface.cell_data.keys()):
-        raise InputError(f"{path}: arrays {surface.cell_data.keys()}, need marker and building; run again")
-    marker = np.asarray(surface.cell_data["marker"])
-    if not np.any(marker == Marker.GROUND):
-        raise InputError(f"{path}: none of {len(marker)} facets is marked as ground; run again")
-    shown = np.isin(marker, (Marker.GROUND, Marker.WALL, Marker.ROOF))
-    points, facets = _sew(np.asarray(surface.points, dtype=np.float64), surface.regular_faces[shown])
-    low, high = points.min(axis=0), points.max(axis=0)
-    origin = np.array([*(low + high)[:2] / 2, low[2]])
-    return City(
-        points=points - origin,
-        facets=facets[:, ::-1],  # the file's look out of the air, which is where the camera is
-        marker=marker[shown],
-        building=np.asarray(surface.cell_data["building"])[shown],
-        origin=origin,
-    )
-
-
-def load_volume(directory: Path) -> Any:
-    """Read ``mesh.pvtu`` as a pyvista grid.
-
-    Raises
-    ------
-    InputError
-        If the file or a piece of it is missing or damaged.
-    """
-    from vtkmodules.vtkIOXML import vtkXMLPUnstructuredGridReader
-
-    return _read(vtkXMLPUnstructuredGridReader(), directory / "mesh.pvtu")
 
 
 def heights_above_ground(city: City) -> NDArray[np.float64]:
@@ -110,16 +47,36 @@ def heights_above_ground(city: City) -> NDArray[np.float64]:
     return np.where(city.building < 0, 0.0, (top - foot)[row])
 
 
-def add_houses(plotter: Any, city: City, size: tuple[int, int]) -> None:
-    """Add walls, roofs coloured by height above ground, and their outlines."""
+def tile_colours(city: City) -> NDArray[np.uint8]:
+    """Colour facets by tile: walls paler than the ground, roofs in full colour.
+
+    Raises
+    ------
+    InputError
+        If a piece is not named after a tile.
+    """
+    keys = np.array([_read_key(name) for name in city.names])
+    odd, white = (keys % 2)[city.piece], np.zeros(max(Marker) + 1)
+    white[list(TILE_WHITE)] = list(TILE_WHITE.values())
+    colours = np.array([[list(bytes.fromhex(colour[1:])) for colour in row] for row in TILE_COLOURS])
+    share = white[city.marker][:, None]
+    rgb: NDArray[np.uint8] = np.rint(colours[odd[:, 0], odd[:, 1]] * (1 - share) + 255 * share).astype(np.uint8)
+    return rgb
+
+
+def add_houses(plotter: Any, city: City, size: tuple[int, int], *, by_tile: bool = False) -> None:
+    """Add walls, roofs coloured by height above ground or by tile, and their outlines."""
     import pyvista
 
     built = city.marker != Marker.GROUND
     if not np.any(built):
         return
     houses = pyvista.PolyData.from_regular_faces(city.points, city.facets[built])
-    rgb = blend(heights_above_ground(city)[built] / TALL, ROOF_COLOURS)
-    rgb[city.marker[built] == Marker.WALL] = blend(np.zeros(1), WALL_COLOURS)
+    if by_tile:
+        rgb = tile_colours(city)[built]
+    else:
+        rgb = blend(heights_above_ground(city)[built] / TALL, ROOF_COLOURS)
+        rgb[city.marker[built] == Marker.WALL] = blend(np.zeros(1), WALL_COLOURS)
     houses.cell_data["rgb"] = rgb
     plotter.add_mesh(houses, rgb=True, scalars="rgb", **MATT, **_edge_style(len(city.facets), size))
     if houses.n_cells <= OUTLINE_FACETS:
@@ -127,29 +84,33 @@ def add_houses(plotter: Any, city: City, size: tuple[int, int]) -> None:
         plotter.add_mesh(lines, color=LINE_COLOUR, line_width=1.2, opacity=0.8)
 
 
-def add_terrain(plotter: Any, city: City, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Add the ground, shaded by height, and the sides of the block below it; returns their points."""
+def add_terrain(plotter: Any, city: City, size: tuple[int, int], *, by_tile: bool = False) -> NDArray[np.float64]:
+    """Add the ground, coloured by height or by tile, and the sides of the block below it; returns their points."""
     import pyvista
 
-    edges = _edge_style(len(city.facets), size)
-    ground = pyvista.PolyData.from_regular_faces(city.points, city.facets[city.marker == Marker.GROUND]).clean()
-    z = ground.points[:, 2]
-    ground["rgb"] = blend(z / max(float(np.percentile(z, 98)), 1e-9), GROUND_COLOURS)
+    edges, open_ground = _edge_style(len(city.facets), size), city.marker == Marker.GROUND
+    ground = pyvista.PolyData.from_regular_faces(city.points, city.facets[open_ground])
+    if by_tile:
+        ground.cell_data["rgb"] = tile_colours(city)[open_ground]
+    ground = ground.clean()
+    if not by_tile:
+        z = ground.points[:, 2]
+        ground["rgb"] = blend(z / max(float(np.percentile(z, 98)), 1e-9), GROUND_COLOURS)
     plotter.add_mesh(ground, rgb=True, scalars="rgb", smooth_shading=True, **MATT, **edges)
     skirt = _skirt(city)
     plotter.add_mesh(skirt, color=SKIRT_COLOUR, **MATT)
     return np.asarray(skirt.points)
 
 
-def add_air(plotter: Any, grid: Any, origin: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
-    """Add the whole tetrahedra whose middle is in the northern half; returns their points."""
-    grid.points = np.asarray(grid.points, dtype=np.float64) - origin
-    middle = grid.points[grid.cell_connectivity.reshape(-1, 4), 1].mean(axis=1)
-    air = grid.extract_cells(np.flatnonzero(middle > 0)).extract_surface(algorithm=None)
-    z = air.cell_centers().points[:, 2]
-    air.cell_data["rgb"] = blend(z / z.max(), AIR_COLOURS)
-    plotter.add_mesh(air, rgb=True, scalars="rgb", **AIRY, **_edge_style(air.n_cells, size))
-    points: NDArray[np.float64] = np.asarray(air.points)
+def add_air(plotter: Any, air: Air, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Add the surface of the cells behind the cut; returns its points."""
+    import pyvista
+
+    surface = pyvista.PolyData.from_regular_faces(air.points, air.facets).clean()
+    z = surface.cell_centers().points[:, 2]
+    surface.cell_data["rgb"] = blend(z / z.max(), AIR_COLOURS)
+    plotter.add_mesh(surface, rgb=True, scalars="rgb", **AIRY, **_edge_style(surface.n_cells, size))
+    points: NDArray[np.float64] = np.asarray(surface.points)
     return points
 
 
@@ -168,30 +129,11 @@ def blend(share: NDArray[np.float64], colours: tuple[str, ...]) -> NDArray[np.ui
     return rgb
 
 
-def _read(reader: Any, path: Path) -> Any:
-    """Run one of VTK's readers, which tell of damage but go on."""
-    import pyvista
-
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; run citystitch first, or name its output folder")
-    reader.SetFileName(os.fspath(path))
-    with pyvista.VtkErrorCatcher(send_to_logging=False) as catcher:
-        reader.Update()
-    data = pyvista.wrap(reader.GetOutput())
-    if catcher.events or data is None or data.n_cells == 0:
-        raise InputError(f"{path}: it or a piece of it is missing, damaged or empty; run again")
-    return data
-
-
-def _sew(points: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Keep the points that facets use, equal ones once."""
-    used = np.unique(facets)
-    order = used[np.lexsort(points[used].T)]
-    new = np.ones(len(order), dtype=np.bool_)
-    new[1:] = np.any(points[order[1:]] != points[order[:-1]], axis=1)
-    index = np.empty(len(points), dtype=np.int64)
-    index[order] = np.cumsum(new) - 1
-    return points[order[new]], index[facets]
+def _read_key(name: str) -> Key:
+    try:
+        return tile_key(name)
+    except ValueError:
+        raise InputError(f"the piece {name!r} is not named after a tile, as '60_243' is; run again") from None
 
 
 def _skirt(city: City) -> Any:

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError
 from tiler.atomic import replacing
-from tiler.picture_parts import City, add_air, add_houses, add_terrain, load_city, load_volume
+from tiler.picture_data import City, load_air, load_city
+from tiler.picture_parts import add_air, add_houses, add_terrain
 from tiler.plain_picture import PlainPlotter, has_graphics
 
 # Pictures, and their sizes (pixels) where nothing else is asked for.
-SIZES = {"boundary": (1600, 1000), "mesh": (1600, 1000), "overview": (2000, 640)}
+SIZES = {"boundary": (1600, 1000), "mesh": (1600, 1000), "overview": (2000, 640), "tiles": (1600, 1000)}
 # Compass direction that the camera stands in, and its angle over the horizon (degrees).
 VIEW = (215.0, 35.0)
 # The cut through the volume, which looks south, is seen more squarely.
@@ -37,12 +38,13 @@ def render_run(
     Parameters
     ----------
     directory : Path
-        Output of a run: ``boundary.pvtp`` and, except for ``"boundary"``, ``mesh.pvtu``.
+        Output of a run: ``boundary.pvtp`` and, for ``"mesh"`` and ``"overview"``, ``mesh.pvtu``.
     output : Path
         The PNG file; it appears whole or not at all.
     what : str
         ``"boundary"``: terrain and houses from the south-west. ``"mesh"``: the same, and behind a cut
         through the middle the tetrahedra of the northern half. ``"overview"``: both side by side.
+        ``"tiles"``: as ``"boundary"``, but coloured by tile: neighbours differ.
     size : (int, int), optional
         Width and height (pixels); 1600 x 1000, for the overview 2000 x 640.
 
@@ -55,7 +57,8 @@ def render_run(
     OutputError
         If the picture cannot be written.
     InputError
-        If a file of the run is missing, damaged, or has no ground.
+        If a file of the run is missing, damaged, or has no ground; if there are more facets than a picture may
+        have (`tiler.picture_data.MOST_FACETS`); if, for ``"tiles"``, a piece is not named after a tile.
 
     Notes
     -----
@@ -138,12 +141,9 @@ def _draw(pv: ModuleType, directory: Path, city: City, what: str, size: tuple[in
     plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
     try:
         plotter.set_background(SKY[0], top=SKY[1])
-        add_houses(plotter, city, size)
-        shown = [city.points, add_terrain(plotter, city, size)]
-        if what == "mesh":
-            shown.append(add_air(plotter, load_volume(directory), city.origin, size))
+        shown = _add_parts(plotter, directory, city, what, size)
         _light(pv, plotter)
-        _aim(plotter, *_camera(np.vstack(shown), what, size))
+        _aim(plotter, *_camera(shown, what, size))
         extent = float(np.ptp(city.points[:, :2], axis=0).max())
         plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=128)
         plotter.enable_anti_aliasing("ssaa")
@@ -155,12 +155,19 @@ def _draw(pv: ModuleType, directory: Path, city: City, what: str, size: tuple[in
 
 def _draw_plainly(directory: Path, city: City, what: str, size: tuple[int, int]) -> NDArray[np.uint8]:
     plotter = PlainPlotter()
-    add_houses(plotter, city, size)
-    shown = [city.points, add_terrain(plotter, city, size)]
-    if what == "mesh":
-        shown.append(add_air(plotter, load_volume(directory), city.origin, size))
-    position, focal = _camera(np.vstack(shown), what, size)
+    shown = _add_parts(plotter, directory, city, what, size)
+    position, focal = _camera(shown, what, size)
     return plotter.paint(position, focal, view_angle=VIEW_ANGLE, size=size, sky=SKY)
+
+
+def _add_parts(plotter: Any, directory: Path, city: City, what: str, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Add what a picture shows; returns the points that it has to hold."""
+    by_tile = what == "tiles"
+    add_houses(plotter, city, size, by_tile=by_tile)
+    shown = [city.points, add_terrain(plotter, city, size, by_tile=by_tile)]
+    if what == "mesh":
+        shown.append(add_air(plotter, load_air(directory, city.origin), size))
+    return np.vstack(shown)
 
 
 def _light(pv: ModuleType, plotter: Any) -> None:

@@ -1,0 +1,183 @@
+"""One file of all tiles, on request: complete, each vertex once, and never over what has to stay."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import OutputError
+from tiler.cli import main
+from tiler.config import make_config
+from tiler.export import export_run
+from tiler.run import run
+from tiler.synth import write_city
+from tiler.vtk_files import read_vtp, read_vtu
+
+
+@pytest.fixture(scope="module")
+def tiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run of a synthetic city on four tiles."""
+    folder = tmp_path_factory.mktemp("export")
+    files = write_city(folder / "city", size=300, buildings=15, density=1.0)
+    run(
+        make_config(
+            {
+                "pointcloud": [str(path) for path in files.clouds],
+                "footprints": str(files.footprints),
+                "out": str(folder / "out"),
+                "tile_size": 150.0,
+                "domain_height": 60.0,
+            }
+        )
+    )
+    return folder / "out"
+
+
+@pytest.fixture
+def copy(tiled: Path, tmp_path: Path) -> Path:
+    """The run without its store, to be damaged."""
+    return shutil.copytree(tiled, tmp_path / "run", ignore=shutil.ignore_patterns("store.zarr"))
+
+
+def read_with_vtk(path: Path) -> Any:
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
+
+    reader = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkXMLUnstructuredGridReader()
+    errors: list[str] = []
+    reader.AddObserver("ErrorEvent", lambda *_: errors.append("error"))
+    reader.SetFileName(str(path))
+    reader.Update()
+    assert not errors
+    return reader.GetOutput()
+
+
+def test_one_file_has_the_counts_of_the_record(tiled: Path, tmp_path: Path) -> None:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    record = json.loads((tiled / "run.json").read_text())
+    assert len(record["tiles"]) == 4
+    for name in ("vtu", "vtp"):
+        command = ["export", str(tiled), "--format", name, "-o", str(tmp_path / f"all.{name}")]
+        assert main(command) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["all.vtp", "all.vtu"]
+    volume, surface = (read_with_vtk(tmp_path / name) for name in ("all.vtu", "all.vtp"))
+    counts = record["counts"]
+    assert (volume.GetNumberOfPoints(), volume.GetNumberOfCells()) == (counts["points"], counts["cells"])
+    assert surface.GetNumberOfCells() == counts["facets"]
+    points = vtk_to_numpy(volume.GetPoints().GetData())
+    assert len(np.unique(points, axis=0)) == len(points)
+    assert np.array_equal(
+        points[vtk_to_numpy(surface.GetPointData().GetArray("vertex"))],
+        vtk_to_numpy(surface.GetPoints().GetData()),
+    )
+
+
+def test_cells_and_marks_are_those_of_the_pieces(tiled: Path, tmp_path: Path) -> None:
+    for name in ("vtu", "vtp"):
+        export_run(tiled, tmp_path / f"all.{name}", name=name)
+    volume, surface = read_vtu(tmp_path / "all.vtu").mesh, read_vtp(tmp_path / "all.vtp")
+    pieces = [read_vtu(path).mesh for path in sorted((tiled / "mesh").iterdir())]
+    corners = np.concatenate([piece.points[piece.cells] for piece in pieces])
+    assert volume.points[volume.cells].tobytes() == corners.tobytes()
+    parts = [read_vtp(path) for path in sorted((tiled / "boundary").iterdir())]
+    corners = np.concatenate([part.points[part.boundary.facets] for part in parts])
+    assert surface.points[surface.boundary.facets].tobytes() == corners.tobytes()
+    for mark in ("marker", "building"):
+        expected = np.concatenate([getattr(part.boundary, mark) for part in parts])
+        assert np.array_equal(getattr(surface.boundary, mark), expected)
+
+
+def test_a_file_is_replaced_on_request_alone(
+    tiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "all.vtp"
+    target.write_text("mine")
+    command = ["export", str(tiled), "--format", "vtp", "-o", str(target)]
+    assert main(command) == 2
+    assert "all.vtp: exists; give another --output, or --overwrite" in capsys.readouterr().err
+    assert target.read_text() == "mine"
+    assert main([*command, "--overwrite"]) == 0
+    assert read_with_vtk(target).GetNumberOfCells() > 0
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("own", ["run.json", "boundary.pvtp", "mesh.pvtu", "mesh", "boundary"])
+def test_files_of_the_run_are_never_replaced(copy: Path, capsys: pytest.CaptureFixture[str], own: str) -> None:
+    target = copy / own
+    target = min(target.iterdir()) if target.is_dir() else target
+    before = target.read_bytes()
+    # By another way to the same file.
+    target = target.parent / ".." / target.parent.name / target.name
+    assert main(["export", str(copy), "--format", "vtu", "-o", str(target), "--overwrite"]) == 2
+    assert "is a file of the run itself" in capsys.readouterr().err
+    assert target.read_bytes() == before
+
+
+def no_record(folder: Path) -> None:
+    (folder / "run.json").unlink()
+
+
+def failed(folder: Path) -> None:
+    (folder / "run.json").write_text(json.dumps({"schema": 1, "status": "failed", "error": "no room"}))
+
+
+def running(folder: Path) -> None:
+    (folder / "run.json").write_text(json.dumps({"schema": 1, "status": "running"}))
+
+
+def unfinished(folder: Path) -> None:
+    record = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(record | {"status": "partial"}))
+
+
+def no_index(folder: Path) -> None:
+    (folder / "mesh.pvtu").unlink()
+
+
+def no_piece(folder: Path) -> None:
+    min((folder / "mesh").iterdir()).unlink()
+
+
+def cut_piece(folder: Path) -> None:
+    piece = max((folder / "mesh").iterdir())
+    piece.write_bytes(piece.read_bytes()[:-5000])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (no_record, "run.json: no such file; run citystitch first"),
+        (failed, "the run failed (no room)"),
+        (running, "the run is running and has no mesh yet"),
+        (unfinished, "the run is 'partial', not 'done'"),
+        (no_index, "mesh.pvtu: cannot be read"),
+        (no_piece, "is missing; run the tile again"),
+        (cut_piece, "not a file of ours or damaged"),
+    ],
+)
+def test_what_is_no_finished_run_is_refused(
+    copy: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    damage: Callable[[Path], None],
+    message: str,
+) -> None:
+    damage(copy)
+    assert main(["export", str(copy), "--format", "vtu", "-o", str(tmp_path / "all.vtu")]) == 1
+    assert message in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_wrong_arguments_and_places(tiled: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="format 'obj' must be one of vtu, vtp"):
+        export_run(tiled, tmp_path / "all.obj", name="obj")
+    with pytest.raises(OutputError, match=r"all.vtu: cannot be written \(No such file or directory\)"):
+        export_run(tiled, tmp_path / "none" / "all.vtu", name="vtu")
+    (tmp_path / "all.vtu").mkdir()
+    with pytest.raises(OutputError, match=r"all.vtu: cannot be written"):
+        export_run(tiled, tmp_path / "all.vtu", name="vtu", overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["all.vtu"]
