@@ -20,7 +20,7 @@ from tiler.config import Config
 from tiler.context import RunContext, pack_tiles
 from tiler.engine import Engine
 from tiler.executors import Executor, connect, local, serial
-from tiler.planning import Plan, identify, make_plan
+from tiler.planning import Plan, check_sources, identify, make_plan
 from tiler.stage import REGION_ITEM
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL, city_model_stages
@@ -62,8 +62,7 @@ def run(
     CityError
         If nothing could be made of the input; ``run.json`` then says so.
     """
-    if not config.pointcloud:
-        raise ConfigError("no point cloud: give files, globs or folders, as in `citystitch run tiles/*.laz`")
+    check_sources(config)
     out = Path(config.out)
     earlier = _check_folder(out, overwrite=config.overwrite)
     start = time.perf_counter()
