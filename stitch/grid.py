@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import starmap
 from typing import NamedTuple
 
 import numpy as np
@@ -85,10 +86,12 @@ def make_grid(bounds: Bounds, *, tile_size: float, mesh_size: float) -> TileGrid
 
 def tile_keys(grid: TileGrid) -> list[Key]:
     """List the tiles, column by column."""
-    i, j = grid.first
-    nx, ny = (len(axis) - 1 for axis in grid.lines)
-    keys = (Key(i + a, j + b) for a in range(nx) for b in range(ny))
-    return [key for key in keys if has_tile(grid, key)]
+    return list(starmap(Key, (np.argwhere(tiles_present(grid)) + grid.first).tolist()))
+
+
+def tiles_present(grid: TileGrid) -> NDArray[np.bool_]:
+    """Tell which tiles there are, by column and row: bool, (nx, ny)."""
+    return np.ones([len(axis) - 1 for axis in grid.lines], np.bool_) if grid.present is None else grid.present
 
 
 def has_tile(grid: TileGrid, tile: Key) -> bool:
@@ -120,11 +123,17 @@ def corner_keys(grid: TileGrid) -> list[Key]:
 
 def seam_keys(grid: TileGrid) -> list[SeamKey]:
     """List all seams that a tile has, those along the region's border included."""
-    last = Key(grid.first.i + len(grid.lines[0]) - 1, grid.first.j + len(grid.lines[1]) - 1)
-    corners = corner_keys(grid)
-    along = [SeamKey(0, i, j) for i, j in corners if i < last.i]
-    seams = along + [SeamKey(1, i, j) for i, j in corners if j < last.j]
-    return [seam for seam in seams if any(has_tile(grid, tile) for tile in tiles_of_seam(seam))]
+    return [
+        SeamKey(axis, i, j)
+        for axis, there in enumerate(seams_present(grid))
+        for i, j in (np.argwhere(there) + grid.first).tolist()
+    ]
+
+
+def seams_present(grid: TileGrid) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Tell which seams have a tile, by column and row of their first corner: (nx, ny + 1) and (nx + 1, ny)."""
+    there = np.pad(tiles_present(grid), 1)
+    return there[1:-1, 1:] | there[1:-1, :-1], there[1:, 1:-1] | there[:-1, 1:-1]
 
 
 def tiles_of_seam(seam: SeamKey) -> tuple[Key, Key]:

@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipeline.errors import CityError, GeometryError, InputError
 from pipeline.notes import Note
 from tiler.engine import Engine
-from tiler.executors import Executor, Serial, connect, local, serial
+from tiler.executors import Executor, Serial, connect, local
 from tiler.keys import item_key, stage_digest
 from tiler.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
 from tiler.store import Store
 from tiler.task import Failure, Record, Task
+from tiler.written import file_sizes
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -261,6 +261,60 @@ def test_a_changed_file_reruns_its_readers_only(serial_run: Engine, tmp_path: Pa
     assert contents(partial.store.path) == contents(whole.store.path)
 
 
+def test_what_comes_out_the_same_makes_nothing_else_run(serial_run: Engine, tmp_path: Path) -> None:
+    """Another file with the same points: it is read, its tiles do not run."""
+    layout = grid_layout()
+    files = dict(layout.files) | {"f2": replace(layout.files["f2"], identity="touched")}
+    shutil.copytree(serial_run.store.path, tmp_path / "store.zarr")
+    again = run_all(make(tmp_path, layout=replace(layout, files=files)))
+    assert rerun(again) == {("ingest", "f2")}
+    assert again.records["ingest", "f2"].key != serial_run.records["ingest", "f2"].key
+    assert again.records["ingest", "f2"].digest == serial_run.records["ingest", "f2"].digest
+
+
+def test_files_beside_the_store_must_be_as_stated(tmp_path: Path) -> None:
+    stages = [Stage("note", Scope.TILE, writes_file), Stage("count", Scope.REGION, seen, (Read("note"),))]
+    engine = make(tmp_path, context=tmp_path)
+    engine.run(*stages)
+    again = make(tmp_path, context=tmp_path)
+    again.run(*stages)
+    assert rerun(again) == set()
+    (tmp_path / "0.0.txt").unlink()
+    (tmp_path / "1.0.txt").write_text("longer than it was")
+    mended = make(tmp_path, context=tmp_path)
+    mended.run(*stages)
+    assert rerun(mended) == {("note", "0.0"), ("note", "1.0")}
+    assert (tmp_path / "1.0.txt").read_text() == "1.0"
+    moved = make(tmp_path, context=tmp_path, folder=tmp_path / "elsewhere")
+    moved.run(*stages)
+    assert {stage for stage, _ in rerun(moved)} == {"note"}
+
+
+def test_a_result_goes_before_its_files_are_written_anew(tmp_path: Path) -> None:
+    """Killed between the files and the commit, a run leaves no result that states files of another one."""
+    engine = make(tmp_path, context=tmp_path)
+    engine.run(Stage("note", Scope.TILE, writes_file))
+    half = make(tmp_path, context=tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        half.run(Stage("note", Scope.TILE, writes_other_file, version=2))
+    assert (tmp_path / "0.0.txt").read_text() == "0,0"
+    again = make(tmp_path, context=tmp_path)
+    again.run(Stage("note", Scope.TILE, writes_file))
+    assert rerun(again) == {("note", "0.0")}
+    assert (tmp_path / "0.0.txt").read_text() == "0.0"
+
+
+def test_results_of_another_run_are_pruned(serial_run: Engine, tmp_path: Path) -> None:
+    shutil.copytree(serial_run.store.path, tmp_path / "store.zarr")
+    store = Store(tmp_path / "store.zarr")
+    store.write("gone", "0.0", {"z": np.arange(3)})
+    store.write("plane", "9.9", {"z": np.arange(3)})
+    engine = run_all(make(tmp_path))
+    engine.prune()
+    assert rerun(engine) == set()
+    assert contents(store.path) == contents(serial_run.store.path)
+
+
 def test_a_moved_file_is_the_same_file(serial_run: Engine, tmp_path: Path) -> None:
     layout = grid_layout()
     files = {name: replace(item, path=f"0{item.path}") for name, item in layout.files.items()}
@@ -422,6 +476,7 @@ def test_wrong_arguments(tmp_path: Path) -> None:
         ("reads", "stage bad reads stage ingest, which it does not declare"),
         ("parameter", "stage bad uses parameter offset, which it does not declare"),
         ("facts", "facts of stage bad"),
+        ("files", "facts of stage bad: 'files' states files that were written"),
         ("reach", "2.2 of source is beyond its reach"),
     ],
 )
@@ -509,6 +564,21 @@ def seen(task: Task) -> Facts:
     return {stage: list(names) for stage, names in task.refs.items()}
 
 
+def writes_file(task: Task) -> Facts:
+    path: Path = task.context / f"{task.name}.txt"
+    path.write_text(task.name)
+    return {"files": file_sizes(task.context, [path])}
+
+
+def writes_other_file(task: Task) -> Facts:
+    (task.context / f"{task.name}.txt").write_text(task.name.replace(".", ","))
+    raise KeyboardInterrupt
+
+
+def odd_files(task: Task) -> Facts:
+    return {"files": 3}
+
+
 def fails(task: Task) -> Facts:
     task.append(points=np.zeros((200_000, 3)))
     if task.name == "1.1":
@@ -562,29 +632,6 @@ MISBEHAVED = {
     "reads": undeclared_read,
     "parameter": undeclared_parameter,
     "facts": odd_facts,
+    "files": odd_files,
     "reach": beyond_reach,
 }
-
-
-# The example of docs/stages.md.
-
-
-def points(task: Task) -> Facts:
-    xyz: NDArray[np.float64] = np.random.default_rng(3).uniform((*task.box[:2], 0), (*task.box[2:], 9), (500, 3))
-    task.put(xyz=xyz, classification=np.where(xyz[:, 2] > 6, 5, 2).astype(np.uint8))
-    return {}
-
-
-def test_the_documented_stage_runs_as_printed(tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "stages.md").read_text()
-    code = page.split("```python\n")[1].split("```")[0]
-    names: dict[str, Any] = {"__name__": "example"}
-    exec(compile(code, "docs/stages.md", "exec"), names)
-    with serial() as executor:
-        engine = make(tmp_path, executor, parameters=names["Parameters"]())
-        engine.run(Stage("points", Scope.TILE, points), names["CANOPY"])
-    for tile in grid_layout().tiles:
-        height = engine.store.read("canopy", tile)[0]["height"]
-        assert height.shape == (5, 5)
-        assert np.nanmax(height) == pytest.approx(engine.records["canopy", tile].facts["highest (m)"])
-        assert 3 < np.nanmax(height) < 9

@@ -253,3 +253,57 @@ def test_a_disk_that_refuses(tmp_path: Path) -> None:
     (tmp_path / "store.zarr").write_text("a file where the folder should be")
     with pytest.raises(OutputError, match="cannot be written"):
         Store(tmp_path / "store.zarr").write("s", "n", {})
+
+
+def digest(store: Store, *, cut: tuple[int, ...] = (), apart: tuple[str, ...] = (), **attributes: Any) -> str:
+    """Digest of a small and a large array, the large one appended in pieces."""
+    with store.writer("s", "n") as writer:
+        for piece in np.split(BIG, cut):
+            writer.append(big=piece)
+        writer.put(small=np.arange(3))
+        found = writer.commit(attributes, apart=apart)
+    assert store.describe("s", "n") == (attributes, found)
+    return found
+
+
+def test_the_digest_tells_content_and_not_how_it_was_put(store: Store) -> None:
+    first = digest(store, size=1.5)
+    assert digest(store, cut=(7, N_CHUNK + 3), size=1.5) == first
+    assert digest(store, size=1.5, key="a", apart=("key",)) == first
+    assert len({first, digest(store, size=1.6), digest(store, size=1.5, key="a")}) == 3
+    store.write("s", "n", {"small": np.arange(3), "big": BIG}, size=1.5)
+    assert store.describe("s", "n")[1] == first
+    others: list[dict[str, NDArray[Any]]] = [
+        {"small": np.arange(3), "big": -BIG},
+        {"small": np.arange(3, dtype=np.int32), "big": BIG},
+        {"small": np.arange(3).reshape(3, 1), "big": BIG},
+        {"little": np.arange(3), "big": BIG},
+        {"small": np.arange(3), "big": np.where(np.arange(len(BIG))[:, None] == 5, 0.0, BIG)},
+    ]
+    digests = []
+    for arrays in others:
+        store.write("s", "n", arrays, size=1.5)
+        digests.append(store.describe("s", "n")[1])
+    assert len({first, *digests}) == len(others) + 1
+
+
+def test_discarded_rows_do_not_count_for_the_digest(store: Store) -> None:
+    with store.writer("s", "n") as writer:
+        writer.append(rows=np.arange(5))
+        writer.discard()
+        writer.append(rows=np.arange(2))
+        found = writer.commit()
+    store.write("s", "other", {"rows": np.arange(2)})
+    assert store.describe("s", "other")[1] == found
+
+
+def test_results_and_stages_are_removed_whole(store: Store) -> None:
+    for stage, name in (("s", "a"), ("s", "b"), ("t", "a")):
+        store.write(stage, name, {"big": BIG})
+    store.remove("s", "a")
+    store.remove("s", "a")
+    assert (store.names("s"), store.stages()) == (["b"], ["s", "t"])
+    store.remove("t")
+    store.remove("none")
+    assert store.stages() == ["s"]
+    assert [path.name for path in store.path.iterdir()] == ["s"]

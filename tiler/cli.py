@@ -1,4 +1,4 @@
-"""The command line: `citystitch run | check | synth | demo | render | export | config`."""
+"""The command line: `citystitch run | plan | check | synth | demo | render | export | config`."""
 
 import argparse
 import dataclasses
@@ -83,6 +83,13 @@ def make_parser() -> argparse.ArgumentParser:
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
     )
     _add_parameters(run)
+    plan = command("plan", _plan, "tell what a run would do and take, without doing it")
+    plan.add_argument(
+        POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
+    )
+    plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
+    plan.add_argument("--picture", type=Path, metavar="FILE.png", help="draw tiles, files and footprints")
+    _add_parameters(plan)
     check = command("check", _check, "prove from the written files that a mesh is right")
     check.add_argument("directory", type=Path, help="folder of a run")
     synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
@@ -176,6 +183,14 @@ def _run_config(config: Config) -> int:
     print_summary(record, Path(config.out))
     code: int = record["exit_code"]
     return code
+
+
+def _plan(options: argparse.Namespace) -> int:
+    from tiler.plan_report import plan_run
+
+    config = make_config(with_file(vars(options)))
+    plan_run(config, json_file=options.json_file, picture=options.picture)
+    return 0
 
 
 def _check(options: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 import zlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import starmap
 
 import numpy as np
 import shapely
@@ -15,13 +16,13 @@ from stitch.grid import (
     TileGrid,
     has_tile,
     make_grid,
-    seam_keys,
-    seam_line,
+    seams_present,
     tile_box,
-    tile_keys,
+    tiles_present,
 )
 from tiler.stage import Box, FileItem, Layout
 
+SHARED = 1e-6  # m that a point cloud must reach into a tile
 AXES = "xy"  # first letter of a seam's name: along which axis it runs
 
 
@@ -57,21 +58,30 @@ class RunContext:
 
 
 def choose_tiles(grid: TileGrid, boxes: list[Box]) -> TileGrid:
-    """Leave out the tiles that share no area with any of the boxes of point clouds."""
-    tree = shapely.STRtree([shapely.box(*box) for box in boxes])
-    keys = tile_keys(grid)
-    tiles = np.array([shapely.box(*tile_box(grid, key)) for key in keys])
-    there = np.unique(tree.query(shapely.buffer(tiles, -1e-6, join_style="mitre"), predicate="intersects")[0])
-    present = np.zeros([len(axis) - 1 for axis in grid.lines], np.bool_)
-    for row in there.tolist():
-        present[keys[row].i - grid.first.i, keys[row].j - grid.first.j] = True
+    """Leave out the tiles that share no area with any of the boxes of point clouds.
+
+    Notes
+    -----
+    The tiles that a box meets are a rectangle of columns and rows; rectangles are laid over each other as the sums
+    of their four corners: O(boxes + tiles).
+    """
+    low, high = np.array(boxes, np.float64).reshape(-1, 2, 2).transpose(1, 2, 0)
+    ends = []
+    for axis, lines in enumerate(grid.lines):
+        first = np.searchsorted(lines[1:] - SHARED, low[axis], side="left")
+        last = np.searchsorted(lines[:-1] + SHARED, high[axis], side="right")
+        ends.append((first, np.maximum(first, last)))
+    corners = np.zeros([len(axis) for axis in grid.lines], np.int64)
+    for a in (0, 1):
+        for b in (0, 1):
+            np.add.at(corners, (ends[0][a], ends[1][b]), 1 if a == b else -1)
+    present = (corners.cumsum(axis=0).cumsum(axis=1) > 0)[:-1, :-1]
     return replace(grid, present=None if present.all() else present)
 
 
 def absent_tiles(grid: TileGrid) -> list[Key]:
     """List the tiles of the region's box that are absent."""
-    every = tile_keys(replace(grid, present=None))
-    return [key for key in every if not has_tile(grid, key)]
+    return list(starmap(Key, (np.argwhere(~tiles_present(grid)) + grid.first).tolist()))
 
 
 def pack_tiles(grid: TileGrid) -> bytes:
@@ -81,10 +91,15 @@ def pack_tiles(grid: TileGrid) -> bytes:
 
 def make_layout(grid: TileGrid, files: dict[str, FileItem], *, identity: str) -> Layout:
     """List the items of a run: files, tiles, and seams with the box of their nominal line."""
+    tiles = np.argwhere(tiles_present(grid))
+    seams: dict[str, Box] = {}
+    for axis, there in enumerate(seams_present(grid)):
+        at = np.argwhere(there)
+        seams |= _named_boxes(grid, AXES[axis], at, at + np.eye(2, dtype=np.int64)[axis])
     return Layout(
         files=files,
-        tiles={tile_name(key): tile_box(grid, key) for key in tile_keys(grid)},
-        seams={seam_name(key): seam_line(grid, key) for key in seam_keys(grid)},
+        tiles=_named_boxes(grid, "", tiles, tiles + 1),
+        seams=seams,
         bounds=grid.bounds,
         identity=identity,
     )
@@ -154,6 +169,14 @@ def region_around(grid: TileGrid, box: Box) -> shapely.Geometry:
     rows = np.flatnonzero((y[1:] >= box[1] - far) & (y[:-1] <= box[3] + far))
     keys = [Key(grid.first.i + int(i), grid.first.j + int(j)) for i in columns for j in rows]
     return shapely.union_all([shapely.box(*tile_box(grid, key)) for key in keys if has_tile(grid, key)])
+
+
+def _named_boxes(grid: TileGrid, prefix: str, low: NDArray[np.int64], high: NDArray[np.int64]) -> dict[str, Box]:
+    """Name the boxes between lines by column and row of their first corner."""
+    x, y = grid.lines
+    names = [f"{prefix}{i}_{j}" for i, j in (low + grid.first).tolist()]
+    sides = (x[low[:, 0]].tolist(), y[low[:, 1]].tolist(), x[high[:, 0]].tolist(), y[high[:, 1]].tolist())
+    return dict(zip(names, zip(*sides, strict=True), strict=True))
 
 
 @lru_cache(maxsize=8)

@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 
 from pipeline.errors import ConfigError, InputError
-from stitch.grid import TileGrid, make_grid, tile_keys
+from stitch.grid import TileGrid, make_grid, tiles_present
 from tiler.clouds import CloudHeader, find_clouds, read_header
 from tiler.config import Config, idle_parameters
 from tiler.context import choose_tiles, make_layout, pack_tiles
@@ -46,6 +46,40 @@ class Plan:
     layout: Layout
 
 
+@dataclass(frozen=True)
+class Survey:
+    """What headers alone tell of a run, before anything is listed by name.
+
+    Attributes
+    ----------
+    region : Region
+        What is meshed.
+    headers : list of CloudHeader
+        All point-cloud files that can be read.
+    clouds : list of CloudHeader
+        Those of them that have points and meet the region.
+    messages : list of str
+        Sentences that the user should read.
+    unreadable : dict
+        Files left out, with the reason.
+    grid : TileGrid
+        Tiles, those without any point cloud left out.
+    """
+
+    region: Region
+    headers: list[CloudHeader]
+    clouds: list[CloudHeader]
+    messages: list[str]
+    unreadable: dict[str, str]
+    grid: TileGrid
+
+
+def check_sources(config: Config) -> None:
+    """Raise ConfigError if no point cloud is named."""
+    if not config.pointcloud:
+        raise ConfigError("no point cloud: give files, globs or folders, as in `citystitch run tiles/*.laz`")
+
+
 def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
     """Find out what a run has to do, from headers alone.
 
@@ -61,6 +95,20 @@ def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
     CityError
         If an input is missing or unreadable, or does not fit the others.
     """
+    found = survey_inputs(config, say)
+    # Which tiles are absent shows in the results of those beside them.
+    identity = f"{found.region.crs} {pack_tiles(found.grid).hex()}"
+    layout = make_layout(found.grid, file_items(found.clouds), identity=identity)
+    return Plan(found.region, found.headers, found.messages, found.unreadable, found.grid, layout)
+
+
+def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
+    """Read headers, and choose region and tiles; parameters and errors as for `make_plan`.
+
+    Notes
+    -----
+    Tiles stay arrays: a country of half a million tiles takes no longer than its headers.
+    """
     paths = find_clouds(config.pointcloud)
     headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
     footprint_crs = read_footprint_crs(Path(config.footprints), config.layer) if config.footprints else None
@@ -73,7 +121,8 @@ def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
     clouds = [header for header in headers if header.n_points and _meets(header, region)]
     whole = make_grid(region.bounds, tile_size=config.tile_size, mesh_size=config.mesh_size)
     grid = choose_tiles(whole, [header.bounds[:4] for header in clouds])
-    n_tiles, n_absent = len(tile_keys(grid)), len(tile_keys(whole)) - len(tile_keys(grid))
+    present = tiles_present(grid)
+    n_tiles, n_absent = int(present.sum()), int((~present).sum())
     if config.smoother == "fem" and config.mesher == "layered" and n_tiles > 1:
         side = math.ceil(max(region.bounds[2] - region.bounds[0], region.bounds[3] - region.bounds[1]))
         raise ConfigError(
@@ -87,10 +136,7 @@ def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
         messages.append("no footprints given: the mesh has terrain only")
     for message in messages:
         say(message)
-    # Which tiles are absent shows in the results of those beside them.
-    identity = f"{region.crs} {pack_tiles(grid).hex()}"
-    layout = make_layout(grid, file_items(clouds), identity=identity)
-    return Plan(region, headers, messages, unreadable, grid, layout)
+    return Survey(region, headers, clouds, messages, unreadable, grid)
 
 
 def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:

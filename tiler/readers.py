@@ -1,12 +1,15 @@
 """What stages read of each other's results: points, terrain, houses and buildings in a box."""
 
 from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.building_points import NEVER_ROOF
+from pipeline.citymodel import Footprints
 from pipeline.ground_filter import FILTER_REACH, classify_ground
 from pipeline.houses import Houses, join_houses
 from pipeline.pointcloud import BUILDING, PointCloud
@@ -14,6 +17,7 @@ from pipeline.raster import Dtm, NodeWindow, grow_window, join_dtm, node_window
 from pipeline.terrain import fill_dtm
 from stitch.grid import Bounds
 from tiler.cells import select_cells
+from tiler.footprint_index import FootprintRows, join_footprints, select_footprints
 from tiler.ingest import CELL, crop_cloud
 from tiler.stage import Box
 from tiler.tables import Buildings, join_buildings, take_buildings, unpack_buildings, unpack_houses
@@ -82,6 +86,28 @@ def read_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm
 def region_window(box: Box, spacing: float, bounds: Bounds) -> NodeWindow:
     """Nodes of a box, and the next ones around it, within the region."""
     return grow_window(node_window(box, spacing), 0, within=node_window(bounds, spacing))
+
+
+def read_outlines(task: Task) -> Footprints:
+    """Read the footprints that meet the task's box, from the stage ``footprints``."""
+    parts = []
+    (found,) = task.read("footprints", ())
+    if found.facts["n"] > 0:
+        names = ("cell_box", "cell_start", "end")
+        arrays, _ = task.store.read("footprints", found.name, names=names)
+
+        def rows(array: str, first: int, last: int) -> NDArray[Any]:
+            return task.read_rows("footprints", found.name, array, first, last)
+
+        byte, letter = (np.cumsum([0, *rows(size, 0, found.facts["n"])]) for size in ("wkb_size", "id_size"))
+        start = np.append(arrays["cell_start"], arrays["end"])
+        for first, last in select_footprints(arrays["cell_box"], start, task.box):
+            text = rows("id", letter[first], letter[last]).tobytes()
+            cuts = (letter[first : last + 1] - letter[first]).tolist()
+            ids = np.array([text[a:b].decode() for a, b in pairwise(cuts)], np.str_)
+            wkb, height = rows("wkb", byte[first], byte[last]), rows("given_height", first, last)
+            parts.append(FootprintRows(wkb, byte[first : last + 1], ids, height, rows("box", first, last)))
+    return join_footprints(parts, task.box)
 
 
 def read_houses(task: Task, stage: str = "houses") -> Iterator[tuple[str, Houses]]:

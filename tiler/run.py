@@ -12,7 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from pipeline.errors import CityError, ConfigError
+from pipeline.errors import CityError
 from tiler.atomic import replacing
 from tiler.config import Config
 from tiler.context import RunContext, pack_tiles
@@ -20,7 +20,7 @@ from tiler.engine import Engine
 from tiler.executors import Executor, connect, local, serial
 from tiler.out_folder import check_folder, clear_folder, only_run, remove_strangers
 from tiler.own_stages import OwnStages, check_own, run_own_stages
-from tiler.planning import Plan, identify, make_plan
+from tiler.planning import Plan, check_sources, identify, make_plan
 from tiler.stage import REGION_ITEM, Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
@@ -76,8 +76,7 @@ def run(
     A folder that holds an unfinished run is gone on with: what is in its store already, and has the same key, is
     not computed again. Results are the same as without the interruption, byte for byte.
     """
-    if not config.pointcloud:
-        raise ConfigError("no point cloud: give files, globs or folders, as in `citystitch run tiles/*.laz`")
+    check_sources(config)
     out = Path(config.out)
     own = check_own(config, stages, parameters)
     check_folder(out, overwrite=config.overwrite)

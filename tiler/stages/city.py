@@ -1,7 +1,6 @@
 """Stages 1.4 to 2.3: houses of each tile, clusters of close ones across tiles, and the simplified city model."""
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -22,7 +21,6 @@ from pipeline.tile import measure_city, prepare_footprints
 from stitch.grid import Key
 from tiler.config import Config
 from tiler.context import find_owned, region_around, tile_key
-from tiler.footprint_index import FootprintRows, join_footprints, select_footprints
 from tiler.options import CITY_PARAMETERS, LAYER_PARAMETERS, city_options, mesh_options
 from tiler.readers import grow, read_cloud, read_terrain
 from tiler.stage import Box, Facts, Read, Scope, Stage
@@ -44,7 +42,7 @@ GROUND = ("dtm_spacing", "ground_filter")
 def house_stage(config: Config, largest: float) -> Stage:
     """Stage of the houses of each tile; `largest` is the longest side of any footprint's box (m)."""
     reads = (
-        Read("footprints"),
+        Read("outlines", own=True),
         Read("points", halo_of_points(config, largest + config.ground_margin)),
         Read("terrain", largest + 2 * config.dtm_spacing),
     )
@@ -95,7 +93,7 @@ def model_stage(config: Config, last: int) -> Stage:
     options = mesh_options(config)
     reach = terrain_reach(options) if isinstance(options, LayeredOptions) else 0.0
     reads = (
-        Read("footprints"),
+        Read("reserved"),
         Read(shapes, own=True),
         Read(members, own=True),
         Read("houses", named_by=members),
@@ -110,7 +108,7 @@ def make_houses(task: Task) -> Facts:
     options, spacing = city_options(task.parameters), task.parameters.dtm_spacing
     grid, bounds = task.context.grid, task.context.bounds
     with task.step("1.4 clean footprints"):
-        read = _read_footprints(task)
+        read = _read_outlines(task)
         around = tuple(shapely.total_bounds(read.polygons).tolist()) if len(read.polygons) else task.box
         inner, notes = prepare_footprints(read, region_around(grid, _hull(task.box, around)), options)
         own = _owned(task, inner)
@@ -139,7 +137,7 @@ def find_near_houses(task: Task) -> Facts:
         outlines = unpack_polygons(result.arrays, "outline")
         rows = _near_rows(task, outlines)
         polygons.append(outlines[rows])
-        owner.append(np.column_stack((np.tile(tile_key(result.name), (len(rows), 1)), rows)))
+        owner.append(_in_tile(result.name, rows))
     close = find_close(np.concatenate(polygons), task.parameters.clearance)
     task.put(pairs=np.concatenate(owner)[close].reshape(-1, 6))
     return {"n": len(close)}
@@ -166,15 +164,15 @@ def join_houses_in_clusters(task: Task) -> Facts:
 def find_near_shapes(task: Task) -> Facts:
     """Find the clusters whose results came close in a tile (step 2.1)."""
     (stage,) = task.refs
-    polygons, cluster = [np.empty(0, object)], [np.empty(0, np.int64)]
+    polygons, cluster = [np.empty(0, object)], [np.empty((0, 3), np.int64)]
     for result in task.read(stage, ("polygon", "polygon_start", "cluster")):
         shapes = unpack_polygons(result.arrays, "polygon")
         rows = _near_rows(task, shapes)
         polygons.append(shapes[rows])
-        cluster.append(result.arrays["cluster"][rows])
+        cluster.append(_in_tile(result.name, result.arrays["cluster"][rows]))
     label = np.concatenate(cluster)
-    close = label[find_close(np.concatenate(polygons), task.parameters.clearance)].reshape(-1, 2)
-    task.put(pairs=np.unique(close[close[:, 0] != close[:, 1]], axis=0))
+    close = label[find_close(np.concatenate(polygons), task.parameters.clearance)].reshape(-1, 6)
+    task.put(pairs=np.unique(close[(close[:, :3] != close[:, 3:]).any(axis=1)], axis=0))
     return {"n": len(close)}
 
 
@@ -183,8 +181,8 @@ def join_close_clusters(task: Task) -> Facts:
     before, near = sorted(task.refs)
     (clusters,) = task.read(before, ("house", "cluster"))
     house, cluster = clusters.arrays["house"], clusters.arrays["cluster"]
-    pairs = np.concatenate([np.empty((0, 2), np.int64)] + [result.arrays["pairs"] for result in task.read(near)])
-    joined = join_pairs(len(cluster), pairs)[cluster]
+    pairs = np.concatenate([np.empty((0, 6), np.int64)] + [result.arrays["pairs"] for result in task.read(near)])
+    joined = join_pairs(len(cluster), _find_rows(house, pairs.reshape(-1, 3)).reshape(-1, 2))[cluster]
     touched = np.isin(joined, joined[joined != cluster])
     _put_clusters(task, house, joined, touched)
     fewer = len(np.unique(cluster)) - len(np.unique(joined))
@@ -192,12 +190,15 @@ def join_close_clusters(task: Task) -> Facts:
 
 
 def list_members(task: Task) -> Facts:
-    """List the houses of the clusters that a tile owns: those whose first house is the tile's."""
+    """List the houses of the clusters that a tile owns: those whose first house is the tile's.
+
+    A cluster is called by the row of that house in its tile: other houses elsewhere change nothing here.
+    """
     (stage,) = task.refs
     (clusters,) = task.read(stage, ("house", "cluster", "changed"))
     house, cluster = clusters.arrays["house"], clusters.arrays["cluster"]
     mine = (house[cluster, :2] == tile_key(task.name)).all(axis=1)
-    task.put(house=house[mine], cluster=cluster[mine], changed=clusters.arrays["changed"][mine])
+    task.put(house=house[mine], cluster=house[cluster[mine], 2], changed=clusters.arrays["changed"][mine])
     tiles = np.unique(house[mine, :2], axis=0).tolist()
     return {"n": int(mine.sum()), "names": sorted(f"{i}_{j}" for i, j in tiles)}
 
@@ -230,7 +231,7 @@ def make_model(task: Task) -> Facts:
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0
     extent = _extent(shapes.polygons)
     cloud, dtm = _surroundings(task, extent, options.ground_margin, reach + 2 * given.dtm_spacing)
-    reserved = {name for result in task.read("footprints", ()) for name in result.facts["part_like"]}
+    reserved = {name for result in task.read("reserved", ()) for name in result.facts["names"]}
     city = raise_buildings(gathered.houses, shapes, dtm, options, reserved=reserved, trace=task.step)
     task.notes(city.notes)
     model = city.model
@@ -248,35 +249,10 @@ def make_model(task: Task) -> Facts:
     return {"n": len(model), "extent": extent, "counts": counts, "outline": city.outline}
 
 
-def _read_footprints(task: Task) -> Footprints:
+def _read_outlines(task: Task) -> Footprints:
     """Footprints that meet the tile."""
-    parts = []
-    for result in task.read("footprints", ("block", "cell_box", "cell_start", "end") if _has_rows(task) else ()):
-        if result.facts["n"] == 0:
-            break
-        arrays = result.arrays
-        start = np.append(arrays["cell_start"], arrays["end"])
-        size = task.read_rows("footprints", result.name, "wkb_size", 0, result.facts["n"])
-        id_size = task.read_rows("footprints", result.name, "id_size", 0, result.facts["n"])
-        byte, letter = np.cumsum([0, *size]), np.cumsum([0, *id_size])
-        for first, last in select_footprints(arrays["cell_box"], start, task.box):
-            text = task.read_rows("footprints", result.name, "id", letter[first], letter[last]).tobytes()
-            cuts = (letter[first : last + 1] - letter[first]).tolist()
-            ids = [text[a:b].decode() for a, b in pairwise(cuts)]
-            parts.append(
-                FootprintRows(
-                    task.read_rows("footprints", result.name, "wkb", byte[first], byte[last]),
-                    byte[first : last + 1],
-                    np.array(ids, np.str_),
-                    task.read_rows("footprints", result.name, "given_height", first, last),
-                    task.read_rows("footprints", result.name, "box", first, last),
-                )
-            )
-    return join_footprints(parts, task.box)
-
-
-def _has_rows(task: Task) -> bool:
-    return any(result.facts["n"] > 0 for result in task.read("footprints", ()))
+    (found,) = (result.arrays for result in task.read("outlines"))
+    return Footprints(unpack_polygons(found, "outline"), found["ids"], found["given_height"])
 
 
 def _owned(task: Task, footprints: Footprints) -> Footprints:
@@ -306,6 +282,11 @@ def _near_rows(task: Task, polygons: NDArray[np.object_]) -> NDArray[np.int64]:
     """Polygons that meet the tile, or are closer to it than the clearance: each close pair is so in some tile."""
     box = shapely.box(*grow(task.box, task.parameters.clearance))
     return np.flatnonzero(shapely.intersects(box, polygons))
+
+
+def _in_tile(name: str, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows of a tile as column and row of the tile and the row, (n, 3)."""
+    return np.column_stack((np.tile(tile_key(name), (len(rows), 1)), rows))
 
 
 def _put_clusters(

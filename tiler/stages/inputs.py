@@ -27,8 +27,9 @@ from tiler.config import Config
 from tiler.context import tile_key
 from tiler.footprint_index import largest_extent, scan_footprints
 from tiler.ingest import read_cells
-from tiler.readers import grow, read_cloud
+from tiler.readers import grow, read_cloud, read_outlines
 from tiler.stage import Facts, Read, Scope, Stage
+from tiler.tables import pack_polygons
 from tiler.task import Task
 
 
@@ -44,6 +45,9 @@ def input_stages(config: Config) -> list[Stage]:
             read_footprint_file,
             parameters=("footprints", "footprints_identity", "layer", "id_attribute", "height_attribute"),
         ),
+        # What a tile needs of the footprints: it does not run again when others change.
+        Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),)),
+        Stage("reserved", Scope.REGION, list_reserved, (Read("footprints"),)),
         Stage("ground", Scope.TILE, bin_tile, (Read("points", halo_of_points(config, spacing)),), ground),
         Stage("flooded", Scope.TILE, flood_tile, (Read("ground", (FILL_RINGS + 2) * spacing),), ("dtm_spacing",)),
         Stage("coarse", Scope.REGION, join_coarse, (Read("flooded"),), ("dtm_spacing",)),
@@ -128,6 +132,24 @@ def read_footprint_file(task: Task) -> Facts:
         task.note(Note("no-footprints-in-region", given.footprints, detail="terrain only"))
     task.put(block=np.array(blocks), end=np.array([n]))
     return {"n": n, "largest": largest, "part_like": sorted(part_like)}
+
+
+def take_outlines(task: Task) -> Facts:
+    """Take the footprints that meet a tile (step 1.2)."""
+    footprints = read_outlines(task)
+    task.put(
+        **pack_polygons(footprints.polygons, "outline"),
+        ids=footprints.ids,
+        given_height=footprints.given_height,
+    )
+    return {"n": len(footprints.ids)}
+
+
+def list_reserved(task: Task) -> Facts:
+    """List the ids of footprints that look like one of a part of a house."""
+    return {
+        "names": sorted({name for result in task.read("footprints", ()) for name in result.facts["part_like"]})
+    }
 
 
 def own_window(task: Task) -> NodeWindow:

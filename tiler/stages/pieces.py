@@ -30,7 +30,7 @@ from tiler.config import Config
 from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
 from tiler.readers import read_buildings, read_cloud, read_terrain
 from tiler.results import COLUMN_ARRAYS, unpack_columns
-from tiler.stage import REGION_ITEM, Facts, Read, Scope, Stage
+from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import unpack_polygons
 from tiler.task import Result, Task
@@ -50,7 +50,9 @@ def piece_stages(config: Config) -> list[Stage]:
     )
     return [
         Stage("numbers", Scope.REGION, number_parts, (Read("seams"), Read("columns"))),
-        Stage("pieces", Scope.TILE, write_piece, (Read("columns"), Read("seams"), Read("numbers"))),
+        # A tile whose own numbers are as before is not written again.
+        Stage("offsets", Scope.TILE, take_offsets, (Read("numbers"),)),
+        Stage("pieces", Scope.TILE, write_piece, (Read("columns"), Read("seams"), Read("offsets", own=True))),
         Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces"),)),
         Stage("fit", Scope.TILE, measure_fit, fit, ("dtm_spacing", "ground_filter")),
         Stage("report", Scope.REGION, sum_up, (Read("pieces"), Read("fit"))),
@@ -76,6 +78,18 @@ def number_parts(task: Task) -> Facts:
     offsets = make_offsets(counts.tolist())
     task.put(offset=offsets)
     return {"points": int(offsets[-1])}
+
+
+def take_offsets(task: Task) -> Facts:
+    """Take where the numbers of a tile's own corners, seams and inner points begin."""
+    grid, key = task.context.grid, tile_key(task.name)
+    parts = {_tile_part(grid, key)}
+    for seam in seams_of_tile(key):
+        parts |= {_seam_part(grid, seam), *(_corner_part(grid, corner) for corner in ends_of_seam(seam))}
+    part = np.array(sorted(parts))
+    (numbers,) = task.read("numbers")
+    task.put(part=part, offset=numbers.arrays["offset"][part])
+    return {}
 
 
 def write_piece(task: Task) -> Facts:
@@ -203,19 +217,18 @@ def _there(task: Task, key: Key) -> NDArray[np.bool_]:
 
 def _number_points(task: Task, mesh: ColumnMesh, grid: TileGrid, key: Key) -> NDArray[np.int64]:
     """Region-wide numbers of a tile's points."""
-
-    def offset(part: int) -> int:
-        return int(task.read_rows("numbers", REGION_ITEM, "offset", part, part + 1)[0])
+    (own,) = (result.arrays for result in task.read("offsets"))
+    offset = dict(zip(own["part"].tolist(), own["offset"].tolist(), strict=True))
 
     seams = []
     for seam in seams_of_tile(key):
         if not is_border(grid, seam):
             xy = task.store.read("seams", seam_name(seam), names=("xy",))[0]["xy"]
-            start, end = (offset(_corner_part(grid, corner)) for corner in ends_of_seam(seam))
+            start, end = (offset[_corner_part(grid, corner)] for corner in ends_of_seam(seam))
             seams.append(
-                SeamNumbers(find_vertices(mesh.plane.xy, xy), (start, offset(_seam_part(grid, seam)), end))
+                SeamNumbers(find_vertices(mesh.plane.xy, xy), (start, offset[_seam_part(grid, seam)], end))
             )
-    return number_points(mesh, seams, offset(_tile_part(grid, key)))
+    return number_points(mesh, seams, offset[_tile_part(grid, key)])
 
 
 def _digest_seams(
