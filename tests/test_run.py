@@ -22,6 +22,7 @@ from tests.cities import Bounds, cloud_over
 from tiler.check import check_run
 from tiler.cli import main
 from tiler.config import make_config
+from tiler.render import SIZES
 from tiler.results import StoredTerrain, read_columns
 from tiler.run import run
 from tiler.store import Store
@@ -551,8 +552,14 @@ def test_real_data_gives_a_mesh_that_its_check_proves(
         assert record["fidelity"]["roof"]["rmse"] < 3.4
 
 
-def test_the_demo_makes_two_meshes_and_two_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo", "--out", str(tmp_path), "--size", "200", "--buildings", "15"]) == 0
+def test_the_demo_makes_two_meshes_and_three_pictures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for what in SIZES:
+        monkeypatch.setitem(SIZES, what, (600, 300))
+    assert main(["demo", "--out", str(tmp_path), "--size", "300", "--buildings", "15"]) == 0
     assert capsys.readouterr().out.count("everything is proved") == 2
-    for picture in ("demo.png", "block.png"):
+    record = json.loads((tmp_path / "result" / "run.json").read_text())
+    assert (len(record["tiles"]), record["parameters"]["workers"]) == (4, 2)
+    for picture in ("demo.png", "tiles.png", "block.png"):
         assert (tmp_path / picture).stat().st_size > 50_000

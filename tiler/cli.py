@@ -22,6 +22,8 @@ EXIT_CODES = (
 METAVARS = {str: "NAME", float: "NUMBER", int: "NUMBER"}
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 POSITIONAL = "pointcloud"
+DEMO_TILES = 3  # tiles along each side of the demo's city, fewer where they would be too small
+LEAST_DEMO_TILE = 150.0  # m
 BLOCK = Path(__file__).with_name("demo_block")  # real data of a few hundred kilobytes
 
 
@@ -95,7 +97,7 @@ def make_parser() -> argparse.ArgumentParser:
     synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
     synth.add_argument("directory", type=Path, help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
-    demo = command("demo", _demo, "mesh, check and draw a synthetic city and a block of a real one")
+    demo = command("demo", _demo, "mesh, check and draw a synthetic city in tiles and a block of a real one")
     demo.add_argument("--out", type=Path, default=Path("demo"), help="folder to write to (default: demo)")
     _add_city(demo, size=600.0, buildings=220)
     render = command("render", _render, "draw a picture of a run")
@@ -231,29 +233,33 @@ def _demo(options: argparse.Namespace) -> int:
     out: Path = options.out
     files = _write_city(out / "city", options)
     clouds, footprints = [str(path) for path in files.clouds], str(files.shapefile)
-    city = {"pointcloud": clouds, "footprints": footprints}
+    tile_size = max(options.size / DEMO_TILES, LEAST_DEMO_TILE)
+    city = {"pointcloud": clouds, "footprints": footprints, "tile_size": tile_size, "workers": 2}
     block = {
         "pointcloud": [str(BLOCK / "cloud.laz")],
         "footprints": str(BLOCK / "footprints.geojson"),
         "border": "clip",
         "mesh_size": 5.0,
     }
+    pictures = {out / "demo.png": "overview", out / "tiles.png": "tiles"}
     codes = [
-        _demonstrate("a synthetic city", city, out / "result", out / "demo.png", "overview"),
-        _demonstrate("a block of Amsterdam", block, out / "block", out / "block.png", "boundary"),
+        _demonstrate("a synthetic city, tile by tile", city, out / "result", pictures),
+        _demonstrate("a block of Amsterdam", block, out / "block", {out / "block.png": "boundary"}),
     ]
     return max(codes)
 
 
-def _demonstrate(title: str, inputs: dict[str, Any], out: Path, picture: Path, what: str) -> int:
+def _demonstrate(title: str, inputs: dict[str, Any], out: Path, pictures: dict[Path, str]) -> int:
     """Mesh, check and draw; returns the exit code of the check."""
     from tiler.render import render_run
 
     print(f"\n{title}")
     _run_config(make_config(inputs | {"out": str(out), "overwrite": True}))
     code = _check_folder(out)
-    render_run(out, picture, what=what)
-    print(f"picture: {picture}\nmesh:    {out / 'mesh.pvtu'} (open it in ParaView)")
+    for picture, what in pictures.items():
+        render_run(out, picture, what=what)
+        print(f"picture: {picture}")
+    print(f"mesh:    {out / 'mesh.pvtu'} (open it in ParaView)")
     return code
 
 

@@ -29,7 +29,7 @@ AIR_COLOURS = ("#8db8d8", "#b9d4e6", "#e6eff4")
 WALL_COLOURS = ("#fffaf0", "#fffaf0")
 # Neighbouring tiles differ in colour: by odd and even column, then by odd and even row. The four are of Tol's
 # medium contrast; any two of them are apart for eyes that miss one kind of cone too.
-TILE_COLOURS = (("#6699cc", "#eecc66"), ("#994455", "#ee99aa"))
+TILE_COLOURS = (("#6699cc", "#994455"), ("#eecc66", "#ee99aa"))
 # How much white is mixed into a tile's colour, so that houses stand out from the ground.
 TILE_WHITE = {Marker.GROUND: 0.3, Marker.WALL: 0.6, Marker.ROOF: 0.0}
 SKIRT_COLOUR = "#c9bfae"
