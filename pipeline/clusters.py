@@ -165,7 +165,12 @@ def join_shapes(several: Sequence[Shapes]) -> Shapes:
 
 def leave_out(shapes: Shapes, clusters: NDArray[np.int64]) -> Shapes:
     """Forget some clusters."""
-    stays = ~np.isin(shapes.cluster, clusters)
+    kept = keep_shapes(shapes, ~np.isin(shapes.cluster, clusters))
+    return replace(kept, closed=shapes.closed[~np.isin(shapes.closed[:, 1], clusters)])
+
+
+def keep_shapes(shapes: Shapes, stays: NDArray[np.bool_]) -> Shapes:
+    """Keep some buildings, whatever their cluster; `closed` is left as it is."""
     size = np.diff(shapes.member_start)
     return replace(
         shapes,
@@ -173,7 +178,6 @@ def leave_out(shapes: Shapes, clusters: NDArray[np.int64]) -> Shapes:
         member_start=np.concatenate(([0], np.cumsum(size[stays]))).astype(np.int64),
         member=shapes.member[np.repeat(stays, size)],
         cluster=shapes.cluster[stays],
-        closed=shapes.closed[~np.isin(shapes.closed[:, 1], clusters)],
     )
 
 

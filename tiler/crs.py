@@ -308,8 +308,9 @@ def _sentences(
         words.append(f"the footprints are reprojected from {crs_name(ours)} to {crs_name(crs)}")
     stray = [cloud for cloud in filled if not _on_its_place(cloud.bounds, crs)]
     if stray:
+        more = f" and {len(stray) - 1} more point clouds lie" if len(stray) > 1 else " lies"
         words.append(
-            f"{stray[0].path.name} and {len(stray) - 1} more point clouds lie outside the area of use of "
+            f"{stray[0].path.name}{more} outside the area of use of "
             f"{crs_name(crs)} ({crs.area_of_use.name if crs.area_of_use else ''}); is it the right CRS?"
         )
     return words

@@ -166,6 +166,14 @@ def run_stages(engine: Engine, config: Config) -> int:
     config : Config
         Parameters of the run.
     """
+    rounds = run_city_stages(engine, config)
+    engine.run(*city_model_stages(), *mesh_stages(config))
+    engine.run(*piece_stages(config))
+    return rounds
+
+
+def run_city_stages(engine: Engine, config: Config) -> int:
+    """Run the stages up to the simplified city model; parameters and result as for `run_stages`."""
     engine.run(*input_stages(config))
     largest = engine.records["footprints", REGION_ITEM].facts["largest"]
     engine.run(house_stage(config, largest))
@@ -179,8 +187,6 @@ def run_stages(engine: Engine, config: Config) -> int:
         last += 1
         engine.run(shape_stage(last))
     engine.run(model_stage(config, last))
-    engine.run(*city_model_stages(), *mesh_stages(config))
-    engine.run(*piece_stages(config))
     return last + 1
 
 

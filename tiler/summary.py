@@ -16,7 +16,7 @@ from tiler.task import Record, read_notes
 
 EXIT_DONE, EXIT_INCOMPLETE = 0, 3
 # Notes of these kinds say that something is missing which the input has: the exit code tells.
-INCOMPLETE = {"building-lost", "building-points-without-footprints"}
+INCOMPLETE = {"building-beyond-region", "building-lost", "building-points-without-footprints"}
 LISTED = 10_000  # notes of a kind that the record lists; the store has all
 
 

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from pipeline.city import City
 from pipeline.citymodel import Footprints
-from pipeline.clusters import Shapes, find_close, join_pairs, join_shapes, leave_out, shape_clusters
+from pipeline.clusters import Shapes, find_close, join_pairs, join_shapes, keep_shapes, leave_out, shape_clusters
 from pipeline.groups import adjacent_houses
 from pipeline.houses import Houses, divide_houses, houses_extent, join_houses, take_houses
 from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
+from pipeline.notes import Note
 from pipeline.point_fidelity import HouseFidelity, measure_houses
 from pipeline.pointcloud import PointCloud
 from pipeline.raster import Dtm
@@ -229,6 +230,7 @@ def make_model(task: Task) -> Facts:
     gathered = _gather(task, _members(task))
     shapes = _earlier_shapes(task, replace(gathered, changed=np.zeros(len(gathered.houses), np.bool_)))
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0
+    shapes = _keep_within(task, shapes, gathered.houses)
     extent = _extent(shapes.polygons)
     cloud, dtm = _surroundings(task, extent, options.ground_margin, reach + 2 * given.dtm_spacing)
     reserved = {name for result in task.read("reserved", ()) for name in result.facts["names"]}
@@ -247,6 +249,22 @@ def make_model(task: Task) -> Facts:
     counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
     counts |= {"roofs on another layer": parted} if parted else {}
     return {"n": len(model), "extent": extent, "counts": counts, "outline": city.outline}
+
+
+def _keep_within(task: Task, shapes: Shapes, houses: Houses) -> Shapes:
+    """Leave out the buildings that leave the region: where its border turns inwards, a hull of several may."""
+    extent = _extent(shapes.polygons)
+    if extent is None:
+        return shapes
+    region = region_around(task.context.grid, extent)
+    shapely.prepare(region)
+    within = shapely.contains_properly(region, shapes.polygons)
+    for row in np.flatnonzero(~within).tolist():
+        members = shapes.member[shapes.member_start[row] : shapes.member_start[row + 1]]
+        ids = sorted(set(houses.ids[houses.parts.house[members]].tolist()))
+        x, y = shapely.get_coordinates(shapely.point_on_surface(shapes.polygons[row]))[0].tolist()
+        task.note(Note("building-beyond-region", ", ".join(ids), x, y, "its simplified outline leaves the region"))
+    return keep_shapes(shapes, within)
 
 
 def _read_outlines(task: Task) -> Footprints:
