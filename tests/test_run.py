@@ -509,15 +509,18 @@ def test_random_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
 
 
 PAPER = {"simplify": "paper", "mesher": "layered", "roof_height": "percentile"}
+LONG = pytest.mark.long
 REAL = [
     ("amsterdam", "amsterdam/footprints.shp", {}, 1400),
-    ("amsterdam_no_building_class", "amsterdam/footprints.shp", {}, 1900),
     ("amsterdam_west_small", "amsterdam_west_small/footprints.gpkg", {}, 300),
-    ("amsterdam", "amsterdam/footprints.shp", {"manifold": True}, 1400),
-    ("amsterdam", "amsterdam/footprints.shp", {"mesher": "layered", "layer_height": 5.0}, 1400),
-    ("amsterdam", "amsterdam/footprints.shp", PAPER, 40),
-    ("amsterdam_no_building_class", "amsterdam/footprints.shp", PAPER, 40),
     ("amsterdam_west_small", "amsterdam_west_small/footprints.gpkg", PAPER, 25),
+    pytest.param("amsterdam_no_building_class", "amsterdam/footprints.shp", {}, 1900, marks=LONG),
+    pytest.param("amsterdam", "amsterdam/footprints.shp", {"manifold": True}, 1400, marks=LONG),
+    pytest.param(
+        "amsterdam", "amsterdam/footprints.shp", {"mesher": "layered", "layer_height": 5.0}, 1400, marks=LONG
+    ),
+    pytest.param("amsterdam", "amsterdam/footprints.shp", PAPER, 40, marks=LONG),
+    pytest.param("amsterdam_no_building_class", "amsterdam/footprints.shp", PAPER, 40, marks=LONG),
 ]
 
 
