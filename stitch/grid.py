@@ -179,6 +179,12 @@ def closest_line(grid: TileGrid, corner: Key) -> float:
     return float(min(*steps, grid.tile_size))
 
 
+def is_pinched(grid: TileGrid, corner: Key) -> bool:
+    """Tell whether two tiles meet in a corner alone, the other two around it being absent."""
+    upper_right, upper_left, lower_left, lower_right = (has_tile(grid, tile) for tile in tiles_of_corner(corner))
+    return upper_right == lower_left != upper_left == lower_right
+
+
 def is_border(grid: TileGrid, seam: SeamKey) -> bool:
     """Tell whether a seam is a part of the region's border: a tile on one side only."""
     return not all(has_tile(grid, tile) for tile in tiles_of_seam(seam))

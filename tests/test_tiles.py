@@ -356,16 +356,12 @@ EVERYDAY = [
 ]  # fmt: skip
 
 
-PINCHED = pytest.mark.xfail(reason="two tiles that touch in a corner alone have columns of their own there")
-
-
 def region_cases() -> list[Any]:
     """All regions with either mesher, most of them long."""
     cases = [(case, mesher) for case in REGIONS for mesher in ("adaptive", "layered")]
     found = []
     for make, mesher in cases:
         marks = [] if (make, mesher) in EVERYDAY else [pytest.mark.long]
-        marks += [PINCHED] if make is corner_to_corner else []
         found.append(pytest.param(make, mesher, marks=marks, id=f"{make.__name__}-{mesher}"))
     return found
 

@@ -18,7 +18,7 @@ from pipeline.raster import Dtm
 from pipeline.spacing import top_reach
 from stitch.corners import Corner, place_corner
 from stitch.facets import Side, find_seam_edges
-from stitch.grid import Bounds, ends_of_seam, seams_of_tile
+from stitch.grid import Bounds, SeamKey, ends_of_seam, is_pinched, seams_of_tile
 from stitch.layered_seams import fill_corner_layers, fill_seam_layers
 from stitch.numbering import count_inner_points, count_points
 from stitch.patches import mesh_patch
@@ -32,7 +32,7 @@ from tiler.options import LAYER_PARAMETERS, PLANE_PARAMETERS, mesh_options, plan
 from tiler.readers import grow, read_buildings, read_terrain
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.tables import Buildings
-from tiler.task import Task
+from tiler.task import Result, Task
 
 NO_PLANE = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))
 PARAMETERS = (*PLANE_PARAMETERS, *LAYER_PARAMETERS, "dtm_spacing", "tile_size")
@@ -81,9 +81,10 @@ def make_seam(task: Task) -> Facts:
     task.put(**pack_seam(seam, buildings.model.numbers))
     facts = {"border": seam.border, "vertices": len(seam.xy)}
     if seam.border:
-        return facts
+        return facts | {"pinched": _fill_pinched(key, (start, end), dtm, buildings, walls, task)}
     with task.step("3.2-3.5 columns of seams"):
-        levels = _fill(seam, (start, end), dtm, buildings, walls, task)
+        ends = (_fill_corner(start, dtm, buildings, walls, task), _fill_corner(end, dtm, buildings, walls, task))
+        levels = _fill(seam, ends, dtm, buildings, task)
     task.put(level_start=levels.start, level_z=levels.z, level_surface=levels.surface)
     return facts | {"points": count_points(levels)}
 
@@ -103,7 +104,9 @@ def make_columns(task: Task) -> Facts:
             _four(sides), model.polygons, walls, mesh_size=given.mesh_size, **plane_options(given)
         )
     inner = [k for k, seam in enumerate(sides) if not seam.border]
-    seam_columns = tile_columns(plane, [(sides[k], unpack_levels(found[names[k]].arrays)) for k in inner])
+    given_columns = [(sides[k], unpack_levels(found[names[k]].arrays)) for k in inner]
+    pinched = [part for k, name in enumerate(names) for part in unpack_pinched(sides[k], found[name])]
+    seam_columns = tile_columns(plane, [*given_columns, *pinched])
     # A tile is on the left of its southern and its eastern seam.
     edges = find_seam_edges(
         plane, [Side(sides[k], left=k < 2) for k in inner], seam_columns, model.roof, model.numbers
@@ -124,7 +127,8 @@ def make_columns(task: Task) -> Facts:
         edge_seam=edge_seam,
     )
     gap, _ = lowest_gap(columns)
-    inner_points = count_inner_points(columns, [find_vertices(plane.xy, sides[k].xy) for k in inner])
+    shared = [find_vertices(plane.xy, seam.xy) for seam, _ in (*given_columns, *pinched)]
+    inner_points = count_inner_points(columns, shared)
     return {
         "inner_points": inner_points,
         "order": columns.order,
@@ -166,6 +170,18 @@ def unpack_levels(arrays: dict[str, NDArray[Any]]) -> Levels:
     return Levels(arrays["level_start"], arrays["level_z"], arrays["level_surface"])
 
 
+def unpack_pinched(seam: Seam, result: Result) -> list[tuple[Seam, Levels]]:
+    """Read the columns of the ends of a border in which two tiles meet alone, each as a seam of one vertex."""
+    arrays = result.arrays
+    return [
+        (
+            dataclasses.replace(seam, xy=seam.xy[[-k]]),
+            Levels(arrays[f"end{k}_start"], arrays[f"end{k}_z"], arrays[f"end{k}_surface"]),
+        )
+        for k, _ in result.facts.get("pinched", [])
+    ]
+
+
 def pack_columns(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """Write columns as arrays; buildings go by their numbers."""
     plane = mesh.plane
@@ -187,33 +203,42 @@ def _surroundings(task: Task) -> tuple[Buildings, Dtm]:
     return buildings, read_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
 
 
-def _fill(
-    seam: Seam,
+def _fill_corner(corner: Corner, dtm: Dtm, buildings: Buildings, walls: NDArray[np.float64], task: Task) -> Levels:
+    """Column of a corner, of the mesher that is chosen."""
+    given, bounds = task.parameters, task.context.bounds
+    options, model = mesh_options(given), buildings.model
+    if isinstance(options, AdaptiveOptions):
+        return fill_corner(corner, dtm, model.roof, model.ids, options)
+    angle = plane_options(given)["min_angle"]
+    patch = mesh_patch(corner, model.polygons, walls, bounds, mesh_size=given.mesh_size, min_angle=angle)
+    return fill_corner_layers(corner, patch, dtm, model.roof, model.ids, buildings.layers, bounds, options)
+
+
+def _fill(seam: Seam, ends: tuple[Levels, Levels], dtm: Dtm, buildings: Buildings, task: Task) -> Levels:
+    """Columns of a seam within the region, of the mesher that is chosen."""
+    options, model = mesh_options(task.parameters), buildings.model
+    if isinstance(options, AdaptiveOptions):
+        return fill_seam(seam, ends, dtm, model.roof, model.ids, options)
+    bounds = task.context.bounds
+    return fill_seam_layers(seam, ends, dtm, model.roof, model.ids, buildings.layers, bounds, options)
+
+
+def _fill_pinched(
+    key: SeamKey,
     ends: tuple[Corner, Corner],
     dtm: Dtm,
     buildings: Buildings,
     walls: NDArray[np.float64],
     task: Task,
-) -> Levels:
-    """Columns of a seam within the region, of the mesher that is chosen."""
-    given, bounds = task.parameters, task.context.bounds
-    options, model = mesh_options(given), buildings.model
-    if isinstance(options, AdaptiveOptions):
-        first, last = (fill_corner(corner, dtm, model.roof, model.ids, options) for corner in ends)
-        return fill_seam(seam, (first, last), dtm, model.roof, model.ids, options)
-    angle, city = (
-        plane_options(given)["min_angle"],
-        (dtm, model.roof, model.ids, buildings.layers, bounds, options),
-    )
-    first, last = (
-        fill_corner_layers(
-            corner,
-            mesh_patch(corner, model.polygons, walls, bounds, mesh_size=given.mesh_size, min_angle=angle),
-            *city,
-        )
-        for corner in ends
-    )
-    return fill_seam_layers(seam, (first, last), *city)
+) -> list[list[int]]:
+    """Fill the columns of the ends of a border in which two tiles meet alone; tell which, with their points."""
+    pinched = []
+    for k, (corner, place) in enumerate(zip(ends_of_seam(key), ends, strict=True)):
+        if is_pinched(task.context.grid, corner):
+            levels = _fill_corner(place, dtm, buildings, walls, task)
+            task.put(**{f"end{k}_start": levels.start, f"end{k}_z": levels.z, f"end{k}_surface": levels.surface})
+            pinched.append([k, len(levels.z)])
+    return pinched
 
 
 def _mesh(

@@ -23,7 +23,7 @@ from pipeline.point_fidelity import KINDS, FidelitySums, conclude_fidelity, merg
 from pipeline.pointcloud import PointCloud
 from pipeline.quality import measure_cells
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
-from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
+from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, is_border, is_pinched, seams_of_tile, tiles_of_seam
 from stitch.numbering import SeamNumbers, make_offsets, number_points
 from stitch.seams import find_vertices
 from tiler.config import Config
@@ -64,10 +64,13 @@ def number_parts(task: Task) -> Facts:
     grid = task.context.grid
     counts = np.zeros(_n_parts(grid), np.int64)
     for result in task.read("seams", ()):
-        if not result.facts["border"]:
-            key = seam_key(result.name)
+        key = seam_key(result.name)
+        start, end = ends_of_seam(key)
+        if result.facts["border"]:
+            for k, n_points in result.facts["pinched"]:
+                counts[_corner_part(grid, (start, end)[k])] = n_points
+        else:
             first, inner, last = result.facts["points"]
-            start, end = ends_of_seam(key)
             counts[[_corner_part(grid, start), _seam_part(grid, key), _corner_part(grid, end)]] = (
                 first,
                 inner,
@@ -222,12 +225,18 @@ def _number_points(task: Task, mesh: ColumnMesh, grid: TileGrid, key: Key) -> ND
 
     seams = []
     for seam in seams_of_tile(key):
-        if not is_border(grid, seam):
-            xy = task.store.read("seams", seam_name(seam), names=("xy",))[0]["xy"]
-            start, end = (offset[_corner_part(grid, corner)] for corner in ends_of_seam(seam))
-            seams.append(
-                SeamNumbers(find_vertices(mesh.plane.xy, xy), (start, offset[_seam_part(grid, seam)], end))
-            )
+        corners = ends_of_seam(seam)
+        ends = [offset[_corner_part(grid, corner)] for corner in corners]
+        border = is_border(grid, seam)
+        if border and not any(is_pinched(grid, corner) for corner in corners):
+            continue
+        vertex = find_vertices(mesh.plane.xy, task.store.read("seams", seam_name(seam), names=("xy",))[0]["xy"])
+        if not border:
+            seams.append(SeamNumbers(vertex, (ends[0], offset[_seam_part(grid, seam)], ends[1])))
+            continue
+        for k, corner in enumerate(corners):
+            if is_pinched(grid, corner):
+                seams.append(SeamNumbers(vertex[[-k, -k]], (ends[k], 0, ends[k])))
     return number_points(mesh, seams, offset[_tile_part(grid, key)])
 
 
