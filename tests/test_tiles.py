@@ -498,11 +498,11 @@ def test_the_model_of_real_blocks_knows_no_tiles_and_no_workers(
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(50))
 def test_random_tiled_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
-    """Cities of any density, size of blocks and relief in four to nine tiles, from files to files."""
+    """Cities of any density, size of blocks and relief in 9 to 25 tiles, from files to files."""
     rng = np.random.default_rng(seed)
     mesh_size = float(rng.choice([6.0, 8.0, 10.0, 15.0]))
     tile_size = float(np.rint(mesh_size * rng.uniform(14, 16)))
-    across = rng.uniform(1.8, 2.9, 2) * tile_size
+    across = rng.uniform(3.05, 4.95, 2) * tile_size
     region = box(*np.rint(across).tolist(), west=X + float(rng.integers(500)), south=Y + float(rng.integers(500)))
     if rng.random() < 0.4:
         houses = terraces(region, seed=seed, angle=float(rng.uniform(0, 90)))
@@ -523,4 +523,5 @@ def test_random_tiled_cities_are_meshed_and_proved(tmp_path: Path, seed: int) ->
     }
     record = run_of(values, tmp_path / "out")
     prove(tmp_path / "out")
+    assert 9 <= record["counts"]["tiles"] <= 25
     assert record["counts"]["buildings"] > 0
