@@ -12,14 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.city import CityOptions
 from pipeline.graph import MILLIMETRES
 from pipeline.house_levels import HouseParts
 from pipeline.merge import merge_footprints
-from pipeline.planar import PlanarCity, shape_planar
+from pipeline.planar import PlanarCity, join_pairs, shape_planar
 
 KEPT = 0.5  # a house that keeps less of its area than this is simplified again by its closed outline
 ROUNDING = 1e-4  # mm, of distances
@@ -129,21 +127,6 @@ def find_close(polygons: NDArray[np.object_], clearance: float) -> NDArray[np.in
     i, j = i[later], j[later]
     close = shapely.distance(polygons[i], polygons[j]) * MILLIMETRES < clearance * MILLIMETRES - ROUNDING
     return np.column_stack((i[close], j[close])).astype(np.int64)
-
-
-def join_pairs(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Name the connected components of n things, int64 (n,), by the smallest index in each.
-
-    Examples
-    --------
-    >>> join_pairs(4, np.array([[3, 1]]))
-    array([0, 1, 2, 1])
-    """
-    links = (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1]))
-    _, component = connected_components(coo_array(links, shape=(n, n)), directed=False)
-    _, first, index = np.unique(component, return_index=True, return_inverse=True)
-    named: NDArray[np.int64] = first[index.reshape(-1)].astype(np.int64)
-    return named
 
 
 def join_shapes(several: Sequence[Shapes]) -> Shapes:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from pipeline.building_points import (
@@ -105,16 +104,3 @@ def join_houses(several: Sequence[Houses]) -> Houses:
         ),
         join_building_points([houses.points for houses in several]),
     )
-
-
-def sort_houses(houses: Houses) -> Houses:
-    """Sort houses by id, so that what follows does not depend on the tiles that they come from."""
-    return take_houses(houses, np.argsort(houses.ids, kind="stable"))
-
-
-def houses_extent(houses: Houses) -> tuple[float, float, float, float] | None:
-    """Box around all houses (m); None without any."""
-    if len(houses) == 0:
-        return None
-    xmin, ymin, xmax, ymax = shapely.total_bounds(houses.polygons).tolist()
-    return xmin, ymin, xmax, ymax

@@ -159,6 +159,21 @@ def shape_planar(
     return _finish(shaped, cluster[order], counts, order, polygons)
 
 
+def join_pairs(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Name the connected components of n things, int64 (n,), by the smallest index in each.
+
+    Examples
+    --------
+    >>> join_pairs(4, np.array([[3, 1]]))
+    array([0, 1, 2, 1])
+    """
+    links = (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1]))
+    _, component = connected_components(coo_array(links, shape=(n, n)), directed=False)
+    _, first, index = np.unique(component, return_index=True, return_inverse=True)
+    named: NDArray[np.int64] = first[index.reshape(-1)].astype(np.int64)
+    return named
+
+
 def find_clusters(polygons: NDArray[np.object_], clearance: float) -> NDArray[np.int64]:
     """Find the chains of polygons closer than the clearance.
 
@@ -175,7 +190,7 @@ def find_clusters(polygons: NDArray[np.object_], clearance: float) -> NDArray[np
         Cluster of each polygon, named by the smallest index in it.
     """
     i, j = _find_close_pairs(polygons, clearance)
-    return _chain(len(polygons), i, j)
+    return join_pairs(len(polygons), np.column_stack((i, j)))
 
 
 def _prepare(
@@ -214,7 +229,7 @@ def _shape_all(houses: NDArray[np.object_], rules: Rules) -> tuple[Shaped, NDArr
         i, j = shaped.cluster[i], shaped.cluster[j]
         if (i == j).all():
             return shaped, cluster, counts
-        joined = _chain(len(houses), i, j)[cluster]
+        joined = join_pairs(len(houses), np.column_stack((i, j)))[cluster]
         touched = np.isin(joined, joined[joined != cluster])
         counts["clusters-joined"] += len(np.unique(cluster)) - len(np.unique(joined))
         shaped = shaped.leave_out(cluster[touched])
@@ -229,14 +244,6 @@ def _find_close_pairs(
     i, j = i[later], j[later]
     close = shapely.distance(polygons[i], polygons[j]) < clearance
     return i[close], j[close]
-
-
-def _chain(n: int, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Name the connected components of n things by the smallest index in each."""
-    _, component = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)
-    _, first, index = np.unique(component, return_index=True, return_inverse=True)
-    named: NDArray[np.int64] = first[index]
-    return named
 
 
 def _finish(

@@ -125,6 +125,20 @@ def grow_window(window: NodeWindow, by: int, *, within: NodeWindow) -> NodeWindo
     return NodeWindow(i0, j0, max(i1 - i0, 0), max(j1 - j0, 0))
 
 
+def hull_windows(windows: Sequence[NodeWindow]) -> NodeWindow:
+    """Smallest window around all that have nodes."""
+    some = [window for window in windows if window.nx and window.ny] or [windows[0]]
+    i0, j0 = min(window.i0 for window in some), min(window.j0 for window in some)
+    i1, j1 = max(window.i0 + window.nx for window in some), max(window.j0 + window.ny for window in some)
+    return NodeWindow(i0, j0, i1 - i0, j1 - j0)
+
+
+def windows_meet(one: NodeWindow, other: NodeWindow) -> bool:
+    """Tell whether two windows have a node in common."""
+    common = grow_window(one, 0, within=other)
+    return common.nx > 0 and common.ny > 0
+
+
 def join_dtm(parts: Sequence[Dtm], window: NodeWindow) -> Dtm:
     """Put the rasters of neighbouring tiles together.
 

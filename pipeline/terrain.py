@@ -5,14 +5,34 @@ A region in one piece takes `compute_dtm`. Tiles take the same steps one by one:
 `merge_coarse` and `coarse_terrain` for the region; then `fill_terrain`. The bytes are the same.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.pointcloud import GROUND, WATER, PointCloud
-from pipeline.raster import HEIGHT_UNIT, Dtm, NodeWindow, node_window, sample_dtm, window_of
+from pipeline.raster import (
+    HEIGHT_UNIT,
+    Dtm,
+    NodeWindow,
+    join_dtm,
+    node_window,
+    sample_dtm,
+    window_of,
+    windows_meet,
+)
 from pipeline.terrain_fill import coarse_terrain, coarsen, fill_terrain, flood_terrain
 
-__all__ = ["HEIGHT_UNIT", "Dtm", "bin_ground", "bin_nodes", "compute_dtm", "fill_dtm", "sample_dtm"]
+__all__ = [
+    "HEIGHT_UNIT",
+    "Dtm",
+    "bin_ground",
+    "bin_nodes",
+    "compute_dtm",
+    "fill_dtm",
+    "join_terrain",
+    "sample_dtm",
+]
 
 
 def bin_nodes(cloud: PointCloud, window: NodeWindow, *, spacing: float) -> tuple[Dtm, NDArray[np.int64]]:
@@ -80,6 +100,15 @@ def fill_dtm(dtm: Dtm) -> Dtm:
     """
     flooded = flood_terrain(dtm, window_of(dtm))
     return fill_terrain(flooded, coarse_terrain(coarsen(flooded)))[0]
+
+
+def join_terrain(parts: Sequence[Dtm], window: NodeWindow) -> Dtm:
+    """Put the terrain of neighbouring tiles together; nodes of tiles that are absent are filled from those around.
+
+    Parameters and errors as in `join_dtm`.
+    """
+    dtm = join_dtm([part for part in parts if windows_meet(window_of(part), window)], window)
+    return fill_dtm(dtm) if np.isnan(dtm.z).any() else dtm
 
 
 def compute_dtm(cloud: PointCloud, bounds: tuple[float, float, float, float], *, spacing: float = 1.0) -> Dtm:

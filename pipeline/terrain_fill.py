@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.raster import HEIGHT_UNIT, Dtm, NodeWindow, cut_nodes, window_of
+from pipeline.raster import HEIGHT_UNIT, Dtm, NodeWindow, cut_nodes, hull_windows, window_of
 
 FILL_RINGS = 64  # rings that are flooded; also how many nodes beyond its own a tile must read
 RIM = FILL_RINGS // 2  # deeper than this ring, the coarse level has a weight
@@ -144,7 +144,7 @@ def merge_coarse(parts: Sequence[CoarseSums]) -> CoarseSums:
         np.concatenate([part.total for part in parts]),
         np.concatenate([part.count for part in parts]),
     )
-    window = _hull([part.window for part in parts])
+    window = hull_windows([part.window for part in parts])
     return CoarseSums(node, total, count, window, sum(part.n_known for part in parts), parts[0].spacing)
 
 
@@ -222,14 +222,6 @@ def fill_terrain(flooded: FloodedDtm, coarse: Dtm) -> tuple[Dtm, FillCounts]:
 
 def _covers(window: NodeWindow, i0: int, j0: int, i1: int, j1: int) -> bool:
     return window.i0 <= i0 and window.j0 <= j0 and i1 < window.i0 + window.nx and j1 < window.j0 + window.ny
-
-
-def _hull(windows: Sequence[NodeWindow]) -> NodeWindow:
-    """Smallest window around all that have nodes."""
-    some = [window for window in windows if window.nx and window.ny] or [windows[0]]
-    i0, j0 = min(window.i0 for window in some), min(window.j0 for window in some)
-    i1, j1 = max(window.i0 + window.nx for window in some), max(window.j0 + window.ny for window in some)
-    return NodeWindow(i0, j0, i1 - i0, j1 - j0)
 
 
 def _sum_up(

@@ -13,29 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.mesh import ColumnMesh
 from pipeline.nodes import Levels
-from stitch.grid import Key, SeamKey, TileGrid, corner_keys, ends_of_seam, is_border, seam_keys, tile_keys
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What points belong to, in the order of their numbers.
-
-    Attributes
-    ----------
-    corners : tuple of Key
-        Corners of two tiles or more: the ends of seams within the region.
-    seams : tuple of SeamKey
-        Seams within the region.
-    tiles : tuple of Key
-        Tiles.
-    """
-
-    corners: tuple[Key, ...]
-    seams: tuple[SeamKey, ...]
-    tiles: tuple[Key, ...]
-
-    def __len__(self) -> int:
-        return len(self.corners) + len(self.seams) + len(self.tiles)
+from stitch.grid import Key, SeamKey, TileGrid
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +32,30 @@ class SeamNumbers:
     first: tuple[int, int, int]
 
 
-def list_parts(grid: TileGrid) -> Parts:
-    """List the parts of a region in the order of their numbers."""
-    seams = tuple(key for key in seam_keys(grid) if not is_border(grid, key))
-    ends = {corner for key in seams for corner in ends_of_seam(key)}
-    return Parts(tuple(key for key in corner_keys(grid) if key in ends), seams, tuple(tile_keys(grid)))
+def count_parts(grid: TileGrid) -> int:
+    """Count the parts of a region, absent ones and borders included, which have no points of their own."""
+    nx, ny = _size(grid)
+    return (nx + 1) * (ny + 1) + nx * (ny + 1) + (nx + 1) * ny + nx * ny
+
+
+def corner_part(grid: TileGrid, key: Key) -> int:
+    """Place of a corner among the parts: corners first, then seams, then tiles; it follows from the key alone."""
+    _, ny = _size(grid)
+    return (key.i - grid.first.i) * (ny + 1) + key.j - grid.first.j
+
+
+def seam_part(grid: TileGrid, key: SeamKey) -> int:
+    """Place of a seam among the parts."""
+    nx, ny = _size(grid)
+    i, j = key.i - grid.first.i, key.j - grid.first.j
+    before = (nx + 1) * (ny + 1)
+    return before + i * (ny + 1) + j if key.axis == 0 else before + nx * (ny + 1) + i * ny + j
+
+
+def tile_part(grid: TileGrid, key: Key) -> int:
+    """Place of a tile among the parts."""
+    nx, ny = _size(grid)
+    return count_parts(grid) - nx * ny + (key.i - grid.first.i) * ny + key.j - grid.first.j
 
 
 def count_points(levels: Levels) -> tuple[int, int, int]:
@@ -79,7 +76,7 @@ def make_offsets(counts: Sequence[int]) -> NDArray[np.int64]:
     Parameters
     ----------
     counts : sequence of p int
-        Points of each part, in the order of `Parts`: corners, seams, tiles. A tile that is missing has 0.
+        Points of each part, by its place. A tile that is missing has 0.
 
     Returns
     -------
@@ -133,3 +130,7 @@ def number_points(mesh: ColumnMesh, seams: Sequence[SeamNumbers], first: int) ->
     begin[own] = first + np.cumsum(count[own]) - count[own]
     numbers: NDArray[np.int64] = np.arange(len(mesh.z)) - np.repeat(mesh.z_start[:-1] - begin, count)
     return numbers
+
+
+def _size(grid: TileGrid) -> tuple[int, int]:
+    return len(grid.lines[0]) - 1, len(grid.lines[1]) - 1

@@ -21,8 +21,8 @@ from pipeline.plane import mesh_plane
 from stitch.conformity import match_facets, pair_cell_faces, pair_edges, pair_faces
 from stitch.facets import label_beyond
 from stitch.frontier import find_edges_below
-from stitch.grid import Key, SeamKey, make_grid
-from stitch.numbering import SeamNumbers, list_parts, number_points
+from stitch.grid import Key, SeamKey, corner_keys, make_grid, seam_keys, tile_keys
+from stitch.numbering import SeamNumbers, corner_part, count_parts, number_points, seam_part, tile_part
 from tests.cities import Bounds, hilly_dtm, tilted_dtm
 from tests.stitching import OPTIONS, Scene, glue, random_scene, scene_of
 from tests.terraces import terrace_town
@@ -233,10 +233,13 @@ def test_a_point_has_one_number_in_all_tiles_and_none_is_left_out(crowded: City,
         assert len(np.unique(np.column_stack((ids, points)), axis=0)) == total
 
 
-def test_parts_follow_each_other() -> None:
-    parts = list_parts(make_grid(SQUARE, tile_size=140.0, mesh_size=10.0))
-    assert (len(parts.corners), len(parts.seams), len(parts.tiles), len(parts)) == (12, 12, 9, 33)
-    assert len(list_parts(make_grid(SQUARE, tile_size=420.0, mesh_size=10.0))) == 1
+def test_every_part_has_a_place_of_its_own_and_none_is_left_over() -> None:
+    grid = make_grid((0.0, 140.0, 420.0, 420.0), tile_size=140.0, mesh_size=10.0)
+    corners, seams, tiles = corner_keys(grid), seam_keys(grid), tile_keys(grid)
+    assert (len(corners), len(seams), len(tiles)) == (12, 17, 6)
+    places = [corner_part(grid, key) for key in corners] + [seam_part(grid, key) for key in seams]
+    places += [tile_part(grid, key) for key in tiles]
+    assert sorted(places) == list(range(count_parts(grid)))
 
 
 def test_corners_with_two_numbers_are_refused(crowded: City) -> None:

@@ -14,7 +14,17 @@ from pipeline.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
 from pipeline.terrain import Dtm, sample_dtm
 from stitch.facets import Side, find_seam_edges
 from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile
-from stitch.numbering import SeamNumbers, count_inner_points, count_points, list_parts, make_offsets, number_points
+from stitch.numbering import (
+    SeamNumbers,
+    corner_part,
+    count_inner_points,
+    count_parts,
+    count_points,
+    make_offsets,
+    number_points,
+    seam_part,
+    tile_part,
+)
 from stitch.seam_columns import tile_columns
 from stitch.seams import find_vertices
 from tests.stitching import OPTIONS, Scene, Tile, clip_scene, mesh_all
@@ -83,30 +93,23 @@ def cut_city(city: City, gone: Collection[Key] = ()) -> Pieces:
 
 def number_city(city: City) -> tuple[dict[Key, NDArray[np.int64]], int]:
     """Number the points of all tiles; also tell how many there are."""
-    parts = list_parts(city.grid)
-    of_corner: dict[Key, int] = {}
-    of_seam: dict[SeamKey, int] = {}
+    grid = city.grid
+    counts = np.zeros(count_parts(grid), np.int64)
     vertex: dict[tuple[Key, SeamKey], NDArray[np.int32]] = {}
     for key, tile in city.tiles.items():
         for seam, levels in tile.columns.items():
             vertex[key, seam] = find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy)
-            start, of_seam[seam], end = count_points(levels)
-            of_corner |= dict(zip(ends_of_seam(seam), (start, end), strict=True))
-    counts = [of_corner[corner] for corner in parts.corners] + [of_seam[seam] for seam in parts.seams]
-    for key in parts.tiles:
-        tile = city.tiles[key]
-        counts.append(count_inner_points(tile.mesh, [vertex[key, seam] for seam in tile.columns]))
-    offsets = make_offsets(counts).tolist()
-    n_corners, n_shared = len(parts.corners), len(parts.corners) + len(parts.seams)
-    corners = dict(zip(parts.corners, offsets[:n_corners], strict=True))
-    seams = dict(zip(parts.seams, offsets[n_corners:n_shared], strict=True))
-    numbers = {}
-    for key, first in zip(parts.tiles, offsets[n_shared:-1], strict=True):
-        own = []
-        for seam in city.tiles[key].columns:
             low, high = ends_of_seam(seam)
-            own.append(SeamNumbers(vertex[key, seam], (corners[low], seams[seam], corners[high])))
-        numbers[key] = number_points(city.tiles[key].mesh, own, first)
+            counts[[corner_part(grid, low), seam_part(grid, seam), corner_part(grid, high)]] = count_points(levels)
+        counts[tile_part(grid, key)] = count_inner_points(tile.mesh, [vertex[key, seam] for seam in tile.columns])
+    offsets = make_offsets(counts.tolist()).tolist()
+    numbers = {}
+    for key, tile in city.tiles.items():
+        own = []
+        for seam in tile.columns:
+            low, high = (offsets[corner_part(grid, end)] for end in ends_of_seam(seam))
+            own.append(SeamNumbers(vertex[key, seam], (low, offsets[seam_part(grid, seam)], high)))
+        numbers[key] = number_points(tile.mesh, own, offsets[tile_part(grid, key)])
     return numbers, offsets[-1]
 
 

@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 from pipeline.building_points import NEVER_ROOF
 from pipeline.citymodel import Footprints
 from pipeline.ground_filter import FILTER_REACH, classify_ground
-from pipeline.houses import Houses, join_houses
 from pipeline.pointcloud import BUILDING, PointCloud
-from pipeline.raster import Dtm, NodeWindow, grow_window, join_dtm, node_window
-from pipeline.terrain import fill_dtm
+from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
+from pipeline.terrain import join_terrain
 from stitch.grid import Bounds
 from tiler.cells import select_cells
 from tiler.footprint_index import FootprintRows, join_footprints, select_footprints
 from tiler.ingest import CELL, crop_cloud
 from tiler.stage import Box
-from tiler.tables import Buildings, join_buildings, take_buildings, unpack_buildings, unpack_houses
+from tiler.tables import Buildings, join_buildings, take_buildings, unpack_buildings
 from tiler.task import Task
 
 GAP_ROWS = 50_000  # ranges of points closer than this are read as one
@@ -58,9 +57,9 @@ def read_cloud(task: Task, box: Box, *, ground_filter: bool = False) -> PointClo
     parts = [PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))]
     marks = [True]
     for name in task.refs["points"]:
-        facts = task.store.attributes("points", name)["facts"]
-        parts += list(_read_ranges(task, name, wide))
-        marks += [facts["marks_buildings"]] * (len(parts) - len(marks))
+        found, marked_file = _read_ranges(task, name, wide)
+        parts += found
+        marks += [marked_file] * len(found)
     cloud = PointCloud(
         np.concatenate([part.xyz for part in parts]), np.concatenate([part.classification for part in parts])
     )
@@ -78,9 +77,7 @@ def read_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm
     Nodes of tiles that are absent are filled from those around.
     """
     window = region_window(box, spacing, bounds)
-    parts = [part for part in _read_rasters(task, "terrain") if _meet(part, window)]
-    dtm = join_dtm(parts, window)
-    return fill_dtm(dtm) if np.isnan(dtm.z).any() else dtm
+    return join_terrain(list(_read_rasters(task, "terrain")), window)
 
 
 def region_window(box: Box, spacing: float, bounds: Bounds) -> NodeWindow:
@@ -110,17 +107,6 @@ def read_outlines(task: Task) -> Footprints:
     return join_footprints(parts, task.box)
 
 
-def read_houses(task: Task, stage: str = "houses") -> Iterator[tuple[str, Houses]]:
-    """Read the houses of each tile."""
-    for result in task.read(stage):
-        yield result.name, unpack_houses(result.arrays)
-
-
-def read_all_houses(task: Task) -> Houses:
-    """Read the houses of all tiles that the task may read, by tile."""
-    return join_houses([houses for _, houses in read_houses(task)])
-
-
 def read_buildings(task: Task, box: Box) -> Buildings:
     """Read the buildings of the simplified city model that meet a box, by ascending id."""
     near = []
@@ -131,14 +117,16 @@ def read_buildings(task: Task, box: Box) -> Buildings:
     return join_buildings(near)
 
 
-def _read_ranges(task: Task, name: str, box: Box) -> Iterator[PointCloud]:
-    """Read the points of a file in cells that meet a box, cropped to it."""
-    arrays, _ = task.store.read("points", name, names=("cell", "cell_row", "block", "end"))
+def _read_ranges(task: Task, name: str, box: Box) -> tuple[list[PointCloud], bool]:
+    """Read the points of a file in cells that meet a box, cropped to it; also whether it marks buildings."""
+    arrays, attributes = task.store.read("points", name, names=("cell", "cell_row", "block", "end"))
     row = np.append(arrays["cell_row"], arrays["end"])
+    parts = []
     for first, last in _ranges_of_blocks(arrays["cell"], row, arrays["block"], box):
         xyz = task.read_rows("points", name, "xyz", first, last)
         classification = task.read_rows("points", name, "classification", first, last)
-        yield crop_cloud(PointCloud(xyz, classification), box)
+        parts.append(crop_cloud(PointCloud(xyz, classification), box))
+    return parts, attributes["facts"]["marks_buildings"]
 
 
 def _ranges_of_blocks(
@@ -160,13 +148,3 @@ def _read_rasters(task: Task, stage: str) -> Iterator[Dtm]:
     for result in task.read(stage, ("z",)):
         facts = result.facts
         yield Dtm(result.arrays["z"], facts["i0"], facts["j0"], facts["spacing"])
-
-
-def _meet(part: Dtm, window: NodeWindow) -> bool:
-    ny, nx = part.z.shape
-    return (
-        part.i0 < window.i0 + window.nx
-        and window.i0 < part.i0 + nx
-        and part.j0 < window.j0 + window.ny
-        and window.j0 < part.j0 + ny
-    )

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.mesh import ColumnMesh, PlaneMesh
-from pipeline.raster import Dtm, NodeWindow, join_dtm, node_window, sample_dtm
-from pipeline.terrain import fill_dtm
+from pipeline.raster import Dtm, NodeWindow, grow_window, hull_windows, node_window, sample_dtm, windows_meet
+from pipeline.terrain import join_terrain
 from tiler.store import Store
 
 COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom")
@@ -62,6 +62,7 @@ class StoredTerrain:
         self._windows = {
             name: NodeWindow(fact["i0"], fact["j0"], fact["nx"], fact["ny"]) for name, fact in facts.items()
         }
+        self._region = hull_windows(list(self._windows.values()))
         self._spacing = float(next(iter(facts.values()))["spacing"])
         self._chunks: dict[str, Dtm] = {}
 
@@ -71,10 +72,9 @@ class StoredTerrain:
             return np.empty(0)
         low, high = xy.min(axis=0), xy.max(axis=0)
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        window = node_window(box, self._spacing)
-        parts = [self._chunk(name) for name, own in self._windows.items() if _meet(own, window)]
-        dtm = join_dtm(parts, _hull(window, [self._windows[name] for name in self._windows]))
-        return sample_dtm(fill_dtm(dtm) if np.isnan(dtm.z).any() else dtm, xy)
+        window = grow_window(node_window(box, self._spacing), 0, within=self._region)
+        parts = [self._chunk(name) for name, own in self._windows.items() if windows_meet(own, window)]
+        return sample_dtm(join_terrain(parts, window), xy)
 
     def _chunk(self, name: str) -> Dtm:
         if name not in self._chunks:
@@ -84,21 +84,3 @@ class StoredTerrain:
             z = self._store.read("terrain", name)[0]["z"]
             self._chunks[name] = Dtm(z, window.i0, window.j0, self._spacing)
         return self._chunks[name]
-
-
-def _meet(one: NodeWindow, other: NodeWindow) -> bool:
-    return (
-        one.i0 < other.i0 + other.nx
-        and other.i0 < one.i0 + one.nx
-        and one.j0 < other.j0 + other.ny
-        and other.j0 < one.j0 + one.ny
-    )
-
-
-def _hull(window: NodeWindow, tiles: list[NodeWindow]) -> NodeWindow:
-    """Cut a window to the region's nodes."""
-    i0, j0 = min(tile.i0 for tile in tiles), min(tile.j0 for tile in tiles)
-    i1, j1 = max(tile.i0 + tile.nx for tile in tiles), max(tile.j0 + tile.ny for tile in tiles)
-    left, low = max(window.i0, i0), max(window.j0, j0)
-    right, high = min(window.i0 + window.nx, i1), min(window.j0 + window.ny, j1)
-    return NodeWindow(left, low, right - left, high - low)

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from pipeline.city import City
 from pipeline.citymodel import Footprints
-from pipeline.clusters import Shapes, find_close, join_pairs, join_shapes, keep_shapes, leave_out, shape_clusters
+from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leave_out, shape_clusters
 from pipeline.groups import adjacent_houses
-from pipeline.houses import Houses, divide_houses, houses_extent, join_houses, take_houses
+from pipeline.houses import Houses, divide_houses, join_houses, take_houses
 from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
+from pipeline.planar import join_pairs
 from pipeline.point_fidelity import HouseFidelity, measure_houses
 from pipeline.pointcloud import PointCloud
 from pipeline.raster import Dtm
@@ -126,7 +127,7 @@ def make_houses(task: Task) -> Facts:
     task.put(**pack_houses(houses), **pack_buildings(full, "full_"))
     return {
         "n": len(houses),
-        "extent": houses_extent(houses),
+        "extent": _extent(houses.polygons),
         "counts": {"buildings before merging": len(houses), **_count_parts(houses)},
     }
 

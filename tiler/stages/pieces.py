@@ -23,8 +23,16 @@ from pipeline.point_fidelity import KINDS, FidelitySums, conclude_fidelity, merg
 from pipeline.pointcloud import PointCloud
 from pipeline.quality import measure_cells
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
-from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, is_border, is_pinched, seams_of_tile, tiles_of_seam
-from stitch.numbering import SeamNumbers, make_offsets, number_points
+from stitch.grid import Key, TileGrid, ends_of_seam, is_border, is_pinched, seams_of_tile, tiles_of_seam
+from stitch.numbering import (
+    SeamNumbers,
+    corner_part,
+    count_parts,
+    make_offsets,
+    number_points,
+    seam_part,
+    tile_part,
+)
 from stitch.seams import find_vertices
 from tiler.config import Config
 from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
@@ -62,22 +70,22 @@ def piece_stages(config: Config) -> list[Stage]:
 def number_parts(task: Task) -> Facts:
     """Find where the numbers of the points of each corner, seam and tile begin, over the whole region."""
     grid = task.context.grid
-    counts = np.zeros(_n_parts(grid), np.int64)
+    counts = np.zeros(count_parts(grid), np.int64)
     for result in task.read("seams", ()):
         key = seam_key(result.name)
         start, end = ends_of_seam(key)
         if result.facts["border"]:
             for k, n_points in result.facts["pinched"]:
-                counts[_corner_part(grid, (start, end)[k])] = n_points
+                counts[corner_part(grid, (start, end)[k])] = n_points
         else:
             first, inner, last = result.facts["points"]
-            counts[[_corner_part(grid, start), _seam_part(grid, key), _corner_part(grid, end)]] = (
+            counts[[corner_part(grid, start), seam_part(grid, key), corner_part(grid, end)]] = (
                 first,
                 inner,
                 last,
             )
     for result in task.read("columns", ()):
-        counts[_tile_part(grid, tile_key(result.name))] = result.facts["inner_points"]
+        counts[tile_part(grid, tile_key(result.name))] = result.facts["inner_points"]
     offsets = make_offsets(counts.tolist())
     task.put(offset=offsets)
     return {"points": int(offsets[-1])}
@@ -86,9 +94,9 @@ def number_parts(task: Task) -> Facts:
 def take_offsets(task: Task) -> Facts:
     """Take where the numbers of a tile's own corners, seams and inner points begin."""
     grid, key = task.context.grid, tile_key(task.name)
-    parts = {_tile_part(grid, key)}
+    parts = {tile_part(grid, key)}
     for seam in seams_of_tile(key):
-        parts |= {_seam_part(grid, seam), *(_corner_part(grid, corner) for corner in ends_of_seam(seam))}
+        parts |= {seam_part(grid, seam), *(corner_part(grid, corner) for corner in ends_of_seam(seam))}
     part = np.array(sorted(parts))
     (numbers,) = task.read("numbers")
     task.put(part=part, offset=numbers.arrays["offset"][part])
@@ -98,9 +106,8 @@ def take_offsets(task: Task) -> Facts:
 def write_piece(task: Task) -> Facts:
     """Write a tile's cells and its boundary as files, and measure the cells (step 3.6)."""
     grid, key = task.context.grid, tile_key(task.name)
-    (own,) = (result for result in task.read("columns", ()) if result.name == task.name)
-    arrays, _ = task.store.read("columns", task.name, names=(*COLUMN_ARRAYS, *EDGE_ARRAYS))
-    mesh, numbers = unpack_columns(arrays, own.facts["order"])
+    arrays, attributes = task.store.read("columns", task.name, names=(*COLUMN_ARRAYS, *EDGE_ARRAYS))
+    mesh, numbers = unpack_columns(arrays, attributes["facts"]["order"])
     edges = SeamEdges(
         arrays["edge"],
         arrays["edge_bottom"],
@@ -226,18 +233,18 @@ def _number_points(task: Task, mesh: ColumnMesh, grid: TileGrid, key: Key) -> ND
     seams = []
     for seam in seams_of_tile(key):
         corners = ends_of_seam(seam)
-        ends = [offset[_corner_part(grid, corner)] for corner in corners]
+        ends = [offset[corner_part(grid, corner)] for corner in corners]
         border = is_border(grid, seam)
         if border and not any(is_pinched(grid, corner) for corner in corners):
             continue
         vertex = find_vertices(mesh.plane.xy, task.store.read("seams", seam_name(seam), names=("xy",))[0]["xy"])
         if not border:
-            seams.append(SeamNumbers(vertex, (ends[0], offset[_seam_part(grid, seam)], ends[1])))
+            seams.append(SeamNumbers(vertex, (ends[0], offset[seam_part(grid, seam)], ends[1])))
             continue
         for k, corner in enumerate(corners):
             if is_pinched(grid, corner):
                 seams.append(SeamNumbers(vertex[[-k, -k]], (ends[k], 0, ends[k])))
-    return number_points(mesh, seams, offset[_tile_part(grid, key)])
+    return number_points(mesh, seams, offset[tile_part(grid, key)])
 
 
 def _digest_seams(
@@ -269,30 +276,3 @@ def _hash_faces(corners: NDArray[np.float64]) -> str:
     face = np.repeat(np.arange(len(corners)), 3)
     flat = rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0], face))].reshape(-1, 9)
     return hashlib.blake2b(flat[np.lexsort(flat.T[::-1])].tobytes(), digest_size=16).hexdigest()
-
-
-def _size(grid: TileGrid) -> tuple[int, int]:
-    return len(grid.lines[0]) - 1, len(grid.lines[1]) - 1
-
-
-def _n_parts(grid: TileGrid) -> int:
-    """Parts of a region, absent ones included: a part's place follows from its key alone."""
-    nx, ny = _size(grid)
-    return (nx + 1) * (ny + 1) + nx * (ny + 1) + (nx + 1) * ny + nx * ny
-
-
-def _corner_part(grid: TileGrid, key: Key) -> int:
-    _, ny = _size(grid)
-    return (key.i - grid.first.i) * (ny + 1) + key.j - grid.first.j
-
-
-def _seam_part(grid: TileGrid, key: SeamKey) -> int:
-    nx, ny = _size(grid)
-    i, j = key.i - grid.first.i, key.j - grid.first.j
-    before = (nx + 1) * (ny + 1)
-    return before + i * (ny + 1) + j if key.axis == 0 else before + nx * (ny + 1) + i * ny + j
-
-
-def _tile_part(grid: TileGrid, key: Key) -> int:
-    nx, ny = _size(grid)
-    return _n_parts(grid) - nx * ny + (key.i - grid.first.i) * ny + key.j - grid.first.j
