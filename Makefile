@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-long lint bench bench-tiles quality clean
+.PHONY: demo test test-long lint bench bench-tiles quality reliability clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("citystitch needs Python 3.11 or newer, this is " + sys.version) if sys.version_info < (3, 11) else None'
@@ -35,6 +35,9 @@ bench-tiles: $(STAMP)
 
 quality: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.quality
+
+reliability: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.reliability
 
 clean:
 	rm -rf $(VENV) demo out .pytest_cache .mypy_cache .ruff_cache

@@ -8,6 +8,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.group_order import sort_values
+from pipeline.inside import are_inside, find_inside
 from pipeline.pointcloud import (
     BUILDING,
     GROUND,
@@ -23,8 +25,7 @@ from pipeline.pointcloud import (
 # Where a cloud has no building class, a point of any class but these may lie on a roof.
 NEVER_ROOF = (GROUND, LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION, LOW_NOISE, WATER, HIGH_NOISE)
 OUTLIER_DEVIATIONS = 2.0  # paper, step 1.5
-CHUNK_POINTS = 2**18
-INDEX_CELL = 4.0  # m, side of a cell of the point index; measured best of 2, 4 and 8 on 3.5 points/m2
+FINE_OUTLINE = 2000  # vertices; only the largest of real houses have so many
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +75,26 @@ def extract_building_points(
 
     Notes
     -----
-    Points are sorted into square cells; each polygon takes the cells that its box touches, then exact
-    containment decides. The result does not depend on the order of the points.
+    The result does not depend on the order of the points.
     """
     roof = cloud.classification == BUILDING if building_class else ~np.isin(cloud.classification, NEVER_ROOF)
     ground = (cloud.classification == GROUND) | (cloud.classification == WATER)
-    roof_start, roof_z = _points_inside(cloud.xyz[roof], polygons, None)
-    rings = shapely.buffer(polygons, margin)
-    ground_start, ground_z = _points_inside(cloud.xyz[ground], rings, polygons)
+    roof_start, roof_z = _points_inside(np.compress(roof, cloud.xyz, axis=0), polygons, None)
+    rings = shapely.buffer(_coarsened(polygons, margin), margin)
+    ground_start, ground_z = _points_inside(np.compress(ground, cloud.xyz, axis=0), rings, polygons)
     return BuildingPoints(*remove_outliers(roof_start, roof_z), *remove_outliers(ground_start, ground_z))
+
+
+def _coarsened(polygons: NDArray[np.object_], margin: float) -> NDArray[np.object_]:
+    """Simplify what has very many vertices within a quarter of the margin that is laid around it.
+
+    Arcs around vertices that are closer to each other than the margin all cross: the time grows with the square of
+    their number. Ragged outlines of 40,000 vertices took 36 s and 2 GB.
+    """
+    fine = shapely.get_num_coordinates(polygons) > FINE_OUTLINE
+    coarse: NDArray[np.object_] = polygons.copy()
+    coarse[fine] = shapely.simplify(polygons[fine], margin / 4)
+    return coarse
 
 
 def remove_outliers(
@@ -163,81 +175,16 @@ def _take(
     return new_start, z[np.arange(new_start[-1]) + np.repeat(start[rows] - new_start[:-1], count)]
 
 
-def find_inside(
-    xy: NDArray[np.float64], polygons: NDArray[np.object_]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find the points inside each polygon, those on its outline left out.
-
-    Parameters
-    ----------
-    xy : float64, (k, 2) or (k, 3)
-        Points (m).
-    polygons : object, (n,)
-        Valid shapely Polygons; a point in several of them is found in each.
-
-    Returns
-    -------
-    polygon, point : int64, (h,)
-        Rows of `polygons` and `xy`, by polygon, then by point.
-
-    Notes
-    -----
-    Points are looked at a quarter of a million at a time, so that memory is that of the result.
-    """
-    boxes = shapely.bounds(polygons).reshape(-1, 4)
-    shapely.prepare(polygons)
-    found = [(np.empty(0, np.int64), np.empty(0, np.int64))]
-    for first in range(0, len(xy), CHUNK_POINTS):
-        chunk = xy[first : first + CHUNK_POINTS]
-        polygon, point = _find_candidates(chunk, boxes)
-        inside = shapely.contains_xy(polygons[polygon], chunk[point, 0], chunk[point, 1])
-        found.append((polygon[inside], point[inside] + first))
-    polygon, point = (np.concatenate(part) for part in zip(*found, strict=True))
-    order = np.lexsort((point, polygon))
-    return polygon[order], point[order]
-
-
 def _points_inside(
     xyz: NDArray[np.float64], polygons: NDArray[np.object_], outside: NDArray[np.object_] | None
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Heights of the points in each polygon, and not in its counterpart in `outside` where given."""
     polygon, point = find_inside(xyz, polygons)
     if outside is not None:
-        shapely.prepare(outside)
-        apart = ~shapely.intersects_xy(outside[polygon], xyz[point, 0], xyz[point, 1])
+        apart = ~are_inside(outside, polygon, xyz[point], closed=True)
         polygon, point = polygon[apart], point[apart]
-    z = xyz[point, 2]
-    order = np.lexsort((z, polygon))
     start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))
-    return start, z[order]
-
-
-def _find_candidates(
-    xyz: NDArray[np.float64], boxes: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs (box, point) of the points in the index cells that each box touches, by box."""
-    if len(xyz) == 0 or len(boxes) == 0:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    cell = np.floor(xyz[:, :2] / INDEX_CELL).astype(np.int64)
-    first = cell.min(axis=0)
-    n_cols, n_rows = (cell.max(axis=0) - first + 1).tolist()
-    key = (cell[:, 1] - first[1]) * n_cols + cell[:, 0] - first[0]
-    order = np.argsort(key, kind="stable")
-    cell_start = np.concatenate(([0], np.cumsum(np.bincount(key, minlength=n_cols * n_rows))))
-
-    low = np.floor(boxes[:, :2] / INDEX_CELL).astype(np.int64) - first
-    high = np.floor(boxes[:, 2:] / INDEX_CELL).astype(np.int64) - first
-    last_col, last_row = n_cols - 1, n_rows - 1
-    meets = (low <= [last_col, last_row]).all(axis=1) & (high >= 0).all(axis=1)
-    low, high = np.clip(low, 0, [last_col, last_row]), np.clip(high, 0, [last_col, last_row])
-    # One run of cells for each row of cells under a box; its points are neighbours in `order`.
-    rows = np.where(meets, high[:, 1] - low[:, 1] + 1, 0)
-    box = np.repeat(np.arange(len(boxes)), rows)
-    row = low[box, 1] + np.arange(len(box)) - np.repeat(np.cumsum(rows) - rows, rows)
-    begin = cell_start[row * n_cols + low[box, 0]]
-    length = cell_start[row * n_cols + high[box, 0] + 1] - begin
-    shift = begin - (np.cumsum(length) - length)
-    return np.repeat(box, length), order[np.arange(length.sum()) + np.repeat(shift, length)]
+    return start, sort_values(start, xyz[point, 2])
 
 
 def _regroup(

@@ -6,22 +6,29 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.inside import Edges, are_inside, list_edges
 from pipeline.lines import Line, rank_lines
+from pipeline.segments import ON_EDGE, are_clear, divide_edges, find_nodes, insert_corners
 
-BLUNT = 0.866  # cosine of 30 degrees, the least angle between a new wall and another
 AREA_TOLERANCE = 1e-5  # m²; what the pieces of a polygon may lack by rounding
-ON_EDGE = 1e-6  # m; a corner of a neighbour this close to an edge lies on it
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class _Outline:
-    """Edges of all rings of a polygon, from ``a`` to ``b``, float64 (m, 2)."""
+    """A polygon and its edges, none of no length."""
 
     polygon: shapely.Polygon
-    a: Array
-    b: Array
+    edges: Edges
+
+    @property
+    def a(self) -> Array:
+        return self.edges.a
+
+    @property
+    def b(self) -> Array:
+        return self.edges.b
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,20 +101,15 @@ def share_vertices(polygon: shapely.Polygon, corners: Array) -> shapely.Polygon:
     corners = corners[inside.all(axis=1)]
     if not len(corners):
         return polygon
-    old = [shapely.get_coordinates(ring) for ring in shapely.get_rings(polygon)]
-    new = [_add_vertices(ring, corners) for ring in old]
-    if all(len(ring) == len(before) for ring, before in zip(new, old, strict=True)):
+    xy = shapely.get_coordinates(polygon)
+    ring = np.zeros(len(xy), np.int64)
+    if polygon.interiors:
+        ring = shapely.get_coordinates(shapely.get_rings(polygon), return_index=True)[1]
+    new_xy, ring = insert_corners(xy, ring, corners)
+    if len(new_xy) == len(xy):
         return polygon
-    return shapely.Polygon(new[0], new[1:])
-
-
-def distances_to_segments(xy: Array, a: Array, b: Array) -> Array:
-    """Distances (m), float64 (k, n), of ``n`` places to the ``k`` segments from `a` to `b`."""
-    d = b - a
-    to = xy[None] - a[:, None]
-    t = np.clip((to * d[:, None]).sum(axis=2) / (d * d).sum(axis=1)[:, None], 0, 1)
-    off = to - t[..., None] * d[:, None]
-    return np.asarray(np.hypot(off[..., 0], off[..., 1]))
+    shell, *holes = shapely.linearrings(new_xy, indices=ring)
+    return shapely.polygons(shell, holes=holes or None)
 
 
 def _cut(outline: _Outline, line: Line, clearance: float) -> tuple[NDArray[np.object_], Array]:
@@ -120,89 +122,33 @@ def _cut(outline: _Outline, line: Line, clearance: float) -> tuple[NDArray[np.ob
 
 
 def _open_outline(polygon: shapely.Polygon) -> _Outline:
-    xy, ring = shapely.get_coordinates(shapely.get_rings(polygon), return_index=True)
-    shapely.prepare(polygon)
-    edge = (ring[1:] == ring[:-1]) & (xy[1:] != xy[:-1]).any(axis=1)
-    return _Outline(polygon, xy[:-1][edge], xy[1:][edge])
+    edges = list_edges(np.array([polygon]))
+    long = (edges.a != edges.b).any(axis=1)
+    return _Outline(polygon, Edges(np.array([0, long.sum()]), edges.a[long], edges.b[long]))
 
 
 def _place_walls(outline: _Outline, line: Line, clearance: float) -> _Walls:
     """Walls along the line inside the outline, bent through the vertices within `clearance` of it."""
     side_a, side_b = outline.a @ line.normal - line.offset, outline.b @ line.normal - line.offset
-    crossed = np.flatnonzero(side_a * side_b < 0)
-    share = side_a[crossed] / (side_a[crossed] - side_b[crossed])
-    places = outline.a[crossed] + share[:, None] * (outline.b[crossed] - outline.a[crossed])
-    free = (_distances(places, outline.a) >= clearance).all(axis=1)
-    near = outline.a[np.abs(side_a) < clearance]
-    nodes = np.concatenate((near, places[free]))
-    edge = np.concatenate((np.full(len(near), -1), crossed[free]))
+    nodes, edge = find_nodes(outline.a, outline.b, side_a, side_b, clearance)
     order = np.argsort(nodes @ line.along, kind="stable")
     nodes, edge = nodes[order], edge[order]
-    a, b = nodes[:-1], nodes[1:]
-    length = np.hypot(*(b - a).T)
-    long = (length >= clearance) & (length > 0)
-    clear = np.zeros(len(long), np.bool_)
-    clear[long] = _is_clear(outline, a[long], b[long], clearance)
-    return _Walls(np.stack((a, b), axis=1)[clear], np.stack((edge[:-1], edge[1:]), axis=1)[clear])
+    clear = np.flatnonzero(are_clear(nodes[:-1], nodes[1:], outline.a, outline.b, clearance))
+    middle = (nodes[clear] + nodes[clear + 1]) / 2
+    clear = clear[_inside(outline, middle)]
+    walls = np.column_stack((clear, clear + 1))
+    return _Walls(nodes[walls], edge[walls])
 
 
-def _is_clear(outline: _Outline, a: Array, b: Array, clearance: float) -> NDArray[np.bool_]:
-    """Tell which walls run inside, clear of the edges and vertices that they do not end at, and end bluntly."""
-    middle = (a + b) / 2
-    inside = shapely.contains_xy(outline.polygon, middle[:, 0], middle[:, 1])
-    room = shapely.distance(shapely.points(middle), outline.polygon.boundary)
-    wide = room >= np.minimum(clearance, np.hypot(*(b - a).T) / 4)
-    from_end = np.minimum(_distances(a, outline.a), _distances(b, outline.a))
-    needed = np.minimum(clearance, from_end / 2) - ON_EDGE
-    far = (distances_to_segments(outline.a, a, b) >= needed).all(axis=1)
-    return np.asarray(inside & wide & far & _is_blunt(outline, a, b) & _is_blunt(outline, b, a))
-
-
-def _is_blunt(outline: _Outline, start: Array, end: Array) -> NDArray[np.bool_]:
-    """Tell which walls leave the outline at `start` at no sharp angle."""
-    along = (end - start) / np.hypot(*(end - start).T)[:, None]
-    meets = distances_to_segments(start, outline.a, outline.b).T <= ON_EDGE
-    sharp = np.zeros(len(start), np.bool_)
-    for other in (outline.a, outline.b):
-        way = other[None] - start[:, None]
-        length = np.hypot(way[..., 0], way[..., 1])
-        ahead = (way * along[:, None]).sum(axis=2) > BLUNT * length
-        sharp |= (meets & ahead & (length > ON_EDGE)).any(axis=1)
-    return ~sharp
+def _inside(outline: _Outline, xy: Array) -> NDArray[np.bool_]:
+    return are_inside(np.array([outline.polygon]), np.zeros(len(xy), np.int64), xy, edges=outline.edges)
 
 
 def _divide(outline: _Outline, walls: _Walls) -> NDArray[np.object_]:
     """Pieces of the polygon between its outline and the walls."""
-    place, edge = walls.ends.reshape(-1, 2), walls.edges.reshape(-1)
-    edge, first = np.unique(edge, return_index=True)
-    place, edge = place[first][edge >= 0], edge[edge >= 0]  # an edge meets a line once
-    whole = np.ones(len(outline.a), np.bool_)
-    whole[edge] = False
-    segments = np.concatenate(
-        (
-            np.stack((outline.a[whole], outline.b[whole]), axis=1),
-            np.stack((outline.a[edge], place), axis=1),
-            np.stack((place, outline.b[edge]), axis=1),
-            walls.ends,
-        )
-    )
+    segments = divide_edges(outline.a, outline.b, walls.ends, walls.edges)
     pieces = shapely.get_parts(shapely.polygonize(shapely.linestrings(segments)))
+    if not outline.polygon.interiors:
+        return np.asarray(pieces)
     middle = shapely.get_coordinates(shapely.point_on_surface(pieces))
-    return np.asarray(pieces[shapely.contains_xy(outline.polygon, middle[:, 0], middle[:, 1])])
-
-
-def _distances(p: Array, q: Array) -> Array:
-    d = p[:, None] - q[None]
-    return np.asarray(np.hypot(d[..., 0], d[..., 1]))
-
-
-def _add_vertices(ring: Array, corners: Array) -> Array:
-    a, b = ring[:-1], ring[1:]
-    between = distances_to_segments(corners, a, b) <= ON_EDGE
-    between &= (_distances(a, corners) > ON_EDGE) & (_distances(b, corners) > ON_EDGE)
-    edge, corner = np.nonzero(between)
-    if not len(edge):
-        return ring
-    from_start = np.hypot(*(corners[corner] - a[edge]).T)
-    order = np.lexsort((from_start, edge))
-    return np.insert(ring, edge[order] + 1, corners[corner[order]], axis=0)
+    return np.asarray(pieces[_inside(outline, middle)])

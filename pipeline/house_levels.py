@@ -7,9 +7,11 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.cuts import cut_best, share_vertices
+from pipeline.inside import find_owner
 from pipeline.regions import join_cells
 from pipeline.rings import make_canonical
 from pipeline.roof_points import RoofPoints
+from pipeline.segments import unite_places
 
 SPREAD = 0.3  # m², a cell stays whole if its squares are less than this for each point of its house
 STRAIGHT = 1e-3  # m, square root of the area of the triangle at a vertex that is dropped as straight
@@ -100,7 +102,7 @@ def split_levels(polygons: NDArray[np.object_], points: RoofPoints, options: Lev
 
     A new wall ends on an outer wall within 1 nm of it, at a vertex that only the parts have: the house next
     door does not, until the walls of both are noded. Houses do not see each other; points count once for
-    each house that contains them. 3 ms a house, 1 ms with one cut.
+    each house that contains them. 1.6 ms a house of Amsterdam.
     """
     _check(polygons, points, options)
     parts: list[shapely.Polygon] = []
@@ -153,8 +155,8 @@ def _cut_to_cells(
                 min_points=options.min_points,
             )
             if len(pieces) > 1:
-                corners = np.unique(np.concatenate((corners, ends)), axis=0)
-                owner = _locate(pieces, inside)
+                corners = unite_places(np.concatenate((corners, ends)))[0]
+                owner = find_owner(pieces, inside)
                 todo.extend((part, inside[owner == k], depth - 1) for k, part in enumerate(pieces))
                 continue
         cells.append(piece)
@@ -171,15 +173,6 @@ def _may_step(polygon: shapely.Polygon, z: Array, options: LevelOptions) -> bool
 
 def _squares(z: Array) -> float:
     return float(((z - z.mean()) ** 2).sum()) if len(z) else 0.0
-
-
-def _locate(pieces: NDArray[np.object_], xyz: Array) -> NDArray[np.int64]:
-    """Piece of each point; -1 for one exactly on a wall."""
-    owner = np.full(len(xyz), -1)
-    shapely.prepare(pieces)
-    for k, piece in enumerate(pieces):
-        owner[shapely.contains_xy(piece, xyz[:, 0], xyz[:, 1])] = k
-    return owner
 
 
 def _check(polygons: NDArray[np.object_], points: RoofPoints, options: LevelOptions) -> None:

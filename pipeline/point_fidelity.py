@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_points import find_inside
+from pipeline.inside import are_inside, find_inside
 from pipeline.pointcloud import GROUND, WATER, PointCloud
 from pipeline.residuals import Residuals, ResidualSums, conclude, merge_residuals, sum_residuals, summarise
 from pipeline.roof_points import RoofPoints, select_roof
@@ -203,22 +203,29 @@ def _find_residuals(
     """Find the residuals (m) of the points of each kind."""
     built = np.isfinite(roof)
     polygons, roof = polygons[built], roof[built]
-    roof_xyz = cloud.xyz[select_roof(cloud, building_class=building_class)]
-    building, point = find_inside(roof_xyz, polygons)
-    inside = _mark(len(roof_xyz), point)
-    original = _mark(len(roof_xyz), find_inside(roof_xyz, footprints)[1])
-    missed = roof_xyz[original & ~inside]
+    roof_xyz = np.compress(select_roof(cloud, building_class=building_class), cloud.xyz, axis=0)
+    building, point, original = _find_in_both(roof_xyz, polygons, footprints)
+    missed = np.compress(original & ~_mark(len(roof_xyz), point), roof_xyz, axis=0)
 
-    ground_xyz = cloud.xyz[(cloud.classification == GROUND) | (cloud.classification == WATER)]
-    over, below = find_inside(ground_xyz, polygons)
-    open_ground = ground_xyz[~_mark(len(ground_xyz), below)]
-    street = ~_mark(len(ground_xyz), find_inside(ground_xyz, footprints)[1])[below]
+    is_ground = (cloud.classification == GROUND) | (cloud.classification == WATER)
+    ground_xyz = np.compress(is_ground, cloud.xyz, axis=0)
+    over, below, original = _find_in_both(ground_xyz, polygons, footprints)
+    open_ground = np.compress(~_mark(len(ground_xyz), below), ground_xyz, axis=0)
     return {
         "roof": roof[building] - roof_xyz[point, 2],
         "missed": sample_dtm(dtm, missed[:, :2]) - missed[:, 2],
         "ground": sample_dtm(dtm, open_ground[:, :2]) - open_ground[:, 2],
-        "swallowed": (roof[over] - ground_xyz[below, 2])[street],
+        "swallowed": (roof[over] - ground_xyz[below, 2])[~original[below]],
     }
+
+
+def _find_in_both(
+    xyz: NDArray[np.float64], polygons: NDArray[np.object_], footprints: NDArray[np.object_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Find the points in each polygon, as `find_inside`, and tell which points are in a footprint."""
+    polygon, point = find_inside(xyz, np.concatenate((polygons, footprints)))
+    n = int(np.searchsorted(polygon, len(polygons)))
+    return polygon[:n], point[:n], _mark(len(xyz), point[n:])
 
 
 def _mark(n: int, index: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -230,30 +237,21 @@ def _mark(n: int, index: NDArray[np.int64]) -> NDArray[np.bool_]:
 def _measure_coverage(
     points: RoofPoints, house: NDArray[np.int64], polygons: NDArray[np.object_]
 ) -> NDArray[np.float64]:
-    cells = np.floor(points.xyz[:, :2] / COVERAGE_CELL).astype(np.int64)
-    filled = np.unique(np.column_stack((house, cells)), axis=0)
-    n_filled = np.bincount(filled[:, 0], minlength=len(polygons))
-    # Cells of the footprint by their centres, then those with a point that have their centre outside.
-    box, cell = _list_cells(shapely.bounds(polygons).reshape(-1, 4))
-    inside = _contains_centre(polygons[box], cell)
-    n_cells = np.bincount(box[inside], minlength=len(polygons))
-    rim = ~_contains_centre(polygons[filled[:, 0]], filled[:, 1:])
-    n_cells += np.bincount(filled[rim, 0], minlength=len(polygons))
-    return n_filled / np.maximum(n_cells, 1)
-
-
-def _contains_centre(polygons: NDArray[np.object_], cell: NDArray[np.int64]) -> NDArray[np.bool_]:
-    centre = (cell + 0.5) * COVERAGE_CELL
-    shapely.prepare(polygons)
-    return np.asarray(shapely.contains_xy(polygons, centre[:, 0], centre[:, 1]), dtype=np.bool_)
-
-
-def _list_cells(boxes: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """List the cells under each box: rows of `boxes`, and column and row of the cell, int64 (k, 2)."""
-    low = np.floor(boxes[:, :2] / COVERAGE_CELL).astype(np.int64)
-    size = np.floor(boxes[:, 2:] / COVERAGE_CELL).astype(np.int64) - low + 1
+    """Share of the cells of each house that have a point; points lie within the box of their house."""
+    low, size = _cells_under(shapely.bounds(polygons).reshape(-1, 4))
     count = size[:, 0] * size[:, 1]
-    box = np.repeat(np.arange(len(boxes)), count)
-    index = np.arange(len(box)) - np.repeat(np.cumsum(count) - count, count)
-    row, column = np.divmod(index, size[box, 0])
-    return box, low[box] + np.column_stack((column, row))
+    begin = np.cumsum(count) - count
+    box = np.repeat(np.arange(len(polygons)), count)
+    row, column = np.divmod(np.arange(len(box)) - begin[box], size[box, 0])
+    belongs = are_inside(polygons, box, (low[box] + np.column_stack((column, row)) + 0.5) * COVERAGE_CELL)
+    cell = np.floor(points.xyz[:, :2] / COVERAGE_CELL).astype(np.int64) - low[house]
+    filled = np.zeros(len(box), np.bool_)
+    filled[begin[house] + cell[:, 1] * size[house, 0] + cell[:, 0]] = True
+    n_filled = np.bincount(box[filled], minlength=len(polygons))
+    return n_filled / np.maximum(np.bincount(box[belongs | filled], minlength=len(polygons)), 1)
+
+
+def _cells_under(boxes: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First cell under each box, column and row, and the number of columns and rows."""
+    low = np.floor(boxes[:, :2] / COVERAGE_CELL).astype(np.int64)
+    return low, np.floor(boxes[:, 2:] / COVERAGE_CELL).astype(np.int64) - low + 1

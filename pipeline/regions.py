@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.cuts import distances_to_segments
+from pipeline.segments import heights_beside, unite_places
 
 STEP_REACH = 2.0  # m on both sides of a wall, where the roof has to step
 MIN_NEAR = 3  # points on each side of a wall, to see a step there
@@ -129,23 +129,16 @@ def _find_borders(cells: NDArray[np.object_], points: list[Array]) -> _Borders:
     xy, ring = shapely.get_coordinates(rings, return_index=True)
     edge = np.flatnonzero(ring[1:] == ring[:-1])
     cell = owner[ring[edge]]
-    _, vertex = np.unique(xy, axis=0, return_inverse=True)
-    vertex = vertex.reshape(-1)
+    _, vertex = unite_places(xy)
     ends = np.sort(np.column_stack((vertex[edge], vertex[edge + 1])), axis=1)
     order = np.lexsort((cell, ends[:, 1], ends[:, 0]))
     again = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
     borders: _Borders = {}
     for e, f in zip(order[again].tolist(), order[again + 1].tolist(), strict=True):
         a, b = xy[edge[e]], xy[edge[e] + 1]
-        beside = [_beside(points[cell[side]], a, b) for side in (e, f)]
+        beside = [heights_beside(points[cell[side]], a, b, STEP_REACH) for side in (e, f)]
         _add_border(borders, int(cell[e]), int(cell[f]), beside[0], beside[1])
     return borders
-
-
-def _beside(xyz: Array, a: Array, b: Array) -> Array:
-    """Heights of the points within `STEP_REACH` of the wall from `a` to `b`."""
-    near = distances_to_segments(xyz[:, :2], a[None], b[None])[0] <= STEP_REACH
-    return np.asarray(xyz[near, 2])
 
 
 def _add_border(borders: _Borders, one: int, two: int, near_one: Array, near_two: Array) -> None:

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.building_points import NEVER_ROOF, find_inside
+from pipeline.building_points import NEVER_ROOF
+from pipeline.group_order import sort_points
+from pipeline.inside import find_inside
 from pipeline.pointcloud import BUILDING, PointCloud
 
 
@@ -55,9 +57,7 @@ def locate_roof_points(cloud: PointCloud, polygons: NDArray[np.object_], *, buil
     Two standard deviations (the outliers of step 1.5) would cut off a low annex with less than a fifth of
     the points: its distance from the mean, ``(1 - p) D``, exceeds ``2 sqrt(p (1 - p)) D`` when ``p < 0.2``.
     """
-    xyz = cloud.xyz[select_roof(cloud, building_class=building_class)]
+    xyz = np.compress(select_roof(cloud, building_class=building_class), cloud.xyz, axis=0)
     polygon, point = find_inside(xyz, polygons)
-    found = xyz[point]
-    order = np.lexsort((found[:, 0], found[:, 1], found[:, 2], polygon))
     start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))
-    return RoofPoints(start, found[order])
+    return RoofPoints(start, sort_points(start, xyz[point]))

@@ -7,6 +7,7 @@ A region in one piece takes `compute_dtm`. Tiles take the same steps one by one:
 
 from collections.abc import Sequence
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,18 +55,34 @@ def bin_nodes(cloud: PointCloud, window: NodeWindow, *, spacing: float) -> tuple
     int64, (ny, nx)
         Points in each bin.
     """
-    nx, ny = window.nx, window.ny
-    ground = cloud.xyz[(cloud.classification == GROUND) | (cloud.classification == WATER)]
-    i = np.rint(ground[:, 0] / spacing).astype(np.int64) - window.i0
-    j = np.rint(ground[:, 1] / spacing).astype(np.int64) - window.j0
-    inside = (i >= 0) & (i < nx) & (j >= 0) & (j < ny)
-    key = j[inside] * nx + i[inside]
-    units = np.rint(ground[inside, 2] / HEIGHT_UNIT)
-    count = np.bincount(key, minlength=nx * ny)
-    total = np.bincount(key, weights=units, minlength=nx * ny)
-    mean = np.full(nx * ny, np.nan)
+    total, count = _sum_bins(
+        cloud.xyz, cloud.classification, spacing, window.i0, window.j0, np.zeros((window.ny, window.nx))
+    )
+    mean = np.full(count.shape, np.nan)
     np.divide(total * HEIGHT_UNIT, count, out=mean, where=count > 0)
-    return Dtm(mean.reshape(ny, nx), window.i0, window.j0, spacing), count.reshape(ny, nx)
+    return Dtm(mean, window.i0, window.j0, spacing), count
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_bins(
+    xyz: NDArray[np.float64],
+    classification: NDArray[np.uint8],
+    spacing: float,
+    i0: int,
+    j0: int,
+    total: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Add up the heights of ground points around each node, in whole `HEIGHT_UNIT`, and count them."""
+    ny, nx = total.shape
+    count = np.zeros((ny, nx), np.int64)
+    for k in range(len(xyz)):
+        if classification[k] != GROUND and classification[k] != WATER:
+            continue
+        i, j = int(np.rint(xyz[k, 0] / spacing)) - i0, int(np.rint(xyz[k, 1] / spacing)) - j0
+        if 0 <= i < nx and 0 <= j < ny:
+            total[j, i] += np.rint(xyz[k, 2] / HEIGHT_UNIT)
+            count[j, i] += 1
+    return total, count
 
 
 def bin_ground(

@@ -104,7 +104,7 @@ def flood_terrain(raw: Dtm, window: NodeWindow) -> FloodedDtm:
     Cost is linear in the nodes.
     """
     outer = window_of(raw)
-    if not _covers(outer, window.i0, window.j0, window.i0 + window.nx - 1, window.j0 + window.ny - 1):
+    if not _covers(outer, window):
         raise ValueError(f"{window} is not inside the raster's {outer}")
     z = raw.z.copy()
     ring = np.empty(z.shape, np.uint8)
@@ -205,23 +205,50 @@ def fill_terrain(flooded: FloodedDtm, coarse: Dtm) -> tuple[Dtm, FillCounts]:
     alone. Between coarse nodes it is bilinear. A tile without rings deeper than `RIM` does not read it.
     """
     dtm = flooded.dtm
-    n_coarse = int((flooded.ring > RIM).sum())
+    n_coarse = count_deep(flooded)
     counts = FillCounts(int((flooded.ring > 0).sum()), n_coarse)
     if coarse.spacing != dtm.spacing * COARSE:
         raise ValueError(f"coarse spacing {coarse.spacing} m is not {COARSE} times {dtm.spacing} m")
     if not n_coarse:
         return dtm, counts
-    ny, nx = dtm.z.shape
-    i1, j1 = -(-(dtm.i0 + nx - 1) // COARSE), -(-(dtm.j0 + ny - 1) // COARSE)
-    if not _covers(window_of(coarse), dtm.i0 // COARSE, dtm.j0 // COARSE, i1, j1):
+    around = _coarse_window(window_of(dtm))
+    if not _covers(window_of(coarse), around):
         raise ValueError(f"coarse nodes {window_of(coarse)} do not reach around {window_of(dtm)}")
     z = dtm.z.copy()
     _blend(z, flooded.ring, dtm.i0, dtm.j0, coarse.z, coarse.i0, coarse.j0)
     return Dtm(z, dtm.i0, dtm.j0, dtm.spacing), counts
 
 
-def _covers(window: NodeWindow, i0: int, j0: int, i1: int, j1: int) -> bool:
-    return window.i0 <= i0 and window.j0 <= j0 and i1 < window.i0 + window.nx and j1 < window.j0 + window.ny
+def count_deep(flooded: FloodedDtm) -> int:
+    """Count the nodes of a tile for which the coarse level has a weight."""
+    return int((flooded.ring > RIM).sum())
+
+
+def coarse_around(coarse: Dtm, window: NodeWindow) -> Dtm:
+    """Take the coarse nodes that a tile needs whose fine nodes are a window.
+
+    Raises
+    ------
+    ValueError
+        If the coarse level does not reach around the tile.
+    """
+    own = _coarse_window(window)
+    if not _covers(window_of(coarse), own):
+        raise ValueError(f"coarse nodes {window_of(coarse)} do not reach around {window}")
+    i, j = own.i0 - coarse.i0, own.j0 - coarse.j0
+    return Dtm(coarse.z[j : j + own.ny, i : i + own.nx].copy(), own.i0, own.j0, coarse.spacing)
+
+
+def _coarse_window(window: NodeWindow) -> NodeWindow:
+    """Coarse nodes around a window of fine ones."""
+    i0, j0 = window.i0 // COARSE, window.j0 // COARSE
+    i1, j1 = -(-(window.i0 + window.nx - 1) // COARSE), -(-(window.j0 + window.ny - 1) // COARSE)
+    return NodeWindow(i0, j0, i1 - i0 + 1, j1 - j0 + 1)
+
+
+def _covers(window: NodeWindow, other: NodeWindow) -> bool:
+    low = window.i0 <= other.i0 and window.j0 <= other.j0
+    return low and other.i0 + other.nx <= window.i0 + window.nx and other.j0 + other.ny <= window.j0 + window.ny
 
 
 def _sum_up(

@@ -1,11 +1,24 @@
 """Region-wide numbers of points: a point has one number, whichever tile writes it (step 3.6).
 
 Points are numbered by parts: the column of each corner, the columns of each seam between its corners, what is left
-of each tile. A part's numbers follow each other, column by column from below; the parts follow each other in one
-order for the whole region. So a tile needs to know where its parts begin, and nothing else of the others.
+of each tile. A point's id is the code of its part, and behind that its number within the part, column by column
+from below. The code is made of the part's kind and its column and row in the CRS: a tile gives its ids without
+knowing any other, and they stay when another tile changes, or when the region does.
+
+    ======  ====================================================================================
+    bits    meaning
+    ======  ====================================================================================
+    61, 62  kind of the part: 0 corner, 1 seam to the east, 2 seam to the north, 3 tile
+    46-60   column of the part in the CRS, modulo 2**15
+    31-45   row of the part in the CRS, modulo 2**15
+    0-30    number within the part
+    ======  ====================================================================================
+
+Ids are unique where a region has fewer than 2**15 tiles to a side. They have gaps. Where numbers without gaps are
+wanted, the ids are counted by their order (`Numbering`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,49 +26,60 @@ from numpy.typing import NDArray
 
 from pipeline.mesh import ColumnMesh
 from pipeline.nodes import Levels
-from stitch.grid import Key, SeamKey, TileGrid
+from stitch.grid import Key, SeamKey, ends_of_seam
+
+INDEX_BITS = 15  # of a column or row
+LOCAL_BITS = 31  # of a number within a part: indices within a piece are int32
+MOST_TILES = 2**INDEX_BITS - 1  # to a side of a region, which has one more line
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class SeamNumbers:
-    """Where the points of a seam begin.
+class Numbering:
+    """From ids to numbers without gaps, 0 to ``n_points - 1``, in the order of the ids.
 
     Attributes
     ----------
-    vertex : int32, (k,)
-        The seam's vertices in the tile's plane mesh, from its first corner to its last.
-    first : (int, int, int)
-        Numbers of the lowest points of its first corner, of its second vertex, of its last corner.
+    start, stop : int64, (r,)
+        Runs of ids that follow each other: from ``start`` to before ``stop``, ascending and apart.
+    offset : int64, (r + 1,)
+        Number of the first id of each run, and of all points.
     """
 
-    vertex: NDArray[np.int32]
-    first: tuple[int, int, int]
+    start: Ints
+    stop: Ints
+    offset: Ints
+
+    @property
+    def n_points(self) -> int:
+        """Number of all points."""
+        return int(self.offset[-1])
 
 
-def count_parts(grid: TileGrid) -> int:
-    """Count the parts of a region, absent ones and borders included, which have no points of their own."""
-    nx, ny = _size(grid)
-    return (nx + 1) * (ny + 1) + nx * (ny + 1) + (nx + 1) * ny + nx * ny
+def corner_part(key: Key) -> int:
+    """Code of a corner."""
+    return _part(0, key.i, key.j)
 
 
-def corner_part(grid: TileGrid, key: Key) -> int:
-    """Place of a corner among the parts: corners first, then seams, then tiles; it follows from the key alone."""
-    _, ny = _size(grid)
-    return (key.i - grid.first.i) * (ny + 1) + key.j - grid.first.j
+def seam_part(key: SeamKey) -> int:
+    """Code of a seam between its corners."""
+    return _part(1 + key.axis, key.i, key.j)
 
 
-def seam_part(grid: TileGrid, key: SeamKey) -> int:
-    """Place of a seam among the parts."""
-    nx, ny = _size(grid)
-    i, j = key.i - grid.first.i, key.j - grid.first.j
-    before = (nx + 1) * (ny + 1)
-    return before + i * (ny + 1) + j if key.axis == 0 else before + nx * (ny + 1) + i * ny + j
+def tile_part(key: Key) -> int:
+    """Code of a tile between its seams."""
+    return _part(3, key.i, key.j)
 
 
-def tile_part(grid: TileGrid, key: Key) -> int:
-    """Place of a tile among the parts."""
-    nx, ny = _size(grid)
-    return count_parts(grid) - nx * ny + (key.i - grid.first.i) * ny + key.j - grid.first.j
+def first_id(part: int) -> int:
+    """Id of the first point of a part.
+
+    Examples
+    --------
+    >>> first_id(corner_part(Key(0, 1))) == 2**31
+    True
+    """
+    return part << LOCAL_BITS
 
 
 def count_points(levels: Levels) -> tuple[int, int, int]:
@@ -70,67 +94,149 @@ def count_inner_points(mesh: ColumnMesh, seams: Sequence[NDArray[np.int32]]) -> 
     return int(len(mesh.z) - np.diff(mesh.z_start)[vertex].sum())
 
 
-def make_offsets(counts: Sequence[int]) -> NDArray[np.int64]:
-    """Find where each part begins, and at last how many points there are.
+def seam_ids(key: SeamKey, levels: Levels) -> Ints:
+    """Give the ids of the lowest points of a seam's columns.
 
     Parameters
     ----------
-    counts : sequence of p int
-        Points of each part, by its place. A tile that is missing has 0.
+    key : SeamKey
+        The seam.
+    levels : Levels
+        Its columns, from its first corner to its last.
 
     Returns
     -------
-    int64, (p + 1,)
-        The lowest number of each part, and the number of all points.
-
-    Examples
-    --------
-    >>> make_offsets([2, 5, 0, 3])
-    array([ 0,  2,  7,  7, 10])
+    int64, (n,)
+        Id of the lowest point of each column; the others of a column follow.
     """
-    return np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
+    ids: Ints = first_id(seam_part(key)) + levels.start[:-1] - levels.start[1]
+    ids[[0, -1]] = [first_id(corner_part(corner)) for corner in ends_of_seam(key)]
+    return ids
 
 
-def number_points(mesh: ColumnMesh, seams: Sequence[SeamNumbers], first: int) -> NDArray[np.int64]:
-    """Give the points of a tile their region-wide numbers.
+def number_points(mesh: ColumnMesh, shared: NDArray[np.int32], lowest: Ints, first: int) -> Ints:
+    """Give the points of a tile their region-wide ids.
 
     Parameters
     ----------
     mesh : ColumnMesh
         The tile's mesh.
-    seams : sequence of SeamNumbers
-        Its seams within the region.
+    shared : int32, (k,)
+        Vertices of its plane mesh on seams within the region; a corner may come several times.
+    lowest : int64, (k,)
+        Ids of their lowest points, see `seam_ids`.
     first : int
-        Where the tile's own points begin.
+        Id of the first of the tile's own points.
 
     Returns
     -------
     int64, (n_points,)
-        Number of each point, in the order of `expand_cells`.
+        Id of each point, in the order of `expand_cells`.
 
     Raises
     ------
     ValueError
-        If two seams number a corner differently.
-
-    Notes
-    -----
-    Numbers are without gaps over all tiles where every level of a seam has a cell on it, and none is missing.
+        If a corner is given with two ids.
     """
     count = np.diff(mesh.z_start)
     begin = np.full(len(count), -1, np.int64)
-    for seam in seams:
-        inner = count[seam.vertex[1:-1]]
-        starts = np.concatenate(([seam.first[0]], seam.first[1] + np.cumsum(inner) - inner, [seam.first[2]]))
-        old = begin[seam.vertex]
-        if ((old >= 0) & (old != starts)).any():
-            raise ValueError("two seams of a tile number a corner differently")
-        begin[seam.vertex] = starts
+    begin[shared] = lowest
+    if (begin[shared] != lowest).any():
+        raise ValueError("two seams of a tile number a corner differently")
     own = begin < 0
     begin[own] = first + np.cumsum(count[own]) - count[own]
-    numbers: NDArray[np.int64] = np.arange(len(mesh.z)) - np.repeat(mesh.z_start[:-1] - begin, count)
+    ids: Ints = np.arange(len(mesh.z)) - np.repeat(mesh.z_start[:-1] - begin, count)
+    return ids
+
+
+def make_offsets(counts: Mapping[int, int]) -> tuple[Ints, Ints]:
+    """Find where each part begins, of numbers without gaps.
+
+    Parameters
+    ----------
+    counts : mapping of int to int
+        Points of each part, by its code; those without any are left out.
+
+    Returns
+    -------
+    part : int64, (p,)
+        Codes, ascending.
+    offset : int64, (p + 1,)
+        The lowest number of each part, and the number of all points.
+
+    Examples
+    --------
+    >>> make_offsets({7: 5, 3: 2, 4: 0})
+    (array([3, 7]), array([0, 2, 7]))
+    """
+    some = sorted((part, count) for part, count in counts.items() if count)
+    part, count = np.array(some, np.int64).reshape(-1, 2).T
+    return part, np.concatenate(([0], np.cumsum(count)))
+
+
+def collect_ids(pieces: Iterable[Ints]) -> Numbering:
+    """Number the points of all pieces without gaps.
+
+    Parameters
+    ----------
+    pieces : iterable of int64, (n,)
+        Ids of the points of each piece; a point may be in several pieces.
+
+    Notes
+    -----
+    Ids are kept as runs. Where every level of a seam has a cell, a part is one run when all its tiles are seen; so
+    memory is some 100 bytes a part, and one piece.
+
+    Examples
+    --------
+    >>> table = collect_ids([np.array([0, 1, 3]), np.array([2**31, 1, 2])])
+    >>> table.start.tolist(), table.stop.tolist()
+    ([0, 2147483648], [4, 2147483649])
+    >>> number_without_gaps(table, np.array([3, 2**31, 0])).tolist()
+    [3, 4, 0]
+    """
+    runs = np.empty((0, 2), np.int64)
+    waiting: list[Ints] = []
+    n_waiting = 0
+    for ids in pieces:
+        waiting.append(_runs(ids))
+        n_waiting += len(waiting[-1])
+        if n_waiting > len(runs):  # each run is moved a few times at most, however many pieces there are
+            runs, waiting, n_waiting = _join_runs([runs, *waiting]), [], 0
+    start, stop = _join_runs([runs, *waiting]).T
+    return Numbering(start, stop, np.concatenate(([0], np.cumsum(stop - start))))
+
+
+def number_without_gaps(numbering: Numbering, ids: Ints) -> Ints:
+    """Turn ids (n,) into numbers from 0 on; ValueError for one that was not collected."""
+    run = np.searchsorted(numbering.start, ids, side="right") - 1
+    if len(ids) and (run.min() < 0 or (ids >= numbering.stop[run]).any()):
+        raise ValueError("an id is not among those that were collected")
+    numbers: Ints = numbering.offset[run] + ids - numbering.start[run]
     return numbers
 
 
-def _size(grid: TileGrid) -> tuple[int, int]:
-    return len(grid.lines[0]) - 1, len(grid.lines[1]) - 1
+def _part(kind: int, i: int, j: int) -> int:
+    # Columns and rows go round, so that no place in the CRS is too far out and none is below 0.
+    wrap = 1 << INDEX_BITS
+    return (kind * wrap + i % wrap) * wrap + j % wrap
+
+
+def _runs(ids: Ints) -> Ints:
+    """Runs (r, 2) of ids that follow each other."""
+    ordered = np.unique(ids)
+    if len(ordered) == 0:
+        return np.empty((0, 2), np.int64)
+    last = np.append(np.flatnonzero(np.diff(ordered) != 1), len(ordered) - 1)
+    return np.stack((ordered[np.append(0, last[:-1] + 1)], ordered[last] + 1), axis=1)
+
+
+def _join_runs(several: Sequence[Ints]) -> Ints:
+    """Join runs that overlap or touch."""
+    runs = np.concatenate(several)
+    start, stop = runs[np.argsort(runs[:, 0], kind="stable")].T
+    reach = np.maximum.accumulate(stop)
+    first = np.ones(len(start), np.bool_)
+    first[1:] = start[1:] > reach[:-1]
+    last = np.append(first[1:], True)[: len(first)]
+    return np.stack((start[first], reach[last]), axis=1)

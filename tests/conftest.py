@@ -13,3 +13,40 @@ def shared_data() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"no real data at {SHARED}")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished run of a synthetic city on four tiles, not to be changed."""
+    from tiler.config import make_config
+    from tiler.run import run
+    from tiler.synth import write_city
+
+    folder = tmp_path_factory.mktemp("small")
+    files = write_city(folder / "city", size=300, buildings=15, density=1.0)
+    given = {
+        "pointcloud": [str(path) for path in files.clouds],
+        "footprints": str(files.footprints),
+        "out": str(folder / "out"),
+        "tile_size": 150.0,
+        "domain_height": 60.0,
+    }
+    run(make_config(given))
+    return folder / "out"
+
+
+@pytest.fixture(scope="session")
+def amsterdam_run(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished run of central Amsterdam on four tiles, not to be changed."""
+    from tiler.config import make_config
+    from tiler.run import run
+
+    data = shared_data / "amsterdam"
+    given = {
+        "pointcloud": [str(path) for path in sorted((data / "tiles").iterdir())],
+        "footprints": str(data / "footprints.gpkg"),
+        "out": str(tmp_path_factory.mktemp("amsterdam") / "out"),
+        "tile_size": 300.0,
+    }
+    run(make_config(given))
+    return Path(str(given["out"]))

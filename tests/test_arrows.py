@@ -20,6 +20,7 @@ HOMES = {
     "dask": ("tiler/",),
     "distributed": ("tiler/",),
     "zarr": ("tiler/store.py",),
+    "h5py": ("tiler/formats/xdmf.py",),
     "laspy": ("tiler/",),
     "pyogrio": ("tiler/",),
     "meshio": ("tiler/",),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.mesh import Boundary, Marker, TetMesh
 from stitch.conformity import pair_cell_faces
+from stitch.frontier import Settled
 from tests.meshes import (
     CORNER,
     HOUSES,
@@ -32,7 +33,7 @@ from tests.meshes import (
     with_mesh,
     write_run,
 )
-from tiler.check import CheckReport, check_run
+from tiler.check import CheckReport, _Sums, check_run
 from tiler.proofs import Dtm, Fault, merge_faults
 from tiler.vtk_files import write_vtp, write_vtu
 from tiler.vtk_xml import make_stream, write_data_file
@@ -639,6 +640,45 @@ def test_a_piece_under_two_names_is_a_fault(tmp_path: Path, city: TinyCity) -> N
     write_run(tmp_path, city, pieces={**pieces, "2_0": pieces["1_0"]})
     found = kinds(check(tmp_path))
     assert found >= {"seam-open", "boundary-open", "plan-area", "roof-area", "counts"}
+
+
+def test_all_houses_that_are_missing_are_counted(tmp_path: Path, city: TinyCity) -> None:
+    write_run(tmp_path, replace(make_city(houses={}), model=city.model))
+    (fault,) = (fault for fault in check(tmp_path).faults if fault.kind == "building-missing")
+    assert (fault.count, len(fault.places)) == (len(HOUSES), 3)
+    inside = shapely.points(np.array(fault.places)[:, :2])
+    order = np.argsort(city.model.numbers)[:3]
+    assert shapely.intersects(city.model.polygons[order], inside).all()
+    np.testing.assert_array_equal(np.array(fault.places)[:, 2], city.model.roof[order])
+
+
+def test_a_house_that_is_missing_beside_missing_tiles(tmp_path: Path, city: TinyCity) -> None:
+    """Where parts of the region are not there, houses count whose place is in the plan of the others."""
+    write_run(tmp_path, mark(fill_house(city), marker=Marker.WEST, to=Marker.MISSING))
+    assert "building-missing" in kinds(check(tmp_path))
+
+
+def test_a_seam_that_settles_bit_by_bit_counts_once() -> None:
+    none = np.empty((0, 3, 3))
+    lines = np.empty((0, 2, 3))
+    sums = _Sums.start(0)
+    for pairs in ([[0, 1]], [], [[0, 1], [1, 2]]):
+        seams = np.array(pairs, np.int64).reshape(-1, 2)
+        sums.add_settled(Settled(len(pairs), seams, none, none, none, none, lines, lines))
+    assert sums.seams.tolist() == [[0, 1], [1, 2]]
+
+
+def test_a_roof_of_a_building_in_another_piece(tmp_path: Path, city: TinyCity) -> None:
+    """Its building is far from the piece, and is known all the same."""
+    pieces = split_city(city, 50.0)
+    (_, boundary), (_, other) = pieces.values()
+    far = np.setdiff1d(other.building, boundary.building)[0]
+    building = boundary.building.copy()
+    building[np.flatnonzero(boundary.marker == Marker.ROOF)[0]] = far
+    name, (mesh, _) = next(iter(pieces.items()))
+    write_run(tmp_path, city, pieces=pieces | {name: (mesh, replace(boundary, building=building))})
+    assert kinds(check(tmp_path)) >= {"roof-off-footprint", "roof-area"}
+    assert "building-unknown" not in kinds(check(tmp_path))
 
 
 # --- the report ------------------------------------------------------------------------------------

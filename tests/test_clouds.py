@@ -21,7 +21,7 @@ def write_cloud(
     path: Path, xyz: ArrayLike, classes: ArrayLike = 2, *, crs: str = "", version: str = "1.4", fmt: int = 6
 ) -> Path:
     header = laspy.LasHeader(version=version, point_format=fmt)
-    header.scales, header.offsets = np.full(3, 0.01), ORIGIN
+    header.scales, header.offsets = np.full(3, 0.01), ORIGIN - (0, 0, 7)
     if crs:
         header.add_crs(pyproj.CRS(crs))
     las = laspy.LasData(header)
@@ -114,6 +114,8 @@ def test_points_come_back(tmp_path: Path, xyz: np.ndarray, version: str, fmt: in
     classes = np.resize([1, 2, 5, 6, 9], len(xyz))
     path = write_cloud(tmp_path / f"a.{suffix}", xyz, classes, version=version, fmt=fmt)
     cloud, counts = read_points(path, EVERYWHERE)
+    las = laspy.read(path)
+    assert cloud.xyz.tobytes() == np.column_stack((las.x, las.y, las.z)).tobytes()
     np.testing.assert_allclose(cloud.xyz, xyz, atol=1e-6)
     np.testing.assert_array_equal(cloud.classification, classes)
     assert counts == {"read": 5000, "outside": 0, "withheld": 0, "noise": 0, "absurd": 0, "kept": 5000}

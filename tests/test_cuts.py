@@ -5,8 +5,9 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.cuts import cut_along, cut_best, distances_to_segments, share_vertices
+from pipeline.cuts import cut_along, cut_best, share_vertices
 from pipeline.lines import Line, rank_lines
+from pipeline.segments import distances_to_segments
 
 Array = NDArray[np.float64]
 

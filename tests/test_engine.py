@@ -23,9 +23,14 @@ from tiler.keys import item_key, stage_digest
 from tiler.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
 from tiler.store import Store
 from tiler.task import Failure, Record, Task
-from tiler.written import file_sizes
+from tiler.written import state_files
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def names_scale(task: Task) -> Facts:
+    scale = task.parameters.scale
+    return {"scale": scale.get(task.name, 2.0) if isinstance(scale, dict) else scale}
 
 
 @dataclass(frozen=True)
@@ -179,6 +184,44 @@ def test_halo_is_met_exactly(tmp_path: Path, halo: float, count: int) -> None:
     assert len(engine.records["reader", "2.2"].facts["source"]) == count
 
 
+def test_what_meets_in_a_corner_only_is_not_beside(tmp_path: Path) -> None:
+    beside = (Read("tile", beside=True), Read("seam", beside=True))
+    engine = make(tmp_path)
+    engine.run(
+        Stage("tile", Scope.TILE, nothing),
+        Stage("seam", Scope.SEAM, nothing),
+        Stage("of tile", Scope.TILE, seen, beside),
+        Stage("of seam", Scope.SEAM, seen, (Read("tile", beside=True),)),
+        Stage("around", Scope.TILE, seen, (Read("tile", 1.0, beside=True),)),
+    )
+    assert engine.records["of tile", "1.1"].facts == {
+        "tile": ["0.1", "1.0", "1.1", "1.2", "2.1"],
+        "seam": ["x1.1", "x2.1", "y1.1", "y1.2"],
+    }
+    assert engine.records["of tile", "0.0"].facts["seam"] == ["x1.0", "y0.1"]
+    assert engine.records["of seam", "x1.1"].facts["tile"] == ["0.1", "1.1"]
+    # Grown by a halo a box has more than a corner in common with what lies across its corners.
+    assert len(engine.records["around", "1.1"].facts["tile"]) == 9
+
+
+def test_of_others_by_name_only_presence_counts(tmp_path: Path) -> None:
+    reader = Stage("reader", Scope.TILE, seen, (Read("source", beside=True, others_by_name=True),))
+    source = Stage("source", Scope.TILE, names_scale, parameters=("scale",))
+    first = make(tmp_path)
+    first.run(source, reader)
+    other = {"2.2": 7.0}
+    again = make(tmp_path, parameters=Toy(scale=other))  # type: ignore[arg-type]
+    again.run(source, reader)
+    changed = {name for stage, name in rerun(again) if stage == "source" and name in other}
+    assert changed == {"2.2"}
+    assert {name for stage, name in rerun(again) if stage == "reader"} == {"2.2"}
+    layout = grid_layout()
+    fewer = replace(layout, tiles={name: box for name, box in layout.tiles.items() if name != "2.2"})
+    without = make(tmp_path, layout=fewer, parameters=Toy(scale=other))  # type: ignore[arg-type]
+    without.run(source, reader)
+    assert {name for stage, name in rerun(without) if stage == "reader"} == {"1.2", "2.1"}
+
+
 def test_two_reads_of_one_stage_join_and_region_is_read_by_all(tmp_path: Path) -> None:
     reader = Stage("reader", Scope.TILE, seen, (Read("source"), Read("source", 10.0), Read("whole")))
     engine = make(tmp_path, layout=replace(grid_layout(5), bounds=(0.0, 0.0, 1.0, 1.0)))
@@ -281,9 +324,16 @@ def test_files_beside_the_store_must_be_as_stated(tmp_path: Path) -> None:
     assert rerun(again) == set()
     (tmp_path / "0.0.txt").unlink()
     (tmp_path / "1.0.txt").write_text("longer than it was")
+    (tmp_path / "1.1.txt").write_text("1,1")
     mended = make(tmp_path, context=tmp_path)
     mended.run(*stages)
-    assert rerun(mended) == {("note", "0.0"), ("note", "1.0")}
+    assert rerun(mended) == {("note", "0.0"), ("note", "1.0"), ("note", "1.1")}
+    assert [mended.records["note", name].damage for name in ("0.0", "0.1", "1.0", "1.1")] == [
+        "0.0.txt is not there",
+        "",
+        "1.0.txt has 18 bytes instead of 3",
+        "1.1.txt its checksum differs",
+    ]
     assert (tmp_path / "1.0.txt").read_text() == "1.0"
     moved = make(tmp_path, context=tmp_path, folder=tmp_path / "elsewhere")
     moved.run(*stages)
@@ -333,18 +383,29 @@ def test_a_deleted_or_damaged_result_runs_again_alone(serial_run: Engine, tmp_pa
     assert contents(store) == contents(serial_run.store.path)
 
 
-def test_a_lost_chunk_is_an_error_with_the_way_out(serial_run: Engine, tmp_path: Path) -> None:
+@pytest.mark.parametrize("lost", ["terrain/1.1/z/c", "terrain/1.1/z/c/0", "plane/0.0/zarr.json"])
+def test_what_is_damaged_is_computed_again_and_told(serial_run: Engine, tmp_path: Path, lost: str) -> None:
     store = tmp_path / "store.zarr"
     shutil.copytree(serial_run.store.path, store)
-    shutil.rmtree(store / "terrain" / "1.1" / "z" / "c")
-    shutil.rmtree(store / "seam" / "x1.1")
-    with pytest.raises(
-        InputError, match=r"stage seam, seam x1\.1: stage terrain, 1\.1: z in .*delete that folder"
-    ):
-        run_all(make(tmp_path))
-    shutil.rmtree(store / "terrain" / "1.1")
-    run_all(make(tmp_path))
+    path = store / lost
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    again = run_all(make(tmp_path))
+    stage, name, rest = lost.split("/", maxsplit=2)
+    assert rerun(again) == {(stage, name)}
+    assert again.records[stage, name].damage.startswith(rest)
     assert contents(store) == contents(serial_run.store.path)
+    assert not any(record.damage for record in run_all(make(tmp_path)).records.values())
+
+
+def test_a_chunk_that_is_lost_while_a_run_is_at_work_is_an_error_with_the_way_out(tmp_path: Path) -> None:
+    stages = [Stage("source", Scope.TILE, many), Stage("reader", Scope.REGION, loses, (Read("source"),))]
+    with pytest.raises(
+        InputError, match=r"stage reader, region region: stage source, 1\.1: z in .*damaged .*run again: it is"
+    ):
+        make(tmp_path).run(*stages)
+    again = make(tmp_path)
+    again.run(stages[0])
+    assert rerun(again) == {("source", "1.1")}
 
 
 def test_what_killed_runs_left_is_swept(tmp_path: Path) -> None:
@@ -431,12 +492,18 @@ def test_some_items_now_and_others_later(tmp_path: Path) -> None:
     assert engine.records["reader", "0.0"].facts["source"] == ["0.0", "0.1", "1.0", "1.1"]
 
 
-def test_records_tell_time_and_memory_and_the_store_does_not(serial_run: Engine) -> None:
-    record = serial_run.records["ingest", "f0"]
+def test_records_tell_time_and_memory_and_the_store_does_not(serial_run: Engine, tmp_path: Path) -> None:
+    told: dict[str, Record] = {}
+    engine = make(tmp_path, progress=lambda stage, done, total, record: told.update({record.name: record}))
+    engine.run(INGEST)
+    record = told["f0"]
     assert set(record.seconds) == {"append", "all"}
     assert 0 < record.seconds["append"] <= record.seconds["all"]
-    assert record.peak_memory > 2**20
     assert record.notes == {"read": 1}
+    assert engine.records.peak_memory >= record.peak_memory > 2**20
+    assert set(engine.records.seconds) == {"ingest", "ingest: append"}
+    assert engine.records.seconds["ingest"] == sum(each.seconds["all"] for each in told.values())
+    assert engine.records["ingest", "f0"].notes == {"read": 1}
     assert set(serial_run.store.attributes("ingest", "f0")) == {"key", "facts", "notes"}
 
 
@@ -564,10 +631,20 @@ def seen(task: Task) -> Facts:
     return {stage: list(names) for stage, names in task.refs.items()}
 
 
+def many(task: Task) -> Facts:
+    task.put(z=np.arange(10_000.0))
+    return {}
+
+
+def loses(task: Task) -> Facts:
+    shutil.rmtree(task.store.folder("source", "1.1") / "z" / "c")
+    return {"n": len(list(task.read("source")))}
+
+
 def writes_file(task: Task) -> Facts:
     path: Path = task.context / f"{task.name}.txt"
     path.write_text(task.name)
-    return {"files": file_sizes(task.context, [path])}
+    return {"files": state_files(task.context, [path])}
 
 
 def writes_other_file(task: Task) -> Facts:

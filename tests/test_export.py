@@ -173,8 +173,8 @@ def test_what_is_no_finished_run_is_refused(
 
 
 def test_wrong_arguments_and_places(tiled: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="format 'obj' must be one of vtu, vtp"):
-        export_run(tiled, tmp_path / "all.obj", name="obj")
+    with pytest.raises(ValueError, match="format 'nope' must be one of vtu, vtp"):
+        export_run(tiled, tmp_path / "all.obj", name="nope")
     with pytest.raises(OutputError, match=r"all.vtu: cannot be written \(No such file or directory\)"):
         export_run(tiled, tmp_path / "none" / "all.vtu", name="vtu")
     (tmp_path / "all.vtu").mkdir()

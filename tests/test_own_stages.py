@@ -17,6 +17,7 @@ from tiler.own_stages import check_own
 from tiler.results import StoredTerrain
 from tiler.run import run
 from tiler.stage import Scope, Stage
+from tiler.status import read_status
 from tiler.store import Store
 from tiler.synth import write_city
 
@@ -73,6 +74,8 @@ def test_the_documented_stage_is_the_same_for_any_tiles(city: Path, tmp_path: Pa
         record = run(config(city, out, size), stages=[example.CANOPY], parameters={"canopy_cell": CELL})
         assert record["counts"]["tiles"] == len(Store(out / "store.zarr").names("canopy"))
         found[record["counts"]["tiles"]] = canopy_of(out)
+        status = read_status(out)
+        assert (status["command"], status["stages"]["canopy"]["done"]) == ("", record["counts"]["tiles"])
     (small, i0, j0), (large, *corner) = (found[n] for n in sorted(found, reverse=True))
     assert len(found) == 2
     assert corner == [i0, j0]
@@ -98,8 +101,11 @@ def test_an_interrupted_stage_of_ones_own_goes_on(city: Path, tmp_path: Path, ex
     """What failed was the user's stage: mended, it alone is run."""
     broken = Stage("canopy", Scope.TILE, divides, example.READS)
     out = tmp_path / "out"
-    with pytest.raises(ZeroDivisionError):
-        run(config(city, out, 600.0), stages=[broken])
+    record = run(config(city, out, 600.0), stages=[broken])
+    assert record["exit_code"] == 3
+    assert record["missing"] == {}
+    assert {found["stage"] for found in record["set_aside"]} == {"canopy"}
+    assert all(found["reason"].startswith("ZeroDivisionError") for found in record["set_aside"])
     record = run(config(city, out, 600.0), stages=[example.CANOPY], parameters={"canopy_cell": CELL})
     assert "canopy" not in record["reused"]
     store = Store(out / "store.zarr")

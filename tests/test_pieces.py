@@ -22,7 +22,17 @@ from stitch.conformity import match_facets, pair_cell_faces, pair_edges, pair_fa
 from stitch.facets import label_beyond
 from stitch.frontier import find_edges_below
 from stitch.grid import Key, SeamKey, corner_keys, make_grid, seam_keys, tile_keys
-from stitch.numbering import SeamNumbers, corner_part, count_parts, number_points, seam_part, tile_part
+from stitch.numbering import (
+    LOCAL_BITS,
+    MOST_TILES,
+    collect_ids,
+    corner_part,
+    first_id,
+    number_points,
+    number_without_gaps,
+    seam_part,
+    tile_part,
+)
 from tests.cities import Bounds, hilly_dtm, tilted_dtm
 from tests.stitching import OPTIONS, Scene, glue, random_scene, scene_of
 from tests.terraces import terrace_town
@@ -31,6 +41,7 @@ from tests.tiled_runs import (
     Pieces,
     SampledDtm,
     Split,
+    count_city,
     cut_city,
     mesh_city,
     number_city,
@@ -222,31 +233,77 @@ def pieces(nine: City) -> Pieces:
 # --- numbers ---------------------------------------------------------------------------------------
 
 
-def test_a_point_has_one_number_in_all_tiles_and_none_is_left_out(crowded: City, nine: City) -> None:
+def test_a_point_has_one_id_in_all_tiles_and_none_is_left_out(crowded: City, nine: City) -> None:
     for city in (crowded, nine):
-        numbers, total = number_city(city)
+        ids, total = number_city(city), count_city(city)
         kept = {key: find_used_points(tile.mesh) for key, tile in city.tiles.items()}
-        ids = np.concatenate([numbers[key][used] for key, used in kept.items()])
+        used = [ids[key][kept[key]] for key in city.tiles]
+        flat = np.concatenate(used)
         points = np.concatenate([expand_cells(city.tiles[key].mesh).points[used] for key, used in kept.items()])
-        assert np.unique(ids).tolist() == list(range(total))
-        assert len(np.unique(points, axis=0)) == total
-        assert len(np.unique(np.column_stack((ids, points)), axis=0)) == total
+        assert flat.min() >= 0
+        assert len(np.unique(flat)) == len(np.unique(points, axis=0)) == total
+        assert len(np.unique(np.column_stack((flat, points)), axis=0)) == total
+        table = collect_ids(used)
+        assert np.unique(number_without_gaps(table, flat)).tolist() == list(range(table.n_points))
+        assert table.n_points == total
+        # Every part is one run: there is no id of a level that no tile uses.
+        assert len(table.start) == len(np.unique(flat >> LOCAL_BITS))
 
 
-def test_every_part_has_a_place_of_its_own_and_none_is_left_over() -> None:
-    grid = make_grid((0.0, 140.0, 420.0, 420.0), tile_size=140.0, mesh_size=10.0)
-    corners, seams, tiles = corner_keys(grid), seam_keys(grid), tile_keys(grid)
-    assert (len(corners), len(seams), len(tiles)) == (12, 17, 6)
-    places = [corner_part(grid, key) for key in corners] + [seam_part(grid, key) for key in seams]
-    places += [tile_part(grid, key) for key in tiles]
-    assert sorted(places) == list(range(count_parts(grid)))
+def test_ids_say_nothing_of_the_region(nine: City) -> None:
+    """Of a larger region with the same houses, the tiles in the middle have the same ids."""
+    houses = CITIES["towers on the corners"]
+    roofs = [9.0, 12.0, 15.0, 18.0]
+    wide = (-420.0, -420.0, 840.0, 840.0)
+    small, large = (
+        mesh_city(
+            scene_of(houses, roofs, tilted_dtm(wide, height=2.0)),
+            make_grid(bounds, tile_size=140.0, mesh_size=10.0),
+        )
+        for bounds in (SQUARE, (-140.0, -140.0, 560.0, 560.0))
+    )
+    key = Key(1, 1)
+    assert (
+        expand_cells(small.tiles[key].mesh).points.tobytes()
+        == expand_cells(large.tiles[key].mesh).points.tobytes()
+    )
+    one, other = (number_city(city)[key] for city in (small, large))
+    assert one.tobytes() == other.tobytes()
 
 
-def test_corners_with_two_numbers_are_refused(crowded: City) -> None:
+def test_every_part_has_a_code_of_its_own_wherever_the_region_is() -> None:
+    for bounds in ((0.0, 140.0, 420.0, 420.0), (-3e7, 2e7, -3e7 + 420, 2e7 + 280)):
+        grid = make_grid(bounds, tile_size=140.0, mesh_size=10.0)
+        corners, seams, tiles = corner_keys(grid), seam_keys(grid), tile_keys(grid)
+        codes = [corner_part(key) for key in corners] + [seam_part(key) for key in seams]
+        codes += [tile_part(key) for key in tiles]
+        assert len(set(codes)) == len(codes) > 30
+        assert min(codes) >= 0
+        assert first_id(max(codes) + 1) <= 2**63
+    # As far apart as a region may be: nothing goes round onto itself.
+    assert (
+        len({tile_part(Key(i, j)) for i in range(-5, MOST_TILES - 5) for j in (0, MOST_TILES - 1)})
+        == 2 * MOST_TILES
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_runs_of_ids_are_numbered_as_their_sorted_list(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pieces = [rng.choice(900, rng.integers(0, 300)) + 2**62 * int(rng.integers(2)) for _ in range(9)]
+    table = collect_ids(pieces)
+    every = np.unique(np.concatenate(pieces))
+    assert table.n_points == len(every)
+    for ids in pieces:
+        assert np.array_equal(number_without_gaps(table, ids), np.searchsorted(every, ids))
+    with pytest.raises(ValueError, match="not among those"):
+        number_without_gaps(table, np.setdiff1d(np.arange(2**62 + 900, 2**62 + 902), every))
+
+
+def test_corners_with_two_ids_are_refused(crowded: City) -> None:
     mesh = crowded.tiles[Key(0, 0)].mesh
-    one, two = (SeamNumbers(np.array([0, k, 5], np.int32), (first, 40, 90)) for k, first in ((1, 0), (2, 7)))
     with pytest.raises(ValueError, match="number a corner differently"):
-        number_points(mesh, [one, two], 100)
+        number_points(mesh, np.array([0, 1, 0], np.int32), np.array([0, 40, 7]), 100)
 
 
 # --- one file of all pieces ------------------------------------------------------------------------
@@ -256,7 +313,7 @@ def test_one_file_has_all_pieces_and_each_vertex_once(tmp_path: Path, nine: City
     volumes, boundaries = write_numbered(tmp_path, nine)
     before = sorted(tmp_path.iterdir())
     write_merged_volume(tmp_path / "all.vtu", volumes)
-    write_merged_boundary(tmp_path / "all.vtp", boundaries)
+    write_merged_boundary(tmp_path / "all.vtp", boundaries, volumes)
     assert sorted(tmp_path.iterdir()) == sorted([*before, tmp_path / "all.vtu", tmp_path / "all.vtp"])
     mesh = meshio.vtu.read(str(tmp_path / "all.vtu"))
     cells = mesh.cells[0].data

@@ -17,14 +17,15 @@ from pipeline.errors import ConfigError
 from stitch.grid import TileGrid, has_tile, make_grid, seam_keys, seam_line, tile_box, tile_keys, tiles_of_seam
 from tiler import cli
 from tiler.clouds import CloudHeader
-from tiler.config import Config
+from tiler.config import Config, make_config
 from tiler.context import absent_tiles, choose_tiles, make_layout, seam_name, tile_name
 from tiler.footprint_sample import FootprintSample, measure_detail, sample_footprints
-from tiler.forecast import Forecast, forecast_run, spread_points
+from tiler.forecast import Forecast, forecast_run, spread_points, warn_of_memory
 from tiler.plan_picture import ABSENT, HATCH, HOUSE, PRESENT, draw_plan
 from tiler.plan_report import describe_plan, plan_run
 from tiler.planning import Survey, survey_inputs
-from tiler.region import Region
+from tiler.region import Region, check_region
+from tiler.run import run
 from tiler.synth import write_city
 
 CRS = "EPSG:3006"
@@ -164,6 +165,14 @@ def test_a_country_of_half_a_million_tiles(tmp_path: Path) -> None:
     assert plan["tiles"]["absent"] == 235 * 235
     draw_plan(survey, None, tmp_path / "plan.png")
     assert (tmp_path / "plan.png").stat().st_size > 1000
+
+
+def test_more_tiles_to_a_side_than_ids_can_tell_are_refused() -> None:
+    """Columns and rows of tiles have 15 bits in the ids of points."""
+    wide = Region((0.0, 0.0, 200.0 * 32_766, 500.0), CRS, 200.0)
+    check_region(wide, 10.0, [])
+    with pytest.raises(ConfigError, match="more than 32766 tiles of 199 m to a side; give --tile-size 200"):
+        check_region(replace(wide, tile_size=199.0), 10.0, [])
 
 
 def test_points_of_files_are_dealt_out_by_area() -> None:
@@ -309,3 +318,27 @@ def test_small_houses_are_dots(tmp_path: Path) -> None:
     scale = 1400 / (grid.bounds[2] - grid.bounds[0])
     assert np.abs(rows - (60 + 1400 - 2504 * scale)).max() <= 2
     assert changed.sum() > 100
+
+
+def test_a_run_says_before_it_starts_which_tiles_may_not_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_city(tmp_path / "city", size=200.0, buildings=4, density=0.5, relief=2, seed=1)
+    for memory in (4.0, 0.4):
+        monkeypatch.setattr("tiler.run.machine_memory", lambda memory=memory: memory * 2**30)
+        said: list[str] = []
+        values = {"pointcloud": [str(tmp_path / "city" / "tiles")], "out": str(tmp_path / str(memory))}
+        record = run(make_config(values | {"tile_size": 100.0, "mesh_size": 5.0}), say=said.append)
+        warned = [message for message in record["messages"] if "may not fit into memory" in message]
+        assert bool(warned) is (memory < 1)
+        assert set(warned) <= set(said)
+    assert "4 of 4 tiles may not fit into memory: up to 0." in warned[0]
+    assert "a worker > 0.3 GiB, 80 % of the 0.4 GiB that it has" in warned[0]
+
+
+def test_the_memory_limit_counts(tmp_path: Path) -> None:
+    write_city(tmp_path / "city", size=200.0, buildings=4, density=0.5, relief=2, seed=1)
+    values = {"pointcloud": [str(tmp_path / "city" / "tiles")], "tile_size": 100.0, "mesh_size": 5.0}
+    for limit, warns in ((0.0, False), (4.0, False), (0.4, True)):
+        config = make_config(values | {"workers": 1, "memory_limit": limit})
+        assert bool(warn_of_memory(survey_inputs(config, print), config, memory=2.0**33)) is warns

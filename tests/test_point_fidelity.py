@@ -9,11 +9,12 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_points import extract_building_points, find_inside
+from pipeline.building_points import extract_building_points
 from pipeline.citymodel import Footprints
 from pipeline.footprints import clean_footprints
 from pipeline.heights import percentile_by_group
 from pipeline.house_levels import LevelOptions, split_levels
+from pipeline.inside import find_inside
 from pipeline.point_fidelity import Residuals, measure_fidelity, measure_houses, summarise
 from pipeline.pointcloud import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER, PointCloud
 from pipeline.roof_points import RoofPoints, locate_roof_points
@@ -47,7 +48,7 @@ CLOUD = cloud_of(
     (35, 30, 1.5, WATER),  # open: -0.5
     (19, 18, 1.5, GROUND),  # footprint only, so outside the model: -0.5
     (9, 18, 2.0, GROUND),  # swallowed: 10 - 2 = 8
-    (12, 18, 2.0, GROUND),  # in both: not counted
+    (12, 18, 3.0, GROUND),  # in both: not counted
     (12, 12, 30.0, HIGH_VEGETATION),
 )
 

@@ -16,7 +16,7 @@ from pipeline.errors import ConfigError
 from tests.test_run import hashes
 from tiler.check import check_run
 from tiler.config import Config, make_config
-from tiler.out_folder import only_run
+from tiler.folder_lock import only_run
 from tiler.results import StoredTerrain
 from tiler.run import run
 from tiler.store import Store
@@ -112,14 +112,6 @@ def test_other_parameters_leave_nothing_of_the_unfinished_run(town: Town, tmp_pa
     assert hashes(out) == hashes(tmp_path / "fresh")
 
 
-def test_a_finished_run_is_refused_and_overwritten_whole(town: Town, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    shutil.copytree(town.out, out)
-    with pytest.raises(ConfigError, match="--overwrite"):
-        run(town.config(out))
-    assert hashes(out) == hashes(town.out)
-
-
 def change_footprints(town: Town, path: Path, change: Any) -> Path:
     """Write the footprints after a change of the columns ids and polygons."""
     meta, _, wkb, (ids,) = pyogrio.raw.read(town.folder / "footprints.gpkg")
@@ -158,8 +150,9 @@ def test_a_changed_footprint_reruns_what_reads_it_and_no_more(town: Town, tmp_pa
     computed = anew(town, record)
     for stage in ("houses", "shapes-0", "model", "citymodel"):
         assert computed[stage] == 1, stage
-    # The other pieces are written again: the numbers of their points have moved.
-    assert (computed["columns"], computed["seams"], computed["pieces"]) == (9, 12, 16)
+    assert (computed["columns"], computed["seams"]) == (9, 12)
+    # A piece is written again where the mesh is another one: the ids of points elsewhere stay.
+    assert 1 <= computed["pieces"] <= 4
     assert computed.keys().isdisjoint({"points", "ground", "flooded", "coarse", "terrain"})
     run(town.config(tmp_path / "whole", footprints=str(changed)))
     assert hashes(out) == hashes(tmp_path / "whole")

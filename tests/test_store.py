@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError, OutputError
-from tiler.packing import CHUNK_BYTES, INLINE_BYTES, PACKED_BYTES
+from tiler.packing import CHUNK_BYTES, INLINE_BYTES, PACKED_BYTES, verified_chunks
 from tiler.store import Store
 
 RNG = np.random.default_rng(7)
@@ -120,6 +121,39 @@ def test_rows_of_a_part(store: Store) -> None:
     for start, stop in [(-1, 2), (3, 2), (0, len(BIG) + 1)]:
         with pytest.raises(ValueError, match="rows"):
             store.read_rows("s", "n", "big", start, stop)
+
+
+@pytest.mark.parametrize(
+    "ranges",
+    [
+        [],
+        [(3, 3)],
+        [(0, 2), (5, 9)],
+        [(0, 2), (N_CHUNK - 1, N_CHUNK + 1), (N_CHUNK + 7, N_CHUNK + 8), (2 * N_CHUNK, len(BIG))],
+        [(1, N_CHUNK), (N_CHUNK, N_CHUNK + 1), (2 * N_CHUNK + 1, 2 * N_CHUNK + 2)],
+    ],
+)
+def test_ranges_are_read_at_once_and_chunks_once(
+    store: Store, monkeypatch: pytest.MonkeyPatch, ranges: list[tuple[int, int]]
+) -> None:
+    numbers = np.arange(len(BIG), dtype=np.uint8)
+    store.write("s", "n", {"big": BIG, "numbers": numbers, "few": BIG[:9]})
+    rows = np.concatenate([np.empty(0, int), *(np.arange(*pair) for pair in ranges)])
+    checked: list[int] = []
+
+    def watch(rows: NDArray[Any], chunk: int, expected: list[int]) -> Iterator[int]:
+        checked.extend(expected)
+        return verified_chunks(rows, chunk, expected)
+
+    monkeypatch.setattr("tiler.store.verified_chunks", watch)
+    found = store.read_ranges("s", "n", ["numbers", "big"], ranges)
+    assert list(found) == ["big", "numbers"]
+    assert found["big"].tobytes() == BIG[rows].tobytes()
+    assert found["numbers"].tolist() == numbers[rows].tolist()
+    assert len(checked) == len(set(checked))
+    assert store.read_ranges("s", "n", ["few"], [(0, 2), (5, 8)])["few"].tolist() == BIG[[0, 1, 5, 6, 7]].tolist()
+    with pytest.raises(ValueError, match="rows"):
+        store.read_ranges("s", "n", ["few"], [(0, 10)])
 
 
 def test_a_damaged_chunk_is_found_where_it_is_read_and_only_there(store: Store) -> None:

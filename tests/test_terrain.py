@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import InputError
 from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
-from pipeline.raster import NodeWindow, cut_nodes, grow_window, join_dtm, node_window, window_of
+from pipeline.raster import HEIGHT_UNIT, NodeWindow, cut_nodes, grow_window, join_dtm, node_window, window_of
 from pipeline.terrain import Dtm, bin_ground, bin_nodes, compute_dtm, fill_dtm, sample_dtm
 from pipeline.terrain_fill import (
     COARSE,
@@ -142,6 +142,12 @@ def test_bins_of_tiles_are_those_of_the_region_from_points_half_a_spacing_beyond
     points = PointCloud(xyz, np.full(n, GROUND, np.uint8))
     region = (1000.0, -80.0, 1100.0, 0.0)
     whole, count = bin_ground(points, region, spacing=spacing)
+    node = np.rint(xyz[:, :2] / spacing).astype(int) - (whole.i0, whole.j0)
+    here = ((node >= 0) & (node < whole.z.shape[::-1])).all(axis=1)
+    bins = node[here] @ [1, whole.z.shape[1]]
+    assert np.bincount(bins, minlength=count.size).tolist() == count.ravel().tolist()
+    heights = np.bincount(bins, np.rint(xyz[here, 2] / HEIGHT_UNIT), count.size).reshape(count.shape) * HEIGHT_UNIT
+    np.testing.assert_array_equal(whole.z[count > 0], heights[count > 0] / count[count > 0])
     parts, n_points = [], 0
     for window in tile_windows(region, 33.3, spacing):
         low = (np.array([window.i0, window.j0]) - 0.5) * spacing - 1e-9

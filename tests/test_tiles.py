@@ -28,6 +28,7 @@ from tests.tiles import (
 )
 from tiler.check import CheckReport, check_run
 from tiler.config import make_config
+from tiler.mesh_pieces import open_pieces
 from tiler.results import StoredTerrain
 from tiler.stages.mesh import terrain_halo
 from tiler.vtk_files import read_vtp
@@ -374,6 +375,8 @@ def test_any_region_is_proved(make: Callable[[], Case], mesher: str, tmp_path: P
         values, tmp_path / "out", **{"tile_size": SIZE, "domain_height": 50.0, "mesher": mesher} | others
     )
     report = prove(tmp_path / "out")
+    # Points have as many ids as places, in corners where two tiles meet alone too.
+    assert open_pieces(tmp_path / "out").n_points == record["counts"]["points"]
     absent = len(files.get("without", ()))
     assert (report.facts["missing_facets"] > 0) == (absent > 0)
     tiles = [path.stem for path in (tmp_path / "out" / "mesh").iterdir()]

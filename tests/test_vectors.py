@@ -274,8 +274,8 @@ def test_layers_must_be_named(tmp_path: Path) -> None:
         read(path)
     with pytest.raises(ConfigError, match=r"no layer 'three'; its layers are: one, two"):
         read_footprint_crs(path, "three")
-    table = tmp_path / "a.csv"
-    table.write_text("id,h\n1,2\n")
+    table = tmp_path / "table.gpkg"
+    pyogrio.raw.write(table, geometry=None, field_data=[np.array(["1"])], fields=["id"], geometry_type=None)
     with pytest.raises(InputError, match="no layer with geometries"):
         read(table)
 

@@ -15,13 +15,13 @@ from pipeline.terrain import Dtm, sample_dtm
 from stitch.facets import Side, find_seam_edges
 from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile
 from stitch.numbering import (
-    SeamNumbers,
     corner_part,
     count_inner_points,
-    count_parts,
     count_points,
+    first_id,
     make_offsets,
     number_points,
+    seam_ids,
     seam_part,
     tile_part,
 )
@@ -91,31 +91,34 @@ def cut_city(city: City, gone: Collection[Key] = ()) -> Pieces:
     }
 
 
-def number_city(city: City) -> tuple[dict[Key, NDArray[np.int64]], int]:
-    """Number the points of all tiles; also tell how many there are."""
-    grid = city.grid
-    counts = np.zeros(count_parts(grid), np.int64)
-    vertex: dict[tuple[Key, SeamKey], NDArray[np.int32]] = {}
+def number_city(city: City) -> dict[Key, NDArray[np.int64]]:
+    """Give the points of all tiles their ids."""
+    ids = {}
     for key, tile in city.tiles.items():
+        shared = [find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy) for seam in tile.columns]
+        lowest = [seam_ids(seam, levels) for seam, levels in tile.columns.items()]
+        ids[key] = number_points(
+            tile.mesh, np.concatenate(shared), np.concatenate(lowest), first_id(tile_part(key))
+        )
+    return ids
+
+
+def count_city(city: City) -> int:
+    """Count the points of all parts, as a run does."""
+    counts: dict[int, int] = {}
+    for key, tile in city.tiles.items():
+        shared = []
         for seam, levels in tile.columns.items():
-            vertex[key, seam] = find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy)
-            low, high = ends_of_seam(seam)
-            counts[[corner_part(grid, low), seam_part(grid, seam), corner_part(grid, high)]] = count_points(levels)
-        counts[tile_part(grid, key)] = count_inner_points(tile.mesh, [vertex[key, seam] for seam in tile.columns])
-    offsets = make_offsets(counts.tolist()).tolist()
-    numbers = {}
-    for key, tile in city.tiles.items():
-        own = []
-        for seam in tile.columns:
-            low, high = (offsets[corner_part(grid, end)] for end in ends_of_seam(seam))
-            own.append(SeamNumbers(vertex[key, seam], (low, offsets[seam_part(grid, seam)], high)))
-        numbers[key] = number_points(tile.mesh, own, offsets[tile_part(grid, key)])
-    return numbers, offsets[-1]
+            shared.append(find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy))
+            low, high = (corner_part(corner) for corner in ends_of_seam(seam))
+            counts |= zip((low, seam_part(seam), high), count_points(levels), strict=True)
+        counts[tile_part(key)] = count_inner_points(tile.mesh, shared)
+    return int(make_offsets(counts)[1][-1])
 
 
 def write_numbered(folder: Path, city: City) -> tuple[list[Path], list[Path]]:
     """Write the pieces of a city with the numbers of their points."""
-    numbers, _ = number_city(city)
+    numbers = number_city(city)
     volumes, boundaries = [], []
     for key, (mesh, boundary) in cut_city(city).items():
         ids = {VERTEX_ID: numbers[key][find_used_points(city.tiles[key].mesh)]}

@@ -23,6 +23,7 @@ from tiler.config import Config, make_config
 from tiler.context import RunContext, pack_tiles
 from tiler.engine import Engine
 from tiler.executors import serial
+from tiler.options import derived_parameters
 from tiler.planning import Plan, identify, make_plan
 from tiler.run import run, run_city_stages
 from tiler.stage import REGION_ITEM
@@ -166,7 +167,7 @@ def open_engine(config: Config) -> Iterator[tuple[Engine, Plan]]:
     )
     parameters = SimpleNamespace(
         **dataclasses.asdict(config),
-        layer_height_or_default=config.layer_height_or_default,
+        **derived_parameters(config),
         footprints_identity=identify(Path(config.footprints)),
     )
     with serial() as executor:
@@ -178,7 +179,11 @@ def open_engine(config: Config) -> Iterator[tuple[Engine, Plan]]:
 
 def hash_files(folder: Path, *, besides: Callable[[Path], bool] = lambda _: False) -> dict[str, str]:
     """Hash of every file of a run but run.json, which has times, and those that are left out."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "run.json")
+    files = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and path.name not in ("run.json", "progress.json", "config.toml")
+    )
     return {
         str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in files

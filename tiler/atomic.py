@@ -1,6 +1,7 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 import os
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,8 +11,15 @@ from pipeline.errors import OutputError
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Give a path beside `path` to write to; the file takes its place when all went well.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    durable : bool
+        Wait until the disk has it: after a loss of power `path` is the old file or the new one, both whole.
 
     Raises
     ------
@@ -22,9 +30,54 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         try:
             yield part
+            if durable:
+                _sync(part)
             os.replace(part, path)
+            if durable:
+                _sync(path.parent)
         finally:
             part.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
+        ) from error
+
+
+def _sync(path: Path) -> None:
+    """Wait until the disk has a file, or the names in a folder."""
+    file = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+@contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Give an empty folder beside `path` to write to; it takes its place when all went well.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written; then `path` is not there, or is the old folder.
+    """
+    stem = f".{path.name}.{os.getpid()}.{threading.get_ident()}"
+    part, old = path.with_name(f"{stem}.part"), path.with_name(f"{stem}.old")
+    try:
+        try:
+            part.mkdir()
+            yield part
+            if path.exists():
+                os.replace(path, old)
+            try:
+                os.replace(part, path)
+            except OSError:
+                if old.exists():
+                    os.replace(old, path)
+                raise
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror}); free space or choose another folder"

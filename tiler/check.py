@@ -11,14 +11,14 @@ from pipeline.errors import InputError
 from pipeline.mesh import Marker
 from stitch.frontier import Settled, add_rim, close_frontier, start_frontier
 from tiler import city_proofs, proofs
+from tiler.building_index import BuildingIndex, index_buildings
 from tiler.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
+from tiler.out_folder import RUN_RECORD, STORE
 from tiler.proofs import Dtm, Fault, Finding, Proof, Vertices
-from tiler.run_folder import Buildings, RunRecord, read_buildings, read_run_record
+from tiler.run_folder import RunRecord, read_run_record
+from tiler.stages.citymodel import CITY_MODEL
 from tiler.vtk_files import read_piece_paths
 
-RUN_RECORD = "run.json"
-STORE = "store.zarr"
-CITY_MODEL = "citymodel.city.json"
 VOLUME_INDEX = "mesh.pvtu"
 BOUNDARY_INDEX = "boundary.pvtp"
 
@@ -85,22 +85,23 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
 
     Notes
     -----
-    Pieces are read one after the other: memory holds one piece, what waits for a neighbour on the frontier
-    (`stitch.frontier`), and the city model.
+    Pieces are read one after the other, along the long side of the region: memory holds one piece with the
+    buildings and the terrain around it, what waits for a neighbour on the frontier (`stitch.frontier`), besides
+    some 100 bytes a building and 500 a piece.
     """
     record = read_run_record(directory / RUN_RECORD)
-    buildings = read_buildings(directory / CITY_MODEL)
-    files = _pair_pieces(directory)
-    dtm = load_dtm(directory / STORE)
-    sums = _Sums.start(len(buildings))
-    frontier = start_frontier()
-    for number, (volume, boundary) in enumerate(files):
-        piece = read_piece(volume, boundary, record.bounds)
-        frontier, settled, fresh = add_rim(frontier, piece.rim, number)
-        sums.add_piece(piece, fresh, record, buildings, dtm)
-        sums.add_settled(settled)
-    sums.add_settled(close_frontier(frontier))
-    return CheckReport(directory, *_conclude(sums, len(files), record, buildings))
+    with index_buildings(directory / CITY_MODEL) as index:
+        files = _in_order(_pair_pieces(directory), record)
+        dtm = load_dtm(directory / STORE)
+        sums = _Sums.start(len(index))
+        frontier = start_frontier()
+        for number, (volume, boundary) in enumerate(files):
+            piece = read_piece(directory / volume, directory / boundary, record.bounds)
+            frontier, settled, fresh = add_rim(frontier, piece.rim, number)
+            sums.add_piece(piece, fresh, record, index, dtm)
+            sums.add_settled(settled)
+        sums.add_settled(close_frontier(frontier))
+        return CheckReport(directory, *_conclude(sums, len(files), record, index))
 
 
 @dataclass(eq=False)
@@ -113,20 +114,21 @@ class _Sums:
     smallest: float
     faults: tuple[Fault, ...]
     crowded: Vertices  # (c, 2): where edges have more than two facets
-    seams: set[tuple[int, int]]
+    seams: NDArray[np.int64]  # (s, 2): pairs of pieces that share faces
 
     @classmethod
     def start(cls, n_buildings: int) -> "_Sums":
-        none = np.zeros(n_buildings)
-        built = city_proofs.Built(none, none.astype(np.int64), none.astype(np.int64), none)
+        built = city_proofs.start_built(n_buildings)
         counts = {"cells": 0, "points": 0, "facets": 0, "buildings": n_buildings}
-        return cls({}, built, counts, np.inf, (), np.empty((0, 2)), set())
+        return cls({}, built, counts, np.inf, (), np.empty((0, 2)), np.empty((0, 2), np.int64))
 
     def add_piece(
-        self, piece: Piece, fresh: NDArray[np.bool_], record: RunRecord, buildings: Buildings, dtm: Dtm
+        self, piece: Piece, fresh: NDArray[np.bool_], record: RunRecord, index: BuildingIndex, dtm: Dtm
     ) -> None:
         """Add what a piece says; `fresh` are the points of its rim that no earlier piece had."""
         surface = piece.surface
+        rows = _find_buildings(index, piece)
+        buildings = index.take(rows)
         found = {
             "same": piece.same_boundary,
             "closed": piece.closed,
@@ -140,7 +142,7 @@ class _Sums:
         }
         for name, finding in found.items():
             self._join(name, finding)
-        self.built = city_proofs.add_built(self.built, city_proofs.find_built(surface, buildings, piece.outline))
+        city_proofs.add_built(self.built, rows, city_proofs.find_built(surface, buildings, piece.outline))
         self.counts["cells"] += piece.n_cells
         self.counts["points"] += piece.n_points + int((piece.rim.points[fresh, 3] == ANY).sum())
         self.counts["facets"] += len(surface.boundary.facets)
@@ -153,7 +155,8 @@ class _Sums:
         self._join("seams", proofs.check_seams(settled))
         self._join("closed", proofs.check_closed(settled.open_lines, settled.crowded_lines))
         self._add_crowded(settled.crowded_lines)
-        self.seams.update((int(one), int(two)) for one, two in settled.seams)
+        if len(settled.seams):
+            self.seams = np.unique(np.concatenate((self.seams, settled.seams)), axis=0)
 
     def _join(self, name: str, finding: Finding) -> None:
         self.found[name] = proofs.join_findings(self.found.get(name, Finding()), finding)
@@ -163,7 +166,7 @@ class _Sums:
 
 
 def _conclude(
-    sums: _Sums, n_pieces: int, record: RunRecord, buildings: Buildings
+    sums: _Sums, n_pieces: int, record: RunRecord, index: BuildingIndex
 ) -> tuple[tuple[Proof, ...], Mapping[str, float]]:
     """Make the claims and the facts of what was found."""
     found, bounds = sums.found, record.bounds
@@ -186,7 +189,7 @@ def _conclude(
         proofs.prove_ground(found["ground"]),
         city_proofs.prove_roofs(found["roofs"]),
         city_proofs.prove_walls(found["walls"]),
-        city_proofs.prove_buildings(sums.built, buildings, bounds, partial=partial),
+        city_proofs.prove_buildings(sums.built, index, bounds, partial=partial),
         proofs.prove_plan(found["sizes"], bounds, partial=partial),
         proofs.prove_volume(found["sizes"]),
         proofs.prove_record(record, sums.counts, partial=partial),
@@ -199,15 +202,43 @@ def _tell(fault: Fault) -> str:
     return f"{fault.kind}: {fault.count}, {fault.detail}" + (f", at {places}" if places else "")
 
 
-def _pair_pieces(directory: Path) -> list[tuple[Path, Path]]:
-    """Return the volume and boundary file of every piece: they have one name."""
-    volumes = {path.stem: path for path in read_piece_paths(directory / VOLUME_INDEX)}
-    boundaries = {path.stem: path for path in read_piece_paths(directory / BOUNDARY_INDEX)}
+def _pair_pieces(directory: Path) -> list[tuple[str, str]]:
+    """Return the volume and boundary file of every piece, below the directory: they have one name."""
+    volumes, boundaries = (
+        {path.stem: str(path.relative_to(directory)) for path in read_piece_paths(directory / index)}
+        for index in (VOLUME_INDEX, BOUNDARY_INDEX)
+    )
     alone = sorted(volumes.keys() ^ boundaries.keys())
     if alone:
         names = f"{VOLUME_INDEX} and {BOUNDARY_INDEX}"
         raise InputError(f"{directory}: only one of {names} names the piece {alone[0]!r}; run again")
     return [(path, boundaries[name]) for name, path in volumes.items()]
+
+
+def _in_order(files: list[tuple[str, str]], record: RunRecord) -> list[tuple[str, str]]:
+    """Put pieces in an order in which few wait: across the region, then along its long side.
+
+    What waits for a neighbour is then no more than the pieces across have. Where the record does not state the
+    boxes of all tiles, pieces stay in the order of the index.
+    """
+    west, south, east, north = record.bounds
+    axes = (0, 1) if east - west >= north - south else (1, 0)
+    corners = [record.tiles.get(Path(volume).stem) for volume, _ in files]
+    known = [corner for corner in corners if corner is not None]
+    if len(known) < len(files):
+        return files
+    order = sorted(range(len(files)), key=lambda k: [known[k][axis] for axis in axes])
+    return [files[k] for k in order]
+
+
+def _find_buildings(index: BuildingIndex, piece: Piece) -> NDArray[np.int64]:
+    """Find the buildings that a piece may have anything of: around its plan, and those that its facets name."""
+    named = index.find_rows(np.unique(piece.surface.boundary.building))
+    rows = [named[named >= 0]]
+    if len(piece.outline):
+        (west, south), (east, north) = (ends(piece.outline, axis=(0, 1)).tolist() for ends in (np.min, np.max))
+        rows.append(index.find_near((west, south, east, north)))
+    return np.unique(np.concatenate(rows))
 
 
 def _prove_cells(sums: _Sums, n_pieces: int) -> Proof:

@@ -1,6 +1,6 @@
 """The proofs of `citystitch check` that hold the mesh against its city model: marks, walls, roofs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,10 +8,13 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.mesh import Marker
+from tiler.building_index import BuildingIndex
 from tiler.proofs import (
     HEIGHT_TOLERANCE,
+    N_PLACES,
     SIDE_TOLERANCE,
     Bounds,
+    Fault,
     Finding,
     Mask,
     Proof,
@@ -23,6 +26,7 @@ from tiler.proofs import (
 )
 from tiler.run_folder import Buildings
 
+LOADED = 4096  # footprints that are measured at once
 OUTLINE_TOLERANCE = 2e-3  # m, in the plane: CityJSON rounds coordinates to 1 mm
 
 
@@ -115,15 +119,15 @@ class Built:
     ----------
     roof_area : float64, (n,)
         Plan area of its roof facets (m²).
-    n_roofs, n_walls : int64, (n,)
+    n_roofs, n_walls : int32, (n,)
         Roof and wall facets.
     plan_area : float64, (n,)
         How much of its footprint lies in the plan of the pieces (m²).
     """
 
     roof_area: NDArray[np.float64]
-    n_roofs: NDArray[np.int64]
-    n_walls: NDArray[np.int64]
+    n_roofs: NDArray[np.int32]
+    n_walls: NDArray[np.int32]
     plan_area: NDArray[np.float64]
 
 
@@ -138,23 +142,24 @@ def find_built(surface: Surface, buildings: Buildings, outline: Vertices) -> Bui
         plan_area[near] += shapely.area(shapely.intersection(buildings.footprints[near], face))
     return Built(
         np.bincount(roof_row, -surface.area[roofs], n).astype(np.float64),
-        np.bincount(roof_row, minlength=n),
-        np.bincount(wall_row, minlength=n),
+        np.bincount(roof_row, minlength=n).astype(np.int32),
+        np.bincount(wall_row, minlength=n).astype(np.int32),
         plan_area,
     )
 
 
-def add_built(one: Built, two: Built) -> Built:
-    """Add what two pieces have."""
-    return Built(
-        one.roof_area + two.roof_area,
-        one.n_roofs + two.n_roofs,
-        one.n_walls + two.n_walls,
-        one.plan_area + two.plan_area,
-    )
+def start_built(n: int) -> Built:
+    """Give what no piece has of n buildings."""
+    return Built(np.zeros(n), np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n))
 
 
-def prove_buildings(built: Built, buildings: Buildings, bounds: Bounds, *, partial: bool) -> Proof:
+def add_built(total: Built, rows: NDArray[np.int64], part: Built) -> None:
+    """Add what a piece has of some buildings, of these rows, to what is known of all."""
+    for name in ("roof_area", "n_roofs", "n_walls", "plan_area"):
+        getattr(total, name)[rows] += getattr(part, name)
+
+
+def prove_buildings(built: Built, index: BuildingIndex, bounds: Bounds, *, partial: bool) -> Proof:
     """Every building of the city model has its walls, and a roof as large as its footprint.
 
     Notes
@@ -163,28 +168,26 @@ def prove_buildings(built: Built, buildings: Buildings, bounds: Bounds, *, parti
     needs no wall of its own where its outline runs along the region's border or a house that is as high.
     If pieces are missing (`partial`), what counts of a footprint is what lies in the others' plan.
     """
-    n, footprints = len(buildings), buildings.footprints
-    full_area, slack = shapely.area(footprints), OUTLINE_TOLERANCE * shapely.length(footprints)
+    n = len(index)
+    full_area, slack = _measure_footprints(index)
     wanted = built.plan_area if partial else full_area
     whole = wanted >= full_area - slack
     has_roof, has_wall = built.n_roofs > 0, built.n_walls > 0
     error = np.abs(built.roof_area - wanted)
     uneven = has_roof & ~(error <= slack)
     bare = ~has_wall & has_roof & whole
-    bare[bare] = [_needs_wall(i, buildings, bounds) for i in np.flatnonzero(bare).tolist()]
+    bare[bare] = [_needs_wall(row, index, bounds) for row in np.flatnonzero(bare).tolist()]
     expected = wanted > (slack if partial else -1)
-    places = np.column_stack(
-        [shapely.get_coordinates(shapely.point_on_surface(footprints)).reshape(n, 2), buildings.roof]
-    )
     faults = [
-        *find_faults(
-            "building-missing", places[expected & ~has_roof & ~has_wall], "in the city model, not in the mesh"
+        *_find_faults(
+            "building-missing", index, expected & ~has_roof & ~has_wall, "in the city model, not in the mesh"
         ),
-        *find_faults("building-without-roof", places[expected & ~has_roof & has_wall], "it has walls but no roof"),
-        *find_faults("building-without-wall", places[bare], "it has a roof but no wall"),
-        *find_faults(
+        *_find_faults("building-without-roof", index, expected & ~has_roof & has_wall, "it has walls but no roof"),
+        *_find_faults("building-without-wall", index, bare, "it has a roof but no wall"),
+        *_find_faults(
             "roof-area",
-            places[uneven],
+            index,
+            uneven,
             f"{error[uneven].max(initial=0):.3g} m² off its footprint; bound: {OUTLINE_TOLERANCE:g} m along its"
             " outline",
         ),
@@ -192,6 +195,25 @@ def prove_buildings(built: Built, buildings: Buildings, bounds: Bounds, *, parti
     total = f"roofs {built.roof_area.sum():.2f} m², footprints {wanted.sum():.2f} m²"
     n_whole = f"{n}" if not partial else f"{np.count_nonzero(whole)} whole and {np.count_nonzero(~whole)} other"
     return Proof(f"the {n_whole} buildings of the city model have their walls and roofs; {total}", tuple(faults))
+
+
+def _measure_footprints(index: BuildingIndex) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Measure each footprint's area (m²), and how far a roof's may be off; some footprints at a time."""
+    area, slack = np.empty(len(index)), np.empty(len(index))
+    for start in range(0, len(index), LOADED):
+        rows = np.arange(start, min(start + LOADED, len(index)))
+        footprints = index.take(rows).footprints
+        area[rows], slack[rows] = shapely.area(footprints), OUTLINE_TOLERANCE * shapely.length(footprints)
+    return area, slack
+
+
+def _find_faults(kind: str, index: BuildingIndex, wrong: Mask, detail: str) -> list[Fault]:
+    """Make one fault of all buildings that are wrong; the places of the first are looked up."""
+    rows = np.flatnonzero(wrong)
+    some = index.take(rows[:N_PLACES])
+    inside = shapely.get_coordinates(shapely.point_on_surface(some.footprints)).reshape(-1, 2)
+    faults = find_faults(kind, np.column_stack([inside, some.roof]), detail)
+    return [replace(fault, count=len(rows)) for fault in faults]
 
 
 def _first(values: NDArray[Any]) -> str:
@@ -224,11 +246,14 @@ def _all_near(shapes: NDArray[np.object_], row: NDArray[np.int64], corners: Vert
     return near
 
 
-def _needs_wall(i: int, buildings: Buildings, bounds: Bounds) -> bool:
-    """Tell whether air must touch the outline of building `i` below its roof."""
-    outline = shapely.boundary(buildings.footprints[i])
-    near = buildings.tree.query(outline, predicate="dwithin", distance=OUTLINE_TOLERANCE)
-    near = near[(buildings.roof[near] >= buildings.roof[i] - HEIGHT_TOLERANCE) & (near != i)]
-    hidden = [*buildings.footprints[near], shapely.boundary(shapely.box(*bounds))]
+def _needs_wall(row: int, index: BuildingIndex, bounds: Bounds) -> bool:
+    """Tell whether air must touch the outline of a building below its roof."""
+    own = index.take(np.array([row]))
+    roof, outline = own.roof[0], shapely.boundary(own.footprints[0])
+    west, south, east, north = shapely.buffer(outline, OUTLINE_TOLERANCE).bounds
+    others = index.find_near((west, south, east, north))
+    near = index.take(others[others != row])
+    hides = shapely.dwithin(near.footprints, outline, OUTLINE_TOLERANCE) & (near.roof >= roof - HEIGHT_TOLERANCE)
+    hidden = [*near.footprints[hides], shapely.boundary(shapely.box(*bounds))]
     cover = shapely.union_all(shapely.buffer(hidden, OUTLINE_TOLERANCE))
     return bool(shapely.length(shapely.difference(outline, cover)) > OUTLINE_TOLERANCE)

@@ -1,7 +1,8 @@
-"""The command line: `citystitch run | plan | check | synth | demo | render | export | config`."""
+"""The command line: `citystitch run | plan | check | status | synth | demo | render | export | config`."""
 
 import argparse
 import dataclasses
+import json
 import os
 import sys
 import tempfile
@@ -10,20 +11,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import CityError, ConfigError
-from tiler.config import Config, annotated_defaults, load_config, make_config
+from tiler.config import Config, annotated_defaults, check_reach, load_config, make_config
 from tiler.export import FORMATS
+from tiler.plain_text import printable
 
 if TYPE_CHECKING:
     from tiler.synth import SynthFiles
 
 EXIT_CODES = (
-    "Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 3 done but for parts listed in run.json."
+    "Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 3 done but for parts listed in run.json, "
+    "130 stopped."
 )
 METAVARS = {str: "NAME", float: "NUMBER", int: "NUMBER"}
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 POSITIONAL = "pointcloud"
 DEMO_TILES = 3  # tiles along each side of the demo's city, fewer where they would be too small
 LEAST_DEMO_TILE = 150.0  # m
+EXPORT_OPTIONS = {option for kind in FORMATS.values() for option in kind.options}
 BLOCK = Path(__file__).with_name("demo_block")  # real data of a few hundred kilobytes
 
 
@@ -44,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except CityError as error:
         if options.traceback:
             raise
-        print(f"citystitch: {error}", file=sys.stderr)
+        print(f"citystitch: {printable(str(error))}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("citystitch: interrupted", file=sys.stderr)
@@ -52,9 +56,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if options.traceback:
             raise
-        reason = " ".join(str(error).split())
+        reason = printable(" ".join(str(error).split()))
         print(f"citystitch: {type(error).__name__}: {reason}; --traceback tells where", file=sys.stderr)
         return EXIT_FAILED
+
+
+def say(text: str) -> None:
+    """Print one line, whatever a path or an attribute in it holds."""
+    print(printable(text))
 
 
 def _find_cache() -> None:
@@ -85,6 +94,7 @@ def make_parser() -> argparse.ArgumentParser:
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
     )
     _add_parameters(run)
+    run.add_argument("--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure")
     plan = command("plan", _plan, "tell what a run would do and take, without doing it")
     plan.add_argument(
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
@@ -94,6 +104,12 @@ def make_parser() -> argparse.ArgumentParser:
     _add_parameters(plan)
     check = command("check", _check, "prove from the written files that a mesh is right")
     check.add_argument("directory", type=Path, help="folder of a run")
+    check.add_argument(
+        "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
+    )
+    status = command("status", _status, "tell how far a run is, whether it is alive, and how to go on")
+    status.add_argument("directory", type=Path, help="folder of a run")
+    status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
     synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
     synth.add_argument("directory", type=Path, help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
@@ -106,12 +122,28 @@ def make_parser() -> argparse.ArgumentParser:
     render.add_argument(
         "--what", choices=("boundary", "mesh", "overview", "tiles"), default="boundary", help="what to draw"
     )
-    export = command("export", _export, "write the mesh of a run as one file, each vertex once")
+    export = command("export", _export, "write the mesh of a run for other programs, each vertex once")
     export.add_argument("directory", type=Path, help="folder of a run")
     kinds = "; ".join(f"{name}: {kind.description}" for name, kind in FORMATS.items())
     export.add_argument("--format", choices=tuple(FORMATS), required=True, help=kinds)
-    export.add_argument("-o", "--output", type=Path, required=True, help="file to write")
-    export.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
+    export.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write")
+    export.add_argument("--overwrite", action="store_true", help="replace it if it exists")
+    export.add_argument(
+        "--parts",
+        type=int,
+        metavar="N",
+        default=argparse.SUPPRESS,
+        help="openfoam: decomposed for N processes instead of whole",
+    )
+    export.add_argument(
+        "--case", choices=("wind",), default=argparse.SUPPRESS, help="openfoam: add the files of a simulation"
+    )
+    export.add_argument(
+        "--buildings",
+        choices=("patches", "zones"),
+        default=argparse.SUPPRESS,
+        help="openfoam: one patch a building instead of walls and roofs, or one face zone beside them",
+    )
     command("config", _config, "print all parameters of a run, annotated, as a configuration file")
     return parser
 
@@ -155,7 +187,13 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int) -
 
 
 def _run(options: argparse.Namespace) -> int:
-    return _run_config(make_config(with_file(vars(options))))
+    config = make_config(with_file(vars(options)))
+    if options.only is None:
+        return _run_config(config)
+    from tiler.run import run_alone
+
+    print(run_alone(config, options.only, say=print))
+    return 0
 
 
 def with_file(options: dict[str, Any]) -> dict[str, Any]:
@@ -174,6 +212,8 @@ def with_file(options: dict[str, Any]) -> dict[str, Any]:
         raise ConfigError(f"{len(files)} configuration files given ({', '.join(files)}); give one")
     clouds = [source for source in sources if source not in files]
     given = load_config(Path(files[0])) if files else {}
+    if files:
+        check_reach(Path(files[0]), {name: value for name, value in given.items() if name not in values})
     return given | ({POSITIONAL: clouds} if clouds else {}) | values
 
 
@@ -181,7 +221,7 @@ def _run_config(config: Config) -> int:
     from tiler.run import run
     from tiler.terminal import print_step, print_summary
 
-    record = run(config, announce=print_step, say=print)
+    record = run(config, announce=print_step, say=say)
     print_summary(record, Path(config.out))
     code: int = record["exit_code"]
     return code
@@ -196,6 +236,10 @@ def _plan(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
+    if options.store:
+        from tiler.audit import audit_run
+
+        return 0 if audit_run(options.directory, print) else EXIT_FAILED
     return _check_folder(options.directory)
 
 
@@ -204,8 +248,21 @@ def _check_folder(directory: Path) -> int:
     from tiler.results import StoredTerrain
 
     report = check_run(directory, StoredTerrain)
-    print("\n".join(report.lines()))
+    print("\n".join(map(printable, report.lines())))
     return 0 if report.ok else EXIT_FAILED
+
+
+def _status(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from tiler.status import print_status, read_status
+
+    status = read_status(options.directory)
+    if options.as_json:
+        print(json.dumps(status, indent=1))
+    else:
+        print_status(options.directory, status, Console(highlight=False))
+    return 0
 
 
 def _synth(options: argparse.Namespace) -> int:
@@ -225,7 +282,7 @@ def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":
         seed=options.seed,
     )
     clouds, shapefile = files.clouds[0].parent, files.shapefile
-    print(f"{len(files.clouds)} LAZ files in {clouds}, footprints in {shapefile} and {files.footprints.name}")
+    say(f"{len(files.clouds)} LAZ files in {clouds}, footprints in {shapefile} and {files.footprints.name}")
     return files
 
 
@@ -258,8 +315,8 @@ def _demonstrate(title: str, inputs: dict[str, Any], out: Path, pictures: dict[P
     code = _check_folder(out)
     for picture, what in pictures.items():
         render_run(out, picture, what=what)
-        print(f"picture: {picture}")
-    print(f"mesh:    {out / 'mesh.pvtu'} (open it in ParaView)")
+        say(f"picture: {picture}")
+    say(f"mesh:    {out / 'mesh.pvtu'} (open it in ParaView)")
     return code
 
 
@@ -267,15 +324,16 @@ def _render(options: argparse.Namespace) -> int:
     from tiler.render import render_run
 
     render_run(options.directory, options.output, what=options.what)
-    print(options.output)
+    say(str(options.output))
     return 0
 
 
 def _export(options: argparse.Namespace) -> int:
     from tiler.export import export_run
 
-    export_run(options.directory, options.output, name=options.format, overwrite=options.overwrite)
-    print(options.output)
+    given = {name: value for name, value in vars(options).items() if name in EXPORT_OPTIONS}
+    export_run(options.directory, options.output, name=options.format, overwrite=options.overwrite, options=given)
+    say(str(options.output))
     return 0
 
 

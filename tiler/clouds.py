@@ -1,7 +1,7 @@
 """Point cloud files: find them, read their headers, read their points within a box (step 1.1)."""
 
-import glob
 import logging
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,18 +13,21 @@ import pyproj
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.pointcloud import HIGH_NOISE, LOW_NOISE, PointCloud
+from pipeline.las_points import KEPT, REASONS, judge_points
+from pipeline.pointcloud import PointCloud
 from tiler.copc import NODE_SLACK, CopcIndex, read_index, read_nodes
-from tiler.lasheader import AGAIN, LasPromise, read_promise
+from tiler.las_chunks import FIELDS, classes_of, coordinates_of
+from tiler.lasheader import AGAIN, RECORD_BYTES, LasPromise, read_promise
 
 CHUNK_POINTS = 1_000_000
 CHUNK_BYTES = 64_000_000  # wins over CHUNK_POINTS where a point has many extra bytes
-HEIGHT_LIMIT = 10_000.0  # m; no ground, building or return lies beyond
 HEADER_SLACK = 1.0  # m that a point may lie outside the header's bounds
 QUERY_SHARE = 0.5  # a COPC file is read by its octree where less than this share of its box is wanted
 
 Box = tuple[float, float, float, float]
 
+# What laspy and pyproj raise on records of a CRS that make no sense.
+_NO_CRS = (pyproj.exceptions.CRSError, ValueError, TypeError, LookupError, OverflowError, struct.error)
 _SUFFIXES = {".las", ".laz"}
 _GLOB_SIGNS = set("*?[")
 
@@ -103,7 +106,8 @@ def read_header(path: str | Path) -> CloudHeader:
     """
     path = Path(path)
     promise = read_promise(path)
-    with _laspy_as_input_error(path, promise, [0]), laspy.open(path) as reader:
+    evlrs = promise.extended <= RECORD_BYTES
+    with _laspy_as_input_error(path, promise, [0]), laspy.open(path, read_evlrs=evlrs) as reader:
         header = reader.header
     return CloudHeader(path, promise.n_points, promise.bounds, _parse_crs(header))
 
@@ -141,12 +145,12 @@ def read_points(path: str | Path, bounds: Box) -> tuple[PointCloud, dict[str, in
     path = Path(path)
     promise = read_promise(path)
     counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
-    parts = [select_usable(chunk, xyz, bounds, counts) for chunk, xyz in _chunks(path, promise)]
-    cloud = PointCloud(
-        np.concatenate([np.empty((0, 3)), *(part.xyz for part in parts)]),
-        np.concatenate([np.empty(0, np.uint8), *(part.classification for part in parts)]),
-    )
-    return cloud, counts
+    places, classes = [np.empty((0, 3))], [np.empty(0, np.uint8)]
+    for chunk, xyz in _chunks(path, promise):
+        kept = select_usable(chunk, xyz, bounds, counts)
+        places.append(xyz[kept])
+        classes.append(classes_of(chunk)[kept])
+    return PointCloud(np.concatenate(places), np.concatenate(classes)), counts
 
 
 def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64], int]]:
@@ -185,7 +189,7 @@ def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePoint
         n_skipped, chunks = int(index.count[~near].sum()), _query(path, promise, index, near)
     first = next(chunks, None)
     if first is None:
-        with _laspy_as_input_error(path, promise, [0]), laspy.open(path) as reader:
+        with _laspy_as_input_error(path, promise, [0]), laspy.open(path, read_evlrs=False) as reader:
             empty = laspy.ScaleAwarePointRecord.zeros(0, header=reader.header)
         yield empty, np.empty((0, 3)), n_skipped
         return
@@ -196,8 +200,8 @@ def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePoint
 
 def select_usable(
     chunk: laspy.ScaleAwarePointRecord, xyz: NDArray[np.float64], bounds: Box, counts: dict[str, int]
-) -> PointCloud:
-    """Keep the usable points of a chunk, and count what became of each.
+) -> NDArray[np.int64]:
+    """Select the usable points of a chunk, and count what became of each.
 
     Parameters
     ----------
@@ -212,27 +216,26 @@ def select_usable(
 
     Returns
     -------
-    PointCloud
-        The kept points in their old order.
+    int64, (k,)
+        Rows of the points to keep, ascending.
     """
-    classes = np.asarray(chunk.classification, np.uint8)
-    xmin, ymin, xmax, ymax = bounds
-    x, y, z = xyz.T
-    left = np.ones(len(xyz), bool)
-    for reason, keep in (
-        ("outside", (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)),
-        ("withheld", np.asarray(chunk.withheld) == 0),
-        ("noise", (classes != LOW_NOISE) & (classes != HIGH_NOISE)),
-        ("absurd", np.abs(z) <= HEIGHT_LIMIT),
-    ):
-        counts[reason] += int(np.count_nonzero(left & ~keep))
-        left &= keep
+    verdict = judge_points(xyz, classes_of(chunk), np.asarray(chunk.withheld) != 0, bounds)
+    for reason, number in zip(REASONS, np.bincount(verdict, minlength=len(REASONS)).tolist(), strict=True):
+        counts[reason] += number
     counts["read"] += len(xyz)
-    counts["kept"] += int(np.count_nonzero(left))
-    return PointCloud(xyz[left], classes[left])
+    return np.flatnonzero(verdict == KEPT)
 
 
 def _expand(source: Path) -> list[Path]:
+    try:
+        return _find(source)
+    except OSError as error:
+        raise InputError(
+            f"{source}: cannot be read ({error.strerror}); check the path and its permissions"
+        ) from error
+
+
+def _find(source: Path) -> list[Path]:
     if source.is_dir():
         found = [path for path in source.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file()]
         if not found:
@@ -241,11 +244,22 @@ def _expand(source: Path) -> list[Path]:
     if source.is_file():
         return [source]
     if _GLOB_SIGNS & set(str(source)):
-        found = [Path(name) for name in glob.glob(str(source), recursive=True) if Path(name).is_file()]
+        found = _glob(source)
         if not found:
             raise InputError(f"{source}: the pattern matches no file; check the folder's name")
         return found
     raise InputError(f"{source}: no such file or folder; check the path")
+
+
+def _glob(pattern: Path) -> list[Path]:
+    """Find the files of a pattern; ``**`` does not go through symbolic links, which may lead in circles."""
+    first = next(k for k, part in enumerate(pattern.parts) if _GLOB_SIGNS & set(part))
+    base, rest = Path(*pattern.parts[:first]), str(Path(*pattern.parts[first:]))
+    try:
+        found = [path for path in base.glob(rest) if path.is_file()]
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{pattern}: the pattern cannot be followed ({error}); name a folder or files") from error
+    return [path for path in found if not any(part.startswith(".") for part in path.relative_to(base).parts)]
 
 
 def _chunks(path: Path, promise: LasPromise) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64]]]:
@@ -254,14 +268,16 @@ def _chunks(path: Path, promise: LasPromise) -> Iterator[tuple[laspy.ScaleAwareP
     n_read = [0]
     with (
         _laspy_as_input_error(path, promise, n_read),
-        laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader,
+        laspy.open(
+            path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False, decompression_selection=FIELDS
+        ) as reader,
     ):
         while n_read[0] < promise.n_points:
             chunk = reader.read_points(step)
             if len(chunk) == 0:
                 break
             n_read[0] += len(chunk)
-            xyz = np.column_stack((chunk.x, chunk.y, chunk.z))
+            xyz = coordinates_of(chunk)
             _check_within_header(path, promise, xyz[:, :2])
             yield chunk, xyz
     if n_read[0] != promise.n_points:
@@ -302,20 +318,21 @@ def _step(promise: LasPromise) -> int:
 def _check_within_header(path: Path, promise: LasPromise, xy: NDArray[np.float64]) -> None:
     low = np.array(promise.bounds[:2]) - HEADER_SLACK
     high = np.array(promise.bounds[2:4]) + HEADER_SLACK
+    if not len(xy) or all(xy[:, k].min() >= low[k] and xy[:, k].max() <= high[k] for k in range(2)):
+        return
     stray = ((xy < low) | (xy > high)).any(axis=1)
-    if stray.any():
-        x, y = xy[stray][0]
-        raise InputError(
-            f"{path}: {np.count_nonzero(stray)} of {len(xy)} points lie more than {HEADER_SLACK:g} m outside "
-            f"the bounds in its header, the first at ({x:.2f}, {y:.2f}): the points or the header are "
-            f"damaged; {AGAIN}, or rewrite it: pdal translate {path.name} mended.laz"
-        )
+    x, y = xy[stray][0]
+    raise InputError(
+        f"{path}: {np.count_nonzero(stray)} of {len(xy)} points lie more than {HEADER_SLACK:g} m outside "
+        f"the bounds in its header, the first at ({x:.2f}, {y:.2f}): the points or the header are "
+        f"damaged; {AGAIN}, or rewrite it: pdal translate {path.name} mended.laz"
+    )
 
 
 def _parse_crs(header: laspy.LasHeader) -> pyproj.CRS | None:
     try:
         crs: pyproj.CRS | None = header.parse_crs()
-    except (pyproj.exceptions.CRSError, UnicodeDecodeError):
+    except _NO_CRS:
         return None
     return crs
 

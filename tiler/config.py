@@ -1,16 +1,22 @@
 """Every parameter of a run, once: default, unit, meaning, source. The command line and TOML follow it."""
 
 import dataclasses
+import json
 import math
+import os
 import tomllib
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import ConfigError
+from tiler.plain_text import shorten
 
 MAX_CONFIG_BYTES = 1_000_000
+MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
+MAX_INT = 2**53
 UNSET = ""
 
 
@@ -184,11 +190,24 @@ class Config:
     workers: int = _parameter(
         0, "run", "worker processes on this machine; 0 runs in this process", least=0, most=1024
     )
+    memory_limit: float = _parameter(
+        0.0, "run", "memory of a worker on this machine; 0 shares out nine tenths of what there is", unit="GiB",
+        least=0,
+    )  # fmt: skip
+    time_limit: float = _parameter(
+        3600.0, "run", "a task that takes longer in a worker of one thread is ended; 0 for no limit", unit="s",
+        least=0,
+    )  # fmt: skip
+    retries: int = _parameter(
+        1, "run", "how often a task that fails is tried again before its tile is left out", least=0, most=100
+    )
     scheduler: str = _parameter(
         UNSET, "run", "address of a running Dask scheduler, whose workers see the same files; instead of workers"
     )
     out: str = _parameter("out", "run", "folder for the results")
-    overwrite: bool = _parameter(False, "run", "replace the results of an earlier run in that folder")
+    overwrite: bool = _parameter(
+        False, "run", "remove the results of an earlier run in that folder, and start anew"
+    )
 
     @property
     def layer_height_or_default(self) -> float:
@@ -242,28 +261,50 @@ def load_config(path: Path) -> dict[str, Any]:
     -----
     Relative paths of inputs and of the output folder are taken from the file's folder.
     """
-    try:
-        if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise ConfigError(
-                f"{path}: {path.stat().st_size} bytes > {MAX_CONFIG_BYTES}; this is no configuration"
-            )
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid TOML ({error}); see `citystitch config` for a template") from error
+    document = _read_toml(path)
     values: dict[str, Any] = {}
     sections = {entry.name: entry.metadata["section"] for entry in dataclasses.fields(Config)}
     for section, table in document.items():
         if section not in sections.values() or not isinstance(table, dict):
-            raise ConfigError(f"{path}: unknown section [{section}]; `citystitch config` lists all")
+            raise ConfigError(f"{path}: unknown section [{shorten(section, 100)}]; `citystitch config` lists all")
         for name, value in table.items():
             if sections.get(name) != section:
                 raise ConfigError(
-                    f"{path}: unknown parameter {name} in [{section}]; `citystitch config` lists all"
+                    f"{path}: unknown parameter {shorten(name, 100)} in [{section}]; `citystitch config` lists all"
                 )
             values[name] = _relative_to(path.parent, name, value)
     return values
+
+
+def check_reach(path: Path, values: Mapping[str, Any]) -> None:
+    """Refuse what a configuration file may not decide, as it may come from someone else.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    values : mapping
+        The parameters that it gives, less those that the command line gives.
+
+    Raises
+    ------
+    ConfigError
+        If the output folder lies outside the file's folder, by ``..``, an absolute path or a symbolic link; or if
+        it names a scheduler: who connects to one runs what it sends.
+    """
+    out = values.get("out", UNSET)
+    if isinstance(out, str) and "\0" not in out:
+        home, target = (Path(os.path.realpath(place)) for place in (path.parent, out or "."))
+        if out and not target.is_relative_to(home):
+            raise ConfigError(
+                f"{path}: out leads to {target}, outside the folder of the file; give it on the command line, "
+                "with --out"
+            )
+    if values.get("scheduler"):
+        raise ConfigError(
+            f"{path}: a file may not name a scheduler, as its address is trusted with this machine; give it on "
+            "the command line, with --scheduler"
+        )
 
 
 def make_config(values: Mapping[str, Any]) -> Config:
@@ -288,7 +329,12 @@ def make_config(values: Mapping[str, Any]) -> Config:
 
 def annotated_defaults() -> str:
     """Write all parameters with their defaults, meaning, unit and source as TOML."""
-    lines = ["# citystitch configuration: all parameters with their defaults.", ""]
+    return write_config(Config(), "all parameters with their defaults")
+
+
+def write_config(config: Config, title: str = "the parameters of a run") -> str:
+    """Write all parameters with their values, meaning, unit and source as TOML."""
+    lines = [f"# citystitch configuration: {title}.", ""]
     section = ""
     for entry in dataclasses.fields(Config):
         data = entry.metadata
@@ -299,8 +345,27 @@ def annotated_defaults() -> str:
         facts += [f"unit: {data['unit']}"] if data["unit"] else []
         facts += [f"one of: {', '.join(data['choices'])}"] if len(data["choices"]) > 1 else []
         facts += [f"({data['source']})"] if data["source"] else []
-        lines += [f"# {'; '.join(facts)}", f"{entry.name} = {_toml(entry.default)}", ""]
+        lines += [f"# {'; '.join(facts)}", f"{entry.name} = {_toml(getattr(config, entry.name))}", ""]
     return "\n".join(lines)
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path}: is no regular file; give a configuration file")
+        with path.open("rb") as file:
+            content = file.read(MAX_CONFIG_BYTES + 1)
+        if len(content) > MAX_CONFIG_BYTES:
+            raise ConfigError(
+                f"{path}: {path.stat().st_size} bytes > {MAX_CONFIG_BYTES}; this is no configuration"
+            )
+        return tomllib.loads(content.decode())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: its values are nested too deep; this is no configuration") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid TOML ({error}); see `citystitch config` for a template") from error
 
 
 def _relative_to(folder: Path, name: str, value: Any) -> Any:
@@ -317,16 +382,35 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         if isinstance(value, str) or not isinstance(value, (list, tuple)):
             value = [value]
         return tuple(_convert(name, item, get_args(wanted)[0]) for item in value)
+    if isinstance(value, int) and abs(value) > MAX_INT:
+        raise ConfigError(f"{name}: a whole number of {value.bit_length()} bits; at most 2^53 is taken")
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not wanted:
-        raise ConfigError(f"{name} = {value!r}: {wanted.__name__} expected, not {type(value).__name__}")
+        raise ConfigError(f"{name} = {_shown(value)}: {wanted.__name__} expected, not {type(value).__name__}")
+    if isinstance(value, str):
+        _check_text(name, value)
     return value
+
+
+def _check_text(name: str, text: str) -> None:
+    if len(text) > MAX_TEXT:
+        raise ConfigError(f"{name}: {len(text)} characters; at most {MAX_TEXT} are taken")
+    allowed = "\n\r\t" if name == "crs" else ""  # WKT has lines
+    if any(sign not in allowed and unicodedata.category(sign) == "Cc" for sign in text):
+        raise ConfigError(f"{name} = {_shown(text)}: has control characters; write it without them")
+
+
+def _shown(value: Any) -> str:
+    """Show a value in a message; tables and lists by their kind alone, as they may be deep."""
+    if isinstance(value, (dict, list)):
+        return "{...}" if isinstance(value, dict) else "[...]"
+    return shorten(repr(value), 100)
 
 
 def _check_bounds(name: str, value: Any, data: Mapping[str, Any]) -> None:
     if data["choices"] and value not in data["choices"]:
-        raise ConfigError(f"{name} = {value!r}: must be one of {', '.join(data['choices'])}")
+        raise ConfigError(f"{name} = {_shown(value)}: must be one of {', '.join(data['choices'])}")
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return
     unit = f" {data['unit']}" if data["unit"] else ""
@@ -377,4 +461,4 @@ def _toml(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, tuple):
         return f"[{', '.join(_toml(item) for item in value)}]"
-    return f'"{value}"' if isinstance(value, str) else repr(value)
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)

@@ -23,6 +23,7 @@ from stitch.grid import (
 from tiler.stage import Box, FileItem, Layout
 
 SHARED = 1e-6  # m that a point cloud must reach into a tile
+NEAR = 2.0  # tile sizes; how far from its extent a tile or seam looks for other tiles, see `region_around`
 AXES = "xy"  # first letter of a seam's name: along which axis it runs
 
 
@@ -102,6 +103,8 @@ def make_layout(grid: TileGrid, files: dict[str, FileItem], *, identity: str) ->
         seams=seams,
         bounds=grid.bounds,
         identity=identity,
+        absent=tuple(tile_box(grid, key) for key in absent_tiles(grid)),
+        near=NEAR * grid.tile_size,
     )
 
 
@@ -154,10 +157,11 @@ def find_owned(box: Box, bounds: Bounds, xy: NDArray[np.float64]) -> NDArray[np.
     >>> find_owned((1.0, 0.0, 2.0, 1.0), (0.0, 0.0, 2.0, 1.0), np.array([[0.9, 0.5], [1.0, 0.5], [7.0, 1.0]]))
     array([False,  True,  True])
     """
-    low, high = np.array(box[:2]), np.array(box[2:])
-    place = np.clip(xy, bounds[:2], bounds[2:])
-    last = high >= np.array(bounds[2:])
-    own: NDArray[np.bool_] = ((place >= low) & ((place < high) | (last & (place == high)))).all(axis=1)
+    own = np.ones(len(xy), np.bool_)
+    for k in range(2):
+        place = np.clip(xy[:, k], bounds[k], bounds[k + 2])
+        own &= place >= box[k]
+        own &= place <= box[k + 2] if box[k + 2] >= bounds[k + 2] else place < box[k + 2]
     return own
 
 

@@ -13,13 +13,14 @@ from laspy.vlrs.known import LasZipVlr
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from tiler.las_chunks import coordinates_of
 from tiler.lasheader import AGAIN, LasPromise
 
 # m that a point may lie outside its node, or a node's box outside the octree's cube.
 NODE_SLACK = 1.0
 
 _INFO = struct.Struct("<5d2Q2d")  # centre x y z, half side, spacing; page offset, page size; GPS time
-_MANY = 20_000_000  # points in one node; writers put some 10^5 there
+_MANY_BYTES = 2**30  # of one node, uncompressed; writers put some 10^5 points of 30 to 60 bytes there
 _ENTRY = np.dtype(
     [
         ("level", "<i4"),
@@ -78,10 +79,12 @@ def read_index(path: Path, promise: LasPromise) -> CopcIndex | None:
             return None
         x, y, _, half, _, place, length, _, _ = _INFO.unpack_from(head, 375 + 54)
         n_bytes = file.seek(0, 2)
+        total = 0
         todo, seen, pages = [(place, length)], {place}, []
         while todo:
             place, length = todo.pop()
-            if not (0 < length <= n_bytes and 0 <= place <= n_bytes - length):
+            total += length
+            if not (0 < length <= n_bytes and 0 <= place <= n_bytes - length and total <= n_bytes):
                 return None
             file.seek(place)
             page = np.frombuffer(file.read(length - length % _ENTRY.itemsize), _ENTRY)
@@ -136,7 +139,7 @@ def read_nodes(
             lazrs.decompress_points_with_chunk_table(b"".join(blobs), zipped, raw, table)
             record = laspy.PackedPointRecord.from_buffer(raw, header.point_format)
             chunk = laspy.ScaleAwarePointRecord(record.array, header.point_format, header.scales, header.offsets)
-            xyz = np.column_stack((chunk.x, chunk.y, chunk.z))
+            xyz = coordinates_of(chunk)
             _check_within_nodes(path, xyz, np.repeat(index.box[part], index.count[part], axis=0))
             yield chunk, xyz
 
@@ -161,7 +164,8 @@ def _fits(
     return bool(
         index.count.sum() == promise.n_points
         and reach <= half + NODE_SLACK
-        and (index.count < _MANY).all()
+        and (index.count < _MANY_BYTES // promise.point_size).all()
+        and index.size.sum() <= n_bytes  # none lies over another
         and (nodes["level"] >= 0).all()
         and (nodes["level"] < 32).all()
         and (index.size > 0).all()

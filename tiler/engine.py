@@ -5,16 +5,18 @@ knows Dask: see `tiler.executors`.
 """
 
 import heapq
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import CityError
 from tiler.executors import Executor
+from tiler.failures import Policy, SetAside, ends_the_run, tell_reason, tries
 from tiler.keys import declared_values, file_identity, item_key, stage_digest
 from tiler.plan import (
     Items,
@@ -28,11 +30,29 @@ from tiler.plan import (
     order_stages,
     reads_everything,
 )
-from tiler.stage import Facts, Layout, Scope, Stage
+from tiler.records import Records
+from tiler.stage import Box, Layout, Scope, Stage
 from tiler.store import Store
-from tiler.task import Declared, Failure, Record, Task, reuse
+from tiler.task import Declared, Failure, Record, Task
 
 Progress = Callable[[str, int, int, Record], None]
+Item = tuple[str, str]  # stage and name
+
+
+@runtime_checkable
+class Watch(Protocol):
+    """What else a progress may want to know."""
+
+    def planned(self, stage: str, total: int) -> None:
+        """Take note of how many items a stage has."""
+
+    def submitted(self, stage: str, name: str) -> None:
+        """Take note of an item that was given to a worker."""
+
+    def failed(self, stage: str, name: str) -> None:
+        """Take note of an item that failed, or that is not run for want of one that did."""
+
+
 PER_WORKER, LEAST_WINDOW = 4, 8  # tasks in flight
 
 
@@ -46,6 +66,12 @@ class _Planned:
     first: int
     digest: bytes
     parameters: Declared
+
+
+class StoppedError(CityError):
+    """The run was asked to stop: what ran was let end, and is kept."""
+
+    exit_code = 130
 
 
 class Engine:
@@ -66,14 +92,21 @@ class Engine:
     window : int, optional
         Largest number of tasks in flight; 4 a worker and at least 8 by default.
     folder : Path, optional
-        Where the files are that results state as the fact ``"files"``, sizes by path; beside the store by default.
+        Where the files are that results state as the fact ``"files"``; beside the store by default.
     progress : callable, optional
-        Called with stage, number of items done, number of items in all, and the record of each item.
+        Called with stage, number of items done, number of items in all, and the record of each item; if it is a
+        `Watch` too, with what is planned, submitted and failed.
+    policy : Policy
+        What becomes of items that fail; the first ends the run by default.
 
     Attributes
     ----------
-    records : dict of (str, str) to Record
+    records : Records
         What came of each stage and item so far.
+    set_aside : dict of (str, str) to SetAside
+        Items that failed.
+    blocked : dict of (str, str) to (str, str)
+        Items that were not run, by the item that they need and that is not there.
     """
 
     def __init__(
@@ -87,12 +120,20 @@ class Engine:
         window: int | None = None,
         folder: Path | None = None,
         progress: Progress | None = None,
+        policy: Policy | None = None,
     ) -> None:
         self.store = Store(store_path)
         self.layout = layout
-        self.records: dict[tuple[str, str], Record] = {}
+        self.records = Records(self.store)
+        self.set_aside: dict[Item, SetAside] = {}
+        self.blocked: dict[Item, Item] = {}
+        self._policy = policy or Policy()
+        self._stop = False
+        self._absent = np.array(layout.absent).reshape(-1, 4)
         self._parameters, self._context = parameters, context
         self._executor, self._progress = executor, progress
+        watch: object = progress
+        self._watch = watch if isinstance(watch, Watch) else None
         self._folder = store_path.parent if folder is None else folder
         self._window = max(PER_WORKER * executor.workers, LEAST_WINDOW) if window is None else window
         if self._window < 1:
@@ -115,8 +156,11 @@ class Engine:
         Raises
         ------
         CityError
-            The first that an item raises, its stage and name in the message. Nothing is submitted after it, and
-            what runs is waited for; all that was committed is kept and skipped next time.
+            The first that an item raises and that the policy does not set aside, its stage and name in the
+            message. Nothing is submitted after it, and what runs is waited for; all that was committed is kept and
+            skipped next time.
+        StoppedError
+            If `stop` was called; likewise.
         Exception
             Any other error of a stage's function likewise, its type kept; stage, name and traceback are its notes.
         ValueError
@@ -131,16 +175,38 @@ class Engine:
             self._items[planned.stage.name] = (planned.stage.scope, planned.items)
             self.store.sweep(planned.stage.name)
             for name in (items or {}).get(planned.stage.name, planned.items.names):
-                self.records.pop((planned.stage.name, name), None)
+                self._forget((planned.stage.name, name))
         try:
             _Run(self, plan).drive()
         finally:
             for planned in plan:
                 self._items[planned.stage.name] = (planned.stage.scope, self._recorded(planned))
 
+    def stop(self) -> None:
+        """Let what runs end, start nothing more, and end `run` with `StoppedError`."""
+        self._stop = True
+
+    def failed(self) -> list[SetAside]:
+        """List what was set aside, in the order of stages and names."""
+        rank = {stage: k for k, stage in enumerate(self._items)}
+        return sorted(self.set_aside.values(), key=lambda one: (rank[one.stage], one.name))
+
+    def give_up(self, failed: Item, lost: Item) -> None:
+        """Take an item that was set aside as the failure of one that it read: nothing reads that any more.
+
+        Parameters
+        ----------
+        failed : (str, str)
+            Stage and name of an item in `set_aside`.
+        lost : (str, str)
+            Stage and name of an item that has a record.
+        """
+        self.records.forget(*lost)
+        self.set_aside[lost] = self.set_aside.pop(failed)
+
     def prune(self) -> None:
         """Remove from the store what this engine has no record of: results of stages and items of another run."""
-        kept = {stage for stage, _ in self.records}
+        kept = set(self.records.stages())
         for stage in self.store.stages():
             if stage not in kept:
                 self.store.remove(stage)
@@ -148,10 +214,18 @@ class Engine:
                 if (stage, name) not in self.records:
                     self.store.remove(stage, name)
 
+    def _forget(self, item: Item) -> None:
+        self.records.forget(*item)
+        self.set_aside.pop(item, None)
+        self.blocked.pop(item, None)
+
+    def _settled(self, item: Item) -> bool:
+        return item in self.records or item in self.set_aside or item in self.blocked
+
     def _recorded(self, planned: "_Planned") -> Items:
-        """Keep of the items those that have a record, which are all unless the run failed."""
+        """Keep of the items those of which something came, which are all unless the run ended early."""
         names = planned.items.names
-        rows = [k for k, name in enumerate(names) if (planned.stage.name, name) in self.records]
+        rows = [k for k, name in enumerate(names) if self._settled((planned.stage.name, name))]
         return Items(tuple(names[k] for k in rows), planned.items.boxes[rows])
 
     def _plan(self, order: list[Stage], only: Mapping[str, Collection[str]]) -> list[_Planned]:
@@ -173,8 +247,30 @@ class Engine:
         earlier = set(self._items[stage.name][1].names) if stage.name in self._items else set()
         return None if only is None else earlier.union(only)
 
-    def _facts(self, stage: str, names: Iterable[str]) -> dict[str, Facts]:
-        return {name: self.records[stage, name].facts for name in names}
+    def _extents(self, items: Items, stage: str) -> Items:
+        """Take extents for boxes; what has no result keeps its box."""
+        boxes = items.boxes.copy()
+        known = [k for k, name in enumerate(items.names) if (stage, name) in self.records]
+        some = Items(tuple(items.names[k] for k in known), items.boxes[known])
+        facts = {name: self.records.kept_facts(stage, name) for name in some.names}
+        boxes[known] = extents(some, facts, stage).boxes
+        return Items(items.names, boxes)
+
+    def _listed(self, stage: str, item: str) -> Iterable[str]:
+        there = (stage, item) in self.records
+        names: Iterable[str] = self.records.kept_facts(stage, item)["names"] if there else ()
+        return names
+
+    def _gaps(self, scope: Scope, box: Box, refs: Mapping[str, Iterable[str]]) -> list[Box]:
+        """List the absent tiles near an item: near its box, and the extents of what it reads."""
+        layout = self.layout
+        if not layout.absent or scope not in (Scope.TILE, Scope.SEAM):
+            return []
+        facts = [self.records.kept_facts(stage, name) for stage, names in refs.items() for name in names]
+        boxes = np.array([box, *(found["extent"] for found in facts if found.get("extent"))])
+        low, high = boxes[:, :2].min(axis=0) - layout.near, boxes[:, 2:].max(axis=0) + layout.near
+        close = (self._absent[:, :2] <= high).all(axis=1) & (self._absent[:, 2:] >= low).all(axis=1)
+        return [layout.absent[k] for k in np.flatnonzero(close).tolist()]
 
     def _refs(self, stage: Stage, here: Items, source: str, known: Mapping[str, tuple[Scope, Items]]) -> Refs:
         """Find refs among all items of the layout first: one that is read but not run is an error, not a gap."""
@@ -186,15 +282,13 @@ class Engine:
         (first, *_) = (read for read in stage.reads if read.stage == source)
         if first.own or first.named_by:
             listed = {
-                name: (name,) if first.own else self.records[first.named_by, name].facts["names"]
-                for name in here.names
+                name: (name,) if first.own else tuple(self._listed(first.named_by, name)) for name in here.names
             }
             return list_refs(here, source, run, listed)
         if first.around:
-            here = extents(here, self._facts(first.around, here.names), first.around)
+            here = self._extents(here, first.around)
         if True in by_extent:
-            reached = extents(run, self._facts(source, run.names), source)
-            return find_refs(stage, here, source, reached, everything=everything)
+            return find_refs(stage, here, source, self._extents(run, source), everything=everything)
         boxes = self.layout.boxes(scope)
         names = tuple(sorted(boxes))
         reach = run
@@ -214,7 +308,7 @@ class _Run:
         links = [(p.first, refs, place[refs.stage].first) for p in plan for refs in p.refs if refs.stage in place]
         self.start, self.waiting = invert(links, n_tasks)
         self.rank = np.repeat(np.arange(len(plan)), [len(planned.items.names) for planned in plan])
-        earlier = [(p.stage.name, name) in engine.records for p in plan for name in p.items.names]
+        earlier = [engine._settled((p.stage.name, name)) for p in plan for name in p.items.names]
         done = np.array(earlier, dtype=np.bool_)
         self.n_done = [int(done[self.rank == k].sum()) for k in range(len(plan))]
         unfinished = self.waiting[np.repeat(~done, np.diff(self.start))]
@@ -223,11 +317,18 @@ class _Run:
         self.ready = [(-int(self.rank[task]), task) for task in ready.tolist()]
         heapq.heapify(self.ready)
         self.in_flight: set[int] = set()
+        self.tried: Counter[int] = Counter()
+        self.tasks: dict[int, Task] = {}
+        if engine._watch is not None:
+            for planned in plan:
+                engine._watch.planned(planned.stage.name, len(planned.items.names))
 
     def drive(self) -> None:
         executor = self.engine._executor
         try:
             while self.ready or self.in_flight:
+                if self.engine._stop:
+                    raise StoppedError("stopped as asked, all that was done is kept; the same command goes on")
                 while self.ready and len(self.in_flight) < self.engine._window:
                     self._begin(heapq.heappop(self.ready)[1])
                 if self.in_flight:
@@ -239,26 +340,49 @@ class _Run:
             raise
 
     def _begin(self, ticket: int) -> None:
-        """Take an earlier result with the same key, or submit the task; what it reads counts by its content."""
+        """Submit a task; what it reads counts by its content. The worker looks for an earlier result."""
         engine, planned = self.engine, self.plan[self.rank[ticket]]
         stage, item = planned.stage, ticket - planned.first
         name = planned.items.names[item]
-        refs = {r.stage: self._names(r, item) for r in planned.refs}
+        refs, lacking = self._find_reads(planned, item)
+        if lacking:
+            engine.blocked[stage.name, name] = lacking[0]
+            self._lose(ticket, name)
+            return
         path, identity = file_identity(engine.layout, stage.scope, name)
         xmin, ymin, xmax, ymax = planned.items.boxes[item].tolist()
         box = (xmin, ymin, xmax, ymax)
+        digest = engine.records.digest
+        by_name = {read.stage for read in stage.reads if read.others_by_name}
         found = (
-            (source, [(n, engine.records[source, n].digest) for n in names]) for source, names in refs.items()
+            (source, [(n, "" if source in by_name and n != name else digest(source, n)) for n in names])
+            for source, names in refs.items()
         )
-        key = item_key(planned.digest, name, box, identity, found)
-        record = reuse(engine.store, stage.name, name, key, folder=engine._folder)
-        if record is not None:
-            self._end(ticket, record)
-            return
-        task = Task(
-            stage.name, name, stage.scope, box, planned.parameters, engine._context, path, engine.store, refs, key
+        key = item_key(planned.digest, name, box, identity, found, engine._gaps(stage.scope, box, refs))
+        parameters, context, store = planned.parameters, engine._context, engine.store
+        self.tasks[ticket] = Task(
+            stage.name, name, stage.scope, box, parameters, context, path, store, refs, key, engine._folder
         )
-        engine._executor.submit(ticket, stage.function, task)
+        self._submit(ticket)
+        if engine._watch is not None:
+            engine._watch.submitted(stage.name, name)
+
+    def _find_reads(self, planned: _Planned, item: int) -> tuple[dict[str, tuple[str, ...]], list[Item]]:
+        """Find what an item reads and is there, by stage, and what it cannot do without and is not there."""
+        engine, stage, name = self.engine, planned.stage, planned.items.names[item]
+        needed = {read.stage for read in stage.reads if not read.optional}
+        wanted = [(by, name) for read in stage.reads for by in (read.around, read.named_by) if by]
+        refs = {}
+        for r in planned.refs:
+            names = self._names(r, item)
+            refs[r.stage] = tuple(n for n in names if (r.stage, n) in engine.records)
+            same = engine._items[r.stage][0] is stage.scope
+            wanted += [(r.stage, n) for n in names if r.stage in needed or (same and n == name)]
+        return refs, [one for one in wanted if one not in engine.records]
+
+    def _submit(self, ticket: int) -> None:
+        function = self.plan[self.rank[ticket]].stage.function
+        self.engine._executor.submit(ticket, function, self.tasks[ticket])
         self.in_flight.add(ticket)
 
     def _names(self, refs: Refs, item: int) -> tuple[str, ...]:
@@ -266,16 +390,51 @@ class _Run:
         return tuple(names[k] for k in refs.of(item).tolist())
 
     def _end(self, ticket: int, outcome: Record | Failure) -> None:
-        """Keep the record and make ready what waited for nothing else."""
+        """Keep what came of a task."""
         rank = int(self.rank[ticket])
         planned = self.plan[rank]
-        name = planned.items.names[ticket - planned.first]
         if isinstance(outcome, Failure):
-            raise _named(outcome.error, planned.stage, name)
-        self.engine.records[planned.stage.name, name] = outcome
+            self._fail(ticket, outcome)
+            return
+        self.engine.records.add(outcome)
         self.n_done[rank] += 1
         if self.engine._progress is not None:
             self.engine._progress(planned.stage.name, self.n_done[rank], len(planned.items.names), outcome)
+        self._settle_one(ticket)
+
+    def _fail(self, ticket: int, failure: Failure) -> None:
+        """Try again, set aside, or end the run."""
+        engine, stage, task = self.engine, self.plan[self.rank[ticket]].stage, self.tasks[ticket]
+        self.tried[ticket] += 1
+        if self.tried[ticket] < tries(failure, engine._policy):
+            self._submit(ticket)
+            return
+        if ends_the_run(failure, stage.scope, engine._policy):
+            if engine._watch is not None:
+                engine._watch.failed(stage.name, task.name)
+            raise _named(failure.error, stage, task.name)
+        engine.set_aside[stage.name, task.name] = SetAside(
+            stage.name,
+            task.name,
+            stage.scope,
+            failure.kind,
+            tell_reason(failure.error),
+            failure.trace,
+            self.tried[ticket],
+            task.refs,
+            task.file,
+        )
+        self._lose(ticket, task.name)
+
+    def _lose(self, ticket: int, name: str) -> None:
+        """Go on without an item."""
+        if self.engine._watch is not None:
+            self.engine._watch.failed(self.plan[self.rank[ticket]].stage.name, name)
+        self._settle_one(ticket)
+
+    def _settle_one(self, ticket: int) -> None:
+        """Make ready what waited for this item and for nothing else."""
+        self.tasks.pop(ticket, None)
         for task in self.waiting[self.start[ticket] : self.start[ticket + 1]].tolist():
             self.n_missing[task] -= 1
             if self.n_missing[task] == 0:
@@ -290,10 +449,13 @@ class _Run:
 
 
 def _among(found: Refs, reach: Items, run: Items, stage: Stage) -> Refs:
-    """Number refs among the items that are run; ValueError if one is not."""
+    """Number refs among the items that are run; ValueError if one is not and the reader cannot do without."""
     position = {name: k for k, name in enumerate(run.names)}
     renumbered = np.array([position.get(name, -1) for name in reach.names], dtype=np.int32)
     index = renumbered[found.index]
+    if all(read.optional for read in stage.reads if read.stage == found.stage):
+        reader = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))[index >= 0]
+        return Refs(found.stage, np.searchsorted(reader, np.arange(len(found.start))), index[index >= 0])
     if (index < 0).any():
         missing = sorted({reach.names[k] for k in found.index[index < 0].tolist()})
         raise ValueError(

@@ -1,17 +1,32 @@
 """Where tasks run: in this process, in worker processes of this machine, or in a Dask cluster anywhere."""
 
+import logging
+import os
+import signal
 import time
 import uuid
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
 from typing import Any, Protocol
 
 from pipeline.errors import CityError
+from tiler.limits import Limits, WorkerError, machine_memory, run_guarded, tell_death, tell_memory
 from tiler.stage import Facts
 from tiler.task import Failure, Record, Task, run_task
 
 Function = Callable[[Task], Facts]
+
+BYSTANDER = 20  # how often a task may wait in a process that dies of another one, before it is an error
+LOOK = 5.0  # s without a word of the scheduler, after which it is asked whether it has workers
+NO_WORKERS = 300.0  # s without any worker, after which a run ends; a busy machine starts them slowly
+MEMORY_SHARE = 0.9  # of the machine, for all workers together
+REFUSE_AT, KILL_AT = 0.9, 0.95  # of the limit: no more is given; a process is ended whose memory was not counted
+
+
+class ClusterError(CityError):
+    """The Dask cluster of a run is gone: start it again, the same command goes on."""
 
 
 class Executor(Protocol):
@@ -30,7 +45,7 @@ class Executor(Protocol):
 
 
 class Serial:
-    """One task after the other in this process."""
+    """One task after the other in this process; no limits, and a crash ends all."""
 
     workers = 1
 
@@ -44,7 +59,10 @@ class Serial:
     def wait(self) -> tuple[int, Record | Failure]:
         """Run the oldest task."""
         ticket, function, task = self._queue.popleft()
-        return ticket, run_task(function, task)
+        outcome = run_task(function, task)
+        if isinstance(outcome, Failure) and outcome.kind == "memory":
+            outcome = tell_memory(outcome, Limits())
+        return ticket, outcome
 
     def drop_waiting(self) -> set[int]:
         """Forget all."""
@@ -62,44 +80,149 @@ class Dask:
         Connected client.
     workers : int
         Number of threads that run tasks.
+    limits : Limits
+        What a task may take.
+
+    Notes
+    -----
+    Where a worker dies, Dask blames all tasks that it had. Here a task is blamed if it had begun, which its file
+    tells (`tiler.limits`); the others are sent again.
     """
 
-    def __init__(self, client: Any, workers: int) -> None:
+    def __init__(self, client: Any, workers: int, limits: Limits | None = None) -> None:
         from distributed import as_completed
 
         self.workers = workers
+        self._limits = limits or Limits()
         self._client = client
         self._completed = as_completed()
-        self._tickets: dict[str, int] = {}
+        self._flying: dict[str, tuple[int, Function, Task]] = {}
+        self._sent: Counter[int] = Counter()
+        self._lost = False
 
     def submit(self, ticket: int, function: Function, task: Task) -> None:
-        """Take a task."""
+        """Take a task; ClusterError if the scheduler is lost."""
+        self._check_scheduler()
         key = f"{task.stage}-{uuid.uuid4().hex}"  # never met again, not even by a second try
-        future = self._client.submit(run_task, function, task, key=key, pure=False, retries=0)
-        self._tickets[future.key] = ticket
+        future = self._client.submit(
+            run_guarded, function, task, self._limits.seconds, key=key, pure=False, retries=0
+        )
+        self._flying[future.key] = (ticket, function, task)
         self._completed.add(future)
 
     def wait(self) -> tuple[int, Record | Failure]:
-        """Wait for the scheduler; the result is released there at once."""
+        """Wait for the scheduler; the result is released there at once.
+
+        Raises
+        ------
+        ClusterError
+            If the scheduler is lost, or has had no worker for `NO_WORKERS` seconds.
+        """
         while True:
+            self._wait_for_one()
             future = next(self._completed)
-            ticket = self._tickets.pop(future.key, None)
-            if ticket is not None:
-                return ticket, _outcome(future)
+            if future.key not in self._flying:
+                continue
+            ticket, function, task = self._flying[future.key]
+            outcome = self._outcome(future, ticket, task)
+            del self._flying[future.key]
+            if outcome is not None:
+                self._sent.pop(ticket, None)
+                return ticket, outcome
+            self._sent[ticket] += 1
+            self.submit(ticket, function, task)
 
     def drop_waiting(self) -> set[int]:
-        """Cancel all that is not done, and wait until no worker holds or runs any of it."""
+        """Cancel all that is not done, and wait until no worker holds or runs any of it.
+
+        Without a scheduler nobody can be asked; what workers then still commit is what a task of that key gives.
+        """
+        try:
+            return self._cancel()
+        except (OSError, RuntimeError, CancelledError):
+            if not self._is_lost():
+                raise
+        dropped = {ticket for ticket, _, _ in self._flying.values()}
+        self._flying.clear()
+        self._completed.clear()
+        return dropped
+
+    def _wait_for_one(self) -> None:
+        """Wait until a future is done. Dask waits for ever, or takes up a new scheduler without our tasks."""
+        began = looked = time.monotonic()
+        while not self._completed.has_ready():
+            self._check_scheduler()
+            if time.monotonic() - looked >= LOOK:
+                looked = time.monotonic()
+                if self._has_workers():
+                    began = looked
+                elif looked - began >= NO_WORKERS:
+                    raise ClusterError(
+                        f"the Dask scheduler has no worker for {looked - began:.0f} s, bound {NO_WORKERS:g} s; "
+                        "start some, the same command goes on where it ended"
+                    )
+            with self._completed.thread_condition:
+                self._completed.thread_condition.wait(timeout=0.1)
+        self._check_scheduler()
+
+    def _has_workers(self) -> bool:
+        try:
+            return bool(self._client.nthreads())
+        except (OSError, RuntimeError, CancelledError):
+            self._check_scheduler()
+            return True
+
+    def _check_scheduler(self) -> None:
+        if self._is_lost():
+            raise ClusterError(
+                "the connection to the Dask scheduler is lost; all that was done is kept: start a scheduler and "
+                "workers, the same command goes on where it ended"
+            )
+
+    def _is_lost(self) -> bool:
+        """Tell whether the client has lost its scheduler since it sent what is in flight."""
+        comm = self._client.scheduler_comm
+        return self._client.status != "running" or comm is None or comm.comm.closed() or self._lost
+
+    def _cancel(self) -> set[int]:
+        if self._is_lost():
+            raise CancelledError
         futures = [
-            future for future in self._completed.futures if future.key in self._tickets and not future.done()
+            future for future in self._completed.futures if future.key in self._flying and not future.done()
         ]
         keys = {future.key for future in futures}
         self._client.cancel(futures)
         clean = 0
         while clean < 2:  # twice, as a task may be on its way to a worker
             time.sleep(0.05)
+            if self._is_lost():
+                raise CancelledError
             held = set().union(*self._client.run(_held, on_error="ignore").values())
             clean = 0 if held & keys else clean + 1
-        return {self._tickets.pop(key) for key in keys}
+        return {self._flying.pop(key)[0] for key in keys}
+
+    def _outcome(self, future: Any, ticket: int, task: Task) -> Record | Failure | None:
+        """What came of a task; None if it must be sent again."""
+        from distributed import KilledWorker
+
+        try:
+            outcome: Record | Failure = future.result()
+        except KilledWorker:
+            found = tell_death(task, self._limits)
+            if found is None and self._sent[ticket] >= BYSTANDER:
+                found = Failure(WorkerError(f"{BYSTANDER} workers died before they began it; look at their logs"))
+            return found
+        except CancelledError:  # nobody but a lost scheduler does that
+            self._lost = True
+            self._check_scheduler()
+            raise
+        except Exception as error:  # what Dask itself raises: a module that a worker lacks
+            return Failure(error)
+        finally:
+            future.release()
+        if isinstance(outcome, Failure) and outcome.kind == "memory":
+            return tell_memory(outcome, self._limits)
+        return outcome
 
 
 @contextmanager
@@ -109,23 +232,40 @@ def serial() -> Iterator[Executor]:
 
 
 @contextmanager
-def local(workers: int, *, memory_limit: str | int = "auto") -> Iterator[Executor]:
+def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
     """Run tasks in worker processes of one thread each on this machine; they end with the context.
 
     Parameters
     ----------
     workers : int
         Number of processes.
-    memory_limit : str or int
-        Memory of one worker (bytes, or ``"4 GB"``); ``"auto"`` shares out what the machine has. A worker that
-        needs more is killed.
+    limits : Limits, optional
+        What a task may take; by default its share of the machine's memory, and any time. A worker that dies is
+        replaced.
     """
     from dask import config
     from distributed import Client, LocalCluster
 
+    from tiler.worker_setup import WorkerSetup
+
+    limits = limits or Limits(memory=share_memory(workers))
     # Everything is bound to this machine, on free ports: two runs do not meet. A dead process shows by its closed
-    # connection, so a worker that is silent because its task holds the interpreter is let live.
-    settings = {"distributed.worker.daemon": False, "distributed.scheduler.worker-ttl": None}
+    # connection, so a worker that is silent because its task holds the interpreter is let live. No array is in
+    # Dask's hands, so there is nothing to spill and nothing to pause for. Dask's log of transitions holds on to
+    # tasks: it is kept short. A process that dies is started again by its nanny: the cluster would give up one
+    # whose process is just starting 15 s after an earlier one died.
+    settings = {
+        "distributed.worker.daemon": False,
+        "distributed.scheduler.worker-ttl": None,
+        "distributed.scheduler.allowed-failures": 0,
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.admin.low-level-log-length": 100,
+        "distributed.deploy.lost-worker-timeout": "3650 days",
+        "distributed.worker.memory.target": False,
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.pause": False,
+        "distributed.worker.memory.terminate": KILL_AT,
+    }
     with (
         config.set(settings),
         LocalCluster(
@@ -134,29 +274,49 @@ def local(workers: int, *, memory_limit: str | int = "auto") -> Iterator[Executo
             processes=True,
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
-            memory_limit=memory_limit,
+            memory_limit=limits.memory,
             silence_logs="CRITICAL",
         ) as cluster,
         Client(cluster) as client,
     ):
-        yield Dask(client, workers)
+        client.register_plugin(WorkerSetup(int(REFUSE_AT * limits.memory)))
+        try:
+            yield Dask(client, workers, limits)
+        except KeyboardInterrupt:  # at once: nobody waits for what workers are at
+            _kill_workers(cluster)
+            raise
+
+
+def _kill_workers(cluster: Any) -> None:
+    for nanny in cluster.workers.values():
+        nanny.auto_restart = False
+        with suppress(OSError, TypeError):
+            os.kill(nanny.pid, signal.SIGKILL)
 
 
 @contextmanager
-def connect(address: str) -> Iterator[Executor]:
+def connect(address: str, limits: Limits | None = None) -> Iterator[Executor]:
     """Run tasks on a Dask cluster whose workers see the same store and files; it is left running.
 
     Parameters
     ----------
     address : str
         Address of its scheduler, ``"tcp://10.0.0.1:8786"``.
+    limits : Limits, optional
+        The time limit holds if workers have one thread each; the memory limit is the cluster's own.
 
     Raises
     ------
     CityError
         If nothing answers there, or it has no workers.
+
+    Notes
+    -----
+    A worker that dies is not replaced: the others take its tasks. A lost scheduler ends the run with a
+    `ClusterError`, and so does a cluster that has had no worker for `NO_WORKERS` seconds.
     """
     from distributed import Client
+    from distributed.utils import silence_logging_cmgr
 
     try:
         client = Client(address)
@@ -164,30 +324,18 @@ def connect(address: str) -> Iterator[Executor]:
         raise CityError(
             f"{address}: no Dask scheduler answers ({error}); start one, or check the address"
         ) from error
-    with client:
-        threads = sum(client.nthreads().values())
+    # A lost scheduler is told once, by us.
+    with silence_logging_cmgr(logging.CRITICAL), client:
+        threads = list(client.nthreads().values())
         if not threads:
             raise CityError(f"{address}: the scheduler has no workers; start some and run again")
-        yield Dask(client, threads)
+        seconds = limits.seconds if limits is not None and max(threads) == 1 else 0.0
+        yield Dask(client, sum(threads), Limits(seconds))
 
 
-def _outcome(future: Any) -> Record | Failure:
-    from distributed import KilledWorker
-
-    try:
-        outcome: Record | Failure = future.result()
-        return outcome
-    except KilledWorker:
-        return Failure(
-            CityError(
-                "the worker process died again and again with this item on it, most likely for want of memory; "
-                "use fewer workers, give each more memory, or make tiles smaller"
-            )
-        )
-    except Exception as error:  # what Dask itself raises: a module that a worker lacks, a lost scheduler
-        return Failure(error)
-    finally:
-        future.release()
+def share_memory(workers: int) -> int:
+    """Share of the machine's memory for each of so many workers (bytes)."""
+    return int(MEMORY_SHARE * machine_memory() / max(workers, 1))
 
 
 def _held(dask_worker: Any) -> list[str]:

@@ -8,10 +8,12 @@ its help, so writers import what they need when they are called.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import ConfigError, InputError
 
 RUN_RECORD, VOLUME_INDEX, BOUNDARY_INDEX = "run.json", "mesh.pvtu", "boundary.pvtp"
+EXPORT_RECORD = "export.json"  # in every folder that was exported: only such a one is ever replaced
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,23 @@ class Format:
     description : str
         What it holds, in a few words.
     write : callable
-        Given a path and the files of a run, writes that file.
+        Given a path and the files of a run, and the options as keywords, writes that file or folder.
+    options : tuple of str
+        Options of the command line that it takes, without dashes.
+    folder : bool
+        Whether it is a folder.
+    suffix : str
+        What the name of the file must end with, if anything.
+    companion : str
+        Suffix of a second file beside it, if there is one.
     """
 
     description: str
-    write: Callable[[Path, RunFiles], None]
+    write: Callable[..., None]
+    options: tuple[str, ...] = ()
+    folder: bool = False
+    suffix: str = ""
+    companion: str = ""
 
 
 def _write_vtu(path: Path, files: RunFiles) -> None:
@@ -56,35 +70,120 @@ def _write_vtu(path: Path, files: RunFiles) -> None:
 def _write_vtp(path: Path, files: RunFiles) -> None:
     from tiler.merged import write_merged_boundary
 
-    write_merged_boundary(path, files.boundaries)
+    write_merged_boundary(path, files.boundaries, files.volumes)
+
+
+def _write_openfoam(path: Path, files: RunFiles, **options: Any) -> None:
+    from tiler.formats.openfoam import export_openfoam
+
+    export_openfoam(path, files.directory, **options)
+
+
+def _write_xdmf(path: Path, files: RunFiles) -> None:
+    from tiler.formats.xdmf import export_xdmf
+
+    export_xdmf(path, files.directory)
+
+
+def _write_msh(path: Path, files: RunFiles) -> None:
+    from tiler.formats.msh import export_msh
+
+    export_msh(path, files.directory)
+
+
+def _write_msh2(path: Path, files: RunFiles) -> None:
+    from tiler.formats.msh import export_msh2
+
+    export_msh2(path, files.directory)
+
+
+def _write_stl(path: Path, files: RunFiles) -> None:
+    from tiler.formats.stl import export_stl
+
+    export_stl(path, files.directory)
+
+
+def _write_obj(path: Path, files: RunFiles) -> None:
+    from tiler.formats.obj import export_obj
+
+    export_obj(path, files.directory)
+
+
+def _write_ply(path: Path, files: RunFiles) -> None:
+    from tiler.formats.ply import export_ply
+
+    export_ply(path, files.directory)
+
+
+def _write_glb(path: Path, files: RunFiles) -> None:
+    from tiler.formats.glb import export_glb
+
+    export_glb(path, files.directory)
+
+
+def _write_cityjsonseq(path: Path, files: RunFiles) -> None:
+    from tiler.formats.cityjsonseq import export_cityjsonseq
+
+    export_cityjsonseq(path, files.directory)
+
+
+def _write_gpkg(path: Path, files: RunFiles) -> None:
+    from tiler.formats.gpkg import export_gpkg
+
+    export_gpkg(path, files.directory)
 
 
 FORMATS: Mapping[str, Format] = {
     "vtu": Format("the volume mesh as one VTK file", _write_vtu),
     "vtp": Format("the marked boundary as one VTK file", _write_vtp),
+    "openfoam": Format(
+        "a case folder of OpenFOAM", _write_openfoam, options=("parts", "case", "buildings"), folder=True
+    ),
+    "xdmf": Format(
+        "mesh and marked facets for FEniCS and ParaView, with the numbers in a file .h5 beside it",
+        _write_xdmf,
+        suffix=".xdmf",
+        companion=".h5",
+    ),
+    "msh": Format("Gmsh's MSH 4.1, binary", _write_msh, suffix=".msh"),
+    "msh2": Format("Gmsh's MSH 2.2, text, as gmshToFoam reads it", _write_msh2, suffix=".msh"),
+    "stl": Format("the boundary as STL, text, one solid a patch", _write_stl, suffix=".stl"),
+    "obj": Format("the boundary as Wavefront OBJ, one group a patch", _write_obj, suffix=".obj"),
+    "ply": Format("the boundary as PLY, binary, with marker and building", _write_ply, suffix=".ply"),
+    "glb": Format("the boundary as glTF 2.0, binary, one material a patch", _write_glb, suffix=".glb"),
+    "cityjsonseq": Format(
+        "the simplified city model as CityJSONSeq, one feature a building", _write_cityjsonseq, suffix=".jsonl"
+    ),
+    "gpkg": Format("the simplified footprints with heights as GeoPackage", _write_gpkg, suffix=".gpkg"),
 }
+NO_OPTIONS: Mapping[str, Any] = {}
 
 
-def export_run(directory: Path, output: Path, *, name: str, overwrite: bool = False) -> None:
-    """Write a run's mesh as one file.
+def export_run(
+    directory: Path, output: Path, *, name: str, overwrite: bool = False, options: Mapping[str, Any] = NO_OPTIONS
+) -> None:
+    """Write a run's mesh for other programs.
 
     Parameters
     ----------
     directory : Path
         Folder of a finished run.
     output : Path
-        The file; it appears whole or not at all.
+        The file or folder; it appears whole or not at all.
     name : str
         Format, one of `FORMATS`.
     overwrite : bool
-        Whether a file of that name may be replaced; one of the run's own never is.
+        Whether a file of that name may be replaced, or a folder that was exported; one of the run's own never is.
+    options : mapping of str to value
+        What the format takes; see docs/formats.md.
 
     Raises
     ------
     ValueError
         If there is no such format.
     ConfigError
-        If the file exists and may not be replaced, or is one of the run's own.
+        If the file exists and may not be replaced, or is one of the run's own; if an option is not one of the
+        format's, or out of range.
     InputError
         If the folder holds no finished run, or a file of it is missing or damaged.
     OutputError
@@ -92,9 +191,19 @@ def export_run(directory: Path, output: Path, *, name: str, overwrite: bool = Fa
     """
     if name not in FORMATS:
         raise ValueError(f"format {name!r} must be one of {', '.join(FORMATS)}")
+    kind = FORMATS[name]
+    for option in options:
+        if option not in kind.options:
+            taken = ", ".join(f"--{known}" for known in kind.options) or "none"
+            raise ConfigError(f"--{option}: format {name} does not take it; its options: {taken}")
+    if not output.name.endswith(kind.suffix):
+        raise ConfigError(f"{output}: a file of format {name} ends with {kind.suffix}; give another --output")
     files = find_files(directory)
-    _check_target(output, files, overwrite=overwrite)
-    FORMATS[name].write(output, files)
+    for target in (output, output.with_suffix(kind.companion)) if kind.companion else (output,):
+        _check_target(target, files, overwrite=overwrite)
+    if kind.folder and output.exists() and not (output / EXPORT_RECORD).is_file():
+        raise ConfigError(f"{output}: holds no {EXPORT_RECORD}, so it was not exported; give another --output")
+    kind.write(output, files, **options)
 
 
 def find_files(directory: Path) -> RunFiles:

@@ -214,22 +214,6 @@ def join_footprints(parts: Sequence[FootprintRows], box: Box) -> Footprints:
     return Footprints(geometry[kept], names[order[kept]], given[order[kept]])
 
 
-def largest_extent(box: NDArray[np.float64]) -> float:
-    """Give the longest side of any footprint's box.
-
-    Parameters
-    ----------
-    box : float64, (n, 4)
-        Boxes of footprints, `FootprintRows.box`.
-
-    Returns
-    -------
-    float
-        In m; 0 if there are none.
-    """
-    return float((box[:, 2:] - box[:, :2]).max(initial=0.0))
-
-
 def _meets(boxes: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
     xmin, ymin, xmax, ymax = boxes.T
     meets: NDArray[np.bool_] = (xmin <= box[2]) & (xmax >= box[0]) & (ymin <= box[3]) & (ymax >= box[1])

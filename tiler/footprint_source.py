@@ -14,7 +14,10 @@ from pipeline.citymodel import Footprints, make_ids
 from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note
 from tiler.crs import crs_name, horizontal_crs, same_crs
+from tiler.lasheader import COORDINATE_LIMIT
 from tiler.layers import Box, Features, Layer, describe_layer, list_some
+from tiler.plain_text import ID_LENGTH, printable, shorten
+from tiler.wkb import parse_wkb
 
 # Attributes that hold a building's own id, first found first taken, in any case: Dutch BAG (and its
 # ten letters in SHP), INSPIRE and GML, OpenStreetMap, then names in general use.
@@ -24,6 +27,9 @@ ID_ATTRIBUTES = (
 )
 
 _BOX_MARGIN = 0.01  # share of the box's size added after reprojection, whose straight edges bend
+# Vertices of one footprint: the largest of a national register have some thousands. Up to this many take less than
+# a minute however they lie, beyond it the time of geometric predicates grows with the square.
+MAX_VERTICES = 100_000
 _POLYGONAL = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)
 
 
@@ -190,24 +196,35 @@ def parse_polygons(wkb: NDArray[np.object_]) -> tuple[NDArray[np.object_], NDArr
         What cannot be parsed, and what is something else.
     """
     with np.errstate(invalid="ignore"):  # GEOS compares NaN coordinates
-        geometry = shapely.force_2d(shapely.from_wkb(wkb, on_invalid="fix"))
+        geometry = shapely.force_2d(parse_wkb(wkb))
     stored = np.array([blob is not None for blob in wkb], bool)
     kinds = shapely.get_type_id(geometry)
     polygonal = np.isin(kinds, _POLYGONAL) & ~shapely.is_empty(geometry)
     other = ~np.isin(kinds, _POLYGONAL) & (kinds >= 0)
     notes = _notes("footprint-unreadable", geometry[stored & (kinds < 0)], "the geometry cannot be parsed")
     for kind in np.unique(kinds[other]):
-        name = shapely.GeometryType(kind).name.lower()
-        notes += _notes("footprint-not-polygon", geometry[kinds == kind], f"is a {name}")
-    rows = np.flatnonzero(polygonal)
+        notes += _notes("footprint-not-polygon", geometry[kinds == kind], f"is a {_kind_name(kind)}")
+    size = shapely.get_num_coordinates(geometry)
+    large = polygonal & (size > MAX_VERTICES)
+    details = [f"{n} vertices > {MAX_VERTICES}; left out" for n in size[large]]
+    notes += _notes("footprint-too-many-vertices", geometry[large], details)
+    rows = np.flatnonzero(polygonal & ~large)
     return geometry[rows], rows, notes
+
+
+def _kind_name(kind: int) -> str:
+    try:
+        return str(shapely.GeometryType(kind).name.lower())
+    except ValueError:  # curves, which GEOS knows and shapely has no name for
+        return f"geometry of type {kind}"
 
 
 def _finite_within(geometry: NDArray[np.object_], bounds: Box) -> tuple[NDArray[np.bool_], list[Note]]:
     coordinates, owner = shapely.get_coordinates(geometry, return_index=True)
     finite = np.ones(len(geometry), bool)
-    finite[owner[~np.isfinite(coordinates).all(axis=1)]] = False
-    notes = _notes("footprint-not-finite", geometry[~finite], "a coordinate is NaN or infinite")
+    finite[owner[~(np.abs(coordinates) <= COORDINATE_LIMIT).all(axis=1)]] = False  # NaN too
+    detail = f"a coordinate is NaN, infinite, or beyond ±{COORDINATE_LIMIT:g} m"
+    notes = _notes("footprint-not-finite", geometry[~finite], detail)
     keep = finite.copy()
     keep[finite] = shapely.intersects(geometry[finite], shapely.box(*bounds))
     return keep, notes
@@ -244,13 +261,18 @@ def id_text(value: Any) -> str:
     Returns
     -------
     str
-        ``""`` where there is none.
+        ``""`` where there is none. Control characters are escaped, and what is longer than `ID_LENGTH` ends in a
+        hash: an id becomes a key of files and part of messages.
 
     Examples
     --------
     >>> id_text(12.0), id_text(" a1 "), id_text(None), id_text(float("nan"))
     ('12', 'a1', '', '')
     """
+    return shorten(printable(_plain_id(value)), ID_LENGTH)
+
+
+def _plain_id(value: Any) -> str:
     if isinstance(value, str):
         return value.strip()
     if isinstance(value, float | np.floating):
@@ -266,14 +288,14 @@ def _heights(
     heights = np.array([_number(value) for value in values], dtype=np.float64)
     bad = ~(heights > 0) | ~np.isfinite(heights)
     heights[bad] = np.nan
-    details = [f"{value!r} is no height above 0 m" for value in values[bad]]
+    details = [f"{shorten(repr(value), ID_LENGTH)} is no height above 0 m" for value in values[bad]]
     return heights, _notes("footprint-height-missing", geometry[bad], details, ids[bad])
 
 
 def _number(value: Any) -> float:
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return float("nan")
 
 

@@ -138,7 +138,7 @@ def forecast_run(
     loads = _loads(survey, sample, config)
     tasks = count_tasks(survey, config)
     n_tasks = sum(entry.number for entry in tasks)
-    tile_memory = BASE_MEMORY + MEMORY_A_CELL * loads.cells + MEMORY_A_LIDAR_POINT * loads.lidar_points
+    tile_memory = _tile_memory(loads)
     nodes, points, houses = (
         loads.area.sum() / config.dtm_spacing**2,
         loads.lidar_points.sum(),
@@ -168,7 +168,7 @@ def list_stages(config: Config) -> list[Stage]:
     """List the stages that every run has, in their order."""
     return [
         *input_stages(config),
-        house_stage(config, 0.0),
+        house_stage(config),
         *first_round(config),
         shape_stage(0),
         *later_round(config, 1),
@@ -247,19 +247,33 @@ def _memory_warnings(
 ) -> list[str]:
     """Say which tiles do not fit into a worker's share of memory, and which tile size would."""
     workers = max(config.workers, 1)
-    limit = MEMORY_SHARE * memory / workers
+    share = config.memory_limit * 2**30 if config.memory_limit and config.workers else memory / workers
+    limit = MEMORY_SHARE * share
     heavy = int((tile_memory > limit).sum())
     if not heavy:
         return []
     words = (
         f"{heavy} of {len(tile_memory)} tiles may not fit into memory: up to {tile_memory.max() / 2**30:.1f} GiB"
     )
-    words += (
-        f" a worker > {limit / 2**30:.1f} GiB, 80 % of the machine's {memory / 2**30:.1f} GiB by {workers} workers"
-    )
+    words += f" a worker > {limit / 2**30:.1f} GiB, 80 % of the {share / 2**30:.1f} GiB that it has"
     per_area = ((tile_memory - BASE_MEMORY) / area).max()  # tiles on the border may be larger than others
     side = np.sqrt(max(limit - BASE_MEMORY, 0.0) / per_area) / LARGEST_TILE
     size = np.floor(side / TILE_STEP) * TILE_STEP
     if size >= max(LEAST_TILE * config.mesh_size, TILE_STEP):
         return [f"{words}; give --tile-size {size:g}, or fewer --workers"]
-    return [f"{words}; give fewer --workers, or a larger --mesh-size"]
+    return [f"{words}; give fewer --workers with more memory each, or a larger --mesh-size"]
+
+
+def warn_of_memory(survey: Survey, config: Config, *, memory: float) -> list[str]:
+    """Say before a run which tiles may not fit into memory, from headers alone; see `forecast_run`.
+
+    Notes
+    -----
+    Footprints are not looked at: what is refined at walls comes on top.
+    """
+    loads = _loads(survey, None, config)
+    return _memory_warnings(_tile_memory(loads), loads.area, config, memory)
+
+
+def _tile_memory(loads: TileLoads) -> NDArray[np.float64]:
+    return BASE_MEMORY + MEMORY_A_CELL * loads.cells + MEMORY_A_LIDAR_POINT * loads.lidar_points

@@ -12,10 +12,17 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from tiler.wkb import parse_wkb
 
 Box = tuple[float, float, float, float]
 
+BATCH_BYTES = 2**30  # of the values of one column in a batch; 50,000 footprints take some 10 MB
 _SUFFIXES = {".parquet", ".geoparquet", ".pq"}
+# What pyarrow, json and pyproj raise on metadata that are wrong or nested too deep.
+_DAMAGE = (
+    *(OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, MemoryError, OverflowError),
+    *(RecursionError, pyproj.exceptions.CRSError),
+)
 
 
 def is_parquet(path: Path) -> bool:
@@ -110,7 +117,7 @@ def scan(
     if box is not None and not geometry:
         raise ValueError("a box needs the geometries")
     with _arrow_as_input_error(path):
-        table = _open(path)
+        table = _open(path, [*columns])
         name, column = _geometry(path, table)
         groups = [group for group in range(table.num_row_groups) if _near(table, group, column, box)]
         parts = table.iter_batches(
@@ -121,6 +128,7 @@ def scan(
             part = next(parts, None)
             if part is None:
                 return
+            _check_expanded(path, part)
             blobs = to_objects(part.column(name).to_pylist() if geometry else [None] * part.num_rows)
             if box is not None:
                 hits = np.flatnonzero(_meets(blobs, box))
@@ -147,7 +155,7 @@ def to_objects(items: list[Any]) -> NDArray[np.object_]:
 
 
 def _meets(wkb: NDArray[np.object_], box: Box) -> NDArray[np.bool_]:
-    xmin, ymin, xmax, ymax = shapely.bounds(shapely.from_wkb(wkb, on_invalid="fix")).T
+    xmin, ymin, xmax, ymax = shapely.bounds(parse_wkb(wkb)).T
     meets: NDArray[np.bool_] = (xmin <= box[2]) & (xmax >= box[0]) & (ymin <= box[3]) & (ymax >= box[1])
     return meets
 
@@ -167,14 +175,38 @@ def _near(table: Any, group: int, column: dict[str, Any], box: Box | None) -> bo
     return bool(low and east.max >= box[0] and north.max >= box[1])
 
 
-def _open(path: Path) -> Any:
+def _check_expanded(path: Path, part: Any) -> None:
+    """Refuse a batch whose values, each written once in the file, take more memory than a batch may.
+
+    Parquet keeps equal values once, in a dictionary: a small file may hold a large polygon a million times.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    for column in part.columns:
+        if pa.types.is_dictionary(column.type):
+            length = pc.take(pc.binary_length(column.dictionary), column.indices)
+            n_bytes = pc.sum(length.cast(pa.int64())).as_py() or 0
+            if n_bytes > BATCH_BYTES:
+                raise InputError(
+                    f"{path}: {len(column)} rows expand to {n_bytes} bytes > {BATCH_BYTES}; write footprints "
+                    "once, and with fewer vertices"
+                )
+
+
+def _open(path: Path, columns: Sequence[str] = ()) -> Any:
     try:
         import pyarrow.parquet
     except ImportError as error:
         raise InputError(
             f"{path}: Parquet needs pyarrow; pip install 'citystitch[parquet]', or convert the file to GPKG"
         ) from error
-    return pyarrow.parquet.ParquetFile(path)
+    table = pyarrow.parquet.ParquetFile(path)
+    size, n_rows = path.stat().st_size, table.metadata.num_rows
+    if n_rows > size:
+        raise InputError(f"{path}: claims {n_rows} features in {size} bytes; copy the file again")
+    geometry = _geometry(path, table)[0]
+    return pyarrow.parquet.ParquetFile(path, read_dictionary=[geometry, *columns])
 
 
 def _geometry(path: Path, table: Any) -> tuple[str, dict[str, Any]]:
@@ -194,5 +226,5 @@ def _geometry(path: Path, table: Any) -> tuple[str, dict[str, Any]]:
 def _arrow_as_input_error(path: Path) -> Iterator[None]:
     try:
         yield
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, pyproj.exceptions.CRSError) as error:
+    except _DAMAGE as error:
         raise InputError(f"{path}: cannot be read as GeoParquet ({error}); copy the file again") from error

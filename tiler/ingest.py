@@ -1,5 +1,6 @@
 """Point cloud files read once, and dealt out to the cells of a fixed grid (step 1.1)."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,13 +8,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.errors import InputError
+from pipeline.las_points import Triple
 from pipeline.pointcloud import PointCloud
 from tiler.cells import Box, order_by_cell
 from tiler.clouds import read_chunks, select_usable
+from tiler.las_chunks import classes_of, scaling_of, units_of
 
 # Side of a cell (m). A box of 250 m reads 1.25, 1.54 and 2.14 times its points in cells of 32, 64 and 128 m, in
 # 21, 14 and 10 ranges of rows: 64 m is between many small reads and much that is read in vain.
 CELL = 64.0
+# Points in one cell of a file, 10,000 a square metre: the densest surveys from the air have some 1,000. What
+# is read of a store is at least a cell, and a small LAZ file may hold any number of copies of one point.
+MOST_POINTS = 40_960_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +29,10 @@ class PointBlock:
 
     Attributes
     ----------
-    xyz : float64, (n, 3)
-        Coordinates in the file's CRS (m), by ascending cell (j, then i); in a cell in the order of the file.
+    units : int32, (n, 3)
+        Coordinates in the file's CRS and units, by ascending cell (j, then i); in a cell in the order of the file.
+    scale, offset : tuple of 3 floats
+        Size of a unit along each axis, and place of unit 0 (m).
     classification : uint8, (n,)
         ASPRS class of each point.
     cell : int64, (c, 2)
@@ -36,7 +45,9 @@ class PointBlock:
         As `read_points` gives them; they add up over the blocks of a file.
     """
 
-    xyz: NDArray[np.float64]
+    units: NDArray[np.int32]
+    scale: Triple
+    offset: Triple
     classification: NDArray[np.uint8]
     cell: NDArray[np.int64]
     start: NDArray[np.int64]
@@ -64,7 +75,7 @@ def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator
     Raises
     ------
     InputError
-        As `read_points`.
+        As `read_points`, and if a cell has more than `MOST_POINTS`.
     ValueError
         If the size is not positive.
 
@@ -79,20 +90,34 @@ def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator
     """
     if not size > 0:
         raise ValueError(f"size of cells {size} m must be positive")
+    total: Counter[tuple[int, int]] = Counter()
     for chunk, xyz, n_skipped in read_chunks(Path(path), bounds):
         counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
-        cloud = select_usable(chunk, xyz, bounds, counts)
+        kept = select_usable(chunk, xyz, bounds, counts)
         counts["read"] += n_skipped
         counts["outside"] += n_skipped
-        found = order_by_cell(cloud.xyz[:, :2], size)
-        classes = np.flatnonzero(np.bincount(np.asarray(chunk.classification, np.uint8), minlength=1))
+        found = order_by_cell(xyz[kept, :2], size)
+        total.update(dict(zip(map(tuple, found.cell.tolist()), np.diff(found.start).tolist(), strict=True)))
+        _check_density(Path(path), total, size)
+        rows, all_classes = kept[found.order], classes_of(chunk)
         yield PointBlock(
-            cloud.xyz[found.order],
-            cloud.classification[found.order],
+            units_of(chunk)[rows],
+            *scaling_of(chunk),
+            all_classes[rows],
             found.cell,
             found.start,
-            classes.astype(np.uint8),
+            np.flatnonzero(np.bincount(all_classes, minlength=1)).astype(np.uint8),
             counts,
+        )
+
+
+def _check_density(path: Path, total: Counter[tuple[int, int]], size: float) -> None:
+    worst = max(total.values(), default=0)
+    if worst > MOST_POINTS:
+        (i, j), _ = max(total.items(), key=lambda item: item[1])
+        raise InputError(
+            f"{path}: more than {worst} points in the square of {size:g} m at ({i * size:g}, {j * size:g}), "
+            f"at most {MOST_POINTS} are taken; thin the file: pdal translate {path.name} thin.laz sample"
         )
 
 

@@ -5,6 +5,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from enum import Enum
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import PurePath
 from typing import Any
@@ -13,11 +14,24 @@ import numpy as np
 
 from tiler.stage import Box, Layout, Scope, Stage
 
-DISTRIBUTION = "citystitch"
+# What computes results: a change of one of their versions redoes everything.
+CODE = (
+    "citystitch",
+    "numpy",
+    "scipy",
+    "shapely",
+    "numba",
+    "triangle",
+    "pyamg",
+    "laspy",
+    "lazrs",
+    "pyogrio",
+    "pyproj",
+)
 
 
 def stage_digest(stage: Stage, parameters: Mapping[str, Any], layout: Layout) -> bytes:
-    """Hash what all items of a stage share: stage, package version, declared parameters, region.
+    """Hash what all items of a stage share: stage, versions of the code, declared parameters, region.
 
     Parameters
     ----------
@@ -39,13 +53,18 @@ def stage_digest(stage: Stage, parameters: Mapping[str, Any], layout: Layout) ->
             values[name] = json.dumps(value, sort_keys=True, default=_plain)
         except (TypeError, ValueError) as error:
             raise ValueError(f"parameter {name} of stage {stage.name}: {error}") from error
-    parts: list[Any] = [stage.name, stage.scope.value, stage.version, package_version(), values]
-    parts += [[float(v).hex() for v in layout.bounds], layout.identity]
+    parts: list[Any] = [stage.name, stage.scope.value, stage.version, code_versions(), values]
+    parts += [_hex(layout.bounds), layout.identity]
     return _hash(json.dumps(parts, sort_keys=True).encode())
 
 
 def item_key(
-    shared: bytes, name: str, box: Box, identity: str, refs: Iterable[tuple[str, Iterable[tuple[str, str]]]]
+    shared: bytes,
+    name: str,
+    box: Box,
+    identity: str,
+    refs: Iterable[tuple[str, Iterable[tuple[str, str]]]],
+    gaps: Iterable[Box] = (),
 ) -> str:
     """Hash what one result depends on.
 
@@ -62,13 +81,15 @@ def item_key(
     refs : iterable
         For each stage that is read, in a fixed order, its name, and name and digest of each result, in a fixed
         order. A result that was computed anew and came out the same changes no key.
+    gaps : iterable of tuple of float
+        Boxes near it that no tile covers (m).
 
     Returns
     -------
     str
         32 hexadecimal digits.
     """
-    parts = [name, [float(v).hex() for v in box], identity, [[stage, list(items)] for stage, items in refs]]
+    parts = [name, _hex(box), identity, [[stage, list(items)] for stage, items in refs], sorted(map(_hex, gaps))]
     return _hash(shared + json.dumps(parts).encode()).hex()
 
 
@@ -87,12 +108,21 @@ def file_identity(layout: Layout, scope: Scope, name: str) -> tuple[str, str]:
     return layout.files[name].path, layout.files[name].identity
 
 
-def package_version() -> str:
-    """Version of this package, ``"unknown"`` where it is not installed."""
+@cache
+def code_versions() -> tuple[tuple[str, str], ...]:
+    """Names and versions of this package and of those that it computes with, ``"unknown"`` for one without."""
+    return tuple((name, _version(name)) for name in CODE)
+
+
+def _version(name: str) -> str:
     try:
-        return version(DISTRIBUTION)
+        return version(name)
     except PackageNotFoundError:
         return "unknown"
+
+
+def _hex(box: Box) -> list[str]:
+    return [float(v).hex() for v in box]
 
 
 def _hash(data: bytes) -> bytes:

@@ -19,6 +19,15 @@ _LONGEST_HEADER = 375
 _VLR_HEADER = 54
 _EVLR_HEADER = 60
 _COMPRESSED = 0x40  # LASzip sets the upper bits of the point format
+# Points that a LAZ file may claim: these, and so many for each byte of compressed points. Surveys have less than
+# 0.4 points a byte, a made-up plane with noise 2, copies of one point 100; reading any claim would take years.
+FREE_POINTS = 2_000_000
+POINTS_PER_BYTE = 16
+# Bytes of the records before the points, and of those behind them that are read: a CRS takes some kilobytes.
+# Waveforms behind the points may be larger, and are left alone.
+RECORD_BYTES = 64_000_000
+_MANY_RECORDS = 1_000_000
+_RETURN_BYTES = 20  # of the shortest point, format 0
 _EMPTY_LAZ = 1000  # what follows the header of a LAZ file without points is shorter than this
 
 
@@ -36,12 +45,15 @@ class LasPromise:
         Whether the points are LAZ.
     bounds : tuple of 6 floats
         xmin, ymin, xmax, ymax, zmin, zmax in the file's CRS; all NaN if there are no points.
+    extended : int
+        Bytes of the records behind the points.
     """
 
     n_points: int
     point_size: int
     compressed: bool
     bounds: tuple[float, float, float, float, float, float]
+    extended: int = 0
 
 
 def read_promise(path: Path) -> LasPromise:
@@ -75,7 +87,7 @@ def read_promise(path: Path) -> LasPromise:
             file.seek(0)
             head = file.read(_LONGEST_HEADER)
             begin, end = _point_bytes(path, head, size)
-            promise = _parse(path, head)
+            promise = _parse(path, head, _check_records(path, head, file, size))
             _check_finished(path, promise, end - begin)
             if promise.compressed and promise.n_points:
                 _check_chunk_table(path, promise, file, begin, size)
@@ -108,13 +120,45 @@ def _point_bytes(path: Path, head: bytes, size: int) -> tuple[int, int]:
     return begin, first_evlr
 
 
-def _parse(path: Path, head: bytes) -> LasPromise:
+def _check_records(path: Path, head: bytes, file: BinaryIO, size: int) -> int:
+    """Follow the records before and behind the points by their lengths; returns the bytes of those behind."""
+    header_size, begin, n_vlrs = struct.unpack_from("<HII", head, 94)
+    if begin - header_size > RECORD_BYTES:
+        raise InputError(f"{path}: {begin - header_size} bytes of records > {RECORD_BYTES}; {AGAIN}")
+    place = header_size
+    for k in range(n_vlrs):
+        file.seek(place + 20)
+        place += _VLR_HEADER + int.from_bytes(file.read(2), "little")
+        if place > begin:
+            raise InputError(
+                f"{path}: record {k + 1} of {n_vlrs} ends at byte {place}, points begin at {begin}; {AGAIN}"
+            )
+    if head[25] < 4:
+        return 0
+    first, n_evlrs = struct.unpack_from("<QI", head, 235)
+    if n_evlrs > _MANY_RECORDS:
+        raise InputError(f"{path}: {n_evlrs} extended records > {_MANY_RECORDS}; {AGAIN}")
+    place = first
+    for k in range(n_evlrs):
+        file.seek(place + 20)
+        place += _EVLR_HEADER + int.from_bytes(file.read(8), "little")
+        if place > size:
+            raise InputError(
+                f"{path}: extended record {k + 1} of {n_evlrs} ends at byte {place} of {size}; {AGAIN}"
+            )
+    return place - first if n_evlrs else 0
+
+
+def _parse(path: Path, head: bytes, extended: int) -> LasPromise:
     point_format, point_size, n_points = struct.unpack_from("<BHI", head, 104)
     if head[25] >= 4:
         n_points = struct.unpack_from("<Q", head, 247)[0]
-    if point_size == 0:
-        raise InputError(f"{path}: the header gives a point 0 bytes; {AGAIN}")
-    return LasPromise(n_points, point_size, point_format >= _COMPRESSED, _bounds(path, head, n_points))
+    if point_size < _RETURN_BYTES:
+        raise InputError(
+            f"{path}: the header gives a point {point_size} bytes, the least point size is {_RETURN_BYTES}; "
+            f"{AGAIN}"
+        )
+    return LasPromise(n_points, point_size, point_format >= _COMPRESSED, _bounds(path, head, n_points), extended)
 
 
 def _bounds(path: Path, head: bytes, n_points: int) -> tuple[float, float, float, float, float, float]:
@@ -144,6 +188,12 @@ def _check_finished(path: Path, promise: LasPromise, n_bytes: int) -> None:
         raise InputError(
             f"{path}: the header claims 0 points, but {n_bytes} bytes follow it: its writer did not finish; "
             f"{AGAIN}"
+        )
+    most = FREE_POINTS + POINTS_PER_BYTE * n_bytes
+    if promise.compressed and promise.n_points > most:
+        raise InputError(
+            f"{path}: none of {promise.n_points} points could be read: {n_bytes} bytes are believed to hold "
+            f"at most {most} ({POINTS_PER_BYTE} a byte and {FREE_POINTS}); {AGAIN}"
         )
     held = n_bytes // promise.point_size
     if not promise.compressed and held < promise.n_points:

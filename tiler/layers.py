@@ -1,5 +1,6 @@
 """Vector files: what a layer says about itself, and its features within a box (step 1.2)."""
 
+import os
 import struct
 import warnings
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError, InputError
 from tiler import geoparquet
+from tiler.vector_forms import check_form, read_head
 
 Box = tuple[float, float, float, float]
 
@@ -77,7 +79,7 @@ def describe_layer(path: Path, layer: str = "") -> Layer:
     Parameters
     ----------
     path : Path
-        SHP, GPKG, GeoJSON, GeoParquet, or whatever else GDAL reads.
+        SHP, GPKG, GeoJSON, FlatGeobuf or GeoParquet; see `check_form`.
     layer : str
         Name of the layer; ``""`` for the only one that has geometries.
 
@@ -92,12 +94,14 @@ def describe_layer(path: Path, layer: str = "") -> Layer:
     ConfigError
         If the layer does not exist, or if there are several and none is named.
     """
-    if not path.exists():
+    if not os.path.exists(path):  # Path.exists raises where a name is too long
         raise InputError(f"{path}: no such file; check the path of the footprints")
     if geoparquet.is_parquet(path):
         if layer:
             raise ConfigError(f"{path}: Parquet has no layers, but layer {layer!r} is asked for; leave it out")
+        read_head(path)
         return Layer(path, "", *geoparquet.describe(path))
+    check_form(path)
     _check_shapefile(path)
     with _gdal_as_input_error(path, []):
         table = pyogrio.list_layers(path)
@@ -187,9 +191,10 @@ def _stream(
         while True:
             with _gdal_as_input_error(layer.path, warned):
                 part = next(reader, None)  # no warning may be caught, and no error be turned, across a yield
+                columns_read = [] if part is None else [column.to_pylist() for column in part.columns]
             if part is None:
                 break
-            lists = [geoparquet.to_objects(column.to_pylist()) for column in part.columns]
+            lists = [geoparquet.to_objects(column) for column in columns_read]
             names = [str(name) for name in meta["fields"]]  # in the order of the stream, the geometry behind them
             wkb = lists[-1] if geometry else np.full(part.num_rows, None, np.object_)
             yield Features(wkb, dict(zip(names, lists, strict=False)), tuple(dict.fromkeys(warned)))

@@ -1,10 +1,10 @@
 """One file of all pieces: the volume mesh and its boundary of a whole region, streamed (step 3.6).
 
-Pieces are files already. Each has a point array of region-wide numbers, by which a vertex that several pieces have
-is written once.
+Pieces are files already. Each has a point array of region-wide ids, by which a vertex that several pieces have is
+written once, as what it is when all ids are counted from 0 on.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError, OutputError
+from stitch.numbering import Numbering, collect_ids, number_without_gaps
 from tiler.vtk_files import TETRA
-from tiler.vtk_xml import Sections, Stream, read_data_file, write_data_file
+from tiler.vtk_xml import Sections, Stream, read_data_file, read_point_array, write_data_file
 
-VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide numbers
+VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide ids, see `stitch.numbering`
 CHUNK = 1 << 20  # vertices that are moved at once
 Reader = Callable[[int], dict[str, dict[str, NDArray[Any]]]]
 
@@ -29,6 +30,7 @@ class _Source:
 
     paths: Sequence[Path]
     read: Reader
+    numbering: Numbering
     width: int
     n_rows: NDArray[np.int64]  # cells or facets of each
     n_points: int
@@ -42,13 +44,13 @@ def write_merged_volume(path: Path, pieces: Sequence[Path]) -> None:
     path : Path
         The file; it appears whole or not at all. While it is written, coordinates wait in a file beside it.
     pieces : sequence of at least one Path
-        VTU pieces (`write_vtu`) with the int64 point array `VERTEX_ID`: each number for one place.
+        VTU pieces (`write_vtu`) with the int64 point array `VERTEX_ID`: each id for one place.
 
     Raises
     ------
     InputError
-        If a piece is missing or damaged, lacks the array or a cell array that the first has, or if a number
-        stands for two places.
+        If a piece is missing or damaged, lacks the array or a cell array that the first has, or if an id stands
+        for two places.
     OutputError
         If the file cannot be written.
     ValueError
@@ -56,30 +58,80 @@ def write_merged_volume(path: Path, pieces: Sequence[Path]) -> None:
 
     Notes
     -----
-    Vertices are in the order of their numbers, cells piece by piece with their arrays. Memory holds one piece and
+    Vertices are in the order of their ids, cells piece by piece with their arrays. Memory holds one piece and
     9 bytes a vertex; coordinates are in a file that the system maps. Each piece is read twice, and again for each
     of its arrays.
     """
-    _write(path, pieces, "UnstructuredGrid")
+    _write(path, pieces, pieces, "UnstructuredGrid")
 
 
-def write_merged_boundary(path: Path, pieces: Sequence[Path]) -> None:
+def write_merged_boundary(path: Path, pieces: Sequence[Path], volumes: Sequence[Path]) -> None:
     """Write one VTP file of many; see `write_merged_volume`.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    pieces : sequence of at least one Path
+        VTP pieces (`write_vtp`).
+    volumes : sequence of Path
+        The VTU pieces of all tiles.
 
     Notes
     -----
-    Only the vertices of facets are written, in the order of their numbers, which become the array ``vertex``: the
-    vertices of the merged volume.
+    Only the vertices of facets are written, in the order of their ids. The array ``vertex`` tells which vertex of
+    the merged volume each is.
     """
-    _write(path, pieces, "PolyData")
+    _write(path, pieces, volumes, "PolyData")
 
 
-def _write(path: Path, pieces: Sequence[Path], kind: str) -> None:
+def read_numbering(volumes: Iterable[Path]) -> Numbering:
+    """Number the points of all volume pieces without gaps, by their ids.
+
+    Parameters
+    ----------
+    volumes : iterable of Path
+        The VTU pieces of all tiles.
+
+    Raises
+    ------
+    InputError
+        If a piece is missing or damaged, or has no ids.
+    """
+    return collect_ids(
+        _checked_ids(path, read_point_array(path, "UnstructuredGrid", VERTEX_ID)) for path in volumes
+    )
+
+
+def number_piece(path: Path, ids: NDArray[Any] | None, numbering: Numbering) -> NDArray[np.int64]:
+    """Turn the ids of a piece into numbers without gaps.
+
+    Parameters
+    ----------
+    path : Path
+        The piece, for messages.
+    ids : int64, (n,)
+        Its array `VERTEX_ID`.
+    numbering : Numbering
+        Of all pieces.
+
+    Raises
+    ------
+    InputError
+        If it has no ids, or one that no volume piece has.
+    """
+    try:
+        return number_without_gaps(numbering, _checked_ids(path, ids))
+    except ValueError:
+        raise InputError(f"{path}: a {VERTEX_ID} of it is in no piece of the volume; run the tile again") from None
+
+
+def _write(path: Path, pieces: Sequence[Path], volumes: Sequence[Path], kind: str) -> None:
     if not pieces:
         raise ValueError("a merged file needs at least one piece")
     try:
         with TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-            _write_file(path, kind, *_gather(pieces, kind, Path(folder)))
+            _write_file(path, kind, *_gather(pieces, read_numbering(volumes), kind, Path(folder)))
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
@@ -109,21 +161,18 @@ def _write_file(
 
 
 def _gather(
-    pieces: Sequence[Path], kind: str, folder: Path
+    pieces: Sequence[Path], numbering: Numbering, kind: str, folder: Path
 ) -> tuple[_Source, NDArray[np.int64], NDArray[np.float64]]:
-    """Read all pieces once: how many rows each has, which numbers there are, and where these are."""
+    """Read all pieces once: how many rows each has, which vertices it has, and where these are."""
     read = _reader(pieces, kind)
-    n_rows, highest = np.empty(len(pieces), np.int64), -1
+    n_rows = np.empty(len(pieces), np.int64)
     section, width = ("Cells", 4) if kind == "UnstructuredGrid" else ("Polys", 3)
+    xyz = np.memmap(folder / "points", np.float64, "w+", shape=(max(numbering.n_points, 1), 3))
+    seen = np.zeros(numbering.n_points, np.bool_)
     for k, piece in enumerate(pieces):
         sections = read(k)
         n_rows[k] = len(sections[section]["connectivity"]) // width
-        highest = max(highest, int(_numbers(piece, sections).max(initial=-1)))
-    xyz = np.memmap(folder / "points", np.float64, "w+", shape=(max(highest + 1, 1), 3))
-    seen = np.zeros(highest + 1, np.bool_)
-    for k, piece in enumerate(pieces):
-        sections = read(k)
-        number, points = _numbers(piece, sections), sections["Points"]["Points"]
+        number, points = _numbers(piece, sections, numbering), sections["Points"]["Points"]
         known = seen[number]
         if (xyz[number[known]] != points[known]).any():
             raise InputError(f"{piece}: a {VERTEX_ID} stands for two places; run the tile again")
@@ -133,7 +182,7 @@ def _gather(
         for i in range(0, len(numbers), CHUNK):
             chosen = numbers[i : i + CHUNK]
             xyz[i : i + len(chosen)] = xyz[chosen]
-    return _Source(pieces, read, width, n_rows, len(numbers)), numbers, xyz[: len(numbers)]
+    return _Source(pieces, read, numbering, width, n_rows, len(numbers)), numbers, xyz[: len(numbers)]
 
 
 def _reader(pieces: Sequence[Path], kind: str) -> Reader:
@@ -144,11 +193,14 @@ def _reader(pieces: Sequence[Path], kind: str) -> Reader:
     return read
 
 
-def _numbers(piece: Path, sections: dict[str, dict[str, NDArray[Any]]]) -> NDArray[np.int64]:
-    numbers = sections["PointData"].get(VERTEX_ID)
-    if numbers is None or numbers.dtype != np.int64 or (numbers < 0).any():
-        raise InputError(f"{piece}: has no point array {VERTEX_ID} of numbers from 0 on; run the tile again")
-    return numbers
+def _numbers(piece: Path, sections: dict[str, dict[str, NDArray[Any]]], numbering: Numbering) -> NDArray[np.int64]:
+    return number_piece(piece, sections["PointData"].get(VERTEX_ID), numbering)
+
+
+def _checked_ids(path: Path, ids: NDArray[Any] | None) -> NDArray[np.int64]:
+    if ids is None or ids.dtype != np.int64 or ids.ndim != 1 or (ids < 0).any():
+        raise InputError(f"{path}: has no point array {VERTEX_ID} of numbers from 0 on; run the tile again")
+    return ids
 
 
 def _flat(name: str, values: NDArray[Any], components: int) -> Stream:
@@ -160,7 +212,7 @@ def _connectivity(source: _Source, kind: str, numbers: NDArray[np.int64]) -> Str
 
     def of_piece(k: int) -> NDArray[Any]:
         sections = source.read(k)
-        number = _numbers(source.paths[k], sections)
+        number = _numbers(source.paths[k], sections, source.numbering)
         place = number if len(numbers) == numbers[-1] + 1 else np.searchsorted(numbers, number)
         flat: NDArray[Any] = place[sections[section]["connectivity"]]
         return flat

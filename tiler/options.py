@@ -7,12 +7,13 @@ from pipeline.city import CityOptions
 from pipeline.layered import LayeredOptions
 from pipeline.spacing import SpacingLimits
 from pipeline.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
+from tiler.config import Config
 
-# Parameters of the city model; two of the mesh are among them, as roofs that meet must differ enough for it.
+# Parameters of the city model; two are raised by what the mesh needs, see `derived_parameters`.
 CITY_PARAMETERS = (
     *("min_building_area", "vertex_tolerance", "ground_margin", "ground_percentile", "roof_height"),
-    *("roof_percentile", "default_height", "roof_clearance", "border", "simplify", "clearance", "clearance_floor"),
-    *("min_courtyard_area", "split_levels", "roof_group", "manifold", "least_spacing", "mesh_size", "mesher"),
+    *("roof_percentile", "default_height", "roof_clearance_or_spacing", "border", "simplify", "clearance"),
+    *("clearance_floor", "min_courtyard_area", "split_levels", "roof_group_or_spacing", "manifold"),
 )
 # Parameters of seams and plane meshes.
 PLANE_PARAMETERS = ("mesh_size", "min_angle", "mesher")
@@ -23,10 +24,22 @@ LAYER_PARAMETERS = (
 )
 
 
+def derived_parameters(config: Config) -> dict[str, float]:
+    """Parameters that follow from others, by name: a stage that declares one does not depend on the others.
+
+    ``roof_clearance_or_spacing`` and ``roof_group_or_spacing`` (m) are at least the least vertical spacing of the
+    adaptive mesher: heights closer than that cannot both be exact in a column.
+    """
+    spacing = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
+    return {
+        "layer_height_or_default": config.layer_height_or_default,
+        "roof_clearance_or_spacing": max(config.roof_clearance, spacing),
+        "roof_group_or_spacing": max(config.roof_group, spacing),
+    }
+
+
 def city_options(given: Any) -> CityOptions:
     """Options of steps 1.4 to 2.3; `given` has the parameters as attributes."""
-    # Heights closer than the least spacing cannot both be exact in a column.
-    gap = given.least_spacing * given.mesh_size if given.mesher == "adaptive" else 0.0
     return CityOptions(
         min_building_area=given.min_building_area,
         vertex_tolerance=given.vertex_tolerance,
@@ -34,14 +47,14 @@ def city_options(given: Any) -> CityOptions:
         ground_percentile=given.ground_percentile,
         roof_percentile=given.roof_percentile if given.roof_height == "percentile" else 50.0,
         default_height=given.default_height,
-        roof_clearance=max(given.roof_clearance, gap),
+        roof_clearance=given.roof_clearance_or_spacing,
         border="clip" if given.border == "clip" else "drop",
         simplify="paper" if given.simplify == "paper" else "clearance",
         clearance=given.clearance,
         clearance_floor=given.clearance_floor,
         min_courtyard_area=given.min_courtyard_area,
         split_levels=given.split_levels,
-        roof_group=max(given.roof_group, gap),
+        roof_group=given.roof_group_or_spacing,
         manifold=given.manifold,
     )
 

@@ -1,33 +1,39 @@
-"""The folder of a run: refuse what is not ours or finished, go on where a run ended early, or start anew."""
+"""The folder of a run: refuse what is not ours, bring the results of an earlier run up to date, or start anew."""
 
-import errno
-import fcntl
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, OutputError
+from tiler.limits import TASKS
 from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL
+from tiler.store import MANIFEST
 
-# What a run writes, and all that --overwrite removes.
+# What a run writes, and all that --overwrite removes; the record is replaced.
 INDEXES = ("mesh.pvtu", "boundary.pvtp")
 PIECES = {"mesh": ".vtu", "boundary": ".vtp"}
-RESULTS = ("run.json", CITY_MODEL, FULL_CITY_MODEL, *INDEXES, *PIECES, "store.zarr")
-UNFINISHED = ("running", "failed")
+RUN_RECORD, PROGRESS, STORE = "run.json", "progress.json", "store.zarr"
+MANIFEST_PATH = f"{STORE}/{MANIFEST}"
+RESULTS = (
+    *(RUN_RECORD, PROGRESS, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
+    *(*INDEXES, *PIECES, STORE, TASKS, "only"),
+)
+# A file on its way to its place, of a writer that was killed: see `tiler.atomic`.
+PART = ".{stem}.*.part{suffix}"
 
 
 def check_folder(out: Path, *, overwrite: bool) -> list[str]:
-    """Refuse an output folder that holds something to keep.
+    """Refuse an output folder that holds something of others.
 
     Parameters
     ----------
     out : Path
         The folder; made if it is missing.
     overwrite : bool
-        Results of a finished run may be replaced.
+        The record of the earlier run need not be readable.
 
     Returns
     -------
@@ -37,16 +43,19 @@ def check_folder(out: Path, *, overwrite: bool) -> list[str]:
     Raises
     ------
     ConfigError
-        If it cannot be written, holds results without the record of a run, or those of a finished run.
+        If it cannot be written, or holds results without the record of a run; or if it, or a folder of results in
+        it, is a symbolic link: what is removed there would be somewhere else.
     """
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; give another --out")
+    refuse_links(out)
     earlier = [name for name in RESULTS if (out / name).exists()]
-    if earlier and not (out / "run.json").is_file():
+    if earlier and not _is_ours(out):
         raise ConfigError(f"{out}: holds {', '.join(earlier)}, but no run.json of a run; give another --out")
-    if earlier and not overwrite and not _is_unfinished(out / "run.json"):
+    if earlier and not overwrite and not _has_record(out):
         raise ConfigError(
-            f"{out}: holds the results of another run ({', '.join(earlier)}); give another --out, or --overwrite"
+            f"{out / RUN_RECORD}: is not the record of a run; give another --out, or --overwrite to remove "
+            f"{', '.join(earlier)}"
         )
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -58,7 +67,9 @@ def check_folder(out: Path, *, overwrite: bool) -> list[str]:
 
 
 def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
-    """Make the folders of a run; of an unfinished one only the indexes go, and its results are used again.
+    """Make the folders of a run, and take away the indexes of an earlier one: what they name is about to change.
+
+    ``run.json`` stays: it must say before this that a run is at work. Other results are used again.
 
     Parameters
     ----------
@@ -67,16 +78,19 @@ def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
     earlier : sequence of str
         From `check_folder`.
     overwrite : bool
-        Remove all results of the earlier run.
+        Remove all other results of the earlier run too.
 
     Raises
     ------
     ConfigError
         If it cannot be written.
     """
+    refuse_links(out)
     try:
-        for name in earlier if overwrite else set(INDEXES) & set(earlier):
+        for name in RESULTS if overwrite else INDEXES:
             path = out / name
+            if name == RUN_RECORD or name not in earlier:
+                continue
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         for folder in PIECES:
             (out / folder).mkdir(exist_ok=True)
@@ -85,42 +99,79 @@ def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
 
 
 def remove_strangers(out: Path, tiles: Collection[str]) -> None:
-    """Remove pieces that an unfinished run has left for tiles which are not of this one."""
+    """Remove what earlier runs have left: pieces of tiles that are gone, and files that were never finished.
+
+    Raises
+    ------
+    OutputError
+        If one cannot be removed.
+    """
+    refuse_links(out)
+    try:
+        _remove_strangers(out, tiles)
+    except OSError as error:
+        raise OutputError(
+            f"{error.filename}: cannot be removed ({error.strerror}); check its permissions"
+        ) from error
+
+
+def _remove_strangers(out: Path, tiles: Collection[str]) -> None:
     for folder, suffix in PIECES.items():
         for path in (out / folder).glob(f"*{suffix}"):
             if path.stem not in tiles:
                 path.unlink()
+    for name in map(Path, RESULTS):
+        for path in out.glob(PART.format(stem=name.stem, suffix=name.suffix)):
+            if path.is_file():
+                path.unlink()
 
 
-@contextmanager
-def only_run(out: Path) -> Iterator[None]:
-    """Hold a folder for one run at a time; the hold ends with the process, however it ends.
+def refuse_links(out: Path) -> None:
+    """Raise ConfigError if the folder of a run, or a folder of results in it, is a symbolic link."""
+    store = out / STORE
+    stages = sorted(store.iterdir()) if store.is_dir() and not store.is_symlink() else []
+    for path in (out, *(out / name for name in RESULTS), *stages):
+        if path.is_symlink():
+            raise ConfigError(
+                f"{path}: is a symbolic link to {os.readlink(path)}; give the folder itself as --out, or remove "
+                "the link"
+            )
+
+
+def refuse_inputs_within(out: Path, inputs: Iterable[Path]) -> None:
+    """Refuse inputs that lie where a run writes and `clear_folder` removes.
 
     Raises
     ------
     ConfigError
-        If another run is at work there.
-
-    Notes
-    -----
-    A lock of the system on the folder. Where its file system knows no locks, there is none.
+        With the first such input.
     """
-    held = os.open(out, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in {errno.EWOULDBLOCK, errno.EACCES}:
-                raise ConfigError(
-                    f"{out}: another run is at work there; wait for its end, or give another --out"
-                ) from error
-        yield
-    finally:
-        os.close(held)
+    own = [Path(os.path.realpath(out / name)) for name in RESULTS]
+    for path in inputs:
+        real = Path(os.path.realpath(path))
+        if any(real.is_relative_to(place) for place in own):
+            raise ConfigError(f"{path}: an input lies among the results in {out}; move it, or give another --out")
 
 
-def _is_unfinished(path: Path) -> bool:
+def _is_ours(out: Path) -> bool:
+    """Tell whether a run has been in a folder: a lost record is mended."""
+    return any((out / name).is_file() for name in (RUN_RECORD, PROGRESS, MANIFEST_PATH))
+
+
+def _has_record(out: Path) -> bool:
+    """Tell whether some file says what run it was; a damaged one is mended."""
+    if (out / MANIFEST_PATH).is_file():
+        return True
+    return any(
+        isinstance(found.get("status"), str) and "schema" in found
+        for found in (_read_object(out / name) for name in (RUN_RECORD, PROGRESS))
+    )
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    """Read a JSON object; an empty one where there is none."""
     try:
-        return json.loads(path.read_text())["status"] in UNFINISHED
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}

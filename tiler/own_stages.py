@@ -7,14 +7,13 @@ from typing import Any
 
 from tiler.config import Config
 from tiler.engine import Engine
+from tiler.options import derived_parameters
 from tiler.stage import Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
-
-DERIVED = ("layer_height_or_default", "footprints_identity")  # parameters that a run adds to those of its Config
 
 
 @dataclass(frozen=True)
@@ -33,6 +32,13 @@ class OwnStages:
     parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
+def list_stages(config: Config) -> list[Stage]:
+    """List the stages of a run in their order, as if its clusters of houses were simplified once."""
+    stages = [*input_stages(config), house_stage(config), *first_round(config), shape_stage(0)]
+    stages += [*later_round(config, 1), model_stage(config, 0), *city_model_stages(), *mesh_stages(config)]
+    return stages + piece_stages(config)
+
+
 def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, Any] | None) -> OwnStages:
     """Take stages and parameters of the user's own.
 
@@ -42,15 +48,12 @@ def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, 
         If a stage has the name of one of ours, or a parameter that of one of the run.
     """
     own = OwnStages(tuple(stages), dict(parameters or {}))
-    ours = [*input_stages(config), house_stage(config, 0.0), *first_round(config), shape_stage(0)]
-    ours += [*later_round(config, 1), model_stage(config, 0), *city_model_stages(), *mesh_stages(config)]
-    ours += piece_stages(config)
     # Rounds of simplification are numbered: near-0, near-1, and so on.
-    names = {stage.name.rstrip("0123456789") for stage in ours}
+    names = {stage.name.rstrip("0123456789") for stage in list_stages(config)}
     taken = sorted(stage.name for stage in own.stages if stage.name.rstrip("0123456789") in names)
     if taken:
         raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")
-    given = {*dataclasses.asdict(config), *DERIVED}
+    given = {*dataclasses.asdict(config), *derived_parameters(config), "footprints_identity"}
     clash = sorted(own.parameters.keys() & given)
     if clash:
         raise ValueError(f"parameter {', '.join(clash)}: the run has one of this name; name yours otherwise")

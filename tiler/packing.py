@@ -1,5 +1,6 @@
 """What the store writes of an array: plain little-endian rows, and a checksum for every chunk of them."""
 
+import math
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,6 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 CHUNK_BYTES = 4 * 2**20  # about what one read or write moves at a time
 PACKED_BYTES = 32 * 2**10  # smaller arrays share one array of bytes: an array of its own costs 3 ms to write
 INLINE_BYTES = 16 * 2**10  # and if all of them are smaller than this, that one is spared too
+BLOSC_VERSIONS = (1, 2)  # of its format, in the first byte
+CHUNK_HEAD = 16  # bytes of the header of a Blosc chunk
+MOST_ROW = 2**30  # bytes; the longest row of a terrain has some 10^5
+MOST_AXES = 8
+DTYPE = re.compile(r"[<|][biuf][1248]|[<|]b1|<U[1-9][0-9]{0,6}")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 Table = dict[str, dict[str, Any]]
@@ -92,6 +98,57 @@ def pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], Table]:
         offset += array.nbytes
     parts = [raw_bytes(array) for _, array in sorted(arrays.items())]
     return np.concatenate(parts) if parts else np.empty(0, np.uint8), table
+
+
+def check_entry(entry: Mapping[str, Any]) -> None:
+    """Check what a store says of an array before anything is allocated by it.
+
+    Raises
+    ------
+    ValueError, KeyError, TypeError
+        If type, shape, chunks or checksums are none that `pack` and the store write.
+    """
+    dtype, shape = str(entry["dtype"]), entry["shape"]
+    if not DTYPE.fullmatch(dtype):
+        raise ValueError(f"type {dtype[:20]!r}")
+    if not (isinstance(shape, list) and len(shape) <= MOST_AXES and all(type(n) is int and n >= 0 for n in shape)):
+        raise ValueError(f"shape {str(shape)[:100]}")
+    if "offset" in entry:
+        if type(entry["offset"]) is not int or entry["offset"] < 0:
+            raise ValueError("place in the packed bytes")
+        return
+    chunk, row_bytes = entry["chunk"], np.dtype(dtype).itemsize * math.prod(max(n, 1) for n in shape[1:])
+    if type(chunk) is not int or not 1 <= chunk * row_bytes <= max(CHUNK_BYTES, min(row_bytes, MOST_ROW)):
+        raise ValueError(f"chunks of {chunk} rows of {row_bytes} bytes")
+    if len(entry["crc"]) != -(-shape[0] // chunk):
+        raise ValueError(f"{len(entry['crc'])} checksums for {shape[0]} rows in chunks of {chunk}")
+
+
+def check_chunk(head: bytes, n_bytes: int) -> None:
+    """Check that a compressed chunk unpacks to the bytes that it should, before it is.
+
+    Parameters
+    ----------
+    head : bytes
+        Its first `CHUNK_HEAD` bytes.
+    n_bytes : int
+        Uncompressed size that is expected.
+
+    Raises
+    ------
+    ValueError
+        If it is no Blosc chunk, or one of another size.
+
+    References
+    ----------
+    Blosc, "README_CHUNK_FORMAT": after four bytes of versions and flags come the uncompressed size, the size of a
+    block, and the compressed size, 32 bits each.
+    """
+    if len(head) < CHUNK_HEAD or head[0] not in BLOSC_VERSIONS:
+        raise ValueError("is not compressed by Blosc")
+    claimed = int.from_bytes(head[4:8], "little")
+    if claimed != n_bytes:
+        raise ValueError(f"a chunk claims {claimed} bytes instead of {n_bytes}")
 
 
 def unpack(packed: NDArray[np.uint8], entry: Mapping[str, Any]) -> NDArray[Any]:

@@ -122,7 +122,9 @@ def find_refs(stage: Stage, items: Items, source: str, reach: Items, *, everythi
         pairs = np.stack([np.repeat(np.arange(n_items), len(there)), np.tile(there, n_items)])
     else:
         tree = shapely.STRtree(shapely.box(*reach.boxes[there].T))
-        found = [_query(tree, items.boxes, read.halo) for read in stage.reads if read.stage == source]
+        found = [
+            _query(tree, items.boxes, reach.boxes[there], read) for read in stage.reads if read.stage == source
+        ]
         pairs = np.concatenate([np.empty((2, 0), np.int64), *found], axis=1)
         pairs[1] = there[pairs[1]] if len(there) else pairs[1]
     return _make_refs(source, pairs, n_items, n_source)
@@ -201,10 +203,17 @@ def joined_reads(stage: Stage) -> list[tuple[str, list[Read]]]:
     return [(name, [read for read in stage.reads if read.stage == name]) for name in names]
 
 
-def _query(tree: shapely.STRtree, boxes: NDArray[np.float64], halo: float) -> NDArray[np.int64]:
+def _query(
+    tree: shapely.STRtree, boxes: NDArray[np.float64], reached: NDArray[np.float64], read: Read
+) -> NDArray[np.int64]:
+    """Find the pairs (2, k) of rows of `boxes` and of `reached`, which are the tree's, that a read joins."""
     some = np.flatnonzero(~np.isnan(boxes[:, 0]))
-    grown = boxes[some] + np.array([-halo, -halo, halo, halo])
+    grown = boxes[some] + read.halo * np.array([-1, -1, 1, 1])
     pairs: NDArray[np.int64] = np.asarray(tree.query(shapely.box(*grown.T)), dtype=np.int64)
+    if read.beside:
+        one, other = grown[pairs[0]], reached[pairs[1]]
+        common = np.minimum(one[:, 2:], other[:, 2:]) - np.maximum(one[:, :2], other[:, :2])
+        pairs = pairs[:, (common > 0).any(axis=1)]
     pairs[0] = some[pairs[0]] if len(some) else pairs[0]
     return pairs
 

@@ -17,7 +17,9 @@ from tiler.atomic import replacing
 from tiler.config import Config
 from tiler.footprint_sample import FootprintSample, sample_footprints
 from tiler.forecast import CELLS_A_POINT, Forecast, forecast_run
+from tiler.limits import machine_memory
 from tiler.planning import Survey, check_sources, survey_inputs
+from tiler.terminal import plain
 
 SCHEMA = 1  # version of the JSON file's layout
 WORKERS = (1, 4, 16, 64)  # numbers of workers that times are given for, besides the one asked for
@@ -71,13 +73,6 @@ def plan_run(
 
         draw_plan(survey, sample, picture)
     return plan
-
-
-def machine_memory() -> float:
-    """Tell how much memory this machine, or its container, has (bytes)."""
-    from distributed.system import MEMORY_LIMIT
-
-    return float(MEMORY_LIMIT)
 
 
 def describe_plan(
@@ -206,7 +201,7 @@ def _print_plan(plan: dict[str, Any], console: Console) -> None:
     table.add_column(width=LABEL, style="bold")
     table.add_column(overflow="fold")
     for label, text in rows:
-        table.add_row(label, text)
+        table.add_row(label, plain(text))
     console.print(table)
 
 

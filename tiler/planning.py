@@ -2,8 +2,8 @@
 
 import math
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
@@ -11,9 +11,9 @@ from pipeline.errors import ConfigError, InputError
 from stitch.grid import TileGrid, make_grid, tiles_present
 from tiler.clouds import CloudHeader, find_clouds, read_header
 from tiler.config import Config, idle_parameters
-from tiler.context import choose_tiles, make_layout, pack_tiles
+from tiler.context import choose_tiles, make_layout, tile_key
 from tiler.crs import resolve_crs
-from tiler.region import Region, check_region, choose_bounds, describe_overhang
+from tiler.region import Region, check_region, check_sizes, choose_bounds, describe_overhang
 from tiler.stage import FileItem, Layout
 from tiler.vectors import read_footprint_crs
 
@@ -36,6 +36,8 @@ class Plan:
         Tiles, those without any point cloud left out.
     layout : Layout
         Items of every scope.
+    survey : Survey
+        What it was made of, all tiles included.
     """
 
     region: Region
@@ -44,6 +46,7 @@ class Plan:
     unreadable: dict[str, str]
     grid: TileGrid
     layout: Layout
+    survey: "Survey"
 
 
 @dataclass(frozen=True)
@@ -96,10 +99,19 @@ def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
         If an input is missing or unreadable, or does not fit the others.
     """
     found = survey_inputs(config, say)
-    # Which tiles are absent shows in the results of those beside them.
-    identity = f"{found.region.crs} {pack_tiles(found.grid).hex()}"
-    layout = make_layout(found.grid, file_items(found.clouds), identity=identity)
-    return Plan(found.region, found.headers, found.messages, found.unreadable, found.grid, layout)
+    layout = make_layout(found.grid, file_items(found.clouds), identity=found.region.crs)
+    return Plan(found.region, found.headers, found.messages, found.unreadable, found.grid, layout, found)
+
+
+def leave_out(plan: Plan, tiles: Collection[str], files: Collection[str]) -> Plan:
+    """Plan the same run without some tiles and files, by name: the others keep their results."""
+    present = tiles_present(plan.grid).copy()
+    for tile in tiles:
+        key = tile_key(tile)
+        present[key.i - plan.grid.first.i, key.j - plan.grid.first.j] = False
+    grid = replace(plan.grid, present=present)
+    kept = {name: item for name, item in plan.layout.files.items() if name not in files}
+    return replace(plan, grid=grid, layout=make_layout(grid, kept, identity=plan.layout.identity))
 
 
 def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
@@ -118,6 +130,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
         choose_bounds(config.bounds, headers), f"EPSG:{code}" if code else crs.to_wkt(), config.tile_size
     )
     check_region(region, config.mesh_size, headers)
+    check_sizes(region, config)
     clouds = [header for header in headers if header.n_points and _meets(header, region)]
     whole = make_grid(region.bounds, tile_size=config.tile_size, mesh_size=config.mesh_size)
     grid = choose_tiles(whole, [header.bounds[:4] for header in clouds])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.building_points import NEVER_ROOF
 from pipeline.citymodel import Footprints
 from pipeline.ground_filter import FILTER_REACH, classify_ground
+from pipeline.las_points import cut_units
 from pipeline.pointcloud import BUILDING, PointCloud
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
 from pipeline.terrain import join_terrain
@@ -21,8 +22,6 @@ from tiler.ingest import CELL, crop_cloud
 from tiler.stage import Box
 from tiler.tables import Buildings, join_buildings, take_buildings, unpack_buildings
 from tiler.task import Task
-
-GAP_ROWS = 50_000  # ranges of points closer than this are read as one
 
 
 def grow(box: Box, by: float) -> Box:
@@ -54,21 +53,21 @@ def read_cloud(task: Task, box: Box, *, ground_filter: bool = False) -> PointClo
         are not ground, water, vegetation or noise.
     """
     wide = clip(grow(box, FILTER_REACH), task.context.bounds) if ground_filter else box
-    parts = [PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))]
+    places, classes = [np.empty((0, 3))], [np.empty(0, np.uint8)]
     marks = [True]
     for name in task.refs["points"]:
-        found, marked_file = _read_ranges(task, name, wide)
-        parts += found
-        marks += [marked_file] * len(found)
-    cloud = PointCloud(
-        np.concatenate([part.xyz for part in parts]), np.concatenate([part.classification for part in parts])
-    )
-    marked = np.repeat(marks, [len(part.xyz) for part in parts])
+        found, marked_file = _read_file(task, name, wide)
+        places.append(found.xyz)
+        classes.append(found.classification)
+        marks.append(marked_file)
+    cloud = PointCloud(np.concatenate(places), np.concatenate(classes))
     if ground_filter:
         cloud = classify_ground(cloud, bounds=wide)
-    roof = ~marked & ~np.isin(cloud.classification, NEVER_ROOF)
-    classes = np.where(roof, BUILDING, cloud.classification).astype(np.uint8)
-    return crop_cloud(PointCloud(cloud.xyz, classes), box)
+    if not all(marks):
+        marked = np.repeat(marks, [len(xyz) for xyz in places])
+        roof = ~marked & ~np.isin(cloud.classification, NEVER_ROOF)
+        cloud = PointCloud(cloud.xyz, np.where(roof, BUILDING, cloud.classification).astype(np.uint8))
+    return crop_cloud(cloud, box) if ground_filter else cloud
 
 
 def read_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm:
@@ -117,31 +116,29 @@ def read_buildings(task: Task, box: Box) -> Buildings:
     return join_buildings(near)
 
 
-def _read_ranges(task: Task, name: str, box: Box) -> tuple[list[PointCloud], bool]:
+def _read_file(task: Task, name: str, box: Box) -> tuple[PointCloud, bool]:
     """Read the points of a file in cells that meet a box, cropped to it; also whether it marks buildings."""
-    arrays, attributes = task.store.read("points", name, names=("cell", "cell_row", "block", "end"))
-    row = np.append(arrays["cell_row"], arrays["end"])
-    parts = []
-    for first, last in _ranges_of_blocks(arrays["cell"], row, arrays["block"], box):
-        xyz = task.read_rows("points", name, "xyz", first, last)
-        classification = task.read_rows("points", name, "classification", first, last)
-        parts.append(crop_cloud(PointCloud(xyz, classification), box))
-    return parts, attributes["facts"]["marks_buildings"]
+    facts = task.store.attributes("points", name)["facts"]
+    if facts["unreadable"]:
+        return PointCloud(np.empty((0, 3)), np.empty(0, np.uint8)), True
+    arrays, _ = task.store.read("points", name, names=("cell", "cell_row", "block", "end"))
+    ranges = _ranges_of_blocks(arrays["cell"], np.append(arrays["cell_row"], arrays["end"]), arrays["block"], box)
+    rows = task.read_ranges("points", name, ("units", "classification"), ranges)
+    scale, offset = tuple(facts["scale"]), tuple(facts["offset"])
+    cut = cut_units(rows["units"], rows["classification"], scale, offset, box)
+    return PointCloud(*cut), facts["marks_buildings"]
 
 
 def _ranges_of_blocks(
     cell: NDArray[np.int64], row: NDArray[np.int64], block: NDArray[np.int64], box: Box
-) -> Iterator[tuple[int, int]]:
-    """Ranges of rows to read; close ones are joined, as whole chunks are read anyway."""
-    ranges: list[tuple[int, int]] = []
-    for first, last in zip(block[:-1].tolist(), block[1:].tolist(), strict=True):
-        start = row[first : last + 1]
-        for begin, end in select_cells(cell[first:last], start, box, size=CELL):
-            if ranges and begin - ranges[-1][1] < GAP_ROWS:
-                ranges[-1] = (ranges[-1][0], end)
-            else:
-                ranges.append((begin, end))
-    yield from ranges
+) -> list[tuple[int, int]]:
+    """Ranges of rows to read, ascending."""
+    blocks = pairwise(block.tolist())
+    return [
+        found
+        for first, last in blocks
+        for found in select_cells(cell[first:last], row[first : last + 1], box, size=CELL)
+    ]
 
 
 def _read_rasters(task: Task, stage: str) -> Iterator[Dtm]:

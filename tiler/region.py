@@ -6,9 +6,14 @@ from dataclasses import dataclass
 
 from pipeline.errors import ConfigError, InputError
 from stitch.grid import LEAST_TILE
+from stitch.numbering import MOST_TILES
 from tiler.clouds import CloudHeader
+from tiler.config import Config
 
 ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray points ...
+MOST_IN_ALL = 10_000_000  # tiles of the region's box; half a million make a country
+MOST_NODES = 400_000_000  # of the terrain of one tile, 8 bytes each
+MOST_CELLS = 2**31  # of one tile, whose local indices have 32 bits
 SPARSEST = 100.0  # m2; ... where it has fewer points than one in this area
 
 Bounds = tuple[float, float, float, float]
@@ -71,8 +76,46 @@ def describe_overhang(bounds: Bounds, clouds: Sequence[CloudHeader]) -> list[str
     return [f"the region reaches beyond the point clouds ({sides}); terrain is carried on there"] if sides else []
 
 
+def check_sizes(region: Region, config: Config) -> None:
+    """Refuse a region of more tiles, or tiles of more terrain or cells, than can be counted.
+
+    A slip in one number, or a header that nobody checked, would otherwise take all memory before the first point.
+
+    Raises
+    ------
+    ConfigError
+        With the number against its bound.
+
+    Notes
+    -----
+    The cells are the fewest that an empty tile has: three for each triangle and level, at the largest spacing.
+    """
+    width, height = region.bounds[2] - region.bounds[0], region.bounds[3] - region.bounds[1]
+    n_tiles = math.ceil(width / region.tile_size) * math.ceil(height / region.tile_size)
+    if n_tiles > MOST_IN_ALL:
+        raise ConfigError(
+            f"region {_words(region.bounds)}: {n_tiles:.3g} tiles of {region.tile_size:g} m > {MOST_IN_ALL:.3g}; "
+            "raise --tile-size or give smaller --bounds"
+        )
+    area = min(width, 1.5 * region.tile_size) * min(height, 1.5 * region.tile_size)
+    nodes = area / config.dtm_spacing**2 if config.dtm_spacing > 1e-9 else math.inf
+    if nodes > MOST_NODES:
+        raise ConfigError(
+            f"dtm_spacing = {config.dtm_spacing:g} m: {nodes:.3g} nodes in a tile of {region.tile_size:g} m > "
+            f"{MOST_NODES:.3g}; raise --dtm-spacing or lower --tile-size"
+        )
+    layered = config.mesher == "layered"
+    spacing = config.layer_height_or_default if layered else config.most_spacing * config.mesh_size
+    cells = 6 * area / config.mesh_size**2 * config.domain_height / spacing
+    if cells > MOST_CELLS:
+        raise ConfigError(
+            f"mesh_size = {config.mesh_size:g} m: at least {cells:.3g} cells in a tile of {region.tile_size:g} m "
+            f"> {MOST_CELLS:.3g}; raise --mesh-size, or lower --tile-size or --domain-height"
+        )
+
+
 def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]) -> None:
-    """Refuse a region that is smaller than a cell, or tiles that are too small for the cells.
+    """Refuse a region that is smaller than a cell, or tiles that are too small for the cells or too many.
 
     A single file that is much larger than a tile is named: a few astray points make its extent absurd.
 
@@ -101,6 +144,12 @@ def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]
                 f"{region.tile_size:g} m, with {cloud.n_points} points; if points lie astray in it, give --bounds "
                 "around the others"
             )
+    least = math.ceil(max(width, height) / (MOST_TILES - 1))
+    if max(width, height) > (MOST_TILES - 1) * region.tile_size:
+        raise ConfigError(
+            f"region {_words(region.bounds)}: more than {MOST_TILES - 1} tiles of {region.tile_size:g} m to a "
+            f"side; give --tile-size {least} or more, or smaller --bounds"
+        )
 
 
 def _words(bounds: Sequence[float]) -> str:

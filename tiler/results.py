@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.mesh import ColumnMesh, PlaneMesh
-from pipeline.raster import Dtm, NodeWindow, grow_window, hull_windows, node_window, sample_dtm, windows_meet
+from pipeline.raster import Dtm, NodeWindow, grow_window, node_window, sample_dtm
 from pipeline.terrain import join_terrain
 from tiler.store import Store
 
@@ -56,14 +56,17 @@ class StoredTerrain:
 
     def __init__(self, path: Path) -> None:
         self._store = Store(path)
-        facts = {name: self._store.attributes("terrain", name)["facts"] for name in self._store.names("terrain")}
-        if not facts:
+        self._names = np.array(self._store.names("terrain"), np.str_)
+        if not len(self._names):
             raise InputError(f"{path}: holds no terrain; run citystitch again")
-        self._windows = {
-            name: NodeWindow(fact["i0"], fact["j0"], fact["nx"], fact["ny"]) for name, fact in facts.items()
-        }
-        self._region = hull_windows(list(self._windows.values()))
-        self._spacing = float(next(iter(facts.values()))["spacing"])
+        self._windows = np.empty((len(self._names), 4), np.int64)  # i0, j0, nx, ny
+        for k, name in enumerate(self._names.tolist()):
+            facts = self._store.attributes("terrain", name)["facts"]
+            self._windows[k] = [facts[part] for part in ("i0", "j0", "nx", "ny")]
+        self._spacing = float(facts["spacing"])
+        some = self._windows[(self._windows[:, 2:] > 0).all(axis=1)]
+        low, high = some[:, :2].min(axis=0), (some[:, :2] + some[:, 2:]).max(axis=0)
+        self._region = NodeWindow(*low.tolist(), *(high - low).tolist())
         self._chunks: dict[str, Dtm] = {}
 
     def sample(self, xy: NDArray[np.float64], /) -> NDArray[np.float64]:
@@ -73,14 +76,19 @@ class StoredTerrain:
         low, high = xy.min(axis=0), xy.max(axis=0)
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
         window = grow_window(node_window(box, self._spacing), 0, within=self._region)
-        parts = [self._chunk(name) for name, own in self._windows.items() if windows_meet(own, window)]
+        low, size = self._windows[:, :2], self._windows[:, 2:]
+        begin, end = (window.i0, window.j0), (window.i0 + window.nx, window.j0 + window.ny)
+        met = ((low < end) & (low + size > begin) & (size > 0)).all(axis=1)
+        parts = [self._chunk(k) for k in np.flatnonzero(met).tolist()]
         return sample_dtm(join_terrain(parts, window), xy)
 
-    def _chunk(self, name: str) -> Dtm:
-        if name not in self._chunks:
+    def _chunk(self, k: int) -> Dtm:
+        name = str(self._names[k])
+        chunk = self._chunks.pop(name, None)
+        if chunk is None:
             while len(self._chunks) >= KEPT_CHUNKS:
                 del self._chunks[next(iter(self._chunks))]
-            window = self._windows[name]
-            z = self._store.read("terrain", name)[0]["z"]
-            self._chunks[name] = Dtm(z, window.i0, window.j0, self._spacing)
-        return self._chunks[name]
+            i0, j0 = self._windows[k, :2].tolist()
+            chunk = Dtm(self._store.read("terrain", name)[0]["z"], i0, j0, self._spacing)
+        self._chunks[name] = chunk  # the youngest is the last
+        return chunk

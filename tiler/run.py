@@ -3,37 +3,66 @@
 import dataclasses
 import json
 import platform
+import shutil
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from pipeline.errors import CityError
+from pipeline.errors import CityError, OutputError
+from stitch.grid import seams_of_tile
 from tiler.atomic import replacing
+from tiler.audit import Audit
 from tiler.config import Config
-from tiler.context import RunContext, pack_tiles
-from tiler.engine import Engine
-from tiler.executors import Executor, connect, local, serial
-from tiler.out_folder import check_folder, clear_folder, only_run, remove_strangers
-from tiler.own_stages import OwnStages, check_own, run_own_stages
+from tiler.context import RunContext, pack_tiles, seam_name, tile_key
+from tiler.engine import Engine, Progress, StoppedError
+from tiler.executors import Executor, connect, local, serial, share_memory
+from tiler.failures import Policy
+from tiler.folder_lock import only_run
+from tiler.forecast import warn_of_memory
+from tiler.keys import code_versions
+from tiler.limits import TASKS, Limits, machine_memory
+from tiler.manifest import find_remade, write_manifest
+from tiler.options import derived_parameters
+from tiler.out_folder import (
+    INDEXES,
+    MANIFEST_PATH,
+    PIECES,
+    RUN_RECORD,
+    STORE,
+    check_folder,
+    clear_folder,
+    refuse_inputs_within,
+    remove_strangers,
+)
+from tiler.own_stages import OwnStages, check_own, list_stages, run_own_stages
 from tiler.planning import Plan, check_sources, identify, make_plan
+from tiler.progress import Announce, RunProgress
+from tiler.quarantine import (
+    HolesError,
+    Missing,
+    config_alone,
+    find_missing,
+    leave_holes,
+    save_config,
+    stop_at_holes,
+)
+from tiler.seal import seal
 from tiler.stage import REGION_ITEM, Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
-from tiler.summary import summarise_run
-from tiler.task import Record, peak_memory
+from tiler.stopping import stops
+from tiler.summary import describe_tasks, summarise_run
+from tiler.task import peak_memory
 from tiler.vtk_files import write_pvtp, write_pvtu
+from tiler.written import state_files
 
 SCHEMA = 1  # version of run.json's layout
-LIBRARIES = ("citystitch", "numpy", "scipy", "shapely", "numba", "triangle", "laspy", "lazrs", "pyogrio", "pyproj")
-Announce = Callable[[str, float], None]
 
 
 def run(
@@ -73,41 +102,64 @@ def run(
 
     Notes
     -----
-    A folder that holds an unfinished run is gone on with: what is in its store already, and has the same key, is
-    not computed again. Results are the same as without the interruption, byte for byte.
+    A folder that holds an earlier run, finished or not, is brought up to date: what is in its store, and has the
+    same key, is not computed again. Results are those of a run into an empty folder, byte for byte. Every byte
+    that is used again is held against its checksum first; what is damaged is computed anew and noted
+    (``damaged-artefact``).
     """
     check_sources(config)
     out = Path(config.out)
     own = check_own(config, stages, parameters)
     check_folder(out, overwrite=config.overwrite)
-    with only_run(out):
+    with only_run(out, say):
         earlier = check_folder(out, overwrite=config.overwrite)
-        return _run(config, out, earlier, own, announce, say or _silent)
+        damage = _find_damage(out) if earlier and not config.overwrite else {}
+        return _run(config, out, earlier, damage, own, announce, say or _silent)
 
 
 def _run(
     config: Config,
     out: Path,
     earlier: list[str],
+    damage: Mapping[str, str],
     own: OwnStages,
     announce: Announce | None,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    start = time.perf_counter()
+    start, untouched = time.perf_counter(), bool(earlier)
     record: dict[str, Any] = {
         "schema": SCHEMA,
+        "checksum": "0" * 8,
         "status": "running",
         "parameters": dataclasses.asdict(config),
-        "versions": {"python": platform.python_version()} | {name: _version(name) for name in LIBRARIES},
+        "versions": {"python": platform.python_version()} | dict(code_versions()),
     }
+    progress: RunProgress | None = None
+    failed = True
     try:
-        # Nothing of an earlier run is touched before the inputs are known to be there.
+        # Nothing of an earlier run is touched before the inputs are known to be there; then, before anything else
+        # changes, its record no longer says that it is done.
         plan = make_plan(config, say)
-        clear_folder(out, earlier, overwrite=config.overwrite)
-        earlier = []
+        vectors = [Path(config.footprints)] if config.footprints else []
+        for warning in _foresee(plan, config):
+            plan.messages.append(warning)
+            say(warning)
+        refuse_inputs_within(out, [*(header.path for header in plan.headers), *vectors])
+        untouched = False
         _write_record(out, record)
-        record |= _mesh_region(config, out, plan, own, announce)
+        clear_folder(out, earlier, overwrite=config.overwrite)
+        shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
+        save_config(config, out)
+        progress = _begin_progress(config, out, plan, own, announce)
+        record |= _mesh_region(config, out, plan, own, progress, damage, say)
+        for message in record["messages"][len(plan.messages) :]:
+            say(message)
         record["status"] = "done"
+        say(describe_tasks(record["tasks"]))
+        failed = False
+    except StoppedError as error:
+        record |= {"status": "stopped", "error": str(error)}
+        raise
     except CityError as error:
         record |= {"status": "failed", "error": str(error)}
         raise
@@ -116,15 +168,70 @@ def _run(
         raise
     finally:
         record["seconds_total"] = round(time.perf_counter() - start, 3)
-        if not earlier:
-            _write_record(out, record)
+        # Where an error is told already, that its record cannot be written either would only hide it.
+        with suppress(OutputError) if failed else nullcontext():
+            if not untouched:
+                _write_record(out, record)
+            if progress is not None:
+                progress.write(record["status"], record.get("error", ""))
     return record
 
 
 def _mesh_region(
-    config: Config, out: Path, plan: Plan, own: OwnStages, announce: Announce | None
+    config: Config,
+    out: Path,
+    plan: Plan,
+    own: OwnStages,
+    progress: RunProgress,
+    damage: Mapping[str, str],
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Run all stages, and write the indexes of their pieces."""
+    """Run all stages, and write the indexes of their pieces and the manifest.
+
+    Where a file or a tile fails on the way to the city model, the region is planned again without it: what that
+    does not touch has its result already. Where one fails later, its neighbours keep the seam with it.
+    """
+    missing = Missing()
+    with _executor(config) as executor:
+        while True:
+            engine = make_engine(config, out, plan, executor, own, progress)
+            with stops(engine.stop, say):
+                try:
+                    rounds = run_stages(engine, config)
+                except HolesError:
+                    plan, missing = leave_holes(plan, missing, engine)
+                    say(f"left out so far: {', '.join(sorted(missing.tiles))}; going on with the rest")
+                    continue
+                run_own_stages(engine, own)
+            break
+    missing = find_missing(plan, missing, engine)
+    remade = {
+        f"{STORE}/{stage}/{name}": what
+        for (stage, name), what in find_remade(out / MANIFEST_PATH, engine.records).items()
+    }
+    engine.prune()
+    engine.store.remove_strays()
+    tiles = sorted(plan.layout.tiles.keys() - missing.tiles.keys())
+    remove_strangers(out, tiles)
+    write_pvtu(out / "mesh.pvtu", [out / "mesh" / f"{tile}.vtu" for tile in tiles])
+    write_pvtp(out / "boundary.pvtp", [out / "boundary" / f"{tile}.vtp" for tile in tiles])
+    indexes = state_files(out, [out / name for name in INDEXES])
+    write_manifest(out / MANIFEST_PATH, engine.records, indexes)
+    summary = summarise_run(engine, plan, config, rounds, missing, dict(damage) | remade)
+    return summary | {"finished": progress.finished, "driver_memory_bytes": peak_memory()}
+
+
+def make_engine(
+    config: Config,
+    out: Path,
+    plan: Plan,
+    executor: Executor,
+    own: OwnStages,
+    progress: Progress | None = None,
+    *,
+    set_aside: bool = True,
+) -> Engine:
+    """Make the engine of a run over the items of its plan; failures are set aside, or end it."""
     context = RunContext(
         plan.region.bounds, plan.region.crs, config.tile_size, config.mesh_size, pack_tiles(plan.grid), str(out)
     )
@@ -132,28 +239,58 @@ def _mesh_region(
     parameters = SimpleNamespace(
         **dataclasses.asdict(config),
         **own.parameters,
-        layer_height_or_default=config.layer_height_or_default,
+        **derived_parameters(config),
         footprints_identity=identify(footprints) if footprints else "",
     )
-    steps = _Steps(announce)
-    with _executor(config) as executor:
-        engine = Engine(
-            out / "store.zarr",
-            plan.layout,
-            parameters=parameters,
-            context=context,
-            executor=executor,
-            progress=steps,
-        )
-        rounds = run_stages(engine, config)
-        run_own_stages(engine, own)
-    engine.prune()
-    remove_strangers(out, plan.layout.tiles)
-    tiles = sorted(plan.layout.tiles)
-    write_pvtu(out / "mesh.pvtu", [out / "mesh" / f"{tile}.vtu" for tile in tiles])
-    write_pvtp(out / "boundary.pvtp", [out / "boundary" / f"{tile}.vtp" for tile in tiles])
-    summary = summarise_run(engine, plan, config, rounds)
-    return summary | {"finished": steps.finished, "driver_memory_bytes": peak_memory()}
+    return Engine(
+        out / STORE,
+        plan.layout,
+        parameters=parameters,
+        context=context,
+        executor=executor,
+        progress=progress,
+        policy=Policy(retries=config.retries, set_aside=set_aside),
+    )
+
+
+def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = None) -> Path:
+    """Mesh one tile alone, with those around it that its halo needs, in this process: to look into a failure.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the whole run.
+    tile : str
+        Name of the tile.
+    say : callable, optional
+        Called with sentences that the user should read.
+
+    Returns
+    -------
+    Path
+        Its VTU piece, in a folder below that of the run. The cells are those of the whole run, bit for bit.
+
+    Raises
+    ------
+    CityError
+        What its stages raise; any other error likewise, its type kept.
+    """
+    check_sources(config)
+    alone = config_alone(config, make_plan(config, _silent), tile)
+    out = Path(alone.out)
+    out.mkdir(parents=True, exist_ok=True)
+    with only_run(out, say):
+        plan = make_plan(alone, say or _silent)
+        for folder in PIECES:
+            (out / folder).mkdir(exist_ok=True)
+        with serial() as executor:
+            engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
+            run_city_stages(engine, alone)
+            seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
+            engine.run(*mesh_stages(alone), items={"seams": seams, "columns": [tile]})
+            (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
+            engine.run(pieces, items={"pieces": [tile]})
+    return out / "mesh" / f"{tile}.vtu"
 
 
 def run_stages(engine: Engine, config: Config) -> int:
@@ -169,67 +306,84 @@ def run_stages(engine: Engine, config: Config) -> int:
     rounds = run_city_stages(engine, config)
     engine.run(*city_model_stages(), *mesh_stages(config))
     engine.run(*piece_stages(config))
+    # Beside a tile without a piece, others were written as if they had a neighbour.
+    while lost := [name for stage, name in engine.set_aside if stage == "pieces"]:
+        for tile in lost:
+            engine.give_up(("pieces", tile), ("columns", tile))
+        engine.run(*piece_stages(config))
     return rounds
 
 
 def run_city_stages(engine: Engine, config: Config) -> int:
-    """Run the stages up to the simplified city model; parameters and result as for `run_stages`."""
+    """Run the stages up to the simplified city model; parameters and result as for `run_stages`.
+
+    Raises
+    ------
+    HolesError
+        If an item was set aside.
+    """
     engine.run(*input_stages(config))
-    largest = engine.records["footprints", REGION_ITEM].facts["largest"]
-    engine.run(house_stage(config, largest))
+    stop_at_holes(engine)
+    engine.run(house_stage(config))
+    stop_at_holes(engine)
     engine.run(*first_round(config))
+    stop_at_holes(engine)
     engine.run(shape_stage(0))
+    stop_at_holes(engine)
     last = 0
     while True:
         engine.run(*later_round(config, last + 1))
+        stop_at_holes(engine)
         if not engine.records[f"join-{last + 1}", REGION_ITEM].facts["joined"]:
             break
         last += 1
         engine.run(shape_stage(last))
+        stop_at_holes(engine)
     engine.run(model_stage(config, last))
+    stop_at_holes(engine)
     return last + 1
 
 
 @contextmanager
 def _executor(config: Config) -> Iterator[Executor]:
     if config.scheduler:
-        with connect(config.scheduler) as executor:
+        with connect(config.scheduler, Limits(config.time_limit)) as executor:
             yield executor
     elif config.workers:
-        with local(config.workers) as executor:
+        memory = int(config.memory_limit * 2**30) or share_memory(config.workers)
+        with local(config.workers, Limits(config.time_limit, memory)) as executor:
             yield executor
     else:
         with serial() as executor:
             yield executor
 
 
-class _Steps:
-    """Announces each stage when its last item is done, with the seconds of all."""
+def _begin_progress(
+    config: Config, out: Path, plan: Plan, own: OwnStages, announce: Announce | None
+) -> RunProgress:
+    """Begin to tell how far a run is, with all stages that are known from the start."""
+    stages = [*list_stages(config), *own.stages]
+    expected = {stage.name: len(plan.layout.boxes(stage.scope)) for stage in stages}
+    command = "" if own.stages else None  # stages of the user's own are not given by a command
+    return RunProgress(out, config, expected, announce=announce, command=command)
 
-    def __init__(self, announce: Announce | None) -> None:
-        self._announce = announce
-        self._seconds: defaultdict[str, float] = defaultdict(float)
-        self._begin = time.perf_counter()
-        self.finished: dict[str, float] = {}
 
-    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
-        self._seconds[stage] += record.seconds.get("all", 0.0)
-        if done == total:
-            self.finished[stage] = round(time.perf_counter() - self._begin, 3)
-            if self._announce is not None:
-                self._announce(f"{stage} ({total})", self._seconds[stage])
+def _find_damage(out: Path) -> dict[str, str]:
+    """Say what is wrong with the files of a finished run that belong to no result.
+
+    Of results and their files it is told by who makes them anew.
+    """
+    return {found.path: found.what for found in Audit(out, deep=False).check_top()}
+
+
+def _foresee(plan: Plan, config: Config) -> list[str]:
+    """Say which tiles may not fit into the memory of this machine."""
+    return [] if config.scheduler else warn_of_memory(plan.survey, config, memory=machine_memory())
 
 
 def _write_record(out: Path, record: dict[str, Any]) -> None:
-    with replacing(out / "run.json") as part:
-        part.write_text(json.dumps(record, indent=1, default=str) + "\n")
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
+    with replacing(out / RUN_RECORD, durable=True) as part:
+        part.write_bytes(seal(json.dumps(record, indent=1, default=str).encode() + b"\n"))
 
 
 def _silent(_: str) -> None:

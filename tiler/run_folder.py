@@ -1,10 +1,11 @@
-"""What a run folder says about itself: its record, its buildings, its volume pieces."""
+"""What a run folder says about itself: its record, buildings, volume pieces."""
 
-import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import cached_property
+from json import JSONDecodeError
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.mesh import TetMesh
+from tiler.json_stream import JsonStream, NoJsonError
 
 SCHEMA = 1  # of run.json
-CITYJSON = "2.0"
-MAX_NUMBER = 2**53  # of a building
+RECORD_MEMBERS = ("schema", "status", "error", "region", "counts")
+TILES = "tiles"
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
 
@@ -37,17 +39,20 @@ class RunRecord:
         Absolute height of the top (m) where the mesher makes it flat, NaN where it does not.
     counts : mapping of str to int
         ``cells``, ``points``, ``facets`` and ``buildings``.
+    tiles : mapping of str to tuple of 4 floats or None
+        Boxes of the tiles by name (m), as far as they are stated.
     """
 
     status: str
     bounds: tuple[float, float, float, float]
     top: float
     counts: Mapping[str, int]
+    tiles: Mapping[str, tuple[float, ...] | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class Buildings:
-    """The buildings of a CityJSON file, by ascending number.
+    """Buildings of a CityJSON file, by ascending number.
 
     Attributes
     ----------
@@ -81,7 +86,7 @@ def read_run_record(path: Path) -> RunRecord:
     InputError
         If it is missing or damaged, or has another schema.
     """
-    record = _read_json(path)
+    record = _read_members(path, RECORD_MEMBERS)
     try:
         if record["schema"] != SCHEMA:
             raise InputError(f"{path}: schema {record['schema']!r}, expected {SCHEMA}; run again")
@@ -95,39 +100,28 @@ def read_run_record(path: Path) -> RunRecord:
         counts = {name: int(record["counts"][name]) for name in names}
         status = str(record["status"])
     except WRONG_FIELD as error:
-        raise _broken(path, error) from None
+        raise broken_field(path, error) from None
     if not (west < east and south < north and math.isfinite(west + south + east + north)):
         raise InputError(f"{path}: region bounds {west, south, east, north} are no box; run again")
-    return RunRecord(status, (west, south, east, north), top, counts)
+    return RunRecord(status, (west, south, east, north), top, counts, record.get(TILES) or {})
 
 
-def read_buildings(path: Path) -> Buildings:
-    """Read the buildings of a CityJSON file, or their parts: numbers, heights and LoD 0 footprints.
+def read_crs(path: Path) -> str:
+    """Read from ``run.json`` in which CRS the run's coordinates are.
 
     Raises
     ------
     InputError
-        If the file is missing or damaged, or a building lacks one of these or shares its number.
+        If it is missing or damaged, or names no CRS.
     """
-    model = _read_json(path)
+    record = _read_members(path, ("region",))
     try:
-        if model["type"] != "CityJSON" or model["version"] != CITYJSON:
-            raise InputError(f"{path}: is no CityJSON {CITYJSON} file; run again")
-        transform = model["transform"]
-        vertices = np.array(model["vertices"], np.float64).reshape(-1, 3)
-        vertices = vertices * np.array(transform["scale"]) + np.array(transform["translate"])
-        objects = [(name, thing) for name, thing in model["CityObjects"].items() if "children" not in thing]
+        crs = record["region"]["crs"]
+        if not isinstance(crs, str) or not crs:
+            raise TypeError(f"crs is {crs!r}")
     except WRONG_FIELD as error:
-        raise _broken(path, error) from None
-    rows = [_read_building(path, name, thing, vertices) for name, thing in objects]
-    order = sorted(range(len(rows)), key=lambda i: rows[i][0])
-    numbers = np.array([rows[i][0] for i in order], np.int64)
-    if np.any(numbers[1:] == numbers[:-1]):
-        raise InputError(f"{path}: two buildings have one number; give each its own id and run again")
-    footprints = np.empty(len(rows), np.object_)
-    footprints[:] = [rows[i][3] for i in order]
-    ground, roof = (np.array([rows[i][k] for i in order], np.float64) for k in (1, 2))
-    return Buildings(numbers, footprints, ground, roof)
+        raise broken_field(path, error) from None
+    return crs
 
 
 def read_volume(path: Path) -> TetMesh:
@@ -163,50 +157,51 @@ def read_volume(path: Path) -> TetMesh:
     return TetMesh(mesh.points.astype(np.float64, copy=False), cells.astype(np.int32))
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+@contextmanager
+def opened_json(path: Path) -> Iterator[JsonStream]:
+    """Open a JSON file whose content is an object, to be read member by member.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is no JSON object, here or wherever it is read inside of the context.
+    """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        with path.open(encoding="utf-8") as file:
+            stream = JsonStream(file)
+            if stream.peek() not in ("{", ""):
+                raise InputError(f"{path}: is no JSON object; run again")
+            yield stream
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); run again") from error
-    except (ValueError, RecursionError) as error:
+    except (JSONDecodeError, UnicodeDecodeError, NoJsonError, RecursionError) as error:
         raise InputError(f"{path}: is no JSON ({error}); run again") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: is no JSON object; run again")
-    return content
 
 
-def _broken(path: Path, error: Exception) -> InputError:
+def broken_field(path: Path, error: Exception) -> InputError:
+    """Make the error of a file with a `WRONG_FIELD`."""
     return InputError(f"{path}: a field is missing or wrong ({error!r}); run again")
 
 
-def _read_building(
-    path: Path, name: str, thing: Mapping[str, Any], vertices: NDArray[np.float64]
-) -> tuple[int, float, float, Any]:
+def _read_members(path: Path, names: Collection[str]) -> dict[str, Any]:
+    """Read some members of a JSON object; of tiles, their boxes (n, 4) by name."""
+    found: dict[str, Any] = {}
+    with opened_json(path) as stream:
+        for key in stream.members():
+            if key == TILES and stream.peek() == "{":
+                found[key] = {name: _box(stream.value()) for name in stream.members()}
+            elif key in names:
+                found[key] = stream.value()
+            else:
+                stream.skip()
+        stream.finish()
+    return found
+
+
+def _box(tile: Any) -> tuple[float, ...] | None:
+    """Take the box of a tile (m), None where it has none."""
     try:
-        values = thing["attributes"]
-        if not 0 <= values["number"] < MAX_NUMBER:
-            raise ValueError(f"number {values['number']}; bound: {MAX_NUMBER}")
-        number, ground, roof = (
-            int(values["number"]),
-            float(values["ground_height"]),
-            float(values["roof_height"]),
-        )
-        (geometry,) = (part for part in thing["geometry"] if str(part["lod"]) == "0")
-        surfaces = [_read_polygon(rings, vertices) for rings in geometry["boundaries"]]
-    except (*WRONG_FIELD, shapely.GEOSException) as error:
-        raise InputError(
-            f"{path}: building {name!r}: a field is missing or wrong ({error!r}); run again"
-        ) from None
-    return number, ground, roof, surfaces[0] if len(surfaces) == 1 else shapely.multipolygons(surfaces)
-
-
-def _read_polygon(rings: list[list[int]], vertices: NDArray[np.float64]) -> Any:
-    shell, *holes = (vertices[_checked(ring, len(vertices)), :2] for ring in rings)
-    return shapely.Polygon(shell, holes)
-
-
-def _checked(ring: list[int], n_vertices: int) -> NDArray[np.int64]:
-    indices = np.array(ring, np.int64)
-    if indices.ndim != 1 or indices.min() < 0 or indices.max() >= n_vertices:
-        raise IndexError(f"vertex {indices.min()}..{indices.max()} of {n_vertices}")
-    return indices
+        west, south, east, north = map(float, tile["box"])
+    except WRONG_FIELD:
+        return None
+    return west, south, east, north

@@ -48,6 +48,15 @@ class Read:
     named_by : str
         A stage of an earlier call: read the items listed as ``"names"`` among the facts of its result for the
         same item.
+    optional : bool
+        An item that was set aside is left out. Otherwise, and where it is the item of the reader's own name, the
+        reader is not run either.
+    beside : bool
+        Leave out the items that meet the reader's box in a corner only: of the tiles around a tile the four beside
+        it and itself are read, of the seams its own four.
+    others_by_name : bool
+        Of all items but the one of the reader's own name it counts only that they are there, not what they hold:
+        their content is in no key, and the reader must not look at it.
     """
 
     stage: str
@@ -56,6 +65,9 @@ class Read:
     around: str = ""
     own: bool = False
     named_by: str = ""
+    optional: bool = False
+    beside: bool = False
+    others_by_name: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.halo) and self.halo >= 0):
@@ -123,6 +135,10 @@ class Layout:
         Box of the region (m), the box of its one item ``"region"``.
     identity : str
         What else all results depend on, such as the CRS; part of every key.
+    absent : tuple of tuple of float
+        Boxes within the region that no tile covers (m); part of the keys of tiles and seams near them.
+    near : float
+        How far from its extent a tile or seam may look whether there is a tile (m).
 
     Raises
     ------
@@ -135,6 +151,8 @@ class Layout:
     seams: Mapping[str, Box] = field(default_factory=dict)
     bounds: Box = (0.0, 0.0, 0.0, 0.0)
     identity: str = ""
+    absent: tuple[Box, ...] = ()
+    near: float = 0.0
 
     def __post_init__(self) -> None:
         for scope in Scope:

@@ -3,19 +3,20 @@
 A result is a zarr group ``<stage>/<name>``. Arrays above 32 kB are arrays of their own; smaller ones lie in one
 array of bytes, ``_packed``, and if all of them are less than 16 kB, in the group's attributes. These hold what the
 writer gave, ``arrays`` (type and shape of each array and the CRC-32 of the raw bytes of each chunk), ``digest``, a
-hash of the content, and ``checksum``, the CRC-32 of all other attributes.
+hash of the content, ``files``, size and CRC-32 of every file of the arrays as it lies on disk, and ``checksum``,
+the CRC-32 of the file that the attributes are in.
 """
 
 import base64
 import errno
 import hashlib
 import json
+import math
 import os
 import shutil
 import uuid
-import zlib
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,14 +24,18 @@ from typing import Any, Self
 import numpy as np
 import zarr
 from numpy.typing import ArrayLike, NDArray
+from zarr.codecs import BloscCodec
 
 from pipeline.errors import InputError, OutputError
 from tiler.packing import (
+    CHUNK_HEAD,
     INLINE_BYTES,
     PACKED_BYTES,
     RowBuffer,
     Table,
     as_rows,
+    check_chunk,
+    check_entry,
     check_name,
     checksums,
     from_rows,
@@ -41,10 +46,18 @@ from tiler.packing import (
     unpack,
     verified_chunks,
 )
+from tiler.seal import is_sealed, seal
+from tiler.written import GONE, find_changed_files, state_files
 
 PACKED = "_packed"
-RESERVED = ("arrays", "checksum", "digest")
+# Bytes of numbers apart, then LZ4: written three times as fast as with zarr's default, a tenth more on disk. zarr
+# calls it from threads of its own, where Blosc uses one thread: the bytes are always the same.
+COMPRESSION = BloscCodec(cname="lz4", clevel=5, shuffle="shuffle")
+CODECS = ["BytesCodec", "BloscCodec"]  # what chunks are written with
+RESERVED = ("arrays", "checksum", "digest", "files")
 PARTIAL = ".partial"
+GROUP = "zarr.json"  # the file of a result's attributes
+MANIFEST = "manifest.jsonl"  # the only file beside the stages, see `tiler.manifest`
 
 
 class Store:
@@ -98,14 +111,15 @@ class Store:
         folder = self.folder(stage, name)
         table, attributes, _ = _open(folder, stage, name)
         wanted = sorted(set(names)) if names is not None else sorted(set(table) - {PACKED})
-        entries = {array: _entry(table, array, stage, name) for array in wanted}
+        entries = {array: _entry(folder, table, array, stage, name) for array in wanted}
         packed = None
         if any("offset" in entry for entry in entries.values()):
-            packed = _read_packed(folder, stage, name, table[PACKED])
+            packed = _read_packed(folder, stage, name, table)
         arrays: dict[str, NDArray[Any]] = {}
         for array, entry in entries.items():
             if packed is not None and "offset" in entry:
-                arrays[array] = unpack(packed, entry)
+                with _damage(folder, stage, name, array):
+                    arrays[array] = unpack(packed, entry)
             else:
                 arrays[array] = _read_chunks(folder, stage, name, array, entry)
         return arrays, attributes
@@ -120,15 +134,41 @@ class Store:
         ValueError
             If there is no such array, or not ``0 <= start <= stop <= n_rows``.
         """
+        return self.read_ranges(stage, name, [array], [(start, stop)])[array]
+
+    def read_ranges(
+        self, stage: str, name: str, names: Collection[str], ranges: Sequence[tuple[int, int]]
+    ) -> dict[str, NDArray[Any]]:
+        """Read ranges of rows of some arrays, put one after the other; errors as for `read_rows`.
+
+        Parameters
+        ----------
+        stage, name : str
+            Which result.
+        names : collection of str
+            Arrays to read.
+        ranges : sequence of (start, stop)
+            Rows, ascending and apart from each other. A chunk that holds rows of several of them is read once.
+        """
         folder = self.folder(stage, name)
         table, _, _ = _open(folder, stage, name)
-        entry = _entry(table, array, stage, name)
-        n_rows = entry["shape"][0] if entry["shape"] else 0
-        if not 0 <= start <= stop <= n_rows:
-            raise ValueError(f"stage {stage}, {name}: rows {start} to {stop} of {array}, which has {n_rows}")
-        if "offset" in entry:
-            return unpack(_read_packed(folder, stage, name, table[PACKED]), entry)[start:stop]
-        return _read_chunks(folder, stage, name, array, entry, start, stop)
+        found = {}
+        for array in sorted(set(names)):
+            entry = _entry(folder, table, array, stage, name)
+            n_rows = entry["shape"][0] if entry["shape"] else 0
+            for start, stop in ranges:
+                if not 0 <= start <= stop <= n_rows:
+                    raise ValueError(
+                        f"stage {stage}, {name}: rows {start} to {stop} of {array}, which has {n_rows}"
+                    )
+            if "offset" in entry:
+                packed = _read_packed(folder, stage, name, table)
+                with _damage(folder, stage, name, array):
+                    rows = unpack(packed, entry)
+                found[array] = _join_rows([rows[start:stop] for start, stop in ranges], rows)
+            else:
+                found[array] = _read_chunks(folder, stage, name, array, entry, ranges)
+        return found
 
     def attributes(self, stage: str, name: str) -> dict[str, Any]:
         """Read the attributes of a result and no array; InputError as for `read`."""
@@ -146,7 +186,7 @@ class Store:
 
     def has(self, stage: str, name: str) -> bool:
         """Whether there is a committed result; its arrays are not looked at."""
-        return (self.folder(stage, name) / "zarr.json").is_file()
+        return (self.folder(stage, name) / GROUP).is_file()
 
     def names(self, stage: str) -> list[str]:
         """List the names that have a result of the stage, sorted."""
@@ -167,12 +207,80 @@ class Store:
             return
         except OSError as error:
             raise OutputError(f"{folder}: cannot be removed ({error}); check its permissions") from error
-        shutil.rmtree(gone, ignore_errors=True)
+        _delete(gone)
 
     def sweep(self, stage: str) -> None:
         """Remove what killed writers of the stage left behind; no writer may be at work."""
         for folder in (self.path / stage).glob(f".*{PARTIAL}"):
-            shutil.rmtree(folder, ignore_errors=True)
+            _delete(folder)
+
+    def find_strays(self) -> list[Path]:
+        """List what no writer of results has made: hidden entries of stages, and files beside these."""
+        if not self.path.is_dir():
+            return []
+        beside = [entry for entry in self.path.iterdir() if not entry.is_dir() and entry.name != MANIFEST]
+        return sorted(beside + [entry for stage in self.stages() for entry in (self.path / stage).glob(".*")])
+
+    def remove_strays(self) -> None:
+        """Remove what `find_strays` lists; no writer may be at work."""
+        for path in self.find_strays():
+            _delete(path)
+
+    def find_damage(self, stage: str, name: str) -> dict[str, str]:
+        """Hold every file of a result against its checksum.
+
+        Returns
+        -------
+        dict of str to str
+            What is wrong, by path below the result's folder; empty for a sound result.
+
+        Notes
+        -----
+        Bytes are read as they lie on disk, a megabyte at a time; nothing is decompressed. Strange files are named
+        too.
+        """
+        folder = self.folder(stage, name)
+        try:
+            files = _read_group(folder)["files"]
+        except FileNotFoundError:
+            return {GROUP: GONE}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            return {GROUP: f"is damaged ({error})"}
+        found = find_changed_files(folder, files)
+        there = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
+        return found | dict.fromkeys(sorted(there - {GROUP, *files}), "is not of this result")
+
+    def compute_digest(self, stage: str, name: str, *, apart: Collection[str] = ()) -> str:
+        """Compute the digest of a result anew from all that is stored, a chunk at a time.
+
+        Parameters
+        ----------
+        stage, name : str
+            Which result.
+        apart : collection of str
+            Attributes that do not count, as for `Writer.commit`.
+
+        Raises
+        ------
+        InputError
+            If it is not there or damaged.
+        """
+        folder = self.folder(stage, name)
+        table, attributes, _ = _open(folder, stage, name)
+        packed = _read_packed(folder, stage, name, table) if PACKED in table else np.empty(0, np.uint8)
+        arrays = []
+        for array in sorted(set(table) - {PACKED}):
+            entry = _entry(folder, table, array, stage, name)
+            found = hashlib.blake2b(digest_size=16)
+            if "offset" in entry:
+                found.update(raw_bytes(unpack(packed, entry)).data)
+            else:
+                for start in range(0, entry["shape"][0], entry["chunk"]):
+                    stop = min(start + entry["chunk"], entry["shape"][0])
+                    rows = _read_chunks(folder, stage, name, array, entry, [(start, stop)])
+                    found.update(raw_bytes(rows).data)
+            arrays.append([array, entry["dtype"], entry["shape"], found.hexdigest()])
+        return _hash_content(arrays, {key: value for key, value in attributes.items() if key not in apart})
 
 
 class Writer:
@@ -273,7 +381,7 @@ class Writer:
         Raises
         ------
         ValueError
-            If the attributes are no plain JSON, or use the names ``arrays``, ``checksum`` or ``digest``.
+            If the attributes are no plain JSON, or use a name of `RESERVED`.
         OutputError
             If the disk refuses.
         """
@@ -296,9 +404,12 @@ class Writer:
         digest = self._digest({name: value for name, value in kept.items() if name not in apart})
         kept["digest"] = digest
         kept["arrays"] = plain_json(self._table)
-        kept["checksum"] = _attributes_checksum(kept)
         with self._disk():
+            files = sorted(path for path in self._partial.rglob("*") if path.is_file())
+            kept |= {"files": state_files(self._partial, files), "checksum": "0" * 8}
             zarr.create_group(str(self._partial), zarr_format=3, attributes=dict(sorted(kept.items())))
+            group = self._partial / GROUP
+            group.write_bytes(seal(group.read_bytes()))
             self._replace()
         return digest
 
@@ -313,8 +424,7 @@ class Writer:
             [name, self._table[name]["dtype"], self._table[name]["shape"], found.hexdigest()]
             for name, found in sorted(self._hashes.items())
         ]
-        text = json.dumps([arrays, attributes], sort_keys=True)
-        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+        return _hash_content(arrays, attributes)
 
     def _put(self, name: str, array: NDArray[Any]) -> None:
         if array.nbytes <= PACKED_BYTES or array.ndim == 0:
@@ -337,6 +447,7 @@ class Writer:
                 data=rows,
                 chunks=(chunk, *(max(n, 1) for n in rows.shape[1:])),
                 zarr_format=3,
+                compressors=COMPRESSION,
                 config={"write_empty_chunks": True},
             )
 
@@ -368,7 +479,7 @@ class Writer:
                 os.replace(self._folder, old)
             except FileNotFoundError:
                 continue
-            shutil.rmtree(old, ignore_errors=True)
+            _delete(old)
 
     @contextmanager
     def _disk(self) -> Iterator[None]:
@@ -394,31 +505,52 @@ def plain_json(value: Any) -> Any:
         raise ValueError(f"{error}; give plain JSON values, None for what is not there") from error
 
 
-def _attributes_checksum(attributes: Mapping[str, Any]) -> int:
-    rest = {name: value for name, value in attributes.items() if name != "checksum"}
-    return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
+def _hash_content(arrays: list[list[Any]], attributes: Mapping[str, Any]) -> str:
+    """Make the digest of a result: name, type, shape and hash of each array, and the attributes that count."""
+    text = json.dumps([arrays, attributes], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _delete(path: Path) -> None:
+    """Delete a folder or a file, as far as that can be done."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
+
+
+def _read_group(folder: Path) -> dict[str, Any]:
+    """Read all attributes of a result; ValueError if its file is not as it was written."""
+    text = (folder / GROUP).read_bytes()
+    if not is_sealed(text):
+        raise ValueError("checksum of the attributes differs")
+    attributes: dict[str, Any] = json.loads(text)["attributes"]
+    return attributes
 
 
 def _open(folder: Path, stage: str, name: str) -> tuple[Table, dict[str, Any], str]:
     """Read the table of arrays, the attributes and the digest of a result."""
     with _damage(folder, stage, name, "attributes"):
-        group = zarr.open_group(str(folder), mode="r", zarr_format=3, use_consolidated=False)
-        attributes: dict[str, Any] = dict(group.attrs.asdict())
-        if attributes.pop("checksum") != _attributes_checksum(attributes):
-            raise ValueError("checksum of the attributes differs")
-        table: Any = attributes.pop("arrays")
-        digest: Any = attributes.pop("digest")
-        return table, attributes, digest
+        attributes = _read_group(folder)
+        table, digest = attributes["arrays"], attributes["digest"]
+        return table, {key: value for key, value in attributes.items() if key not in RESERVED}, digest
 
 
-def _entry(table: Table, array: str, stage: str, name: str) -> dict[str, Any]:
+def _entry(folder: Path, table: Table, array: str, stage: str, name: str) -> dict[str, Any]:
     if array not in table or array == PACKED:
         names = ", ".join(sorted(set(table) - {PACKED})) or "none"
         raise ValueError(f"stage {stage}, {name}: no array {array}, it has: {names}")
+    with _damage(folder, stage, name, array):
+        check_entry(table[array])
     return table[array]
 
 
-def _read_packed(folder: Path, stage: str, name: str, entry: Mapping[str, Any]) -> NDArray[Any]:
+def _read_packed(folder: Path, stage: str, name: str, table: Table) -> NDArray[Any]:
+    with _damage(folder, stage, name, PACKED):
+        entry = table[PACKED]
+        if "base64" not in entry:
+            check_entry(entry)
     if "base64" in entry:  # under the checksum of the attributes
         return np.frombuffer(base64.b64decode(entry["base64"]), dtype=np.uint8)
     return _read_chunks(folder, stage, name, PACKED, entry)
@@ -430,26 +562,63 @@ def _read_chunks(
     name: str,
     array: str,
     entry: Mapping[str, Any],
-    start: int = 0,
-    stop: int | None = None,
+    ranges: Sequence[tuple[int, int]] | None = None,
 ) -> NDArray[Any]:
-    """Read rows of one zarr array and verify every chunk that was read."""
+    """Read rows of one zarr array, all by default, and verify every chunk that was read."""
     n_rows, chunk = entry["shape"][0], entry["chunk"]
-    stop = n_rows if stop is None else stop
-    first, last = start // chunk, max(-(-stop // chunk), start // chunk)
-    low, high = first * chunk, min(last * chunk, n_rows)
+    wanted = [(0, n_rows)] if ranges is None else ranges
+    parts = []
     with _damage(folder, stage, name, array):
         stored = zarr.open_array(str(folder / array), mode="r", zarr_format=3)
         if stored.shape[: len(entry["shape"])] != tuple(entry["shape"]):
             raise ValueError(f"shape {stored.shape} instead of {tuple(entry['shape'])}")
-        rows = np.asarray(stored[low:high])
-        values = from_rows(rows, entry["dtype"])
-        if values.dtype != np.dtype(entry["dtype"]):
-            raise ValueError(f"type {values.dtype} instead of {entry['dtype']}")
-        wrong = [first + k for k in verified_chunks(values, chunk, entry["crc"][first:last])]
-        if wrong:
-            raise ValueError(f"checksum differs in {len(wrong)} chunks, first in chunk {wrong[0]}")
-    return values if (low, high) == (start, stop) else values[start - low : stop - low].copy()
+        for first, last, inside in _chunks_of_ranges(wanted, chunk):
+            low, high = first * chunk, min(last * chunk, n_rows)
+            _check_chunks(folder / array, stored, entry, range(first, last))
+            rows = from_rows(np.asarray(stored[low:high]), entry["dtype"])
+            if rows.dtype != np.dtype(entry["dtype"]):
+                raise ValueError(f"type {rows.dtype} instead of {entry['dtype']}")
+            wrong = [first + k for k in verified_chunks(rows, chunk, entry["crc"][first:last])]
+            if wrong:
+                raise ValueError(f"checksum differs in {len(wrong)} chunks, first in chunk {wrong[0]}")
+            parts += [rows[start - low : stop - low] for start, stop in inside]
+    return _join_rows(parts, rows)
+
+
+def _chunks_of_ranges(
+    ranges: Sequence[tuple[int, int]], chunk: int
+) -> Iterator[tuple[int, int, list[tuple[int, int]]]]:
+    """Group ascending ranges of rows that share chunks: first chunk, last and one more, and the ranges."""
+    first, last, inside = 0, 0, list[tuple[int, int]]()
+    for start, stop in ranges:
+        begin, end = start // chunk, -(-stop // chunk)
+        if inside and begin >= last:
+            yield first, last, inside
+            inside = []
+        first, last = (first, max(last, end)) if inside else (begin, max(begin, end))
+        inside.append((start, stop))
+    yield first, last, inside
+
+
+def _join_rows(parts: Sequence[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
+    """Put rows one after the other in memory of their own, so that no chunk stays with a few of them."""
+    if len(parts) == 1 and len(parts[0]) == len(like):
+        return parts[0]
+    return np.concatenate([like[:0], *parts])
+
+
+def _check_chunks(folder: Path, stored: Any, entry: Mapping[str, Any], wanted: range) -> None:
+    """Check the form of a zarr array and the sizes that its chunks claim, before any is decompressed."""
+    dtype = np.dtype(entry["dtype"])
+    text = (dtype.itemsize,) if dtype.kind == "U" else ()
+    rows = np.dtype(np.uint8) if text else dtype
+    chunks = (entry["chunk"], *(max(n, 1) for n in (*entry["shape"][1:], *text)))
+    codecs = [type(codec).__name__ for codec in stored.metadata.codecs]
+    if stored.dtype != rows or stored.chunks != chunks or codecs != CODECS or len(stored.shape) != len(chunks):
+        raise ValueError(f"chunks {stored.chunks} of {stored.dtype} by {', '.join(codecs)}")
+    for k in wanted:
+        with (folder / "c" / "/".join(map(str, (k, *(0,) * (len(chunks) - 1))))).open("rb") as file:
+            check_chunk(file.read(CHUNK_HEAD), math.prod(chunks) * rows.itemsize)
 
 
 @contextmanager
@@ -460,7 +629,7 @@ def _damage(folder: Path, stage: str, name: str, array: str) -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:
-        state = "is damaged" if (folder / "zarr.json").is_file() else "is not there"
+        state = "is damaged" if (folder / GROUP).is_file() else "is not there"
         raise InputError(
-            f"stage {stage}, {name}: {array} in {folder} {state} ({error}); delete that folder and run again"
+            f"stage {stage}, {name}: {array} in {folder} {state} ({error}); run again: it is made anew"
         ) from error

@@ -1,8 +1,9 @@
 """What the stages of a run tell, collected for its record."""
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from pipeline.clusters import add_counts
@@ -11,16 +12,23 @@ from tiler.config import Config
 from tiler.context import absent_tiles, tile_name
 from tiler.engine import Engine
 from tiler.planning import Plan
-from tiler.stage import REGION_ITEM
-from tiler.task import Record, read_notes
+from tiler.quarantine import Missing, describe_missing
+from tiler.stage import REGION_ITEM, Facts
+from tiler.task import read_notes
 
 EXIT_DONE, EXIT_INCOMPLETE = 0, 3
 # Notes of these kinds say that something is missing which the input has: the exit code tells.
-INCOMPLETE = {"building-beyond-region", "building-lost", "building-points-without-footprints"}
+INCOMPLETE = {
+    *("building-beyond-region", "building-lost", "building-points-without-footprints"),
+    "footprint-too-many-vertices",
+}
+DAMAGED = "damaged-artefact"  # kind of the notes on what was damaged or missing, and made anew
 LISTED = 10_000  # notes of a kind that the record lists; the store has all
 
 
-def summarise_run(engine: Engine, plan: Plan, config: Config, rounds: int) -> dict[str, Any]:
+def summarise_run(
+    engine: Engine, plan: Plan, config: Config, rounds: int, missing: Missing, damage: Mapping[str, str]
+) -> dict[str, Any]:
     """Collect what all stages tell, for the record.
 
     Parameters
@@ -28,32 +36,35 @@ def summarise_run(engine: Engine, plan: Plan, config: Config, rounds: int) -> di
     engine : Engine
         The engine, all stages run.
     plan : Plan
-        The plan of the run.
+        The plan of the run, without the tiles that failed before there was a city model.
     config : Config
         Its parameters.
     rounds : int
         How often clusters of houses were simplified.
+    missing : Missing
+        Tiles that failed.
+    damage : mapping of str to str
+        What was wrong with artefacts that were made anew, by path.
     """
     records = engine.records
-    notes = [*_collect_notes(engine), *_notes_of_clouds(engine, config)]
+    clouds = {record.name: record.facts for record in records.of("points")}
+    notes = [*_collect_notes(engine), *_notes_of_clouds(engine, config, list(clouds.values()))]
+    notes += [Note(DAMAGED, path, detail=f"{what}; made anew") for path, what in sorted(damage.items())]
     unreadable = dict(plan.unreadable)
     unreadable |= {
-        plan.layout.files[name].path: record.facts["unreadable"]
-        for (stage, name), record in records.items()
-        if stage == "points" and record.facts["unreadable"]
+        plan.layout.files[name].path: facts["unreadable"] for name, facts in clouds.items() if facts["unreadable"]
     }
     report = records["report", REGION_ITEM].facts
-    outline = _join_outlines(
-        [record.facts["outline"] for (stage, _), record in records.items() if stage == "model"]
-    )
-    incomplete = unreadable or INCOMPLETE & {note.kind for note in notes}
+    outline = _join_outlines([record.facts["outline"] for record in records.of("model")])
+    incomplete = unreadable or missing.tiles or missing.others or INCOMPLETE & {note.kind for note in notes}
+    absent = {tile_name(key) for key in absent_tiles(plan.grid)} - missing.tiles.keys()
     return {
         "exit_code": EXIT_INCOMPLETE if incomplete else EXIT_DONE,
         "region": {
             "bounds": list(plan.region.bounds),
             "crs": plan.region.crs,
             "tile_size": plan.region.tile_size,
-            "absent": [tile_name(key) for key in absent_tiles(plan.grid)],
+            "absent": sorted(absent),
         },
         "tiles": {
             name: {
@@ -62,33 +73,49 @@ def summarise_run(engine: Engine, plan: Plan, config: Config, rounds: int) -> di
                 "counts": records["columns", name].facts["counts"] | records["pieces", name].facts["counts"],
                 "facts": records["columns", name].facts["facts"],
             }
-            for name in sorted(plan.layout.tiles)
+            for name in sorted(plan.layout.tiles.keys() - missing.tiles.keys())
         },
-        "counts": _join_counts(engine, plan, rounds),
+        **describe_missing(missing, Path(config.out)),
+        "counts": _join_counts(engine, plan, rounds) | {"tiles missing": len(missing.tiles)},
         "quality": report["quality"],
         "fidelity": report["fidelity"] | ({"outline": outline} if outline else {}),
-        "reused": dict(sorted(Counter(record.stage for record in records.values() if record.reused).items())),
-        "seconds": _join_seconds(records.values()),
-        "peak_memory_bytes": max(record.peak_memory for record in records.values()),
-        "messages": list(plan.messages),
+        "tasks": {"all": len(records), "ran": len(records) - sum(records.count_reused().values())},
+        "reused": records.count_reused(),
+        "ran": records.count_ran(),
+        "seconds": {name: round(seconds, 3) for name, seconds in sorted(records.seconds.items())},
+        "peak_memory_bytes": records.peak_memory,
+        "messages": [*plan.messages, *_tell_damage(damage)],
         "unreadable": unreadable,
         "notes": group_notes(notes),
     }
 
 
+def describe_tasks(tasks: Mapping[str, int]) -> str:
+    """Say how many tasks ran, and how many results were taken as they were.
+
+    Examples
+    --------
+    >>> describe_tasks({"all": 1204, "ran": 312})
+    '312 of 1,204 tasks ran, 892 results were there'
+    """
+    return f"{tasks['ran']:,} of {tasks['all']:,} tasks ran, {tasks['all'] - tasks['ran']:,} results were there"
+
+
+def _tell_damage(damage: Mapping[str, str]) -> list[str]:
+    if not damage:
+        return []
+    return [f"{len(damage)} damaged or missing artefacts of an earlier run were made anew: {DAMAGED} in the notes"]
+
+
 def _collect_notes(engine: Engine) -> list[Note]:
     """Read the notes of all results that have some, by stage and item."""
-    notes: list[Note] = []
-    for stage, name in sorted(key for key, record in engine.records.items() if record.notes):
-        notes += read_notes(engine.store, stage, name)
-    return notes
+    return [note for item in engine.records.noted() for note in read_notes(engine.store, *item)]
 
 
-def _notes_of_clouds(engine: Engine, config: Config) -> list[Note]:
+def _notes_of_clouds(engine: Engine, config: Config, clouds: Sequence[Facts]) -> list[Note]:
     """Notes on what the point clouds say of buildings."""
     notes = []
-    clouds = [record.facts for (stage, _), record in engine.records.items() if stage == "points"]
-    houses = sum(record.facts["n"] for (stage, _), record in engine.records.items() if stage == "houses")
+    houses = sum(record.facts["n"] for record in engine.records.of("houses"))
     marks = any(facts["marks_buildings"] and facts["counts"] for facts in clouds)
     if config.ground_filter:
         notes.append(Note("ground-filter", detail="ground found by progressive morphological opening"))
@@ -113,17 +140,19 @@ def _join_counts(engine: Engine, plan: Plan, rounds: int) -> dict[str, int]:
     total["tiles absent"] = len(absent_tiles(plan.grid))
     total["rounds of simplification"] = rounds
     total["footprints read"] = engine.records["footprints", REGION_ITEM].facts["n"]
-    for (stage, _), record in sorted(engine.records.items(), key=lambda item: item[0]):
-        counts = record.facts.get("counts", {})
-        if stage == "points":
-            counts = {f"points {name}": n for name, n in counts.items()}
-        if stage != "pieces":
-            add_counts(total, counts)
-        else:
-            total["facets"] += counts["facets"]
+    for stage in engine.records.stages():
+        for record in engine.records.of(stage):
+            counts = record.facts.get("counts", {})
+            if stage == "points":
+                counts = {f"points {name}": n for name, n in counts.items()}
+            if stage == "proofs":
+                total["seams"] += record.facts["faces"] > 0
+                total["seam faces"] += record.facts["faces"]
+            elif stage == "pieces":
+                total["facets"] += counts["facets"]
+            else:
+                add_counts(total, counts)
     total["points"] = engine.records["numbers", REGION_ITEM].facts["points"]
-    faces = [record.facts["faces"] for (stage, _), record in engine.records.items() if stage == "proofs"]
-    total["seams"], total["seam faces"] = sum(n > 0 for n in faces), sum(faces)
     return dict(total)
 
 
@@ -136,15 +165,6 @@ def _join_outlines(parts: Sequence[dict[str, float]]) -> dict[str, float]:
     for name in ("min_clearance", "sharpest"):
         joined[name] = min(part[name] for part in known)
     return {name: round(value, 6) for name, value in joined.items()}
-
-
-def _join_seconds(records: Iterable[Record]) -> dict[str, float]:
-    """Seconds by stage, and by step of stages."""
-    total: defaultdict[str, float] = defaultdict(float)
-    for record in records:
-        for step, seconds in record.seconds.items():
-            total[record.stage if step == "all" else f"{record.stage}: {step}"] += seconds
-    return {name: round(seconds, 3) for name, seconds in sorted(total.items())}
 
 
 def group_notes(notes: Sequence[Note]) -> dict[str, dict[str, Any]]:

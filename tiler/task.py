@@ -6,7 +6,7 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +18,9 @@ from pipeline.errors import CityError
 from pipeline.notes import Note, count_notes
 from tiler.stage import Box, Facts, Scope
 from tiler.store import Store, Writer, plain_json
-from tiler.written import FILES, check_files, files_are_there
+from tiler.written import FILES, check_files, find_changed_files
+
+APART = ("key",)  # attributes of a result that are no content
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +65,8 @@ class Record:
         Largest resident memory of the process so far (bytes).
     reused : bool
         True if an earlier result with the same key was taken.
+    damage : str
+        What was wrong with an earlier result that was there and computed again for that; else empty.
     """
 
     stage: str
@@ -74,13 +78,26 @@ class Record:
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory: int = 0
     reused: bool = False
+    damage: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Failure:
-    """An error that came back as a value: raised in a worker, Dask would print where in the code it arose."""
+    """An error that came back as a value: raised in a worker, Dask would print where in the code it arose.
+
+    Attributes
+    ----------
+    error : Exception
+        The error.
+    trace : str
+        Where in the code it arose, as text; empty where nobody knows.
+    kind : str
+        ``"error"``; or ``"memory"``, ``"time"``, ``"crash"`` or ``"killed"`` of a process that ended.
+    """
 
     error: Exception
+    trace: str = ""
+    kind: str = "error"
 
 
 class Declared:
@@ -131,6 +148,8 @@ class Task:
         Items to read by stage, sorted.
     key : str
         Key of all that the result depends on.
+    folder : Path
+        Where the files are that results state as the fact ``"files"``.
     """
 
     stage: str
@@ -143,6 +162,7 @@ class Task:
     store: Store
     refs: dict[str, tuple[str, ...]]
     key: str
+    folder: Path
     _writer: Writer | None = None
     _notes: list[Note] = field(default_factory=list)
     _seconds: dict[str, float] = field(default_factory=dict)
@@ -171,6 +191,14 @@ class Task:
         if name not in self._declared(stage):
             raise ValueError(f"stage {self.stage}, {self.name}: {name} of {stage} is beyond its reach")
         return self.store.read_rows(stage, name, array, start, stop)
+
+    def read_ranges(
+        self, stage: str, name: str, names: Collection[str], ranges: Sequence[tuple[int, int]]
+    ) -> dict[str, NDArray[Any]]:
+        """Read ranges of rows of some arrays, ascending, put one after the other; errors as for `read`."""
+        if name not in self._declared(stage):
+            raise ValueError(f"stage {self.stage}, {self.name}: {name} of {stage} is beyond its reach")
+        return self.store.read_ranges(stage, name, names, ranges)
 
     def put(self, **arrays: ArrayLike) -> None:
         """Write whole arrays of the result, each name once."""
@@ -208,7 +236,7 @@ class Task:
 
     def _result(self, stage: str, name: str, names: Collection[str] | None) -> Result:
         arrays, attributes = self.store.read(stage, name, names=names)
-        return Result(name, arrays, attributes["facts"], tuple(map(_note_from_json, attributes["notes"])))
+        return Result(name, arrays, attributes["facts"], tuple(notes_from_json(attributes["notes"])))
 
     def _open_writer(self) -> Writer:
         if self._writer is None:
@@ -217,51 +245,76 @@ class Task:
 
 
 def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
-    """Run a stage's function, commit its result, and say what came of it; an error leaves nothing behind.
+    """Take an earlier result of a task, or run its stage's function and commit what comes of it.
 
-    Errors come back as values; one that cannot be pickled as a RuntimeError with its text.
+    An earlier result is taken if it has the task's key, and every byte of it and of the files that it states is as
+    it was written; a damaged one is computed again. An error leaves nothing behind. Errors come back as values; a
+    RuntimeError with the text stands for one that cannot be pickled.
     """
     start = time.perf_counter()
     try:
+        earlier = _take_earlier(task)
+        if isinstance(earlier, Record):
+            return earlier
         _drop_stale(task)
         with task.store.writer(task.stage, task.name) as task._writer:
             facts = _plain_facts(task, function(task))
             notes = [_note_to_json(note) for note in task._notes]
-            digest = task._writer.commit({"key": task.key, "facts": facts, "notes": notes}, apart=("key",))
+            digest = task._writer.commit({"key": task.key, "facts": facts, "notes": notes}, apart=APART)
     except CityError as error:
-        return Failure(error)
+        return Failure(error, _trace(error))
     except Exception as error:
-        return Failure(_portable(error))
+        kind = "memory" if isinstance(error, MemoryError) else "error"
+        return Failure(_portable(error), _trace(error), kind)
     finally:
         task._writer = None
     seconds = {step: round(value, 4) for step, value in task._seconds.items()}
     seconds["all"] = round(time.perf_counter() - start, 4)
-    notes_by_kind = count_notes(task._notes)
     return Record(
-        task.stage, task.name, task.key, digest, facts, notes_by_kind, seconds, peak_memory=peak_memory()
+        task.stage,
+        task.name,
+        task.key,
+        digest,
+        facts,
+        count_notes(task._notes),
+        seconds,
+        peak_memory=peak_memory(),
+        damage=earlier,
     )
 
 
-def reuse(store: Store, stage: str, name: str, key: str, *, folder: Path) -> Record | None:
-    """Give the record of a committed result if it has this key, and its files are below `folder` as it states.
-
-    A damaged result counts as none.
-    """
-    if not store.has(stage, name):
-        return None
+def _take_earlier(task: Task) -> Record | str:
+    """Give the record of the committed result, or say what is wrong with it: nothing if it is of another key."""
+    stage, name, store = task.stage, task.name, task.store
+    if not store.folder(stage, name).exists():
+        return ""
     try:
         attributes, digest = store.describe(stage, name)
     except CityError:
-        return None
-    if attributes.get("key") != key or not files_are_there(folder, attributes["facts"]):
-        return None
-    notes = count_notes(map(_note_from_json, attributes["notes"]))
-    return Record(stage, name, key, digest, attributes["facts"], notes, reused=True)
+        return _tell_damage(store.find_damage(stage, name))
+    if attributes.get("key") != task.key:
+        return ""
+    facts = attributes["facts"]
+    damage = store.find_damage(stage, name) | find_changed_files(task.folder, facts.get(FILES, {}))
+    if damage:
+        return _tell_damage(damage)
+    notes = count_notes(notes_from_json(attributes["notes"]))
+    return Record(stage, name, task.key, digest, facts, notes, reused=True)
+
+
+def _tell_damage(damage: Mapping[str, str]) -> str:
+    (path, what), *more = damage.items()
+    return f"{path} {what}" + (f", and {len(more)} more" if more else "")
 
 
 def read_notes(store: Store, stage: str, name: str) -> list[Note]:
     """Read the notes of a result."""
-    return [_note_from_json(values) for values in store.attributes(stage, name)["notes"]]
+    return notes_from_json(store.attributes(stage, name)["notes"])
+
+
+def notes_from_json(rows: Iterable[list[Any]]) -> list[Note]:
+    """Read notes as the store has them."""
+    return [_note_from_json(values) for values in rows]
 
 
 def peak_memory() -> int:
@@ -309,9 +362,13 @@ def _note_from_json(values: list[Any]) -> Note:
     return Note(kind, subject, nan if x is None else x, nan if y is None else y, detail)
 
 
+def _trace(error: Exception) -> str:
+    return "".join(traceback.format_exception(error))
+
+
 def _portable(error: Exception) -> Exception:
     """Make an error survive the way back, with the traceback as a note."""
-    text = "".join(traceback.format_exception(error))
+    text = _trace(error)
     try:
         error.add_note(f"where it arose:\n{text}")
         pickle.loads(pickle.dumps(error))

@@ -4,10 +4,9 @@ Arrays are appended raw in zlib blocks, little-endian, so a file streams to disk
 twice. ParaView and vtk read all four kinds, meshio the volume.
 """
 
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from tiler.vtk_xml import (
     damaged,
     make_stream,
     opened,
+    parse_xml,
     read_data_file,
     write_data_file,
     write_index,
@@ -229,13 +229,14 @@ def read_piece_paths(path: Path) -> list[Path]:
     """
     with opened(path) as file:
         text = file.read(INDEX_BYTES)
-    try:
-        root = ET.fromstring(text)
-    except (ET.ParseError, ValueError, LookupError) as error:
-        raise damaged(path, str(error)) from None
-    pieces = [path.parent / element.get("Source", "") for element in root.findall("./*/Piece")]
-    if not pieces:
+    root = parse_xml(path, text)
+    sources = [PurePath(element.get("Source", "")) for element in root.findall("./*/Piece")]
+    if not sources:
         raise damaged(path, "it names no piece")
+    for source in sources:
+        if source.is_absolute() or ".." in source.parts:
+            raise damaged(path, f"the piece {source} lies outside its folder")
+    pieces = [path.parent / source for source in sources]
     for piece in pieces:
         if not piece.is_file():
             raise InputError(f"{path}: the piece {piece} is missing; run the tile again")

@@ -174,6 +174,16 @@ def damaged(path: Path, why: str) -> InputError:
     return InputError(f"{path}: not a file of ours or damaged ({why}); run the tile again")
 
 
+def parse_xml(path: Path, text: bytes) -> ET.Element:
+    """Parse the XML of a file; declarations, by which a few bytes can expand without end, are refused."""
+    if b"<!" in text or b"\0" in text:  # zeros: UTF-16, in which the former would not be found
+        raise damaged(path, "it has declarations")
+    try:
+        return ET.fromstring(text)
+    except (ET.ParseError, ValueError, LookupError, RecursionError) as error:
+        raise damaged(path, str(error)) from None
+
+
 @contextmanager
 def opened(path: Path) -> Iterator[BinaryIO]:
     """Open a file to read; whatever the system says against it becomes an `InputError`."""
@@ -190,10 +200,7 @@ def _read_head(path: Path, file: BinaryIO, kind: str) -> _Head:
     start = text.find(b"_", end)
     if end < 0 or start < 0:
         raise damaged(path, "no appended data")
-    try:
-        root = ET.fromstring(text[:end] + b"</VTKFile>")
-    except (ET.ParseError, ValueError, LookupError) as error:
-        raise damaged(path, str(error)) from None
+    root = parse_xml(path, text[:end] + b"</VTKFile>")
     piece = root.find(f"./{kind}/Piece")
     if piece is None or root.get("header_type") != "UInt64" or root.get("byte_order") != "LittleEndian":
         raise damaged(path, f"no little-endian {kind} with UInt64 headers")
@@ -230,6 +237,24 @@ def read_data_file(path: Path, kind: str) -> dict[str, dict[str, NDArray[Any]]]:
     if missing or "Points" not in sections["Points"] or sections["Points"]["Points"].dtype != np.float64:
         raise damaged(path, f"no float64 points or no section {sorted(missing)}")
     return sections
+
+
+def read_point_array(path: Path, kind: str, name: str) -> NDArray[Any] | None:
+    """Read one point array of a file of one piece, and no other; None if it has none of that name.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged.
+    """
+    with opened(path) as file:
+        head = _read_head(path, file, kind)
+        size = file.seek(0, os.SEEK_END)
+        arrays = [array for array in head.piece.findall("PointData/DataArray") if array.get("Name") == name]
+        try:
+            return _read_array(file, head, arrays[0], "PointData", size) if arrays else None
+        except (ValueError, KeyError, TypeError, zlib.error) as error:
+            raise damaged(path, f"{error}") from None
 
 
 def _read_array(file: BinaryIO, head: _Head, array: ET.Element, section: str, size: int) -> NDArray[Any]:

@@ -41,12 +41,12 @@ from tiler.task import Result, Task
 GROUND = ("dtm_spacing", "ground_filter")
 
 
-def house_stage(config: Config, largest: float) -> Stage:
-    """Stage of the houses of each tile; `largest` is the longest side of any footprint's box (m)."""
+def house_stage(config: Config) -> Stage:
+    """Stage of the houses of each tile."""
     reads = (
         Read("outlines", own=True),
-        Read("points", halo_of_points(config, largest + config.ground_margin)),
-        Read("terrain", largest + 2 * config.dtm_spacing),
+        Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
+        Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
     return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *GROUND))
 
@@ -59,7 +59,7 @@ def first_round(config: Config) -> list[Stage]:
             Scope.TILE,
             find_near_houses,
             (Read("houses", config.clearance, by_extent=True),),
-            CITY_PARAMETERS,
+            ("clearance",),
         ),
         Stage("join-0", Scope.REGION, join_houses_in_clusters, (Read("houses"), Read("near-0"))),
         Stage("members-0", Scope.TILE, list_members, (Read("join-0"),)),
@@ -82,7 +82,7 @@ def later_round(config: Config, number: int) -> list[Stage]:
             Scope.TILE,
             find_near_shapes,
             (Read(f"shapes-{before}", config.clearance, by_extent=True),),
-            CITY_PARAMETERS,
+            ("clearance",),
         ),
         Stage(f"join-{after}", Scope.REGION, join_close_clusters, (Read(f"join-{before}"), Read(f"near-{after}"))),
         Stage(f"members-{after}", Scope.TILE, list_members, (Read(f"join-{after}"),)),
@@ -102,7 +102,8 @@ def model_stage(config: Config, last: int) -> Stage:
         Read("points", halo_of_points(config, 2 * config.ground_margin), around=shapes),
         Read("terrain", reach + 2 * config.dtm_spacing, around=shapes),
     )
-    return Stage("model", Scope.TILE, make_model, reads, (*CITY_PARAMETERS, *GROUND, *LAYER_PARAMETERS))
+    mesh = LAYER_PARAMETERS if config.mesher == "layered" else ("mesher",)
+    return Stage("model", Scope.TILE, make_model, reads, (*CITY_PARAMETERS, *GROUND, *mesh))
 
 
 def make_houses(task: Task) -> Facts:
@@ -227,7 +228,8 @@ def shape_members(task: Task) -> Facts:
 def make_model(task: Task) -> Facts:
     """Give the buildings of the clusters that a tile owns their ids, heights and layers (steps 2.3 and 3.4)."""
     given, bounds = task.parameters, task.context.bounds
-    options, mesh = city_options(given), mesh_options(given)
+    options = city_options(given)
+    mesh = mesh_options(given) if given.mesher == "layered" else None
     gathered = _gather(task, _members(task))
     shapes = _earlier_shapes(task, replace(gathered, changed=np.zeros(len(gathered.houses), np.bool_)))
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0

@@ -23,7 +23,7 @@ from tiler.tables import (
     unpack_polygons,
 )
 from tiler.task import Task
-from tiler.written import FILES, file_sizes
+from tiler.written import FILES, state_files
 
 FULL_CITY_MODEL = "citymodel-full.city.json"
 CITY_MODEL = "citymodel.city.json"
@@ -107,7 +107,7 @@ def _write(task: Task, stage: str, prefix: str, file: str) -> Facts:
     out = Path(task.context.out)
     with task.step("write"):
         task.notes(write_city_blocks(out / file, blocks, crs=task.context.crs, bounds=bounds))
-    return {"n": len(survey.number), FILES: file_sizes(out, [out / file])}
+    return {"n": len(survey.number), FILES: state_files(out, [out / file])}
 
 
 def _survey(task: Task, stage: str, prefix: str) -> _Survey:

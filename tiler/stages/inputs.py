@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pyproj
+import shapely
 
 from pipeline.errors import InputError
 from pipeline.notes import Note
@@ -13,11 +14,14 @@ from pipeline.pointcloud import BUILDING
 from pipeline.raster import Dtm, NodeWindow, grow_window, join_dtm, node_window
 from pipeline.terrain import bin_nodes
 from pipeline.terrain_fill import (
+    COARSE,
     FILL_RINGS,
     CoarseSums,
     FloodedDtm,
+    coarse_around,
     coarse_terrain,
     coarsen,
+    count_deep,
     fill_terrain,
     flood_terrain,
     merge_coarse,
@@ -25,10 +29,10 @@ from pipeline.terrain_fill import (
 from stitch.grid import Key, has_tile
 from tiler.config import Config
 from tiler.context import tile_key
-from tiler.footprint_index import largest_extent, scan_footprints
+from tiler.footprint_index import scan_footprints
 from tiler.ingest import read_cells
-from tiler.readers import grow, read_cloud, read_outlines
-from tiler.stage import Facts, Read, Scope, Stage
+from tiler.readers import clip, grow, read_cloud, read_outlines
+from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.tables import pack_polygons
 from tiler.task import Task
 
@@ -38,7 +42,7 @@ def input_stages(config: Config) -> list[Stage]:
     spacing = config.dtm_spacing
     ground = ("dtm_spacing", "ground_filter")
     return [
-        Stage("points", Scope.FILE, read_point_file, parameters=("skip_unreadable",)),
+        Stage("points", Scope.FILE, read_point_file, parameters=("skip_unreadable",), version=2),
         Stage(
             "footprints",
             Scope.REGION,
@@ -46,12 +50,28 @@ def input_stages(config: Config) -> list[Stage]:
             parameters=("footprints", "footprints_identity", "layer", "id_attribute", "height_attribute"),
         ),
         # What a tile needs of the footprints: it does not run again when others change.
-        Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),)),
+        Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),), version=2),
         Stage("reserved", Scope.REGION, list_reserved, (Read("footprints"),)),
         Stage("ground", Scope.TILE, bin_tile, (Read("points", halo_of_points(config, spacing)),), ground),
-        Stage("flooded", Scope.TILE, flood_tile, (Read("ground", (FILL_RINGS + 2) * spacing),), ("dtm_spacing",)),
+        Stage(
+            "flooded",
+            Scope.TILE,
+            flood_tile,
+            (Read("ground", (FILL_RINGS + 2) * spacing),),
+            ("dtm_spacing",),
+            version=2,
+        ),
         Stage("coarse", Scope.REGION, join_coarse, (Read("flooded"),), ("dtm_spacing",)),
-        Stage("terrain", Scope.TILE, fill_tile, (Read("flooded"), Read("coarse")), ("dtm_spacing",)),
+        # What a tile needs of the coarse level, which is nothing but in wide lakes.
+        Stage("lakes", Scope.TILE, take_coarse, (Read("flooded", own=True), Read("coarse")), ("dtm_spacing",)),
+        Stage(
+            "terrain",
+            Scope.TILE,
+            fill_tile,
+            (Read("flooded", own=True), Read("lakes", own=True)),
+            ("dtm_spacing",),
+            version=2,
+        ),
     ]
 
 
@@ -71,16 +91,17 @@ def read_point_file(task: Task) -> Facts:
     try:
         for block in read_cells(task.file, task.context.bounds):
             task.append(
-                xyz=block.xyz,
+                units=block.units,
                 classification=block.classification,
                 cell=block.cell,
                 cell_row=block.start[:-1] + row,
             )
             counts.update(block.counts)
             classes |= set(block.classes.tolist())
-            row += len(block.xyz)
+            row += len(block.units)
             n_cells += len(block.cell)
             blocks.append(n_cells)
+            scaling = {"scale": block.scale, "offset": block.offset}
     except InputError as error:
         if not task.parameters.skip_unreadable:
             raise
@@ -92,6 +113,7 @@ def read_point_file(task: Task) -> Facts:
         "classes": sorted(classes),
         "marks_buildings": BUILDING in classes,
         "unreadable": None,
+        **scaling,
     }
 
 
@@ -99,8 +121,8 @@ def read_footprint_file(task: Task) -> Facts:
     """Read the footprints of the region and deal them out to cells (step 1.2)."""
     given = task.parameters
     if not given.footprints:
-        return {"n": 0, "largest": 0.0, "part_like": []}
-    n, largest, first = 0, 0.0, 0
+        return {"n": 0, "part_like": []}
+    n, first = 0, 0
     blocks, part_like = [0], set[str]()
     for block in scan_footprints(
         Path(given.footprints),
@@ -126,12 +148,11 @@ def read_footprint_file(task: Task) -> Facts:
         n += len(rows)
         first += len(block.cell)
         blocks.append(first)
-        largest = max(largest, largest_extent(rows.box))
         part_like |= {name for name in rows.ids.tolist() if "-part" in name}
     if n == 0:
         task.note(Note("no-footprints-in-region", given.footprints, detail="terrain only"))
     task.put(block=np.array(blocks), end=np.array([n]))
-    return {"n": n, "largest": largest, "part_like": sorted(part_like)}
+    return {"n": n, "part_like": sorted(part_like)}
 
 
 def take_outlines(task: Task) -> Facts:
@@ -142,7 +163,12 @@ def take_outlines(task: Task) -> Facts:
         ids=footprints.ids,
         given_height=footprints.given_height,
     )
-    return {"n": len(footprints.ids)}
+    extent: Box | None = None
+    if len(footprints.ids):
+        # A house keeps within its footprint, and within the region.
+        xmin, ymin, xmax, ymax = shapely.total_bounds(footprints.polygons).tolist()
+        extent = clip((xmin, ymin, xmax, ymax), task.context.bounds)
+    return {"n": len(footprints.ids), "extent": extent}
 
 
 def list_reserved(task: Task) -> Facts:
@@ -188,7 +214,7 @@ def flood_tile(task: Task) -> Facts:
     flooded = flood_terrain(join_dtm(parts, grow_window(own, FILL_RINGS, within=within)), own)
     sums = coarsen(flooded)
     task.put(z=flooded.dtm.z, ring=flooded.ring, node=sums.node.reshape(-1, 2), total=sums.total, count=sums.count)
-    return _raster_facts(flooded.dtm) | {"known": sums.n_known}
+    return _raster_facts(flooded.dtm) | {"known": sums.n_known, "deep": count_deep(flooded)}
 
 
 def join_coarse(task: Task) -> Facts:
@@ -205,11 +231,24 @@ def join_coarse(task: Task) -> Facts:
     return _raster_facts(raster)
 
 
+def take_coarse(task: Task) -> Facts:
+    """Take the coarse nodes that a tile needs, none where nothing in it is empty and deep (step 1.3)."""
+    (own,) = (result.facts for result in task.read("flooded", ()))
+    nothing = Dtm(np.empty((0, 0)), 0, 0, COARSE * task.parameters.dtm_spacing)
+    if not own["deep"]:
+        return _raster_facts(nothing)
+    (coarse,) = (_raster(result.arrays["z"], result.facts) for result in task.read("coarse"))
+    around = coarse_around(coarse, NodeWindow(own["i0"], own["j0"], own["nx"], own["ny"]))
+    task.put(z=around.z)
+    return _raster_facts(around)
+
+
 def fill_tile(task: Task) -> Facts:
     """Fill the large empty areas of a tile's terrain (step 1.3)."""
-    (own,) = (result for result in task.read("flooded", ("z", "ring")) if result.name == task.name)
+    (own,) = task.read("flooded", ("z", "ring"))
     flooded = FloodedDtm(_raster(own.arrays["z"], own.facts), own.arrays["ring"])
-    (coarse,) = (_raster(result.arrays["z"], result.facts) for result in task.read("coarse"))
+    (lakes,) = task.read("lakes")
+    coarse = _raster(lakes.arrays.get("z", np.empty((0, 0))), lakes.facts)
     filled, counts = fill_terrain(flooded, coarse)
     task.put(z=filled.z)
     return _raster_facts(filled) | {

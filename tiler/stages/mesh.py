@@ -20,7 +20,7 @@ from stitch.corners import Corner, place_corner
 from stitch.facets import Side, find_seam_edges
 from stitch.grid import Bounds, SeamKey, ends_of_seam, is_pinched, seams_of_tile
 from stitch.layered_seams import fill_corner_layers, fill_seam_layers
-from stitch.numbering import count_inner_points, count_points
+from stitch.numbering import corner_part, count_inner_points, count_points, first_id, seam_ids
 from stitch.patches import mesh_patch
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
 from stitch.seams import Seam, find_vertices, trace_seam
@@ -44,7 +44,7 @@ def mesh_stages(config: Config) -> list[Stage]:
     reads = (Read("model", halo, by_extent=True), Read("terrain", halo + terrain_halo(config)))
     return [
         Stage("seams", Scope.SEAM, make_seam, reads, PARAMETERS),
-        Stage("columns", Scope.TILE, make_columns, (*reads, Read("seams")), PARAMETERS),
+        Stage("columns", Scope.TILE, make_columns, (*reads, Read("seams", beside=True)), PARAMETERS, version=2),
     ]
 
 
@@ -128,6 +128,15 @@ def make_columns(task: Task) -> Facts:
     )
     gap, _ = lowest_gap(columns)
     shared = [find_vertices(plane.xy, seam.xy) for seam, _ in (*given_columns, *pinched)]
+    keys = [seam_key(name) for name in names]
+    lowest = [seam_ids(keys[k], levels) for k, (_, levels) in zip(inner, given_columns, strict=True)]
+    for key, name in zip(keys, names, strict=True):
+        ends = [ends_of_seam(key)[k] for k, _ in found[name].facts.get("pinched", [])]
+        lowest += [np.array([first_id(corner_part(corner))]) for corner in ends]
+    task.put(
+        shared=np.concatenate([np.empty(0, np.int32), *shared]),
+        shared_id=np.concatenate([np.empty(0, np.int64), *lowest]),
+    )
     inner_points = count_inner_points(columns, shared)
     return {
         "inner_points": inner_points,

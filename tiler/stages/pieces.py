@@ -23,19 +23,11 @@ from pipeline.point_fidelity import KINDS, FidelitySums, conclude_fidelity, merg
 from pipeline.pointcloud import PointCloud
 from pipeline.quality import measure_cells
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
-from stitch.grid import Key, TileGrid, ends_of_seam, is_border, is_pinched, seams_of_tile, tiles_of_seam
-from stitch.numbering import (
-    SeamNumbers,
-    corner_part,
-    count_parts,
-    make_offsets,
-    number_points,
-    seam_part,
-    tile_part,
-)
-from stitch.seams import find_vertices
+from stitch.grid import Key, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
+from stitch.numbering import corner_part, first_id, make_offsets, number_points, seam_part, tile_part
 from tiler.config import Config
 from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
+from tiler.merged import VERTEX_ID
 from tiler.readers import read_buildings, read_cloud, read_terrain
 from tiler.results import COLUMN_ARRAYS, unpack_columns
 from tiler.stage import Facts, Read, Scope, Stage
@@ -43,9 +35,10 @@ from tiler.stages.inputs import halo_of_points
 from tiler.tables import unpack_polygons
 from tiler.task import Result, Task
 from tiler.vtk_files import write_vtp, write_vtu
-from tiler.written import FILES, file_sizes
+from tiler.written import FILES, state_files
 
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
+ID_ARRAYS = ("shared", "shared_id")
 
 
 def piece_stages(config: Config) -> list[Stage]:
@@ -56,57 +49,47 @@ def piece_stages(config: Config) -> list[Stage]:
         Read("model", by_extent=True),
         Read("houses", by_extent=True),
     )
+    meshed = (Read("seams", optional=True), Read("columns", optional=True))
+    beside = (Read("columns", beside=True, others_by_name=True, optional=True),)
     return [
-        Stage("numbers", Scope.REGION, number_parts, (Read("seams"), Read("columns"))),
-        # A tile whose own numbers are as before is not written again.
-        Stage("offsets", Scope.TILE, take_offsets, (Read("numbers"),)),
-        Stage("pieces", Scope.TILE, write_piece, (Read("columns"), Read("seams"), Read("offsets", own=True))),
-        Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces"),)),
+        Stage("numbers", Scope.REGION, number_parts, meshed, version=3),
+        # Of the tiles around it a piece asks only which of them there are.
+        Stage("pieces", Scope.TILE, write_piece, beside, version=2),
+        Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces", beside=True, optional=True),)),
         Stage("fit", Scope.TILE, measure_fit, fit, ("dtm_spacing", "ground_filter")),
-        Stage("report", Scope.REGION, sum_up, (Read("pieces"), Read("fit"))),
+        Stage("report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True))),
     ]
 
 
 def number_parts(task: Task) -> Facts:
-    """Find where the numbers of the points of each corner, seam and tile begin, over the whole region."""
-    grid = task.context.grid
-    counts = np.zeros(count_parts(grid), np.int64)
+    """Find where the points of each corner, seam and tile begin if all are numbered without gaps.
+
+    A seam between two tiles that failed has no points in any file.
+    """
+    counts: dict[int, int] = {}
+    there = {tile_key(name) for name in task.refs["columns"]}
     for result in task.read("seams", ()):
         key = seam_key(result.name)
+        if there.isdisjoint(tiles_of_seam(key)):
+            continue
         start, end = ends_of_seam(key)
         if result.facts["border"]:
             for k, n_points in result.facts["pinched"]:
-                counts[corner_part(grid, (start, end)[k])] = n_points
+                counts[corner_part((start, end)[k])] = n_points
         else:
             first, inner, last = result.facts["points"]
-            counts[[corner_part(grid, start), seam_part(grid, key), corner_part(grid, end)]] = (
-                first,
-                inner,
-                last,
-            )
+            counts |= {corner_part(start): first, seam_part(key): inner, corner_part(end): last}
     for result in task.read("columns", ()):
-        counts[tile_part(grid, tile_key(result.name))] = result.facts["inner_points"]
-    offsets = make_offsets(counts.tolist())
-    task.put(offset=offsets)
-    return {"points": int(offsets[-1])}
-
-
-def take_offsets(task: Task) -> Facts:
-    """Take where the numbers of a tile's own corners, seams and inner points begin."""
-    grid, key = task.context.grid, tile_key(task.name)
-    parts = {tile_part(grid, key)}
-    for seam in seams_of_tile(key):
-        parts |= {seam_part(grid, seam), *(corner_part(grid, corner) for corner in ends_of_seam(seam))}
-    part = np.array(sorted(parts))
-    (numbers,) = task.read("numbers")
-    task.put(part=part, offset=numbers.arrays["offset"][part])
-    return {}
+        counts[tile_part(tile_key(result.name))] = result.facts["inner_points"]
+    part, offset = make_offsets(counts)
+    task.put(part=part, offset=offset)
+    return {"points": int(offset[-1])}
 
 
 def write_piece(task: Task) -> Facts:
     """Write a tile's cells and its boundary as files, and measure the cells (step 3.6)."""
-    grid, key = task.context.grid, tile_key(task.name)
-    arrays, attributes = task.store.read("columns", task.name, names=(*COLUMN_ARRAYS, *EDGE_ARRAYS))
+    key = tile_key(task.name)
+    arrays, attributes = task.store.read("columns", task.name, names=(*COLUMN_ARRAYS, *EDGE_ARRAYS, *ID_ARRAYS))
     mesh, numbers = unpack_columns(arrays, attributes["facts"]["order"])
     edges = SeamEdges(
         arrays["edge"],
@@ -122,7 +105,8 @@ def write_piece(task: Task) -> Facts:
     cells, boundary = drop_points(cells, boundary, used)
     out = Path(task.context.out)
     with task.step("3.6 write pieces"):
-        number = {"vertex_id": _number_points(task, mesh, grid, key)[used]}
+        ids = number_points(mesh, arrays["shared"], arrays["shared_id"], first_id(tile_part(key)))
+        number = {VERTEX_ID: ids[used]}
         files = out / "mesh" / f"{task.name}.vtu", out / "boundary" / f"{task.name}.vtp"
         write_vtu(files[0], cells, point_data=number)
         write_vtp(files[1], cells.points, boundary, point_data=number)
@@ -133,7 +117,7 @@ def write_piece(task: Task) -> Facts:
     return {
         "counts": {"cells": len(cells.cells), "facets": len(boundary.facets), "seam faces": len(shared)},
         "seams": seams,
-        FILES: file_sizes(out, files),
+        FILES: state_files(out, files),
     }
 
 
@@ -163,7 +147,7 @@ def measure_fit(task: Task) -> Facts:
     given, bounds = task.parameters, task.context.bounds
     cloud = read_cloud(task, task.box, ground_filter=given.ground_filter)
     own = find_owned(task.box, bounds, cloud.xyz[:, :2])
-    cloud = PointCloud(cloud.xyz[own], cloud.classification[own])
+    cloud = PointCloud(np.compress(own, cloud.xyz, axis=0), cloud.classification[own])
     dtm = read_terrain(task, task.box, spacing=given.dtm_spacing, bounds=bounds)
     buildings = read_buildings(task, task.box)
     outlines = [np.empty(0, object)]
@@ -223,28 +207,6 @@ def _there(task: Task, key: Key) -> NDArray[np.bool_]:
     return np.array(
         [tile_name(tile) in around for tile in (Key(i, j - 1), Key(i + 1, j), Key(i, j + 1), Key(i - 1, j))]
     )
-
-
-def _number_points(task: Task, mesh: ColumnMesh, grid: TileGrid, key: Key) -> NDArray[np.int64]:
-    """Region-wide numbers of a tile's points."""
-    (own,) = (result.arrays for result in task.read("offsets"))
-    offset = dict(zip(own["part"].tolist(), own["offset"].tolist(), strict=True))
-
-    seams = []
-    for seam in seams_of_tile(key):
-        corners = ends_of_seam(seam)
-        ends = [offset[corner_part(grid, corner)] for corner in corners]
-        border = is_border(grid, seam)
-        if border and not any(is_pinched(grid, corner) for corner in corners):
-            continue
-        vertex = find_vertices(mesh.plane.xy, task.store.read("seams", seam_name(seam), names=("xy",))[0]["xy"])
-        if not border:
-            seams.append(SeamNumbers(vertex, (ends[0], offset[seam_part(grid, seam)], ends[1])))
-            continue
-        for k, corner in enumerate(corners):
-            if is_pinched(grid, corner):
-                seams.append(SeamNumbers(vertex[[-k, -k]], (ends[k], 0, ends[k])))
-    return number_points(mesh, seams, offset[tile_part(grid, key)])
 
 
 def _digest_seams(

@@ -1,0 +1,150 @@
+"""Files of OpenFOAM: headers, and long lists in binary, written in any order of their rows."""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tiler.formats.rows import blocks_of
+
+BANNER = "// Written by citystitch.\n"
+LABEL_LIMIT = 2**31 - 1  # numbers that a 32 bit label can hold
+COUNT_WIDTH = 20  # characters of a count that is known when its list is whole
+ROWS = 1 << 20  # rows that are made at once
+
+
+def foam_header(
+    name: str, kind: str, *, location: str, binary: bool = False, label: int = 32, note: str = ""
+) -> str:
+    """Make the head of a file.
+
+    Parameters
+    ----------
+    name, kind : str
+        Its ``object`` and ``class``.
+    location : str
+        Folder of it within the case.
+    binary : bool
+        Whether the lists in it are binary: little-endian, ``label`` bits an integer, 64 bits a float.
+    note : str
+        What some programs print; no quotes in it.
+    """
+    lines = ["FoamFile", "{", "    version     2.0;", f"    format      {'binary' if binary else 'ascii'};"]
+    if binary:
+        lines.append(f'    arch        "LSB;label={label};scalar=64";')
+    if note:
+        lines.append(f'    note        "{note}";')
+    lines += [f"    class       {kind};", f'    location    "{location}";', f"    object      {name};", "}", ""]
+    return BANNER + "\n".join(lines) + "\n"
+
+
+class FoamList:
+    """One binary list of `n` rows, written in pieces.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    header : str
+        What stands before the list; `foam_header`.
+    dtype : numpy dtype
+        Of the numbers.
+    width : int
+        Numbers a row.
+    n : int, optional
+        Number of rows; if not given, that of those that were appended.
+    """
+
+    def __init__(self, path: Path, header: str, dtype: Any, *, width: int = 1, n: int | None = None) -> None:
+        self._dtype, self._width, self._n, self._end = np.dtype(dtype).newbyteorder("<"), width, n, 0
+        self._file: BinaryIO = path.open("wb")
+        self._header = header
+        self._head()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+        self._file.close()
+
+    @property
+    def n(self) -> int:
+        """Rows that the list has, or has so far."""
+        return self._end if self._n is None else self._n
+
+    def write(self, start: int, rows: NDArray[Any]) -> None:
+        """Write rows from number `start` on."""
+        self._file.seek(self._start + start * self._width * self._dtype.itemsize)
+        self._file.write(np.ascontiguousarray(rows, self._dtype).data)
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Write rows behind those that were appended before."""
+        self.write(self._end, rows)
+        self._end += len(rows)
+
+    def scatter(self, place: NDArray[np.int64], rows: NDArray[Any]) -> None:
+        """Write each row at its own place: cheap where many follow each other."""
+        for start, chosen in blocks_of(place):
+            self.write(start, rows[chosen])
+
+    def close(self) -> None:
+        """Write the end of the list."""
+        self._file.seek(self._start + self.n * self._width * self._dtype.itemsize)
+        self._file.write(b")\n")
+        self._head()
+
+    def _head(self) -> None:
+        self._file.seek(0)
+        self._file.write(f"{self._header}{self.n:<{COUNT_WIDTH}d}\n(".encode())
+        self._start = self._file.tell()
+
+
+class FoamFaces:
+    """The file ``faces`` of triangles: where each face begins, then their vertices.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    location : str
+        Folder of it within the case.
+    label : int
+        Bits of an integer.
+    n : int
+        Number of faces.
+    """
+
+    def __init__(self, path: Path, *, location: str, label: int, n: int) -> None:
+        self._dtype = np.dtype(f"<i{label // 8}")
+        self._file: BinaryIO = path.open("wb")
+        header = foam_header("faces", "faceCompactList", location=location, binary=True, label=label)
+        self._file.write(f"{header}{n + 1}\n(".encode())
+        for i in range(0, n + 1, ROWS):
+            self._file.write((3 * np.arange(i, min(i + ROWS, n + 1))).astype(self._dtype).data)
+        self._file.write(f")\n{3 * n}\n(".encode())
+        self._start, self._n = self._file.tell(), n
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self._seek(self._n)
+            self._file.write(b")\n")
+        self._file.close()
+
+    def write(self, start: int, corners: NDArray[Any]) -> None:
+        """Write the vertices (k, 3) of faces from number `start` on."""
+        self._seek(start)
+        self._file.write(np.ascontiguousarray(corners, self._dtype).data)
+
+    def _seek(self, face: int) -> None:
+        self._file.seek(self._start + 3 * face * self._dtype.itemsize)

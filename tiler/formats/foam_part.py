@@ -1,0 +1,310 @@
+"""One polyMesh of OpenFOAM: the whole mesh, or the part of one process."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stitch.cell_faces import CellFaces
+from tiler.formats.foam_files import FoamFaces, FoamList, foam_header
+from tiler.formats.foam_patches import POLY_MESH, ZonesFile, patch_of_key, runs_of, write_boundary
+from tiler.formats.pieces import Pieces
+from tiler.formats.region_faces import FacetSets, Ints, RegionFaces, faces_of_piece, lowest_first, own_faces
+from tiler.mesh_pieces import MeshPiece
+
+
+@dataclass(frozen=True)
+class PartCounts:
+    """What was written of a mesh, or of one part of it.
+
+    Attributes
+    ----------
+    cells, points, faces, inner_faces : int
+        Their numbers.
+    patches : mapping of str to int
+        Faces of each patch, processor patches included.
+    lowest : mapping of str to float
+        Lowest point (m) of each patch of the region's boundary that has faces here.
+    """
+
+    cells: int
+    points: int
+    faces: int
+    inner_faces: int
+    patches: Mapping[str, int]
+    lowest: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class FoamPlan:
+    """What all parts are written from.
+
+    Attributes
+    ----------
+    pieces : Pieces
+        The mesh.
+    region : RegionFaces
+        Numbers of cells and faces.
+    patches, zones : FacetSets
+        Patches by key (`patch_of_key`); face zones by number of building, or None.
+    patch_keys, zone_keys : callable
+        Give the key of each facet of a piece.
+    part : int64, (k,)
+        Part of each piece.
+    label : int
+        Bits of an integer.
+    """
+
+    pieces: Pieces
+    region: RegionFaces
+    patches: FacetSets
+    zones: FacetSets | None
+    patch_keys: Callable[[MeshPiece], Ints]
+    zone_keys: Callable[[MeshPiece], Ints]
+    part: Ints
+    label: int
+
+
+class PointPlaces:
+    """Numbers of points within parts that are written one after the other; a file, 8 bytes a point of the region.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    n_points : int
+        Points of the region.
+    """
+
+    def __init__(self, path: Path, n_points: int) -> None:
+        self._place = np.memmap(path, np.int64, "w+", shape=(max(n_points, 1),))
+        self._base = self._end = 0
+
+    def begin_part(self) -> None:
+        """Forget the numbers of the last part."""
+        self._base = self._end
+
+    def add(self, ids: Ints) -> tuple[Ints, NDArray[np.bool_]]:
+        """Number the points of a piece in the order in which they come; tell also which of them are new."""
+        fresh = self._place[ids] <= self._base
+        n = int(fresh.sum())
+        self._place[ids[fresh]] = self._end + 1 + np.arange(n)
+        self._end += n
+        return self._place[ids] - (self._base + 1), fresh
+
+
+@dataclass(frozen=True, eq=False)
+class _Numbers:
+    """The numbers of a part: where cells of each piece, faces of each patch begin, faces towards other parts."""
+
+    number: int
+    pieces: Sequence[int]
+    start: Ints
+    n_cells: int
+    n_inner: int
+    others: dict[int, int]
+    first: dict[int, dict[int, int]]
+    patch_n: Ints
+    patch_start: Ints
+
+    @property
+    def n_faces(self) -> int:
+        return self.n_inner + int(self.patch_n.sum()) + sum(self.others.values())
+
+
+@dataclass(frozen=True, eq=False)
+class _Across:
+    """Faces towards other parts: which, number over the region, whether turned, owner and vertices here."""
+
+    other: Ints
+    face: Ints
+    turned: NDArray[np.bool_]
+    owner: Ints
+    corners: Ints
+
+
+def write_part(folder: Path, plan: FoamPlan, number: int, places: PointPlaces | None) -> PartCounts:
+    """Write the polyMesh of one part.
+
+    Parameters
+    ----------
+    folder : Path
+        The case, or the folder of the process; made if it is missing.
+    plan : FoamPlan
+        The region's numbers.
+    number : int
+        Which part.
+    places : PointPlaces, optional
+        Numbers of points in parts. If not given, there is one part, the whole mesh, and points keep the region's
+        numbers.
+    """
+    (folder / POLY_MESH).mkdir(parents=True)
+    with ExitStack() as stack:
+        writer = _PartWriter(folder / POLY_MESH, plan, number, places, stack)
+        for k in writer.numbers.pieces:
+            writer.add(k)
+        return writer.finish()
+
+
+class _PartWriter:
+    """The open files of a part."""
+
+    def __init__(
+        self, folder: Path, plan: FoamPlan, number: int, places: PointPlaces | None, stack: ExitStack
+    ) -> None:
+        self._folder, self._plan, self._places, self._stack = folder, plan, places, stack
+        self.numbers = numbers = _number_part(plan, number)
+        self._row = 0
+        self._across: list[_Across] = []
+        self._lowest: dict[str, float] = {}
+        n = numbers.n_faces
+        self._faces = stack.enter_context(FoamFaces(folder / "faces", location=POLY_MESH, label=plan.label, n=n))
+        n_points = plan.pieces.n_points if places is None else None
+        self._points = self._open("points", n=n_points, kind="vectorField", dtype="f8", width=3)
+        self._owner, self._neighbour = self._open("owner", n=n), self._open("neighbour", n=numbers.n_inner)
+        if places is not None:
+            places.begin_part()
+            self._point_to, self._cell_to = self._open("pointProcAddressing"), self._open("cellProcAddressing")
+            self._face_to = self._open("faceProcAddressing", n=n)
+            self._whole = _number_facets(plan.patches, range(len(plan.part)), plan.region.n_inner)
+        self._zones = None
+        if plan.zones is not None:
+            self._zones = stack.enter_context(ZonesFile(folder / "faceZones", plan.zones, numbers.pieces))
+
+    def add(self, k: int) -> None:
+        """Write piece `k`."""
+        piece = self._plan.pieces.read(k)
+        faces = faces_of_piece(piece)
+        local = self._add_points(k, piece)
+        self._add_inner(k, piece, faces, local)
+        self._add_facets(k, piece, faces, local)
+
+    def finish(self) -> PartCounts:
+        """Write what stands behind the pieces."""
+        plan, numbers = self._plan, self.numbers
+        if self._places is not None:
+            self._add_across()
+            rows = [*range(len(plan.patches.keys)), *(-1 for _ in numbers.others)]
+            self._open("boundaryProcAddressing").append(np.array(rows, np.int64))
+        patches = {
+            patch_of_key(key): n
+            for key, n in zip(plan.patches.keys.tolist(), numbers.patch_n.tolist(), strict=True)
+        }
+        counts = write_boundary(
+            self._folder / "boundary", patches, start=numbers.n_inner, number=numbers.number, others=numbers.others
+        )
+        return PartCounts(numbers.n_cells, self._points.n, numbers.n_faces, numbers.n_inner, counts, self._lowest)
+
+    def _open(
+        self, name: str, *, n: int | None = None, kind: str = "labelList", dtype: str = "", width: int = 1
+    ) -> FoamList:
+        header = foam_header(name, kind, location=POLY_MESH, binary=True, label=self._plan.label)
+        file = FoamList(self._folder / name, header, dtype or f"i{self._plan.label // 8}", width=width, n=n)
+        return self._stack.enter_context(file)
+
+    def _add_points(self, k: int, piece: MeshPiece) -> Ints:
+        """Write the points of a piece; returns their numbers in this part."""
+        if self._places is None:
+            self._points.scatter(piece.ids, piece.points)
+            return piece.ids
+        local, fresh = self._places.add(piece.ids)
+        self._points.append(piece.points[fresh])
+        self._point_to.append(piece.ids[fresh])
+        self._cell_to.append(np.arange(*self._plan.region.cell_start[k : k + 2]))
+        return local
+
+    def _add_inner(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> None:
+        """Write the faces whose lower cell is in the piece and whose other cell is in the part."""
+        region, part, start = self._plan.region, self._plan.part, self.numbers.start
+        own = own_faces(region, k, piece, faces)
+        beyond = region.piece_of(own.neighbour)
+        other = part[beyond]
+        owner, corners = own.owner - region.cell_start[k] + start[k], local[own.corners]
+        inside = other == self.numbers.number
+        self._faces.write(self._row, corners[inside])
+        self._owner.write(self._row, owner[inside])
+        within = beyond[inside]
+        self._neighbour.write(self._row, own.neighbour[inside] - region.cell_start[within] + start[within])
+        if self._places is not None:
+            face = region.face_start[k] + np.arange(len(inside))
+            self._face_to.write(self._row, face[inside] + 1)
+            out = ~inside
+            turned = np.zeros(int(out.sum()), np.bool_)
+            self._across.append(_Across(other[out], face[out], turned, owner[out], corners[out]))
+            self._across.append(self._find_turned(k, piece, faces, local))
+        self._row += int(inside.sum())
+
+    def _find_turned(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> _Across:
+        """Find the faces of a piece whose lower cell is in another part."""
+        region = self._plan.region
+        rows = np.arange(*region.shared_start[k : k + 2])
+        cell, lower = region.cell[rows], region.cell[region.mate[rows]]
+        other = self._plan.part[region.piece_of(lower)]
+        turned = (lower < cell) & (other != self.numbers.number)
+        corners = local[lowest_first(faces.shared[turned], piece.ids)]
+        owner = cell[turned] - region.cell_start[k] + self.numbers.start[k]
+        face = region.face[rows[turned]]
+        return _Across(other[turned], face, np.ones(len(face), np.bool_), owner, corners)
+
+    def _add_facets(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> None:
+        """Write the facets of a piece, each where its patch has room for them."""
+        numbers, keys = self.numbers, self._plan.patches.keys
+        corners, owner = local[piece.facets], faces.facet_cell + numbers.start[k]
+        face = np.empty(len(owner), np.int64)
+        for row, chosen in runs_of(keys, self._plan.patch_keys(piece)):
+            at = int(numbers.patch_start[row]) + numbers.first[k][row]
+            self._faces.write(at, corners[chosen])
+            self._owner.write(at, owner[chosen])
+            face[chosen] = at + np.arange(len(chosen))
+            if self._places is not None:
+                first, _, start = self._whole
+                self._face_to.write(at, int(start[row]) + first[k][row] + 1 + np.arange(len(chosen)))
+            name, lowest = patch_of_key(int(keys[row])).name, float(piece.points[piece.facets[chosen], 2].min())
+            self._lowest[name] = min(self._lowest.get(name, lowest), lowest)
+        if self._zones is not None:
+            self._zones.write(k, self._plan.zone_keys(piece), face)
+
+    def _add_across(self) -> None:
+        """Write the faces towards other parts: by part, then by number over the region, so in its order too."""
+        names = ("other", "face", "turned", "owner", "corners")
+        other, face, turned, owner, corners = (
+            np.concatenate([getattr(across, name) for across in self._across]) for name in names
+        )
+        order = np.lexsort((face, other))
+        at = self.numbers.n_inner + int(self.numbers.patch_n.sum())
+        self._faces.write(at, corners[order])
+        self._owner.write(at, owner[order])
+        self._face_to.write(at, (np.where(turned, -1, 1) * (face + 1))[order])
+
+
+def _number_part(plan: FoamPlan, number: int) -> _Numbers:
+    region, part = plan.region, plan.part
+    chosen = np.flatnonzero(part == number)
+    n_cells = np.diff(region.cell_start)
+    start = np.full(len(part), -1, np.int64)
+    start[chosen] = np.cumsum(n_cells[chosen]) - n_cells[chosen]
+    n_inner = int(np.diff(region.face_start)[chosen].sum())
+    others: Counter[int] = Counter()
+    for (k, beyond), count in region.between.items():
+        own, other = int(part[k]), int(part[beyond])
+        if own != other and number in (own, other):
+            others[own + other - number] += count
+            n_inner -= count if own == number else 0
+    pieces = chosen.tolist()
+    first, patch_n, patch_start = _number_facets(plan.patches, pieces, n_inner)
+    towards = dict(sorted(others.items()))
+    return _Numbers(
+        number, pieces, start, int(n_cells[chosen].sum()), n_inner, towards, first, patch_n, patch_start
+    )
+
+
+def _number_facets(
+    patches: FacetSets, pieces: Sequence[int], n_inner: int
+) -> tuple[dict[int, dict[int, int]], Ints, Ints]:
+    """Where the facets of each piece begin in each patch, how many each patch has, and where it begins."""
+    first, n = patches.first(pieces)
+    return first, n, n_inner + np.cumsum(n) - n

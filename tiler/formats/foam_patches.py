@@ -1,0 +1,181 @@
+"""Patches and face zones of OpenFOAM: their names, and the files `boundary` and `faceZones`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.mesh import Marker
+from tiler.formats.foam_files import foam_header
+from tiler.formats.region_faces import FacetSets, Ints
+
+POLY_MESH = "constant/polyMesh"
+PATCHES = {
+    Marker.GROUND: "ground",
+    Marker.WALL: "walls",
+    Marker.ROOF: "roofs",
+    Marker.TOP: "top",
+    Marker.WEST: "west",
+    Marker.EAST: "east",
+    Marker.SOUTH: "south",
+    Marker.NORTH: "north",
+    Marker.MISSING: "missing",
+}
+HOUSE = (Marker.WALL, Marker.ROOF)
+SOLID = (Marker.GROUND, *HOUSE)
+FIRST_BUILDING = 100  # keys of patches from here on are buildings, those below are markers
+WIDTH = 20  # characters of a face's number in a zone, its line break among them
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A patch of the region's boundary.
+
+    Attributes
+    ----------
+    name, kind : str
+        Its name and type.
+    groups : tuple of str
+        Names under which boundary conditions can take it together with others.
+    """
+
+    name: str
+    kind: str
+    groups: tuple[str, ...]
+
+
+def patch_of_key(key: int) -> Patch:
+    """Tell the patch of a key: a marker, or `FIRST_BUILDING` and the number of a building.
+
+    Examples
+    --------
+    >>> patch_of_key(4).name, patch_of_key(107)
+    ('top', Patch(name='building_7', kind='wall', groups=('wall', 'buildings')))
+    """
+    if key >= FIRST_BUILDING:
+        return Patch(building_name(key - FIRST_BUILDING), "wall", ("wall", "buildings"))
+    marker = Marker(key)
+    if marker not in SOLID:
+        return Patch(PATCHES[marker], "patch", ())
+    return Patch(PATCHES[marker], "wall", ("wall", "buildings") if marker in HOUSE else ("wall",))
+
+
+def building_name(number: int) -> str:
+    """Name the patch or zone of a building."""
+    return f"building_{number}"
+
+
+def write_boundary(
+    path: Path, patches: Mapping[Patch, int], *, start: int, number: int, others: Mapping[int, int]
+) -> dict[str, int]:
+    """Write the file ``boundary``.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    patches : mapping of Patch to int
+        Faces of each, in their order.
+    start : int
+        Number of the first of these faces.
+    number : int
+        Which part this is.
+    others : mapping of int to int
+        Faces towards each other part.
+
+    Returns
+    -------
+    dict of str to int
+        Faces by name of patch.
+    """
+    entries, counts = [], {}
+    for patch, n in patches.items():
+        groups = f"inGroups        {len(patch.groups)}({' '.join(patch.groups)});" if patch.groups else ""
+        entries.append((patch.name, patch.kind, n, [groups] if groups else []))
+    for other, n in others.items():
+        words = [
+            "inGroups        1(processor);",
+            "matchTolerance  0.0001;",
+            "transform       unknown;",
+            f"myProcNo        {number};",
+            f"neighbProcNo    {other};",
+        ]
+        entries.append((f"procBoundary{number}to{other}", "processor", n, words))
+    lines = [str(len(entries)), "("]
+    for name, kind, n, words in entries:
+        own = [f"type            {kind};", *words, f"nFaces          {n};", f"startFace       {start};"]
+        lines += [f"    {name}", "    {", *(f"        {word}" for word in own), "    }"]
+        counts[name] = n
+        start += n
+    header = foam_header("boundary", "polyBoundaryMesh", location=POLY_MESH)
+    path.write_text("\n".join([header, *lines, ")", ""]))
+    return counts
+
+
+class ZonesFile:
+    """The file ``faceZones``, filled piece by piece.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    sets : FacetSets
+        Zones by number of building.
+    pieces : sequence of int
+        The pieces that will be written.
+
+    Notes
+    -----
+    Numbers are text of a fixed width, so that each place is known before; memory holds names and places.
+    """
+
+    def __init__(self, path: Path, sets: FacetSets, pieces: Sequence[int]) -> None:
+        self._keys = sets.keys
+        self._first, count = sets.first(pieces)
+        self._file: BinaryIO = path.open("wb")
+        self._file.write(
+            f"{foam_header('faceZones', 'regIOobject', location=POLY_MESH)}{len(count)}\n(\n".encode()
+        )
+        self._start = np.empty(len(count), np.int64)
+        for row, (key, n) in enumerate(zip(self._keys.tolist(), count.tolist(), strict=True)):
+            name = building_name(key)
+            self._file.write(f"{name}\n{{\n    type faceZone;\n    faceLabels List<label>\n{n}\n(\n".encode())
+            self._start[row] = self._file.tell()
+            self._file.seek(n * WIDTH, 1)
+            flips = f"{n}{{0}}" if n else "0()"  # OpenFOAM cannot read 0{0}
+            self._file.write(f")\n    ;\n    flipMap List<bool> {flips};\n}}\n".encode())
+        self._file.write(b")\n")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def write(self, k: int, keys: Ints, faces: Ints) -> None:
+        """Write which faces of piece `k` are in the zones `keys`, -1 for none."""
+        for row, chosen in runs_of(self._keys, keys):
+            lines = "".join(f"{face:>{WIDTH - 1}d}\n" for face in faces[chosen].tolist())
+            self._file.seek(int(self._start[row]) + self._first[k][row] * WIDTH)
+            self._file.write(lines.encode())
+
+
+def runs_of(keys: Ints, of_facet: Ints) -> list[tuple[int, NDArray[np.int64]]]:
+    """Group facets by key: the row of each key that there is, and its facets in their order.
+
+    Examples
+    --------
+    >>> runs_of(np.array([1, 4, 9]), np.array([9, -1, 1, 9]))
+    [(0, array([2])), (2, array([0, 3]))]
+    """
+    order = np.argsort(of_facet, kind="stable")
+    order = order[np.searchsorted(of_facet[order], 0) :]
+    present, begin = np.unique(of_facet[order], return_index=True)
+    groups = np.split(order, begin[1:])
+    return list(zip(np.searchsorted(keys, present).tolist(), groups, strict=False))

@@ -1,0 +1,172 @@
+"""glTF 2.0 in one binary file: the boundary as one mesh, with a primitive and a material a patch.
+
+glTF has float32 and y up: coordinates are shifted to a local origin and turned, and the file's `extras` tell how.
+"""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.mesh import Marker
+from tiler.atomic import replacing
+from tiler.export import RUN_RECORD
+from tiler.formats.surface import (
+    Surface,
+    SurfaceSurvey,
+    open_surface,
+    patch_name,
+    place_vertices,
+    survey_surface,
+)
+from tiler.run_folder import read_crs
+
+FLOAT, UNSIGNED_INT = 5126, 5125
+VERTICES, INDICES = 34962, 34963  # targets of buffer views
+VERTEX_BYTES = FACET_BYTES = 12
+MOST_BYTES = 2**32 - 1  # of a GLB file: its length has 32 bits
+AXES = "x east, y up, z south; easting = origin[0] + x, northing = origin[1] - z, height = origin[2] + y"
+COLOURS = {Marker.GROUND: (0.45, 0.5, 0.38), Marker.WALL: (0.82, 0.78, 0.7), Marker.ROOF: (0.66, 0.33, 0.25)}
+SIDE_COLOUR, SIDE_OPACITY = (0.6, 0.75, 0.9), 0.1  # of top and sides, through which the city is seen
+
+
+def export_glb(output: Path, directory: Path) -> None:
+    """Write the boundary of a finished run as GLB.
+
+    Parameters
+    ----------
+    output : Path
+        The file; it appears whole or not at all.
+    directory : Path
+        Folder of the run.
+
+    Raises
+    ------
+    InputError
+        If the run is not finished, or a file of it is missing or damaged; if the file would be longer than GLB
+        allows.
+    OutputError
+        If the file cannot be written.
+    """
+    surface = open_surface(directory)
+    crs = read_crs(directory / RUN_RECORD)
+    with replacing(output) as part:
+        write_glb(part, surface, crs=crs)
+
+
+def write_glb(path: Path, surface: Surface, *, crs: str) -> None:
+    """Write a boundary as GLB.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    surface : Surface
+        The boundary; facets are counter-clockwise seen from outside the air, and drawn from both sides.
+    crs : str
+        CRS of its coordinates.
+
+    Raises
+    ------
+    InputError
+        If the boundary is empty, or the file would have 4 GiB or more.
+
+    Notes
+    -----
+    The origin is the middle of the box in whole metres, at its lowest height. All patches share the vertices.
+    Memory holds one piece, and a quarter of a byte a point of the mesh. Each piece is read twice.
+    """
+    survey = survey_surface(surface)
+    if not survey.n_facets:
+        raise InputError("boundary: has no facets, and GLB no empty meshes; mesh the region again")
+    origin = np.floor([*(survey.low + survey.high)[:2] / 2, survey.low[2]])
+    text = json.dumps(_document(survey, origin, crs), separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    data = _data_bytes(survey)
+    total = 28 + len(text) + data
+    if total > MOST_BYTES:
+        raise InputError(
+            f"boundary: {total} bytes as GLB; bound: {MOST_BYTES}; use --format ply, or mesh a part of the region"
+        )
+    with path.open("wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", data, b"BIN\0"))
+        start = file.tell()
+        places, place = {}, start + survey.n_vertices * VERTEX_BYTES
+        for marker, n in survey.facets.items():
+            places[marker] = place
+            place += n * FACET_BYTES
+        for k in range(len(surface.names)):
+            piece = surface.read(k)
+            runs, facets = place_vertices(piece, survey.vertices)
+            for first, points in runs:
+                file.seek(start + first * VERTEX_BYTES)
+                file.write(_local(points, origin).tobytes())
+            for marker, place in places.items():
+                chosen = facets[piece.marker == marker].astype("<u4")
+                file.seek(place)
+                file.write(chosen.tobytes())
+                places[marker] = place + chosen.nbytes
+
+
+def _local(points: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Shift points (n, 3) to the origin and turn them: east, up, south. Adding 0 turns -0 into 0."""
+    return ((points - origin)[:, [0, 2, 1]] * [1, 1, -1] + 0.0).astype("<f4")
+
+
+def _data_bytes(survey: SurfaceSurvey) -> int:
+    return survey.n_vertices * VERTEX_BYTES + survey.n_facets * FACET_BYTES
+
+
+def _document(survey: SurfaceSurvey, origin: NDArray[np.float64], crs: str) -> dict[str, Any]:
+    # Rounding keeps order, so the corners of the box are turned into the exact least and greatest coordinates.
+    box = _local(np.stack((survey.low, survey.high)), origin)
+    split = survey.n_vertices * VERTEX_BYTES
+    position = {
+        "bufferView": 0,
+        "componentType": FLOAT,
+        "count": survey.n_vertices,
+        "type": "VEC3",
+        "min": box.min(axis=0).tolist(),
+        "max": box.max(axis=0).tolist(),
+    }
+    indices, place = [], 0
+    for n in survey.facets.values():
+        accessor = {"bufferView": 1, "componentType": UNSIGNED_INT, "count": 3 * n, "type": "SCALAR"}
+        indices.append(accessor | ({"byteOffset": place} if place else {}))
+        place += n * FACET_BYTES
+    primitives = [
+        {"attributes": {"POSITION": 0}, "indices": 1 + i, "material": i, "extras": {"marker": marker}}
+        for i, marker in enumerate(survey.facets)
+    ]
+    return {
+        "asset": {
+            "version": "2.0",
+            "generator": "citystitch",
+            "extras": {"crs": crs, "origin": origin.tolist(), "axes": AXES},
+        },
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "boundary"}],
+        "meshes": [{"name": "boundary", "primitives": primitives}],
+        "materials": [_material(Marker(marker)) for marker in survey.facets],
+        "accessors": [position, *indices],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": split, "target": VERTICES},
+            {"buffer": 0, "byteOffset": split, "byteLength": survey.n_facets * FACET_BYTES, "target": INDICES},
+        ],
+        "buffers": [{"byteLength": _data_bytes(survey)}],
+    }
+
+
+def _material(marker: Marker) -> dict[str, Any]:
+    """Colour a patch; its back is what one sees from the air."""
+    solid = marker in COLOURS
+    colour = [*COLOURS.get(marker, SIDE_COLOUR), 1.0 if solid else SIDE_OPACITY]
+    surface = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material = {"name": patch_name(marker), "pbrMetallicRoughness": surface, "doubleSided": True}
+    return material if solid else material | {"alphaMode": "BLEND"}

@@ -1,0 +1,156 @@
+"""GeoPackage of the simplified footprints: a row a building, or part of one, with heights and all attributes."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+import numpy as np
+import pyogrio
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.errors import OutputError
+from tiler.atomic import replacing
+from tiler.building_index import has_parts, read_building, spool_vertices
+from tiler.export import RUN_RECORD
+from tiler.formats.cityjsonseq import CITY_MODEL
+from tiler.run_folder import opened_json, read_crs
+
+LAYER = "buildings"
+BATCH = 5000  # rows that are written at once
+# GeoPackage says when it was written; equal input gives equal bytes.
+TIME = {"OGR_CURRENT_DATE": "2000-01-01T00:00:00.000Z"}
+Kinds = dict[str, set[type]]
+Column = tuple[NDArray[Any], NDArray[np.bool_] | None]  # values, and where there is none
+
+
+def export_gpkg(output: Path, directory: Path) -> None:
+    """Write the footprints of a finished run's simplified city model as GeoPackage.
+
+    Parameters
+    ----------
+    output : Path
+        The file; it appears whole or not at all.
+    directory : Path
+        Folder of the run.
+
+    Raises
+    ------
+    InputError
+        If the city model or the run's record is missing or damaged.
+    OutputError
+        If the file cannot be written.
+    """
+    crs = read_crs(directory / RUN_RECORD)
+    with replacing(output) as part:
+        write_gpkg(part, directory / CITY_MODEL, crs=crs)
+
+
+def write_gpkg(path: Path, model: Path, *, crs: str) -> None:
+    """Write the footprints of a CityJSON file as GeoPackage, layer `LAYER`.
+
+    Parameters
+    ----------
+    path : Path
+        The file; not there yet.
+    model : Path
+        CityJSON 2.0 of buildings with numbers, heights and LoD 0 footprints.
+    crs : str
+        CRS of its coordinates.
+
+    Raises
+    ------
+    InputError
+        If the city model is missing or damaged.
+    OutputError
+        If the file cannot be written.
+
+    Notes
+    -----
+    ``id`` is the building's or part's, ``house`` that of the building; further columns are the attributes, lists
+    as JSON text. The city model is read three times, an object at a time; memory holds `BATCH` rows.
+    """
+    kinds = _survey(model)
+    with TemporaryFile() as spool, _fixed_time():
+        vertices = spool_vertices(model, spool)
+        rows = ((name, thing, read_building(model, name, thing, vertices)[3]) for name, thing in _objects(model))
+        batch = list(islice(rows, BATCH))
+        _append(path, batch, kinds, crs)
+        while batch := list(islice(rows, BATCH)):
+            _append(path, batch, kinds, crs, append=True)
+
+
+def _objects(model: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    with opened_json(model) as stream:
+        for key in stream.members():
+            if key != "CityObjects":
+                stream.skip()
+                continue
+            for name in stream.members():
+                thing = stream.value()
+                if not has_parts(model, thing):
+                    yield name, thing
+
+
+def _survey(model: Path) -> Kinds:
+    """Find the attributes, and the types of their values."""
+    kinds: Kinds = {}
+    for _, thing in _objects(model):
+        for name, value in thing.get("attributes", {}).items():
+            kinds.setdefault(name, set()).add(type(value))
+    return kinds
+
+
+def _append(
+    path: Path, rows: Sequence[tuple[str, Mapping[str, Any], Any]], kinds: Kinds, crs: str, *, append: bool = False
+) -> None:
+    ids = [name for name, _, _ in rows]
+    houses = [thing["parents"][0] if thing.get("parents") else name for name, thing, _ in rows]
+    columns: dict[str, Column] = {
+        "id": (np.array(ids, np.object_), None),
+        "house": (np.array(houses, np.object_), None),
+    }
+    for name, found in kinds.items():
+        columns[name] = _column([thing["attributes"].get(name) for _, thing, _ in rows], found)
+    try:
+        pyogrio.raw.write(
+            path,
+            shapely.to_wkb(np.array([footprint for _, _, footprint in rows], np.object_)),
+            [values for values, _ in columns.values()],
+            list(columns),
+            field_mask=[mask for _, mask in columns.values()],
+            geometry_type="Polygon",
+            crs=crs,
+            layer=LAYER,
+            driver="GPKG",
+            append=append,
+        )
+    except (RuntimeError, ValueError) as error:  # pyogrio's own errors are RuntimeErrors
+        # What GDAL says names the file.
+        raise OutputError(
+            f"GeoPackage cannot be written ({error}); free space or choose another folder"
+        ) from error
+
+
+def _column(values: list[Any], kinds: set[type]) -> Column:
+    """Make a column, and say where it has no value."""
+    none = np.array([value is None for value in values], np.bool_)
+    known = kinds - {type(None)}
+    if known and known <= {int, float}:
+        dtype: type = np.int64 if known == {int} else np.float64
+        return np.array([0 if value is None else value for value in values], dtype), none
+    texts = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
+    return np.array(texts, np.object_), None
+
+
+@contextmanager
+def _fixed_time() -> Iterator[None]:
+    pyogrio.set_gdal_config_options(TIME)
+    try:
+        yield
+    finally:
+        pyogrio.set_gdal_config_options(dict.fromkeys(TIME))

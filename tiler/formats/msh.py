@@ -1,0 +1,201 @@
+"""Gmsh's mesh files: MSH 4.1 binary, and MSH 2.2 as text for programs that read no other.
+
+Surfaces are one entity a marker, and the volume one: each has a physical group with a name. The number of a group
+is that of the marker, that of the volume `AIR`.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.mesh import Marker
+from tiler.atomic import replacing
+from tiler.formats.foam_patches import PATCHES
+from tiler.formats.pieces import Pieces
+from tiler.formats.rows import blocks_of
+from tiler.mesh_pieces import open_pieces
+
+AIR, AIR_NAME = 10, "air"  # no marker has this number: some programs know groups by number alone
+TRIANGLE, TETRAHEDRON = 2, 4  # Gmsh's types of elements
+ROWS = 1 << 18  # rows that are made at once
+TEXT_FLOAT = "%24.16e"  # 17 digits, enough for any float64; each has the same width
+
+_Box = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Survey:
+    """What is known after reading all pieces once: boxes (xmin, ymin, zmin, xmax, ..., m) and counts."""
+
+    n_points: int
+    n_cells: int
+    box: _Box
+    facets: dict[int, int]
+    boxes: dict[int, _Box]
+
+    @property
+    def groups(self) -> list[tuple[int, int, str]]:
+        """Dimension, number and name of each physical group."""
+        return [*((2, marker, PATCHES[Marker(marker)]) for marker in self.facets), (3, AIR, AIR_NAME)]
+
+
+def export_msh(output: Path, directory: Path) -> None:
+    """Write the mesh of a finished run as MSH 4.1, binary.
+
+    Parameters
+    ----------
+    output : Path
+        The file; it appears whole or not at all.
+    directory : Path
+        Folder of the run.
+
+    Raises
+    ------
+    InputError
+        If the run is not finished, or a file of it is missing or damaged.
+    OutputError
+        If the file cannot be written.
+
+    Notes
+    -----
+    Memory: one piece. Nodes are in the order of their numbers, which begin with 1. Each piece is read twice. All
+    nodes belong to the volume.
+    """
+    pieces = open_pieces(directory)
+    survey = _survey(pieces)
+    with replacing(output) as part, part.open("wb") as file:
+        file.write(b"$MeshFormat\n4.1 1 8\n" + np.array([1], "<i4").tobytes() + b"\n$EndMeshFormat\n")
+        _write_names(file, survey)
+        _write_entities(file, survey)
+        nodes = _begin_nodes(file, survey.n_points)
+        elements = _begin_elements(file, survey)
+        seen = dict.fromkeys(elements, 0)
+        for k in range(len(pieces.names)):
+            piece = pieces.read(k)
+            for start, rows in blocks_of(piece.ids):
+                file.seek(nodes + 24 * start)
+                file.write(np.ascontiguousarray(piece.points[rows], "<f8").data)
+            for group, (place, first) in elements.items():
+                corners = piece.ids[piece.cells if group == AIR else piece.facets[piece.marker == group]]
+                tags = first + seen[group] + np.arange(len(corners))
+                file.seek(place + 8 * (1 + corners.shape[1]) * seen[group])
+                file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
+                seen[group] += len(corners)
+
+
+def export_msh2(output: Path, directory: Path) -> None:
+    """Write the mesh of a finished run as MSH 2.2, text; see `export_msh`."""
+    pieces = open_pieces(directory)
+    survey = _survey(pieces)
+    with replacing(output) as part, part.open("wb") as file:
+        file.write(b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n")
+        _write_names(file, survey)
+        digits = len(str(survey.n_points))
+        file.write(f"$Nodes\n{survey.n_points}\n".encode())
+        nodes, width = file.tell(), digits + 3 * 25 + 1
+        file.seek(nodes + survey.n_points * width)
+        n = survey.n_cells + sum(survey.facets.values())
+        file.write(f"$EndNodes\n$Elements\n{n}\n".encode())
+        tag = 1
+        for k in range(len(pieces.names)):
+            piece = pieces.read(k)
+            markers = piece.marker.astype(np.int64)
+            facets = _numbered(tag, piece.ids[piece.facets] + 1, TRIANGLE, markers)
+            tag += len(facets)
+            cells = _numbered(tag, piece.ids[piece.cells] + 1, TETRAHEDRON, np.full(len(piece.cells), AIR))
+            tag += len(cells)
+            for rows in (facets, cells):
+                _write_lines(file, " ".join(["%d"] * rows.shape[1]) + "\n", rows)
+            end = file.tell()
+            line = f"%{digits}d {TEXT_FLOAT} {TEXT_FLOAT} {TEXT_FLOAT}\n"
+            for start, chosen in blocks_of(piece.ids):
+                file.seek(nodes + start * width)
+                _write_lines(file, line, np.column_stack((piece.ids[chosen] + 1, piece.points[chosen])))
+            file.seek(end)
+        file.write(b"$EndElements\n")
+
+
+def _survey(pieces: Pieces) -> _Survey:
+    n_cells, box = 0, _no_box()
+    facets: dict[int, int] = {}
+    boxes: dict[int, _Box] = {}
+    for k in range(len(pieces.names)):
+        piece = pieces.read(k)
+        n_cells += len(piece.cells)
+        box = _grown(box, piece.points)
+        for marker in np.unique(piece.marker).tolist():
+            chosen = piece.facets[piece.marker == marker]
+            facets[marker] = facets.get(marker, 0) + len(chosen)
+            boxes[marker] = _grown(boxes.get(marker, _no_box()), piece.points[chosen.ravel()])
+    return _Survey(pieces.n_points, n_cells, box, dict(sorted(facets.items())), boxes)
+
+
+def _no_box() -> _Box:
+    return np.repeat([np.inf, -np.inf], 3)
+
+
+def _grown(box: _Box, points: NDArray[np.float64]) -> _Box:
+    if not len(points):
+        return box
+    return np.concatenate((np.minimum(box[:3], points.min(axis=0)), np.maximum(box[3:], points.max(axis=0))))
+
+
+def _write_names(file: BinaryIO, survey: _Survey) -> None:
+    lines = [f'{dimension} {number} "{name}"' for dimension, number, name in survey.groups]
+    file.write("\n".join(["$PhysicalNames", str(len(lines)), *lines, "$EndPhysicalNames", ""]).encode())
+
+
+def _write_entities(file: BinaryIO, survey: _Survey) -> None:
+    file.write(b"$Entities\n" + _packed("u8", [0, 0, len(survey.facets), 1]))
+    for marker in survey.facets:
+        file.write(_packed("i4", [marker]) + _packed("f8", survey.boxes[marker]))
+        file.write(_packed("u8", [1]) + _packed("i4", [marker]) + _packed("u8", [0]))
+    file.write(_packed("i4", [AIR]) + _packed("f8", survey.box) + _packed("u8", [1]) + _packed("i4", [AIR]))
+    file.write(_packed("u8", [len(survey.facets)]) + _packed("i4", survey.facets) + b"\n$EndEntities\n")
+
+
+def _begin_nodes(file: BinaryIO, n: int) -> int:
+    """Write all of the section but coordinates; returns where they begin."""
+    file.write(b"$Nodes\n" + _packed("u8", [1, n, 1, n]) + _packed("i4", [3, AIR, 0]) + _packed("u8", [n]))
+    for i in range(0, n, ROWS):
+        file.write(_packed("u8", np.arange(i + 1, min(i + ROWS, n) + 1)))
+    start = file.tell()
+    file.seek(start + 24 * n)
+    file.write(b"\n$EndNodes\n")
+    return start
+
+
+def _begin_elements(file: BinaryIO, survey: _Survey) -> dict[int, tuple[int, int]]:
+    """Write all of the section but elements; returns by group where they begin, and the first one's number."""
+    n = survey.n_cells + sum(survey.facets.values())
+    file.write(b"$Elements\n" + _packed("u8", [len(survey.facets) + 1, n, 1, n]))
+    places, tag = {}, 1
+    for group, count in {**survey.facets, AIR: survey.n_cells}.items():
+        dimension, kind = (3, TETRAHEDRON) if group == AIR else (2, TRIANGLE)
+        file.write(_packed("i4", [dimension, group, kind]) + _packed("u8", [count]))
+        places[group] = file.tell(), tag
+        file.seek(count * 8 * (2 + dimension), 1)
+        tag += count
+    file.write(b"\n$EndElements\n")
+    return places
+
+
+def _packed(kind: str, numbers: Iterable[Any]) -> bytes:
+    values = numbers if isinstance(numbers, np.ndarray) else list(numbers)
+    return np.asarray(values, f"<{kind}").tobytes()
+
+
+def _numbered(tag: int, nodes: NDArray[np.int64], kind: int, group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Make the lines of elements: number, type, two tags (group and entity), nodes."""
+    n = len(nodes)
+    return np.column_stack((tag + np.arange(n), np.full(n, kind), np.full(n, 2), group, group, nodes))
+
+
+def _write_lines(file: BinaryIO, line: str, rows: NDArray[Any]) -> None:
+    for i in range(0, len(rows), ROWS):
+        some = rows[i : i + ROWS]
+        file.write((line * len(some) % tuple(some.ravel().tolist())).encode())

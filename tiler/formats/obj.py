@@ -1,0 +1,82 @@
+"""Wavefront OBJ: the boundary with shared vertices, one group a patch."""
+
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from numpy.typing import NDArray
+
+from tiler.atomic import replacing
+from tiler.formats.surface import Surface, open_surface, patch_name, place_vertices, slices, survey_surface
+
+VERTEX = "v" + " %24.16e" * 3 + "\n"
+VERTEX_BYTES = len(VERTEX % ((0.0,) * 3))
+
+
+def export_obj(output: Path, directory: Path) -> None:
+    """Write the boundary of a finished run as OBJ.
+
+    Parameters
+    ----------
+    output : Path
+        The file; it appears whole or not at all.
+    directory : Path
+        Folder of the run.
+
+    Raises
+    ------
+    InputError
+        If the run is not finished, or a file of it is missing or damaged.
+    OutputError
+        If the file cannot be written.
+    """
+    surface = open_surface(directory)
+    with replacing(output) as part:
+        write_obj(part, surface)
+
+
+def write_obj(path: Path, surface: Surface) -> None:
+    """Write a boundary as OBJ.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    surface : Surface
+        The boundary; facets are counter-clockwise seen from outside the air.
+
+    Notes
+    -----
+    Coordinates have 17 digits. Numbers are padded to one width, so that the place of every line is known from
+    counts. Memory holds one piece, and a quarter of a byte a point of the mesh. Each piece is read twice.
+    """
+    survey = survey_surface(surface)
+    digits = len(str(survey.n_vertices))
+    line = f"f %{digits}d %{digits}d %{digits}d\n"
+    width = 3 * digits + 5
+    with path.open("wb") as file:
+        file.write(b"# boundary of the air, metres\no boundary\n")
+        start = file.tell()
+        file.seek(start + survey.n_vertices * VERTEX_BYTES)
+        places = {}
+        for marker, n in survey.facets.items():
+            file.write(f"g {patch_name(marker)}\n".encode())
+            places[marker] = file.tell()
+            file.seek(n * width, 1)
+        file.truncate()
+        for k in range(len(surface.names)):
+            piece = surface.read(k)
+            runs, facets = place_vertices(piece, survey.vertices)
+            for first, points in runs:
+                file.seek(start + first * VERTEX_BYTES)
+                _write_lines(file, VERTEX, points)
+            for marker, place in places.items():
+                chosen = facets[piece.marker == marker] + 1
+                file.seek(place)
+                _write_lines(file, line, chosen)
+                places[marker] = place + len(chosen) * width
+
+
+def _write_lines(file: BinaryIO, line: str, rows: NDArray[Any]) -> None:
+    for some in slices(len(rows)):
+        part = rows[some]
+        file.write((line * len(part) % tuple(part.ravel().tolist())).encode())

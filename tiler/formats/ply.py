@@ -1,0 +1,95 @@
+"""PLY, binary: the boundary with shared vertices, and the marker and building of each facet."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import InputError
+from tiler.atomic import replacing
+from tiler.formats.surface import Surface, SurfaceSurvey, open_surface, patch_name, place_vertices, survey_surface
+
+VERTEX_BYTES = 24
+# PLY has no integers of 64 bits; the number of a building is below 2^53, so a double holds it exactly.
+FACE = np.dtype([("n", "u1"), ("vertex", "<i4", 3), ("marker", "<i4"), ("building", "<f8")])
+MOST_VERTICES = 2**31
+
+
+def export_ply(output: Path, directory: Path) -> None:
+    """Write the boundary of a finished run as PLY, binary.
+
+    Parameters
+    ----------
+    output : Path
+        The file; it appears whole or not at all.
+    directory : Path
+        Folder of the run.
+
+    Raises
+    ------
+    InputError
+        If the run is not finished, or a file of it is missing or damaged; if it has too many vertices for PLY.
+    OutputError
+        If the file cannot be written.
+    """
+    surface = open_surface(directory)
+    with replacing(output) as part:
+        write_ply(part, surface)
+
+
+def write_ply(path: Path, surface: Surface) -> None:
+    """Write a boundary as PLY.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    surface : Surface
+        The boundary; facets are counter-clockwise seen from outside the air.
+
+    Raises
+    ------
+    InputError
+        If it has more than 2^31 vertices.
+
+    Notes
+    -----
+    Vertices stand in the order of their numbers, facets piece by piece. Memory holds one piece, and a quarter of a
+    byte a point of the mesh. Each piece is read twice.
+    """
+    survey = survey_surface(surface)
+    if survey.n_vertices > MOST_VERTICES:
+        raise InputError(
+            f"boundary: {survey.n_vertices} vertices; PLY's bound: {MOST_VERTICES}; export parts of the region"
+        )
+    with path.open("wb") as file:
+        file.write(_header(survey))
+        start = file.tell()
+        face = start + survey.n_vertices * VERTEX_BYTES
+        for k in range(len(surface.names)):
+            piece = surface.read(k)
+            runs, facets = place_vertices(piece, survey.vertices)
+            for first, points in runs:
+                file.seek(start + first * VERTEX_BYTES)
+                file.write(np.ascontiguousarray(points, "<f8").data)
+            rows = np.empty(len(facets), FACE)
+            rows["n"], rows["vertex"], rows["marker"], rows["building"] = 3, facets, piece.marker, piece.building
+            file.seek(face)
+            file.write(rows.tobytes())
+            face += rows.nbytes
+
+
+def _header(survey: SurfaceSurvey) -> bytes:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment marker {marker} {patch_name(marker)}" for marker in survey.facets),
+        f"element vertex {survey.n_vertices}",
+        *(f"property double {axis}" for axis in "xyz"),
+        f"element face {survey.n_facets}",
+        "property list uchar int vertex_indices",
+        "property int marker",
+        "property double building",
+        "end_header",
+        "",
+    ]
+    return "\n".join(lines).encode()

@@ -1,0 +1,287 @@
+"""Faces of a whole region, numbered piece by piece: what OpenFOAM's order of faces rests on.
+
+Cells are numbered piece by piece. A face inside the region belongs to the lower of its two cells, so the faces
+of one piece are those inside it and those to later pieces; sorted by owner and neighbour they are the region's
+upper triangular order. A face that two pieces share is found by the numbers of its vertices and waits from the
+first of them to the second; what is known of it then stands in files.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from stitch.cell_faces import CellFaces, find_cell_faces
+from stitch.conformity import group_rows
+from tiler.formats.pieces import Pieces
+from tiler.mesh_pieces import MeshPiece
+
+Ints = NDArray[np.int64]
+# Given a piece, the key of a set of facets for each of its facets; several sets may have a facet.
+SetsOf = Callable[[MeshPiece], Ints]
+
+
+@dataclass(frozen=True, eq=False)
+class FacetSets:
+    """Sets of facets, patches say, and how many facets of each every piece has.
+
+    Attributes
+    ----------
+    keys : int64, (p,)
+        Keys of the sets, ascending.
+    counts : list of dict of int to int
+        For each piece, how many of its facets a set has, by row in `keys`.
+    """
+
+    keys: Ints
+    counts: list[dict[int, int]]
+
+    def first(self, pieces: Sequence[int]) -> tuple[dict[int, dict[int, int]], Ints]:
+        """Put the facets of some pieces, in their order, set by set.
+
+        Returns
+        -------
+        first : dict of int to dict of int to int
+            For each of the pieces, where its facets of a set begin within that set.
+        n : int64, (p,)
+            Facets of each set.
+        """
+        n, first = np.zeros(len(self.keys), np.int64), {}
+        for k in pieces:
+            first[k] = {row: int(n[row]) for row in self.counts[k]}
+            for row, count in self.counts[k].items():
+                n[row] += count
+        return first, n
+
+
+@dataclass(frozen=True, eq=False)
+class RegionFaces:
+    """How the faces of a region are numbered: ``k`` pieces, ``s`` faces shared by two of them, each twice.
+
+    Attributes
+    ----------
+    cell_start, face_start, shared_start : int64, (k + 1,)
+        Where the cells, the faces and the shared faces of each piece begin. The last is their number.
+    cell : int64, (s,)
+        Cell of each shared face, in the order of `CellFaces.shared`, piece by piece; a file.
+    mate : int64, (s,)
+        The same face as the other piece has it, as a row of these arrays; a file.
+    face : int64, (s,)
+        Its number among the faces of the region; a file.
+    centre : float64, (k, 2)
+        Middle of each piece's box (m).
+    between : Counter of (int, int)
+        Number of faces that two pieces share, by their numbers, the lower first.
+    """
+
+    cell_start: Ints
+    face_start: Ints
+    shared_start: Ints
+    cell: Ints
+    mate: Ints
+    face: Ints
+    centre: NDArray[np.float64]
+    between: Counter[tuple[int, int]]
+
+    @property
+    def n_inner(self) -> int:
+        """Number of faces with two cells."""
+        return int(self.face_start[-1])
+
+    def piece_of(self, cell: Ints) -> Ints:
+        """Tell which piece has each cell, by their numbers over the region."""
+        found: Ints = np.searchsorted(self.cell_start, cell, side="right") - 1
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class OwnFaces:
+    """The faces of a piece that have two cells and whose lower cell is in it, in the region's order.
+
+    Attributes
+    ----------
+    owner, neighbour : int64, (n,)
+        Cells by their numbers over the region, ascending pairs.
+    corners : int32, (n, 3)
+        Vertices as rows of the piece's points, that of the lowest number over the region first; the normal points
+        out of the owner.
+    """
+
+    owner: Ints
+    neighbour: Ints
+    corners: NDArray[np.int32]
+
+
+@dataclass
+class _Waiting:
+    """Shared faces of pieces that came before: vertices and row of each."""
+
+    corners: Ints
+    row: Ints
+
+
+def survey_faces(
+    pieces: Pieces, folder: Path, *, kinds: tuple[SetsOf, ...]
+) -> tuple[RegionFaces, list[FacetSets]]:
+    """Read all pieces once, and number cells, faces and facets.
+
+    Parameters
+    ----------
+    pieces : Pieces
+        The mesh.
+    folder : Path
+        An existing folder for files; they must stay as long as the result is used.
+    kinds : tuple of callable
+        Each gives a key for every facet of a piece, or -1 for none.
+
+    Returns
+    -------
+    RegionFaces
+        Numbers of cells and faces.
+    list of FacetSets
+        What each of `kinds` gave.
+
+    Raises
+    ------
+    InputError
+        If cells of a piece, or pieces, do not fit together.
+
+    Notes
+    -----
+    Memory: one piece, the shared faces of the pieces that wait for a later one (32 bytes each) and the number of
+    facets that each piece has of each set. Files: 40 bytes a shared face.
+    """
+    n = len(pieces.names)
+    n_cells, n_faces, n_shared = (np.zeros(n, np.int64) for _ in range(3))
+    centre = np.empty((n, 2))
+    counts: list[list[dict[int, int]]] = [[] for _ in kinds]
+    waiting = _Waiting(np.empty((0, 3), np.int64), np.empty(0, np.int64))
+    paths = [folder / name for name in ("cells", "before", "mates")]
+    with paths[0].open("wb") as cells_file, paths[1].open("wb") as before_file, paths[2].open("wb") as mates_file:
+        for k in range(n):
+            piece = pieces.read(k)
+            faces = faces_of_piece(piece)
+            n_cells[k], n_faces[k], n_shared[k] = len(piece.cells), len(faces.owner), len(faces.shared)
+            centre[k] = (piece.points[:, :2].min(axis=0) + piece.points[:, :2].max(axis=0)) / 2
+            for found, sets_of in zip(counts, kinds, strict=True):
+                keys, count = np.unique(sets_of(piece), return_counts=True)
+                found.append({key: c for key, c in zip(keys.tolist(), count.tolist(), strict=True) if key >= 0})
+            (faces.shared_cell + n_cells[:k].sum()).astype(np.int64).tofile(cells_file)
+            np.searchsorted(faces.owner, faces.shared_cell, side="right").astype(np.int64).tofile(before_file)
+            rows = n_shared[:k].sum() + np.arange(n_shared[k])
+            waiting, mates = _meet(waiting, piece.ids[faces.shared], rows, piece.name)
+            mates.tofile(mates_file)
+    if len(waiting.row):
+        k = int(np.searchsorted(np.cumsum(n_shared), waiting.row[0], side="right"))
+        raise InputError(
+            f"tile {pieces.names[k]}: {len(waiting.row)} faces at seams have no other cell; run citystitch check"
+        )
+    region = _number_faces(paths, n_cells, n_faces, n_shared, centre)
+    return region, [_collect(found) for found in counts]
+
+
+def faces_of_piece(piece: MeshPiece) -> CellFaces:
+    """Find the faces of a piece.
+
+    Raises
+    ------
+    InputError
+        If its cells and facets do not fit together.
+    """
+    try:
+        return find_cell_faces(piece.cells, piece.facets, len(piece.points))
+    except ValueError as error:
+        raise InputError(f"tile {piece.name}: {error}; run citystitch check") from None
+
+
+def own_faces(region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces) -> OwnFaces:
+    """Take the faces that piece `k` has of the region's list: rows ``face_start[k]`` to ``face_start[k + 1]``."""
+    rows = slice(int(region.shared_start[k]), int(region.shared_start[k + 1]))
+    cell, other = np.asarray(region.cell[rows]), np.asarray(region.cell[np.asarray(region.mate[rows])])
+    later = np.flatnonzero(other > cell)
+    start = int(region.cell_start[k])
+    owner = np.concatenate([faces.owner.astype(np.int64) + start, cell[later]])
+    neighbour = np.concatenate([faces.neighbour.astype(np.int64) + start, other[later]])
+    order = np.lexsort((neighbour, owner))
+    corners = np.concatenate([faces.inner, faces.shared[later]])[order]
+    return OwnFaces(owner[order], neighbour[order], lowest_first(corners, piece.ids))
+
+
+def lowest_first(corners: NDArray[np.int32], ids: Ints) -> NDArray[np.int32]:
+    """Turn each row (n, 3) so that the vertex with the lowest of `ids` stands first; the orientation stays.
+
+    Two pieces so begin a face with the same vertex, as OpenFOAM asks of both sides of a processor patch.
+
+    Examples
+    --------
+    >>> lowest_first(np.array([[0, 1, 2], [2, 1, 0]], np.int32), np.array([70, 30, 50]))
+    array([[1, 2, 0],
+           [1, 0, 2]], dtype=int32)
+    """
+    turn = (ids[corners].argmin(axis=1)[:, None] + np.arange(3)) % 3
+    turned: NDArray[np.int32] = np.take_along_axis(corners, turn, axis=1)
+    return turned
+
+
+def _meet(waiting: _Waiting, corners: Ints, rows: Ints, name: str) -> tuple[_Waiting, Ints]:
+    """Find which shared faces of a piece an earlier one has, as pairs (earlier, own) of rows (p, 2)."""
+    both = np.concatenate([waiting.corners, np.sort(corners, axis=1)])
+    row = np.concatenate([waiting.row, rows])
+    group, n_groups = group_rows(both)
+    count = np.bincount(group, minlength=n_groups)
+    if (count > 2).any():
+        raise InputError(f"tile {name}: a face at a seam has more than two cells; run citystitch check")
+    order = np.argsort(group, kind="stable")
+    is_pair = count[group[order]] == 2
+    left = np.sort(order[~is_pair])
+    return _Waiting(both[left], row[left]), row[order[is_pair]].reshape(-1, 2)
+
+
+def _number_faces(
+    paths: list[Path], n_cells: Ints, n_faces: Ints, n_shared: Ints, centre: NDArray[np.float64]
+) -> RegionFaces:
+    """Number the shared faces among those of the piece that has their lower cell."""
+    cell_start, shared_start = _starts(n_cells), _starts(n_shared)
+    n = int(shared_start[-1])
+    cell, before = (_open(path, n) for path in paths[:2])
+    mate, face = (_make(paths[0].with_name(name), n) for name in ("mate", "face"))
+    pairs = _open(paths[2], n)
+    if n:
+        first, second = pairs[::2], pairs[1::2]
+        mate[first], mate[second] = second, first
+    face_start = np.zeros(len(n_cells) + 1, np.int64)
+    between: Counter[tuple[int, int]] = Counter()
+    for k in range(len(n_cells)):
+        rows = slice(int(shared_start[k]), int(shared_start[k + 1]))
+        own, mates = np.asarray(cell[rows]), np.asarray(mate[rows])
+        other = np.asarray(cell[mates])
+        later = np.flatnonzero(other > own)
+        later = later[np.lexsort((other[later], own[later]))]
+        number = face_start[k] + np.asarray(before[rows])[later] + np.arange(len(later))
+        face[rows.start + later], face[mates[later]] = number, number
+        face_start[k + 1] = face_start[k] + n_faces[k] + len(later)
+        beyond, count = np.unique(np.searchsorted(cell_start, other[later], "right") - 1, return_counts=True)
+        between.update({(k, b): c for b, c in zip(beyond.tolist(), count.tolist(), strict=True)})
+    return RegionFaces(cell_start, face_start, shared_start, cell, mate, face, centre, between)
+
+
+def _collect(counts: list[dict[int, int]]) -> FacetSets:
+    keys = sorted(set().union(*counts))
+    row = {key: i for i, key in enumerate(keys)}
+    return FacetSets(np.array(keys, np.int64), [{row[key]: n for key, n in found.items()} for found in counts])
+
+
+def _starts(counts: Ints) -> Ints:
+    return np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
+
+
+def _open(path: Path, n: int) -> Ints:
+    return np.memmap(path, np.int64, "r", shape=(n,)) if n else np.empty(0, np.int64)
+
+
+def _make(path: Path, n: int) -> Ints:
+    return np.memmap(path, np.int64, "w+", shape=(n,)) if n else np.empty(0, np.int64)

@@ -1,0 +1,89 @@
+"""STL as text: the boundary with one solid a patch.
+
+Text, not binary: a binary file holds one solid without a name, and its coordinates are float32, which far from
+the CRS's origin rounds them by centimetres. Programs that tell patches apart, as snappyHexMesh and
+surfaceFeatures do, take them from the text.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tiler.atomic import replacing
+from tiler.formats.surface import Surface, open_surface, patch_name, slices, survey_surface
+
+_CORNER = "      vertex" + " %23.16e" * 3 + "\n"
+# Each number has the same width, so that the place of every facet is known from counts.
+FACET = "  facet normal" + " %13.6e" * 3 + "\n    outer loop\n" + _CORNER * 3 + "    endloop\n  endfacet\n"
+FACET_BYTES = len(FACET % ((0.0,) * 12))
+
+
+def export_stl(output: Path, directory: Path) -> None:
+    """Write the boundary of a finished run as STL, text.
+
+    Parameters
+    ----------
+    output : Path
+        The file; it appears whole or not at all.
+    directory : Path
+        Folder of the run.
+
+    Raises
+    ------
+    InputError
+        If the run is not finished, or a file of it is missing or damaged.
+    OutputError
+        If the file cannot be written.
+    """
+    surface = open_surface(directory)
+    with replacing(output) as part:
+        write_stl(part, surface)
+
+
+def write_stl(path: Path, surface: Surface) -> None:
+    """Write a boundary as STL.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    surface : Surface
+        The boundary; normals point out of the air.
+
+    Notes
+    -----
+    Coordinates have 17 digits, so vertices that facets share read as equal float64. Memory holds one piece. Each
+    piece is read twice.
+    """
+    survey = survey_surface(surface)
+    with path.open("wb") as file:
+        places = {}
+        for marker, n in survey.facets.items():
+            name = patch_name(marker)
+            file.write(f"solid {name}\n".encode())
+            places[marker] = file.tell()
+            file.seek(n * FACET_BYTES, 1)
+            file.write(f"endsolid {name}\n".encode())
+        for k in range(len(surface.names)):
+            piece = surface.read(k)
+            for marker, place in places.items():
+                corners = piece.points[piece.facets[piece.marker == marker]]
+                file.seek(place)
+                for rows in slices(len(corners)):
+                    file.write(_render(corners[rows]))
+                places[marker] = place + len(corners) * FACET_BYTES
+
+
+def _render(corners: NDArray[np.float64]) -> bytes:
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    # Adding 0 turns -0 into 0; a component below 1e-99 would need a digit more.
+    normal = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0).round(12) + 0.0
+    rows = np.column_stack((normal, _wide_enough(corners).reshape(-1, 9)))
+    return (FACET * len(rows) % tuple(rows.ravel().tolist())).encode()
+
+
+def _wide_enough(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Take for 0 what needs three digits of exponent: no metre is that short."""
+    return np.where(np.abs(values) < 1e-99, 0.0, values)

@@ -1,0 +1,237 @@
+"""The boundary of a finished run for surface formats: facets piece by piece, vertices numbered from 0 on."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.mesh import Marker
+from tiler.formats.foam_patches import PATCHES
+from tiler.formats.rows import blocks_of
+from tiler.merged import VERTEX_ID, number_piece
+from tiler.mesh_pieces import MeshPieces, open_pieces
+from tiler.vtk_files import read_vtp
+
+ROWS = 1 << 16  # rows that are made at once
+WORD = 64  # points in a word of `VertexSet`
+
+
+class SurfacePiece(Protocol):
+    """The part of the boundary that one tile holds, as `tiler.mesh_pieces.MeshPiece` has it too."""
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """Points (n, 3), in metres; some may have no facet."""
+
+    @property
+    def facets(self) -> NDArray[np.int32]:
+        """Facets (f, 3) as rows of `points`, counter-clockwise seen from outside the air."""
+
+    @property
+    def marker(self) -> NDArray[np.int32]:
+        """`pipeline.mesh.Marker` of each facet."""
+
+    @property
+    def building(self) -> NDArray[np.int64]:
+        """Number of each facet's building, -1 where there is none."""
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """Number of each point over the whole mesh."""
+
+
+class Surface(Protocol):
+    """A boundary in pieces."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the pieces, in their order."""
+
+    @property
+    def n_points(self) -> int:
+        """Number of different points of the whole mesh."""
+
+    def read(self, k: int) -> SurfacePiece:
+        """Read piece `k`."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryPart:
+    """A `SurfacePiece` of a run."""
+
+    points: NDArray[np.float64]
+    facets: NDArray[np.int32]
+    marker: NDArray[np.int32]
+    building: NDArray[np.int64]
+    ids: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class RunSurface:
+    """The boundary of a finished run; cells are not read."""
+
+    pieces: MeshPieces
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Its tiles, sorted."""
+        return self.pieces.names
+
+    @property
+    def n_points(self) -> int:
+        """Number of different points of the whole mesh."""
+        return self.pieces.n_points
+
+    def read(self, k: int) -> BoundaryPart:
+        """Read piece `k`.
+
+        Raises
+        ------
+        InputError
+            If its file is missing or damaged, or has an unknown marker.
+        """
+        path = self.pieces.files.boundaries[k]
+        piece = read_vtp(path)
+        marks = piece.boundary.marker
+        if not np.isin(marks, [int(marker) for marker in PATCHES]).all():
+            raise InputError(
+                f"{path}: markers {marks.min()}..{marks.max()}, known are 1..{max(PATCHES)}; run the tile again"
+            )
+        ids = number_piece(path, piece.point_data.get(VERTEX_ID), self.pieces.numbering)
+        return BoundaryPart(piece.points, piece.boundary.facets, marks, piece.boundary.building, ids)
+
+
+def open_surface(directory: Path) -> RunSurface:
+    """Open the boundary of a finished run.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no finished run, or a file of it is missing or damaged.
+    """
+    return RunSurface(open_pieces(directory))
+
+
+class VertexSet:
+    """Which points of a mesh are vertices of its boundary, and the place of each among these.
+
+    Parameters
+    ----------
+    n_points : int
+        Points of the mesh.
+
+    Notes
+    -----
+    A quarter of a byte a point: a bit each, and how many come before each word of bits.
+
+    Examples
+    --------
+    >>> vertices = VertexSet(200)
+    >>> vertices.add(np.array([3, 130, 70, 3]))
+    >>> vertices.count()
+    3
+    >>> vertices.places(np.array([130, 3, 70])).tolist()
+    [2, 0, 1]
+    """
+
+    def __init__(self, n_points: int) -> None:
+        self._words = np.zeros(-(-n_points // WORD), np.uint64)
+        self._before = np.zeros(len(self._words), np.int64)
+
+    def add(self, ids: NDArray[np.int64]) -> None:
+        """Add points, (k,); places of those known before may change."""
+        np.bitwise_or.at(self._words, ids // WORD, _bit(ids))
+
+    def count(self) -> int:
+        """Count them, and settle their places."""
+        counts = np.bitwise_count(self._words).astype(np.int64)
+        self._before = np.cumsum(counts) - counts
+        return int(counts.sum())
+
+    def places(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Tell the places of points that are in the set, (k,) to (k,), in the order of their ids."""
+        word = ids // WORD
+        lower = self._words[word] & (_bit(ids) - np.uint64(1))
+        return self._before[word] + np.bitwise_count(lower)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSurvey:
+    """What is known after reading a boundary once.
+
+    Attributes
+    ----------
+    vertices : VertexSet
+        Places of its vertices.
+    n_vertices : int
+        How many there are.
+    facets : dict of int to int
+        Facets by marker, ascending; markers without facets are not there.
+    low, high : float64, (3,)
+        Box of its vertices (m); infinite where there is none.
+    """
+
+    vertices: VertexSet
+    n_vertices: int
+    facets: dict[int, int]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    @property
+    def n_facets(self) -> int:
+        """Number of all facets."""
+        return sum(self.facets.values())
+
+
+def survey_surface(surface: Surface) -> SurfaceSurvey:
+    """Read a boundary once, a piece at a time."""
+    vertices = VertexSet(surface.n_points)
+    facets: dict[int, int] = {}
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for k in range(len(surface.names)):
+        piece = surface.read(k)
+        used = np.unique(piece.facets)
+        vertices.add(piece.ids[used])
+        if len(used):
+            points = piece.points[used]
+            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+        for marker, n in zip(*np.unique(piece.marker, return_counts=True), strict=True):
+            facets[int(marker)] = facets.get(int(marker), 0) + int(n)
+    return SurfaceSurvey(vertices, vertices.count(), dict(sorted(facets.items())), low, high)
+
+
+def place_vertices(
+    piece: SurfacePiece, vertices: VertexSet
+) -> tuple[list[tuple[int, NDArray[np.float64]]], NDArray[np.int64]]:
+    """Give what a piece adds to the region's vertices and facets.
+
+    Returns
+    -------
+    list of (int, float64 (k, 3))
+        Runs of vertices (m), each with the place of its first.
+    int64, (f, 3)
+        The facets, by places.
+    """
+    used, local = np.unique(piece.facets, return_inverse=True)
+    places = vertices.places(piece.ids[used])
+    runs = [(start, piece.points[used[rows]]) for start, rows in blocks_of(places)]
+    return runs, places[local.reshape(-1, 3)]
+
+
+def patch_name(marker: int) -> str:
+    """Name a patch."""
+    return PATCHES[Marker(marker)]
+
+
+def slices(n: int) -> Iterator[slice]:
+    """Cut n rows into slices of `ROWS`."""
+    for start in range(0, n, ROWS):
+        yield slice(start, start + ROWS)
+
+
+def _bit(ids: NDArray[np.int64]) -> NDArray[np.uint64]:
+    return np.left_shift(np.uint64(1), (ids % WORD).astype(np.uint64))

@@ -1,0 +1,35 @@
+"""What the steps take of a chunk of LAS points, as arrays (step 1.1)."""
+
+import laspy
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.las_points import Triple, find_coordinates
+
+_FIELDS = laspy.DecompressionSelection
+# Fields to decompress where points are stored by fields (formats 6 to 10): coordinates, class and withheld.
+FIELDS = _FIELDS.XY_RETURNS_CHANNEL | _FIELDS.Z | _FIELDS.CLASSIFICATION | _FIELDS.FLAGS
+
+
+def units_of(chunk: laspy.ScaleAwarePointRecord) -> NDArray[np.int32]:
+    """Give the coordinates in units of the file, int32 (n, 3)."""
+    units = np.empty((len(chunk), 3), np.int32)
+    for k, axis in enumerate("XYZ"):
+        units[:, k] = chunk.array[axis]
+    return units
+
+
+def scaling_of(chunk: laspy.ScaleAwarePointRecord) -> tuple[Triple, Triple]:
+    """Give the size of a unit along each axis, and the place of unit 0 (m)."""
+    (a, b, c), (x, y, z) = (np.asarray(values, np.float64).tolist() for values in (chunk.scales, chunk.offsets))
+    return (a, b, c), (x, y, z)
+
+
+def coordinates_of(chunk: laspy.ScaleAwarePointRecord) -> NDArray[np.float64]:
+    """Give the coordinates (m), float64 (n, 3)."""
+    return np.asarray(find_coordinates(units_of(chunk), *scaling_of(chunk)))
+
+
+def classes_of(chunk: laspy.ScaleAwarePointRecord) -> NDArray[np.uint8]:
+    """Give the ASPRS class of each point, uint8 (n,)."""
+    return np.ascontiguousarray(chunk.classification, np.uint8)

@@ -1,0 +1,137 @@
+"""Limits of tasks in worker processes, and what a process that ends leaves to tell why.
+
+A task that crashes its process, hangs, or takes more memory than there is cannot report it. So before it starts
+a file is opened, into which the interpreter's own fault handler writes the traceback of a crash or at the time
+limit; the file goes when the task ends. What is found in it afterwards says which task it was, and why.
+"""
+
+import faulthandler
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+from pipeline.errors import CityError, OutputError
+from tiler.stage import Facts
+from tiler.task import Failure, Record, Task, run_task
+
+TASKS = ".tasks"  # folder beside the store, with a file for every task that runs
+TIMEOUT = "Timeout ("  # how the fault handler begins at the time limit
+ADVICE = "use fewer workers, give each more memory (--memory-limit), or make tiles smaller"
+
+
+class WorkerError(CityError):
+    """The process of a task ended before the task did."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a task may take.
+
+    Attributes
+    ----------
+    seconds : float
+        Wall time (s); 0 for no limit.
+    memory : int
+        Memory of a worker process (bytes); 0 for no limit.
+    """
+
+    seconds: float = 0.0
+    memory: int = 0
+
+
+def trace_file(task: Task) -> Path:
+    """File that is there while a task runs in a worker."""
+    return task.store.path.parent / TASKS / f"{task.stage}.{task.name}.txt"
+
+
+def run_guarded(function: Callable[[Task], Facts], task: Task, seconds: float) -> Record | Failure:
+    """Run a task so that a crash leaves a traceback, and end the process at the time limit.
+
+    Notes
+    -----
+    The fault handler's watchdog is no Python thread: it acts even while the task holds the interpreter. There is
+    one for the process, so workers of several threads have no time limit.
+    """
+    path = trace_file(task)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("w")
+    except OSError as error:
+        words = f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
+        return Failure(OutputError(words))
+    with _watched(path, file, seconds):
+        return run_task(function, task)
+
+
+@contextmanager
+def _watched(path: Path, file: TextIO, seconds: float) -> Iterator[None]:
+    with file:
+        faulthandler.enable(file)
+        if seconds:
+            faulthandler.dump_traceback_later(seconds, exit=True, file=file)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+            faulthandler.disable()
+    with suppress(OSError):  # a disk that refuses says so where results are written
+        path.unlink()
+
+
+def tell_death(task: Task, limits: Limits) -> Failure | None:
+    """Tell from its file how a task ended whose process died; None if it had not begun.
+
+    The file goes.
+    """
+    path = trace_file(task)
+    try:
+        trace = path.read_text(errors="replace").strip()
+    except FileNotFoundError:
+        return None
+    with suppress(OSError):
+        path.unlink()
+    if trace.startswith(TIMEOUT):
+        words = (
+            f"not done after {limits.seconds:g} s, the limit of a task; raise --time-limit, or make tiles smaller"
+        )
+        return Failure(WorkerError(words), trace, "time")
+    if trace:
+        words = f"the worker process died of it: {trace.splitlines()[0]}; a fault of citystitch or a library"
+        return Failure(WorkerError(words), trace, "crash")
+    words = f"the worker process died with this item on it, killed or for want of memory; {ADVICE}"
+    return Failure(WorkerError(words), "", "killed")
+
+
+def tell_memory(failure: Failure, limits: Limits) -> Failure:
+    """Put the limit and the way out into the error of a task that was refused memory."""
+    bound = f"the limit of a worker, {limits.memory / 2**30:.2f} GiB" if limits.memory else "what the machine has"
+    return Failure(
+        WorkerError(f"needs more memory than {bound} ({failure.error}); {ADVICE}"), failure.trace, "memory"
+    )
+
+
+def limit_memory(memory: int) -> None:
+    """Let this process have so much memory (bytes): beyond it, what asks for more gets a MemoryError.
+
+    Notes
+    -----
+    Linux counts writable private memory, touched or not; what is mapped so far and not touched comes on top.
+    """
+    status = Path("/proc/self/status")
+    if not status.is_file():
+        return
+    text = status.read_text()
+    mapped, resident = (int(text.split(f"{key}:")[1].split()[0]) * 1024 for key in ("VmData", "VmRSS"))
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    bound = memory + max(mapped - resident, 0)
+    resource.setrlimit(resource.RLIMIT_DATA, (bound if hard == resource.RLIM_INFINITY else min(bound, hard), hard))
+
+
+def machine_memory() -> int:
+    """Memory of this machine, or of the container it is (bytes)."""
+    from distributed.system import MEMORY_LIMIT
+
+    return int(MEMORY_LIMIT)

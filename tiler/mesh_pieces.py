@@ -1,0 +1,137 @@
+"""The mesh of a finished run, piece by piece, with its points numbered from 0 on over the whole region (step 3.6).
+
+What exporters are written on: one piece is in memory at a time, and the store is not read.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from stitch.numbering import Numbering
+from tiler.export import RUN_RECORD, RunFiles, find_files
+from tiler.merged import VERTEX_ID, number_piece, read_numbering
+from tiler.run_folder import read_run_record
+from tiler.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPiece:
+    """The part of the mesh that one tile holds: ``n`` points, ``m`` cells, ``f`` facets.
+
+    Attributes
+    ----------
+    name : str
+        The tile, ``"60_-3"``: its column and row in the CRS.
+    points : float64, (n, 3)
+        Points that its cells use (m).
+    cells : int32, (m, 4)
+        Tetrahedra of positive volume, as rows of `points`.
+    facets : int32, (f, 3)
+        Facets of the region's boundary, as rows of `points`, counter-clockwise seen from outside; faces that it
+        shares with another tile are not among them.
+    marker : int32, (f,)
+        `pipeline.mesh.Marker` of each facet.
+    building : int64, (f,)
+        Number of each facet's building, -1 where there is none.
+    ids : int64, (n,)
+        Number of each point over the whole region, 0 to ``n_points - 1`` of `MeshPieces`. A point that several
+        tiles have is bitwise the same in all of them, and has one number.
+    """
+
+    name: str
+    points: NDArray[np.float64]
+    cells: NDArray[np.int32]
+    facets: NDArray[np.int32]
+    marker: NDArray[np.int32]
+    building: NDArray[np.int64]
+    ids: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPieces:
+    """The pieces of a finished run.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Its tiles, sorted.
+    files : RunFiles
+        The files that hold them, in the same order.
+    numbering : Numbering
+        From the ids in the pieces to numbers without gaps.
+    """
+
+    names: tuple[str, ...]
+    files: RunFiles
+    numbering: Numbering
+
+    @property
+    def n_points(self) -> int:
+        """Number of different points of the whole mesh."""
+        return self.numbering.n_points
+
+    def read(self, k: int) -> MeshPiece:
+        """Read piece `k`.
+
+        Raises
+        ------
+        InputError
+            If a file of it is missing or damaged, or the two do not fit together.
+        """
+        path = self.files.volumes[k]
+        volume, boundary = read_vtu(path), read_vtp(self.files.boundaries[k])
+        return MeshPiece(
+            self.names[k],
+            volume.mesh.points,
+            volume.mesh.cells,
+            _facets_in_volume(self.files.boundaries[k], volume, boundary),
+            boundary.boundary.marker,
+            boundary.boundary.building,
+            number_piece(path, volume.point_data.get(VERTEX_ID), self.numbering),
+        )
+
+
+def open_pieces(directory: Path) -> MeshPieces:
+    """Open the mesh of a finished run.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of the run.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no finished run, or a file of it is missing or damaged.
+
+    Notes
+    -----
+    The ids of all points are read once, a piece at a time; memory holds some 100 bytes for each tile's parts.
+    """
+    files = find_files(directory)
+    names = tuple(path.stem for path in files.volumes)
+    if names != tuple(path.stem for path in files.boundaries) or list(names) != sorted(set(names)):
+        raise InputError(f"{directory}: the indexes of mesh and boundary name other tiles; run again")
+    numbering = read_numbering(files.volumes)
+    counted = read_run_record(directory / RUN_RECORD).counts["points"]
+    if numbering.n_points != counted:
+        raise InputError(
+            f"{directory}: its pieces have {numbering.n_points} different {VERTEX_ID}, {RUN_RECORD} says "
+            f"{counted} points; run again"
+        )
+    return MeshPieces(names, files, numbering)
+
+
+def _facets_in_volume(path: Path, volume: VolumePiece, boundary: BoundaryPiece) -> NDArray[np.int32]:
+    """Give facets as rows of the volume's points."""
+    vertex, points = boundary.vertex, volume.mesh.points
+    if vertex.size and (vertex.min() < 0 or vertex.max() >= len(points)):
+        raise InputError(
+            f"{path}: vertex {vertex.min()}..{vertex.max()} of the volume's {len(points)}; run the tile again"
+        )
+    if points[vertex].tobytes() != boundary.points.tobytes():
+        raise InputError(f"{path}: its points are not those of the volume; run the tile again")
+    return vertex.astype(np.int32)[boundary.boundary.facets]

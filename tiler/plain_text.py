@@ -1,0 +1,58 @@
+"""Text from files and paths, made safe to print and to store as a name."""
+
+import hashlib
+import unicodedata
+
+# Unicode categories that move a cursor, hide or reorder text, or cannot be written as UTF-8: control, format,
+# surrogate, line and paragraph separators. A terminal obeys the first, a reader is misled by the second.
+_UNSAFE = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+
+ID_LENGTH = 200  # characters of a building's id; registers have some 20, a URI some 100
+
+
+def printable(text: str) -> str:
+    r"""Write control characters as escapes, so that text is one line and no terminal obeys it.
+
+    Parameters
+    ----------
+    text : str
+        Anything: paths, attributes, what a library said.
+
+    Returns
+    -------
+    str
+        The same where there are none; others as ``\n``, ``\x1b``, ``\u202e``.
+
+    Examples
+    --------
+    >>> printable("red \x1b[31m\nhouse")
+    'red \\x1b[31m\\nhouse'
+    """
+    if text.isprintable():
+        return text
+    return "".join(_escape(sign) if unicodedata.category(sign) in _UNSAFE else sign for sign in text)
+
+
+def shorten(text: str, length: int) -> str:
+    """Cut text to a length; what is cut shows as a hash of the whole, so that different texts stay different.
+
+    Parameters
+    ----------
+    text : str
+        Anything.
+    length : int
+        Characters to keep at most, at least 18.
+
+    Examples
+    --------
+    >>> shorten("a" * 30, 20)
+    'aaa~71fab4a212af99bb'
+    """
+    if len(text) <= length:
+        return text
+    mark = "~" + hashlib.blake2b(text.encode(errors="surrogatepass"), digest_size=8).hexdigest()
+    return text[: length - len(mark)] + mark
+
+
+def _escape(sign: str) -> str:
+    return sign.encode("unicode_escape", errors="surrogatepass").decode("ascii")

@@ -1,0 +1,75 @@
+"""Which vector files GDAL may open: those that hold their own features (step 1.2).
+
+GDAL tells formats by their content, whatever the name. Some only point elsewhere: a VRT, WFS or GDALG file of a
+few lines makes it read other files, ask servers and databases, or run an algorithm. Archives may hold any of them,
+and expand without end. So a file is looked at before GDAL is asked.
+"""
+
+import stat
+from pathlib import Path
+
+from pipeline.errors import InputError
+
+_HEAD = 65_536  # bytes that are looked at; GDAL looks for these marks in fewer
+# Marks by which GDAL's drivers recognise a file that points elsewhere, lower case.
+_POINTERS = (
+    b"<ogrvrtdatasource", b"<vrtdataset", b"<ogrwfsdatasource", b"<ogrcswdatasource", b"gdal_streamed_alg",
+)  # fmt: skip
+_BEGINNINGS = {
+    b"\x00\x00\x27\x0a": "Shapefile",
+    b"SQLite format 3\x00": "GeoPackage",
+    b"fgb": "FlatGeobuf",
+    b"{": "GeoJSON",
+    b"\x1e": "GeoJSON sequence",
+}
+
+
+def check_form(path: Path) -> None:
+    """Refuse a vector file that GDAL should not open.
+
+    Parameters
+    ----------
+    path : Path
+        Shapefile, GeoPackage, GeoJSON (also as a sequence, TopoJSON and Esri JSON) or FlatGeobuf, told by its
+        content; or a folder, such as an Esri geodatabase.
+
+    Raises
+    ------
+    InputError
+        If it is of another form, points elsewhere, is no regular file, or cannot be read.
+    """
+    if path.is_dir():
+        return
+    head = read_head(path)
+    pointer = next((mark for mark in _POINTERS if mark in head.lower()), None)
+    start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if pointer is not None or not any(start.startswith(mark) for mark in _BEGINNINGS):
+        what = (
+            f"points to other data ({pointer.decode()})"
+            if pointer
+            else "is none of SHP, GPKG, GeoJSON, FlatGeobuf"
+        )
+        raise InputError(
+            f'{path}: cannot be read: it {what}; convert it, if you trust it: ogr2ogr footprints.gpkg "{path}"'
+        )
+
+
+def read_head(path: Path) -> bytes:
+    """Read the first 64 kB of a file that is to be opened by a library.
+
+    Raises
+    ------
+    InputError
+        If it is empty or cannot be read, or is no regular file: a pipe or a device may never end.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise InputError(f"{path}: is no regular file; give a file with footprint polygons")
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"{path}: cannot be read ({reason}); check the path and its permissions") from error
+    if not head:
+        raise InputError(f"{path}: is empty; copy it again")
+    return head
