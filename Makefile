@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-long lint bench bench-tiles quality reliability clean
+.PHONY: demo test test-long lint bench bench-tiles studies quality reliability clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("citystitch needs Python 3.11 or newer, this is " + sys.version) if sys.version_info < (3, 11) else None'
@@ -32,6 +32,10 @@ bench: $(STAMP)
 
 bench-tiles: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.tiles
+
+studies: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check py-spy
+	$(BIN)/python -m tests.benchmarks.studies
 
 quality: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.quality

@@ -25,7 +25,7 @@ from tiler.atomic import replacing
 GRID = 0.001
 # Attributes of every building; further columns may not take their names.
 ATTRIBUTES = ("number", "ground_height", "roof_height", "height", "members")
-RUN = 4096  # buildings that are written at once, and share their vertices
+RUN = 512  # buildings that are written at once, and share their vertices
 COPY_BYTES = 1 << 20
 GROUND, ROOF, WALL = range(3)
 # Semantic surfaces of every solid, by the numbers above.

@@ -5,6 +5,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import laspy
@@ -334,7 +335,13 @@ def _parse_crs(header: laspy.LasHeader) -> pyproj.CRS | None:
         crs: pyproj.CRS | None = header.parse_crs()
     except _NO_CRS:
         return None
-    return crs
+    return None if crs is None else _one_crs(crs.srs)
+
+
+@lru_cache(maxsize=64)
+def _one_crs(text: str) -> pyproj.CRS:
+    """Give the one CRS of a text: a country's files state the same, and each takes some 30 kB."""
+    return pyproj.CRS.from_user_input(text)
 
 
 @contextmanager

@@ -1,0 +1,345 @@
+"""`make studies`: how cost grows with cells, buildings, area, workers and tile size, and where the time goes.
+
+The first two are the paper's studies (its section 2.2): (a) cost against the number of cells, (b) against that of
+buildings. What is measured is kept in docs/studies.json, a study each, and docs/studies.md and its pictures
+are written from that: `python -m tests.benchmarks.studies cells` measures one study anew and leaves the others.
+"""
+
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.benchmarks.bench import COMMAND, citystitch, record_of
+from tests.benchmarks.log_plot import draw_log_plot
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+KEPT, REPORT = DOCS / "studies.json", DOCS / "studies.md"
+MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
+BUILDINGS = (100, 300, 1000, 3000, 10_000, 20_000, 50_000)
+SIDES = (1000, 2000, 3000, 5000)  # m; 10000 with --large
+TILES = (250, 500, 850, 1250, 2500)  # m, on 2.5 km
+LEAST_SECONDS = 0.1  # less is not fitted
+
+# Steps of the paper by the stages and parts of stages that do them, as run.json names them.
+STEPS: Mapping[str, tuple[str, ...]] = {
+    "1.1 points": ("points",),
+    "1.2 footprints": ("footprints", "outlines"),
+    "1.3 terrain": ("ground", "flooded", "coarse", "lakes", "terrain"),
+    "1.4-2.0 houses": ("houses",),
+    "2.1 simplify": ("near", "join", "members", "shapes"),
+    "2.3 heights": ("model",),
+    "1.7, 2.4 city model": ("citymodel", "citymodel-full"),
+    "3.1 plane mesh": ("columns: 3.1 plane mesh", "seams: 3.1 seams"),
+    "3.2-3.5 columns": ("columns: 3.2-3.5 columns", "seams: 3.2-3.5 columns of seams"),
+    "3.6 pieces": ("pieces",),
+    "fit, proofs, report": ("fit", "proofs", "report", "numbers"),
+}
+
+
+def step_seconds(record: Mapping[str, Any]) -> dict[str, float]:
+    """Seconds of each step of a run, all tiles together; what no step names is ``rest``."""
+    given: Counter[str] = Counter()
+    for name, seconds in record["seconds"].items():
+        given[re.sub(r"-\d+(?=:|$)", "", name)] += seconds
+    found = {step: sum(given[part] for part in parts) for step, parts in STEPS.items()}
+    stages = sum(seconds for name, seconds in record["seconds"].items() if ": " not in name)
+    found["rest"] = max(stages - sum(found.values()), 0.0)
+    return {step: round(seconds, 3) for step, seconds in found.items()}
+
+
+def fit_exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float | None:
+    """Slope of log(seconds) over log(sizes) by least squares; None with fewer than two values that count.
+
+    Examples
+    --------
+    >>> round(fit_exponent([1, 10, 100], [2, 20, 200]), 3)
+    1.0
+    """
+    n, t = np.asarray(sizes, np.float64), np.asarray(seconds, np.float64)
+    use = t >= LEAST_SECONDS
+    if use.sum() < 2:
+        return None
+    return float(np.polyfit(np.log(n[use]), np.log(t[use]), 1)[0])
+
+
+def measure(city: Path, out: Path, *options: str, cores: int = 1) -> dict[str, Any]:
+    """Mesh a city; what a study keeps of run.json."""
+    record = record_of(city, out, *options, cores=cores)
+    return {
+        "cells": record["counts"]["cells"],
+        "total": record["seconds_total"],
+        "steps": step_seconds(record),
+        "peak": record["peak_memory_bytes"],
+        "driver": record["driver_memory_bytes"],
+        "tiles": record["tiles"] if isinstance(record["tiles"], int) else len(record["tiles"]),
+        "ran": sum(record["ran"].values()),
+    }
+
+
+class Cities:
+    """Synthetic cities, made when they are asked for."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+
+    def make(self, size: int, buildings: int) -> Path:
+        """Folder of a city of `size` metres with so many buildings."""
+        folder = self.home / f"city-{size}-{buildings}"
+        if not folder.exists():
+            citystitch("synth", str(folder), "--size", str(size), "--buildings", str(buildings))
+        return folder
+
+
+def study_cells(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(a) One kilometre with 480 buildings, in one process on one core, by mesh size."""
+    city = cities.make(1000, 480)
+    sizes = ("--tile-size", "500", "--workers", "0")
+    return [measure(city, out, "--mesh-size", str(size), *sizes) | {"mesh size": size} for size in MESH_SIZES]
+
+
+def study_buildings(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(b) 6.25 km2 with more and more buildings, in one process on one core."""
+    return [
+        measure(cities.make(2500, n), out, "--tile-size", "625", "--workers", "0") | {"buildings": n}
+        for n in BUILDINGS
+    ]
+
+
+def study_area(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(c) 480 buildings a km2 on more and more of them, one worker."""
+    sides = (*SIDES, 10_000) if "--large" in sys.argv else SIDES
+    return [
+        measure(
+            cities.make(side, round(480 * side**2 / 1e6)), out, "--tile-size", "500", "--workers", "1", cores=2
+        )
+        | {"area": side**2 / 1e6}
+        for side in sides
+    ]
+
+
+def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(d) The city of 2.5 km serially, with one and with two workers; runs take turns."""
+    city = cities.make(2500, 3000)
+    rows = [
+        measure(city, out, "--tile-size", "625", "--workers", workers, cores=2) | {"workers": int(workers)}
+        for _ in range(3)
+        for workers in ("0", "1", "2")
+    ]
+    return [sorted((r for r in rows if r["workers"] == n), key=lambda r: float(r["total"]))[1] for n in (0, 1, 2)]
+
+
+def study_tiles(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(e) The city of 2.5 km with tiles of several sizes, two workers."""
+    city = cities.make(2500, 3000)
+    return [
+        measure(city, out, "--tile-size", str(size), "--workers", "2", cores=2) | {"tile size": size}
+        for size in TILES
+    ]
+
+
+def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """The city of 2.5 km at 10, 5 and 2.5 m with two workers: tiles as large as the cells allow."""
+    city = cities.make(2500, 3000)
+    return [
+        measure(city, out, "--mesh-size", str(size), "--tile-size", str(tile), "--workers", "2", cores=2)
+        | {"mesh size": size, "tile size": tile}
+        for size, tile in ((10.0, 625), (5.0, 320), (2.5, 160))
+    ]
+
+
+def study_profile(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(f) Samples of a serial run of the city of 2.5 km by the function that was at work, with py-spy."""
+    if shutil.which("py-spy") is None:
+        raise SystemExit("no py-spy; python -m pip install py-spy")
+    city, raw = cities.make(2500, 3000), out.parent / "samples"
+    words = [*COMMAND, "run", str(city / "tiles"), "--footprints", str(city / "footprints.shp")]
+    words += ["--tile-size", "625", "--workers", "0", "--overwrite", "--out", str(out)]
+    subprocess.run(
+        ["py-spy", "record", "-r", "100", "-f", "raw", "-o", str(raw), "--", *words],
+        check=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    counts: dict[tuple[str, str], int] = {}
+    total = 0
+    for line in raw.read_text().splitlines():
+        stack, _, number = line.rpartition(" ")
+        frames = [_frame(frame) for frame in stack.split(";")]
+        ours = [frame for frame in frames if frame[0].split("/")[0] in ("pipeline", "stitch", "tiler")]
+        in_task = any(name == "run_task" for _, name in ours)
+        key = ours[-1] if in_task else ("driver", "outside of tasks")
+        counts[key] = counts.get(key, 0) + int(number)
+        total += int(number)
+    rows = sorted(counts.items(), key=lambda item: -item[1])[:30]
+    return [{"place": f"{file}: {name}", "share": round(n / total, 4)} for (file, name), n in rows]
+
+
+def _frame(text: str) -> tuple[str, str]:
+    """File, from its package on, and function of a sample's frame."""
+    name, _, place = text.partition(" (")
+    path = Path(place.rstrip(")").rpartition(":")[0])
+    return "/".join(path.parts[-2:]) if "stages" not in path.parts else "/".join(path.parts[-3:]), name
+
+
+def study_limits(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """What the machine does at best: LAZ decompression alone, a copy in memory, a file written and flushed."""
+    import laspy
+
+    files = sorted((cities.make(2500, 3000) / "tiles").glob("*.laz"))
+    start, n_points = time.perf_counter(), 0
+    for path in files:
+        with laspy.open(path) as reader:
+            n_points += len(reader.read().points)
+    laz = n_points / (time.perf_counter() - start)
+    block = np.ones(2**25)
+    target = np.empty_like(block)
+    start = time.perf_counter()
+    for _ in range(8):
+        np.copyto(target, block)
+    copy = 8 * 2 * block.nbytes / (time.perf_counter() - start)
+    path = out.parent / "block"
+    start = time.perf_counter()
+    with path.open("wb") as file:
+        for _ in range(4):
+            file.write(block.data)
+        file.flush()
+        os.fsync(file.fileno())
+    disk = 4 * block.nbytes / (time.perf_counter() - start)
+    path.unlink()
+    return [
+        {"limit": "LAZ decompression by lazrs, one core", "value": f"{laz / 1e6:.2f} M points/s"},
+        {"limit": "copy in memory, read and written, one core", "value": f"{copy / 1e9:.1f} GB/s"},
+        {"limit": "file written and flushed", "value": f"{disk / 1e6:.0f} MB/s"},
+    ]
+
+
+Study = Callable[[Cities, Path], list[dict[str, Any]]]
+STUDIES: Mapping[str, Study] = {
+    "cells": study_cells,
+    "buildings": study_buildings,
+    "area": study_area,
+    "workers": study_workers,
+    "tiles": study_tiles,
+    "fine": study_fine,
+    "profile": study_profile,
+    "limits": study_limits,
+}
+
+
+def main() -> None:
+    """Measure the studies that are named, or all; write what is known."""
+    names = [word for word in sys.argv[1:] if not word.startswith("-")] or list(STUDIES)
+    unknown = sorted(set(names) - STUDIES.keys())
+    if unknown:
+        raise SystemExit(f"no study {unknown[0]!r}; there are {', '.join(STUDIES)}")
+    kept: dict[str, Any] = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    with tempfile.TemporaryDirectory() as folder:
+        cities, out = Cities(Path(folder)), Path(folder) / "out"
+        measure(cities.make(1000, 480), out)  # fills numba's cache
+        for name in names:
+            start = time.perf_counter()
+            kept[name] = STUDIES[name](cities, out)
+            KEPT.write_text(json.dumps(kept, indent=1) + "\n")
+            print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+    write_report(kept)
+
+
+def write_report(kept: Mapping[str, Any]) -> None:
+    """Write docs/studies.md and its pictures of what was measured."""
+    lines = [
+        "# Studies of cost",
+        "",
+        "Written by `make studies` (one study: `python -m tests.benchmarks.studies cells`); do not edit.",
+        "Synthetic cities (`citystitch synth`), LAZ and SHP to written pieces, numba's cache warm, one run each",
+        "where nothing else is said. The machine is shared: compare within a table.",
+        "",
+        f"Machine: {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}.",
+    ]
+    growth = (
+        ("cells", "(a) Cells", "cells", "One kilometre with 480 buildings, mesh size 20 to 2.5 m, serial."),
+        ("buildings", "(b) Buildings", "buildings", "6.25 km², mesh size 10 m, serial."),
+        ("area", "(c) Area", "area", "480 buildings a km², mesh size 10 m, tiles of 500 m, one worker."),
+    )
+    for name, title, key, words in growth:
+        if name in kept:
+            lines += ["", f"## {title}", "", words, "", *_growth(kept[name], name, key)]
+    tables = (
+        (
+            "workers",
+            "(d) Workers",
+            "workers",
+            "The city of 2.5 km with 3,000 buildings; the middle one of 3.",
+        ),
+        ("tiles", "(e) Tile size", "tile size", "The city of 2.5 km, two workers."),
+        ("fine", "Fine meshes", "mesh size", "The city of 2.5 km, two workers, smaller tiles for smaller cells."),
+    )
+    for name, title, key, words in tables:
+        if name in kept:
+            lines += ["", f"## {title}", "", words, "", *_runs(kept[name], key)]
+    if "workers" in kept:
+        lines += ["", "## (f) Shares", "", *_shares(kept["workers"])]
+    if "profile" in kept:
+        lines += [
+            "",
+            "## Where the time goes",
+            "",
+            "Serial run of the city of 2.5 km, 100 samples a second (py-spy): our",
+        ]
+        lines += ["innermost function, with what it calls of others.", "", "| function | share |", "|---|---|"]
+        lines += [f"| `{row['place']}` | {100 * row['share']:.1f} % |" for row in kept["profile"]]
+    if "limits" in kept:
+        lines += ["", "## What the machine can", "", "| | |", "|---|---|"]
+        lines += [f"| {row['limit']} | {row['value']} |" for row in kept["limits"]]
+    REPORT.write_text("\n".join(lines) + "\n")
+
+
+def _growth(rows: list[dict[str, Any]], name: str, key: str) -> list[str]:
+    """A table of runs, one of exponents, and the plot."""
+    sizes = [float(row[key]) for row in rows]
+    steps = [*STEPS, "rest"]
+    series = {step: [row["steps"][step] for row in rows] for step in steps}
+    whole = [sum(row["steps"].values()) for row in rows]
+    draw_log_plot(DOCS / f"study-{name}.png", sizes, {**series, "all": whole}, x=key, y="seconds")
+    lines = [*_runs(rows, key), "", "| step | exponent, all sizes | upper half |", "|---|---|---|"]
+    half = len(rows) // 2
+    for step, seconds in {**series, "all steps": whole}.items():
+        told = [fit_exponent(sizes, seconds), fit_exponent(sizes[half:], seconds[half:])]
+        lines.append(f"| {step} | " + " | ".join("-" if e is None else f"{e:.2f}" for e in told) + " |")
+    return [*lines, "", f"![Seconds of each step against {key}](study-{name}.png)"]
+
+
+def _runs(rows: list[dict[str, Any]], key: str) -> list[str]:
+    lines = [
+        f"| {key} | tiles | cells | whole run | worker's peak | driver | tasks |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines.extend(
+        f"| {row[key]:,g} | {row['tiles']} | {row['cells'] / 1e6:.2f} M | {row['total']:.1f} s "
+        f"| {row['peak'] / 2**20:.0f} MiB | {row['driver'] / 2**20:.1f} MiB | {row['ran']:,} |"
+        for row in rows
+    )
+    return lines
+
+
+def _shares(rows: list[dict[str, Any]]) -> list[str]:
+    lines = ["| step | " + " | ".join(f"{row['workers']} workers" for row in rows) + " |", "|---|---|---|---|"]
+    for step in (*STEPS, "rest"):
+        parts = (f"{100 * row['steps'][step] / sum(row['steps'].values()):.1f} %" for row in rows)
+        lines.append(f"| {step} | " + " | ".join(parts) + " |")
+    return lines
+
+
+if __name__ == "__main__":
+    main()
