@@ -142,7 +142,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--buildings",
         choices=("patches", "zones"),
         default=argparse.SUPPRESS,
-        help="openfoam: one patch a building instead of walls and roofs, or one face zone beside them",
+        help="one patch a building instead of walls and roofs; openfoam also: one face zone beside them",
     )
     command("config", _config, "print all parameters of a run, annotated, as a configuration file")
     return parser

@@ -45,6 +45,8 @@ class Format:
         Given a path and the files of a run, and the options as keywords, writes that file or folder.
     options : tuple of str
         Options of the command line that it takes, without dashes.
+    buildings : tuple of str
+        What the option ``buildings`` may be, where it is taken.
     folder : bool
         Whether it is a folder.
     suffix : str
@@ -56,6 +58,7 @@ class Format:
     description: str
     write: Callable[..., None]
     options: tuple[str, ...] = ()
+    buildings: tuple[str, ...] = ("patches",)
     folder: bool = False
     suffix: str = ""
     companion: str = ""
@@ -83,6 +86,12 @@ def _write_xdmf(path: Path, files: RunFiles) -> None:
     from tiler.formats.xdmf import export_xdmf
 
     export_xdmf(path, files.directory)
+
+
+def _write_cgns(path: Path, files: RunFiles, **options: Any) -> None:
+    from tiler.formats.cgns import export_cgns
+
+    export_cgns(path, files.directory, **options)
 
 
 def _write_msh(path: Path, files: RunFiles) -> None:
@@ -137,7 +146,11 @@ FORMATS: Mapping[str, Format] = {
     "vtu": Format("the volume mesh as one VTK file", _write_vtu),
     "vtp": Format("the marked boundary as one VTK file", _write_vtp),
     "openfoam": Format(
-        "a case folder of OpenFOAM", _write_openfoam, options=("parts", "case", "buildings"), folder=True
+        "a case folder of OpenFOAM",
+        _write_openfoam,
+        options=("parts", "case", "buildings"),
+        buildings=("patches", "zones"),
+        folder=True,
     ),
     "xdmf": Format(
         "mesh and marked facets for FEniCS and ParaView, with the numbers in a file .h5 beside it",
@@ -145,6 +158,7 @@ FORMATS: Mapping[str, Format] = {
         suffix=".xdmf",
         companion=".h5",
     ),
+    "cgns": Format("mesh and named patches as CGNS in HDF5", _write_cgns, options=("buildings",), suffix=".cgns"),
     "msh": Format("Gmsh's MSH 4.1, binary", _write_msh, suffix=".msh"),
     "msh2": Format("Gmsh's MSH 2.2, text, as gmshToFoam reads it", _write_msh2, suffix=".msh"),
     "stl": Format("the boundary as STL, text, one solid a patch", _write_stl, suffix=".stl"),
@@ -196,6 +210,9 @@ def export_run(
         if option not in kind.options:
             taken = ", ".join(f"--{known}" for known in kind.options) or "none"
             raise ConfigError(f"--{option}: format {name} does not take it; its options: {taken}")
+    asked = options.get("buildings", kind.buildings[0])
+    if asked not in kind.buildings:
+        raise ConfigError(f"--buildings {asked}: format {name} takes {' or '.join(kind.buildings)}")
     if not output.name.endswith(kind.suffix):
         raise ConfigError(f"{output}: a file of format {name} ends with {kind.suffix}; give another --output")
     files = find_files(directory)
