@@ -94,28 +94,28 @@ def _write_cgns(path: Path, files: RunFiles, **options: Any) -> None:
     export_cgns(path, files.directory, **options)
 
 
-def _write_msh(path: Path, files: RunFiles) -> None:
+def _write_msh(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.msh import export_msh
 
-    export_msh(path, files.directory)
+    export_msh(path, files.directory, **options)
 
 
-def _write_msh2(path: Path, files: RunFiles) -> None:
+def _write_msh2(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.msh import export_msh2
 
-    export_msh2(path, files.directory)
+    export_msh2(path, files.directory, **options)
 
 
-def _write_stl(path: Path, files: RunFiles) -> None:
+def _write_stl(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.stl import export_stl
 
-    export_stl(path, files.directory)
+    export_stl(path, files.directory, **options)
 
 
-def _write_obj(path: Path, files: RunFiles) -> None:
+def _write_obj(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.obj import export_obj
 
-    export_obj(path, files.directory)
+    export_obj(path, files.directory, **options)
 
 
 def _write_ply(path: Path, files: RunFiles) -> None:
@@ -124,10 +124,10 @@ def _write_ply(path: Path, files: RunFiles) -> None:
     export_ply(path, files.directory)
 
 
-def _write_glb(path: Path, files: RunFiles) -> None:
+def _write_glb(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.glb import export_glb
 
-    export_glb(path, files.directory)
+    export_glb(path, files.directory, **options)
 
 
 def _write_cityjsonseq(path: Path, files: RunFiles) -> None:
@@ -142,6 +142,7 @@ def _write_gpkg(path: Path, files: RunFiles) -> None:
     export_gpkg(path, files.directory)
 
 
+PER_BUILDING = ("buildings",)
 FORMATS: Mapping[str, Format] = {
     "vtu": Format("the volume mesh as one VTK file", _write_vtu),
     "vtp": Format("the marked boundary as one VTK file", _write_vtp),
@@ -158,13 +159,19 @@ FORMATS: Mapping[str, Format] = {
         suffix=".xdmf",
         companion=".h5",
     ),
-    "cgns": Format("mesh and named patches as CGNS in HDF5", _write_cgns, options=("buildings",), suffix=".cgns"),
-    "msh": Format("Gmsh's MSH 4.1, binary", _write_msh, suffix=".msh"),
-    "msh2": Format("Gmsh's MSH 2.2, text, as gmshToFoam reads it", _write_msh2, suffix=".msh"),
-    "stl": Format("the boundary as STL, text, one solid a patch", _write_stl, suffix=".stl"),
-    "obj": Format("the boundary as Wavefront OBJ, one group a patch", _write_obj, suffix=".obj"),
+    "cgns": Format("mesh and named patches as CGNS in HDF5", _write_cgns, options=PER_BUILDING, suffix=".cgns"),
+    "msh": Format("Gmsh's MSH 4.1, binary", _write_msh, options=PER_BUILDING, suffix=".msh"),
+    "msh2": Format(
+        "Gmsh's MSH 2.2, text, as gmshToFoam reads it", _write_msh2, options=PER_BUILDING, suffix=".msh"
+    ),
+    "stl": Format("the boundary as STL, text, one solid a patch", _write_stl, options=PER_BUILDING, suffix=".stl"),
+    "obj": Format(
+        "the boundary as Wavefront OBJ, one group a patch", _write_obj, options=PER_BUILDING, suffix=".obj"
+    ),
     "ply": Format("the boundary as PLY, binary, with marker and building", _write_ply, suffix=".ply"),
-    "glb": Format("the boundary as glTF 2.0, binary, one material a patch", _write_glb, suffix=".glb"),
+    "glb": Format(
+        "the boundary as glTF 2.0, binary, one material a patch", _write_glb, options=PER_BUILDING, suffix=".glb"
+    ),
     "cityjsonseq": Format(
         "the simplified city model as CityJSONSeq, one feature a building", _write_cityjsonseq, suffix=".jsonl"
     ),

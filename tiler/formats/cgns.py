@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tiler.atomic import replacing
 from tiler.export import RUN_RECORD
-from tiler.formats.foam_patches import Patch, patch_keys, patch_of_key, runs_of
+from tiler.formats.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of
 from tiler.formats.xdmf import as_output_error
@@ -97,15 +97,15 @@ def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = 
     survey = _survey(pieces, by_building=buildings is not None)
     with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
         coordinates, sections = _write_tree(file, survey, crs)
-        keys, seen = np.array(sorted(survey.facets), np.int64), dict.fromkeys(sections, 0)
+        seen = dict.fromkeys(sections, 0)
         for k in range(len(pieces.names)):
             piece = pieces.read(k)
             for start, rows in blocks_of(piece.ids):
                 for axis, data in enumerate(coordinates):
                     data[start : start + len(rows)] = piece.points[rows, axis]
             found = patch_keys(piece.marker, piece.building, by_building=buildings is not None)
-            chosen = [(int(keys[row]), piece.facets[rows]) for row, rows in runs_of(keys, found)]
-            for key, corners in [(0, piece.cells), *chosen]:
+            patches = [(key, piece.facets[rows]) for key, rows in facets_by_key(survey.facets, found)]
+            for key, corners in [(0, piece.cells), *patches]:
                 nodes = piece.ids[corners].ravel() + 1
                 sections[key][seen[key] : seen[key] + len(nodes)] = nodes
                 seen[key] += len(nodes)

@@ -1,6 +1,6 @@
 """Patches and face zones of OpenFOAM: their names, and the files `boundary` and `faceZones`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -85,6 +85,18 @@ def patch_keys(marker: NDArray[np.int32], building: NDArray[np.int64], *, by_bui
         return marker.astype(np.int64)
     keys: Ints = np.where(is_house(marker, building), building + FIRST_BUILDING, marker)
     return keys
+
+
+def facets_by_key(keys: Iterable[int], of_facet: Ints) -> list[tuple[int, Ints]]:
+    """Group facets by key of `patch_keys`: each key that there is among `keys`, ascending, and its facets.
+
+    Examples
+    --------
+    >>> facets_by_key([1, 4, 9], np.array([9, 1, 9]))
+    [(1, array([1])), (9, array([0, 2]))]
+    """
+    known = np.fromiter(keys, np.int64)
+    return [(int(known[row]), rows) for row, rows in runs_of(known, of_facet)]
 
 
 def is_house(marker: NDArray[np.int32], building: NDArray[np.int64]) -> NDArray[np.bool_]:
