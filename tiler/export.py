@@ -64,16 +64,16 @@ class Format:
     companion: str = ""
 
 
-def _write_vtu(path: Path, files: RunFiles) -> None:
+def _write_vtu(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.merged import write_merged_volume
 
-    write_merged_volume(path, files.volumes)
+    write_merged_volume(path, files.volumes, **options)
 
 
-def _write_vtp(path: Path, files: RunFiles) -> None:
+def _write_vtp(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.merged import write_merged_boundary
 
-    write_merged_boundary(path, files.boundaries, files.volumes)
+    write_merged_boundary(path, files.boundaries, files.volumes, **options)
 
 
 def _write_openfoam(path: Path, files: RunFiles, **options: Any) -> None:
@@ -144,8 +144,8 @@ def _write_gpkg(path: Path, files: RunFiles) -> None:
 
 PER_BUILDING = ("buildings",)
 FORMATS: Mapping[str, Format] = {
-    "vtu": Format("the volume mesh as one VTK file", _write_vtu),
-    "vtp": Format("the marked boundary as one VTK file", _write_vtp),
+    "vtu": Format("the volume mesh as one VTK file", _write_vtu, options=("scalars",)),
+    "vtp": Format("the marked boundary as one VTK file", _write_vtp, options=("scalars",)),
     "openfoam": Format(
         "a case folder of OpenFOAM",
         _write_openfoam,
@@ -154,7 +154,7 @@ FORMATS: Mapping[str, Format] = {
         folder=True,
     ),
     "xdmf": Format(
-        "mesh and marked facets for FEniCS and ParaView, with the numbers in a file .h5 beside it",
+        "mesh and marked facets for FEniCS and ParaView, with a file .h5 beside it",
         _write_xdmf,
         suffix=".xdmf",
         companion=".h5",
