@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-long lint bench bench-tiles quality reliability clean
+.PHONY: demo test test-long lint bench bench-tiles bench-exports quality reliability clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("citystitch needs Python 3.11 or newer, this is " + sys.version) if sys.version_info < (3, 11) else None'
@@ -32,6 +32,9 @@ bench: $(STAMP)
 
 bench-tiles: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.tiles
+
+bench-exports: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.exports
 
 quality: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.quality
