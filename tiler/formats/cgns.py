@@ -96,7 +96,9 @@ def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = 
     """
     survey = _survey(pieces, by_building=buildings is not None)
     with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
-        coordinates, sections = _write_tree(file, survey, crs)
+        zone = _write_tree(file, survey, crs)
+        coordinates = [zone[f"GridCoordinates/Coordinate{axis}/ data"] for axis in "XYZ"]
+        sections = {0: CELLS} | {key: patch_of_key(key).name for key in survey.facets}
         seen = dict.fromkeys(sections, 0)
         for k in range(len(pieces.names)):
             piece = pieces.read(k)
@@ -107,7 +109,8 @@ def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = 
             patches = [(key, piece.facets[rows]) for key, rows in facets_by_key(survey.facets, found)]
             for key, corners in [(0, piece.cells), *patches]:
                 nodes = piece.ids[corners].ravel() + 1
-                sections[key][seen[key] : seen[key] + len(nodes)] = nodes
+                # Not kept open: each open data set that was written has a buffer of 64 kB.
+                zone[f"{sections[key]}/ElementConnectivity/ data"][seen[key] : seen[key] + len(nodes)] = nodes
                 seen[key] += len(nodes)
 
 
@@ -124,8 +127,8 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
     return _Survey(pieces.n_points, n_cells, dict(sorted(facets.items())))
 
 
-def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> tuple[list[h5py.Dataset], dict[int, h5py.Dataset]]:
-    """Write all nodes; returns the data sets of coordinates, and of nodes by key of patch, 0 for the cells."""
+def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
+    """Write all nodes, without the numbers of points and elements; returns that of the zone."""
     kind = survey.integer
     _describe(file, "HDF5 MotherNode", "Root Node of HDF5 File", "MT")
     for name, text in ((" format", "IEEE_LITTLE_32"), (" hdf5version", "HDF5 Version 1.8.0")):
@@ -143,21 +146,21 @@ def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> tuple[list[h5py.D
     zone = _node(base, ZONE, "Zone_t", size)
     _node(zone, "ZoneType", "ZoneType_t", "Unstructured")
     grid = _node(zone, "GridCoordinates", "GridCoordinates_t")
-    coordinates = [_array(grid, f"Coordinate{axis}", survey.n_points, "f8") for axis in "XYZ"]
-    for data in coordinates:
-        _node(data.parent, "DimensionalExponents", "DimensionalExponents_t", np.array(LENGTH, "<f4"))
-    sections = {0: _write_section(zone, CELLS, TETRAHEDRON, 4, 1, survey.n_cells, kind)}
+    for axis in "XYZ":
+        coordinate = _array(grid, f"Coordinate{axis}", survey.n_points, "f8")
+        _node(coordinate, "DimensionalExponents", "DimensionalExponents_t", np.array(LENGTH, "<f4"))
+    _write_section(zone, CELLS, TETRAHEDRON, 4, 1, survey.n_cells, kind)
     conditions = _node(zone, "ZoneBC", "ZoneBC_t") if patches else None
     first = survey.n_cells + 1
     for key, patch in patches.items():
         n = survey.facets[key]
-        sections[key] = _write_section(zone, patch.name, TRIANGLE, 3, first, n, kind)
+        _write_section(zone, patch.name, TRIANGLE, 3, first, n, kind)
         condition = _node(conditions, patch.name, "BC_t", "FamilySpecified")
         _node(condition, "PointRange", "IndexRange_t", np.array([[first], [first + n - 1]], f"<{kind}"))
         _node(condition, "GridLocation", "GridLocation_t", "FaceCenter")
         _node(condition, "FamilyName", "FamilyName_t", patch.name)
         first += n
-    return coordinates, sections
+    return zone
 
 
 def _write_family(base: h5py.Group, patch: Patch) -> None:
@@ -165,12 +168,10 @@ def _write_family(base: h5py.Group, patch: Patch) -> None:
     _node(family, "FamilyBC", "FamilyBC_t", "BCWall" if patch.kind == "wall" else "UserDefined")
 
 
-def _write_section(
-    zone: h5py.Group, name: str, element: int, width: int, first: int, n: int, kind: str
-) -> h5py.Dataset:
+def _write_section(zone: h5py.Group, name: str, element: int, width: int, first: int, n: int, kind: str) -> None:
     section = _node(zone, name, "Elements_t", np.array([element, 0], "<i4"))
     _node(section, "ElementRange", "IndexRange_t", np.array([first, first + n - 1], f"<{kind}"))
-    return _array(section, "ElementConnectivity", n * width, kind)
+    _array(section, "ElementConnectivity", n * width, kind)
 
 
 def _node(parent: h5py.Group, name: str, label: str, value: NDArray[Any] | str | None = None) -> h5py.Group:
@@ -184,12 +185,13 @@ def _node(parent: h5py.Group, name: str, label: str, value: NDArray[Any] | str |
     return group
 
 
-def _array(parent: h5py.Group, name: str, n: int, kind: str) -> h5py.Dataset:
+def _array(parent: h5py.Group, name: str, n: int, kind: str) -> h5py.Group:
     """Make a node with `n` numbers that are to be written."""
     group = parent.create_group(name, track_order=True)
     _describe(group, name, "DataArray_t", TYPES[kind])
     group.attrs.create("flags", np.array([1], "<i4"))
-    return group.create_dataset(" data", (n,), f"<{kind}")
+    group.create_dataset(" data", (n,), f"<{kind}")
+    return group
 
 
 def _describe(group: h5py.Group, name: str, label: str, kind: str) -> None:
