@@ -1,5 +1,7 @@
 """The surface of each building by its number, in every format that can hold it."""
 
+import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.mesh import Marker
+from tests.programs import mesh_is_ok, run_foam
 from tests.test_formats_cgns import corners_of, read_with_vtk
 from tests.test_formats_glb import read_document, turned, validate
 from tests.test_formats_msh import check_with_gmsh
@@ -166,3 +169,25 @@ def test_the_gltf_validator_has_no_complaints(exported: dict[str, Path], monkeyp
     report = validate(exported["glb"], monkeypatch)
     assert report["issues"]["messages"] == []
     assert report["info"]["drawCallCount"] > 20
+
+
+def patch_sizes(case: Path) -> dict[str, int]:
+    """Faces by patch, as the file `boundary` says."""
+    text = (case / "constant" / "polyMesh" / "boundary").read_text()
+    return {name: int(n) for name, n in re.findall(r"(\w+)\s*\{[^}]*nFaces +(\d+);", text)}
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1200)
+def test_gmsh_to_foam_has_the_patches_of_our_own_case(
+    small_run: Path, exported: dict[str, Path], tmp_path: Path
+) -> None:
+    case = tmp_path / "case"
+    export_run(small_run, case, name="openfoam", options={"buildings": "patches"})
+    ours = patch_sizes(case)
+    shutil.rmtree(case / "constant")
+    run_foam("gmshToFoam", case, str(exported["msh2"]))
+    # checkMesh prints long names and numbers without a space between them.
+    assert mesh_is_ok(run_foam("checkMesh", case))
+    assert sum(name.startswith("building_") for name in ours) >= 10
+    assert patch_sizes(case) == ours

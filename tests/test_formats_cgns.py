@@ -17,6 +17,7 @@ from tests.hand_pieces import box_pieces
 from tests.programs import run_program
 from tiler.cli import main
 from tiler.export import export_run
+from tiler.formats import cgns
 from tiler.formats.cgns import write_cgns
 from tiler.formats.foam_patches import HOUSE, PATCHES, building_name
 from tiler.mesh_pieces import open_pieces
@@ -97,6 +98,21 @@ def test_pieces_in_any_order_keep_all_cells(tmp_path: Path, seed: int) -> None:
     found, expected = read_with_vtk(tmp_path / "box.cgns"), corners_of(pieces, by_building=True)
     assert sorted(found) == sorted(expected)
     assert "building_11" in found
+    for name, corners in expected.items():
+        assert np.array_equal(found[name], corners), name
+
+
+def test_numbers_beyond_32_bits_are_read_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cgns, "INT32_LIMIT", 10)
+    pieces = box_pieces()
+    write_cgns(tmp_path / "box.cgns", pieces, crs="EPSG:28992")
+    with h5py.File(tmp_path / "box.cgns") as file:
+        zone = file["city/air"]
+        places = ["", "cells/ElementRange/", "cells/ElementConnectivity/", "ZoneBC/top/PointRange/"]
+        assert {zone[f"{place} data"].dtype for place in places} == {np.dtype(np.int64)}
+        assert {zone[place or "."].attrs["type"] for place in places} == {b"I8"}
+    found, expected = read_with_vtk(tmp_path / "box.cgns"), corners_of(pieces, by_building=False)
+    assert sorted(found) == sorted(expected)
     for name, corners in expected.items():
         assert np.array_equal(found[name], corners), name
 
