@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-long lint bench bench-tiles studies quality reliability clean
+.PHONY: demo test test-long lint bench bench-tiles bench-exports studies quality reliability clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("citystitch needs Python 3.11 or newer, this is " + sys.version) if sys.version_info < (3, 11) else None'
@@ -36,6 +36,9 @@ bench-tiles: $(STAMP)
 studies: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check py-spy
 	$(BIN)/python -m tests.benchmarks.studies
+
+bench-exports: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.exports
 
 quality: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.quality

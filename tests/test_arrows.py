@@ -20,7 +20,7 @@ HOMES = {
     "dask": ("tiler/",),
     "distributed": ("tiler/",),
     "zarr": ("tiler/store.py",),
-    "h5py": ("tiler/formats/xdmf.py",),
+    "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py"),
     "laspy": ("tiler/",),
     "pyogrio": ("tiler/",),
     "meshio": ("tiler/",),

@@ -12,7 +12,7 @@ import pytest
 from pipeline.errors import OutputError
 from tiler.cli import main
 from tiler.config import make_config
-from tiler.export import export_run
+from tiler.export import FORMATS, export_run
 from tiler.run import run
 from tiler.synth import write_city
 from tiler.vtk_files import read_vtp, read_vtu
@@ -89,6 +89,46 @@ def test_cells_and_marks_are_those_of_the_pieces(tiled: Path, tmp_path: Path) ->
     for mark in ("marker", "building"):
         expected = np.concatenate([getattr(part.boundary, mark) for part in parts])
         assert np.array_equal(getattr(surface.boundary, mark), expected)
+
+
+def test_scalars_to_colour_by_are_added_on_request(tiled: Path, tmp_path: Path) -> None:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    for name in ("vtu", "vtp"):
+        command = ["export", str(tiled), "--format", name, "-o", str(tmp_path / f"plain.{name}")]
+        assert main(command) == 0
+        assert main([*command[:-1], str(tmp_path / f"all.{name}"), "--scalars"]) == 0
+    plain = [read_with_vtk(tmp_path / f"plain.{name}") for name in ("vtu", "vtp")]
+    volume, surface = (read_with_vtk(tmp_path / f"all.{name}") for name in ("vtu", "vtp"))
+    for grid, without in zip((volume, surface), plain, strict=True):
+        names, few = (
+            {g.GetCellData().GetArrayName(i) for i in range(g.GetCellData().GetNumberOfArrays())}
+            for g in (grid, without)
+        )
+        assert names - few == ({"tile", "radius_ratio"} if grid is volume else {"tile"})
+    folders = [sorted((tiled / folder).iterdir()) for folder in ("mesh", "boundary")]
+    cells = [len(read_vtu(path).mesh.cells) for path in folders[0]]
+    facets = [len(read_vtp(path).boundary.facets) for path in folders[1]]
+    for grid, sizes in ((volume, cells), (surface, facets)):
+        tile = vtk_to_numpy(grid.GetCellData().GetArray("tile"))
+        assert np.array_equal(tile, np.repeat(np.arange(4), sizes))
+    found = vtk_to_numpy(volume.GetCellData().GetArray("radius_ratio"))
+    nodes = vtk_to_numpy(volume.GetCells().GetConnectivityArray()).reshape(-1, 4)
+    corners = vtk_to_numpy(volume.GetPoints().GetData())[nodes]
+    edges = corners[:, 1:] - corners[:, :1]
+    outer = np.linalg.norm(np.linalg.solve(2 * edges, (edges**2).sum(axis=2)[..., None])[..., 0], axis=1)
+    # The inscribed radius is one over the sum of the reciprocal heights, the lengths of the dual basis.
+    dual = np.linalg.inv(edges)
+    heights = np.linalg.norm(np.concatenate((dual, -dual.sum(axis=2, keepdims=True)), axis=2), axis=1)
+    assert np.allclose(found, 3 / heights.sum(axis=1) / outer, rtol=1e-4)
+
+
+def test_help_has_a_line_a_format(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["export", "--help"])
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    for name, kind in FORMATS.items():
+        assert [name, *kind.description.split()] in lines
 
 
 def test_a_file_is_replaced_on_request_alone(

@@ -3,6 +3,7 @@
 import json
 import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,8 @@ def exported(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def read_glb(path: Path) -> tuple[dict[str, Any], NDArray[np.float32], dict[str, NDArray[np.uint32]]]:
-    """Read the document, positions (n, 3), and triangles (k, 3) by material."""
+def read_document(path: Path) -> tuple[dict[str, Any], Callable[[int], NDArray[Any]]]:
+    """Read the document, and give what takes the numbers of an accessor."""
     data = path.read_bytes()
     magic, version, total, size, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, total, size % 4, kind) == (b"glTF", 2, len(data), 0, b"JSON")
@@ -54,6 +55,12 @@ def read_glb(path: Path) -> tuple[dict[str, Any], NDArray[np.float32], dict[str,
         assert start + 4 * n <= view["byteLength"]
         return np.frombuffer(body, dtype, n, view.get("byteOffset", 0) + start)
 
+    return document, take
+
+
+def read_glb(path: Path) -> tuple[dict[str, Any], NDArray[np.float32], dict[str, NDArray[np.uint32]]]:
+    """Read the document, positions (n, 3), and triangles (k, 3) by material."""
+    document, take = read_document(path)
     (mesh,) = document["meshes"]
     assert {primitive["attributes"]["POSITION"] for primitive in mesh["primitives"]} == {0}
     facets = {

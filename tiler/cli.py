@@ -122,28 +122,7 @@ def make_parser() -> argparse.ArgumentParser:
     render.add_argument(
         "--what", choices=("boundary", "mesh", "overview", "tiles"), default="boundary", help="what to draw"
     )
-    export = command("export", _export, "write the mesh of a run for other programs, each vertex once")
-    export.add_argument("directory", type=Path, help="folder of a run")
-    kinds = "; ".join(f"{name}: {kind.description}" for name, kind in FORMATS.items())
-    export.add_argument("--format", choices=tuple(FORMATS), required=True, help=kinds)
-    export.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write")
-    export.add_argument("--overwrite", action="store_true", help="replace it if it exists")
-    export.add_argument(
-        "--parts",
-        type=int,
-        metavar="N",
-        default=argparse.SUPPRESS,
-        help="openfoam: decomposed for N processes instead of whole",
-    )
-    export.add_argument(
-        "--case", choices=("wind",), default=argparse.SUPPRESS, help="openfoam: add the files of a simulation"
-    )
-    export.add_argument(
-        "--buildings",
-        choices=("patches", "zones"),
-        default=argparse.SUPPRESS,
-        help="openfoam: one patch a building instead of walls and roofs, or one face zone beside them",
-    )
+    _add_export(command("export", _export, "write the mesh of a run for other programs, each vertex once"))
     command("config", _config, "print all parameters of a run, annotated, as a configuration file")
     return parser
 
@@ -184,6 +163,31 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int) -
     parser.add_argument("--density", type=float, default=1.5, help="points per m2 (default: 1.5)")
     parser.add_argument("--relief", type=float, default=20.0, help="height of the hills in m (default: 20)")
     parser.add_argument("--seed", type=int, default=1, help="same seed, same bytes (default: 1)")
+
+
+def _add_export(export: argparse.ArgumentParser) -> None:
+    """Add the options of all formats, and the table of these below them."""
+    export.add_argument("directory", type=Path, help="folder of a run")
+    export.add_argument("--format", choices=tuple(FORMATS), metavar="NAME", required=True, help="see below")
+    export.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write")
+    export.add_argument("--overwrite", action="store_true", help="replace it if it exists")
+    given: dict[str, dict[str, Any]] = {
+        "parts": {"type": int, "metavar": "N", "help": "decomposed for N processes instead of whole"},
+        "case": {"choices": ("wind",), "help": "add the files of a simulation"},
+        "buildings": {
+            "choices": ("patches", "zones"),
+            "help": "one patch a building instead of walls and roofs; zones: one face zone beside them (openfoam)",
+        },
+        "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
+    }
+    for option, words in given.items():
+        takers = ", ".join(name for name, kind in FORMATS.items() if option in kind.options)
+        words |= {"default": argparse.SUPPRESS, "help": f"{takers}: {words['help']}"}
+        export.add_argument(f"--{option}", **words)
+    width = max(map(len, FORMATS))
+    rows = [f"  {name:<{width}}  {kind.description}" for name, kind in FORMATS.items()]
+    export.formatter_class = argparse.RawDescriptionHelpFormatter
+    export.epilog = "\n".join(["formats:", *rows, "", EXIT_CODES])
 
 
 def _run(options: argparse.Namespace) -> int:

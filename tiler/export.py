@@ -45,6 +45,8 @@ class Format:
         Given a path and the files of a run, and the options as keywords, writes that file or folder.
     options : tuple of str
         Options of the command line that it takes, without dashes.
+    buildings : tuple of str
+        What the option ``buildings`` may be, where it is taken.
     folder : bool
         Whether it is a folder.
     suffix : str
@@ -56,21 +58,22 @@ class Format:
     description: str
     write: Callable[..., None]
     options: tuple[str, ...] = ()
+    buildings: tuple[str, ...] = ("patches",)
     folder: bool = False
     suffix: str = ""
     companion: str = ""
 
 
-def _write_vtu(path: Path, files: RunFiles) -> None:
+def _write_vtu(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.merged import write_merged_volume
 
-    write_merged_volume(path, files.volumes)
+    write_merged_volume(path, files.volumes, **options)
 
 
-def _write_vtp(path: Path, files: RunFiles) -> None:
+def _write_vtp(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.merged import write_merged_boundary
 
-    write_merged_boundary(path, files.boundaries, files.volumes)
+    write_merged_boundary(path, files.boundaries, files.volumes, **options)
 
 
 def _write_openfoam(path: Path, files: RunFiles, **options: Any) -> None:
@@ -85,28 +88,34 @@ def _write_xdmf(path: Path, files: RunFiles) -> None:
     export_xdmf(path, files.directory)
 
 
-def _write_msh(path: Path, files: RunFiles) -> None:
+def _write_cgns(path: Path, files: RunFiles, **options: Any) -> None:
+    from tiler.formats.cgns import export_cgns
+
+    export_cgns(path, files.directory, **options)
+
+
+def _write_msh(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.msh import export_msh
 
-    export_msh(path, files.directory)
+    export_msh(path, files.directory, **options)
 
 
-def _write_msh2(path: Path, files: RunFiles) -> None:
+def _write_msh2(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.msh import export_msh2
 
-    export_msh2(path, files.directory)
+    export_msh2(path, files.directory, **options)
 
 
-def _write_stl(path: Path, files: RunFiles) -> None:
+def _write_stl(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.stl import export_stl
 
-    export_stl(path, files.directory)
+    export_stl(path, files.directory, **options)
 
 
-def _write_obj(path: Path, files: RunFiles) -> None:
+def _write_obj(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.obj import export_obj
 
-    export_obj(path, files.directory)
+    export_obj(path, files.directory, **options)
 
 
 def _write_ply(path: Path, files: RunFiles) -> None:
@@ -115,10 +124,10 @@ def _write_ply(path: Path, files: RunFiles) -> None:
     export_ply(path, files.directory)
 
 
-def _write_glb(path: Path, files: RunFiles) -> None:
+def _write_glb(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.glb import export_glb
 
-    export_glb(path, files.directory)
+    export_glb(path, files.directory, **options)
 
 
 def _write_cityjsonseq(path: Path, files: RunFiles) -> None:
@@ -133,24 +142,36 @@ def _write_gpkg(path: Path, files: RunFiles) -> None:
     export_gpkg(path, files.directory)
 
 
+PER_BUILDING = ("buildings",)
 FORMATS: Mapping[str, Format] = {
-    "vtu": Format("the volume mesh as one VTK file", _write_vtu),
-    "vtp": Format("the marked boundary as one VTK file", _write_vtp),
+    "vtu": Format("the volume mesh as one VTK file", _write_vtu, options=("scalars",)),
+    "vtp": Format("the marked boundary as one VTK file", _write_vtp, options=("scalars",)),
     "openfoam": Format(
-        "a case folder of OpenFOAM", _write_openfoam, options=("parts", "case", "buildings"), folder=True
+        "a case folder of OpenFOAM",
+        _write_openfoam,
+        options=("parts", "case", "buildings"),
+        buildings=("patches", "zones"),
+        folder=True,
     ),
     "xdmf": Format(
-        "mesh and marked facets for FEniCS and ParaView, with the numbers in a file .h5 beside it",
+        "mesh and marked facets for FEniCS and ParaView, with a file .h5 beside it",
         _write_xdmf,
         suffix=".xdmf",
         companion=".h5",
     ),
-    "msh": Format("Gmsh's MSH 4.1, binary", _write_msh, suffix=".msh"),
-    "msh2": Format("Gmsh's MSH 2.2, text, as gmshToFoam reads it", _write_msh2, suffix=".msh"),
-    "stl": Format("the boundary as STL, text, one solid a patch", _write_stl, suffix=".stl"),
-    "obj": Format("the boundary as Wavefront OBJ, one group a patch", _write_obj, suffix=".obj"),
+    "cgns": Format("mesh and named patches as CGNS in HDF5", _write_cgns, options=PER_BUILDING, suffix=".cgns"),
+    "msh": Format("Gmsh's MSH 4.1, binary", _write_msh, options=PER_BUILDING, suffix=".msh"),
+    "msh2": Format(
+        "Gmsh's MSH 2.2, text, as gmshToFoam reads it", _write_msh2, options=PER_BUILDING, suffix=".msh"
+    ),
+    "stl": Format("the boundary as STL, text, one solid a patch", _write_stl, options=PER_BUILDING, suffix=".stl"),
+    "obj": Format(
+        "the boundary as Wavefront OBJ, one group a patch", _write_obj, options=PER_BUILDING, suffix=".obj"
+    ),
     "ply": Format("the boundary as PLY, binary, with marker and building", _write_ply, suffix=".ply"),
-    "glb": Format("the boundary as glTF 2.0, binary, one material a patch", _write_glb, suffix=".glb"),
+    "glb": Format(
+        "the boundary as glTF 2.0, binary, one material a patch", _write_glb, options=PER_BUILDING, suffix=".glb"
+    ),
     "cityjsonseq": Format(
         "the simplified city model as CityJSONSeq, one feature a building", _write_cityjsonseq, suffix=".jsonl"
     ),
@@ -196,6 +217,9 @@ def export_run(
         if option not in kind.options:
             taken = ", ".join(f"--{known}" for known in kind.options) or "none"
             raise ConfigError(f"--{option}: format {name} does not take it; its options: {taken}")
+    asked = options.get("buildings", kind.buildings[0])
+    if asked not in kind.buildings:
+        raise ConfigError(f"--buildings {asked}: format {name} takes {' or '.join(kind.buildings)}")
     if not output.name.endswith(kind.suffix):
         raise ConfigError(f"{output}: a file of format {name} ends with {kind.suffix}; give another --output")
     files = find_files(directory)

@@ -15,11 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError, OutputError
+from pipeline.mesh import TetMesh
+from pipeline.quality import measure_cells
 from stitch.numbering import Numbering, collect_ids, number_without_gaps
 from tiler.vtk_files import TETRA
 from tiler.vtk_xml import Sections, Stream, read_data_file, read_point_array, write_data_file
 
 VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide ids, see `stitch.numbering`
+TILE = "tile"  # cell array on request: which tile a cell is of, counted from 0 by name
+RADIUS_RATIO = "radius_ratio"  # cell array on request
 CHUNK = 1 << 20  # vertices that are moved at once
 Reader = Callable[[int], dict[str, dict[str, NDArray[Any]]]]
 
@@ -36,7 +40,7 @@ class _Source:
     n_points: int
 
 
-def write_merged_volume(path: Path, pieces: Sequence[Path]) -> None:
+def write_merged_volume(path: Path, pieces: Sequence[Path], *, scalars: bool = False) -> None:
     """Write one VTU file of many.
 
     Parameters
@@ -45,6 +49,8 @@ def write_merged_volume(path: Path, pieces: Sequence[Path]) -> None:
         The file; it appears whole or not at all. While it is written, coordinates wait in a file beside it.
     pieces : sequence of at least one Path
         VTU pieces (`write_vtu`) with the int64 point array `VERTEX_ID`: each id for one place.
+    scalars : bool
+        Add cell arrays to colour by: `TILE`, and `RADIUS_RATIO` as `pipeline.quality` measures it.
 
     Raises
     ------
@@ -62,10 +68,12 @@ def write_merged_volume(path: Path, pieces: Sequence[Path]) -> None:
     9 bytes a vertex; coordinates are in a file that the system maps. Each piece is read twice, and again for each
     of its arrays.
     """
-    _write(path, pieces, pieces, "UnstructuredGrid")
+    _write(path, pieces, pieces, "UnstructuredGrid", scalars=scalars)
 
 
-def write_merged_boundary(path: Path, pieces: Sequence[Path], volumes: Sequence[Path]) -> None:
+def write_merged_boundary(
+    path: Path, pieces: Sequence[Path], volumes: Sequence[Path], *, scalars: bool = False
+) -> None:
     """Write one VTP file of many; see `write_merged_volume`.
 
     Parameters
@@ -76,13 +84,15 @@ def write_merged_boundary(path: Path, pieces: Sequence[Path], volumes: Sequence[
         VTP pieces (`write_vtp`).
     volumes : sequence of Path
         The VTU pieces of all tiles.
+    scalars : bool
+        Add the cell array `TILE`.
 
     Notes
     -----
     Only the vertices of facets are written, in the order of their ids. The array ``vertex`` tells which vertex of
     the merged volume each is.
     """
-    _write(path, pieces, volumes, "PolyData")
+    _write(path, pieces, volumes, "PolyData", scalars=scalars)
 
 
 def read_numbering(volumes: Iterable[Path]) -> Numbering:
@@ -126,12 +136,13 @@ def number_piece(path: Path, ids: NDArray[Any] | None, numbering: Numbering) -> 
         raise InputError(f"{path}: a {VERTEX_ID} of it is in no piece of the volume; run the tile again") from None
 
 
-def _write(path: Path, pieces: Sequence[Path], volumes: Sequence[Path], kind: str) -> None:
+def _write(path: Path, pieces: Sequence[Path], volumes: Sequence[Path], kind: str, *, scalars: bool) -> None:
     if not pieces:
         raise ValueError("a merged file needs at least one piece")
     try:
         with TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-            _write_file(path, kind, *_gather(pieces, read_numbering(volumes), kind, Path(folder)))
+            gathered = _gather(pieces, read_numbering(volumes), kind, Path(folder))
+            _write_file(path, kind, *gathered, scalars=scalars)
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
@@ -139,16 +150,25 @@ def _write(path: Path, pieces: Sequence[Path], volumes: Sequence[Path], kind: st
 
 
 def _write_file(
-    path: Path, kind: str, source: _Source, numbers: NDArray[np.int64], xyz: NDArray[np.float64]
+    path: Path,
+    kind: str,
+    source: _Source,
+    numbers: NDArray[np.int64],
+    xyz: NDArray[np.float64],
+    *,
+    scalars: bool,
 ) -> None:
     rows = [_connectivity(source, kind, numbers), _offsets(source)]
     arrays = source.read(0)["CellData"]
+    of_cells = {name: _cell_array(source, name, array) for name, array in arrays.items()}
+    if scalars:
+        of_cells |= {stream.name: stream for stream in _scalars(source, kind)}
     n_rows = int(source.n_rows.sum())
     sections: Sections = {
         "Points": [_flat("Points", xyz.reshape(-1), 3)],
         "Cells" if kind == "UnstructuredGrid" else "Polys": rows,
         "PointData": [],
-        "CellData": [_cell_array(source, name, array) for name, array in arrays.items()],
+        "CellData": list(of_cells.values()),
     }
     if kind == "UnstructuredGrid":
         rows.append(Stream("types", np.dtype(np.uint8), 1, n_rows, lambda i, j: np.full(j - i, TETRA, np.uint8)))
@@ -238,6 +258,21 @@ def _cell_array(source: _Source, name: str, first: NDArray[Any]) -> Stream:
 
     components = first.shape[1] if first.ndim == 2 else 1
     return _joined(name, first.dtype, source.n_rows * components, of_piece, components=components)
+
+
+def _scalars(source: _Source, kind: str) -> list[Stream]:
+    """Make the arrays that pieces do not have, but that one wants to colour cells by."""
+
+    def quality(k: int) -> NDArray[Any]:
+        sections = source.read(k)
+        cells = sections["Cells"]["connectivity"].reshape(-1, source.width)
+        return measure_cells(TetMesh(sections["Points"]["Points"], cells)).radius_ratio
+
+    number = np.dtype(np.int32)
+    tile = _joined(TILE, number, source.n_rows, lambda k: np.full(source.n_rows[k], k, number), components=1)
+    if kind != "UnstructuredGrid":
+        return [tile]
+    return [tile, _joined(RADIUS_RATIO, np.dtype(np.float32), source.n_rows, quality, components=1)]
 
 
 def _joined(

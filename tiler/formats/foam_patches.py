@@ -1,6 +1,6 @@
 """Patches and face zones of OpenFOAM: their names, and the files `boundary` and `faceZones`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -62,6 +62,46 @@ def patch_of_key(key: int) -> Patch:
     if marker not in SOLID:
         return Patch(PATCHES[marker], "patch", ())
     return Patch(PATCHES[marker], "wall", ("wall", "buildings") if marker in HOUSE else ("wall",))
+
+
+def patch_keys(marker: NDArray[np.int32], building: NDArray[np.int64], *, by_building: bool) -> Ints:
+    """Give the key of each facet's patch.
+
+    Parameters
+    ----------
+    marker : int32, (f,)
+        `pipeline.mesh.Marker` of each facet.
+    building : int64, (f,)
+        Number of its building, -1 where there is none.
+    by_building : bool
+        Whether walls and roofs belong to a patch of their building.
+
+    Examples
+    --------
+    >>> patch_keys(np.array([1, 2, 3], np.int32), np.array([-1, 7, -1]), by_building=True).tolist()
+    [1, 107, 3]
+    """
+    if not by_building:
+        return marker.astype(np.int64)
+    keys: Ints = np.where(is_house(marker, building), building + FIRST_BUILDING, marker)
+    return keys
+
+
+def facets_by_key(keys: Iterable[int], of_facet: Ints) -> list[tuple[int, Ints]]:
+    """Group facets by key of `patch_keys`: each key that there is among `keys`, ascending, and its facets.
+
+    Examples
+    --------
+    >>> facets_by_key([1, 4, 9], np.array([9, 1, 9]))
+    [(1, array([1])), (9, array([0, 2]))]
+    """
+    known = np.fromiter(keys, np.int64)
+    return [(int(known[row]), rows) for row, rows in runs_of(known, of_facet)]
+
+
+def is_house(marker: NDArray[np.int32], building: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which facets (f,) are walls and roofs of a building that has a number; see `patch_keys`."""
+    return np.isin(marker, HOUSE) & (building >= 0)
 
 
 def building_name(number: int) -> str:

@@ -15,11 +15,13 @@ from pipeline.errors import InputError
 from pipeline.mesh import Marker
 from tiler.atomic import replacing
 from tiler.export import RUN_RECORD
+from tiler.formats.foam_patches import FIRST_BUILDING, PATCHES, building_name, facets_by_key, is_house
 from tiler.formats.surface import (
     Surface,
+    SurfacePiece,
     SurfaceSurvey,
+    by_marker,
     open_surface,
-    patch_name,
     place_vertices,
     survey_surface,
 )
@@ -34,7 +36,7 @@ COLOURS = {Marker.GROUND: (0.45, 0.5, 0.38), Marker.WALL: (0.82, 0.78, 0.7), Mar
 SIDE_COLOUR, SIDE_OPACITY = (0.6, 0.75, 0.9), 0.1  # of top and sides, through which the city is seen
 
 
-def export_glb(output: Path, directory: Path) -> None:
+def export_glb(output: Path, directory: Path, *, buildings: str | None = None) -> None:
     """Write the boundary of a finished run as GLB.
 
     Parameters
@@ -43,6 +45,8 @@ def export_glb(output: Path, directory: Path) -> None:
         The file; it appears whole or not at all.
     directory : Path
         Folder of the run.
+    buildings : {"patches"}, optional
+        Give each building a node of its own.
 
     Raises
     ------
@@ -55,10 +59,10 @@ def export_glb(output: Path, directory: Path) -> None:
     surface = open_surface(directory)
     crs = read_crs(directory / RUN_RECORD)
     with replacing(output) as part:
-        write_glb(part, surface, crs=crs)
+        write_glb(part, surface, crs=crs, buildings=buildings)
 
 
-def write_glb(path: Path, surface: Surface, *, crs: str) -> None:
+def write_glb(path: Path, surface: Surface, *, crs: str, buildings: str | None = None) -> None:
     """Write a boundary as GLB.
 
     Parameters
@@ -69,6 +73,8 @@ def write_glb(path: Path, surface: Surface, *, crs: str) -> None:
         The boundary; facets are counter-clockwise seen from outside the air, and drawn from both sides.
     crs : str
         CRS of its coordinates.
+    buildings : {"patches"}, optional
+        See `export_glb`.
 
     Raises
     ------
@@ -80,7 +86,8 @@ def write_glb(path: Path, surface: Surface, *, crs: str) -> None:
     The origin is the middle of the box in whole metres, at its lowest height. All patches share the vertices.
     Memory holds one piece, and a quarter of a byte a point of the mesh. Each piece is read twice.
     """
-    survey = survey_surface(surface)
+    keys_of = by_marker if buildings is None else _by_building_and_marker
+    survey = survey_surface(surface, keys_of)
     if not survey.n_facets:
         raise InputError("boundary: has no facets, and GLB no empty meshes; mesh the region again")
     origin = np.floor([*(survey.low + survey.high)[:2] / 2, survey.low[2]])
@@ -97,8 +104,8 @@ def write_glb(path: Path, surface: Surface, *, crs: str) -> None:
         file.write(struct.pack("<I4s", data, b"BIN\0"))
         start = file.tell()
         places, place = {}, start + survey.n_vertices * VERTEX_BYTES
-        for marker, n in survey.facets.items():
-            places[marker] = place
+        for key, n in survey.facets.items():
+            places[key] = place
             place += n * FACET_BYTES
         for k in range(len(surface.names)):
             piece = surface.read(k)
@@ -106,11 +113,25 @@ def write_glb(path: Path, surface: Surface, *, crs: str) -> None:
             for first, points in runs:
                 file.seek(start + first * VERTEX_BYTES)
                 file.write(_local(points, origin).tobytes())
-            for marker, place in places.items():
-                chosen = facets[piece.marker == marker].astype("<u4")
-                file.seek(place)
-                file.write(chosen.tobytes())
-                places[marker] = place + chosen.nbytes
+            for key, rows in facets_by_key(places, keys_of(piece)):
+                file.seek(places[key])
+                file.write(facets[rows].astype("<u4").tobytes())
+                places[key] += len(rows) * FACET_BYTES
+
+
+def _by_building_and_marker(piece: SurfacePiece) -> NDArray[np.int64]:
+    """Give walls and roofs of a building two keys that follow each other."""
+    roof = piece.marker == Marker.ROOF
+    keys = FIRST_BUILDING + 2 * piece.building + roof
+    return np.where(is_house(piece.marker, piece.building), keys, piece.marker)
+
+
+def _of_key(key: int) -> tuple[int, Marker]:
+    """Tell number of building, -1 for none, and marker of a key."""
+    if key < FIRST_BUILDING:
+        return -1, Marker(key)
+    number, roof = divmod(key - FIRST_BUILDING, 2)
+    return number, Marker.ROOF if roof else Marker.WALL
 
 
 def _local(points: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -139,9 +160,21 @@ def _document(survey: SurfaceSurvey, origin: NDArray[np.float64], crs: str) -> d
         accessor = {"bufferView": 1, "componentType": UNSIGNED_INT, "count": 3 * n, "type": "SCALAR"}
         indices.append(accessor | ({"byteOffset": place} if place else {}))
         place += n * FACET_BYTES
-    primitives = [
-        {"attributes": {"POSITION": 0}, "indices": 1 + i, "material": i, "extras": {"marker": marker}}
-        for i, marker in enumerate(survey.facets)
+    materials = sorted({_of_key(key)[1] for key in survey.facets})
+    primitives: dict[int, list[dict[str, Any]]] = {}
+    for i, (number, marker) in enumerate(map(_of_key, survey.facets)):
+        primitives.setdefault(number, []).append(
+            {
+                "attributes": {"POSITION": 0},
+                "indices": 1 + i,
+                "material": materials.index(marker),
+                "extras": {"marker": int(marker)},
+            }
+        )
+    names = {number: "boundary" if number < 0 else building_name(number) for number in primitives}
+    nodes = [
+        {"mesh": i, "name": name} | ({} if number < 0 else {"extras": {"building": number}})
+        for i, (number, name) in enumerate(names.items())
     ]
     return {
         "asset": {
@@ -150,10 +183,10 @@ def _document(survey: SurfaceSurvey, origin: NDArray[np.float64], crs: str) -> d
             "extras": {"crs": crs, "origin": origin.tolist(), "axes": AXES},
         },
         "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "boundary"}],
-        "meshes": [{"name": "boundary", "primitives": primitives}],
-        "materials": [_material(Marker(marker)) for marker in survey.facets],
+        "scenes": [{"nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": [{"name": names[number], "primitives": parts} for number, parts in primitives.items()],
+        "materials": [_material(marker) for marker in materials],
         "accessors": [position, *indices],
         "bufferViews": [
             {"buffer": 0, "byteLength": split, "target": VERTICES},
@@ -168,5 +201,5 @@ def _material(marker: Marker) -> dict[str, Any]:
     solid = marker in COLOURS
     colour = [*COLOURS.get(marker, SIDE_COLOUR), 1.0 if solid else SIDE_OPACITY]
     surface = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
-    material = {"name": patch_name(marker), "pbrMetallicRoughness": surface, "doubleSided": True}
+    material = {"name": PATCHES[marker], "pbrMetallicRoughness": surface, "doubleSided": True}
     return material if solid else material | {"alphaMode": "BLEND"}

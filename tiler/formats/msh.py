@@ -12,9 +12,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker
 from tiler.atomic import replacing
-from tiler.formats.foam_patches import PATCHES
+from tiler.formats.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of
 from tiler.mesh_pieces import open_pieces
@@ -29,7 +28,7 @@ _Box = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class _Survey:
-    """What is known after reading all pieces once: boxes (xmin, ymin, zmin, xmax, ..., m) and counts."""
+    """What is known after reading all pieces once: boxes (xmin, ymin, zmin, xmax, ..., m) and counts by key."""
 
     n_points: int
     n_cells: int
@@ -40,10 +39,20 @@ class _Survey:
     @property
     def groups(self) -> list[tuple[int, int, str]]:
         """Dimension, number and name of each physical group."""
-        return [*((2, marker, PATCHES[Marker(marker)]) for marker in self.facets), (3, AIR, AIR_NAME)]
+        names = [(2, number, patch_of_key(key).name) for key, number in self.numbers.items()]
+        return sorted([*names, (3, AIR, AIR_NAME)])
+
+    @property
+    def numbers(self) -> dict[int, int]:
+        """Numbers of surfaces by key: the marker, and from 100 on for buildings in the order of theirs."""
+        n_markers = sum(key < FIRST_BUILDING for key in self.facets)
+        return {
+            key: key if key < FIRST_BUILDING else FIRST_BUILDING + i - n_markers
+            for i, key in enumerate(self.facets)
+        }
 
 
-def export_msh(output: Path, directory: Path) -> None:
+def export_msh(output: Path, directory: Path, *, buildings: str | None = None) -> None:
     """Write the mesh of a finished run as MSH 4.1, binary.
 
     Parameters
@@ -52,6 +61,8 @@ def export_msh(output: Path, directory: Path) -> None:
         The file; it appears whole or not at all.
     directory : Path
         Folder of the run.
+    buildings : {"patches"}, optional
+        Give each building, walls and roofs, a physical group of its own instead of the two.
 
     Raises
     ------
@@ -66,7 +77,8 @@ def export_msh(output: Path, directory: Path) -> None:
     nodes belong to the volume.
     """
     pieces = open_pieces(directory)
-    survey = _survey(pieces)
+    by_building = buildings is not None
+    survey = _survey(pieces, by_building=by_building)
     with replacing(output) as part, part.open("wb") as file:
         file.write(b"$MeshFormat\n4.1 1 8\n" + np.array([1], "<i4").tobytes() + b"\n$EndMeshFormat\n")
         _write_names(file, survey)
@@ -79,18 +91,23 @@ def export_msh(output: Path, directory: Path) -> None:
             for start, rows in blocks_of(piece.ids):
                 file.seek(nodes + 24 * start)
                 file.write(np.ascontiguousarray(piece.points[rows], "<f8").data)
-            for group, (place, first) in elements.items():
-                corners = piece.ids[piece.cells if group == AIR else piece.facets[piece.marker == group]]
+            found = patch_keys(piece.marker, piece.building, by_building=by_building)
+            patches = [(key, piece.facets[rows]) for key, rows in facets_by_key(survey.facets, found)]
+            for group, rows_of_group in [*patches, (AIR, piece.cells)]:
+                place, first = elements[group]
+                corners = piece.ids[rows_of_group]
                 tags = first + seen[group] + np.arange(len(corners))
                 file.seek(place + 8 * (1 + corners.shape[1]) * seen[group])
                 file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
                 seen[group] += len(corners)
 
 
-def export_msh2(output: Path, directory: Path) -> None:
+def export_msh2(output: Path, directory: Path, *, buildings: str | None = None) -> None:
     """Write the mesh of a finished run as MSH 2.2, text; see `export_msh`."""
     pieces = open_pieces(directory)
-    survey = _survey(pieces)
+    by_building = buildings is not None
+    survey = _survey(pieces, by_building=by_building)
+    keys, numbers = (np.array(list(some), np.int64) for some in (survey.numbers, survey.numbers.values()))
     with replacing(output) as part, part.open("wb") as file:
         file.write(b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n")
         _write_names(file, survey)
@@ -103,8 +120,9 @@ def export_msh2(output: Path, directory: Path) -> None:
         tag = 1
         for k in range(len(pieces.names)):
             piece = pieces.read(k)
-            markers = piece.marker.astype(np.int64)
-            facets = _numbered(tag, piece.ids[piece.facets] + 1, TRIANGLE, markers)
+            found = patch_keys(piece.marker, piece.building, by_building=by_building)
+            groups = numbers[np.searchsorted(keys, found)]
+            facets = _numbered(tag, piece.ids[piece.facets] + 1, TRIANGLE, groups)
             tag += len(facets)
             cells = _numbered(tag, piece.ids[piece.cells] + 1, TETRAHEDRON, np.full(len(piece.cells), AIR))
             tag += len(cells)
@@ -119,7 +137,7 @@ def export_msh2(output: Path, directory: Path) -> None:
         file.write(b"$EndElements\n")
 
 
-def _survey(pieces: Pieces) -> _Survey:
+def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
     n_cells, box = 0, _no_box()
     facets: dict[int, int] = {}
     boxes: dict[int, _Box] = {}
@@ -127,10 +145,10 @@ def _survey(pieces: Pieces) -> _Survey:
         piece = pieces.read(k)
         n_cells += len(piece.cells)
         box = _grown(box, piece.points)
-        for marker in np.unique(piece.marker).tolist():
-            chosen = piece.facets[piece.marker == marker]
-            facets[marker] = facets.get(marker, 0) + len(chosen)
-            boxes[marker] = _grown(boxes.get(marker, _no_box()), piece.points[chosen.ravel()])
+        found = patch_keys(piece.marker, piece.building, by_building=by_building)
+        for key, rows in facets_by_key(np.unique(found).tolist(), found):
+            facets[key] = facets.get(key, 0) + len(rows)
+            boxes[key] = _grown(boxes.get(key, _no_box()), piece.points[piece.facets[rows].ravel()])
     return _Survey(pieces.n_points, n_cells, box, dict(sorted(facets.items())), boxes)
 
 
@@ -151,11 +169,11 @@ def _write_names(file: BinaryIO, survey: _Survey) -> None:
 
 def _write_entities(file: BinaryIO, survey: _Survey) -> None:
     file.write(b"$Entities\n" + _packed("u8", [0, 0, len(survey.facets), 1]))
-    for marker in survey.facets:
-        file.write(_packed("i4", [marker]) + _packed("f8", survey.boxes[marker]))
-        file.write(_packed("u8", [1]) + _packed("i4", [marker]) + _packed("u8", [0]))
+    for key, number in survey.numbers.items():
+        file.write(_packed("i4", [number]) + _packed("f8", survey.boxes[key]))
+        file.write(_packed("u8", [1]) + _packed("i4", [number]) + _packed("u8", [0]))
     file.write(_packed("i4", [AIR]) + _packed("f8", survey.box) + _packed("u8", [1]) + _packed("i4", [AIR]))
-    file.write(_packed("u8", [len(survey.facets)]) + _packed("i4", survey.facets) + b"\n$EndEntities\n")
+    file.write(_packed("u8", [len(survey.facets)]) + _packed("i4", survey.numbers.values()) + b"\n$EndEntities\n")
 
 
 def _begin_nodes(file: BinaryIO, n: int) -> int:
@@ -170,13 +188,14 @@ def _begin_nodes(file: BinaryIO, n: int) -> int:
 
 
 def _begin_elements(file: BinaryIO, survey: _Survey) -> dict[int, tuple[int, int]]:
-    """Write all of the section but elements; returns by group where they begin, and the first one's number."""
+    """Write all of the section but elements; returns by key where they begin, and the first one's number."""
     n = survey.n_cells + sum(survey.facets.values())
     file.write(b"$Elements\n" + _packed("u8", [len(survey.facets) + 1, n, 1, n]))
     places, tag = {}, 1
+    numbers = survey.numbers | {AIR: AIR}
     for group, count in {**survey.facets, AIR: survey.n_cells}.items():
         dimension, kind = (3, TETRAHEDRON) if group == AIR else (2, TRIANGLE)
-        file.write(_packed("i4", [dimension, group, kind]) + _packed("u8", [count]))
+        file.write(_packed("i4", [dimension, numbers[group], kind]) + _packed("u8", [count]))
         places[group] = file.tell(), tag
         file.seek(count * 8 * (2 + dimension), 1)
         tag += count

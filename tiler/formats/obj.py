@@ -6,13 +6,14 @@ from typing import Any, BinaryIO
 from numpy.typing import NDArray
 
 from tiler.atomic import replacing
-from tiler.formats.surface import Surface, open_surface, patch_name, place_vertices, slices, survey_surface
+from tiler.formats.foam_patches import facets_by_key, patch_of_key
+from tiler.formats.surface import Surface, keys_asked, open_surface, place_vertices, slices, survey_surface
 
 VERTEX = "v" + " %24.16e" * 3 + "\n"
 VERTEX_BYTES = len(VERTEX % ((0.0,) * 3))
 
 
-def export_obj(output: Path, directory: Path) -> None:
+def export_obj(output: Path, directory: Path, *, buildings: str | None = None) -> None:
     """Write the boundary of a finished run as OBJ.
 
     Parameters
@@ -21,6 +22,8 @@ def export_obj(output: Path, directory: Path) -> None:
         The file; it appears whole or not at all.
     directory : Path
         Folder of the run.
+    buildings : {"patches"}, optional
+        Give each building, walls and roofs, a group of its own instead of the two.
 
     Raises
     ------
@@ -31,10 +34,10 @@ def export_obj(output: Path, directory: Path) -> None:
     """
     surface = open_surface(directory)
     with replacing(output) as part:
-        write_obj(part, surface)
+        write_obj(part, surface, buildings=buildings)
 
 
-def write_obj(path: Path, surface: Surface) -> None:
+def write_obj(path: Path, surface: Surface, *, buildings: str | None = None) -> None:
     """Write a boundary as OBJ.
 
     Parameters
@@ -43,13 +46,16 @@ def write_obj(path: Path, surface: Surface) -> None:
         The file.
     surface : Surface
         The boundary; facets are counter-clockwise seen from outside the air.
+    buildings : {"patches"}, optional
+        See `export_obj`.
 
     Notes
     -----
     Coordinates have 17 digits. Numbers are padded to one width, so that the place of every line is known from
     counts. Memory holds one piece, and a quarter of a byte a point of the mesh. Each piece is read twice.
     """
-    survey = survey_surface(surface)
+    keys_of = keys_asked(buildings)
+    survey = survey_surface(surface, keys_of)
     digits = len(str(survey.n_vertices))
     line = f"f %{digits}d %{digits}d %{digits}d\n"
     width = 3 * digits + 5
@@ -58,9 +64,9 @@ def write_obj(path: Path, surface: Surface) -> None:
         start = file.tell()
         file.seek(start + survey.n_vertices * VERTEX_BYTES)
         places = {}
-        for marker, n in survey.facets.items():
-            file.write(f"g {patch_name(marker)}\n".encode())
-            places[marker] = file.tell()
+        for key, n in survey.facets.items():
+            file.write(f"g {patch_of_key(key).name}\n".encode())
+            places[key] = file.tell()
             file.seek(n * width, 1)
         file.truncate()
         for k in range(len(surface.names)):
@@ -69,11 +75,10 @@ def write_obj(path: Path, surface: Surface) -> None:
             for first, points in runs:
                 file.seek(start + first * VERTEX_BYTES)
                 _write_lines(file, VERTEX, points)
-            for marker, place in places.items():
-                chosen = facets[piece.marker == marker] + 1
-                file.seek(place)
-                _write_lines(file, line, chosen)
-                places[marker] = place + len(chosen) * width
+            for key, rows in facets_by_key(places, keys_of(piece)):
+                file.seek(places[key])
+                _write_lines(file, line, facets[rows] + 1)
+                places[key] += len(rows) * width
 
 
 def _write_lines(file: BinaryIO, line: str, rows: NDArray[Any]) -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError
 from tiler.atomic import replacing_folder
@@ -20,7 +19,7 @@ from tiler.export import EXPORT_RECORD
 from tiler.formats.foam_case import INLET, OUTLET, write_system, write_wind_case
 from tiler.formats.foam_files import LABEL_LIMIT
 from tiler.formats.foam_part import FoamPlan, PartCounts, PointPlaces, write_part
-from tiler.formats.foam_patches import FIRST_BUILDING, HOUSE
+from tiler.formats.foam_patches import is_house, patch_keys
 from tiler.formats.partition import split_pieces
 from tiler.formats.pieces import Pieces
 from tiler.formats.region_faces import Ints, survey_faces
@@ -137,16 +136,12 @@ def write_openfoam(
 
 
 def _by_marker(piece: MeshPiece) -> Ints:
-    return piece.marker.astype(np.int64)
+    return patch_keys(piece.marker, piece.building, by_building=False)
 
 
 def _by_building(piece: MeshPiece) -> Ints:
-    return np.where(_is_house(piece), piece.building + FIRST_BUILDING, piece.marker)
+    return patch_keys(piece.marker, piece.building, by_building=True)
 
 
 def _by_zone(piece: MeshPiece) -> Ints:
-    return np.where(_is_house(piece), piece.building, -1)
-
-
-def _is_house(piece: MeshPiece) -> NDArray[np.bool_]:
-    return np.isin(piece.marker, HOUSE) & (piece.building >= 0)
+    return np.where(is_house(piece.marker, piece.building), piece.building, -1)

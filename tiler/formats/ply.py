@@ -6,7 +6,8 @@ import numpy as np
 
 from pipeline.errors import InputError
 from tiler.atomic import replacing
-from tiler.formats.surface import Surface, SurfaceSurvey, open_surface, patch_name, place_vertices, survey_surface
+from tiler.formats.foam_patches import patch_of_key
+from tiler.formats.surface import Surface, SurfaceSurvey, open_surface, place_vertices, survey_surface
 
 VERTEX_BYTES = 24
 # PLY has no integers of 64 bits; the number of a building is below 2^53, so a double holds it exactly.
@@ -82,7 +83,7 @@ def _header(survey: SurfaceSurvey) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        *(f"comment marker {marker} {patch_name(marker)}" for marker in survey.facets),
+        *(f"comment marker {key} {patch_of_key(key).name}" for key in survey.facets),
         f"element vertex {survey.n_vertices}",
         *(f"property double {axis}" for axis in "xyz"),
         f"element face {survey.n_facets}",

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiler.atomic import replacing
-from tiler.formats.surface import Surface, open_surface, patch_name, slices, survey_surface
+from tiler.formats.foam_patches import facets_by_key, patch_of_key
+from tiler.formats.surface import Surface, keys_asked, open_surface, slices, survey_surface
 
 _CORNER = "      vertex" + " %23.16e" * 3 + "\n"
 # Each number has the same width, so that the place of every facet is known from counts.
@@ -19,7 +20,7 @@ FACET = "  facet normal" + " %13.6e" * 3 + "\n    outer loop\n" + _CORNER * 3 + 
 FACET_BYTES = len(FACET % ((0.0,) * 12))
 
 
-def export_stl(output: Path, directory: Path) -> None:
+def export_stl(output: Path, directory: Path, *, buildings: str | None = None) -> None:
     """Write the boundary of a finished run as STL, text.
 
     Parameters
@@ -28,6 +29,8 @@ def export_stl(output: Path, directory: Path) -> None:
         The file; it appears whole or not at all.
     directory : Path
         Folder of the run.
+    buildings : {"patches"}, optional
+        Give each building, walls and roofs, a solid of its own instead of the two.
 
     Raises
     ------
@@ -38,10 +41,10 @@ def export_stl(output: Path, directory: Path) -> None:
     """
     surface = open_surface(directory)
     with replacing(output) as part:
-        write_stl(part, surface)
+        write_stl(part, surface, buildings=buildings)
 
 
-def write_stl(path: Path, surface: Surface) -> None:
+def write_stl(path: Path, surface: Surface, *, buildings: str | None = None) -> None:
     """Write a boundary as STL.
 
     Parameters
@@ -50,29 +53,31 @@ def write_stl(path: Path, surface: Surface) -> None:
         The file.
     surface : Surface
         The boundary; normals point out of the air.
+    buildings : {"patches"}, optional
+        See `export_stl`.
 
     Notes
     -----
     Coordinates have 17 digits, so vertices that facets share read as equal float64. Memory holds one piece. Each
     piece is read twice.
     """
-    survey = survey_surface(surface)
+    keys_of = keys_asked(buildings)
+    survey = survey_surface(surface, keys_of)
     with path.open("wb") as file:
         places = {}
-        for marker, n in survey.facets.items():
-            name = patch_name(marker)
+        for key, n in survey.facets.items():
+            name = patch_of_key(key).name
             file.write(f"solid {name}\n".encode())
-            places[marker] = file.tell()
+            places[key] = file.tell()
             file.seek(n * FACET_BYTES, 1)
             file.write(f"endsolid {name}\n".encode())
         for k in range(len(surface.names)):
             piece = surface.read(k)
-            for marker, place in places.items():
-                corners = piece.points[piece.facets[piece.marker == marker]]
-                file.seek(place)
-                for rows in slices(len(corners)):
-                    file.write(_render(corners[rows]))
-                places[marker] = place + len(corners) * FACET_BYTES
+            for key, chosen in facets_by_key(places, keys_of(piece)):
+                file.seek(places[key])
+                for rows in slices(len(chosen)):
+                    file.write(_render(piece.points[piece.facets[chosen[rows]]]))
+                places[key] += len(chosen) * FACET_BYTES
 
 
 def _render(corners: NDArray[np.float64]) -> bytes:

@@ -1,6 +1,6 @@
 """The boundary of a finished run for surface formats: facets piece by piece, vertices numbered from 0 on."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.mesh import Marker
-from tiler.formats.foam_patches import PATCHES
+from tiler.formats.foam_patches import PATCHES, patch_keys
 from tiler.formats.rows import blocks_of
 from tiler.merged import VERTEX_ID, number_piece
 from tiler.mesh_pieces import MeshPieces, open_pieces
@@ -42,6 +41,10 @@ class SurfacePiece(Protocol):
     @property
     def ids(self) -> NDArray[np.int64]:
         """Number of each point over the whole mesh."""
+
+
+# Given a piece, the key of each of its facets' sets, (f,), 0 or more: patches, say.
+KeysOf = Callable[[SurfacePiece], NDArray[np.int64]]
 
 
 class Surface(Protocol):
@@ -170,7 +173,7 @@ class SurfaceSurvey:
     n_vertices : int
         How many there are.
     facets : dict of int to int
-        Facets by marker, ascending; markers without facets are not there.
+        Facets by key, ascending; keys without facets are not there.
     low, high : float64, (3,)
         Box of its vertices (m); infinite where there is none.
     """
@@ -187,8 +190,23 @@ class SurfaceSurvey:
         return sum(self.facets.values())
 
 
-def survey_surface(surface: Surface) -> SurfaceSurvey:
-    """Read a boundary once, a piece at a time."""
+def by_marker(piece: SurfacePiece) -> NDArray[np.int64]:
+    """Give the marker of each facet as the key of its patch."""
+    return patch_keys(piece.marker, piece.building, by_building=False)
+
+
+def by_building(piece: SurfacePiece) -> NDArray[np.int64]:
+    """Give the key of each facet's patch where buildings have their own; see `patch_keys`."""
+    return patch_keys(piece.marker, piece.building, by_building=True)
+
+
+def keys_asked(buildings: str | None) -> KeysOf:
+    """Choose the keys of patches by the option ``buildings``."""
+    return by_marker if buildings is None else by_building
+
+
+def survey_surface(surface: Surface, keys_of: KeysOf = by_marker) -> SurfaceSurvey:
+    """Read a boundary once, a piece at a time, and count facets by the keys that `keys_of` gives them."""
     vertices = VertexSet(surface.n_points)
     facets: dict[int, int] = {}
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -199,8 +217,8 @@ def survey_surface(surface: Surface) -> SurfaceSurvey:
         if len(used):
             points = piece.points[used]
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
-        for marker, n in zip(*np.unique(piece.marker, return_counts=True), strict=True):
-            facets[int(marker)] = facets.get(int(marker), 0) + int(n)
+        for key, n in zip(*np.unique(keys_of(piece), return_counts=True), strict=True):
+            facets[int(key)] = facets.get(int(key), 0) + int(n)
     return SurfaceSurvey(vertices, vertices.count(), dict(sorted(facets.items())), low, high)
 
 
@@ -220,11 +238,6 @@ def place_vertices(
     places = vertices.places(piece.ids[used])
     runs = [(start, piece.points[used[rows]]) for start, rows in blocks_of(places)]
     return runs, places[local.reshape(-1, 3)]
-
-
-def patch_name(marker: int) -> str:
-    """Name a patch."""
-    return PATCHES[Marker(marker)]
 
 
 def slices(n: int) -> Iterator[slice]:

@@ -57,7 +57,7 @@ def export_xdmf(output: Path, directory: Path) -> None:
     n_cells, n_facets = count_rows(pieces)
     data = output.with_suffix(DATA)
     with replacing(output) as text_part, replacing(data) as data_part:
-        with _as_output_error(data):
+        with as_output_error(data):
             _write_data(data_part, pieces, n_cells, n_facets)
         text_part.write_text(_render(data.name, pieces.n_points, n_cells, n_facets))
         # Numbers that do not belong to an old text must not be read with it.
@@ -75,7 +75,7 @@ def count_rows(pieces: Pieces) -> tuple[int, int]:
 
 
 @contextmanager
-def _as_output_error(path: Path) -> Iterator[None]:
+def as_output_error(path: Path) -> Iterator[None]:
     """Take what HDF5 says when it cannot write, often without a reason of the system."""
     try:
         yield

@@ -1,0 +1,210 @@
+"""CGNS in an HDF5 file: one unstructured zone, with a section of elements, a condition and a family a patch.
+
+The nodes of CGNS's file mapping are HDF5 groups with the attributes ``name``, ``label``, ``type`` and ``flags``,
+their values a data set named " data" with the axes in Fortran's order. h5py writes them, without a CGNS library.
+
+References
+----------
+CGNS Standard Interface Data Structures (AIAA R-101A-2005) and its HDF5 file mapping, cgns.github.io.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from tiler.atomic import replacing
+from tiler.export import RUN_RECORD
+from tiler.formats.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
+from tiler.formats.pieces import Pieces
+from tiler.formats.rows import blocks_of
+from tiler.formats.xdmf import as_output_error
+from tiler.mesh_pieces import open_pieces
+from tiler.run_folder import read_crs
+
+VERSION = 3.3  # of CGNS, the first in which all that is written has today's meaning
+TRIANGLE, TETRAHEDRON = 5, 10  # TRI_3 and TETRA_4 among CGNS's types of elements
+BASE, ZONE, CELLS = "city", "air", "cells"
+INT32_LIMIT = 2**31 - 1
+NAME_BYTES, TYPE_BYTES = 33, 3  # of attributes and the strings at the root, their last byte zero
+UNITS = ("Null", "Meter", "Null", "Null", "Null")  # mass, length, time, temperature, angle: 32 characters each
+LENGTH = (0, 1, 0, 0, 0)  # its exponents in these
+TYPES = {"i4": "I4", "i8": "I8", "f4": "R4", "f8": "R8", "i1": "C1"}
+
+
+@dataclass(frozen=True, eq=False)
+class _Survey:
+    """What is known after reading all pieces once: cells, and facets by key of patch, ascending."""
+
+    n_points: int
+    n_cells: int
+    facets: dict[int, int]
+
+    @property
+    def integer(self) -> str:
+        """Type of all numbers of points and elements: 64 bits only where a length does not fit in 32."""
+        n_elements = self.n_cells + sum(self.facets.values())
+        return "i4" if max(self.n_points, n_elements, 4 * self.n_cells) <= INT32_LIMIT else "i8"
+
+
+def export_cgns(output: Path, directory: Path, *, buildings: str | None = None) -> None:
+    """Write the mesh of a finished run as CGNS.
+
+    Parameters
+    ----------
+    output : Path
+        The file; it appears whole or not at all.
+    directory : Path
+        Folder of the run.
+    buildings : {"patches"}, optional
+        See `write_cgns`.
+
+    Raises
+    ------
+    InputError
+        If the run is not finished, or a file of it is missing or damaged.
+    OutputError
+        If the file cannot be written.
+    """
+    pieces = open_pieces(directory)
+    crs = read_crs(directory / RUN_RECORD)
+    with replacing(output) as part, as_output_error(output):
+        write_cgns(part, pieces, crs=crs, buildings=buildings)
+
+
+def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = None) -> None:
+    """Write a mesh as CGNS.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    pieces : Pieces
+        The mesh.
+    crs : str
+        CRS of its coordinates, kept as a descriptor.
+    buildings : {"patches"}, optional
+        Give each building, walls and roofs, a patch of its own instead of the two.
+
+    Notes
+    -----
+    Points are in the order of their numbers, elements cells first, then patch by patch, each piece by piece.
+    Memory: one piece and some kilobytes a patch. Each piece is read twice.
+    """
+    survey = _survey(pieces, by_building=buildings is not None)
+    with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
+        zone = _write_tree(file, survey, crs)
+        coordinates = [zone[f"GridCoordinates/Coordinate{axis}/ data"] for axis in "XYZ"]
+        sections = {0: CELLS} | {key: patch_of_key(key).name for key in survey.facets}
+        seen = dict.fromkeys(sections, 0)
+        for k in range(len(pieces.names)):
+            piece = pieces.read(k)
+            for start, rows in blocks_of(piece.ids):
+                for axis, data in enumerate(coordinates):
+                    data[start : start + len(rows)] = piece.points[rows, axis]
+            found = patch_keys(piece.marker, piece.building, by_building=buildings is not None)
+            patches = [(key, piece.facets[rows]) for key, rows in facets_by_key(survey.facets, found)]
+            for key, corners in [(0, piece.cells), *patches]:
+                nodes = piece.ids[corners].ravel() + 1
+                # Not kept open: each open data set that was written has a buffer of 64 kB.
+                zone[f"{sections[key]}/ElementConnectivity/ data"][seen[key] : seen[key] + len(nodes)] = nodes
+                seen[key] += len(nodes)
+
+
+def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
+    n_cells, facets = 0, dict[int, int]()
+    for k in range(len(pieces.names)):
+        piece = pieces.read(k)
+        n_cells += len(piece.cells)
+        keys, counts = np.unique(
+            patch_keys(piece.marker, piece.building, by_building=by_building), return_counts=True
+        )
+        for key, n in zip(keys.tolist(), counts.tolist(), strict=True):
+            facets[key] = facets.get(key, 0) + n
+    return _Survey(pieces.n_points, n_cells, dict(sorted(facets.items())))
+
+
+def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
+    """Write all nodes, without the numbers of points and elements; returns that of the zone."""
+    kind = survey.integer
+    _describe(file, "HDF5 MotherNode", "Root Node of HDF5 File", "MT")
+    for name, text in ((" format", "IEEE_LITTLE_32"), (" hdf5version", "HDF5 Version 1.8.0")):
+        file.create_dataset(name, data=_characters(text.ljust(NAME_BYTES, "\0")))
+    _node(file, "CGNSLibraryVersion", "CGNSLibraryVersion_t", np.array([VERSION], "<f4"))
+    base = _node(file, BASE, "CGNSBase_t", np.array([3, 3], "<i4"))
+    _node(base, "DataClass", "DataClass_t", "Dimensional")
+    units = np.stack([_characters(unit.ljust(32)) for unit in UNITS])
+    _node(base, "DimensionalUnits", "DimensionalUnits_t", units)
+    _node(base, "CRS", "Descriptor_t", crs)
+    patches = {key: patch_of_key(key) for key in survey.facets}
+    for patch in patches.values():
+        _write_family(base, patch)
+    size = np.array([[survey.n_points], [survey.n_cells], [0]], f"<{kind}")
+    zone = _node(base, ZONE, "Zone_t", size)
+    _node(zone, "ZoneType", "ZoneType_t", "Unstructured")
+    grid = _node(zone, "GridCoordinates", "GridCoordinates_t")
+    for axis in "XYZ":
+        coordinate = _array(grid, f"Coordinate{axis}", survey.n_points, "f8")
+        _node(coordinate, "DimensionalExponents", "DimensionalExponents_t", np.array(LENGTH, "<f4"))
+    _write_section(zone, CELLS, TETRAHEDRON, 4, 1, survey.n_cells, kind)
+    conditions = _node(zone, "ZoneBC", "ZoneBC_t") if patches else None
+    first = survey.n_cells + 1
+    for key, patch in patches.items():
+        n = survey.facets[key]
+        _write_section(zone, patch.name, TRIANGLE, 3, first, n, kind)
+        condition = _node(conditions, patch.name, "BC_t", "FamilySpecified")
+        _node(condition, "PointRange", "IndexRange_t", np.array([[first], [first + n - 1]], f"<{kind}"))
+        _node(condition, "GridLocation", "GridLocation_t", "FaceCenter")
+        _node(condition, "FamilyName", "FamilyName_t", patch.name)
+        first += n
+    return zone
+
+
+def _write_family(base: h5py.Group, patch: Patch) -> None:
+    family = _node(base, patch.name, "Family_t")
+    _node(family, "FamilyBC", "FamilyBC_t", "BCWall" if patch.kind == "wall" else "UserDefined")
+
+
+def _write_section(zone: h5py.Group, name: str, element: int, width: int, first: int, n: int, kind: str) -> None:
+    section = _node(zone, name, "Elements_t", np.array([element, 0], "<i4"))
+    _node(section, "ElementRange", "IndexRange_t", np.array([first, first + n - 1], f"<{kind}"))
+    _array(section, "ElementConnectivity", n * width, kind)
+
+
+def _node(parent: h5py.Group, name: str, label: str, value: NDArray[Any] | str | None = None) -> h5py.Group:
+    """Make a node; a value has its axes in the file's order, the reverse of Fortran's."""
+    data = _characters(value) if isinstance(value, str) else value
+    group = parent.create_group(name, track_order=True)
+    _describe(group, name, label, "MT" if data is None else TYPES[data.dtype.str[1:]])
+    group.attrs.create("flags", np.array([1], "<i4"))
+    if data is not None:
+        group.create_dataset(" data", data=data)
+    return group
+
+
+def _array(parent: h5py.Group, name: str, n: int, kind: str) -> h5py.Group:
+    """Make a node with `n` numbers that are to be written."""
+    group = parent.create_group(name, track_order=True)
+    _describe(group, name, "DataArray_t", TYPES[kind])
+    group.attrs.create("flags", np.array([1], "<i4"))
+    group.create_dataset(" data", (n,), f"<{kind}")
+    return group
+
+
+def _describe(group: h5py.Group, name: str, label: str, kind: str) -> None:
+    for key, text, length in (
+        ("name", name, NAME_BYTES),
+        ("label", label, NAME_BYTES),
+        ("type", kind, TYPE_BYTES),
+    ):
+        string = h5py.h5t.C_S1.copy()
+        string.set_size(length)
+        space = h5py.h5s.create(h5py.h5s.SCALAR)
+        h5py.h5a.create(group.id, key.encode(), string, space).write(np.array(text.encode(), f"S{length}"))
+
+
+def _characters(text: str) -> NDArray[np.int8]:
+    return np.frombuffer(text.encode(), np.int8)
