@@ -592,7 +592,7 @@ CHUNKS: list[tuple[str, Damage, str]] = [
     (
         "other codecs",
         other_zarr(codecs=[{"name": "bytes", "configuration": {"endian": "little"}}]),
-        "by BytesCodec",
+        "by bytes",
     ),
     (
         "large chunks",

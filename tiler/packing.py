@@ -63,13 +63,6 @@ def as_rows(array: NDArray[Any]) -> NDArray[Any]:
     return raw_bytes(array).reshape(*array.shape, array.dtype.itemsize)
 
 
-def from_rows(rows: NDArray[Any], dtype: str) -> NDArray[Any]:
-    """Undo `as_rows`."""
-    if np.dtype(dtype).kind != "U":
-        return rows
-    return np.ascontiguousarray(rows).reshape(-1).view(dtype).reshape(rows.shape[:-1])
-
-
 def rows_per_chunk(array: NDArray[Any]) -> int:
     """Count the rows of a chunk of about `CHUNK_BYTES`; it depends on the width of a row alone."""
     row_bytes = array.dtype.itemsize * int(np.prod(array.shape[1:]))
@@ -124,13 +117,13 @@ def check_entry(entry: Mapping[str, Any]) -> None:
         raise ValueError(f"{len(entry['crc'])} checksums for {shape[0]} rows in chunks of {chunk}")
 
 
-def check_chunk(head: bytes, n_bytes: int) -> None:
-    """Check that a compressed chunk unpacks to the bytes that it should, before it is.
+def check_chunk(data: bytes, n_bytes: int) -> None:
+    """Check that a compressed chunk is whole and unpacks to the bytes that it should, before it is.
 
     Parameters
     ----------
-    head : bytes
-        Its first `CHUNK_HEAD` bytes.
+    data : bytes
+        The chunk.
     n_bytes : int
         Uncompressed size that is expected.
 
@@ -144,11 +137,13 @@ def check_chunk(head: bytes, n_bytes: int) -> None:
     Blosc, "README_CHUNK_FORMAT": after four bytes of versions and flags come the uncompressed size, the size of a
     block, and the compressed size, 32 bits each.
     """
-    if len(head) < CHUNK_HEAD or head[0] not in BLOSC_VERSIONS:
+    if len(data) < CHUNK_HEAD or data[0] not in BLOSC_VERSIONS:
         raise ValueError("is not compressed by Blosc")
-    claimed = int.from_bytes(head[4:8], "little")
+    claimed, size = (int.from_bytes(data[k : k + 4], "little") for k in (4, 12))
     if claimed != n_bytes:
         raise ValueError(f"a chunk claims {claimed} bytes instead of {n_bytes}")
+    if size != len(data):
+        raise ValueError(f"a chunk claims {size} compressed bytes and has {len(data)}")
 
 
 def unpack(packed: NDArray[np.uint8], entry: Mapping[str, Any]) -> NDArray[Any]:

@@ -160,14 +160,17 @@ def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_profile(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(f) Samples of a serial run of the city of 2.5 km by the function that was at work, with py-spy."""
+    """(f) Samples of a serial run of the city of 2.5 km by our function that was at work, with py-spy.
+
+    The main thread's alone, those in which it waits for zarr's threads among them.
+    """
     if shutil.which("py-spy") is None:
         raise SystemExit("no py-spy; python -m pip install py-spy")
     city, raw = cities.make(2500, 3000), out.parent / "samples"
     words = [*COMMAND, "run", str(city / "tiles"), "--footprints", str(city / "footprints.shp")]
     words += ["--tile-size", "625", "--workers", "0", "--overwrite", "--out", str(out)]
     subprocess.run(
-        ["py-spy", "record", "-r", "100", "-f", "raw", "-o", str(raw), "--", *words],
+        ["py-spy", "record", "-r", "100", "-t", "-i", "-f", "raw", "-o", str(raw), "--", *words],
         check=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -176,6 +179,8 @@ def study_profile(cities: Cities, out: Path) -> list[dict[str, Any]]:
     total = 0
     for line in raw.read_text().splitlines():
         stack, _, number = line.rpartition(" ")
+        if "MainThread" not in stack:
+            continue
         frames = [_frame(frame) for frame in stack.split(";")]
         ours = [frame for frame in frames if frame[0].split("/")[0] in ("pipeline", "stitch", "tiler")]
         in_task = any(name == "run_task" for _, name in ours)
