@@ -259,7 +259,7 @@ def _memory_warnings(
     per_area = ((tile_memory - BASE_MEMORY) / area).max()  # tiles on the border may be larger than others
     side = np.sqrt(max(limit - BASE_MEMORY, 0.0) / per_area) / LARGEST_TILE
     size = np.floor(side / TILE_STEP) * TILE_STEP
-    if size >= max(LEAST_TILE * config.mesh_size, TILE_STEP):
+    if size >= max(LEAST_TILE * config.largest_size, TILE_STEP):
         return [f"{words}; give --tile-size {size:g}, or fewer --workers"]
     return [f"{words}; give fewer --workers with more memory each, or a larger --mesh-size"]
 

@@ -105,8 +105,8 @@ def check_sizes(region: Region, config: Config) -> None:
             f"{MOST_NODES:.3g}; raise --dtm-spacing or lower --tile-size"
         )
     layered = config.mesher == "layered"
-    spacing = config.layer_height_or_default if layered else config.most_spacing * config.mesh_size
-    cells = 6 * area / config.mesh_size**2 * config.domain_height / spacing
+    spacing = config.layer_height_or_default if layered else config.most_spacing * config.largest_size
+    cells = 6 * area / config.largest_size**2 * config.domain_height / spacing
     if cells > MOST_CELLS:
         raise ConfigError(
             f"mesh_size = {config.mesh_size:g} m: at least {cells:.3g} cells in a tile of {region.tile_size:g} m "
