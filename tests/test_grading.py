@@ -9,7 +9,7 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.mesh import PlaneMesh
+from pipeline.mesh import Marker, PlaneMesh
 from pipeline.plane import mesh_plane
 from pipeline.quality import measure_cells
 from pipeline.sizes import SizeField, SizeRule, local_sizes, size_field, wall_distances
@@ -37,7 +37,12 @@ from tests.stitching import (
 from tests.tiles import column_arrays, hash_files, make_town, run_of, write_town
 from tiler.check import check_run
 from tiler.config import Config, idle_parameters, make_config
+from tiler.footprint_sample import sample_footprints
+from tiler.forecast import forecast_run
+from tiler.picture_data import City
+from tiler.planning import survey_inputs
 from tiler.results import StoredTerrain
+from tiler.sizes_picture import draw_sizes, plan_edges
 from tiler.stages.mesh import mesh_stages
 
 RULE = SizeRule(mesh_size=10.0, open_size=25.0, grading=0.2)
@@ -217,6 +222,50 @@ def test_workers_leave_the_same_files(tmp_path: Path) -> None:
     run_of(values, tmp_path / "one")
     run_of(values, tmp_path / "two", workers=2)
     assert hash_files(tmp_path / "one") == hash_files(tmp_path / "two")
+
+
+def test_the_plan_counts_the_cells_of_graded_sizes(tmp_path: Path) -> None:
+    values = open_town(tmp_path / "city")
+    for mesher in ("adaptive", "layered"):
+        given = values | {"mesher": mesher, "domain_height": 60.0}
+        record = run_of(given, tmp_path / mesher)
+        config = make_config(given)
+        survey = survey_inputs(config, lambda _: None)
+        cells = forecast_run(survey, sample_footprints(config, survey.region), config).loads.cells.sum()
+        assert 0.7 < cells / record["counts"]["cells"] < 1.4
+        even = replace(config, open_size=0.0)
+        assert cells < 0.4 * forecast_run(survey, sample_footprints(even, survey.region), even).loads.cells.sum()
+
+
+def test_the_picture_shows_edges_from_above_by_length_and_tile(tmp_path: Path) -> None:
+    """A western tile of short edges, an eastern one of long ones, and a wall between them."""
+    side = 8
+    x, y = np.meshgrid(np.arange(side + 1.0), np.arange(side + 1.0))
+    xy = np.column_stack((x.ravel(), y.ravel()))
+    corner = np.array([k for k in range(side * (side + 1)) if k % (side + 1) < side])
+    west = np.concatenate([corner[:, None] + [0, 1, side + 2], corner[:, None] + [0, side + 2, side + 1]])
+    n = len(xy)
+    points = np.concatenate([xy, [[8.0, 0.0], [16.0, 0.0], [16.0, 8.0], [8.0, 8.0]]])
+    facets = np.concatenate([west, [[n, n + 1, n + 2], [n, n + 2, n + 3], [n, n + 3, n + 3]]])
+    marker = np.full(len(facets), Marker.GROUND)
+    marker[-1] = Marker.WALL
+    piece = np.repeat([0, 1], [len(west), 3])
+    height = np.zeros((len(points), 1))
+    city = City(np.hstack((points, height)), facets, marker, piece * 0 - 1, piece, ("4_7", "5_7"), np.zeros(3))
+    np.testing.assert_allclose(plan_edges(city)[[0, -2]], np.array([1, 8]) * (2 + np.sqrt(2)) / 3)
+    image = draw_sizes(city, (320, 160 + 46)).astype(int)
+    assert image.shape == (206, 320, 3)
+    # Odd and even column and row: the warm ramp's dark end, then the cool one's light end; the wall is black.
+    west_colour, east_colour = (
+        np.median(image[:150, 5:150], axis=(0, 1)),
+        np.median(image[:150, 170:310], axis=(0, 1)),
+    )
+    assert west_colour[0] > west_colour[2]
+    assert west_colour.max() < 120
+    assert east_colour[2] > east_colour[0] > 200
+    assert image[20:140, 159:161].max(axis=2).min(axis=1).max() < 60
+    with pytest.raises(ValueError, match="size 50 x 46 must have more than 46 rows"):
+        draw_sizes(city, (50, 46))
 
 
 def test_only_a_graded_mesh_depends_on_the_grading() -> None:
