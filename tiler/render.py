@@ -20,7 +20,7 @@ SIZES = {
     "mesh": (1600, 1000),
     "overview": (2000, 640),
     "tiles": (1600, 1000),
-    "sizes": (1200, 1246),
+    "sizes": (1000, 1046),
 }
 # Compass direction that the camera stands in, and its angle over the horizon (degrees).
 VIEW = (215.0, 35.0)
@@ -54,7 +54,7 @@ def render_run(
         ``"tiles"``: as ``"boundary"``, but coloured by tile: neighbours differ.
         ``"sizes"``: triangles from above, coloured by the length of their edges, and by tile.
     size : (int, int), optional
-        Width and height (pixels); 1600 x 1000, for the overview 2000 x 640, for the sizes 1200 x 1246.
+        Width and height (pixels); 1600 x 1000, for the overview 2000 x 640, for the sizes 1000 x 1046.
 
     Raises
     ------
