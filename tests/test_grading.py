@@ -9,6 +9,7 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.errors import ConfigError
 from pipeline.mesh import Marker, PlaneMesh
 from pipeline.plane import mesh_plane
 from pipeline.quality import measure_cells
@@ -222,6 +223,14 @@ def test_workers_leave_the_same_files(tmp_path: Path) -> None:
     run_of(values, tmp_path / "one")
     run_of(values, tmp_path / "two", workers=2)
     assert hash_files(tmp_path / "one") == hash_files(tmp_path / "two")
+
+
+def test_tiles_that_are_too_small_for_the_open_size_are_refused(tmp_path: Path) -> None:
+    values = open_town(tmp_path / "city") | {"tile_size": 349.0}
+    with pytest.raises(
+        ConfigError, match=r"349 m is below 14 open sizes of 25 m; give --tile-size 350 .*--open-size"
+    ):
+        survey_inputs(make_config(values), lambda _: None)
 
 
 def test_the_plan_counts_the_cells_of_graded_sizes(tmp_path: Path) -> None:

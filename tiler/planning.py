@@ -129,7 +129,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     region = Region(
         choose_bounds(config.bounds, headers), f"EPSG:{code}" if code else crs.to_wkt(), config.tile_size
     )
-    check_region(region, config.largest_size, headers)
+    check_region(region, config.largest_size, headers, kind="open" if config.open_size else "mesh")
     check_sizes(region, config)
     clouds = [header for header in headers if header.n_points and _meets(header, region)]
     whole = make_grid(
