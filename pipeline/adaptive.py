@@ -17,6 +17,7 @@ from pipeline.levels import fill_levels, stagger_columns
 from pipeline.mesh import ColumnMesh, PlaneMesh
 from pipeline.neighbours import check_groups
 from pipeline.nodes import Levels, Nodes, SeamColumns, no_seam, place_nodes, triangle_surfaces
+from pipeline.sizes import SizeField, local_sizes
 from pipeline.spacing import SpacingLimits, domain_top, mean_edges, vertical_spacing
 from pipeline.terrain import Dtm, sample_dtm
 from pipeline.trim import check_headroom
@@ -87,6 +88,7 @@ def mesh_adaptive(
     options: AdaptiveOptions,
     *,
     seam: SeamColumns | None = None,
+    sizes: SizeField | None = None,
 ) -> tuple[ColumnMesh, AdaptiveReport]:
     """Fill the columns, merge them, and mend the worst cells.
 
@@ -107,6 +109,9 @@ def mesh_adaptive(
         Parameters.
     seam : SeamColumns, optional
         Columns that are given by a seam: they stay bit for bit.
+    sizes : SizeField, optional
+        Target edge lengths of the plane mesh, where they are not the same everywhere: the spacing's limits are in
+        these.
 
     Raises
     ------
@@ -117,12 +122,13 @@ def mesh_adaptive(
     """
     check_groups(roof, group)
     seam = no_seam() if seam is None else seam
-    levels, bottom, moves = _fill_columns(plane, dtm, roof, ids, options, seam)
+    levels, bottom, moves = _fill_columns(plane, dtm, roof, ids, options, seam, sizes)
     mesh = ColumnMesh(plane, levels.start, levels.z, bottom, "heights")
     free = np.isnan(levels.surface)
     count = np.diff(levels.start)
     free &= ~np.repeat(np.isin(np.arange(len(plane.xy)), seam.vertex), count)
-    spacing = vertical_spacing(mean_edges(plane), options.mesh_size, options.limits)
+    size = local_sizes(sizes, plane.xy, mesh_size=options.mesh_size)
+    spacing = vertical_spacing(mean_edges(plane), size, options.limits)
     mesh, worst, improved = improve_columns(mesh, free, spacing, passes=options.passes)
     report = AdaptiveReport(
         n_columns=len(plane.xy),
@@ -142,12 +148,14 @@ def fill_columns(
     roof: NDArray[np.float64],
     ids: NDArray[np.str_],
     options: AdaptiveOptions,
+    *,
+    sizes: SizeField | None = None,
 ) -> Levels:
     """Fill the columns of a plane mesh, as a seam's are from the mesh of its strip.
 
     Parameters and errors as in `mesh_adaptive`.
     """
-    return _fill_columns(plane, dtm, roof, ids, options, no_seam())[0]
+    return _fill_columns(plane, dtm, roof, ids, options, no_seam(), sizes)[0]
 
 
 def _fill_columns(
@@ -157,13 +165,15 @@ def _fill_columns(
     ids: NDArray[np.str_],
     options: AdaptiveOptions,
     seam: SeamColumns,
+    sizes: SizeField | None,
 ) -> tuple[Levels, NDArray[np.int32], NDArray[np.float64]]:
     """Levels, where cells begin in them, and how far each node was moved (m)."""
     size, limits = options.mesh_size, options.limits
     top = domain_top(dtm, plane.xy, domain_height=options.domain_height)
     air = HEADROOM * limits.most * size
     check_headroom(top, plane, roof, ids, domain_height=options.domain_height, air=air)
-    spacing = vertical_spacing(mean_edges(plane), size, limits)
+    local = local_sizes(sizes, plane.xy, mesh_size=size)
+    spacing = vertical_spacing(mean_edges(plane), local, limits)
     shift = np.zeros(len(plane.xy))
     if options.stagger:
         shift = options.stagger * stagger_columns(len(plane.xy), plane_edges(plane.triangles)[0])

@@ -26,7 +26,7 @@ def improve_plane(
     triangles: NDArray[np.int32],
     label: NDArray[np.int32],
     *,
-    mesh_size: float,
+    mesh_size: float | NDArray[np.float64],
     passes: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Move free vertices and flip free edges for better angles.
@@ -39,8 +39,8 @@ def improve_plane(
         Vertex indices, counter-clockwise.
     label : int32, (m,)
         What each triangle belongs to; edges between different labels are kept.
-    mesh_size : float
-        Target edge length (m), which scales the search.
+    mesh_size : float or float64 (n,)
+        Target edge length (m), one for all or one a vertex, which scales the search.
     passes : int
         Rounds of moving and flipping; 0 returns the input.
 
@@ -61,8 +61,9 @@ def improve_plane(
         return xy, triangles
     neighbour = triangle_neighbours(triangles)
     frozen = _frozen_vertices(len(xy), triangles, neighbour, label)
+    first_step = FIRST_STEP * np.broadcast_to(np.asarray(mesh_size, np.float64), len(xy))
     for _ in range(passes):
-        _move_vertices(xy, triangles, neighbour, frozen, DIRECTIONS, FIRST_STEP * mesh_size)
+        _move_vertices(xy, triangles, neighbour, frozen, DIRECTIONS, first_step)
         _flip_edges(xy, triangles, neighbour, label)
     return xy, triangles
 
@@ -150,18 +151,18 @@ def _move_vertices(
     neighbour: NDArray[np.int32],
     frozen: NDArray[np.bool_],
     directions: NDArray[np.float64],
-    first_step: float,
+    first_step: NDArray[np.float64],
 ) -> None:
     """Compass search: the best of eight places a step away, else half the step."""
     of_vertex = np.full(len(xy), -1, np.int32)
     for t in range(len(triangles)):
         for k in range(3):
             of_vertex[triangles[t, k]] = t
-    step = np.full(len(xy), first_step)
+    step = first_step.copy()
     ring = np.empty((MAX_RING, 5))
     for _ in range(SEARCH_SWEEPS):
         for v in range(len(xy)):
-            if frozen[v] or of_vertex[v] < 0 or step[v] < LAST_STEP * first_step:
+            if frozen[v] or of_vertex[v] < 0 or step[v] < LAST_STEP * first_step[v]:
                 continue
             n = _collect_ring(xy, triangles, neighbour, v, of_vertex[v], ring)
             x, y = xy[v, 0], xy[v, 1]

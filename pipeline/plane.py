@@ -1,6 +1,8 @@
 """Step 3.1: the 2D mesh of the region with the walls as edges. The one place that knows Triangle."""
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -10,9 +12,11 @@ from numpy.typing import NDArray
 from pipeline.errors import GeometryError
 from pipeline.improve_plane import improve_plane
 from pipeline.mesh import PlaneMesh
+from pipeline.sizes import SizeField, local_sizes
 
 MIN_ANGLE = 25.0  # degrees; Triangle's quality bound (paper, step 3.1; higher may not terminate)
 STEINER_FACTOR = 40  # Steiner points allowed for each expected vertex before Triangle is stopped
+CLEAR_OF_GRAPH = 0.6  # local sizes; vertices on open ground are that far from walls and given vertices
 AREA_TOLERANCE = 1e-6  # relative; triangles of a building against its footprint
 
 
@@ -86,6 +90,7 @@ def triangulate_plane(
     min_angle: float = MIN_ANGLE,
     refinements: int = 0,
     frozen: bool = False,
+    sizes: SizeField | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32], bool]:
     """Triangulate a planar straight-line graph with bounds on area and angle.
 
@@ -104,6 +109,9 @@ def triangulate_plane(
         the bound, one more none; a third makes tiny edges at sharp corners of walls.
     frozen : bool
         Keep the outer border as it is: no vertex is added to it.
+    sizes : SizeField, optional
+        Target edge lengths h that are not the same everywhere, instead of `max_area`: triangles are about
+        h**2 / 2 at most, with h that in their middle.
 
     Returns
     -------
@@ -120,23 +128,36 @@ def triangulate_plane(
     ------
     GeometryError
         If Triangle cannot make sense of the graph.
+
+    Notes
+    -----
+    Graded sizes come from vertices on open ground that Triangle is given beside the graph: those of a mesh of
+    the graph's box, in which it finds the sizes round by round, as a triangle inherits the bound on its area from
+    the one that it comes of. Refining the mesh of the graph itself in as many rounds makes edges of 0.05 m at
+    sharp corners.
     """
     # Near the origin the predicates keep all their digits.
     origin = np.floor(graph.xy.min(axis=0))
     local = graph.xy - origin
+    largest, smallest = max_area, max_area
+    if sizes is not None:
+        largest, smallest = sizes.rule.open_size**2 / 2, sizes.rule.mesh_size**2 / 2
+        local = np.concatenate((local, _open_vertices(local, graph.segments, origin, sizes)))
     width, height = local.max(axis=0)
-    limit = STEINER_FACTOR * int(len(local) + width * height / max_area + 100)
+    limit = STEINER_FACTOR * int(len(local) + width * height / smallest + 100)
     data = {"vertices": local, "segments": graph.segments}
     if len(graph.seeds):
         # Labels count from 1: Triangle gives 0 to what no seed reaches.
         number = np.arange(1.0, len(graph.seeds) + 1)
         data["regions"] = np.column_stack((graph.seeds - origin, number, np.zeros(len(number))))
     try:
-        quality = f"q{min_angle:g}a{max_area:.12g}" + "Y" * frozen
-        out = triangle.triangulate(data, f"p{quality}AS{limit}")
+        quality, end = f"q{min_angle:g}", "Y" * frozen + f"S{limit}"
+        out = triangle.triangulate(data, f"p{quality}a{largest:.12g}A{end}")
         for _ in range(refinements):
-            kept = ("vertices", "triangles", "segments", "triangle_attributes")
-            out = triangle.triangulate({name: out[name] for name in kept if name in out}, f"rp{quality}S{limit}")
+            if sizes is None:
+                out = triangle.triangulate(_kept(out), f"rp{quality}a{largest:.12g}{end}")
+            else:
+                out = triangle.triangulate(_kept(out) | _area_bounds(out, origin, sizes), f"rp{quality}a{end}")
         triangles = out["triangles"].astype(np.int32)
     except (RuntimeError, KeyError, ValueError) as error:
         place = ", ".join(f"{value:.1f}" for value in graph.xy.mean(axis=0))
@@ -152,6 +173,45 @@ def triangulate_plane(
     return xy, triangles, label, len(xy) - len(local) < limit
 
 
+def _kept(out: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """What Triangle needs of its own result to refine it."""
+    kept = ("vertices", "triangles", "segments", "triangle_attributes")
+    return {name: out[name] for name in kept if name in out}
+
+
+def _area_bounds(
+    out: dict[str, NDArray[Any]], origin: NDArray[np.float64], sizes: SizeField
+) -> dict[str, NDArray[np.float64]]:
+    """Bound on the area of each triangle of Triangle's result (m2), which what comes of it inherits."""
+    middle = out["vertices"][out["triangles"]].mean(axis=1) + origin
+    size = local_sizes(sizes, middle, mesh_size=sizes.rule.mesh_size)
+    return {"triangle_max_area": size[:, None] ** 2 / 2}
+
+
+def _open_vertices(
+    local: NDArray[np.float64], segments: NDArray[np.int32], origin: NDArray[np.float64], sizes: SizeField
+) -> NDArray[np.float64]:
+    """Vertices of a mesh of the graph's box in these sizes, but for those close to the graph."""
+    low, high = local.min(axis=0), local.max(axis=0)
+    box = ring_edges(shapely.get_rings(np.array([shapely.box(*low, *high)])))[:, 0]
+    sides = {"vertices": box, "segments": np.array([[0, 1], [1, 2], [2, 3], [3, 0]])}
+    out = triangle.triangulate(sides, f"pq{MIN_ANGLE:g}a{sizes.rule.open_size**2 / 2:.12g}")
+    for _ in range(math.ceil(math.log2(sizes.rule.open_size / sizes.rule.mesh_size)) + 1):
+        a, b, c = (out["vertices"][out["triangles"][:, k]] for k in range(3))
+        u, v = b - a, c - a
+        quarter = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])[:, None] / 8
+        bounds = _area_bounds(out, origin, sizes)["triangle_max_area"]
+        out = triangle.triangulate(
+            _kept(out) | {"triangle_max_area": np.maximum(bounds, quarter)}, f"rpq{MIN_ANGLE:g}a"
+        )
+    xy: NDArray[np.float64] = out["vertices"]
+    size = local_sizes(sizes, xy + origin, mesh_size=sizes.rule.mesh_size)
+    alone = np.setdiff1d(np.arange(len(local)), segments)
+    graph = np.concatenate((shapely.linestrings(local[segments]), shapely.points(local[alone])))
+    near, _ = shapely.STRtree(graph).query(shapely.points(xy), predicate="dwithin", distance=CLEAR_OF_GRAPH * size)
+    return np.delete(xy, near, axis=0)
+
+
 def mesh_plane(
     bounds: tuple[float, float, float, float],
     polygons: NDArray[np.object_],
@@ -160,6 +220,7 @@ def mesh_plane(
     min_angle: float = MIN_ANGLE,
     refinements: int = 0,
     passes: int = 0,
+    sizes: SizeField | None = None,
 ) -> tuple[PlaneMesh, bool]:
     """Mesh the region with all walls as edges (paper, step 3.1).
 
@@ -177,6 +238,8 @@ def mesh_plane(
         Further runs of Triangle, as in `triangulate_plane`.
     passes : int
         Rounds of `improve_plane`. With any, a triangle may be larger than the bound.
+    sizes : SizeField, optional
+        As in `triangulate_plane`.
 
     Returns
     -------
@@ -192,9 +255,10 @@ def mesh_plane(
     """
     graph = plane_graph(bounds, polygons)
     xy, triangles, label, complete = triangulate_plane(
-        graph, max_area=mesh_size**2 / 2, min_angle=min_angle, refinements=refinements
+        graph, max_area=mesh_size**2 / 2, min_angle=min_angle, refinements=refinements, sizes=sizes
     )
-    xy, triangles = improve_plane(xy, triangles, label, mesh_size=mesh_size, passes=passes)
+    size = local_sizes(sizes, xy, mesh_size=mesh_size)
+    xy, triangles = improve_plane(xy, triangles, label, mesh_size=size, passes=passes)
     plane = order_plane(xy, triangles, label)
     check_areas(plane, float(shapely.box(*bounds).area), shapely.area(polygons), polygons)
     return plane, complete

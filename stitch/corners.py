@@ -6,6 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.sizes import SizeField, local_sizes, wall_distances
 from stitch.grid import (
     CORNER_SHARE,
     Key,
@@ -52,6 +53,7 @@ def place_corner(
     walls: NDArray[np.float64],
     *,
     mesh_size: float,
+    sizes: SizeField | None = None,
 ) -> Corner:
     """Choose a corner's place, far from walls, and the first edges of its seams.
 
@@ -67,6 +69,8 @@ def place_corner(
         Their walls in pieces (`cut_walls`).
     mesh_size : float
         Target edge length (m).
+    sizes : SizeField, optional
+        Target edge lengths that are not the same everywhere.
 
     Returns
     -------
@@ -88,7 +92,11 @@ def place_corner(
     building = _building_at(polygons, xy)
     worth = np.rint(np.where(building >= 0, INSIDE_WORTH, 1.0) * clear / SAME)
     best = np.lexsort((offset[:, 1], offset[:, 0], (offset**2).sum(axis=1), -worth))[0]
-    length = min(SPOKE_OF_CLEARANCE * clear[best], LONGEST_SPOKE * mesh_size, SPOKE_OF_DEPTH * depth)
+    free, size = clear[best], mesh_size
+    if sizes is not None:
+        free = max(free, wall_distances(sizes, xy[[best]])[0])
+        size = local_sizes(sizes, xy[[best]], mesh_size=mesh_size)[0]
+    length = min(SPOKE_OF_CLEARANCE * free, LONGEST_SPOKE * size, SPOKE_OF_DEPTH * depth)
     tips = xy[best] + length * DIRECTIONS
     there = [has_tile(grid, tile) for tile in tiles_of_corner(key)]
     # Tiles beside the first edges eastwards, northwards, westwards and southwards.

@@ -13,7 +13,8 @@ Bounds = tuple[float, float, float, float]
 LEAST_TILE = 14.0  # mesh sizes; below, strips would reach beyond a border tile of half a size
 CORNER_REACH = 25.0  # m; how far a corner may be from its nominal place
 BAND = 35.0  # m; how far a seam may be from its nominal line
-# The same two where tiles are small, in tile sizes.
+OPEN_BAND = 2.0  # open sizes; the same where sizes are graded, if that is more
+# The first two where tiles are small, in tile sizes.
 CORNER_SHARE = 1 / 6
 BAND_SHARE = 1 / 4
 
@@ -52,6 +53,8 @@ class TileGrid:
     present : bool, (nx, ny), optional
         Which tiles there are, by column and row; all where it is None. The region is made of these: towards a
         tile that is absent it has a straight border.
+    open_size : float
+        Largest target edge length (m) where sizes are graded, 0 where they are the same everywhere.
     """
 
     bounds: Bounds
@@ -59,15 +62,16 @@ class TileGrid:
     first: Key
     lines: tuple[NDArray[np.float64], NDArray[np.float64]]
     present: NDArray[np.bool_] | None = None
+    open_size: float = 0.0
 
 
-def make_grid(bounds: Bounds, *, tile_size: float, mesh_size: float) -> TileGrid:
+def make_grid(bounds: Bounds, *, tile_size: float, mesh_size: float, open_size: float = 0.0) -> TileGrid:
     """Lay the tile grid over a region.
 
     Raises
     ------
     ValueError
-        If tiles are smaller than `LEAST_TILE` mesh sizes, or the region is empty.
+        If tiles are smaller than `LEAST_TILE` mesh sizes, or open sizes, or the region is empty.
 
     Examples
     --------
@@ -75,13 +79,14 @@ def make_grid(bounds: Bounds, *, tile_size: float, mesh_size: float) -> TileGrid
     >>> grid.first, grid.lines[0], grid.lines[1]
     (Key(i=1, j=0), array([ 90., 200., 300., 390.]), array([ 30., 130.]))
     """
-    if not tile_size >= LEAST_TILE * mesh_size > 0:
-        raise ValueError(f"tile size {tile_size} m is below {LEAST_TILE:g} mesh sizes of {mesh_size} m")
+    size = max(mesh_size, open_size)
+    if not tile_size >= LEAST_TILE * size > 0:
+        raise ValueError(f"tile size {tile_size} m is below {LEAST_TILE:g} mesh sizes of {size} m")
     if not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
         raise ValueError(f"the region {bounds} is empty")
     i, x = _axis_lines(bounds[0], bounds[2], tile_size)
     j, y = _axis_lines(bounds[1], bounds[3], tile_size)
-    return TileGrid(bounds, tile_size, Key(i, j), (x, y))
+    return TileGrid(bounds, tile_size, Key(i, j), (x, y), open_size=open_size)
 
 
 def tile_keys(grid: TileGrid) -> list[Key]:
@@ -208,9 +213,9 @@ def corner_reach(tile_size: float) -> float:
     return min(CORNER_REACH, CORNER_SHARE * tile_size)
 
 
-def band_width(tile_size: float) -> float:
-    """How far a seam may be from its nominal line (m)."""
-    return min(BAND, BAND_SHARE * tile_size)
+def band_width(tile_size: float, open_size: float = 0.0) -> float:
+    """How far a seam may be from its nominal line (m), see `TileGrid.open_size`."""
+    return min(max(BAND, OPEN_BAND * open_size), BAND_SHARE * tile_size)
 
 
 def _axis_lines(low: float, high: float, size: float) -> tuple[int, NDArray[np.float64]]:

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from pipeline.mesh import PlaneMesh
 from pipeline.plane import collect_graph, order_plane, ring_edges, triangulate_plane
+from pipeline.sizes import SizeField, local_sizes
 from stitch.corners import Corner
 from stitch.grid import Bounds
 from stitch.strips import MARGIN, label_triangles
@@ -22,6 +23,7 @@ def mesh_patch(
     *,
     mesh_size: float,
     min_angle: float,
+    sizes: SizeField | None = None,
 ) -> PlaneMesh:
     """Triangulate the surroundings of a corner.
 
@@ -39,6 +41,8 @@ def mesh_patch(
         Target edge length h (m).
     min_angle : float
         Bound on the angles (degrees).
+    sizes : SizeField, optional
+        Target edge lengths that are not the same everywhere; the corner's own then is its mesh size here.
 
     Returns
     -------
@@ -55,12 +59,13 @@ def mesh_patch(
     -----
     As in a strip, pieces of wall that meet the square are taken whole, and what lies beyond makes no difference.
     """
-    core = _square(corner.xy, PATCH * mesh_size, bounds)
-    outer = _square(corner.xy, (PATCH + LONGEST_PIECE + MARGIN) * mesh_size, bounds)
+    size = float(local_sizes(sizes, corner.xy[None], mesh_size=mesh_size)[0])
+    core = _square(corner.xy, PATCH * size, bounds)
+    outer = _square(corner.xy, PATCH * size + (LONGEST_PIECE + MARGIN) * mesh_size, bounds)
     outline = ring_edges(shapely.get_rings(shapely.box(*outer)))
     edges = np.concatenate((outline, walls_within(walls, shapely.box(*core)), _first_edges(corner, bounds)))
     xy, triangles, _, _ = triangulate_plane(
-        collect_graph(edges, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle
+        collect_graph(edges, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle, sizes=sizes
     )
     centre = xy[triangles].mean(axis=1)
     triangles = triangles[((centre >= core[:2]) & (centre <= core[2:])).all(axis=1)]

@@ -52,7 +52,7 @@ def find_path(grid: TileGrid, seam: SeamKey, ends: tuple[Corner, Corner], strip:
     axis = seam.axis
     along, across = strip.xy[:, axis], strip.xy[:, 1 - axis]
     start, end = ends[0].xy, ends[1].xy
-    band = band_width(grid.tile_size)
+    band = band_width(grid.tile_size, grid.open_size)
     line = grid.lines[1 - axis][seam[2 - axis] - grid.first[1 - axis]]
     first = _spoke(strip, ends[0], ends[0].tips[axis], axis)
     last = _spoke(strip, ends[1], ends[1].tips[2 + axis], axis)[::-1]

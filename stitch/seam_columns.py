@@ -9,13 +9,20 @@ from pipeline.adaptive import AdaptiveOptions, fill_columns
 from pipeline.mesh import PlaneMesh
 from pipeline.nodes import Levels, SeamColumns, take_columns
 from pipeline.plane import order_plane
+from pipeline.sizes import SizeField
 from pipeline.terrain import Dtm
 from stitch.corners import Corner
 from stitch.seams import Seam, find_vertices
 
 
 def fill_corner(
-    corner: Corner, dtm: Dtm, roof: NDArray[np.float64], ids: NDArray[np.str_], options: AdaptiveOptions
+    corner: Corner,
+    dtm: Dtm,
+    roof: NDArray[np.float64],
+    ids: NDArray[np.str_],
+    options: AdaptiveOptions,
+    *,
+    sizes: SizeField | None = None,
 ) -> Levels:
     """Fill the column of a corner: it belongs to the corner, and all its seams take it over.
 
@@ -25,7 +32,7 @@ def fill_corner(
         A corner of two tiles or more. No wall is as close to it as the tips of its first edges.
     dtm : Dtm
         Terrain as far beyond these as `top_reach` says.
-    roof, ids, options
+    roof, ids, options, sizes
         As in `mesh_adaptive`.
 
     Returns
@@ -34,7 +41,8 @@ def fill_corner(
         One column, with a spacing that follows the length of the first edges.
     """
     fan = _fan(corner)
-    return take_columns(fill_columns(fan, dtm, roof, ids, options), find_vertices(fan.xy, corner.xy[None]))
+    levels = fill_columns(fan, dtm, roof, ids, options, sizes=sizes)
+    return take_columns(levels, find_vertices(fan.xy, corner.xy[None]))
 
 
 def fill_seam(
@@ -44,6 +52,8 @@ def fill_seam(
     roof: NDArray[np.float64],
     ids: NDArray[np.str_],
     options: AdaptiveOptions,
+    *,
+    sizes: SizeField | None = None,
 ) -> Levels:
     """Fill the columns of a seam within the region from the triangles on both of its sides.
 
@@ -55,7 +65,7 @@ def fill_seam(
         Columns of its first and last corner.
     dtm : Dtm
         Terrain as far beyond its triangles as `top_reach` says.
-    roof, ids, options
+    roof, ids, options, sizes
         As in `mesh_adaptive`.
 
     Returns
@@ -63,7 +73,7 @@ def fill_seam(
     Levels
         A column for each vertex, with a level for every roof on either side.
     """
-    levels = fill_columns(seam.ring, dtm, roof, ids, options)
+    levels = fill_columns(seam.ring, dtm, roof, ids, options, sizes=sizes)
     return join_levels([ends[0], take_columns(levels, seam.vertex[1:-1]), ends[1]])
 
 

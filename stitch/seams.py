@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.mesh import PlaneMesh
 from pipeline.plane import order_plane
+from pipeline.sizes import SizeField, largest_size, local_sizes
 from stitch.corners import Corner
 from stitch.grid import Bounds, SeamKey, TileGrid, is_border
 from stitch.paths import find_path
@@ -56,6 +57,7 @@ def trace_seam(
     mesh_size: float,
     min_angle: float,
     passes: int,
+    sizes: SizeField | None = None,
 ) -> Seam:
     """Find a seam in the triangles of its strip.
 
@@ -75,6 +77,7 @@ def trace_seam(
         mesh_size=mesh_size,
         min_angle=min_angle,
         passes=0 if border else passes,
+        sizes=sizes,
     )
     if border:
         nothing = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))
@@ -85,7 +88,9 @@ def trace_seam(
     on, _ = find_on_walls(strip.walls, xy, reach=ON_WALL)
     around = np.isin(strip.triangles, path).any(axis=1)
     ring = order_plane(strip.xy, strip.triangles[around], strip.building[around])
-    near = around | _is_near(strip, xy, strip_core(grid, key, mesh_size=mesh_size), SURROUNDINGS * mesh_size)
+    core = strip_core(grid, key, mesh_size=largest_size(sizes, mesh_size=mesh_size))
+    centre = strip.xy[strip.triangles].mean(axis=1)
+    near = around | _is_near(centre, xy, core, SURROUNDINGS * local_sizes(sizes, centre, mesh_size=mesh_size))
     surroundings = order_plane(strip.xy, strip.triangles[near], strip.building[near])
     return Seam(xy, xy[np.unique(on)], False, ring, find_vertices(ring.xy, xy), surroundings)
 
@@ -119,9 +124,10 @@ def find_vertices(among: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArra
     return row.astype(np.int32)
 
 
-def _is_near(strip: Strip, line: NDArray[np.float64], core: Bounds, reach: float) -> NDArray[np.bool_]:
+def _is_near(
+    centre: NDArray[np.float64], line: NDArray[np.float64], core: Bounds, reach: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Whether triangles have their centres close to a line, and where it is known what holds them."""
-    centre = strip.xy[strip.triangles].mean(axis=1)
     known = ((centre >= core[:2]) & (centre <= core[2:])).all(axis=1)
     near: NDArray[np.bool_] = known & shapely.dwithin(shapely.LineString(line), shapely.points(centre), reach)
     return near

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.improve_plane import improve_plane
 from pipeline.plane import collect_graph, triangulate_plane
+from pipeline.sizes import SizeField, largest_size, local_sizes
 from stitch.corners import Corner
 from stitch.grid import Bounds, SeamKey, TileGrid, band_width, corner_reach, is_border, seam_bounds
 from stitch.walls import LONGEST_PIECE, walls_within
@@ -49,6 +50,7 @@ def mesh_strip(
     mesh_size: float,
     min_angle: float,
     passes: int,
+    sizes: SizeField | None = None,
 ) -> Strip:
     """Triangulate a strip.
 
@@ -70,6 +72,8 @@ def mesh_strip(
         Bound on the angles (degrees).
     passes : int
         Rounds of `improve_plane`, of no use on the region's border, whose vertices stay.
+    sizes : SizeField, optional
+        Target edge lengths that are not the same everywhere.
 
     Raises
     ------
@@ -81,28 +85,29 @@ def mesh_strip(
     The core is the band that the seam may use and the triangles around it. All pieces of wall that meet it
     are in the strip, whole; beyond it nothing counts, so what lies there makes no difference.
     """
-    core = strip_core(grid, seam, mesh_size=mesh_size)
+    core = strip_core(grid, seam, mesh_size=largest_size(sizes, mesh_size=mesh_size))
     inside = walls_within(walls, shapely.box(*core))
     bounds = seam_bounds(grid, seam)
     outer = _grow(core, (LONGEST_PIECE + MARGIN) * mesh_size, bounds)
     spokes = _spokes(ends, bounds)
     edges = np.concatenate((_outline(outer, ends), inside, spokes))
     xy, triangles, _, _ = triangulate_plane(
-        collect_graph(edges, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle
+        collect_graph(edges, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle, sizes=sizes
     )
     building = label_triangles(xy, triangles, polygons)
     # Beyond the core, what holds a triangle is a matter of which houses were given.
     building[~_within(xy, triangles, core)] = -1
     # Different labels on the two sides of a first edge keep it where it is.
     label = building * SECTORS + _sectors(xy, triangles, ends)
-    xy, triangles = improve_plane(xy, triangles, label.astype(np.int32), mesh_size=mesh_size, passes=passes)
+    size = local_sizes(sizes, xy, mesh_size=mesh_size)
+    xy, triangles = improve_plane(xy, triangles, label.astype(np.int32), mesh_size=size, passes=passes)
     return Strip(xy, triangles, building, inside)
 
 
 def strip_core(grid: TileGrid, seam: SeamKey, *, mesh_size: float) -> Bounds:
-    """Box of what counts for a seam, within the region (m)."""
+    """Box of what counts for a seam, within the region (m); `mesh_size` is the largest there."""
     reach = corner_reach(grid.tile_size) + RING * mesh_size
-    band = 0.0 if is_border(grid, seam) else band_width(grid.tile_size)
+    band = 0.0 if is_border(grid, seam) else band_width(grid.tile_size, grid.open_size)
     i, j = seam.i - grid.first.i, seam.j - grid.first.j
     x, y = grid.lines
     low = (x[i], y[j])

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 from pipeline.improve_plane import improve_plane
 from pipeline.mesh import PlaneMesh
 from pipeline.plane import check_areas, collect_graph, order_plane, triangulate_plane
+from pipeline.sizes import SizeField, SizeRule, local_sizes
 from stitch.corners import corner_sight
 from stitch.grid import band_width, corner_reach
+from stitch.patches import PATCH
 from stitch.seams import ON_WALL, Seam
-from stitch.strips import RING, label_triangles
-from stitch.walls import split_walls, walls_within
+from stitch.strips import MARGIN, RING, label_triangles
+from stitch.walls import LONGEST_PIECE, split_walls, walls_within
 
 CLEAR_OF_SEAMS = 1.2  # mesh sizes; vertices of a strip that the tile begins with are that far from its other seams
 CLEAR_OF_OTHERS = 0.6  # mesh sizes; that far from those of another strip
@@ -31,6 +33,7 @@ def mesh_tile(
     min_angle: float,
     refinements: int,
     passes: int,
+    sizes: SizeField | None = None,
 ) -> tuple[PlaneMesh, bool]:
     """Mesh a tile between its four seams.
 
@@ -42,7 +45,7 @@ def mesh_tile(
         Footprints, at least those that meet the tile.
     walls : float64, (w, 2, 2)
         Their walls in pieces (`cut_walls`).
-    mesh_size, min_angle, refinements, passes
+    mesh_size, min_angle, refinements, passes, sizes
         As in `mesh_plane`.
 
     Returns
@@ -70,28 +73,45 @@ def mesh_tile(
     inner = pieces[shapely.contains_xy(tile, middle[:, 0], middle[:, 1])]
     border = np.stack((ring, np.roll(ring, -1, axis=0)), axis=1)
     graph = collect_graph(np.concatenate((border, inner)), np.empty((0, 2)))
-    loose = _strip_vertices(sides, tile, inner, mesh_size)
+    loose = _strip_vertices(sides, tile, inner, mesh_size, sizes)
     xy, triangles, _, complete = triangulate_plane(
         replace(graph, xy=np.concatenate((graph.xy, loose))),
         max_area=mesh_size**2 / 2,
         min_angle=min_angle,
         refinements=refinements,
         frozen=True,
+        sizes=sizes,
     )
     label = label_triangles(xy, triangles, polygons)
-    xy, triangles = improve_plane(xy, triangles, label, mesh_size=mesh_size, passes=passes)
+    size = local_sizes(sizes, xy, mesh_size=mesh_size)
+    xy, triangles = improve_plane(xy, triangles, label, mesh_size=size, passes=passes)
     plane = order_plane(xy, triangles, label)
     check_areas(plane, tile.area, shapely.area(shapely.intersection(polygons, tile)), polygons)
     return plane, complete
 
 
-def tile_halo(tile_size: float, mesh_size: float) -> float:
+def tile_halo(tile_size: float, mesh_size: float, rule: SizeRule | None = None) -> float:
     """How far beyond a tile's lines buildings count for it and its seams, and terrain is sampled (m).
 
-    The adaptive mesher looks at terrain `top_reach` farther.
+    The adaptive mesher looks at terrain `top_reach` farther. Where sizes are graded, buildings count as far as
+    `sizes_halo`.
     """
+    if rule is not None:
+        return _strip_reach(tile_size, rule)
     widest = max(band_width(tile_size), corner_reach(tile_size)) + RING * mesh_size
     return max(widest, corner_sight(tile_size)) + mesh_size
+
+
+def sizes_halo(tile_size: float, rule: SizeRule) -> float:
+    """How far beyond a tile's lines walls count for the sizes in it and in the strips of its seams (m)."""
+    return _strip_reach(tile_size, rule) + rule.reach
+
+
+def _strip_reach(tile_size: float, rule: SizeRule) -> float:
+    """How far from a line strips and patches end (m)."""
+    band = max(band_width(tile_size, rule.open_size), corner_reach(tile_size))
+    widest = band + max(RING, PATCH) * rule.open_size + (LONGEST_PIECE + MARGIN) * rule.mesh_size
+    return max(widest, corner_sight(tile_size) + rule.mesh_size)
 
 
 def tile_ring(sides: Sides) -> NDArray[np.float64]:
@@ -101,7 +121,11 @@ def tile_ring(sides: Sides) -> NDArray[np.float64]:
 
 
 def _strip_vertices(
-    sides: Sides, tile: shapely.Polygon, walls: NDArray[np.float64], mesh_size: float
+    sides: Sides,
+    tile: shapely.Polygon,
+    walls: NDArray[np.float64],
+    mesh_size: float,
+    sizes: SizeField | None,
 ) -> NDArray[np.float64]:
     """Vertices of the strips beside the seams, within the tile."""
     lines = shapely.linestrings(walls)
@@ -110,11 +134,11 @@ def _strip_vertices(
     for side in sides:
         xy = np.delete(side.ring.xy, side.vertex, axis=0)
         xy = xy[shapely.contains_xy(tile, xy[:, 0], xy[:, 1])]
-        points = shapely.points(xy)
+        points, size = shapely.points(xy), local_sizes(sizes, xy, mesh_size=mesh_size)
         others = shapely.multilinestrings([shapely.LineString(other.xy) for other in sides if other is not side])
-        clear = shapely.distance(others, points) > CLEAR_OF_SEAMS * mesh_size
-        clear[wall_tree.query(points, predicate="dwithin", distance=CLEAR_OF_WALLS * mesh_size)[0]] = False
+        clear = shapely.distance(others, points) > CLEAR_OF_SEAMS * size
+        clear[wall_tree.query(points, predicate="dwithin", distance=CLEAR_OF_WALLS * size)[0]] = False
         earlier = shapely.STRtree(shapely.points(np.concatenate(chosen)))
-        clear[earlier.query(points, predicate="dwithin", distance=CLEAR_OF_OTHERS * mesh_size)[0]] = False
+        clear[earlier.query(points, predicate="dwithin", distance=CLEAR_OF_OTHERS * size)[0]] = False
         chosen.append(xy[clear])
     return np.concatenate(chosen)

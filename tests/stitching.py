@@ -22,6 +22,7 @@ from pipeline.nodes import Levels
 from pipeline.plane import signed_areas
 from pipeline.pointcloud import PointCloud
 from pipeline.simplify import simplify_city
+from pipeline.sizes import SizeField, SizeRule, size_field
 from pipeline.spacing import SpacingLimits, domain_top, top_reach
 from pipeline.terrain import Dtm, compute_dtm, sample_dtm
 from pipeline.tile import build_city
@@ -32,7 +33,7 @@ from stitch.layered_seams import fill_corner_layers, fill_seam_layers
 from stitch.patches import mesh_patch
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
 from stitch.seams import Seam, trace_seam
-from stitch.tiles import mesh_tile, tile_halo
+from stitch.tiles import mesh_tile, sizes_halo, tile_halo
 from stitch.walls import cut_walls
 from tests.cities import Bounds, city_of, crowded_blocks, hilly_dtm
 from tiler.clouds import find_clouds, read_points
@@ -144,12 +145,13 @@ def layers_of(scene: Scene, bounds: Bounds, options: LayeredOptions) -> NDArray[
     ]
 
 
-def clip_scene(scene: Scene, grid: TileGrid, tile: Key, options: Options) -> Scene:
+def clip_scene(scene: Scene, grid: TileGrid, tile: Key, options: Options, rule: SizeRule | None = None) -> Scene:
     """Take what a tile may look at, and nothing else."""
     i, j = tile.i - grid.first.i, tile.j - grid.first.j
     (xmin, xmax), (ymin, ymax) = grid.lines[0][i : i + 2], grid.lines[1][j : j + 2]
-    halo = tile_halo(grid.tile_size, options.mesh_size)
-    box = shapely.box(xmin - halo, ymin - halo, xmax + halo, ymax + halo)
+    halo = tile_halo(grid.tile_size, options.mesh_size, rule)
+    see = halo if rule is None else sizes_halo(grid.tile_size, rule)
+    box = shapely.box(xmin - see, ymin - see, xmax + see, ymax + see)
     near = select_houses(scene, np.flatnonzero(shapely.intersects(scene.model.polygons, box)))
     dtm, far = scene.dtm, halo + reach_of(options) + 2 * scene.dtm.spacing
     west, east, south, north = (
@@ -173,12 +175,13 @@ def mesh_alone(
     *,
     clip: bool = True,
     removed: NDArray[np.int32] | None = None,
+    rule: SizeRule | None = None,
 ) -> Tile:
     """Mesh one tile: its corners and seams first, from what its halo holds, or from the whole scene.
 
     With layers, those removed in each house are given, or chosen from the whole scene.
     """
-    near = clip_scene(scene, grid, tile, options) if clip else scene
+    near = clip_scene(scene, grid, tile, options, rule) if clip else scene
     model, size = near.model, options.mesh_size
     # Rows of the whole city, so that meshes from halos of any extent compare.
     order = np.argsort(scene.model.numbers)
@@ -186,19 +189,28 @@ def mesh_alone(
     if isinstance(options, LayeredOptions):
         removed = (layers_of(scene, grid.bounds, options) if removed is None else removed)[rows]
     walls = cut_walls(model.polygons, mesh_size=size)
+    sizes = size_field(walls, rule) if rule else None
     corners: dict[Key, Corner] = {}
     seams: dict[SeamKey, Seam] = {}
     columns: dict[SeamKey, Levels] = {}
     for key in seams_of_tile(tile):
         start, end = (
-            corners.setdefault(at, place_corner(grid, at, model.polygons, walls, mesh_size=size))
+            corners.setdefault(at, place_corner(grid, at, model.polygons, walls, mesh_size=size, sizes=sizes))
             for at in ends_of_seam(key)
         )
         seams[key] = seam = trace_seam(
-            grid, key, (start, end), model.polygons, walls, mesh_size=size, min_angle=MIN_ANGLE, passes=PASSES
+            grid,
+            key,
+            (start, end),
+            model.polygons,
+            walls,
+            mesh_size=size,
+            min_angle=MIN_ANGLE,
+            passes=PASSES,
+            sizes=sizes,
         )
         if not seam.border:
-            columns[key] = _seam_levels(seam, (start, end), near, walls, removed, grid, options)
+            columns[key] = _seam_levels(seam, (start, end), near, walls, removed, grid, options, sizes)
     south, east, north, west = (seams[key] for key in seams_of_tile(tile))
     plane, complete = mesh_tile(
         (south, east, north, west),
@@ -208,11 +220,14 @@ def mesh_alone(
         min_angle=MIN_ANGLE,
         refinements=REFINEMENTS,
         passes=PASSES,
+        sizes=sizes,
     )
     assert complete
     given = tile_columns(plane, [(seams[key], columns[key]) for key in columns])
     if isinstance(options, AdaptiveOptions):
-        mesh, _ = mesh_adaptive(plane, near.dtm, model.roof, near.group, model.ids, options, seam=given)
+        mesh, _ = mesh_adaptive(
+            plane, near.dtm, model.roof, near.group, model.ids, options, seam=given, sizes=sizes
+        )
     else:
         none = np.empty(0)
         mesh, _ = mesh_layers(plane, near.dtm, model, none, grid.bounds, options, removed=removed, seam=given)
@@ -220,10 +235,12 @@ def mesh_alone(
     return Tile(replace(mesh, plane=replace(plane, building=building)), seams, columns)
 
 
-def mesh_all(scene: Scene, grid: TileGrid, options: Options = OPTIONS) -> dict[Key, Tile]:
+def mesh_all(
+    scene: Scene, grid: TileGrid, options: Options = OPTIONS, *, rule: SizeRule | None = None
+) -> dict[Key, Tile]:
     """Mesh every tile alone."""
     removed = layers_of(scene, grid.bounds, options) if isinstance(options, LayeredOptions) else None
-    return {tile: mesh_alone(scene, grid, tile, options, removed=removed) for tile in tile_keys(grid)}
+    return {tile: mesh_alone(scene, grid, tile, options, removed=removed, rule=rule) for tile in tile_keys(grid)}
 
 
 def _seam_levels(
@@ -234,12 +251,13 @@ def _seam_levels(
     removed: NDArray[np.int32] | None,
     grid: TileGrid,
     options: Options,
+    sizes: SizeField | None,
 ) -> Levels:
     """Columns of a seam, those of its corners first."""
     dtm, roof, ids = near.dtm, near.model.roof, near.model.ids
     if isinstance(options, AdaptiveOptions):
-        start, end = (fill_corner(corner, dtm, roof, ids, options) for corner in ends)
-        return fill_seam(seam, (start, end), dtm, roof, ids, options)
+        start, end = (fill_corner(corner, dtm, roof, ids, options, sizes=sizes) for corner in ends)
+        return fill_seam(seam, (start, end), dtm, roof, ids, options, sizes=sizes)
     assert removed is not None
     start, end = (
         fill_corner_layers(
@@ -251,6 +269,7 @@ def _seam_levels(
                 grid.bounds,
                 mesh_size=options.mesh_size,
                 min_angle=MIN_ANGLE,
+                sizes=sizes,
             ),
             dtm,
             roof,

@@ -66,6 +66,9 @@ def test_every_parameter_is_an_option(capsys: pytest.CaptureFixture[str]) -> Non
         ({"clearance_floor": 2.0}, "clearance_floor = 2 m: must be at most clearance = 1 m"),
         ({"layer_height": 60.0, "mesher": "layered"}, "layer height 60 m: at most half of domain_height"),
         ({"mesh_size": 100.0}, "vertical spacing of up to 80 m .*: at most half of domain_height = 100 m"),
+        ({"open_size": 10.0}, "open_size = 10 m: must be above mesh_size = 10 m; 0 takes mesh_size everywhere"),
+        ({"open_size": 70.0}, r"of up to 56 m \(most_spacing x open_size\).*--most-spacing or --open-size"),
+        ({"grading": 0.0}, "grading = 0: must be above 0"),
         ({"least_spacing": 0.9}, "least_spacing = 0.9: must be at most most_spacing = 0.8"),
     ],
 )

@@ -163,7 +163,13 @@ def open_engine(config: Config) -> Iterator[tuple[Engine, Plan]]:
         (out / folder).mkdir(parents=True, exist_ok=True)
     plan = make_plan(config, lambda _: None)
     context = RunContext(
-        plan.region.bounds, plan.region.crs, config.tile_size, config.mesh_size, pack_tiles(plan.grid), str(out)
+        plan.region.bounds,
+        plan.region.crs,
+        config.tile_size,
+        config.mesh_size,
+        pack_tiles(plan.grid),
+        str(out),
+        config.open_size,
     )
     parameters = SimpleNamespace(
         **dataclasses.asdict(config),

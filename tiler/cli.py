@@ -120,7 +120,10 @@ def make_parser() -> argparse.ArgumentParser:
     render.add_argument("directory", type=Path, help="folder of a run")
     render.add_argument("-o", "--output", type=Path, required=True, help="PNG file to write")
     render.add_argument(
-        "--what", choices=("boundary", "mesh", "overview", "tiles"), default="boundary", help="what to draw"
+        "--what",
+        choices=("boundary", "mesh", "overview", "tiles", "sizes"),
+        default="boundary",
+        help="what to draw; sizes: triangles from above, by the length of their edges",
     )
     _add_export(command("export", _export, "write the mesh of a run for other programs, each vertex once"))
     command("config", _config, "print all parameters of a run, annotated, as a configuration file")

@@ -140,6 +140,13 @@ class Config:
         10.0, "mesh", "target edge length h: triangles of the plane mesh have about h^2/2 at most", unit="m",
         source="paper, step 3.1", least=0.1,
     )  # fmt: skip
+    open_size: float = _parameter(
+        0.0, "mesh", "target edge length far from walls, above mesh_size, which is that at walls; 0 takes "
+        "mesh_size everywhere", unit="m", least=0,
+    )  # fmt: skip
+    grading: float = _parameter(
+        0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size", above=0, most=1
+    )
     min_angle: float = _parameter(
         0.0, "mesh", "least angle of the plane mesh, but at sharp corners; 0 takes the mesher's own: 28 adaptive, "
         "25 layered", unit="degrees", source="paper, step 3.1", least=0, most=32,
@@ -210,6 +217,11 @@ class Config:
     )
 
     @property
+    def largest_size(self) -> float:
+        """Largest target edge length (m)."""
+        return self.open_size or self.mesh_size
+
+    @property
     def layer_height_or_default(self) -> float:
         """Height of a layer (m): the mesh size where none is given."""
         return self.layer_height or self.mesh_size
@@ -242,7 +254,8 @@ def idle_parameters(config: Config) -> list[str]:
     ['smoother = fem has no effect: it counts with mesher = layered']
     """
     default = Config()
-    return [
+    idle = [f"grading = {config.grading} has no effect: it counts with open_size"]
+    return idle * (config.grading != default.grading and not config.open_size) + [
         f"{name} = {getattr(config, name)} has no effect: it counts with {other} = {value}"
         for name, (other, value) in CONDITIONS.items()
         if getattr(config, name) != getattr(default, name) and getattr(config, other) != value
@@ -439,20 +452,27 @@ def _check_together(config: Config) -> None:
         raise ConfigError(
             f"clearance_floor = {config.clearance_floor:g} m: must be at most clearance = {config.clearance:g} m"
         )
+    if config.open_size and config.open_size <= config.mesh_size:
+        raise ConfigError(
+            f"open_size = {config.open_size:g} m: must be above mesh_size = {config.mesh_size:g} m; 0 takes "
+            "mesh_size everywhere"
+        )
     if config.least_spacing > config.most_spacing:
         raise ConfigError(
             f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
         )
-    layer, most = config.layer_height_or_default, config.most_spacing * config.mesh_size
+    layer, most = config.layer_height_or_default, config.most_spacing * config.largest_size
     if config.mesher == "layered" and layer > config.domain_height / 2:
         raise ConfigError(
             f"layer height {layer:g} m: at most half of domain_height = {config.domain_height:g} m; lower "
             "--layer-height or raise --domain-height"
         )
+    name = "open_size" if config.open_size else "mesh_size"
     if config.mesher == "adaptive" and most > config.domain_height / 2:
         raise ConfigError(
-            f"vertical spacing of up to {most:g} m (most_spacing x mesh_size): at most half of domain_height = "
-            f"{config.domain_height:g} m; lower --most-spacing or --mesh-size, or raise --domain-height"
+            f"vertical spacing of up to {most:g} m (most_spacing x {name}): at most half of domain_height = "
+            f"{config.domain_height:g} m; lower --most-spacing or --{name.replace('_', '-')}, or raise "
+            "--domain-height"
         )
 
 

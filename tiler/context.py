@@ -43,6 +43,8 @@ class RunContext:
         Which tiles there are, see `pack_tiles`.
     out : str
         Folder of the run's files.
+    open_size : float
+        Largest target edge length (m) where sizes are graded, else 0.
     """
 
     bounds: Bounds
@@ -51,11 +53,12 @@ class RunContext:
     mesh_size: float
     present: bytes
     out: str
+    open_size: float = 0.0
 
     @property
     def grid(self) -> TileGrid:
         """The tile grid."""
-        return _grid(self.bounds, self.tile_size, self.mesh_size, self.present)
+        return _grid(self.bounds, self.tile_size, self.mesh_size, self.open_size, self.present)
 
 
 def choose_tiles(grid: TileGrid, boxes: list[Box]) -> TileGrid:
@@ -184,8 +187,8 @@ def _named_boxes(grid: TileGrid, prefix: str, low: NDArray[np.int64], high: NDAr
 
 
 @lru_cache(maxsize=8)
-def _grid(bounds: Bounds, tile_size: float, mesh_size: float, present: bytes) -> TileGrid:
-    grid = make_grid(bounds, tile_size=tile_size, mesh_size=mesh_size)
+def _grid(bounds: Bounds, tile_size: float, mesh_size: float, open_size: float, present: bytes) -> TileGrid:
+    grid = make_grid(bounds, tile_size=tile_size, mesh_size=mesh_size, open_size=open_size)
     if not present:
         return grid
     shape = tuple(len(axis) - 1 for axis in grid.lines)

@@ -4,12 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
+from pipeline.sizes import SizeField, local_sizes
 from stitch.grid import LEAST_TILE, TileGrid, seams_present, tiles_present
 from tiler.clouds import CloudHeader
 from tiler.config import Config
 from tiler.footprint_sample import FootprintSample
+from tiler.options import size_rule
 from tiler.planning import Survey
 from tiler.stage import Scope, Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
@@ -41,6 +44,8 @@ SECONDS_TO_START = 3.0
 MEASURED_ON = "a shared core of a cloud server (x86-64, 2026)"
 MEMORY_SHARE = 0.8  # of a worker's share of the machine, beyond which a tile is said not to fit
 LARGEST_TILE = 1.5  # tile sizes; side of a tile on the border
+LOOKS_A_SIDE = 16  # places along each side of a tile in which graded sizes are looked up
+MOST_LOOKS = 250_000  # in all tiles; fewer a tile where there are many, but four
 TILE_STEP = 50.0  # m; tile sizes that are proposed are multiples of it
 
 
@@ -212,17 +217,39 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
     houses, built, detail, octaves = (np.zeros_like(area) for _ in range(4))
     if sample is not None and len(sample):
         houses, built, detail, octaves = _house_sums(grid, sample, np.where(there, area, 0.0))
+    thin = _thinning(survey, sample, config)
     volume = np.maximum(area * height - built * min(BUILT_HEIGHT, height), 0.0)
     if config.mesher == "adaptive":
         spacing = h * FULL_SPACING / 0.8 * min(config.most_spacing, 1.0)
-        cells = 3 * TRIANGLES * volume / (h**2 * spacing) + CELLS_AT_WALLS * height * detail
+        cells = 3 * TRIANGLES * volume * thin / (h**2 * spacing) + CELLS_AT_WALLS * height * detail
     else:
         layers = max(round(height / config.layer_height_or_default), 1)
-        triangles = TRIANGLES * area / h**2 + TRIANGLES_AN_OCTAVE * octaves
+        triangles = TRIANGLES * area * thin / h**2 + TRIANGLES_AN_OCTAVE * octaves
         cells = 3 * layers * triangles * volume / (area * height)
     index = np.argwhere(there) + grid.first
     points = spread_points(grid, survey.clouds)
     return TileLoads(index, *(values[there] for values in (area, points, houses, cells)))
+
+
+def _thinning(survey: Survey, sample: FootprintSample | None, config: Config) -> NDArray[np.float64]:
+    """How many cells open ground has with graded sizes, of those without, in each tile: float64 (nx, ny).
+
+    Sizes are looked up in some places of each tile. Footprints that are not known are taken to be everywhere.
+    """
+    x, y = survey.grid.lines
+    shape = len(x) - 1, len(y) - 1
+    known = sample.complete if sample is not None else not config.footprints
+    if not config.open_size or not known:
+        return np.ones(shape)
+    side = int(np.clip(np.sqrt(MOST_LOOKS / (shape[0] * shape[1])), 2, LOOKS_A_SIDE))
+    places = (np.arange(side) + 0.5) / side
+    columns, rows = ((axis[:-1, None] + np.diff(axis)[:, None] * places).ravel() for axis in (x, y))
+    xy = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1).reshape(-1, 2)
+    houses = shapely.STRtree(sample.polygons if sample is not None else [])
+    size = local_sizes(SizeField(size_rule(config), houses), xy, mesh_size=config.mesh_size)
+    share = (config.mesh_size / size) ** (3 if config.mesher == "adaptive" else 2)
+    mean: NDArray[np.float64] = share.reshape(shape[0], side, shape[1], side).mean(axis=(1, 3))
+    return mean
 
 
 def _house_sums(
@@ -259,7 +286,7 @@ def _memory_warnings(
     per_area = ((tile_memory - BASE_MEMORY) / area).max()  # tiles on the border may be larger than others
     side = np.sqrt(max(limit - BASE_MEMORY, 0.0) / per_area) / LARGEST_TILE
     size = np.floor(side / TILE_STEP) * TILE_STEP
-    if size >= max(LEAST_TILE * config.mesh_size, TILE_STEP):
+    if size >= max(LEAST_TILE * config.largest_size, TILE_STEP):
         return [f"{words}; give --tile-size {size:g}, or fewer --workers"]
     return [f"{words}; give fewer --workers with more memory each, or a larger --mesh-size"]
 

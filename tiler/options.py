@@ -5,6 +5,7 @@ from typing import Any
 from pipeline.adaptive import AdaptiveOptions
 from pipeline.city import CityOptions
 from pipeline.layered import LayeredOptions
+from pipeline.sizes import SizeRule
 from pipeline.spacing import SpacingLimits
 from pipeline.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
 from tiler.config import Config
@@ -17,6 +18,8 @@ CITY_PARAMETERS = (
 )
 # Parameters of seams and plane meshes.
 PLANE_PARAMETERS = ("mesh_size", "min_angle", "mesher")
+# Further ones of both where sizes are graded.
+SIZE_PARAMETERS = ("open_size", "grading")
 # Parameters of the columns.
 LAYER_PARAMETERS = (
     *("mesh_size", "mesher", "domain_height", "least_spacing", "most_spacing", "stagger", "improve_passes"),
@@ -77,6 +80,11 @@ def mesh_options(given: Any) -> LayeredOptions | AdaptiveOptions:
         tolerance=given.smoothing_tolerance,
         fem_tolerance=given.fem_tolerance,
     )
+
+
+def size_rule(given: Any) -> SizeRule:
+    """Rule of the sizes in the plane, where ``open_size`` is given."""
+    return SizeRule(given.mesh_size, given.open_size, given.grading)
 
 
 def plane_options(given: Any) -> dict[str, Any]:

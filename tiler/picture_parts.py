@@ -47,6 +47,17 @@ def heights_above_ground(city: City) -> NDArray[np.float64]:
     return np.where(city.building < 0, 0.0, (top - foot)[row])
 
 
+def tile_keys(city: City) -> NDArray[np.int64]:
+    """Column and row of the tile of each piece, int64 (p, 2).
+
+    Raises
+    ------
+    InputError
+        If a piece is not named after a tile.
+    """
+    return np.array([_read_key(name) for name in city.names], np.int64)
+
+
 def tile_colours(city: City) -> NDArray[np.uint8]:
     """Colour facets by tile: walls paler than the ground, roofs in full colour.
 
@@ -55,8 +66,7 @@ def tile_colours(city: City) -> NDArray[np.uint8]:
     InputError
         If a piece is not named after a tile.
     """
-    keys = np.array([_read_key(name) for name in city.names])
-    odd, white = (keys % 2)[city.piece], np.zeros(max(Marker) + 1)
+    odd, white = (tile_keys(city) % 2)[city.piece], np.zeros(max(Marker) + 1)
     white[list(TILE_WHITE)] = list(TILE_WHITE.values())
     colours = np.array([[list(bytes.fromhex(colour[1:])) for colour in row] for row in TILE_COLOURS])
     share = white[city.marker][:, None]

@@ -129,10 +129,12 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     region = Region(
         choose_bounds(config.bounds, headers), f"EPSG:{code}" if code else crs.to_wkt(), config.tile_size
     )
-    check_region(region, config.mesh_size, headers)
+    check_region(region, config.largest_size, headers, kind="open" if config.open_size else "mesh")
     check_sizes(region, config)
     clouds = [header for header in headers if header.n_points and _meets(header, region)]
-    whole = make_grid(region.bounds, tile_size=config.tile_size, mesh_size=config.mesh_size)
+    whole = make_grid(
+        region.bounds, tile_size=config.tile_size, mesh_size=config.mesh_size, open_size=config.open_size
+    )
     grid = choose_tiles(whole, [header.bounds[:4] for header in clouds])
     present = tiles_present(grid)
     n_tiles, n_absent = int(present.sum()), int((~present).sum())

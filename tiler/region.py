@@ -105,8 +105,8 @@ def check_sizes(region: Region, config: Config) -> None:
             f"{MOST_NODES:.3g}; raise --dtm-spacing or lower --tile-size"
         )
     layered = config.mesher == "layered"
-    spacing = config.layer_height_or_default if layered else config.most_spacing * config.mesh_size
-    cells = 6 * area / config.mesh_size**2 * config.domain_height / spacing
+    spacing = config.layer_height_or_default if layered else config.most_spacing * config.largest_size
+    cells = 6 * area / config.largest_size**2 * config.domain_height / spacing
     if cells > MOST_CELLS:
         raise ConfigError(
             f"mesh_size = {config.mesh_size:g} m: at least {cells:.3g} cells in a tile of {region.tile_size:g} m "
@@ -114,9 +114,10 @@ def check_sizes(region: Region, config: Config) -> None:
         )
 
 
-def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]) -> None:
+def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader], *, kind: str = "mesh") -> None:
     """Refuse a region that is smaller than a cell, or tiles that are too small for the cells or too many.
 
+    The size of cells is the largest one, and its `kind` says which option gives it, ``mesh`` or ``open``.
     A single file that is much larger than a tile is named: a few astray points make its extent absurd.
 
     Raises
@@ -128,12 +129,12 @@ def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]
     if min(width, height) < mesh_size:
         raise ConfigError(
             f"region {_words(region.bounds)}: {width:g} x {height:g} m is smaller than one cell of "
-            f"{mesh_size:g} m; lower --mesh-size or give larger --bounds"
+            f"{mesh_size:g} m; lower --{kind}-size or give larger --bounds"
         )
     if region.tile_size < LEAST_TILE * mesh_size:
         raise ConfigError(
-            f"tile size {region.tile_size:g} m is below {LEAST_TILE:g} mesh sizes of {mesh_size:g} m; give "
-            f"--tile-size {math.ceil(LEAST_TILE * mesh_size)} or more, or lower --mesh-size"
+            f"tile size {region.tile_size:g} m is below {LEAST_TILE:g} {kind} sizes of {mesh_size:g} m; give "
+            f"--tile-size {math.ceil(LEAST_TILE * mesh_size)} or more, or lower --{kind}-size"
         )
     for cloud in clouds:
         span = max(cloud.bounds[2] - cloud.bounds[0], cloud.bounds[3] - cloud.bounds[1])

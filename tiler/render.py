@@ -12,9 +12,16 @@ from tiler.atomic import replacing
 from tiler.picture_data import City, load_air, load_city
 from tiler.picture_parts import add_air, add_houses, add_terrain
 from tiler.plain_picture import PlainPlotter, has_graphics
+from tiler.sizes_picture import draw_sizes
 
 # Pictures, and their sizes (pixels) where nothing else is asked for.
-SIZES = {"boundary": (1600, 1000), "mesh": (1600, 1000), "overview": (2000, 640), "tiles": (1600, 1000)}
+SIZES = {
+    "boundary": (1600, 1000),
+    "mesh": (1600, 1000),
+    "overview": (2000, 640),
+    "tiles": (1600, 1000),
+    "sizes": (1000, 1046),
+}
 # Compass direction that the camera stands in, and its angle over the horizon (degrees).
 VIEW = (215.0, 35.0)
 # The cut through the volume, which looks south, is seen more squarely.
@@ -45,8 +52,9 @@ def render_run(
         ``"boundary"``: terrain and houses from the south-west. ``"mesh"``: the same, and behind a cut
         through the middle the tetrahedra of the northern half. ``"overview"``: both side by side.
         ``"tiles"``: as ``"boundary"``, but coloured by tile: neighbours differ.
+        ``"sizes"``: triangles from above, coloured by the length of their edges, and by tile.
     size : (int, int), optional
-        Width and height (pixels); 1600 x 1000, for the overview 2000 x 640.
+        Width and height (pixels); 1600 x 1000, for the overview 2000 x 640, for the sizes 1000 x 1046.
 
     Raises
     ------
@@ -58,7 +66,8 @@ def render_run(
         If the picture cannot be written.
     InputError
         If a file of the run is missing, damaged, or has no ground; if there are more facets than a picture may
-        have (`tiler.picture_data.MOST_FACETS`); if, for ``"tiles"``, a piece is not named after a tile.
+        have (`tiler.picture_data.MOST_FACETS`); if, for ``"tiles"`` and ``"sizes"``, a piece is not named after a
+        tile.
 
     Notes
     -----
@@ -79,6 +88,9 @@ def render_run(
     # VTK says aloud that there is no display before it takes the way without one.
     with pv.vtk_verbosity("off"):
         city = load_city(directory)
+        if what == "sizes":
+            _save(draw_sizes(city, (columns, rows)), output)
+            return
         images = [_draw(pv, directory, city, part, (width, rows)) for part, width in panels]
     _save(np.hstack(images), output)
 

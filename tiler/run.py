@@ -233,7 +233,13 @@ def make_engine(
 ) -> Engine:
     """Make the engine of a run over the items of its plan; failures are set aside, or end it."""
     context = RunContext(
-        plan.region.bounds, plan.region.crs, config.tile_size, config.mesh_size, pack_tiles(plan.grid), str(out)
+        plan.region.bounds,
+        plan.region.crs,
+        config.tile_size,
+        config.mesh_size,
+        pack_tiles(plan.grid),
+        str(out),
+        config.open_size,
     )
     footprints = Path(config.footprints) if config.footprints else None
     parameters = SimpleNamespace(

@@ -15,6 +15,7 @@ from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.nodes import Levels
 from pipeline.notes import Note
 from pipeline.raster import Dtm
+from pipeline.sizes import SizeField, size_field
 from pipeline.spacing import top_reach
 from stitch.corners import Corner, place_corner
 from stitch.facets import Side, find_seam_edges
@@ -24,11 +25,18 @@ from stitch.numbering import corner_part, count_inner_points, count_points, firs
 from stitch.patches import mesh_patch
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
 from stitch.seams import Seam, find_vertices, trace_seam
-from stitch.tiles import Sides, mesh_tile, tile_halo
+from stitch.tiles import Sides, mesh_tile, sizes_halo, tile_halo
 from stitch.walls import cut_walls
 from tiler.config import Config
 from tiler.context import seam_key, seam_name, tile_key
-from tiler.options import LAYER_PARAMETERS, PLANE_PARAMETERS, mesh_options, plane_options
+from tiler.options import (
+    LAYER_PARAMETERS,
+    PLANE_PARAMETERS,
+    SIZE_PARAMETERS,
+    mesh_options,
+    plane_options,
+    size_rule,
+)
 from tiler.readers import grow, read_buildings, read_terrain
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.tables import Buildings
@@ -40,11 +48,12 @@ PARAMETERS = (*PLANE_PARAMETERS, *LAYER_PARAMETERS, "dtm_spacing", "tile_size")
 
 def mesh_stages(config: Config) -> list[Stage]:
     """Stages of seams and columns."""
-    halo = tile_halo(config.tile_size, config.mesh_size)
-    reads = (Read("model", halo, by_extent=True), Read("terrain", halo + terrain_halo(config)))
+    halo, see = _halos(config, graded=config.open_size > 0)
+    reads = (Read("model", see, by_extent=True), Read("terrain", halo + terrain_halo(config)))
+    names = (*PARAMETERS, *SIZE_PARAMETERS) if config.open_size else PARAMETERS
     return [
-        Stage("seams", Scope.SEAM, make_seam, reads, PARAMETERS),
-        Stage("columns", Scope.TILE, make_columns, (*reads, Read("seams", beside=True)), PARAMETERS, version=2),
+        Stage("seams", Scope.SEAM, make_seam, reads, names),
+        Stage("columns", Scope.TILE, make_columns, (*reads, Read("seams", beside=True)), names, version=2),
     ]
 
 
@@ -63,9 +72,11 @@ def make_seam(task: Task) -> Facts:
     buildings, dtm = _surroundings(task)
     polygons = buildings.model.polygons
     walls = cut_walls(polygons, mesh_size=given.mesh_size)
+    sizes = _sizes(walls, task)
     with task.step("3.1 seams"):
         start, end = (
-            place_corner(grid, corner, polygons, walls, mesh_size=given.mesh_size) for corner in ends_of_seam(key)
+            place_corner(grid, corner, polygons, walls, mesh_size=given.mesh_size, sizes=sizes)
+            for corner in ends_of_seam(key)
         )
         plane = plane_options(given)
         seam = trace_seam(
@@ -77,14 +88,15 @@ def make_seam(task: Task) -> Facts:
             mesh_size=given.mesh_size,
             min_angle=plane["min_angle"],
             passes=plane["passes"],
+            sizes=sizes,
         )
     task.put(**pack_seam(seam, buildings.model.numbers))
     facts = {"border": seam.border, "vertices": len(seam.xy)}
     if seam.border:
-        return facts | {"pinched": _fill_pinched(key, (start, end), dtm, buildings, walls, task)}
+        return facts | {"pinched": _fill_pinched(key, (start, end), dtm, buildings, walls, sizes, task)}
     with task.step("3.2-3.5 columns of seams"):
-        ends = (_fill_corner(start, dtm, buildings, walls, task), _fill_corner(end, dtm, buildings, walls, task))
-        levels = _fill(seam, ends, dtm, buildings, task)
+        first, last = (_fill_corner(corner, dtm, buildings, walls, sizes, task) for corner in (start, end))
+        levels = _fill(seam, (first, last), dtm, buildings, sizes, task)
     task.put(level_start=levels.start, level_z=levels.z, level_surface=levels.surface)
     return facts | {"points": count_points(levels)}
 
@@ -96,12 +108,13 @@ def make_columns(task: Task) -> Facts:
     buildings, dtm = _surroundings(task)
     model = buildings.model
     walls = cut_walls(model.polygons, mesh_size=given.mesh_size)
+    sizes = _sizes(walls, task)
     names = [seam_name(key) for key in seams_of_tile(tile_key(task.name))]
     found = {result.name: result for result in task.read("seams") if result.name in names}
     sides = tuple(unpack_seam(found[name].arrays, model.numbers) for name in names)
     with task.step("3.1 plane mesh"):
         plane, complete = mesh_tile(
-            _four(sides), model.polygons, walls, mesh_size=given.mesh_size, **plane_options(given)
+            _four(sides), model.polygons, walls, mesh_size=given.mesh_size, sizes=sizes, **plane_options(given)
         )
     inner = [k for k, seam in enumerate(sides) if not seam.border]
     given_columns = [(sides[k], unpack_levels(found[names[k]].arrays)) for k in inner]
@@ -112,7 +125,7 @@ def make_columns(task: Task) -> Facts:
         plane, [Side(sides[k], left=k < 2) for k in inner], seam_columns, model.roof, model.numbers
     )
     with task.step("3.2-3.5 columns"):
-        columns, report = _mesh(plane, dtm, buildings, options, seam_columns, task)
+        columns, report = _mesh(plane, dtm, buildings, options, seam_columns, sizes, task)
     _check(columns)
     edges, edge_seam = _add_straight_borders(plane, edges, sides, inner, task)
     if not complete:
@@ -204,30 +217,60 @@ def pack_columns(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> dict[str, NDAr
     }
 
 
+def _halos(given: Any, *, graded: bool) -> tuple[float, float]:
+    """How far beyond a box terrain is sampled, and buildings count (m)."""
+    if not graded:
+        halo = tile_halo(given.tile_size, given.mesh_size)
+        return halo, halo
+    rule = size_rule(given)
+    return tile_halo(given.tile_size, given.mesh_size, rule), sizes_halo(given.tile_size, rule)
+
+
+def _sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
+    """Sizes around walls; None where they are the same everywhere."""
+    return size_field(walls, size_rule(task.parameters)) if task.context.open_size else None
+
+
 def _surroundings(task: Task) -> tuple[Buildings, Dtm]:
     given = task.parameters
-    halo = tile_halo(given.tile_size, given.mesh_size)
-    buildings = read_buildings(task, grow(task.box, halo))
+    halo, see = _halos(given, graded=task.context.open_size > 0)
+    buildings = read_buildings(task, grow(task.box, see))
     reach = grow(task.box, halo + terrain_halo(given))
     return buildings, read_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
 
 
-def _fill_corner(corner: Corner, dtm: Dtm, buildings: Buildings, walls: NDArray[np.float64], task: Task) -> Levels:
+def _fill_corner(
+    corner: Corner,
+    dtm: Dtm,
+    buildings: Buildings,
+    walls: NDArray[np.float64],
+    sizes: SizeField | None,
+    task: Task,
+) -> Levels:
     """Column of a corner, of the mesher that is chosen."""
     given, bounds = task.parameters, task.context.bounds
     options, model = mesh_options(given), buildings.model
     if isinstance(options, AdaptiveOptions):
-        return fill_corner(corner, dtm, model.roof, model.ids, options)
+        return fill_corner(corner, dtm, model.roof, model.ids, options, sizes=sizes)
     angle = plane_options(given)["min_angle"]
-    patch = mesh_patch(corner, model.polygons, walls, bounds, mesh_size=given.mesh_size, min_angle=angle)
+    patch = mesh_patch(
+        corner, model.polygons, walls, bounds, mesh_size=given.mesh_size, min_angle=angle, sizes=sizes
+    )
     return fill_corner_layers(corner, patch, dtm, model.roof, model.ids, buildings.layers, bounds, options)
 
 
-def _fill(seam: Seam, ends: tuple[Levels, Levels], dtm: Dtm, buildings: Buildings, task: Task) -> Levels:
+def _fill(
+    seam: Seam,
+    ends: tuple[Levels, Levels],
+    dtm: Dtm,
+    buildings: Buildings,
+    sizes: SizeField | None,
+    task: Task,
+) -> Levels:
     """Columns of a seam within the region, of the mesher that is chosen."""
     options, model = mesh_options(task.parameters), buildings.model
     if isinstance(options, AdaptiveOptions):
-        return fill_seam(seam, ends, dtm, model.roof, model.ids, options)
+        return fill_seam(seam, ends, dtm, model.roof, model.ids, options, sizes=sizes)
     bounds = task.context.bounds
     return fill_seam_layers(seam, ends, dtm, model.roof, model.ids, buildings.layers, bounds, options)
 
@@ -238,25 +281,32 @@ def _fill_pinched(
     dtm: Dtm,
     buildings: Buildings,
     walls: NDArray[np.float64],
+    sizes: SizeField | None,
     task: Task,
 ) -> list[list[int]]:
     """Fill the columns of the ends of a border in which two tiles meet alone; tell which, with their points."""
     pinched = []
     for k, (corner, place) in enumerate(zip(ends_of_seam(key), ends, strict=True)):
         if is_pinched(task.context.grid, corner):
-            levels = _fill_corner(place, dtm, buildings, walls, task)
+            levels = _fill_corner(place, dtm, buildings, walls, sizes, task)
             task.put(**{f"end{k}_start": levels.start, f"end{k}_z": levels.z, f"end{k}_surface": levels.surface})
             pinched.append([k, len(levels.z)])
     return pinched
 
 
 def _mesh(
-    plane: PlaneMesh, dtm: Dtm, buildings: Buildings, options: Any, seam: Any, task: Task
+    plane: PlaneMesh,
+    dtm: Dtm,
+    buildings: Buildings,
+    options: Any,
+    seam: Any,
+    sizes: SizeField | None,
+    task: Task,
 ) -> tuple[ColumnMesh, Any]:
     model = buildings.model
     group: NDArray[np.int32] = np.unique(buildings.group, return_inverse=True)[1].reshape(-1).astype(np.int32)
     if isinstance(options, AdaptiveOptions):
-        return mesh_adaptive(plane, dtm, model.roof, group, model.ids, options, seam=seam)
+        return mesh_adaptive(plane, dtm, model.roof, group, model.ids, options, seam=seam, sizes=sizes)
     return mesh_layers(
         plane,
         dtm,
