@@ -101,7 +101,8 @@ def first_layers(mesh: ColumnMesh, city: CityModel, *, beyond: float) -> NDArray
     """Heights of the first layer (m) in columns over open ground farther from walls than that."""
     free = shapely.distance(shapely.union_all(city.polygons), shapely.points(mesh.plane.xy)) > beyond
     assert free.sum() > 30
-    return (mesh.z[mesh.z_start[:-1] + 1] - mesh.z[mesh.z_start[:-1]])[free]
+    height: NDArray[np.float64] = (mesh.z[mesh.z_start[:-1] + 1] - mesh.z[mesh.z_start[:-1]])[free]
+    return height
 
 
 @pytest.mark.parametrize("growth", [GROWTH, Growth(1.0, 1.3), Growth(2.0, 1.0)])
