@@ -11,13 +11,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from pipeline.errors import CityError, InputError, OutputError
+from pipeline.errors import CityError, OutputError
 from stitch.grid import seams_of_tile
 from tiler.atomic import replacing
 from tiler.audit import Audit
-from tiler.config import Config, check_height
+from tiler.config import Config
 from tiler.context import RunContext, pack_tiles, seam_name, tile_key
-from tiler.domain import Domain, settle
 from tiler.engine import Engine, Progress, StoppedError
 from tiler.executors import Executor, connect, local, serial, share_memory
 from tiler.failures import Policy
@@ -26,7 +25,7 @@ from tiler.forecast import warn_of_memory
 from tiler.keys import code_versions
 from tiler.limits import TASKS, Limits, machine_memory
 from tiler.manifest import find_remade, write_manifest
-from tiler.options import derived_parameters, needs_region
+from tiler.options import derived_parameters
 from tiler.out_folder import (
     INDEXES,
     MANIFEST_PATH,
@@ -51,15 +50,14 @@ from tiler.quarantine import (
     stop_at_holes,
 )
 from tiler.seal import seal
+from tiler.settling import domain_of_run, settle_domain, take_domain
 from tiler.stage import REGION_ITEM, Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
-from tiler.stages.domain import domain_stages, layer_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
 from tiler.stopping import stops
-from tiler.store import Store
 from tiler.summary import describe_tasks, summarise_run
 from tiler.task import peak_memory
 from tiler.vtk_files import write_pvtp, write_pvtu
@@ -290,7 +288,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
             engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
             run_city_stages(engine, alone)
             seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
-            domain = _domain_of_run(config)
+            domain = domain_of_run(config)
             take_domain(engine, alone, domain)
             engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
             (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
@@ -318,41 +316,6 @@ def run_stages(engine: Engine, config: Config) -> int:
             engine.give_up(("pieces", tile), ("columns", tile))
         engine.run(*piece_stages(config))
     return rounds
-
-
-def settle_domain(engine: Engine, config: Config) -> Domain:
-    """Measure the city model, and decide height and top of the domain, which later stages take as parameters.
-
-    Parameters
-    ----------
-    engine : Engine
-        Engine, `run_city_stages` done.
-    config : Config
-        Parameters of the run.
-
-    Raises
-    ------
-    ConfigError
-        If the height follows from buildings and there are none, or it is too low for the vertical spacing.
-    HolesError
-        If an item was set aside.
-    """
-    engine.run(*domain_stages(config))
-    stop_at_holes(engine)
-    domain = settle(config.domain_height, config.top, engine.records["domain", REGION_ITEM].facts)
-    take_domain(engine, config, domain)
-    return domain
-
-
-def take_domain(engine: Engine, config: Config, domain: Domain) -> None:
-    """Give the stages after the city model the height and top of the domain, and choose the layers that need them.
-
-    Parameters and errors as for `settle_domain`.
-    """
-    check_height(config, domain.height)
-    engine.add_parameters(domain_height=domain.height, top_elevation=domain.top)
-    engine.run(*layer_stages(config, domain))
-    stop_at_holes(engine)
 
 
 def run_city_stages(engine: Engine, config: Config) -> int:
@@ -383,20 +346,6 @@ def run_city_stages(engine: Engine, config: Config) -> int:
     engine.run(model_stage(config, last))
     stop_at_holes(engine)
     return last + 1
-
-
-def _domain_of_run(config: Config) -> Domain:
-    """Height and top of the domain of a whole run; from its store where they follow from all of the region."""
-    if not needs_region(config):
-        return Domain(config.expected_height, None)
-    try:
-        facts = Store(Path(config.out) / STORE).attributes("domain", REGION_ITEM)["facts"]
-    except InputError as error:
-        raise InputError(
-            f"{config.out}: the height of the domain follows from the whole region, and its run has not come that "
-            f"far ({error}); run it without --only first"
-        ) from None
-    return settle(config.domain_height, config.top, facts)
 
 
 @contextmanager
