@@ -99,6 +99,25 @@ def test_a_flat_top_above_grown_layers_is_proved_in_tiles_of_any_size(
     assert len(models[0]) >= 2
 
 
+@pytest.mark.long
+@pytest.mark.shared
+@pytest.mark.parametrize("mesher", ["adaptive", "layered"])
+def test_real_blocks_have_a_flat_top_above_grown_layers(shared_data: Path, mesher: str, tmp_path: Path) -> None:
+    data = shared_data / "amsterdam"
+    inputs = {"pointcloud": [str(data / "tiles")], "footprints": str(data / "footprints.gpkg")}
+    given = (
+        inputs
+        | CFD
+        | {"crs": "EPSG:28992"}
+        | {"first_layer": 1.0, "domain_height": "3H", "tile_size": 300.0, "mesher": mesher}
+    )
+    record = run(make_config(given | {"out": str(tmp_path)}))
+    report = prove(tmp_path)
+    assert report.facts["seam_faces"] > 5000
+    assert record["notes"][LOW_DOMAIN]["count"] == 1
+    assert record["quality"]["radius_ratio"]["0"] > 0.05
+
+
 @pytest.mark.parametrize(
     ("mesher", "options"),
     [

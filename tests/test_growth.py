@@ -21,6 +21,7 @@ from pipeline.nodes import no_seam, place_nodes, take_columns, triangle_surfaces
 from pipeline.plane import mesh_plane
 from pipeline.spacing import mean_edges, vertical_spacing
 from pipeline.terrain import Dtm, sample_dtm
+from pipeline.trim import count_removed_layers
 from stitch.grid import make_grid, tile_keys
 from tests.cities import city_of, crowded_blocks, hilly_dtm
 from tests.stitching import LAYERED, OPTIONS, mesh_all, prove_seams, random_scene
@@ -183,3 +184,19 @@ def test_seams_share_columns_that_grow_below_a_flat_top(mesher: str) -> None:
         assert np.abs(first / GROWTH.first - 1).max() < 0.1
         assert lowest_gap(tile.mesh)[1] == 0
         assert (tile.mesh.z[tile.mesh.z_start[1:] - 1] == top).all()
+
+
+def test_roofs_take_as_many_thin_layers_as_are_not_squeezed() -> None:
+    """0.4 of the levels below a roof must fit between the highest ground at a wall and the roof."""
+    flat = np.array([0.0, 1.0, 3.0, 7.0, 15.0])
+    for ground, layers in ((1.9, 2), (2.1, 1), (-9.0, 2)):
+        removed = count_removed_layers(
+            flat[None],
+            np.zeros(1, np.int64),
+            np.array([3.2]),
+            np.array([ground]),
+            np.zeros(1, np.int32),
+            layer_height=3.75,
+            flat_levels=flat,
+        )
+        assert removed.tolist() == [layers]
