@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.columns import plane_edges
 from pipeline.errors import GeometryError
+from pipeline.growth import Growth, movable_height
 from pipeline.improve_columns import improve_columns
 from pipeline.levels import fill_levels, stagger_columns
 from pipeline.mesh import ColumnMesh, PlaneMesh
@@ -34,13 +35,17 @@ class AdaptiveOptions:
     mesh_size : float
         Mesh size of the plane mesh (m).
     domain_height : float
-        Height of the domain above the smoothed terrain (m).
+        Height of the domain above the smoothed terrain, or above the highest terrain where its top is flat (m).
     limits : SpacingLimits
         Limits of the vertical spacing.
     stagger : float
         By how much neighbouring columns are shifted against each other: 0 for none, 1 for thirds of a step.
     passes : int
         Rounds of moving levels at the worst cells.
+    growth : Growth or None
+        How the vertical spacing grows from the ground up to the limits; None: it is the same at all heights.
+    top : float or None
+        Absolute height of the domain's top (m) if it is flat; None: it follows the smoothed terrain.
     """
 
     mesh_size: float
@@ -48,6 +53,8 @@ class AdaptiveOptions:
     limits: SpacingLimits
     stagger: float
     passes: int
+    growth: Growth | None = None
+    top: float | None = None
 
 
 @dataclass(frozen=True)
@@ -129,7 +136,12 @@ def mesh_adaptive(
     free &= ~np.repeat(np.isin(np.arange(len(plane.xy)), seam.vertex), count)
     size = local_sizes(sizes, plane.xy, mesh_size=options.mesh_size)
     spacing = vertical_spacing(mean_edges(plane), size, options.limits)
-    mesh, worst, improved = improve_columns(mesh, free, spacing, passes=options.passes)
+    if options.growth is not None:
+        lowest = sample_dtm(dtm, plane.xy) + movable_height(spacing, options.growth)
+        free &= levels.z > np.repeat(lowest, count)
+    mesh, worst, improved = improve_columns(
+        mesh, free, spacing, passes=options.passes, flat_cells=options.growth is not None
+    )
     report = AdaptiveReport(
         n_columns=len(plane.xy),
         n_levels=len(levels.z),
@@ -169,7 +181,10 @@ def _fill_columns(
 ) -> tuple[Levels, NDArray[np.int32], NDArray[np.float64]]:
     """Levels, where cells begin in them, and how far each node was moved (m)."""
     size, limits = options.mesh_size, options.limits
-    top = domain_top(dtm, plane.xy, domain_height=options.domain_height)
+    if options.top is None:
+        top = domain_top(dtm, plane.xy, domain_height=options.domain_height)
+    else:
+        top = np.full(len(plane.xy), options.top)
     air = HEADROOM * limits.most * size
     check_headroom(top, plane, roof, ids, domain_height=options.domain_height, air=air)
     local = local_sizes(sizes, plane.xy, mesh_size=size)
@@ -179,9 +194,10 @@ def _fill_columns(
         shift = options.stagger * stagger_columns(len(plane.xy), plane_edges(plane.triangles)[0])
     surface = triangle_surfaces(plane, roof)
     least_gap = np.full(len(plane.xy), limits.least * size)
-    nodes, moves = place_nodes(plane, surface, sample_dtm(dtm, plane.xy), seam, least_gap=least_gap)
+    ground = sample_dtm(dtm, plane.xy)
+    nodes, moves = place_nodes(plane, surface, ground, seam, least_gap=least_gap)
     _check_top(plane, nodes, top, least_gap, options.domain_height)
-    levels, bottom = fill_levels(nodes, top, spacing, shift, seam)
+    levels, bottom = fill_levels(nodes, top, spacing, shift, seam, ground=ground, growth=options.growth)
     return levels, bottom, moves
 
 

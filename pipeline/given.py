@@ -40,6 +40,7 @@ def find_given_levels(
     seam: SeamColumns,
     *,
     n_layers: int,
+    top: float | None = None,
 ) -> GivenLevels:
     """Collect the levels that step 3.5 keeps: the ground under air, every roof, and the columns of seams.
 
@@ -57,6 +58,8 @@ def find_given_levels(
         Columns that are given, all up to the domain's top.
     n_layers : int
         Layers of the slab.
+    top : float, optional
+        Absolute height of a flat top (m), which is given too.
 
     Raises
     ------
@@ -75,6 +78,8 @@ def find_given_levels(
     if (surface[vertex, level] != height).any():
         raise ValueError("two roofs of different heights that meet share a layer; choose layers by all that touch")
     z = np.where(surface == GROUND_SURFACE, ground[:, None], surface)
+    if top is not None:
+        z[:, -1] = top
     column, place = _seam_places(seam, n_layers)
     given = np.full((n, n_layers + 1), np.nan)
     given[column, place] = np.where(seam.levels.surface == TOP_SURFACE, np.nan, seam.levels.surface)

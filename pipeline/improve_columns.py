@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.columns import expand_cells
-from pipeline.mesh import ColumnMesh
+from pipeline.mesh import ColumnMesh, TetMesh
 
 WORST = 0.5  # levels of cells with a radius ratio below this may move
 SEARCH_SWEEPS = 10
@@ -21,7 +21,12 @@ LAST_STEP = 0.02  # of the first step
 
 
 def improve_columns(
-    mesh: ColumnMesh, free: NDArray[np.bool_], spacing: NDArray[np.float64], *, passes: int
+    mesh: ColumnMesh,
+    free: NDArray[np.bool_],
+    spacing: NDArray[np.float64],
+    *,
+    passes: int,
+    flat_cells: bool = False,
 ) -> tuple[ColumnMesh, tuple[float, float], int]:
     """Move free levels at the worst cells along their columns.
 
@@ -35,6 +40,9 @@ def improve_columns(
         Distance of levels in each column (m), which scales the search.
     passes : int
         Rounds of searching and merging; 0 returns the mesh as it is.
+    flat_cells : bool
+        Cells without a free level are flat on purpose, as those of a thin first layer: they do not count where the
+        rounds are compared.
 
     Returns
     -------
@@ -52,7 +60,7 @@ def improve_columns(
     """
     step = np.repeat(FIRST_STEP * spacing, np.diff(mesh.z_start))
     cells = expand_cells(mesh)
-    ratio, cost = _measure(cells.points, cells.cells)
+    ratio, cost = _measure_mesh(cells, free, flat_cells)
     best, least_cost = mesh, cost
     before = after = float(ratio.min())
     moved = 0
@@ -63,7 +71,7 @@ def improve_columns(
         moved += _search(points, cells.cells, np.flatnonzero(active), start, of_level, step)
         mesh = replace(mesh, z=points[:, 2].copy())
         cells = expand_cells(mesh)
-        ratio, cost = _measure(cells.points, cells.cells)
+        ratio, cost = _measure_mesh(cells, free, flat_cells)
         if cost < least_cost:
             best, least_cost, after = mesh, cost, float(ratio.min())
     return best, (before, after), moved
@@ -80,6 +88,14 @@ def radius_ratios(points: NDArray[np.float64], cells: NDArray[np.int32]) -> NDAr
     """
     ratio: NDArray[np.float64] = _measure(points, cells)[0]
     return ratio
+
+
+def _measure_mesh(mesh: TetMesh, free: NDArray[np.bool_], flat_cells: bool) -> tuple[NDArray[np.float64], float]:
+    """Radius ratio of every cell, and what the search minimises, over those that count."""
+    ratio, cost = _measure(mesh.points, mesh.cells)
+    if flat_cells:
+        cost = _measure(mesh.points, mesh.cells[free[mesh.cells].any(axis=1)])[1]
+    return ratio, cost
 
 
 def _levels_of(cells: NDArray[np.int32], chosen: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:

@@ -12,12 +12,13 @@ from pipeline.columns import expand_cells
 from pipeline.fem import solve_laplace
 from pipeline.given import GivenLevels, find_given_levels, take_used_levels
 from pipeline.groups import adjacent_houses
+from pipeline.growth import Growth, full_height, layer_levels
 from pipeline.mesh import ColumnMesh, PlaneMesh
 from pipeline.neighbours import check_groups, join_equal_roofs, part_neighbours
 from pipeline.nodes import Levels, SeamColumns, no_seam
 from pipeline.relax import guess_displacement, relax_columns
 from pipeline.repair import repair_columns
-from pipeline.slab import Bounds, lift_places, slab_reach, slab_window, smooth_slab
+from pipeline.slab import Bounds, SlabShape, lift_places, shape_levels, slab_reach, slab_window, smooth_slab
 from pipeline.terrain import Dtm, sample_dtm
 from pipeline.trim import check_headroom, count_removed_layers, first_kept, first_levels
 
@@ -45,6 +46,10 @@ class LayeredOptions:
         Residual over the diagonal (m) at which the fast path's step 3.5 stops.
     fem_tolerance : float
         Relative residual at which the finite elements stop.
+    growth : Growth or None
+        How layers grow from the ground up to `layer_height`; None: all have the same height.
+    top : float or None
+        Absolute height of the domain's top (m) if it is flat; None: it follows the smoothed terrain.
     """
 
     mesh_size: float
@@ -53,6 +58,8 @@ class LayeredOptions:
     smoother: Smoother
     tolerance: float
     fem_tolerance: float
+    growth: Growth | None = None
+    top: float | None = None
 
 
 @dataclass(frozen=True)
@@ -83,7 +90,21 @@ class LayeredReport:
 
 def count_layers(options: LayeredOptions) -> int:
     """Number of layers: the closest whole number, at least two."""
+    if options.growth is not None:
+        return len(layer_levels(options.domain_height, options.layer_height, options.growth)) - 1
     return max(round(options.domain_height / options.layer_height), 2)
+
+
+def slab_shape(options: LayeredOptions) -> SlabShape | None:
+    """Shape of the slab's layers; None for equal ones below a top that follows the terrain."""
+    if options.growth is None and options.top is None:
+        return None
+    if options.growth is None:
+        n_layers = count_layers(options)
+        return SlabShape(options.domain_height * np.arange(n_layers + 1) / n_layers, 0.0, options.top)
+    levels = layer_levels(options.domain_height, options.layer_height, options.growth)
+    calm = min(float(full_height(options.layer_height, options.growth)), options.domain_height)
+    return SlabShape(levels, calm, options.top)
 
 
 def terrain_reach(options: LayeredOptions) -> float:
@@ -145,7 +166,7 @@ def choose_layers(
     check_groups(roof, group)
     if len(roof) == 0:
         return np.empty(0, np.int32), 0
-    n_layers = count_layers(options)
+    n_layers, shape = count_layers(options), slab_shape(options)
     xy, building = shapely.get_coordinates(shapely.segmentize(polygons, options.mesh_size), return_index=True)
     places = np.unique(np.column_stack((building, xy)), axis=0)  # a ring's first vertex is its last as well
     levels = lift_places(
@@ -155,6 +176,7 @@ def choose_layers(
         domain_height=options.domain_height,
         n_layers=n_layers,
         grid_spacing=GRID_FACTOR * options.mesh_size,
+        shape=shape,
     )
     group = join_equal_roofs(pairs, roof, group)
     removed = count_removed_layers(
@@ -164,6 +186,7 @@ def choose_layers(
         wall_ground,
         group,
         layer_height=options.domain_height / n_layers,
+        flat_levels=None if options.growth is None or shape is None else shape.levels,
     )
     return part_neighbours(pairs, roof, group, removed, polygons, n_layers=n_layers)
 
@@ -284,17 +307,20 @@ def _settle(
 ) -> tuple[NDArray[np.float64], GivenLevels, LayeredReport]:
     """Steps 3.3 to 3.5: heights of all levels."""
     n_layers = count_layers(options)
-    layer_height = options.domain_height / n_layers
-    min_gap = MIN_GAP * layer_height
+    lowest = highest = options.domain_height / n_layers
+    shape = slab_shape(options)
+    if shape is not None:
+        lowest, highest = (float(step) for step in np.diff(shape.levels)[[0, -1]])
+    min_gap = MIN_GAP * lowest
     if options.smoother == "fem" and len(seam.vertex):
         raise ValueError("finite elements on one tile know nothing of its seams; take smoother columns")
     z, iterations = _follow_terrain(plane, dtm, bounds, n_layers, options)
     ground_only = np.zeros(z.shape, np.bool_)
     ground_only[:, 0] = True
     z, moved_terrain = repair_columns(z, np.zeros(len(z), np.int32), ground_only, min_gap=min_gap)
-    check_headroom(z[:, -1], plane, roof, ids, domain_height=options.domain_height, air=layer_height / 2)
+    check_headroom(z[:, -1], plane, roof, ids, domain_height=options.domain_height, air=highest / 2)
     first = first_levels(plane, removed)
-    given = find_given_levels(plane, first, z[:, 0], roof, seam, n_layers=n_layers)
+    given = find_given_levels(plane, first, z[:, 0], roof, seam, n_layers=n_layers, top=options.top)
     fixed = given.stays | (np.arange(n_layers + 1) < given.kept[:, None])
     displacement = np.where(given.stays, given.z - z, 0.0)
     if options.smoother == "fem":
@@ -316,11 +342,22 @@ def _follow_terrain(
     options: LayeredOptions,
 ) -> tuple[NDArray[np.float64], int]:
     """Step 3.3: heights of all levels, and the iterations that it took."""
+    shape = slab_shape(options)
     if options.smoother == "columns":
         height, spacing = options.domain_height, GRID_FACTOR * options.mesh_size
         window = slab_window(plane.xy, bounds, domain_height=height, grid_spacing=spacing)
-        return smooth_slab(dtm, plane.xy, window, domain_height=height, n_layers=n_layers, grid_spacing=spacing), 0
-    flat = np.tile(np.linspace(0, options.domain_height, n_layers + 1), (len(plane.xy), 1))
+        z = smooth_slab(
+            dtm,
+            plane.xy,
+            window,
+            domain_height=height,
+            n_layers=n_layers,
+            grid_spacing=spacing,
+            shape=shape,
+        )
+        return z, 0
+    levels = np.linspace(0, options.domain_height, n_layers + 1) if shape is None else shape.levels
+    flat = np.tile(levels, (len(plane.xy), 1))
     first = np.zeros(len(plane.triangles), np.int32)
     fixed = np.zeros(flat.shape, np.bool_)
     fixed[:, 0] = True
@@ -332,7 +369,8 @@ def _follow_terrain(
         relative_tolerance=options.fem_tolerance,
         step="3.3",
     )
-    return flat + u.reshape(flat.shape), iterations
+    z = flat + u.reshape(flat.shape)
+    return z if shape is None else shape_levels(z, shape), iterations
 
 
 def _solve_fem(

@@ -4,6 +4,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.growth import Growth, count_steps, height_of_steps, stagger_weight
 from pipeline.nodes import TOP_SURFACE, Levels, Nodes, SeamColumns
 
 N_PHASES = 3
@@ -16,6 +17,9 @@ def fill_levels(
     spacing: NDArray[np.float64],
     shift: NDArray[np.float64],
     seam: SeamColumns,
+    *,
+    ground: NDArray[np.float64] | None = None,
+    growth: Growth | None = None,
 ) -> tuple[Levels, NDArray[np.int32]]:
     """Space levels evenly between the nodes of each column and up to its top.
 
@@ -31,6 +35,11 @@ def fill_levels(
         By which part of a step, between -1/2 and 1/2, the levels between two nodes are shifted.
     seam : SeamColumns
         Columns that are given: copied bit for bit.
+    ground : float64, (n,), optional
+        Terrain in each column (m), under buildings too; needed with `growth`.
+    growth : Growth, optional
+        Levels follow the steps that grow with the height above the ground, up to `spacing`; between two nodes all
+        are stretched or squeezed by the same part of a step. Shifts fade out towards the ground.
 
     Returns
     -------
@@ -41,11 +50,15 @@ def fill_levels(
     """
     given = np.full(len(top), -1, np.int64)
     given[seam.vertex] = np.arange(len(seam.vertex))
-    steps, start = _count_levels(nodes.start, nodes.z, top, spacing, given, seam.levels.start)
+    # Heights count from the ground, or from the lowest node where that is still lower.
+    base = nodes.z[nodes.start[:-1]] if ground is None else np.minimum(ground, nodes.z[nodes.start[:-1]])
+    first, ratio = (growth.first, growth.ratio) if growth else (0.0, 1.0)
+    law = (base, first, ratio)
+    steps, start = _count_levels(nodes.start, nodes.z, top, spacing, *law, given, seam.levels.start)
     z, surface = np.empty(start[-1]), np.full(start[-1], np.nan)
     level = np.empty(len(nodes.z), np.int64)
     _fill(
-        nodes.start, nodes.surface, nodes.z, top, shift, steps,
+        nodes.start, nodes.surface, nodes.z, top, spacing, *law, shift, steps,
         given, seam.levels.start, seam.levels.z, seam.levels.surface,
         start, z, surface, level,
     )  # fmt: skip
@@ -87,10 +100,13 @@ def _count_levels(
     node_z: NDArray[np.float64],
     top: NDArray[np.float64],
     spacing: NDArray[np.float64],
+    base: NDArray[np.float64],
+    first: float,
+    ratio: float,
     given: NDArray[np.int64],
     seam_start: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Steps above each node, and the first level of each column."""
+    """Steps above each node, and the first level of each column. A `first` layer of 0 stands for no growth."""
     n = len(top)
     steps = np.zeros(len(node_z), np.int64)
     start = np.zeros(n + 1, np.int64)
@@ -98,7 +114,11 @@ def _count_levels(
         count = 1
         for k in range(node_start[i], node_start[i + 1]):
             above = node_z[k + 1] if k + 1 < node_start[i + 1] else top[i]
-            steps[k] = max(1, int(np.floor((above - node_z[k]) / spacing[i] + 0.5)))
+            wanted = (above - node_z[k]) / spacing[i]
+            if first > 0:
+                wanted = count_steps(above - base[i], spacing[i], first, ratio)
+                wanted -= count_steps(node_z[k] - base[i], spacing[i], first, ratio)
+            steps[k] = max(1, int(np.floor(wanted + 0.5)))
             count += steps[k]
         if given[i] >= 0:
             count = seam_start[given[i] + 1] - seam_start[given[i]]
@@ -112,6 +132,10 @@ def _fill(
     node_surface: NDArray[np.float64],
     node_z: NDArray[np.float64],
     top: NDArray[np.float64],
+    spacing: NDArray[np.float64],
+    base: NDArray[np.float64],
+    first: float,
+    ratio: float,
     shift: NDArray[np.float64],
     steps: NDArray[np.int64],
     given: NDArray[np.int64],
@@ -125,11 +149,11 @@ def _fill(
 ) -> None:
     for i in range(len(top)):
         if given[i] >= 0:
-            first, node = seam_start[given[i]], node_start[i]
+            row, node = seam_start[given[i]], node_start[i]
             for k in range(start[i + 1] - start[i]):
-                z[start[i] + k] = seam_z[first + k]
-                surface[start[i] + k] = seam_surface[first + k]
-                if node < node_start[i + 1] and seam_surface[first + k] == node_surface[node]:
+                z[start[i] + k] = seam_z[row + k]
+                surface[start[i] + k] = seam_surface[row + k]
+                if node < node_start[i + 1] and seam_surface[row + k] == node_surface[node]:
                     level[node] = k
                     node += 1
             continue
@@ -141,8 +165,16 @@ def _fill(
             step = (above - below) / steps[node]
             z[at] = below
             surface[at] = node_surface[node]
-            for k in range(1, steps[node]):
-                z[at + k] = below + (k + shift[i]) * step
+            if first > 0:
+                low = count_steps(below - base[i], spacing[i], first, ratio)
+                part = (count_steps(above - base[i], spacing[i], first, ratio) - low) / steps[node]
+                for k in range(1, steps[node]):
+                    height = height_of_steps(low + k * part, spacing[i], first, ratio)
+                    moved = k + shift[i] * stagger_weight(height, spacing[i], first, ratio)
+                    z[at + k] = base[i] + height_of_steps(low + moved * part, spacing[i], first, ratio)
+            else:
+                for k in range(1, steps[node]):
+                    z[at + k] = below + (k + shift[i]) * step
             at += steps[node]
         z[at] = top[i]
         surface[at] = TOP_SURFACE

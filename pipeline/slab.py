@@ -8,6 +8,8 @@ What the terrain at some place adds fades with the distance d like exp(-pi d / (
 tile is as good as the region: `slab_window` for a mesh, `lift_places` for places that belong to none.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
@@ -18,6 +20,27 @@ REACH = 3.0  # domain heights; terrain farther from a mesh counts for nothing
 BLOCK = 1.0  # domain heights; side of the squares that `lift_places` works in
 
 Bounds = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SlabShape:
+    """How the layers of a slab differ from equal ones that all follow the terrain by Laplace's equation.
+
+    Attributes
+    ----------
+    levels : float64, (n_layers + 1,)
+        Heights of the levels on flat ground (m), from 0 to the slab's thickness.
+    calm : float
+        Height (m) below which the equation's levels turn, with its square, into those that stand at their heights
+        above the terrain; 0 if none do. Thin layers would otherwise follow the slope, and cross small bumps.
+    top : float or None
+        Absolute height of a flat top (m), to which levels are drawn with the square of their height; None leaves
+        the top as the equation has it.
+    """
+
+    levels: NDArray[np.float64]
+    calm: float
+    top: float | None
 
 
 def slab_reach(domain_height: float, *, grid_spacing: float) -> float:
@@ -63,6 +86,7 @@ def lift_places(
     domain_height: float,
     n_layers: int,
     grid_spacing: float,
+    shape: SlabShape | None = None,
 ) -> NDArray[np.float64]:
     """Give the levels of single places (step 3.3): each depends on its place and the terrain in reach alone.
 
@@ -91,6 +115,7 @@ def lift_places(
             domain_height=domain_height,
             n_layers=n_layers,
             grid_spacing=grid_spacing,
+            shape=shape,
         )
     return z
 
@@ -103,6 +128,7 @@ def smooth_slab(
     domain_height: float,
     n_layers: int,
     grid_spacing: float,
+    shape: SlabShape | None = None,
 ) -> NDArray[np.float64]:
     """Lift the layers of a slab so that they follow the terrain, less and less with height (step 3.3).
 
@@ -117,10 +143,12 @@ def smooth_slab(
     domain_height : float
         Thickness of the slab H (m).
     n_layers : int
-        Number of layers L of equal thickness.
+        Number of layers L, of equal thickness unless a shape is given.
     grid_spacing : float
         Distance of the nodes (m) between which the solution is interpolated; the bottom layer is the
         terrain itself.
+    shape : SlabShape, optional
+        Layers of other heights, and a flat top.
 
     Returns
     -------
@@ -139,10 +167,29 @@ def smooth_slab(
     z = np.empty((len(xy), n_layers + 1))
     z[:, 0] = sample_dtm(dtm, xy)
     for level in range(1, n_layers + 1):
-        height = domain_height * level / n_layers
+        height = domain_height * level / n_layers if shape is None else float(shape.levels[level])
         lifted = idctn(spectrum * _damping(wave, height, domain_height), type=1).ravel()
         z[:, level] = height + (lifted[node] * weight).sum(axis=1)
-    return z
+    return z if shape is None else shape_levels(z, shape)
+
+
+def shape_levels(z: NDArray[np.float64], shape: SlabShape) -> NDArray[np.float64]:
+    """Let the lowest levels keep their heights above the terrain, and the highest ones come to a flat top.
+
+    Parameters
+    ----------
+    z : float64, (n, n_layers + 1)
+        Levels after step 3.3 (m), the terrain first.
+    shape : SlabShape
+        What to make of them.
+    """
+    share = np.minimum(shape.levels / shape.calm, 1.0) ** 2 if shape.calm > 0 else np.ones(len(shape.levels))
+    shaped = share * z + (1 - share) * (z[:, :1] + shape.levels)
+    shaped[:, 0] = z[:, 0]
+    if shape.top is not None:
+        shaped += (shape.levels / shape.levels[-1]) ** 2 * (shape.top - shaped[:, -1:])
+        shaped[:, -1] = shape.top
+    return shaped
 
 
 def _clip(low: NDArray[np.float64], high: NDArray[np.float64], region: Bounds) -> Bounds:

@@ -18,6 +18,7 @@ def count_removed_layers(
     group: NDArray[np.int32],
     *,
     layer_height: float,
+    flat_levels: NDArray[np.float64] | None = None,
 ) -> NDArray[np.int32]:
     """Choose the layer that becomes the roof of each building: the closest, within limits (step 3.4).
 
@@ -35,6 +36,8 @@ def count_removed_layers(
         Buildings of one group have one roof, and so one layer.
     layer_height : float
         Height of a layer of the slab (m).
+    flat_levels : float64, (n_layers + 1,), optional
+        Heights of the levels on flat ground (m), where layers differ in height.
 
     Returns
     -------
@@ -58,6 +61,8 @@ def count_removed_layers(
     highest_ground = np.full(n_groups, -np.inf)
     np.maximum.at(highest_ground, member, wall_ground)
     room = np.floor((roof[first] - highest_ground) / (MIN_SQUEEZE * layer_height)).astype(np.int64)
+    if flat_levels is not None:
+        room = np.searchsorted(MIN_SQUEEZE * flat_levels, roof[first] - highest_ground, side="right") - 1
     removed = np.clip(np.minimum(closest, room), 1, n_layers - 1).astype(np.int32)
     of_building: NDArray[np.int32] = removed[member]
     return of_building

@@ -288,7 +288,7 @@ def test_another_cloud_in_place_of_one_reaches_the_tiles_under_it(nine: Town, tm
         ),
         pytest.param(
             {"domain_height": 75.0},
-            {"seams", "columns", "numbers", "pieces", "proofs", "report"},
+            {"domain", "seams", "columns", "numbers", "pieces", "proofs", "report"},
             marks=pytest.mark.long,
         ),
     ],

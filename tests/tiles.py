@@ -26,6 +26,7 @@ from tiler.executors import serial
 from tiler.options import derived_parameters
 from tiler.planning import Plan, identify, make_plan
 from tiler.run import run, run_city_stages
+from tiler.settling import settle_domain
 from tiler.stage import REGION_ITEM
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.mesh import mesh_stages
@@ -207,7 +208,7 @@ def column_arrays(values: dict[str, Any], out: Path, tile: str) -> tuple[dict[st
     config = make_config(values | {"out": str(out)})
     with open_engine(config) as (engine, plan):
         run_city_stages(engine, config)
-        seams, columns = mesh_stages(config)
+        seams, columns = mesh_stages(config, settle_domain(engine, config))
         box = shapely.box(*plan.layout.tiles[tile])
         near = [name for name, line in plan.layout.seams.items() if shapely.box(*line).intersects(box)]
         engine.run(seams, items={"seams": near})

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import CityError, ConfigError
 from tiler.config import Config, annotated_defaults, check_reach, load_config, make_config
+from tiler.domain import Height
 from tiler.export import FORMATS
 from tiler.plain_text import printable
 
@@ -144,6 +145,8 @@ def _add_parameters(parser: argparse.ArgumentParser) -> None:
             words["action"] = argparse.BooleanOptionalAction
         elif get_origin(wanted) is tuple:
             words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
+        elif wanted == Height:
+            words |= {"type": str, "metavar": "M|nH"}
         else:
             unit = "" if wanted is str else data["unit"].upper()
             words |= {"type": wanted, "metavar": unit or METAVARS[wanted]}

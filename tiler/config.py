@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import ConfigError
+from tiler.domain import EXPECTED_TALLEST, Height, height_in_metres, read_height
 from tiler.plain_text import shorten
 
 MAX_CONFIG_BYTES = 1_000_000
 MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
 MAX_INT = 2**53
 UNSET = ""
+LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
 
 def _parameter(
@@ -151,8 +153,20 @@ class Config:
         0.0, "mesh", "least angle of the plane mesh, but at sharp corners; 0 takes the mesher's own: 28 adaptive, "
         "25 layered", unit="degrees", source="paper, step 3.1", least=0, most=32,
     )  # fmt: skip
-    domain_height: float = _parameter(
-        100.0, "mesh", "height of the domain above the terrain", unit="m", source="paper, step 3.2", above=0
+    domain_height: float | str = _parameter(
+        100.0, "mesh", "height of the domain above the terrain: metres, or 6H for six times the height of the "
+        "tallest building", unit="m", source="paper, step 3.2", above=0,
+    )  # fmt: skip
+    top: str = _parameter(
+        "terrain", "mesh", "top of the domain: it follows the smoothed terrain, or is flat, domain_height above "
+        "the highest terrain of the region", choices=("terrain", "flat"),
+    )  # fmt: skip
+    first_layer: float = _parameter(
+        0.0, "mesh", "height of the lowest cells above open ground, from which vertical spacing grows; 0 for a "
+        "spacing that is the same at all heights", unit="m", least=0,
+    )  # fmt: skip
+    layer_growth: float = _parameter(
+        1.2, "mesh", "with first_layer: ratio by which each layer is higher than the one below it", least=1, most=3
     )
     mesher: str = _parameter(
         "adaptive", "mesh", "how columns are filled: each by its own levels, or by the paper's layers",
@@ -226,6 +240,11 @@ class Config:
         """Height of a layer (m): the mesh size where none is given."""
         return self.layer_height or self.mesh_size
 
+    @property
+    def expected_height(self) -> float:
+        """Height of the domain (m); before there is a city model, a multiple is that of an expected building."""
+        return height_in_metres(self.domain_height, EXPECTED_TALLEST)
+
 
 # Parameters that count only where another one has a certain value.
 CONDITIONS = {
@@ -254,12 +273,16 @@ def idle_parameters(config: Config) -> list[str]:
     ['smoother = fem has no effect: it counts with mesher = layered']
     """
     default = Config()
-    idle = [f"grading = {config.grading} has no effect: it counts with open_size"]
-    return idle * (config.grading != default.grading and not config.open_size) + [
+    idle = [
         f"{name} = {getattr(config, name)} has no effect: it counts with {other} = {value}"
         for name, (other, value) in CONDITIONS.items()
         if getattr(config, name) != getattr(default, name) and getattr(config, other) != value
     ]
+    if config.grading != default.grading and not config.open_size:
+        idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
+    if config.layer_growth != default.layer_growth and not config.first_layer:
+        idle.append(f"layer_growth = {config.layer_growth:g} has no effect: it counts with first_layer above 0")
+    return idle
 
 
 def load_config(path: Path) -> dict[str, Any]:
@@ -391,6 +414,10 @@ def _relative_to(folder: Path, name: str, value: Any) -> Any:
 
 
 def _convert(name: str, value: Any, wanted: Any) -> Any:
+    if wanted == Height:
+        wanted = str if isinstance(value, str) else float
+        converted = _convert(name, value, wanted)
+        return read_height(converted)
     if get_origin(wanted) is tuple:
         if isinstance(value, str) or not isinstance(value, (list, tuple)):
             value = [value]
@@ -461,19 +488,56 @@ def _check_together(config: Config) -> None:
         raise ConfigError(
             f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
         )
-    layer, most = config.layer_height_or_default, config.most_spacing * config.largest_size
-    if config.mesher == "layered" and layer > config.domain_height / 2:
+    spacing = largest_spacing(config)
+    if config.first_layer > spacing:
+        source = "layer_height" if config.mesher == "layered" else f"most_spacing x {_size_name(config)}"
         raise ConfigError(
-            f"layer height {layer:g} m: at most half of domain_height = {config.domain_height:g} m; lower "
-            "--layer-height or raise --domain-height"
+            f"first_layer = {config.first_layer:g} m: at most the largest vertical spacing, {spacing:g} m "
+            f"({source}); lower --first-layer"
         )
-    name = "open_size" if config.open_size else "mesh_size"
-    if config.mesher == "adaptive" and most > config.domain_height / 2:
+    if 0 < config.first_layer < LEAST_FIRST_LAYER * config.mesh_size:
         raise ConfigError(
-            f"vertical spacing of up to {most:g} m (most_spacing x {name}): at most half of domain_height = "
-            f"{config.domain_height:g} m; lower --most-spacing or --{name.replace('_', '-')}, or raise "
-            "--domain-height"
+            f"first_layer = {config.first_layer:g} m: at least {LEAST_FIRST_LAYER:g} of mesh_size = "
+            f"{config.mesh_size:g} m; raise --first-layer or lower --mesh-size"
         )
+    if not isinstance(config.domain_height, str):
+        check_height(config, config.domain_height)
+
+
+def largest_spacing(config: Config) -> float:
+    """Largest vertical spacing (m), of either mesher."""
+    if config.mesher == "layered":
+        return config.layer_height_or_default
+    return config.most_spacing * config.largest_size
+
+
+def _size_name(config: Config) -> str:
+    return "open_size" if config.open_size else "mesh_size"
+
+
+def check_height(config: Config, height: float) -> None:
+    """Refuse a domain of less than two layers.
+
+    Raises
+    ------
+    ConfigError
+        With the spacing against the height (m).
+    """
+    spacing = largest_spacing(config)
+    if spacing <= height / 2:
+        return
+    shown = f"domain_height = {height:g} m"
+    if isinstance(config.domain_height, str):
+        shown = f"domain_height = {config.domain_height}, here {height:g} m"
+    if config.mesher == "layered":
+        raise ConfigError(
+            f"layer height {spacing:g} m: at most half of {shown}; lower --layer-height or raise --domain-height"
+        )
+    name = _size_name(config)
+    raise ConfigError(
+        f"vertical spacing of up to {spacing:g} m (most_spacing x {name}): at most half of {shown}; lower "
+        f"--most-spacing or --{name.replace('_', '-')}, or raise --domain-height"
+    )
 
 
 def _toml(value: Any) -> str:

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -181,6 +182,10 @@ class Engine:
         finally:
             for planned in plan:
                 self._items[planned.stage.name] = (planned.stage.scope, self._recorded(planned))
+
+    def add_parameters(self, **values: Any) -> None:
+        """Give values to parameters that only what was run so far decides; those of the same name are replaced."""
+        self._parameters = SimpleNamespace(**(vars(self._parameters) | values))
 
     def stop(self) -> None:
         """Let what runs end, start nothing more, and end `run` with `StoppedError`."""

@@ -11,12 +11,14 @@ from pipeline.sizes import SizeField, local_sizes
 from stitch.grid import LEAST_TILE, TileGrid, seams_present, tiles_present
 from tiler.clouds import CloudHeader
 from tiler.config import Config
+from tiler.domain import Domain
 from tiler.footprint_sample import FootprintSample
-from tiler.options import size_rule
+from tiler.options import expected_levels, size_rule
 from tiler.planning import Survey
 from tiler.stage import Scope, Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
+from tiler.stages.domain import domain_stages, layer_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
@@ -178,6 +180,8 @@ def list_stages(config: Config) -> list[Stage]:
         shape_stage(0),
         *later_round(config, 1),
         model_stage(config, 0),
+        *domain_stages(config),
+        *layer_stages(config, Domain(config.expected_height, None)),
         *city_model_stages(),
         *mesh_stages(config),
         *piece_stages(config),
@@ -213,7 +217,7 @@ def _shares(lines: NDArray[np.float64], low: float, high: float) -> tuple[slice,
 def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> TileLoads:
     grid, there = survey.grid, tiles_present(survey.grid)
     area = np.multiply.outer(*(np.diff(axis) for axis in grid.lines))
-    h, height = config.mesh_size, config.domain_height
+    h, height = config.mesh_size, config.expected_height
     houses, built, detail, octaves = (np.zeros_like(area) for _ in range(4))
     if sample is not None and len(sample):
         houses, built, detail, octaves = _house_sums(grid, sample, np.where(there, area, 0.0))
@@ -221,9 +225,10 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
     volume = np.maximum(area * height - built * min(BUILT_HEIGHT, height), 0.0)
     if config.mesher == "adaptive":
         spacing = h * FULL_SPACING / 0.8 * min(config.most_spacing, 1.0)
-        cells = 3 * TRIANGLES * volume * thin / (h**2 * spacing) + CELLS_AT_WALLS * height * detail
+        closer = expected_levels(config, spacing) * spacing / height
+        cells = 3 * TRIANGLES * volume * thin / (h**2 * spacing) * closer + CELLS_AT_WALLS * height * detail
     else:
-        layers = max(round(height / config.layer_height_or_default), 1)
+        layers = max(round(expected_levels(config, config.layer_height_or_default)), 1)
         triangles = TRIANGLES * area * thin / h**2 + TRIANGLES_AN_OCTAVE * octaves
         cells = 3 * layers * triangles * volume / (area * height)
     index = np.argwhere(there) + grid.first

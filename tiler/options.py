@@ -4,11 +4,14 @@ from typing import Any
 
 from pipeline.adaptive import AdaptiveOptions
 from pipeline.city import CityOptions
+from pipeline.growth import Growth, count_steps
 from pipeline.layered import LayeredOptions
 from pipeline.sizes import SizeRule
 from pipeline.spacing import SpacingLimits
 from pipeline.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
 from tiler.config import Config
+from tiler.domain import Domain
+from tiler.task import Declared
 
 # Parameters of the city model; two are raised by what the mesh needs, see `derived_parameters`.
 CITY_PARAMETERS = (
@@ -41,6 +44,24 @@ def derived_parameters(config: Config) -> dict[str, float]:
     }
 
 
+def needs_region(config: Config) -> bool:
+    """Whether height and top of the domain follow from what the whole region holds."""
+    return config.top == "flat" or isinstance(config.domain_height, str)
+
+
+def layer_parameters(config: Config) -> tuple[str, ...]:
+    """Parameters of the columns: those of features only where these are used, so that keys stay without them."""
+    growth = ("first_layer", "layer_growth") if config.first_layer else ()
+    return (*LAYER_PARAMETERS, *growth, *(("top_elevation",) if config.top == "flat" else ()))
+
+
+def expected_levels(config: Config, spacing: float) -> float:
+    """Number of levels of a column over flat ground, for forecasts, with this spacing without growth (m)."""
+    if not config.first_layer:
+        return config.expected_height / spacing
+    return float(count_steps(config.expected_height, spacing, config.first_layer, config.layer_growth))
+
+
 def city_options(given: Any) -> CityOptions:
     """Options of steps 1.4 to 2.3; `given` has the parameters as attributes."""
     return CityOptions(
@@ -62,23 +83,31 @@ def city_options(given: Any) -> CityOptions:
     )
 
 
-def mesh_options(given: Any) -> LayeredOptions | AdaptiveOptions:
-    """Options of steps 3.2 to 3.5, of the mesher that is chosen."""
+def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | AdaptiveOptions:
+    """Options of steps 3.2 to 3.5, of the mesher that is chosen; with a domain, its height and top."""
+    if domain is None:
+        domain = Domain(given.domain_height, _optional(given, "top_elevation", None))
+    first = _optional(given, "first_layer", 0.0)
+    growth = Growth(first, given.layer_growth) if first else None
     if given.mesher == "adaptive":
         return AdaptiveOptions(
             mesh_size=given.mesh_size,
-            domain_height=given.domain_height,
+            domain_height=domain.height,
             limits=SpacingLimits(given.least_spacing, given.most_spacing),
             stagger=given.stagger,
             passes=given.improve_passes,
+            growth=growth,
+            top=domain.top,
         )
     return LayeredOptions(
         mesh_size=given.mesh_size,
         layer_height=given.layer_height_or_default,
-        domain_height=given.domain_height,
+        domain_height=domain.height,
         smoother="fem" if given.smoother == "fem" else "columns",
         tolerance=given.smoothing_tolerance,
         fem_tolerance=given.fem_tolerance,
+        growth=growth,
+        top=domain.top,
     )
 
 
@@ -95,3 +124,8 @@ def plane_options(given: Any) -> dict[str, Any]:
         "refinements": ADAPTIVE_REFINEMENTS if adaptive else 0,
         "passes": ADAPTIVE_PASSES if adaptive else 0,
     }
+
+
+def _optional(given: Any, name: str, default: Any) -> Any:
+    """Value of a parameter that a stage declares only where it counts."""
+    return given.get(name, default) if isinstance(given, Declared) else getattr(given, name, default)

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from tiler.config import Config
+from tiler.domain import Domain
 from tiler.engine import Engine
 from tiler.options import derived_parameters
 from tiler.stage import Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
+from tiler.stages.domain import domain_stages, layer_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
@@ -35,8 +37,9 @@ class OwnStages:
 def list_stages(config: Config) -> list[Stage]:
     """List the stages of a run in their order, as if its clusters of houses were simplified once."""
     stages = [*input_stages(config), house_stage(config), *first_round(config), shape_stage(0)]
-    stages += [*later_round(config, 1), model_stage(config, 0), *city_model_stages(), *mesh_stages(config)]
-    return stages + piece_stages(config)
+    stages += [*later_round(config, 1), model_stage(config, 0), *domain_stages(config)]
+    stages += [*layer_stages(config, Domain(config.expected_height, None)), *city_model_stages()]
+    return [*stages, *mesh_stages(config), *piece_stages(config)]
 
 
 def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, Any] | None) -> OwnStages:
@@ -53,7 +56,7 @@ def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, 
     taken = sorted(stage.name for stage in own.stages if stage.name.rstrip("0123456789") in names)
     if taken:
         raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")
-    given = {*dataclasses.asdict(config), *derived_parameters(config), "footprints_identity"}
+    given = {*dataclasses.asdict(config), *derived_parameters(config), "footprints_identity", "top_elevation"}
     clash = sorted(own.parameters.keys() & given)
     if clash:
         raise ValueError(f"parameter {', '.join(clash)}: the run has one of this name; name yours otherwise")

@@ -1,6 +1,7 @@
 """What stages read of each other's results: points, terrain, houses and buildings in a box."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -107,10 +108,16 @@ def read_outlines(task: Task) -> Footprints:
 
 
 def read_buildings(task: Task, box: Box) -> Buildings:
-    """Read the buildings of the simplified city model that meet a box, by ascending id."""
+    """Read the buildings of the simplified city model that meet a box, by ascending id.
+
+    Their layers are those of the stage ``layers``, where the task reads it.
+    """
     near = []
+    later = task.read("layers") if "layers" in task.refs else iter(())
+    layers = {result.name: result.arrays["layers"] for result in later}
     for result in task.read("model"):
         buildings = unpack_buildings(result.arrays)
+        buildings = replace(buildings, layers=layers.get(result.name, buildings.layers))
         rows = np.flatnonzero(shapely.intersects(shapely.box(*box), buildings.model.polygons))
         near.append(take_buildings(buildings, rows))
     return join_buildings(near)

@@ -9,6 +9,7 @@ from stitch.grid import LEAST_TILE
 from stitch.numbering import MOST_TILES
 from tiler.clouds import CloudHeader
 from tiler.config import Config
+from tiler.options import expected_levels
 
 ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray points ...
 MOST_IN_ALL = 10_000_000  # tiles of the region's box; half a million make a country
@@ -106,7 +107,7 @@ def check_sizes(region: Region, config: Config) -> None:
         )
     layered = config.mesher == "layered"
     spacing = config.layer_height_or_default if layered else config.most_spacing * config.largest_size
-    cells = 6 * area / config.largest_size**2 * config.domain_height / spacing
+    cells = 6 * area / config.largest_size**2 * expected_levels(config, spacing)
     if cells > MOST_CELLS:
         raise ConfigError(
             f"mesh_size = {config.mesh_size:g} m: at least {cells:.3g} cells in a tile of {region.tile_size:g} m "

@@ -50,6 +50,7 @@ from tiler.quarantine import (
     stop_at_holes,
 )
 from tiler.seal import seal
+from tiler.settling import domain_of_run, settle_domain, take_domain
 from tiler.stage import REGION_ITEM, Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
@@ -293,7 +294,9 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
             engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
             run_city_stages(engine, alone)
             seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
-            engine.run(*mesh_stages(alone), items={"seams": seams, "columns": [tile]})
+            domain = domain_of_run(config)
+            take_domain(engine, alone, domain)
+            engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
             (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
             engine.run(pieces, items={"pieces": [tile]})
     return out / "mesh" / f"{tile}.vtu"
@@ -310,7 +313,8 @@ def run_stages(engine: Engine, config: Config) -> int:
         Parameters of the run.
     """
     rounds = run_city_stages(engine, config)
-    engine.run(*city_model_stages(), *mesh_stages(config))
+    domain = settle_domain(engine, config)
+    engine.run(*city_model_stages(), *mesh_stages(config, domain))
     engine.run(*piece_stages(config))
     # Beside a tile without a piece, others were written as if they had a neighbour.
     while lost := [name for stage, name in engine.set_aside if stage == "pieces"]:

@@ -10,10 +10,12 @@ from pipeline.clusters import add_counts
 from pipeline.notes import Note, count_notes
 from tiler.config import Config
 from tiler.context import absent_tiles, tile_name
+from tiler.domain import settle
 from tiler.engine import Engine
 from tiler.planning import Plan
 from tiler.quarantine import Missing, describe_missing
 from tiler.stage import REGION_ITEM, Facts
+from tiler.stages.domain import LOW_DOMAIN
 from tiler.task import read_notes
 
 EXIT_DONE, EXIT_INCOMPLETE = 0, 3
@@ -55,6 +57,8 @@ def summarise_run(
         plan.layout.files[name].path: facts["unreadable"] for name, facts in clouds.items() if facts["unreadable"]
     }
     report = records["report", REGION_ITEM].facts
+    found = records["domain", REGION_ITEM].facts
+    domain = settle(config.domain_height, config.top, found)
     outline = _join_outlines([record.facts["outline"] for record in records.of("model")])
     incomplete = unreadable or missing.tiles or missing.others or INCOMPLETE & {note.kind for note in notes}
     absent = {tile_name(key) for key in absent_tiles(plan.grid)} - missing.tiles.keys()
@@ -65,7 +69,9 @@ def summarise_run(
             "crs": plan.region.crs,
             "tile_size": plan.region.tile_size,
             "absent": sorted(absent),
-        },
+        }
+        | ({} if domain.top is None else {"top": domain.top}),
+        "domain": {"height (m)": domain.height, "tallest building (m)": found["tallest"]},
         "tiles": {
             name: {
                 "status": "done",
@@ -84,7 +90,7 @@ def summarise_run(
         "ran": records.count_ran(),
         "seconds": {name: round(seconds, 3) for name, seconds in sorted(records.seconds.items())},
         "peak_memory_bytes": records.peak_memory,
-        "messages": [*plan.messages, *_tell_damage(damage)],
+        "messages": [*plan.messages, *_tell_damage(damage), *_tell_low_domain(notes)],
         "unreadable": unreadable,
         "notes": group_notes(notes),
     }
@@ -105,6 +111,10 @@ def _tell_damage(damage: Mapping[str, str]) -> list[str]:
     if not damage:
         return []
     return [f"{len(damage)} damaged or missing artefacts of an earlier run were made anew: {DAMAGED} in the notes"]
+
+
+def _tell_low_domain(notes: Sequence[Note]) -> list[str]:
+    return [f"{LOW_DOMAIN}: {note.detail}" for note in notes if note.kind == LOW_DOMAIN]
 
 
 def _collect_notes(engine: Engine) -> list[Note]:

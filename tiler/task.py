@@ -122,6 +122,10 @@ class Declared:
             raise ValueError(f"stage {self._stage} uses parameter {name}, which it does not declare")
         return self._values[name]
 
+    def get(self, name: str, default: Any) -> Any:
+        """Value of a parameter that is declared only where it counts; the default where it is not."""
+        return self._values.get(name, default)
+
 
 @dataclass(eq=False)
 class Task:

@@ -6,6 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.adaptive import AdaptiveOptions
 from pipeline.city import City
 from pipeline.citymodel import Footprints
 from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leave_out, shape_clusters
@@ -23,7 +24,7 @@ from pipeline.tile import measure_city, prepare_footprints
 from stitch.grid import Key
 from tiler.config import Config
 from tiler.context import find_owned, region_around, tile_key
-from tiler.options import CITY_PARAMETERS, LAYER_PARAMETERS, city_options, mesh_options
+from tiler.options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
 from tiler.readers import grow, read_cloud, read_terrain
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
@@ -92,7 +93,8 @@ def later_round(config: Config, number: int) -> list[Stage]:
 def model_stage(config: Config, last: int) -> Stage:
     """Stage of the buildings of the clusters that a tile owns, with their heights."""
     shapes, members = f"shapes-{last}", f"members-{last}"
-    options = mesh_options(config)
+    layered = config.mesher == "layered" and not chooses_layers_later(config)
+    options = mesh_options(config) if layered else None
     reach = terrain_reach(options) if isinstance(options, LayeredOptions) else 0.0
     reads = (
         Read("reserved"),
@@ -102,8 +104,14 @@ def model_stage(config: Config, last: int) -> Stage:
         Read("points", halo_of_points(config, 2 * config.ground_margin), around=shapes),
         Read("terrain", reach + 2 * config.dtm_spacing, around=shapes),
     )
-    mesh = LAYER_PARAMETERS if config.mesher == "layered" else ("mesher",)
-    return Stage("model", Scope.TILE, make_model, reads, (*CITY_PARAMETERS, *GROUND, *mesh))
+    mesh = layer_parameters(config) if layered else ("mesher",)
+    make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
+    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *GROUND, *mesh))
+
+
+def chooses_layers_later(config: Config) -> bool:
+    """Whether the layers of roofs wait for the height of the domain, which follows from the city model."""
+    return config.mesher == "layered" and needs_region(config)
 
 
 def make_houses(task: Task) -> Facts:
@@ -227,9 +235,17 @@ def shape_members(task: Task) -> Facts:
 
 def make_model(task: Task) -> Facts:
     """Give the buildings of the clusters that a tile owns their ids, heights and layers (steps 2.3 and 3.4)."""
+    return _make_model(task, mesh_options(task.parameters) if task.parameters.mesher == "layered" else None)
+
+
+def make_model_without_layers(task: Task) -> Facts:
+    """Give the buildings of the clusters that a tile owns their ids and heights; their layers are chosen later."""
+    return _make_model(task, None)
+
+
+def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Facts:
     given, bounds = task.parameters, task.context.bounds
     options = city_options(given)
-    mesh = mesh_options(given) if given.mesher == "layered" else None
     gathered = _gather(task, _members(task))
     shapes = _earlier_shapes(task, replace(gathered, changed=np.zeros(len(gathered.houses), np.bool_)))
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0

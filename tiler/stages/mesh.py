@@ -29,37 +29,42 @@ from stitch.tiles import Sides, mesh_tile, sizes_halo, tile_halo
 from stitch.walls import cut_walls
 from tiler.config import Config
 from tiler.context import seam_key, seam_name, tile_key
+from tiler.domain import Domain
 from tiler.options import (
-    LAYER_PARAMETERS,
     PLANE_PARAMETERS,
     SIZE_PARAMETERS,
+    layer_parameters,
     mesh_options,
     plane_options,
     size_rule,
 )
 from tiler.readers import grow, read_buildings, read_terrain
 from tiler.stage import Facts, Read, Scope, Stage
+from tiler.stages.city import chooses_layers_later
 from tiler.tables import Buildings
 from tiler.task import Result, Task
 
 NO_PLANE = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))
-PARAMETERS = (*PLANE_PARAMETERS, *LAYER_PARAMETERS, "dtm_spacing", "tile_size")
 
 
-def mesh_stages(config: Config) -> list[Stage]:
-    """Stages of seams and columns."""
+def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
+    """Stages of seams and columns, with the halos of a domain as it is settled; as it is expected without one."""
     halo, see = _halos(config, graded=config.open_size > 0)
-    reads = (Read("model", see, by_extent=True), Read("terrain", halo + terrain_halo(config)))
-    names = (*PARAMETERS, *SIZE_PARAMETERS) if config.open_size else PARAMETERS
+    domain = domain or Domain(config.expected_height, None)
+    reads = [Read("model", see, by_extent=True), Read("terrain", halo + terrain_halo(config, domain))]
+    reads += [Read("layers", see, by_extent=True)] if chooses_layers_later(config) else []
+    parameters = (*PLANE_PARAMETERS, *layer_parameters(config), "dtm_spacing", "tile_size")
+    parameters += SIZE_PARAMETERS if config.open_size else ()
+    columns = (*reads, Read("seams", beside=True))
     return [
-        Stage("seams", Scope.SEAM, make_seam, reads, names),
-        Stage("columns", Scope.TILE, make_columns, (*reads, Read("seams", beside=True)), names, version=2),
+        Stage("seams", Scope.SEAM, make_seam, tuple(reads), parameters),
+        Stage("columns", Scope.TILE, make_columns, columns, parameters, version=2),
     ]
 
 
-def terrain_halo(given: Any) -> float:
+def terrain_halo(given: Any, domain: Domain | None = None) -> float:
     """How far beyond the buildings that count terrain does (m)."""
-    options = mesh_options(given)
+    options = mesh_options(given, domain)
     if isinstance(options, AdaptiveOptions):
         return top_reach(options.domain_height) + 2 * float(given.dtm_spacing)
     return terrain_reach(options) + 2 * float(given.dtm_spacing)

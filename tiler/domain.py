@@ -1,0 +1,110 @@
+"""The height of the domain: in metres or in heights of the tallest building, and what guidelines ask of it.
+
+Air above the tallest building should be five times as high as the building, so the domain six times:
+Franke et al., *Best practice guideline for the CFD simulation of flows in the urban environment*, COST action
+732 (2007), and Tominaga et al., *AIJ guidelines for practical applications of CFD to pedestrian wind environment
+around buildings*, J. Wind Eng. Ind. Aerodyn. 96 (2008), 1749-1761.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.errors import ConfigError
+
+MULTIPLE = re.compile(r"([0-9]*\.?[0-9]+)\s*[hH]")
+EXPECTED_TALLEST = 20.0  # m; the tallest building where a forecast needs one before there is a city model
+GUIDELINE = 6.0  # heights of the tallest building: least height of the domain (COST 732, AIJ)
+ROUNDING = 1e-9
+
+Height = float | str
+
+
+@dataclass(frozen=True)
+class Domain:
+    """The domain of a region, as the stages from its seams on have it.
+
+    Attributes
+    ----------
+    height : float
+        Height above the smoothed terrain, or above the highest terrain where the top is flat (m).
+    top : float or None
+        Absolute height of a flat top (m); None where the top follows the terrain.
+    """
+
+    height: float
+    top: float | None
+
+
+def read_height(value: Height) -> Height:
+    """Read a height: metres as a number, or a multiple of the tallest building as a text.
+
+    Raises
+    ------
+    ConfigError
+        If it is neither.
+
+    Examples
+    --------
+    >>> read_height("6 h"), read_height("80"), read_height(80.0)
+    ('6H', 80.0, 80.0)
+    """
+    if isinstance(value, float):
+        return value
+    text = value.strip()
+    found = MULTIPLE.fullmatch(text)
+    if found and float(found[1]) > 0:
+        return f"{float(found[1]):g}H"
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigError(
+            f"domain_height = {text[:40]!r}: expected metres, or a multiple of the tallest building's height as 6H"
+        ) from None
+
+
+def height_in_metres(height: Height, tallest: float) -> float:
+    """Height of the domain (m), given that of the tallest building (m).
+
+    Examples
+    --------
+    >>> height_in_metres("6H", 21.5), height_in_metres(80.0, 21.5)
+    (129.0, 80.0)
+    """
+    return float(height[:-1]) * tallest if isinstance(height, str) else height
+
+
+def settle(height: Height, top: str, facts: Mapping[str, Any]) -> Domain:
+    """Decide height and top of the domain from what the stage ``domain`` found.
+
+    Parameters
+    ----------
+    height : float or str
+        As configured.
+    top : "terrain" or "flat"
+        As configured.
+    facts : mapping
+        ``"tallest"`` (m) and, with a flat top, ``"highest_ground"`` (m).
+
+    Raises
+    ------
+    ConfigError
+        If the height is a multiple of the tallest building's, and there is none.
+    """
+    tallest = float(facts["tallest"])
+    if isinstance(height, str) and tallest <= 0:
+        raise ConfigError(f"domain_height = {height}: there are no buildings in the region; give it in metres")
+    metres = height_in_metres(height, tallest)
+    return Domain(metres, float(facts["highest_ground"]) + metres if top == "flat" else None)
+
+
+def is_low(height: float, tallest: float) -> bool:
+    """Whether guidelines ask for a higher domain.
+
+    Examples
+    --------
+    >>> is_low(100.0, 20.0), is_low(120.0, 20.0), is_low(100.0, 0.0)
+    (True, False, False)
+    """
+    return height < GUIDELINE * tallest * (1 - ROUNDING)

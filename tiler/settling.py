@@ -1,0 +1,74 @@
+"""Between the city model and the seams: height and top of the domain become parameters of all that follows."""
+
+from pathlib import Path
+
+from pipeline.errors import InputError
+from tiler.config import Config, check_height
+from tiler.domain import Domain, settle
+from tiler.engine import Engine
+from tiler.options import needs_region
+from tiler.out_folder import STORE
+from tiler.quarantine import stop_at_holes
+from tiler.stage import REGION_ITEM
+from tiler.stages.domain import domain_stages, layer_stages
+from tiler.store import Store
+
+
+def settle_domain(engine: Engine, config: Config) -> Domain:
+    """Measure the city model, and decide height and top of the domain, which later stages take as parameters.
+
+    Parameters
+    ----------
+    engine : Engine
+        Engine, `run_city_stages` done.
+    config : Config
+        Parameters of the run.
+
+    Raises
+    ------
+    ConfigError
+        If the height follows from buildings and there are none, or it is too low for the vertical spacing.
+    HolesError
+        If an item was set aside.
+    """
+    engine.run(*domain_stages(config))
+    stop_at_holes(engine)
+    domain = settle(config.domain_height, config.top, engine.records["domain", REGION_ITEM].facts)
+    take_domain(engine, config, domain)
+    return domain
+
+
+def take_domain(engine: Engine, config: Config, domain: Domain) -> None:
+    """Give the stages after the city model the height and top of the domain, and choose the layers that need them.
+
+    Parameters and errors as for `settle_domain`.
+    """
+    check_height(config, domain.height)
+    engine.add_parameters(domain_height=domain.height, top_elevation=domain.top)
+    engine.run(*layer_stages(config, domain))
+    stop_at_holes(engine)
+
+
+def domain_of_run(config: Config) -> Domain:
+    """Take height and top of the domain of a whole run, for one of its tiles alone.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the whole run; where height and top follow from all of the region, its store has them.
+
+    Raises
+    ------
+    InputError
+        If it has not.
+    """
+    if not needs_region(config):
+        return Domain(config.expected_height, None)
+    try:
+        facts = Store(Path(config.out) / STORE).attributes("domain", REGION_ITEM)["facts"]
+    except InputError as error:
+        raise InputError(
+            f"{config.out}: the height of the domain follows from the whole region, and its run has not come that "
+            f"far ({error}); run it without --only first"
+        ) from None
+    return settle(config.domain_height, config.top, facts)

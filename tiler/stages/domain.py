@@ -1,0 +1,112 @@
+"""Stages between city model and seams: what the domain's height is measured by, and layers that wait for it."""
+
+from typing import Any
+
+import numpy as np
+import shapely
+
+from pipeline.groups import adjacent_houses
+from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
+from pipeline.notes import Note
+from tiler.config import Config
+from tiler.domain import GUIDELINE, Domain, height_in_metres, is_low
+from tiler.options import layer_parameters, mesh_options
+from tiler.readers import grow, read_terrain
+from tiler.stage import Facts, Read, Scope, Stage
+from tiler.stages.city import chooses_layers_later
+from tiler.tables import unpack_buildings, unpack_polygons
+from tiler.task import Task
+
+LOW_DOMAIN = "domain-lower-than-guidelines"
+
+
+def domain_stages(config: Config) -> list[Stage]:
+    """Stages that find the tallest building and, for a flat top, the highest ground of the region."""
+    reads = [Read("model")]
+    stages = []
+    if config.top == "flat":
+        stages = [Stage("summits", Scope.TILE, find_summit, (Read("terrain", own=True),))]
+        reads += [Read("summits")]
+    parameters = ("domain_height", "top")
+    return [*stages, Stage("domain", Scope.REGION, measure_domain, tuple(reads), parameters)]
+
+
+def layer_stages(config: Config, domain: Domain) -> list[Stage]:
+    """Stage that chooses the layers of roofs where the domain's height is not known before the city model."""
+    if not chooses_layers_later(config):
+        return []
+    reach = mesh_reach(config, domain) + 2 * config.dtm_spacing
+    reads = (Read("model", own=True), Read("terrain", reach, around="model"))
+    parameters = (*layer_parameters(config), "dtm_spacing")
+    return [Stage("layers", Scope.TILE, choose_tile_layers, reads, parameters)]
+
+
+def mesh_reach(config: Config, domain: Domain) -> float:
+    """How far beyond walls terrain counts for the layers of roofs (m)."""
+    options = mesh_options(config, domain)
+    return terrain_reach(options) if isinstance(options, LayeredOptions) else 0.0
+
+
+def find_summit(task: Task) -> Facts:
+    """Find the highest terrain of a tile."""
+    (terrain,) = task.read("terrain", ("z",))
+    return {"highest_ground": float(terrain.arrays["z"].max())}
+
+
+def measure_domain(task: Task) -> Facts:
+    """Find the tallest building and the highest terrain; note a domain that is too low for the building."""
+    given = task.parameters
+    best: tuple[float, str, str] = (0.0, "", "")
+    for result in task.read("model", ("ground", "roof", "id")):
+        found = result.arrays
+        if len(found["id"]):
+            height = found["roof"] - found["ground"]
+            row = np.lexsort((found["id"], -height))[0]
+            best = min(best, (-float(height[row]), str(found["id"][row]), result.name))
+    tallest, building, tile = abs(best[0]), best[1], best[2]
+    facts: dict[str, Any] = {"tallest": tallest, "building": building}
+    if given.top == "flat":
+        facts["highest_ground"] = max(result.facts["highest_ground"] for result in task.read("summits", ()))
+    height = height_in_metres(given.domain_height, tallest)
+    if is_low(height, tallest):
+        wanted = f"guidelines (COST 732, AIJ) ask for {GUIDELINE:g} times: --domain-height {GUIDELINE:g}H"
+        times = f"{height / tallest:.2f} times the tallest building's {tallest:.1f} m"
+        detail = f"the domain is {height:.1f} m high, {times}; {wanted}"
+        task.note(Note(LOW_DOMAIN, building, *_place(task, tile, building), detail))
+    return facts
+
+
+def choose_tile_layers(task: Task) -> Facts:
+    """Choose the layers that become the roofs of the buildings that a tile owns (step 3.4)."""
+    given, bounds = task.parameters, task.context.bounds
+    (result,) = task.read("model")
+    extent = result.facts["extent"]
+    if extent is None:
+        task.put(layers=np.empty(0, np.int32))
+        return {"extent": None}
+    options = mesh_options(given)
+    if not isinstance(options, LayeredOptions):
+        raise ValueError("only the layered mesher has layers")
+    buildings = unpack_buildings(result.arrays)
+    model = buildings.model
+    reach = terrain_reach(options) + 2 * given.dtm_spacing
+    layers, parted = choose_layers(
+        model.polygons,
+        model.roof,
+        buildings.wall_ground,
+        buildings.group.astype(np.int32),
+        adjacent_houses(model.polygons),
+        read_terrain(task, grow(tuple(extent), reach), spacing=given.dtm_spacing, bounds=bounds),
+        bounds,
+        options,
+    )
+    task.put(layers=layers)
+    return {"extent": extent, "counts": {"roofs on another layer": parted} if parted else {}}
+
+
+def _place(task: Task, tile: str, building: str) -> tuple[float, float]:
+    """A place in a building (m)."""
+    arrays, _ = task.store.read("model", tile, names=("polygon", "polygon_start", "id"))
+    row = int(np.flatnonzero(arrays["id"] == building)[0])
+    x, y = shapely.get_coordinates(shapely.point_on_surface(unpack_polygons(arrays, "polygon")[row]))[0].tolist()
+    return x, y
