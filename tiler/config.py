@@ -147,6 +147,10 @@ class Config:
     domain_height: float = _parameter(
         100.0, "mesh", "height of the domain above the terrain", unit="m", source="paper, step 3.2", above=0
     )
+    underground: float = _parameter(
+        0.0, "mesh", "depth of the soil that is meshed below the terrain, with the ground inside; 0 for none",
+        unit="m", least=0, most=10_000,
+    )  # fmt: skip
     mesher: str = _parameter(
         "adaptive", "mesh", "how columns are filled: each by its own levels, or by the paper's layers",
         source="paper, steps 3.2-3.5", choices=("adaptive", "layered"),
@@ -231,6 +235,7 @@ CONDITIONS = {
     "smoothing_tolerance": ("mesher", "layered"),
     "fem_tolerance": ("mesher", "layered"),
 }
+SOIL = ("least_spacing", "most_spacing", "stagger")  # of these, those that count for soil with either mesher
 
 
 def idle_parameters(config: Config) -> list[str]:
@@ -245,7 +250,9 @@ def idle_parameters(config: Config) -> list[str]:
     return [
         f"{name} = {getattr(config, name)} has no effect: it counts with {other} = {value}"
         for name, (other, value) in CONDITIONS.items()
-        if getattr(config, name) != getattr(default, name) and getattr(config, other) != value
+        if getattr(config, name) != getattr(default, name)
+        and getattr(config, other) != value
+        and not (config.underground and name in SOIL)
     ]
 
 
@@ -442,6 +449,12 @@ def _check_together(config: Config) -> None:
     if config.least_spacing > config.most_spacing:
         raise ConfigError(
             f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
+        )
+    least = config.least_spacing * config.mesh_size
+    if 0 < config.underground < least:
+        raise ConfigError(
+            f"underground = {config.underground:g} m: at least {least:g} m (least_spacing x mesh_size), the least "
+            "height of a cell; raise it, lower --least-spacing, or give 0 for no soil"
         )
     layer, most = config.layer_height_or_default, config.most_spacing * config.mesh_size
     if config.mesher == "layered" and layer > config.domain_height / 2:

@@ -26,11 +26,14 @@ class RunFiles:
         Folder of the run.
     volumes, boundaries : tuple of Path
         VTU and VTP pieces, in the order of the index files: by name of tile.
+    depth : float
+        Depth of its soil (m), 0 where it has none.
     """
 
     directory: Path
     volumes: tuple[Path, ...]
     boundaries: tuple[Path, ...]
+    depth: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,8 @@ class Format:
         What the name of the file must end with, if anything.
     companion : str
         Suffix of a second file beside it, if there is one.
+    soil : bool
+        Whether it can hold a mesh with soil.
     """
 
     description: str
@@ -59,6 +64,7 @@ class Format:
     folder: bool = False
     suffix: str = ""
     companion: str = ""
+    soil: bool = False
 
 
 def _write_vtu(path: Path, files: RunFiles) -> None:
@@ -134,8 +140,8 @@ def _write_gpkg(path: Path, files: RunFiles) -> None:
 
 
 FORMATS: Mapping[str, Format] = {
-    "vtu": Format("the volume mesh as one VTK file", _write_vtu),
-    "vtp": Format("the marked boundary as one VTK file", _write_vtp),
+    "vtu": Format("the volume mesh as one VTK file", _write_vtu, soil=True),
+    "vtp": Format("the marked boundary as one VTK file", _write_vtp, soil=True),
     "openfoam": Format(
         "a case folder of OpenFOAM", _write_openfoam, options=("parts", "case", "buildings"), folder=True
     ),
@@ -199,6 +205,12 @@ def export_run(
     if not output.name.endswith(kind.suffix):
         raise ConfigError(f"{output}: a file of format {name} ends with {kind.suffix}; give another --output")
     files = find_files(directory)
+    if files.depth and not kind.soil:
+        able = ", ".join(known for known, other in FORMATS.items() if other.soil)
+        raise ConfigError(
+            f"{directory}: the mesh has soil to {files.depth:g} m below ground, which format {name} cannot hold; "
+            f"take one of {able}, or mesh without --underground"
+        )
     for target in (output, output.with_suffix(kind.companion)) if kind.companion else (output,):
         _check_target(target, files, overwrite=overwrite)
     if kind.folder and output.exists() and not (output / EXPORT_RECORD).is_file():
@@ -220,11 +232,11 @@ def find_files(directory: Path) -> RunFiles:
     record = directory / RUN_RECORD
     if not record.is_file():
         raise InputError(f"{record}: no such file; run citystitch first, or name its output folder")
-    status = read_run_record(record).status
-    if status != "done":
-        raise InputError(f"{record}: the run is {status!r}, not 'done'; finish it or run again")
+    found = read_run_record(record)
+    if found.status != "done":
+        raise InputError(f"{record}: the run is {found.status!r}, not 'done'; finish it or run again")
     volumes, boundaries = (read_piece_paths(directory / name) for name in (VOLUME_INDEX, BOUNDARY_INDEX))
-    return RunFiles(directory, tuple(volumes), tuple(boundaries))
+    return RunFiles(directory, tuple(volumes), tuple(boundaries), found.depth)
 
 
 def _check_target(output: Path, files: RunFiles, *, overwrite: bool) -> None:

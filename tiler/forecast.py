@@ -220,6 +220,9 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
         layers = max(round(height / config.layer_height_or_default), 1)
         triangles = TRIANGLES * area / h**2 + TRIANGLES_AN_OCTAVE * octaves
         cells = 3 * layers * triangles * volume / (area * height)
+    if config.underground:
+        spacing = h * FULL_SPACING / 0.8 * min(config.most_spacing, 1.0)
+        cells = cells + 3 * TRIANGLES * area * config.underground / (h**2 * spacing)
     index = np.argwhere(there) + grid.first
     points = spread_points(grid, survey.clouds)
     return TileLoads(index, *(values[there] for values in (area, points, houses, cells)))

@@ -7,6 +7,7 @@ from pipeline.city import CityOptions
 from pipeline.layered import LayeredOptions
 from pipeline.spacing import SpacingLimits
 from pipeline.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
+from pipeline.underground import SoilOptions
 from tiler.config import Config
 
 # Parameters of the city model; two are raised by what the mesh needs, see `derived_parameters`.
@@ -22,6 +23,8 @@ LAYER_PARAMETERS = (
     *("mesh_size", "mesher", "domain_height", "least_spacing", "most_spacing", "stagger", "improve_passes"),
     *("layer_height", "layer_height_or_default", "smoother", "smoothing_tolerance", "fem_tolerance"),
 )
+# Parameters of the soil, which counts only where it is asked for.
+SOIL_PARAMETERS = ("underground", "mesh_size", "least_spacing", "most_spacing", "stagger")
 
 
 def derived_parameters(config: Config) -> dict[str, float]:
@@ -77,6 +80,12 @@ def mesh_options(given: Any) -> LayeredOptions | AdaptiveOptions:
         tolerance=given.smoothing_tolerance,
         fem_tolerance=given.fem_tolerance,
     )
+
+
+def soil_options(given: Any) -> SoilOptions:
+    """Options of the soil, the same with both meshers."""
+    limits = SpacingLimits(given.least_spacing, given.most_spacing)
+    return SoilOptions(given.underground, given.mesh_size, limits, given.stagger)
 
 
 def plane_options(given: Any) -> dict[str, Any]:

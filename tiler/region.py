@@ -107,6 +107,7 @@ def check_sizes(region: Region, config: Config) -> None:
     layered = config.mesher == "layered"
     spacing = config.layer_height_or_default if layered else config.most_spacing * config.mesh_size
     cells = 6 * area / config.mesh_size**2 * config.domain_height / spacing
+    cells += 6 * area / config.mesh_size**2 * config.underground / (config.most_spacing * config.mesh_size)
     if cells > MOST_CELLS:
         raise ConfigError(
             f"mesh_size = {config.mesh_size:g} m: at least {cells:.3g} cells in a tile of {region.tile_size:g} m "
