@@ -20,8 +20,8 @@ class Marker(IntEnum):
     SOUTH = 7
     NORTH = 8
     MISSING = 9  # a seam whose other tile is not there
-    BOTTOM = 10  # what the soil ends at
-    FOUNDATION = 11  # the soil's top under a building
+    BOTTOM = 11  # what the soil ends at; 10 is the number of the air in Gmsh's files
+    FOUNDATION = 12  # the soil's top under a building
 
 
 class Region(IntEnum):

@@ -33,7 +33,6 @@ from tests.cities import Bounds, crowded_blocks
 from tests.test_tiles import prove_local, put_beside
 from tests.tiles import hash_files, make_town, run_of, write_town
 from tiler.check import CheckReport, check_run
-from tiler.cli import main
 from tiler.config import Config, idle_parameters, make_config
 from tiler.export import export_run
 from tiler.results import StoredTerrain
@@ -484,14 +483,3 @@ def test_one_file_has_the_regions_and_shares_the_ground(four: tuple[dict[str, An
     assert np.intersect1d(air, soil).tolist() == ground.tolist()
     volume = compute_cell_volumes(whole.mesh.points, whole.mesh.cells)[0]
     np.testing.assert_allclose(volume[region == Region.SOIL].sum(), 280.0**2 * DEPTH, rtol=1e-9)
-
-
-def test_a_format_that_cannot_hold_soil_refuses(
-    four: tuple[dict[str, Any], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code = main(["export", str(four[1]), "--format", "glb", "-o", str(tmp_path / "a.glb")])
-    assert code == 2
-    assert (
-        "soil to 25 m below ground, which format glb cannot hold; take one of vtu, vtp" in capsys.readouterr().err
-    )
-    assert not (tmp_path / "a.glb").exists()

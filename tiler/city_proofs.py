@@ -39,11 +39,10 @@ def check_marks(surface: Surface, buildings: Buildings, *, soil: bool = False) -
     built = surface.marked(Marker.WALL, Marker.ROOF, Marker.FOUNDATION)
     unknown = built & (_rows_of(owner, buildings) < 0)
     astray = ~built & (owner != -1)
+    bound = "1 to 9, 11 or 12" if soil else "1 to 9"
     centres = surface.corners.mean(axis=1)
     faults = [
-        *find_faults(
-            "marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: 1 to {max(known)}"
-        ),
+        *find_faults("marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: {bound}"),
         *find_faults(
             "building-unknown",
             centres[unknown],

@@ -54,8 +54,6 @@ class Format:
         What the name of the file must end with, if anything.
     companion : str
         Suffix of a second file beside it, if there is one.
-    soil : bool
-        Whether it can hold a mesh with soil.
     """
 
     description: str
@@ -64,7 +62,6 @@ class Format:
     folder: bool = False
     suffix: str = ""
     companion: str = ""
-    soil: bool = False
 
 
 def _write_vtu(path: Path, files: RunFiles) -> None:
@@ -140,8 +137,8 @@ def _write_gpkg(path: Path, files: RunFiles) -> None:
 
 
 FORMATS: Mapping[str, Format] = {
-    "vtu": Format("the volume mesh as one VTK file", _write_vtu, soil=True),
-    "vtp": Format("the marked boundary as one VTK file", _write_vtp, soil=True),
+    "vtu": Format("the volume mesh as one VTK file", _write_vtu),
+    "vtp": Format("the marked boundary as one VTK file", _write_vtp),
     "openfoam": Format(
         "a case folder of OpenFOAM", _write_openfoam, options=("parts", "case", "buildings"), folder=True
     ),
@@ -205,12 +202,6 @@ def export_run(
     if not output.name.endswith(kind.suffix):
         raise ConfigError(f"{output}: a file of format {name} ends with {kind.suffix}; give another --output")
     files = find_files(directory)
-    if files.depth and not kind.soil:
-        able = ", ".join(known for known, other in FORMATS.items() if other.soil)
-        raise ConfigError(
-            f"{directory}: the mesh has soil to {files.depth:g} m below ground, which format {name} cannot hold; "
-            f"take one of {able}, or mesh without --underground"
-        )
     for target in (output, output.with_suffix(kind.companion)) if kind.companion else (output,):
         _check_target(target, files, overwrite=overwrite)
     if kind.folder and output.exists() and not (output / EXPORT_RECORD).is_file():
