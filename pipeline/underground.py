@@ -8,7 +8,6 @@ by the air's rule, so its faces match without exchange too.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,8 +16,6 @@ from pipeline.levels import stagger_columns
 from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
 from pipeline.nodes import GROUND_SURFACE, Levels, SeamColumns, join_levels, take_columns
 from pipeline.spacing import SpacingLimits, mean_edges, vertical_spacing
-
-GROWTH = 1.25  # of the spacing, from each step to the one below it
 
 
 @dataclass(frozen=True)
@@ -93,7 +90,7 @@ def soil_tops(
 def fill_soil(
     plane: PlaneMesh, vertex: NDArray[np.int32], top: NDArray[np.float64], options: SoilOptions
 ) -> Levels:
-    """Space the levels of soil: at the ground as widely as the air's, wider and wider below.
+    """Space the levels of soil evenly, as widely as those of the air over open ground.
 
     Parameters
     ----------
@@ -110,18 +107,23 @@ def fill_soil(
     -------
     Levels
         ``k`` columns from `depth` below their tops up to these; their levels stand for no surface.
+
+    Notes
+    -----
+    Steps that grow downwards save cells where triangles are small, but make slivers of these: up to twice as wide
+    saves 40 % of the soil under the centre of Amsterdam, and the worst radius ratio falls from 0.18 to 0.08.
     """
     spacing = vertical_spacing(mean_edges(plane), options.mesh_size, options.limits)[vertex]
     shift = np.zeros(len(plane.xy))
     if options.stagger:
         shift = options.stagger * stagger_columns(len(plane.xy), plane_edges(plane.triangles)[0])
-    most = options.limits.most * options.mesh_size
-    count = np.empty(len(vertex), np.int64)
-    sides = (top, spacing, shift[vertex], most, options.depth)
-    _fill_soil(*sides, count, np.empty(0, np.int64), np.empty(0))
-    start = np.concatenate(([0], np.cumsum(count))).astype(np.int64)
-    z = np.empty(start[-1])
-    _fill_soil(*sides, count, start, z)
+    steps = np.maximum(np.floor(options.depth / spacing + 0.5), 1).astype(np.int64)
+    start = np.concatenate(([0], np.cumsum(steps + 1))).astype(np.int64)
+    column = np.repeat(np.arange(len(vertex)), steps + 1)
+    level = np.arange(start[-1]) - start[column]
+    bottom = top - options.depth
+    z = bottom[column] + (level + shift[vertex][column]) * (options.depth / steps)[column]
+    z[start[:-1]], z[start[1:] - 1] = bottom, top
     return Levels(start, z, np.full(len(z), np.nan))
 
 
@@ -280,36 +282,3 @@ def _take_soil(mesh: SoilMesh) -> tuple[ColumnMesh, NDArray[np.int32]]:
     ground = PlaneMesh(plane.xy, plane.triangles, np.full(len(plane.triangles), -1, np.int32))
     bottom = np.zeros(plane.triangles.shape, np.int32)
     return ColumnMesh(ground, start, columns.z[rows], bottom, "heights"), rows.astype(np.int32)
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill_soil(
-    top: NDArray[np.float64],
-    spacing: NDArray[np.float64],
-    shift: NDArray[np.float64],
-    most: float,
-    depth: float,
-    count: NDArray[np.int64],
-    start: NDArray[np.int64],
-    z: NDArray[np.float64],
-) -> None:
-    """Count the levels of each column, and write them where there is room.
-
-    Steps grow up to the largest spacing. There are as many as come closest to the depth; all are stretched to it.
-    """
-    for i in range(len(top)):
-        step, n, total = spacing[i], 0, 0.0
-        while n == 0 or total + step / 2 <= depth:
-            n, total = n + 1, total + step
-            step = min(step * GROWTH, most)
-        count[i] = n + 1
-        if len(z) == 0:
-            continue
-        last = start[i] + n
-        z[last], z[start[i]] = top[i], top[i] - depth
-        step, at = spacing[i] * (depth / total), 0.0
-        largest = most * (depth / total)
-        for k in range(1, n):
-            at += step
-            above, step = step, min(step * GROWTH, largest)
-            z[last - k] = top[i] - (at + shift[i] * (step if shift[i] > 0 else above))

@@ -88,21 +88,18 @@ def test_soil_ends_at_the_ground_or_at_the_terrain_below_the_roof() -> None:
     assert lowered.tolist() == [False, False, True]
 
 
-def test_levels_of_soil_go_down_to_the_depth_at_growing_distances() -> None:
+def test_levels_of_soil_are_even_down_to_the_depth() -> None:
     plane = two_triangles(-1, -1)
-    options = replace(OPTIONS, stagger=0.0, mesh_size=40.0)  # edges of 10 and 14 m: room to grow to 32 m
-    top = np.array([3.0, 7.0])
-    levels = fill_soil(plane, np.array([1, 0], np.int32), top, replace(options, depth=100.0))
-    columns = np.split(levels.z, levels.start[1:-1])
-    for column, z in zip(columns, top, strict=True):
-        assert column[-1] == z
-        assert column[0] == z - 100.0
-        steps = np.diff(column)[::-1]
-        np.testing.assert_allclose(steps[1:] / steps[:-1], 1.25)
-        assert 8.0 < steps[0] < 14.0
-    deep = fill_soil(plane, np.array([0], np.int32), top[:1], replace(options, depth=2000.0))
-    assert 25.0 < np.diff(deep.z).max() < 33.0
-    shallow = fill_soil(plane, np.array([0], np.int32), top[:1], replace(options, depth=0.5))
+    # Edges of 10 and 10 m at vertex 1, and of 14.1 m besides at vertex 0: 11.4 m in the mean.
+    options = replace(OPTIONS, stagger=0.0, mesh_size=40.0, depth=80.0)
+    levels = fill_soil(plane, np.array([1, 0], np.int32), np.array([3.0, 7.0]), options)
+    assert levels.start.tolist() == [0, 9, 17]
+    np.testing.assert_allclose(levels.z[:9], np.arange(-77, 4, 10))
+    np.testing.assert_allclose(levels.z[9:], np.linspace(-73, 7, 8))
+    assert np.isnan(levels.surface).all()
+    # At most 8 m apart where cells are 10 m large, and one step at least.
+    assert np.diff(fill_soil(plane, np.array([1], np.int32), np.zeros(1), OPTIONS).start).tolist() == [4]
+    shallow = fill_soil(plane, np.array([0], np.int32), np.array([3.0]), replace(options, depth=0.5))
     assert shallow.z.tolist() == [2.5, 3.0]
 
 
