@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError, InputError
 from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
-from pipeline.nodes import GROUND_SURFACE, TOP_SURFACE, Levels, no_seam
+from pipeline.nodes import GROUND_SURFACE, TOP_SURFACE, Levels, SeamColumns, no_seam
 from pipeline.spacing import SpacingLimits
 from pipeline.underground import (
     SoilOptions,
@@ -91,11 +91,11 @@ def test_soil_ends_at_the_ground_or_at_the_terrain_below_the_roof() -> None:
 def test_levels_of_soil_are_even_down_to_the_depth() -> None:
     plane = two_triangles(-1, -1)
     # Edges of 10 and 10 m at vertex 1, and of 14.1 m besides at vertex 0: 11.4 m in the mean.
-    options = replace(OPTIONS, stagger=0.0, mesh_size=40.0, depth=80.0)
+    options = replace(OPTIONS, stagger=0.0, mesh_size=40.0, depth=84.0)
     levels = fill_soil(plane, np.array([1, 0], np.int32), np.array([3.0, 7.0]), options)
     assert levels.start.tolist() == [0, 9, 17]
-    np.testing.assert_allclose(levels.z[:9], np.arange(-77, 4, 10))
-    np.testing.assert_allclose(levels.z[9:], np.linspace(-73, 7, 8))
+    np.testing.assert_allclose(levels.z[:9], np.linspace(-81, 3, 9))
+    np.testing.assert_allclose(levels.z[9:], np.linspace(-77, 7, 8))
     assert np.isnan(levels.surface).all()
     # At most 8 m apart where cells are 10 m large, and one step at least.
     assert np.diff(fill_soil(plane, np.array([1], np.int32), np.zeros(1), OPTIONS).start).tolist() == [4]
@@ -158,6 +158,22 @@ def test_soil_goes_on_under_a_house() -> None:
     assert boundary.building[boundary.marker == Marker.FOUNDATION].tolist() == [7]
     foundation = cells.points[boundary.facets[boundary.marker == Marker.FOUNDATION][0]]
     assert sorted(foundation[:, 2].tolist()) == [0.0, 0.0, 0.5]
+
+
+def test_soil_ends_at_the_ground_that_a_neighbour_has_at_a_seam() -> None:
+    """A tile of one house whose wall is the seam: columns there have ground, which its own cells do not reach."""
+    plane = two_triangles(0, 0)
+    air = air_over(plane, [0.0, 0.0, 2.0, 2.0], [[1, 0, 0], [1, 1, 0]])
+    start, vertex = np.array([0, 3, 6]), np.array([0, 1], np.int32)
+    levels = Levels(start, air.z[:6], np.array([GROUND_SURFACE, 2.0, TOP_SURFACE] * 2))
+    given = fill_soil(plane, vertex, np.zeros(2), OPTIONS)
+    terrain = np.full(4, 0.7)  # other than the ground of the seam, to tell which is taken
+    mesh, raised, _ = add_soil(air, terrain, SeamColumns(vertex, levels), SeamColumns(vertex, given), OPTIONS)
+    columns = np.split(mesh.columns.z, mesh.columns.z_start[1:-1])
+    assert all((np.diff(column) > 0).all() for column in columns)
+    assert [column[top] for column, top in zip(columns, mesh.top, strict=True)] == [0.0, 0.0, 0.7, 0.7]
+    assert (mesh.top + 1 - raised).tolist() == [1, 1, 0, 0]
+    assert [column[raised[k] + 1] for k, column in enumerate(columns)] == [2.0, 2.0, 4.0, 4.0]
 
 
 def test_terrain_that_reaches_a_roof_from_inside_is_lowered() -> None:
