@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Marker(IntEnum):
-    """What a boundary facet bounds."""
+    """What a facet bounds; with soil below, the ground has cells on both sides."""
 
     GROUND = 1
     WALL = 2
@@ -20,6 +20,15 @@ class Marker(IntEnum):
     SOUTH = 7
     NORTH = 8
     MISSING = 9  # a seam whose other tile is not there
+    BOTTOM = 11  # what the soil ends at; 10 is the number of the air in Gmsh's files
+    FOUNDATION = 12  # the soil's top under a building
+
+
+class Region(IntEnum):
+    """What a cell is filled with."""
+
+    AIR = 0
+    SOIL = 1
 
 
 @dataclass(frozen=True, eq=False)

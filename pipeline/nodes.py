@@ -4,6 +4,7 @@ A surface is what cells stand on: the ground, written as a height of minus infin
 height. A column has a node for every surface that its vertex touches, and its top.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -90,6 +91,16 @@ def take_columns(levels: Levels, vertices: NDArray[np.int32]) -> Levels:
     start = np.concatenate(([0], np.cumsum(count)))
     rows = np.arange(start[-1]) + np.repeat(levels.start[vertices] - start[:-1], count)
     return Levels(start, levels.z[rows], levels.surface[rows])
+
+
+def join_levels(parts: Sequence[Levels]) -> Levels:
+    """Put the columns of several parts one after the other."""
+    count = np.concatenate([np.diff(part.start) for part in parts] or [np.empty(0, np.int64)])
+    return Levels(
+        np.concatenate(([0], np.cumsum(count))).astype(np.int64),
+        np.concatenate([part.z for part in parts] or [np.empty(0)]),
+        np.concatenate([part.surface for part in parts] or [np.empty(0)]),
+    )
 
 
 def place_nodes(

@@ -5,11 +5,10 @@ from numpy.typing import NDArray
 
 from pipeline.layered import LayeredOptions, fill_layers
 from pipeline.mesh import PlaneMesh
-from pipeline.nodes import Levels, SeamColumns, take_columns
+from pipeline.nodes import Levels, SeamColumns, join_levels, take_columns
 from pipeline.terrain import Dtm
 from stitch.corners import Corner
 from stitch.grid import Bounds
-from stitch.seam_columns import join_levels
 from stitch.seams import Seam, find_vertices
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions, fill_columns
 from pipeline.mesh import PlaneMesh
-from pipeline.nodes import Levels, SeamColumns, take_columns
+from pipeline.nodes import Levels, SeamColumns, join_levels, take_columns
 from pipeline.plane import order_plane
 from pipeline.sizes import SizeField
 from pipeline.terrain import Dtm
@@ -40,7 +40,7 @@ def fill_corner(
     Levels
         One column, with a spacing that follows the length of the first edges.
     """
-    fan = _fan(corner)
+    fan = mesh_fan(corner)
     levels = fill_columns(fan, dtm, roof, ids, options, sizes=sizes)
     return take_columns(levels, find_vertices(fan.xy, corner.xy[None]))
 
@@ -100,18 +100,8 @@ def tile_columns(plane: PlaneMesh, seams: Sequence[tuple[Seam, Levels]]) -> Seam
     return SeamColumns(vertex, take_columns(levels, first.astype(np.int32)))
 
 
-def join_levels(parts: Sequence[Levels]) -> Levels:
-    """Put the columns of several parts one after the other."""
-    count = np.concatenate([np.diff(part.start) for part in parts] or [np.empty(0, np.int64)])
-    return Levels(
-        np.concatenate(([0], np.cumsum(count))).astype(np.int64),
-        np.concatenate([part.z for part in parts] or [np.empty(0)]),
-        np.concatenate([part.surface for part in parts] or [np.empty(0)]),
-    )
-
-
-def _fan(corner: Corner) -> PlaneMesh:
-    """Triangles between a corner and the neighbouring tips."""
+def mesh_fan(corner: Corner) -> PlaneMesh:
+    """Make the triangles between a corner and the neighbouring tips."""
     xy = np.concatenate((corner.xy[None], corner.tips))
     triangles = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], np.int32)
     triangles = triangles[~np.isnan(xy[triangles]).any(axis=(1, 2))]

@@ -115,7 +115,7 @@ def test_pieces_in_any_order_make_the_same_surface(tmp_path: Path, seed: int) ->
     write_glb(tmp_path / "box.glb", pieces, crs="EPSG:28992")
     document = check_document(tmp_path / "box.glb", pieces)
     marks = {primitive["extras"]["marker"] for primitive in document["meshes"][0]["primitives"]}
-    assert marks == {m.value for m in Marker} - {Marker.WALL, Marker.EAST}
+    assert marks == {m.value for m in Marker} - {Marker.WALL, Marker.EAST, Marker.BOTTOM, Marker.FOUNDATION}
 
 
 def test_export_is_the_same_bytes_again(small_run: Path, exported: Path, tmp_path: Path) -> None:

@@ -253,7 +253,7 @@ def test_an_unknown_marker_is_told(small_run: Path, tmp_path: Path) -> None:
         Boundary(piece.boundary.facets, marks, piece.boundary.building),
         point_data=piece.point_data,
     )
-    with pytest.raises(CityError, match=r"markers 1\.\.10, known are 1\.\.9; run the tile again"):
+    with pytest.raises(CityError, match=r"markers 1\.\.13, known are 1\.\.12; run the tile again"):
         export_run(copy, tmp_path / "x.ply", name="ply")
     assert not (tmp_path / "x.ply").exists()
 

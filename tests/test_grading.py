@@ -285,5 +285,5 @@ def test_only_a_graded_mesh_depends_on_the_grading() -> None:
     # Walls count (20 - 10) / 0.2 m beyond the places whose sizes are asked for.
     assert halos[1]["model"] >= halos[0]["model"] + 50
     assert idle_parameters(make_config({"grading": 0.3})) == [
-        "grading = 0.3 has no effect: it counts with open_size"
+        "grading = 0.3 has no effect: it counts with open_size above 0"
     ]

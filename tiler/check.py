@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.mesh import Marker
 from stitch.frontier import Settled, add_rim, close_frontier, start_frontier
-from tiler import city_proofs, proofs
+from tiler import city_proofs, proofs, soil_proofs
 from tiler.building_index import BuildingIndex, index_buildings
 from tiler.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
 from tiler.out_folder import RUN_RECORD, STORE
@@ -96,7 +96,7 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
         sums = _Sums.start(len(index))
         frontier = start_frontier()
         for number, (volume, boundary) in enumerate(files):
-            piece = read_piece(directory / volume, directory / boundary, record.bounds)
+            piece = read_piece(directory / volume, directory / boundary, record.bounds, soil=record.depth > 0)
             frontier, settled, fresh = add_rim(frontier, piece.rim, number)
             sums.add_piece(piece, fresh, record, index, dtm)
             sums.add_settled(settled)
@@ -132,14 +132,21 @@ class _Sums:
         found = {
             "same": piece.same_boundary,
             "closed": piece.closed,
-            "marks": city_proofs.check_marks(surface, buildings),
+            "marks": city_proofs.check_marks(surface, buildings, soil=record.depth > 0),
             "box": proofs.check_box(surface, record.bounds, piece.rim.edges),
             "top": proofs.check_top(take_vertices(piece, Marker.TOP, TOP, fresh), record.top),
             "ground": proofs.check_ground(take_vertices(piece, Marker.GROUND, GROUND, fresh), dtm),
             "roofs": city_proofs.check_roofs(surface, buildings),
             "walls": city_proofs.check_walls(surface, buildings),
-            "sizes": proofs.check_sizes(surface, piece.outline, piece.volume),
+            "sizes": proofs.check_sizes(surface, piece.outline, piece.air),
         }
+        if record.depth:
+            found |= {
+                "between": piece.ground,
+                "bottom": soil_proofs.check_bottom(surface, record.depth),
+                "foundations": soil_proofs.check_foundations(surface, dtm),
+                "soil": soil_proofs.check_soil_sizes(surface, piece.soil),
+            }
         for name, finding in found.items():
             self._join(name, finding)
         city_proofs.add_built(self.built, rows, city_proofs.find_built(surface, buildings, piece.outline))
@@ -178,7 +185,7 @@ def _conclude(
         "seam_faces": int(found["seams"].sums["faces"]),
         "missing_facets": int(found["box"].sums["missing"]),
     }
-    claims = (
+    claims: tuple[Proof, ...] = (
         _prove_cells(sums, n_pieces),
         proofs.prove_seams(found["seams"], len(sums.seams), n_pieces),
         proofs.prove_same_boundary(found["same"]),
@@ -194,6 +201,14 @@ def _conclude(
         proofs.prove_volume(found["sizes"]),
         proofs.prove_record(record, sums.counts, partial=partial),
     )
+    if record.depth:
+        claims += (
+            soil_proofs.prove_between(found["between"]),
+            soil_proofs.prove_bottom(found["bottom"], record.depth),
+            soil_proofs.prove_foundations(found["foundations"]),
+            soil_proofs.prove_soil_sizes(found["soil"], found["sizes"]),
+        )
+        facts |= {"soil_volume": found["soil"].sums["cells"]}
     return claims, facts
 
 

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Boundary, Marker, TetMesh
+from pipeline.mesh import Boundary, Marker, Region, TetMesh
 from stitch import conformity
 from stitch.frontier import Rim, as_places, find_border, find_edges_below, find_outline
 from tiler import proofs
 from tiler.proofs import Bounds, Fault, Finding, Mask, Surface, Vertices
 from tiler.run_folder import read_volume
+from tiler.soil_proofs import check_between
 from tiler.vtk_files import BoundaryPiece, read_vtp
 
 # Kinds of points over the rim, each counted once: any, of the ground, of the top.
@@ -26,8 +27,8 @@ class Piece:
     ----------
     n_cells, n_points : int
         Cells, and points that are not over the rim.
-    volume, smallest : float
-        Volume of all cells and of the smallest (m³).
+    air, soil, smallest : float
+        Volume of all cells of air, of all cells of soil, and of the smallest (m³).
     surface : Surface
         Its boundary file, on the distinct vertices of this and of the exterior faces.
     outline : float64, (k, 2, 2)
@@ -36,8 +37,8 @@ class Piece:
         What it has over those of them that are not on the region's border.
     on_rim : bool, (n,)
         Which of the surface's points are over the rim.
-    same_boundary, closed : Finding
-        What the piece alone says of these claims.
+    same_boundary, ground, closed : Finding
+        What the piece alone says of these claims; of the ground only with soil below it.
     crowded : float64, (c, 2, 3)
         Boundary edges of more than two facets, paired, not over the rim.
     faults : tuple of Fault
@@ -46,51 +47,62 @@ class Piece:
 
     n_cells: int
     n_points: int
-    volume: float
+    air: float
+    soil: float
     smallest: float
     surface: Surface
     outline: Vertices
     rim: Rim
     on_rim: Mask
     same_boundary: Finding
+    ground: Finding
     closed: Finding
     crowded: Vertices
     faults: tuple[Fault, ...]
 
 
-def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds) -> Piece:
-    """Read the two files of a piece of the region with these bounds (m).
+def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: bool = False) -> Piece:
+    """Read the two files of a piece of the region with these bounds (m), which has soil or has not.
 
     Raises
     ------
     InputError
         If one is missing or damaged.
     """
-    mesh, file = read_volume(volume_path), read_vtp(boundary_path)
+    (mesh, region), file = read_volume(volume_path, regions=soil), read_vtp(boundary_path)
     pairs = conformity.pair_cell_faces(mesh.cells, len(mesh.points))
     volumes, flat = conformity.compute_cell_volumes(mesh.points, mesh.cells)
-    surface, faces = _join(mesh.points[pairs.exterior], file)
+    between, of_soil = _part_regions(mesh, region, pairs.exterior)
+    surface, rows = _join(mesh.points[np.concatenate((pairs.exterior, between))], file)
+    faces, between = rows[: len(pairs.exterior)], rows[len(pairs.exterior) :]
     # Faces of cells whose vertices are there twice meet where coordinates are equal.
     joined = conformity.pair_faces(faces)
     exterior = joined.exterior
-    match = conformity.match_facets(exterior, surface.boundary.facets)
+    # With soil below it, the ground is no boundary.
+    inside = surface.marked(Marker.GROUND) & soil
+    facets, ground = surface.boundary.facets[~inside], surface.boundary.facets[inside]
+    match = conformity.match_facets(exterior, facets)
     known = np.ones(len(exterior), np.bool_)
     known[match.missing] = False
-    outline = find_outline(surface.points, _facing_up(surface.points, exterior[known]))
+    of_air = known.copy()
+    of_air[np.setdiff1d(np.arange(len(exterior)), conformity.match_facets(faces[of_soil], exterior).extra)] = False
+    outline = find_outline(surface.points, _facing_up(surface.points, exterior[of_air]))
     edges = outline[~find_border(outline, bounds, tolerance=proofs.SIDE_TOLERANCE)]
     over = find_edges_below(surface.points[exterior], edges) >= 0
-    rim, on_rim = _find_rim(surface, edges, exterior[over], known[over], faces)
-    open_edges, crowded = _pair_edges(surface, on_rim)
+    rim, on_rim = _find_rim(surface, facets, edges, exterior[over], known[over], faces)
+    open_edges, crowded = _pair_edges(surface.points, facets, on_rim)
     return Piece(
         n_cells=len(mesh.cells),
         n_points=len(mesh.points) - len(np.unique(pairs.exterior)) + int((~on_rim[np.unique(faces)]).sum()),
-        volume=float(volumes.sum()),
+        air=float(volumes[region == Region.AIR].sum()),
+        soil=float(volumes[region == Region.SOIL].sum()),
         smallest=float(volumes.min(initial=np.inf)),
         surface=surface,
         outline=outline,
         rim=rim,
         on_rim=on_rim,
-        same_boundary=proofs.check_same_boundary(surface, exterior, match, over),
+        same_boundary=proofs.check_same_boundary(surface.points, facets, exterior, match, over),
+        ground=check_between(surface.points, ground, between) if soil else Finding(),
         closed=proofs.check_closed(open_edges, crowded),
         crowded=crowded,
         faults=proofs.merge_faults(
@@ -111,6 +123,19 @@ def take_vertices(piece: Piece, marker: Marker, kind: int, fresh: Mask) -> Verti
     return np.concatenate((piece.surface.points[row[~piece.on_rim[row]]], rest))
 
 
+def _part_regions(
+    mesh: TetMesh, region: NDArray[np.int8], exterior: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], Mask]:
+    """Find the faces between air and soil (g, 3), as the air has them, and which exterior faces are the soil's."""
+    if (region == Region.AIR).all():
+        return np.empty((0, 3), np.int32), np.zeros(len(exterior), np.bool_)
+    air = conformity.pair_cell_faces(mesh.cells[region == Region.AIR], len(mesh.points)).exterior
+    match = conformity.match_facets(exterior, air)
+    of_soil = np.zeros(len(exterior), np.bool_)
+    of_soil[match.missing] = True
+    return air[match.extra], of_soil
+
+
 def _join(exterior: Vertices, file: BoundaryPiece) -> tuple[Surface, NDArray[np.int32]]:
     """Put the boundary and the exterior faces (k, 3, 3) on common points, equal where coordinates are."""
     corners = file.points[file.boundary.facets]
@@ -129,12 +154,20 @@ def _facing_up(points: Vertices, faces: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def _find_rim(
-    surface: Surface, edges: Vertices, over: NDArray[np.int32], known: Mask, faces: NDArray[np.int32]
+    surface: Surface,
+    facets: NDArray[np.int32],
+    edges: Vertices,
+    over: NDArray[np.int32],
+    known: Mask,
+    faces: NDArray[np.int32],
 ) -> tuple[Rim, Mask]:
-    """Gather what stands over the rim's edges: exterior faces `over` them, some `known` to the boundary file."""
+    """Gather what stands over the rim's edges: exterior faces `over` them, some `known` to the boundary file.
+
+    Of the boundary file, `facets` are those that bound the cells.
+    """
     boundary, points = surface.boundary, surface.points
     on_rim = np.isin(as_places(points), as_places(edges))
-    start, end = boundary.facets.ravel(), np.roll(boundary.facets, -1, axis=1).ravel()
+    start, end = facets.ravel(), np.roll(facets, -1, axis=1).ravel()
     both = on_rim[start] & on_rim[end]
     kinds = [
         np.unique(faces),
@@ -152,11 +185,11 @@ def _find_rim(
     return rim, on_rim
 
 
-def _pair_edges(surface: Surface, on_rim: Mask) -> tuple[Vertices, Vertices]:
+def _pair_edges(points: Vertices, facets: NDArray[np.int32], on_rim: Mask) -> tuple[Vertices, Vertices]:
     """Pair the boundary's edges that are not over the rim: those left open, and those of many facets."""
-    edges = conformity.pair_edges(surface.boundary.facets)
+    edges = conformity.pair_edges(facets)
     kept = [rows[~on_rim[rows].all(axis=1)] for rows in (edges.open, edges.non_manifold)]
-    return surface.points[kept[0]], surface.points[kept[1]]
+    return points[kept[0]], points[kept[1]]
 
 
 def _find_link_faults(mesh: TetMesh, piece: BoundaryPiece) -> list[Fault]:

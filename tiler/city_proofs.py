@@ -27,28 +27,31 @@ from tiler.proofs import (
 from tiler.run_folder import Buildings
 
 LOADED = 4096  # footprints that are measured at once
+BELOW = (Marker.BOTTOM, Marker.FOUNDATION)  # markers that only a run with soil has
 OUTLINE_TOLERANCE = 2e-3  # m, in the plane: CityJSON rounds coordinates to 1 mm
 
 
-def check_marks(surface: Surface, buildings: Buildings) -> Finding:
-    """Every facet has one marker, and walls and roofs alone have a building, a known one."""
+def check_marks(surface: Surface, buildings: Buildings, *, soil: bool = False) -> Finding:
+    """Every facet has one marker, and walls, roofs and foundations alone have a building, a known one."""
     marker, owner = surface.boundary.marker, surface.boundary.building
-    unmarked = ~surface.marked(*Marker)
-    built = surface.marked(Marker.WALL, Marker.ROOF)
+    known = [mark for mark in Marker if soil or mark not in BELOW]
+    unmarked = ~surface.marked(*known)
+    built = surface.marked(Marker.WALL, Marker.ROOF, Marker.FOUNDATION)
     unknown = built & (_rows_of(owner, buildings) < 0)
     astray = ~built & (owner != -1)
+    bound = "1 to 9, 11 or 12" if soil else "1 to 9"
     centres = surface.corners.mean(axis=1)
     faults = [
-        *find_faults("marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: 1 to 9"),
+        *find_faults("marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: {bound}"),
         *find_faults(
             "building-unknown",
             centres[unknown],
-            f"building {_first(owner[unknown])} of a wall or roof is not in the city model",
+            f"building {_first(owner[unknown])} of a wall, roof or foundation is not in the city model",
         ),
         *find_faults(
             "building-astray",
             centres[astray],
-            f"building {_first(owner[astray])} on a facet that is no wall or roof; expected -1",
+            f"building {_first(owner[astray])} on a facet that is no wall, roof or foundation; expected -1",
         ),
     ]
     counts = {mark.name.lower(): int(np.count_nonzero(marker == mark)) for mark in Marker}
@@ -58,7 +61,8 @@ def check_marks(surface: Surface, buildings: Buildings) -> Finding:
 def prove_marks(found: Finding) -> Proof:
     """Tell how many facets have which marker."""
     names = [mark.name.lower() for mark in Marker]
-    counts = ", ".join(f"{found.sums[name]} {name}" for name in names if name != "missing" or found.sums[name])
+    rare = [mark.name.lower() for mark in (Marker.MISSING, *BELOW)]
+    counts = ", ".join(f"{found.sums[name]} {name}" for name in names if name not in rare or found.sums[name])
     return Proof(f"every facet has one marker: {counts}", found.faults)
 
 

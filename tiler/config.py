@@ -168,6 +168,10 @@ class Config:
     layer_growth: float = _parameter(
         1.2, "mesh", "with first_layer: ratio by which each layer is higher than the one below it", least=1, most=3
     )
+    underground: float = _parameter(
+        0.0, "mesh", "depth of the soil that is meshed below the terrain, with the ground inside; 0 for none",
+        unit="m", least=0, most=10_000,
+    )  # fmt: skip
     mesher: str = _parameter(
         "adaptive", "mesh", "how columns are filled: each by its own levels, or by the paper's layers",
         source="paper, steps 3.2-3.5", choices=("adaptive", "layered"),
@@ -262,6 +266,7 @@ CONDITIONS = {
     "smoothing_tolerance": ("mesher", "layered"),
     "fem_tolerance": ("mesher", "layered"),
 }
+SOIL = ("least_spacing", "most_spacing", "stagger")  # of these, those that count for soil with either mesher
 
 
 def idle_parameters(config: Config) -> list[str]:
@@ -276,7 +281,9 @@ def idle_parameters(config: Config) -> list[str]:
     idle = [
         f"{name} = {getattr(config, name)} has no effect: it counts with {other} = {value}"
         for name, (other, value) in CONDITIONS.items()
-        if getattr(config, name) != getattr(default, name) and getattr(config, other) != value
+        if getattr(config, name) != getattr(default, name)
+        and getattr(config, other) != value
+        and not (config.underground and name in SOIL)
     ]
     if config.grading != default.grading and not config.open_size:
         idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
@@ -487,6 +494,12 @@ def _check_together(config: Config) -> None:
     if config.least_spacing > config.most_spacing:
         raise ConfigError(
             f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
+        )
+    least = config.least_spacing * config.mesh_size
+    if 0 < config.underground < least:
+        raise ConfigError(
+            f"underground = {config.underground:g} m: at least {least:g} m (least_spacing x mesh_size), the least "
+            "height of a cell; raise it, lower --least-spacing, or give 0 for no soil"
         )
     spacing = largest_spacing(config)
     if config.first_layer > spacing:

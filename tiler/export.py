@@ -26,11 +26,14 @@ class RunFiles:
         Folder of the run.
     volumes, boundaries : tuple of Path
         VTU and VTP pieces, in the order of the index files: by name of tile.
+    depth : float
+        Depth of its soil (m), 0 where it has none.
     """
 
     directory: Path
     volumes: tuple[Path, ...]
     boundaries: tuple[Path, ...]
+    depth: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -244,11 +247,11 @@ def find_files(directory: Path) -> RunFiles:
     record = directory / RUN_RECORD
     if not record.is_file():
         raise InputError(f"{record}: no such file; run citystitch first, or name its output folder")
-    status = read_run_record(record).status
-    if status != "done":
-        raise InputError(f"{record}: the run is {status!r}, not 'done'; finish it or run again")
+    found = read_run_record(record)
+    if found.status != "done":
+        raise InputError(f"{record}: the run is {found.status!r}, not 'done'; finish it or run again")
     volumes, boundaries = (read_piece_paths(directory / name) for name in (VOLUME_INDEX, BOUNDARY_INDEX))
-    return RunFiles(directory, tuple(volumes), tuple(boundaries))
+    return RunFiles(directory, tuple(volumes), tuple(boundaries), found.depth)
 
 
 def _check_target(output: Path, files: RunFiles, *, overwrite: bool) -> None:

@@ -231,6 +231,10 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
         layers = max(round(expected_levels(config, config.layer_height_or_default)), 1)
         triangles = TRIANGLES * area * thin / h**2 + TRIANGLES_AN_OCTAVE * octaves
         cells = 3 * layers * triangles * volume / (area * height)
+    if config.underground:
+        spacing = h * FULL_SPACING / 0.8 * min(config.most_spacing, 1.0)
+        open_ground = 3 * TRIANGLES * area / (h**2 * spacing)
+        cells = cells + config.underground * (open_ground + CELLS_AT_WALLS * detail)
     index = np.argwhere(there) + grid.first
     points = spread_points(grid, survey.clouds)
     return TileLoads(index, *(values[there] for values in (area, points, houses, cells)))

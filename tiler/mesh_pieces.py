@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from pipeline.mesh import Region
 from stitch.numbering import Numbering
 from tiler.export import RUN_RECORD, RunFiles, find_files
 from tiler.merged import VERTEX_ID, number_piece, read_numbering
-from tiler.run_folder import read_run_record
+from tiler.run_folder import REGION, read_run_record
 from tiler.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
 
 
@@ -31,7 +32,7 @@ class MeshPiece:
         Tetrahedra of positive volume, as rows of `points`.
     facets : int32, (f, 3)
         Facets of the region's boundary, as rows of `points`, counter-clockwise seen from outside; faces that it
-        shares with another tile are not among them.
+        shares with another tile are not among them. With soil, the ground is there although it is inside.
     marker : int32, (f,)
         `pipeline.mesh.Marker` of each facet.
     building : int64, (f,)
@@ -39,6 +40,8 @@ class MeshPiece:
     ids : int64, (n,)
         Number of each point over the whole region, 0 to ``n_points - 1`` of `MeshPieces`. A point that several
         tiles have is bitwise the same in all of them, and has one number.
+    region : int8, (m,), or None
+        `pipeline.mesh.Region` of each cell; None where all is air.
     """
 
     name: str
@@ -48,6 +51,7 @@ class MeshPiece:
     marker: NDArray[np.int32]
     building: NDArray[np.int64]
     ids: NDArray[np.int64]
+    region: NDArray[np.int8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +95,7 @@ class MeshPieces:
             boundary.boundary.marker,
             boundary.boundary.building,
             number_piece(path, volume.point_data.get(VERTEX_ID), self.numbering),
+            _regions(path, volume) if self.files.depth else None,
         )
 
 
@@ -123,6 +128,13 @@ def open_pieces(directory: Path) -> MeshPieces:
             f"{counted} points; run again"
         )
     return MeshPieces(names, files, numbering)
+
+
+def _regions(path: Path, volume: VolumePiece) -> NDArray[np.int8]:
+    region = volume.cell_data.get(REGION)
+    if region is None or region.dtype != np.int8 or not np.isin(region, list(Region)).all():
+        raise InputError(f"{path}: has no cell array {REGION!r} of 0 (air) and 1 (soil) alone; run the tile again")
+    return region
 
 
 def _facets_in_volume(path: Path, volume: VolumePiece, boundary: BoundaryPiece) -> NDArray[np.int32]:

@@ -9,6 +9,7 @@ from pipeline.layered import LayeredOptions
 from pipeline.sizes import SizeRule
 from pipeline.spacing import SpacingLimits
 from pipeline.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
+from pipeline.underground import SoilOptions
 from tiler.config import Config
 from tiler.domain import Domain
 from tiler.task import Declared
@@ -28,6 +29,8 @@ LAYER_PARAMETERS = (
     *("mesh_size", "mesher", "domain_height", "least_spacing", "most_spacing", "stagger", "improve_passes"),
     *("layer_height", "layer_height_or_default", "smoother", "smoothing_tolerance", "fem_tolerance"),
 )
+# Parameters of the soil, which counts only where it is asked for.
+SOIL_PARAMETERS = ("underground", "mesh_size", "least_spacing", "most_spacing", "stagger")
 
 
 def derived_parameters(config: Config) -> dict[str, float]:
@@ -114,6 +117,12 @@ def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | A
 def size_rule(given: Any) -> SizeRule:
     """Rule of the sizes in the plane, where ``open_size`` is given."""
     return SizeRule(given.mesh_size, given.open_size, given.grading)
+
+
+def soil_options(given: Any) -> SoilOptions:
+    """Options of the soil, the same with both meshers."""
+    limits = SpacingLimits(given.least_spacing, given.most_spacing)
+    return SoilOptions(given.underground, given.mesh_size, limits, given.stagger)
 
 
 def plane_options(given: Any) -> dict[str, Any]:

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.mesh import Marker, TetMesh
-from tiler.vtk_files import TETRA, BoundaryPiece, read_piece_paths, read_vtp, read_vtu
+from pipeline.mesh import Marker, Region, TetMesh
+from tiler.run_folder import REGION
+from tiler.vtk_files import TETRA, BoundaryPiece, VolumePiece, read_piece_paths, read_vtp, read_vtu
 
 BOUNDARY_INDEX, VOLUME_INDEX = "boundary.pvtp", "mesh.pvtu"
 SHOWN = (Marker.GROUND, Marker.WALL, Marker.ROOF)
@@ -141,7 +142,7 @@ def load_air(directory: Path, origin: NDArray[np.float64]) -> Air:
     """
     points, facets, n_points = [], [], 0
     for path in _find_pieces(directory / VOLUME_INDEX):
-        shell = _find_shell(read_vtu(path).mesh, float(origin[1]))
+        shell = _find_shell(_take_air(read_vtu(path)), float(origin[1]))
         points.append(shell.points)
         facets.append(shell.facets + n_points)
         n_points += len(shell.points)
@@ -179,6 +180,12 @@ def _keep_used(part: BoundaryPiece, shown: NDArray[np.bool_]) -> tuple[NDArray[n
     facets = part.boundary.facets[shown]
     used, corners = np.unique(facets, return_inverse=True)
     return part.points[used], corners.reshape(-1, 3).astype(np.int64, copy=False)
+
+
+def _take_air(piece: VolumePiece) -> TetMesh:
+    """Leave out the soil, if there is some."""
+    region = piece.cell_data.get(REGION)
+    return piece.mesh if region is None else TetMesh(piece.mesh.points, piece.mesh.cells[region == Region.AIR])
 
 
 def _find_shell(mesh: TetMesh, south: float) -> Air:

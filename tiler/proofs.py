@@ -175,37 +175,41 @@ def find_cell_faults(mesh: TetMesh, volumes: NDArray[np.float64], flat: Mask) ->
 def find_face_faults(points: Vertices, pairs: conformity.FacePairs) -> list[Fault]:
     """Find faces of more than two cells, or of two cells on the same side."""
     return [
-        *find_faults("face-shared", _centres(points, pairs.shared), SHARED),
-        *find_faults("face-same-side", _centres(points, pairs.same_side), SAME_SIDE),
+        *find_faults("face-shared", centres_of(points, pairs.shared), SHARED),
+        *find_faults("face-same-side", centres_of(points, pairs.same_side), SAME_SIDE),
     ]
 
 
 def check_same_boundary(
-    surface: Surface, exterior: NDArray[np.int32], match: conformity.Matched, on_rim: Mask
+    points: Vertices,
+    facets: NDArray[np.int32],
+    exterior: NDArray[np.int32],
+    match: conformity.Matched,
+    on_rim: Mask,
 ) -> Finding:
     """The facets of the boundary files are the exterior faces of the cells, each once, outwards.
 
     Parameters
     ----------
-    surface : Surface
-        The boundary file of a piece.
+    points : float64, (n, 3)
+        Points of a piece's surface (m).
+    facets : int32, (f, 3)
+        What its boundary file has: all facets but ground with soil below it.
     exterior : int32, (k, 3)
-        Exterior faces of its cells, as indices of the surface's points.
+        Exterior faces of its cells.
     match : Matched
-        These against the surface's facets.
+        These against the facets.
     on_rim : bool, (k,)
         Which of them another piece may have too: what the file lacks of these is no fault yet.
     """
-    facets, missing = surface.boundary.facets, match.missing[~on_rim[match.missing]]
+    missing = match.missing[~on_rim[match.missing]]
     lists = [
         ("facet-missing", exterior[missing], "an exterior face of the cells is not in the boundary file"),
         ("facet-extra", facets[match.extra], EXTRA),
         ("facet-flipped", facets[match.flipped], "a facet points into its cell"),
         ("facet-duplicate", facets[match.duplicate], "a facet is there twice"),
     ]
-    faults = [
-        fault for kind, rows, why in lists for fault in find_faults(kind, _centres(surface.points, rows), why)
-    ]
+    faults = [fault for kind, rows, why in lists for fault in find_faults(kind, centres_of(points, rows), why)]
     n_exterior = len(exterior) - len(match.missing) + len(missing)
     return Finding(merge_faults(faults), {"facets": len(facets), "exterior": n_exterior})
 
@@ -391,14 +395,14 @@ def prove_plan(found: Finding, bounds: Bounds, *, partial: bool) -> Proof:
     whole = found.sums["plan"] if partial else (east - west) * (north - south)
     name = "the pieces' plan" if partial else "box"
     claim = f"plan areas: ground and roofs {below:.6f}, top {top:.6f}, {name} {whole:.6f} m²"
-    return Proof(claim, _unless_equal("plan-area", claim, whole, below, top))
+    return Proof(claim, unless_equal("plan-area", claim, whole, below, top))
 
 
 def prove_volume(found: Finding) -> Proof:
     """The cells fill the box without the ground and the buildings."""
     air, cells = found.sums["air"], found.sums["cells"]
     claim = f"volumes: cells {cells:.6f}, box minus ground minus buildings {air:.6f} m³"
-    return Proof(claim, _unless_equal("volume", claim, air, cells))
+    return Proof(claim, unless_equal("volume", claim, air, cells))
 
 
 def prove_record(record: RunRecord, counts: Mapping[str, int], *, partial: bool) -> Proof:
@@ -412,12 +416,14 @@ def prove_record(record: RunRecord, counts: Mapping[str, int], *, partial: bool)
     return Proof(f"run.json has what the files have: {found}", tuple(faults))
 
 
-def _centres(points: Vertices, rows: NDArray[np.int32]) -> Vertices:
+def centres_of(points: Vertices, rows: NDArray[np.int32]) -> Vertices:
+    """Return the middle of each face."""
     centres: Vertices = points[rows].mean(axis=1)
     return centres
 
 
-def _unless_equal(kind: str, detail: str, first: float, *others: float) -> tuple[Fault, ...]:
+def unless_equal(kind: str, detail: str, first: float, *others: float) -> tuple[Fault, ...]:
+    """Make a fault if one of the others is not the first, but for rounding."""
     equal = all(abs(other - first) <= RELATIVE_TOLERANCE * abs(first) for other in others)
     bound = f"{detail}; bound: {RELATIVE_TOLERANCE:g} relative"
     return () if equal else (Fault(kind, 1, (), bound),)

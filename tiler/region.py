@@ -108,6 +108,7 @@ def check_sizes(region: Region, config: Config) -> None:
     layered = config.mesher == "layered"
     spacing = config.layer_height_or_default if layered else config.most_spacing * config.largest_size
     cells = 6 * area / config.largest_size**2 * expected_levels(config, spacing)
+    cells += 6 * area / config.largest_size**2 * config.underground / (config.most_spacing * config.largest_size)
     if cells > MOST_CELLS:
         raise ConfigError(
             f"mesh_size = {config.mesh_size:g} m: at least {cells:.3g} cells in a tile of {region.tile_size:g} m "

@@ -15,12 +15,13 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.mesh import TetMesh
+from pipeline.mesh import Region, TetMesh
 from tiler.json_stream import JsonStream, NoJsonError
 
 SCHEMA = 1  # of run.json
-RECORD_MEMBERS = ("schema", "status", "error", "region", "counts")
+RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters")
 TILES = "tiles"
+REGION = "region"  # cell array of a piece with soil
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
 
@@ -41,6 +42,8 @@ class RunRecord:
         ``cells``, ``points``, ``facets`` and ``buildings``.
     tiles : mapping of str to tuple of 4 floats or None
         Boxes of the tiles by name (m), as far as they are stated.
+    depth : float
+        Depth of the soil below the terrain (m), 0 where there is none.
     """
 
     status: str
@@ -48,6 +51,7 @@ class RunRecord:
     top: float
     counts: Mapping[str, int]
     tiles: Mapping[str, tuple[float, ...] | None] = field(default_factory=dict)
+    depth: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +103,14 @@ def read_run_record(path: Path) -> RunRecord:
         names = ("cells", "points", "facets", "buildings")
         counts = {name: int(record["counts"][name]) for name in names}
         status = str(record["status"])
+        depth = float(record.get("parameters", {}).get("underground", 0.0))
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
     if not (west < east and south < north and math.isfinite(west + south + east + north)):
         raise InputError(f"{path}: region bounds {west, south, east, north} are no box; run again")
-    return RunRecord(status, (west, south, east, north), top, counts, record.get(TILES) or {})
+    if not 0 <= depth < math.inf:
+        raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
+    return RunRecord(status, (west, south, east, north), top, counts, record.get(TILES) or {}, depth)
 
 
 def read_crs(path: Path) -> str:
@@ -124,13 +131,27 @@ def read_crs(path: Path) -> str:
     return crs
 
 
-def read_volume(path: Path) -> TetMesh:
+def read_volume(path: Path, *, regions: bool = False) -> tuple[TetMesh, NDArray[np.int8]]:
     """Read a VTU piece with meshio: a reader that is not ours.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    regions : bool
+        Whether its cells must tell their region.
+
+    Returns
+    -------
+    TetMesh
+        The mesh.
+    int8, (n_cells,)
+        `pipeline.mesh.Region` of each cell: all air if they need not tell.
 
     Raises
     ------
     InputError
-        If meshio cannot read it, or if it holds something else than finite points and tetrahedra.
+        If meshio cannot read it, if it holds something else than finite points and tetrahedra, or lacks a region.
 
     Notes
     -----
@@ -154,7 +175,15 @@ def read_volume(path: Path) -> TetMesh:
         )
     if not np.isfinite(mesh.points).all():
         raise InputError(f"{path}: a coordinate is not finite; run the tile again")
-    return TetMesh(mesh.points.astype(np.float64, copy=False), cells.astype(np.int32))
+    region = np.full(len(cells), Region.AIR, np.int8)
+    if regions:
+        known = mesh.cell_data.get(REGION, [])
+        if len(known) != 1 or known[0].shape != region.shape or not np.isin(known[0], list(Region)).all():
+            raise InputError(
+                f"{path}: has no cell array {REGION!r} of 0 (air) and 1 (soil) alone; run the tile again"
+            )
+        region = known[0].astype(np.int8)
+    return TetMesh(mesh.points.astype(np.float64, copy=False), cells.astype(np.int32)), region
 
 
 @contextmanager

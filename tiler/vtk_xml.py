@@ -31,6 +31,7 @@ VTK_TYPES = {
     "int64": "Int64",
     "int32": "Int32",
     "uint8": "UInt8",
+    "int8": "Int8",
 }
 DTYPES = {name: np.dtype(dtype).newbyteorder("<") for dtype, name in VTK_TYPES.items()}
 

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.errors import ConfigError
 from tiler.atomic import replacing
 from tiler.export import RUN_RECORD
 from tiler.formats.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
@@ -64,6 +65,8 @@ def export_cgns(output: Path, directory: Path, *, buildings: str | None = None) 
 
     Raises
     ------
+    ConfigError
+        If the mesh has soil.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
@@ -118,6 +121,10 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
     n_cells, facets = 0, dict[int, int]()
     for k in range(len(pieces.names)):
         piece = pieces.read(k)
+        if piece.region is not None and piece.region.any():
+            raise ConfigError(
+                "cgns: the mesh has soil, and the file holds one zone, of air; use openfoam, msh or xdmf"
+            )
         n_cells += len(piece.cells)
         keys, counts = np.unique(
             patch_keys(piece.marker, piece.building, by_building=by_building), return_counts=True

@@ -11,9 +11,27 @@ from numpy.typing import NDArray
 
 from stitch.cell_faces import CellFaces
 from tiler.formats.foam_files import FoamFaces, FoamList, foam_header
-from tiler.formats.foam_patches import POLY_MESH, ZonesFile, patch_of_key, runs_of, write_boundary
+from tiler.formats.foam_patches import (
+    GROUND_ZONE,
+    POLY_MESH,
+    ZonesFile,
+    cell_zone_name,
+    face_zone_name,
+    patch_of_key,
+    runs_of,
+    write_boundary,
+)
 from tiler.formats.pieces import Pieces
-from tiler.formats.region_faces import FacetSets, Ints, RegionFaces, faces_of_piece, lowest_first, own_faces
+from tiler.formats.region_faces import (
+    FacetSets,
+    Ints,
+    RegionFaces,
+    faces_of_piece,
+    find_ground,
+    find_outer,
+    lowest_first,
+    own_faces,
+)
 from tiler.mesh_pieces import MeshPiece
 
 
@@ -49,10 +67,10 @@ class FoamPlan:
         The mesh.
     region : RegionFaces
         Numbers of cells and faces.
-    patches, zones : FacetSets
-        Patches by key (`patch_of_key`); face zones by number of building, or None.
+    patches, zones, volumes : FacetSets
+        Patches by key (`patch_of_key`); face zones by key (`face_zone_name`), or None; cell zones by region.
     patch_keys, zone_keys : callable
-        Give the key of each facet of a piece.
+        Give the key of each facet of a piece, -1 for none.
     part : int64, (k,)
         Part of each piece.
     label : int
@@ -63,6 +81,7 @@ class FoamPlan:
     region: RegionFaces
     patches: FacetSets
     zones: FacetSets | None
+    volumes: FacetSets
     patch_keys: Callable[[MeshPiece], Ints]
     zone_keys: Callable[[MeshPiece], Ints]
     part: Ints
@@ -173,7 +192,12 @@ class _PartWriter:
             self._whole = _number_facets(plan.patches, range(len(plan.part)), plan.region.n_inner)
         self._zones = None
         if plan.zones is not None:
-            self._zones = stack.enter_context(ZonesFile(folder / "faceZones", plan.zones, numbers.pieces))
+            faces = ZonesFile(folder / "faceZones", plan.zones, numbers.pieces, face_zone_name)
+            self._zones = stack.enter_context(faces)
+        self._volumes = None
+        if len(plan.volumes.keys):
+            cells = ZonesFile(folder / "cellZones", plan.volumes, numbers.pieces, cell_zone_name)
+            self._volumes = stack.enter_context(cells)
 
     def add(self, k: int) -> None:
         """Write piece `k`."""
@@ -182,6 +206,9 @@ class _PartWriter:
         local = self._add_points(k, piece)
         self._add_inner(k, piece, faces, local)
         self._add_facets(k, piece, faces, local)
+        if self._volumes is not None and piece.region is not None:
+            cells = self.numbers.start[k] + np.arange(len(piece.cells))
+            self._volumes.write(k, piece.region.astype(np.int64), cells)
 
     def finish(self) -> PartCounts:
         """Write what stands behind the pieces."""
@@ -236,6 +263,10 @@ class _PartWriter:
             turned = np.zeros(int(out.sum()), np.bool_)
             self._across.append(_Across(other[out], face[out], turned, owner[out], corners[out]))
             self._across.append(self._find_turned(k, piece, faces, local))
+        ground = np.flatnonzero(find_ground(region, k, piece, own))
+        if self._zones is not None and len(ground):
+            number = self._row + np.cumsum(inside)[ground] - 1
+            self._zones.write(k, np.full(len(ground), GROUND_ZONE), number)
         self._row += int(inside.sum())
 
     def _find_turned(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> _Across:
@@ -253,9 +284,11 @@ class _PartWriter:
     def _add_facets(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> None:
         """Write the facets of a piece, each where its patch has room for them."""
         numbers, keys = self.numbers, self._plan.patches.keys
-        corners, owner = local[piece.facets], faces.facet_cell + numbers.start[k]
+        outer = find_outer(piece)
+        facets, owner = piece.facets[outer], faces.facet_cell + numbers.start[k]
+        corners = local[facets]
         face = np.empty(len(owner), np.int64)
-        for row, chosen in runs_of(keys, self._plan.patch_keys(piece)):
+        for row, chosen in runs_of(keys, self._plan.patch_keys(piece)[outer]):
             at = int(numbers.patch_start[row]) + numbers.first[k][row]
             self._faces.write(at, corners[chosen])
             self._owner.write(at, owner[chosen])
@@ -263,10 +296,10 @@ class _PartWriter:
             if self._places is not None:
                 first, _, start = self._whole
                 self._face_to.write(at, int(start[row]) + first[k][row] + 1 + np.arange(len(chosen)))
-            name, lowest = patch_of_key(int(keys[row])).name, float(piece.points[piece.facets[chosen], 2].min())
+            name, lowest = patch_of_key(int(keys[row])).name, float(piece.points[facets[chosen], 2].min())
             self._lowest[name] = min(self._lowest.get(name, lowest), lowest)
         if self._zones is not None:
-            self._zones.write(k, self._plan.zone_keys(piece), face)
+            self._zones.write(k, self._plan.zone_keys(piece)[outer], face)
 
     def _add_across(self) -> None:
         """Write the faces towards other parts: by part, then by number over the region, so in its order too."""

@@ -1,6 +1,6 @@
-"""Patches and face zones of OpenFOAM: their names, and the files `boundary` and `faceZones`."""
+"""Patches and zones of OpenFOAM: their names, and the files `boundary`, `faceZones` and `cellZones`."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -9,7 +9,7 @@ from typing import BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker
+from pipeline.mesh import Marker, Region
 from tiler.formats.foam_files import foam_header
 from tiler.formats.region_faces import FacetSets, Ints
 
@@ -24,10 +24,13 @@ PATCHES = {
     Marker.SOUTH: "south",
     Marker.NORTH: "north",
     Marker.MISSING: "missing",
+    Marker.BOTTOM: "bottom",
+    Marker.FOUNDATION: "foundations",
 }
 HOUSE = (Marker.WALL, Marker.ROOF)
-SOLID = (Marker.GROUND, *HOUSE)
+SOLID = (Marker.GROUND, *HOUSE, Marker.FOUNDATION)
 FIRST_BUILDING = 100  # keys of patches from here on are buildings, those below are markers
+GROUND_ZONE = 1 << 62  # key of the face zone of the ground, where it is inside; those below are buildings
 WIDTH = 20  # characters of a face's number in a zone, its line break among them
 
 
@@ -109,6 +112,28 @@ def building_name(number: int) -> str:
     return f"building_{number}"
 
 
+def face_zone_name(key: int) -> str:
+    """Name a face zone: that of a building, or of the ground where it is inside.
+
+    Examples
+    --------
+    >>> face_zone_name(7), face_zone_name(GROUND_ZONE)
+    ('building_7', 'ground')
+    """
+    return PATCHES[Marker.GROUND] if key == GROUND_ZONE else building_name(key)
+
+
+def cell_zone_name(key: int) -> str:
+    """Name a cell zone: that of a region.
+
+    Examples
+    --------
+    >>> cell_zone_name(1)
+    'soil'
+    """
+    return Region(key).name.lower()
+
+
 def write_boundary(
     path: Path, patches: Mapping[Patch, int], *, start: int, number: int, others: Mapping[int, int]
 ) -> dict[str, int]:
@@ -157,37 +182,39 @@ def write_boundary(
 
 
 class ZonesFile:
-    """The file ``faceZones``, filled piece by piece.
+    """The file ``faceZones`` or ``cellZones``, filled piece by piece.
 
     Parameters
     ----------
     path : Path
-        The file.
+        The file; its name tells what is in the zones.
     sets : FacetSets
-        Zones by number of building.
+        Zones by key.
     pieces : sequence of int
         The pieces that will be written.
+    name_of : callable
+        Gives the name of a key.
 
     Notes
     -----
     Numbers are text of a fixed width, so that each place is known before; memory holds names and places.
     """
 
-    def __init__(self, path: Path, sets: FacetSets, pieces: Sequence[int]) -> None:
+    def __init__(self, path: Path, sets: FacetSets, pieces: Sequence[int], name_of: Callable[[int], str]) -> None:
         self._keys = sets.keys
         self._first, count = sets.first(pieces)
         self._file: BinaryIO = path.open("wb")
-        self._file.write(
-            f"{foam_header('faceZones', 'regIOobject', location=POLY_MESH)}{len(count)}\n(\n".encode()
-        )
+        of = path.name.removesuffix("Zones")
+        self._file.write(f"{foam_header(path.name, 'regIOobject', location=POLY_MESH)}{len(count)}\n(\n".encode())
         self._start = np.empty(len(count), np.int64)
         for row, (key, n) in enumerate(zip(self._keys.tolist(), count.tolist(), strict=True)):
-            name = building_name(key)
-            self._file.write(f"{name}\n{{\n    type faceZone;\n    faceLabels List<label>\n{n}\n(\n".encode())
+            words = f"{name_of(key)}\n{{\n    type {of}Zone;\n    {of}Labels List<label>\n{n}\n(\n"
+            self._file.write(words.encode())
             self._start[row] = self._file.tell()
             self._file.seek(n * WIDTH, 1)
             flips = f"{n}{{0}}" if n else "0()"  # OpenFOAM cannot read 0{0}
-            self._file.write(f")\n    ;\n    flipMap List<bool> {flips};\n}}\n".encode())
+            turned = f"    flipMap List<bool> {flips};\n" if of == "face" else ""
+            self._file.write(f")\n    ;\n{turned}}}\n".encode())
         self._file.write(b")\n")
 
     def __enter__(self) -> Self:
@@ -198,10 +225,10 @@ class ZonesFile:
     ) -> None:
         self._file.close()
 
-    def write(self, k: int, keys: Ints, faces: Ints) -> None:
-        """Write which faces of piece `k` are in the zones `keys`, -1 for none."""
+    def write(self, k: int, keys: Ints, numbers: Ints) -> None:
+        """Write which faces or cells of piece `k` are in the zones `keys`, -1 for none."""
         for row, chosen in runs_of(self._keys, keys):
-            lines = "".join(f"{face:>{WIDTH - 1}d}\n" for face in faces[chosen].tolist())
+            lines = "".join(f"{number:>{WIDTH - 1}d}\n" for number in numbers[chosen].tolist())
             self._file.seek(int(self._start[row]) + self._first[k][row] * WIDTH)
             self._file.write(lines.encode())
 

@@ -32,7 +32,14 @@ VERTICES, INDICES = 34962, 34963  # targets of buffer views
 VERTEX_BYTES = FACET_BYTES = 12
 MOST_BYTES = 2**32 - 1  # of a GLB file: its length has 32 bits
 AXES = "x east, y up, z south; easting = origin[0] + x, northing = origin[1] - z, height = origin[2] + y"
-COLOURS = {Marker.GROUND: (0.45, 0.5, 0.38), Marker.WALL: (0.82, 0.78, 0.7), Marker.ROOF: (0.66, 0.33, 0.25)}
+EARTH = (0.42, 0.33, 0.24)
+COLOURS = {
+    Marker.GROUND: (0.45, 0.5, 0.38),
+    Marker.WALL: (0.82, 0.78, 0.7),
+    Marker.ROOF: (0.66, 0.33, 0.25),
+    Marker.BOTTOM: EARTH,
+    Marker.FOUNDATION: EARTH,
+}
 SIDE_COLOUR, SIDE_OPACITY = (0.6, 0.75, 0.9), 0.1  # of top and sides, through which the city is seen
 
 

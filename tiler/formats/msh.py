@@ -1,7 +1,7 @@
 """Gmsh's mesh files: MSH 4.1 binary, and MSH 2.2 as text for programs that read no other.
 
-Surfaces are one entity a marker, and the volume one: each has a physical group with a name. The number of a group
-is that of the marker, that of the volume `AIR`.
+Surfaces are one entity a marker, volumes one a region, air and soil: each has a physical group with a name. The
+number of a group is that of the marker, those of volumes stand in `VOLUMES`.
 """
 
 from collections.abc import Iterable
@@ -12,13 +12,20 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.mesh import Marker, Region
 from tiler.atomic import replacing
 from tiler.formats.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of
-from tiler.mesh_pieces import open_pieces
+from tiler.mesh_pieces import MeshPiece, open_pieces
 
-AIR, AIR_NAME = 10, "air"  # no marker has this number: some programs know groups by number alone
+# No marker has one of these numbers: some programs know groups by number alone.
+VOLUMES = {Region.AIR: 10, Region.SOIL: 20}
+AIR = VOLUMES[Region.AIR]
+NAMES = {number: region.name.lower() for region, number in VOLUMES.items()}
+# Markers of facets that bound one of the two regions alone.
+OF_AIR = (Marker.WALL, Marker.ROOF, Marker.TOP)
+OF_SOIL = (Marker.BOTTOM, Marker.FOUNDATION)
 TRIANGLE, TETRAHEDRON = 2, 4  # Gmsh's types of elements
 ROWS = 1 << 18  # rows that are made at once
 TEXT_FLOAT = "%24.16e"  # 17 digits, enough for any float64; each has the same width
@@ -31,16 +38,20 @@ class _Survey:
     """What is known after reading all pieces once: boxes (xmin, ymin, zmin, xmax, ..., m) and counts by key."""
 
     n_points: int
-    n_cells: int
-    box: _Box
+    cells: dict[int, int]
     facets: dict[int, int]
     boxes: dict[int, _Box]
+
+    @property
+    def n_elements(self) -> int:
+        """Number of all facets and cells."""
+        return sum(self.facets.values()) + sum(self.cells.values())
 
     @property
     def groups(self) -> list[tuple[int, int, str]]:
         """Dimension, number and name of each physical group."""
         names = [(2, number, patch_of_key(key).name) for key, number in self.numbers.items()]
-        return sorted([*names, (3, AIR, AIR_NAME)])
+        return sorted([*names, *((3, group, NAMES[group]) for group in self.cells)])
 
     @property
     def numbers(self) -> dict[int, int]:
@@ -74,7 +85,7 @@ def export_msh(output: Path, directory: Path, *, buildings: str | None = None) -
     Notes
     -----
     Memory: one piece. Nodes are in the order of their numbers, which begin with 1. Each piece is read twice. All
-    nodes belong to the volume.
+    nodes belong to the air.
     """
     pieces = open_pieces(directory)
     by_building = buildings is not None
@@ -93,7 +104,9 @@ def export_msh(output: Path, directory: Path, *, buildings: str | None = None) -
                 file.write(np.ascontiguousarray(piece.points[rows], "<f8").data)
             found = patch_keys(piece.marker, piece.building, by_building=by_building)
             patches = [(key, piece.facets[rows]) for key, rows in facets_by_key(survey.facets, found)]
-            for group, rows_of_group in [*patches, (AIR, piece.cells)]:
+            volumes = _groups(piece)
+            patches += [(group, piece.cells[volumes == group]) for group in survey.cells]
+            for group, rows_of_group in patches:
                 place, first = elements[group]
                 corners = piece.ids[rows_of_group]
                 tags = first + seen[group] + np.arange(len(corners))
@@ -115,8 +128,7 @@ def export_msh2(output: Path, directory: Path, *, buildings: str | None = None) 
         file.write(f"$Nodes\n{survey.n_points}\n".encode())
         nodes, width = file.tell(), digits + 3 * 25 + 1
         file.seek(nodes + survey.n_points * width)
-        n = survey.n_cells + sum(survey.facets.values())
-        file.write(f"$EndNodes\n$Elements\n{n}\n".encode())
+        file.write(f"$EndNodes\n$Elements\n{survey.n_elements}\n".encode())
         tag = 1
         for k in range(len(pieces.names)):
             piece = pieces.read(k)
@@ -124,7 +136,7 @@ def export_msh2(output: Path, directory: Path, *, buildings: str | None = None) 
             groups = numbers[np.searchsorted(keys, found)]
             facets = _numbered(tag, piece.ids[piece.facets] + 1, TRIANGLE, groups)
             tag += len(facets)
-            cells = _numbered(tag, piece.ids[piece.cells] + 1, TETRAHEDRON, np.full(len(piece.cells), AIR))
+            cells = _numbered(tag, piece.ids[piece.cells] + 1, TETRAHEDRON, _groups(piece))
             tag += len(cells)
             for rows in (facets, cells):
                 _write_lines(file, " ".join(["%d"] * rows.shape[1]) + "\n", rows)
@@ -138,18 +150,26 @@ def export_msh2(output: Path, directory: Path, *, buildings: str | None = None) 
 
 
 def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
-    n_cells, box = 0, _no_box()
+    cells: dict[int, int] = {}
     facets: dict[int, int] = {}
     boxes: dict[int, _Box] = {}
     for k in range(len(pieces.names)):
         piece = pieces.read(k)
-        n_cells += len(piece.cells)
-        box = _grown(box, piece.points)
+        volumes = _groups(piece)
         found = patch_keys(piece.marker, piece.building, by_building=by_building)
-        for key, rows in facets_by_key(np.unique(found).tolist(), found):
-            facets[key] = facets.get(key, 0) + len(rows)
-            boxes[key] = _grown(boxes.get(key, _no_box()), piece.points[piece.facets[rows].ravel()])
-    return _Survey(pieces.n_points, n_cells, box, dict(sorted(facets.items())), boxes)
+        parts = [(cells, group, piece.cells[volumes == group]) for group in np.unique(volumes).tolist()]
+        keys = facets_by_key(np.unique(found).tolist(), found)
+        parts += [(facets, key, piece.facets[rows]) for key, rows in keys]
+        for counts, group, corners in parts:
+            counts[group] = counts.get(group, 0) + len(corners)
+            boxes[group] = _grown(boxes.get(group, _no_box()), piece.points[corners.ravel()])
+    return _Survey(pieces.n_points, dict(sorted(cells.items())), dict(sorted(facets.items())), boxes)
+
+
+def _groups(piece: MeshPiece) -> NDArray[np.int64]:
+    """Give the number of each cell's group."""
+    region = np.zeros(len(piece.cells), np.int8) if piece.region is None else piece.region
+    return np.array([VOLUMES[value] for value in Region], np.int64)[region]
 
 
 def _no_box() -> _Box:
@@ -168,12 +188,21 @@ def _write_names(file: BinaryIO, survey: _Survey) -> None:
 
 
 def _write_entities(file: BinaryIO, survey: _Survey) -> None:
-    file.write(b"$Entities\n" + _packed("u8", [0, 0, len(survey.facets), 1]))
+    file.write(b"$Entities\n" + _packed("u8", [0, 0, len(survey.facets), len(survey.cells)]))
     for key, number in survey.numbers.items():
         file.write(_packed("i4", [number]) + _packed("f8", survey.boxes[key]))
         file.write(_packed("u8", [1]) + _packed("i4", [number]) + _packed("u8", [0]))
-    file.write(_packed("i4", [AIR]) + _packed("f8", survey.box) + _packed("u8", [1]) + _packed("i4", [AIR]))
-    file.write(_packed("u8", [len(survey.facets)]) + _packed("i4", survey.numbers.values()) + b"\n$EndEntities\n")
+    for group in survey.cells:
+        file.write(_packed("i4", [group]) + _packed("f8", survey.boxes[group]))
+        file.write(_packed("u8", [1]) + _packed("i4", [group]))
+        bounding = [number for key, number in survey.numbers.items() if _bounds(key, group)]
+        file.write(_packed("u8", [len(bounding)]) + _packed("i4", bounding))
+    file.write(b"\n$EndEntities\n")
+
+
+def _bounds(key: int, group: int) -> bool:
+    """Tell whether a surface bounds a volume: those of buildings and the top that of air alone."""
+    return key not in OF_SOIL if group == AIR else key < FIRST_BUILDING and key not in OF_AIR
 
 
 def _begin_nodes(file: BinaryIO, n: int) -> int:
@@ -189,12 +218,12 @@ def _begin_nodes(file: BinaryIO, n: int) -> int:
 
 def _begin_elements(file: BinaryIO, survey: _Survey) -> dict[int, tuple[int, int]]:
     """Write all of the section but elements; returns by key where they begin, and the first one's number."""
-    n = survey.n_cells + sum(survey.facets.values())
-    file.write(b"$Elements\n" + _packed("u8", [len(survey.facets) + 1, n, 1, n]))
+    n = survey.n_elements
+    file.write(b"$Elements\n" + _packed("u8", [len(survey.facets) + len(survey.cells), n, 1, n]))
     places, tag = {}, 1
-    numbers = survey.numbers | {AIR: AIR}
-    for group, count in {**survey.facets, AIR: survey.n_cells}.items():
-        dimension, kind = (3, TETRAHEDRON) if group == AIR else (2, TRIANGLE)
+    numbers = survey.numbers | {group: group for group in survey.cells}
+    for group, count in {**survey.facets, **survey.cells}.items():
+        dimension, kind = (3, TETRAHEDRON) if group in NAMES else (2, TRIANGLE)
         file.write(_packed("i4", [dimension, numbers[group], kind]) + _packed("u8", [count]))
         places[group] = file.tell(), tag
         file.seek(count * 8 * (2 + dimension), 1)

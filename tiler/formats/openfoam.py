@@ -19,10 +19,10 @@ from tiler.export import EXPORT_RECORD
 from tiler.formats.foam_case import INLET, OUTLET, write_system, write_wind_case
 from tiler.formats.foam_files import LABEL_LIMIT
 from tiler.formats.foam_part import FoamPlan, PartCounts, PointPlaces, write_part
-from tiler.formats.foam_patches import is_house, patch_keys
+from tiler.formats.foam_patches import FIRST_BUILDING, GROUND_ZONE, is_house
 from tiler.formats.partition import split_pieces
 from tiler.formats.pieces import Pieces
-from tiler.formats.region_faces import Ints, survey_faces
+from tiler.formats.region_faces import Ints, find_outer, survey_faces
 from tiler.mesh_pieces import MeshPiece, open_pieces
 
 
@@ -50,13 +50,18 @@ def export_openfoam(
     Raises
     ------
     ConfigError
-        If there are fewer tiles than parts, or no side for the wind to come from.
+        If there are fewer tiles than parts, no side for the wind to come from, or soil where it should blow.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
         If the folder cannot be written.
     """
     pieces = open_pieces(directory)
+    if case is not None and pieces.files.depth:
+        raise ConfigError(
+            f"--case {case}: the mesh has soil to {pieces.files.depth:g} m below ground, where no wind blows; "
+            "leave --case out, or mesh without --underground"
+        )
     with replacing_folder(output) as folder:
         counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings)
         write_system(folder, parts=parts, case=case)
@@ -119,16 +124,17 @@ def write_openfoam(
             f"give 1 to {n} parts, or mesh with a smaller --tile-size"
         )
     sets_of = _by_building if buildings == "patches" else _by_marker
+    zones_of = _by_zone if buildings == "zones" else _by_ground
     with TemporaryDirectory(dir=folder, prefix=".faces.") as scratch:
-        region, (patches, *zones) = survey_faces(
-            pieces, Path(scratch), kinds=(sets_of, _by_zone) if buildings == "zones" else (sets_of,)
+        region, (patches, zones, volumes) = survey_faces(
+            pieces, Path(scratch), kinds=(sets_of, zones_of, _by_region)
         )
         weight = np.diff(region.cell_start)
         part = np.zeros(n, np.int64) if parts is None else split_pieces(region.centre, weight, parts)
         n_faces = region.n_inner + int(patches.first(range(n))[1].sum())
         label = 32 if max(3 * n_faces, pieces.n_points, int(region.cell_start[-1])) <= LABEL_LIMIT else 64
-        found = zones[0] if zones else None
-        plan = FoamPlan(pieces, region, patches, found, sets_of, _by_zone, part, label)
+        found = zones if buildings == "zones" or len(zones.keys) else None
+        plan = FoamPlan(pieces, region, patches, found, volumes, sets_of, zones_of, part, label)
         if parts is None:
             return [write_part(folder, plan, 0, None)]
         places = PointPlaces(Path(scratch) / "places", pieces.n_points)
@@ -136,12 +142,21 @@ def write_openfoam(
 
 
 def _by_marker(piece: MeshPiece) -> Ints:
-    return patch_keys(piece.marker, piece.building, by_building=False)
+    return np.where(find_outer(piece), piece.marker, -1).astype(np.int64)
 
 
 def _by_building(piece: MeshPiece) -> Ints:
-    return patch_keys(piece.marker, piece.building, by_building=True)
+    houses = is_house(piece.marker, piece.building)
+    return np.where(houses, piece.building + FIRST_BUILDING, _by_marker(piece))
 
 
 def _by_zone(piece: MeshPiece) -> Ints:
-    return np.where(is_house(piece.marker, piece.building), piece.building, -1)
+    return np.where(is_house(piece.marker, piece.building), piece.building, _by_ground(piece))
+
+
+def _by_ground(piece: MeshPiece) -> Ints:
+    return np.where(find_outer(piece), -1, GROUND_ZONE)
+
+
+def _by_region(piece: MeshPiece) -> Ints:
+    return np.empty(0, np.int64) if piece.region is None else piece.region.astype(np.int64)

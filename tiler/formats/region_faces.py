@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from pipeline.mesh import Marker, Region
 from stitch.cell_faces import CellFaces, find_cell_faces
 from stitch.conformity import group_rows
 from tiler.formats.pieces import Pieces
 from tiler.mesh_pieces import MeshPiece
 
 Ints = NDArray[np.int64]
-# Given a piece, the key of a set of facets for each of its facets; several sets may have a facet.
+# Given a piece, the key of a set of facets, or of cells, for each of them; several sets may have one.
 SetsOf = Callable[[MeshPiece], Ints]
 
 
@@ -136,7 +137,7 @@ def survey_faces(
     folder : Path
         An existing folder for files; they must stay as long as the result is used.
     kinds : tuple of callable
-        Each gives a key for every facet of a piece, or -1 for none.
+        Each gives a key for every facet of a piece, or for every cell, or -1 for none.
 
     Returns
     -------
@@ -193,9 +194,40 @@ def faces_of_piece(piece: MeshPiece) -> CellFaces:
         If its cells and facets do not fit together.
     """
     try:
-        return find_cell_faces(piece.cells, piece.facets, len(piece.points))
+        return find_cell_faces(piece.cells, piece.facets[find_outer(piece)], len(piece.points))
     except ValueError as error:
         raise InputError(f"tile {piece.name}: {error}; run citystitch check") from None
+
+
+def find_outer(piece: MeshPiece) -> NDArray[np.bool_]:
+    """Tell which facets of a piece bound its cells, bool (f,): all, but for the ground with soil below it."""
+    if piece.region is None:
+        return np.ones(len(piece.facets), np.bool_)
+    outer: NDArray[np.bool_] = piece.marker != Marker.GROUND
+    return outer
+
+
+def find_ground(region: RegionFaces, k: int, piece: MeshPiece, own: "OwnFaces") -> NDArray[np.bool_]:
+    """Tell which of the faces that piece `k` has of the region's list are the ground between air and soil.
+
+    Raises
+    ------
+    InputError
+        If these are not as many as the piece marks, or the normal of one points up.
+    """
+    ground = np.zeros(len(own.owner), np.bool_)
+    if piece.region is None:
+        return ground
+    owner, neighbour = own.owner - region.cell_start[k], own.neighbour - region.cell_start[k]
+    within = np.flatnonzero(neighbour < len(piece.cells))
+    pair = piece.region[owner[within]], piece.region[neighbour[within]]
+    ground[within] = (pair[0] == Region.AIR) & (pair[1] == Region.SOIL)
+    if ground.sum() != (~find_outer(piece)).sum() or (pair[0] > pair[1]).any():
+        raise InputError(
+            f"tile {piece.name}: its ground is not what air and soil share, the air's cells first; run citystitch "
+            "check"
+        )
+    return ground
 
 
 def own_faces(region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces) -> OwnFaces:

@@ -1,7 +1,7 @@
 """XDMF with HDF5: cells and marked facets in two grids on the same points, for FEniCS and ParaView.
 
 The first grid, ``mesh``, has the tetrahedra, the second, ``facets``, the boundary's triangles with ``marker`` and
-``building``: what `XDMFFile.read_mesh` and `read_meshtags` of DOLFINx take.
+``building``: what `XDMFFile.read_mesh` and `read_meshtags` of DOLFINx take. With soil, ``mesh`` has ``region``.
 """
 
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from pipeline.errors import OutputError
 from tiler.atomic import replacing
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of
-from tiler.mesh_pieces import open_pieces
+from tiler.mesh_pieces import MeshPieces, open_pieces
 
 DATA = ".h5"  # suffix of the second file
 ARRAYS = {
@@ -26,6 +26,7 @@ ARRAYS = {
     "facets": (np.int64, 3),
     "marker": (np.int32, 1),
     "building": (np.int64, 1),
+    "region": (np.int32, 1),
 }
 HEAD = '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
 TAIL = "  </Domain>\n</Xdmf>\n"
@@ -59,7 +60,8 @@ def export_xdmf(output: Path, directory: Path) -> None:
     with replacing(output) as text_part, replacing(data) as data_part:
         with as_output_error(data):
             _write_data(data_part, pieces, n_cells, n_facets)
-        text_part.write_text(_render(data.name, pieces.n_points, n_cells, n_facets))
+        tags = ("region",) if pieces.files.depth else ()
+        text_part.write_text(_render(data.name, pieces.n_points, n_cells, n_facets, tags))
         # Numbers that do not belong to an old text must not be read with it.
         output.unlink(missing_ok=True)
 
@@ -84,7 +86,7 @@ def as_output_error(path: Path) -> Iterator[None]:
         raise OutputError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
 
 
-def _write_data(path: Path, pieces: Pieces, n_cells: int, n_facets: int) -> None:
+def _write_data(path: Path, pieces: MeshPieces, n_cells: int, n_facets: int) -> None:
     rows = {
         "points": pieces.n_points,
         "cells": n_cells,
@@ -92,10 +94,13 @@ def _write_data(path: Path, pieces: Pieces, n_cells: int, n_facets: int) -> None
         "marker": n_facets,
         "building": n_facets,
     }
+    if pieces.files.depth:
+        rows["region"] = n_cells
     with h5py.File(path, "w", libver=("earliest", "v108")) as file:
         sets = {
             name: file.create_dataset(name, (rows[name], width) if width > 1 else (rows[name],), dtype)
             for name, (dtype, width) in ARRAYS.items()
+            if name in rows
         }
         cell = facet = 0
         for k in range(len(pieces.names)):
@@ -103,6 +108,8 @@ def _write_data(path: Path, pieces: Pieces, n_cells: int, n_facets: int) -> None
             for start, chosen in blocks_of(piece.ids):
                 _put(sets["points"], start, piece.points[chosen])
             _put(sets["cells"], cell, piece.ids[piece.cells])
+            if piece.region is not None:
+                _put(sets["region"], cell, piece.region)
             cell += len(piece.cells)
             _put(sets["facets"], facet, piece.ids[piece.facets])
             _put(sets["marker"], facet, piece.marker)
@@ -115,7 +122,7 @@ def _put(data: h5py.Dataset, start: int, rows: NDArray[np.generic]) -> None:
         data[start : start + len(rows)] = rows
 
 
-def _render(data: str, n_points: int, n_cells: int, n_facets: int) -> str:
+def _render(data: str, n_points: int, n_cells: int, n_facets: int, tags: tuple[str, ...]) -> str:
     def item(name: str, n: int) -> str:
         dtype, width = ARRAYS[name]
         kind = "Float" if dtype is np.float64 else "Int"
@@ -144,5 +151,5 @@ def _render(data: str, n_points: int, n_cells: int, n_facets: int) -> str:
             ]
         return "\n".join([*lines, "    </Grid>", ""])
 
-    cells = grid("mesh", "Tetrahedron", n_cells, "cells")
+    cells = grid("mesh", "Tetrahedron", n_cells, "cells", tags)
     return HEAD + cells + grid("facets", "Triangle", n_facets, "facets", ("marker", "building")) + TAIL

@@ -14,9 +14,10 @@ from pipeline.layered import mesh_layers, terrain_reach
 from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.nodes import Levels
 from pipeline.notes import Note
-from pipeline.raster import Dtm
+from pipeline.raster import Dtm, sample_dtm
 from pipeline.sizes import SizeField, size_field
 from pipeline.spacing import top_reach
+from pipeline.underground import SoilOptions
 from stitch.corners import Corner, place_corner
 from stitch.facets import Side, find_seam_edges
 from stitch.grid import Bounds, SeamKey, ends_of_seam, is_pinched, seams_of_tile
@@ -25,6 +26,7 @@ from stitch.numbering import corner_part, count_inner_points, count_points, firs
 from stitch.patches import mesh_patch
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
 from stitch.seams import Seam, find_vertices, trace_seam
+from stitch.soil_columns import fill_corner_soil, fill_seam_soil, join_seam
 from stitch.tiles import Sides, mesh_tile, sizes_halo, tile_halo
 from stitch.walls import cut_walls
 from tiler.config import Config
@@ -33,14 +35,17 @@ from tiler.domain import Domain
 from tiler.options import (
     PLANE_PARAMETERS,
     SIZE_PARAMETERS,
+    SOIL_PARAMETERS,
     layer_parameters,
     mesh_options,
     plane_options,
     size_rule,
+    soil_options,
 )
 from tiler.readers import grow, read_buildings, read_terrain
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.city import chooses_layers_later
+from tiler.stages.soil import lay_soil, unpack_pinched_soil, unpack_soil
 from tiler.tables import Buildings
 from tiler.task import Result, Task
 
@@ -55,10 +60,13 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     reads += [Read("layers", see, by_extent=True)] if chooses_layers_later(config) else []
     parameters = (*PLANE_PARAMETERS, *layer_parameters(config), "dtm_spacing", "tile_size")
     parameters += SIZE_PARAMETERS if config.open_size else ()
-    columns = (*reads, Read("seams", beside=True))
+    parameters += SOIL_PARAMETERS if config.underground else ()
+    seams, columns = (
+        (make_seam_with_soil, make_columns_with_soil) if config.underground else (make_seam, make_columns)
+    )
     return [
-        Stage("seams", Scope.SEAM, make_seam, tuple(reads), parameters),
-        Stage("columns", Scope.TILE, make_columns, columns, parameters, version=2),
+        Stage("seams", Scope.SEAM, seams, tuple(reads), parameters),
+        Stage("columns", Scope.TILE, columns, (*reads, Read("seams", beside=True)), parameters, version=2),
     ]
 
 
@@ -72,6 +80,25 @@ def terrain_halo(given: Any, domain: Domain | None = None) -> float:
 
 def make_seam(task: Task) -> Facts:
     """Find a seam and fill its columns."""
+    return _make_seam(task, None)
+
+
+def make_seam_with_soil(task: Task) -> Facts:
+    """Find a seam and fill its columns, with soil below them."""
+    return _make_seam(task, soil_options(task.parameters))
+
+
+def make_columns(task: Task) -> Facts:
+    """Mesh a tile between its seams, and fill its columns (steps 3.1 to 3.5)."""
+    return _make_columns(task, None)
+
+
+def make_columns_with_soil(task: Task) -> Facts:
+    """Mesh a tile as `make_columns` does, with soil below it."""
+    return _make_columns(task, soil_options(task.parameters))
+
+
+def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
     given, grid = task.parameters, task.context.grid
     key = seam_key(task.name)
     buildings, dtm = _surroundings(task)
@@ -98,16 +125,25 @@ def make_seam(task: Task) -> Facts:
     task.put(**pack_seam(seam, buildings.model.numbers))
     facts = {"border": seam.border, "vertices": len(seam.xy)}
     if seam.border:
-        return facts | {"pinched": _fill_pinched(key, (start, end), dtm, buildings, walls, sizes, task)}
+        pinched = _fill_pinched(key, (start, end), dtm, buildings, walls, sizes, soil, task)
+        return facts | {"pinched": pinched}
     with task.step("3.2-3.5 columns of seams"):
         first, last = (_fill_corner(corner, dtm, buildings, walls, sizes, task) for corner in (start, end))
         levels = _fill(seam, (first, last), dtm, buildings, sizes, task)
     task.put(level_start=levels.start, level_z=levels.z, level_surface=levels.surface)
+    if soil is not None:
+        with task.step("soil of seams"):
+            low, high = (
+                fill_corner_soil(*corner, dtm, soil, sizes=sizes)
+                for corner in zip((start, end), (first, last), strict=True)
+            )
+            below = fill_seam_soil(seam, (low, high), levels, dtm, soil, sizes=sizes)
+        task.put(soil_start=below.start, soil_z=below.z)
+        levels = join_seam(below, levels)
     return facts | {"points": count_points(levels)}
 
 
-def make_columns(task: Task) -> Facts:
-    """Mesh a tile between its seams, and fill its columns (steps 3.1 to 3.5)."""
+def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
     given = task.parameters
     options = mesh_options(given)
     buildings, dtm = _surroundings(task)
@@ -132,6 +168,20 @@ def make_columns(task: Task) -> Facts:
     with task.step("3.2-3.5 columns"):
         columns, report = _mesh(plane, dtm, buildings, options, seam_columns, sizes, task)
     _check(columns)
+    shared = [find_vertices(plane.xy, seam.xy) for seam, _ in (*given_columns, *pinched)]
+    cells, n_cells = count_cells(columns), 0
+    if soil is not None:
+        below = [unpack_soil(found[names[k]].arrays) for k in inner]
+        below += [part for name in names for part in unpack_pinched_soil(found[name])]
+        with task.step("soil"):
+            ground = sample_dtm(dtm, plane.xy)
+            columns, edges, n_cells = lay_soil(
+                columns, ground, edges, shared, seam_columns, below, soil, sizes, task
+            )
+        given_columns = [
+            (seam, join_seam(part, levels))
+            for (seam, levels), part in zip(given_columns, below[: len(inner)], strict=True)
+        ]
     edges, edge_seam = _add_straight_borders(plane, edges, sides, inner, task)
     if not complete:
         x, y = (task.box[0] + task.box[2]) / 2, (task.box[1] + task.box[3]) / 2
@@ -145,7 +195,6 @@ def make_columns(task: Task) -> Facts:
         edge_seam=edge_seam,
     )
     gap, _ = lowest_gap(columns)
-    shared = [find_vertices(plane.xy, seam.xy) for seam, _ in (*given_columns, *pinched)]
     keys = [seam_key(name) for name in names]
     lowest = [seam_ids(keys[k], levels) for k, (_, levels) in zip(inner, given_columns, strict=True)]
     for key, name in zip(keys, names, strict=True):
@@ -156,12 +205,13 @@ def make_columns(task: Task) -> Facts:
         shared_id=np.concatenate([np.empty(0, np.int64), *lowest]),
     )
     inner_points = count_inner_points(columns, shared)
-    return {
+    underground = {} if soil is None else {"soil": {"depth (m)": soil.depth, "cells": n_cells}}
+    return underground | {
         "inner_points": inner_points,
         "order": columns.order,
         "facts": {"smallest gap (m)": round(gap, 4)} | dataclasses.asdict(report),
         "counts": {
-            "cells": count_cells(columns),
+            "cells": cells + n_cells,
             "triangles": len(plane.triangles),
             "columns": len(plane.xy),
         },
@@ -287,6 +337,7 @@ def _fill_pinched(
     buildings: Buildings,
     walls: NDArray[np.float64],
     sizes: SizeField | None,
+    soil: SoilOptions | None,
     task: Task,
 ) -> list[list[int]]:
     """Fill the columns of the ends of a border in which two tiles meet alone; tell which, with their points."""
@@ -295,6 +346,10 @@ def _fill_pinched(
         if is_pinched(task.context.grid, corner):
             levels = _fill_corner(place, dtm, buildings, walls, sizes, task)
             task.put(**{f"end{k}_start": levels.start, f"end{k}_z": levels.z, f"end{k}_surface": levels.surface})
+            if soil is not None:
+                below = fill_corner_soil(place, levels, dtm, soil, sizes=sizes)
+                task.put(**{f"end{k}_soil_start": below.start, f"end{k}_soil_z": below.z})
+                levels = join_seam(below, levels)
             pinched.append([k, len(levels.z)])
     return pinched
 

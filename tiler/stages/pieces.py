@@ -23,6 +23,7 @@ from pipeline.point_fidelity import KINDS, FidelitySums, conclude_fidelity, merg
 from pipeline.pointcloud import PointCloud
 from pipeline.quality import measure_cells
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
+from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
 from stitch.grid import Key, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
 from stitch.numbering import corner_part, first_id, make_offsets, number_points, seam_part, tile_part
 from tiler.config import Config
@@ -30,6 +31,7 @@ from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
 from tiler.merged import VERTEX_ID
 from tiler.readers import read_buildings, read_cloud, read_terrain
 from tiler.results import COLUMN_ARRAYS, unpack_columns
+from tiler.run_folder import REGION
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import unpack_polygons
@@ -97,18 +99,25 @@ def write_piece(task: Task) -> Facts:
         arrays["edge_building"],
         arrays["edge_missing"] | ~_there(task, key)[arrays["edge_seam"]],
     )
-    cells = expand_cells(mesh)
-    boundary, shared = split_boundary(mesh, numbers, task.context.bounds, edges)
+    region: dict[str, NDArray[np.int8]] = {}
+    if "soil" in attributes["facts"]:
+        soil = SoilMesh(mesh, task.store.read("columns", task.name, names=("soil",))[0]["soil"])
+        cells, region[REGION] = expand_regions(soil)
+        boundary, shared = split_regions(soil, numbers, task.context.bounds, edges)
+        used = find_used(soil)
+    else:
+        cells = expand_cells(mesh)
+        boundary, shared = split_boundary(mesh, numbers, task.context.bounds, edges)
+        used = find_used_points(mesh)
     seams = _digest_seams(mesh, cells.points, shared, arrays["edge"], arrays["edge_seam"], key)
     # A column of a seam has levels that only the tile beyond uses, below a roof whose wall is the seam.
-    used = find_used_points(mesh)
     cells, boundary = drop_points(cells, boundary, used)
     out = Path(task.context.out)
     with task.step("3.6 write pieces"):
         ids = number_points(mesh, arrays["shared"], arrays["shared_id"], first_id(tile_part(key)))
         number = {VERTEX_ID: ids[used]}
         files = out / "mesh" / f"{task.name}.vtu", out / "boundary" / f"{task.name}.vtp"
-        write_vtu(files[0], cells, point_data=number)
+        write_vtu(files[0], cells, point_data=number, cell_data=region)
         write_vtp(files[1], cells.points, boundary, point_data=number)
     with task.step("3.6 measure cells"):
         histograms = quality_histograms(measure_cells(cells))
