@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from pipeline.errors import ConfigError, InputError
 from pipeline.mesh import Marker, Region
 from stitch.conformity import compute_cell_volumes, pair_edges
 from tests.foam_reader import PolyMesh, read_poly_mesh, read_zones
@@ -279,8 +279,8 @@ def test_a_surface_without_its_ground_is_closed(soil_run: Path, tmp_path: Path) 
     assert len(pair_edges(np.concatenate((outer, np.array(groups["ground"], np.int32)))).open) > 0
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_every_format_takes_a_mesh_with_soil(soil_run: Path, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", sorted(FORMATS.keys() - {"cgns"}))
+def test_every_other_format_takes_a_mesh_with_soil(soil_run: Path, tmp_path: Path, name: str) -> None:
     target = tmp_path / f"a{FORMATS[name].suffix}"
     export_run(soil_run, target, name=name)
     assert target.exists()
