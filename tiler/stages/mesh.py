@@ -14,11 +14,12 @@ from pipeline.layered import mesh_layers, terrain_reach
 from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.nodes import Levels
 from pipeline.notes import Note
-from pipeline.raster import Dtm
+from pipeline.raster import Dtm, window_of
 from pipeline.spacing import top_reach
+from pipeline.terrain import cut_terrain
 from stitch.corners import Corner, place_corner
 from stitch.facets import Side, find_seam_edges
-from stitch.grid import Bounds, SeamKey, ends_of_seam, is_pinched, seams_of_tile
+from stitch.grid import Bounds, Key, SeamKey, ends_of_seam, is_pinched, nominal_corner, seams_of_tile
 from stitch.layered_seams import fill_corner_layers, fill_seam_layers
 from stitch.numbering import corner_part, count_inner_points, count_points, first_id, seam_ids
 from stitch.patches import mesh_patch
@@ -29,7 +30,7 @@ from stitch.walls import cut_walls
 from tiler.config import Config
 from tiler.context import seam_key, seam_name, tile_key
 from tiler.options import LAYER_PARAMETERS, PLANE_PARAMETERS, mesh_options, plane_options
-from tiler.readers import grow, read_buildings, read_terrain
+from tiler.readers import grow, read_buildings, read_known_terrain, region_window
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.tables import Buildings
 from tiler.task import Result, Task
@@ -43,7 +44,7 @@ def mesh_stages(config: Config) -> list[Stage]:
     halo = tile_halo(config.tile_size, config.mesh_size)
     reads = (Read("model", halo, by_extent=True), Read("terrain", halo + terrain_halo(config)))
     return [
-        Stage("seams", Scope.SEAM, make_seam, reads, PARAMETERS),
+        Stage("seams", Scope.SEAM, make_seam, reads, PARAMETERS, version=2),
         Stage("columns", Scope.TILE, make_columns, (*reads, Read("seams", beside=True)), PARAMETERS, version=2),
     ]
 
@@ -83,8 +84,11 @@ def make_seam(task: Task) -> Facts:
     if seam.border:
         return facts | {"pinched": _fill_pinched(key, (start, end), dtm, buildings, walls, task)}
     with task.step("3.2-3.5 columns of seams"):
-        ends = (_fill_corner(start, dtm, buildings, walls, task), _fill_corner(end, dtm, buildings, walls, task))
-        levels = _fill(seam, ends, dtm, buildings, task)
+        first, last = (
+            _fill_corner(place, corner, dtm, buildings, walls, task)
+            for place, corner in zip((start, end), ends_of_seam(key), strict=True)
+        )
+        levels = _fill(seam, (first, last), cut_terrain(dtm, window_of(dtm)), buildings, task)
     task.put(level_start=levels.start, level_z=levels.z, level_surface=levels.surface)
     return facts | {"points": count_points(levels)}
 
@@ -112,7 +116,8 @@ def make_columns(task: Task) -> Facts:
         plane, [Side(sides[k], left=k < 2) for k in inner], seam_columns, model.roof, model.numbers
     )
     with task.step("3.2-3.5 columns"):
-        columns, report = _mesh(plane, dtm, buildings, options, seam_columns, task)
+        terrain = cut_terrain(dtm, window_of(dtm))
+        columns, report = _mesh(plane, terrain, buildings, options, seam_columns, task)
     _check(columns)
     edges, edge_seam = _add_straight_borders(plane, edges, sides, inner, task)
     if not complete:
@@ -205,17 +210,33 @@ def pack_columns(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> dict[str, NDAr
 
 
 def _surroundings(task: Task) -> tuple[Buildings, Dtm]:
+    """Read what counts for a tile or a seam; the terrain is NaN at nodes of tiles that are absent."""
     given = task.parameters
     halo = tile_halo(given.tile_size, given.mesh_size)
     buildings = read_buildings(task, grow(task.box, halo))
     reach = grow(task.box, halo + terrain_halo(given))
-    return buildings, read_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
+    return buildings, read_known_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
 
 
-def _fill_corner(corner: Corner, dtm: Dtm, buildings: Buildings, walls: NDArray[np.float64], task: Task) -> Levels:
-    """Column of a corner, of the mesher that is chosen."""
+def _terrain_around(key: Key, dtm: Dtm, task: Task) -> Dtm:
+    """Terrain that counts for a corner: the same nodes in all tasks that compute its column.
+
+    All of them read `terrain_halo` and more around it. The window ends two nodes short of that: the closest nodes
+    beyond a tile towards an absent one are the tile's, and a task may see them without reading that tile.
+    """
+    given = task.parameters
+    x, y = nominal_corner(task.context.grid, key)
+    reach = tile_halo(given.tile_size, given.mesh_size) + terrain_halo(given) - 2 * given.dtm_spacing
+    return cut_terrain(dtm, region_window(grow((x, y, x, y), reach), given.dtm_spacing, task.context.bounds))
+
+
+def _fill_corner(
+    corner: Corner, key: Key, dtm: Dtm, buildings: Buildings, walls: NDArray[np.float64], task: Task
+) -> Levels:
+    """Column of a corner, of the mesher that is chosen: all seams that end there find the same one."""
     given, bounds = task.parameters, task.context.bounds
     options, model = mesh_options(given), buildings.model
+    dtm = _terrain_around(key, dtm, task)
     if isinstance(options, AdaptiveOptions):
         return fill_corner(corner, dtm, model.roof, model.ids, options)
     angle = plane_options(given)["min_angle"]
@@ -244,7 +265,7 @@ def _fill_pinched(
     pinched = []
     for k, (corner, place) in enumerate(zip(ends_of_seam(key), ends, strict=True)):
         if is_pinched(task.context.grid, corner):
-            levels = _fill_corner(place, dtm, buildings, walls, task)
+            levels = _fill_corner(place, corner, dtm, buildings, walls, task)
             task.put(**{f"end{k}_start": levels.start, f"end{k}_z": levels.z, f"end{k}_surface": levels.surface})
             pinched.append([k, len(levels.z)])
     return pinched
