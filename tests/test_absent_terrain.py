@@ -89,7 +89,7 @@ def test_a_window_without_any_tile_is_an_error() -> None:
 @pytest.mark.parametrize("mesher", ["adaptive", "layered"])
 @pytest.mark.parametrize("seed", range(4))
 def test_any_tiles_may_be_absent(seed: int, mesher: str, tmp_path: Path) -> None:
-    """Tile sizes and sets of absent files: four in a square and three others, most of them off the tiles' lines."""
+    """Tile sizes and sets of absent files: four in a square and three others, off most tiles' lines."""
     rng = np.random.default_rng([seed, 5])
     a, b = rng.integers(0, 3, 2).tolist()
     square = [(a + i, b + j) for i in range(2) for j in range(2)]
