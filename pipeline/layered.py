@@ -137,7 +137,7 @@ def choose_layers(
     pairs : int64, (p, 2)
         Buildings that touch, as from `adjacent_houses`.
     dtm : Dtm
-        Terrain, as far beyond the walls as `terrain_reach` says.
+        Terrain, as far beyond the walls as `terrain_reach` says; it may be NaN at nodes of tiles that are absent.
     bounds : (xmin, ymin, xmax, ymax)
         The region (m).
     options : LayeredOptions

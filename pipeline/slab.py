@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
-from pipeline.terrain import Dtm, sample_dtm
+from pipeline.raster import node_window
+from pipeline.terrain import Dtm, cut_terrain, sample_dtm
 
 REACH = 3.0  # domain heights; terrain farther from a mesh counts for nothing
 BLOCK = 1.0  # domain heights; side of the squares that `lift_places` works in
@@ -90,12 +91,14 @@ def lift_places(
 ) -> NDArray[np.float64]:
     """Give the levels of single places (step 3.3): each depends on its place and the terrain in reach alone.
 
-    Parameters and result as in `smooth_slab`, with the region instead of an area of the slab.
+    Parameters and result as in `smooth_slab`, with the region instead of an area of the slab; the terrain may be
+    NaN at nodes of tiles that are absent.
 
     Notes
     -----
     The plane is divided into squares as wide as the domain is high, aligned to the CRS; all places of one have
-    a common window, which ends a domain height short of `slab_reach` beyond the square. Levels jump between
+    a common window, which ends a domain height short of `slab_reach` beyond the square; nodes of tiles that are
+    absent are filled from that window alone. Levels jump between
     squares by what that leaves out, some 4 % of the relief's changes there: good for choosing a layer, not
     for a mesh. Cost is one small transform a square.
     """
@@ -108,10 +111,11 @@ def lift_places(
     ends = np.searchsorted(member.reshape(-1)[order], np.arange(len(block) + 1))
     for corner, begin, end in zip(block, ends[:-1], ends[1:], strict=True):
         rows = order[begin:end]
+        window = _clip(corner * side - margin, (corner + 1) * side + margin, region)
         z[rows] = smooth_slab(
-            dtm,
+            cut_terrain(dtm, node_window(window, dtm.spacing)),
             within[rows],
-            _clip(corner * side - margin, (corner + 1) * side + margin, region),
+            window,
             domain_height=domain_height,
             n_layers=n_layers,
             grid_spacing=grid_spacing,

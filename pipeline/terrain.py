@@ -16,6 +16,8 @@ from pipeline.raster import (
     HEIGHT_UNIT,
     Dtm,
     NodeWindow,
+    cut_nodes,
+    grow_window,
     join_dtm,
     node_window,
     sample_dtm,
@@ -30,6 +32,7 @@ __all__ = [
     "bin_ground",
     "bin_nodes",
     "compute_dtm",
+    "cut_terrain",
     "fill_dtm",
     "join_terrain",
     "sample_dtm",
@@ -120,12 +123,42 @@ def fill_dtm(dtm: Dtm) -> Dtm:
 
 
 def join_terrain(parts: Sequence[Dtm], window: NodeWindow) -> Dtm:
-    """Put the terrain of neighbouring tiles together; nodes of tiles that are absent are filled from those around.
+    """Put the terrain of neighbouring tiles together; nodes of tiles that are absent stay NaN.
 
-    Parameters and errors as in `join_dtm`.
+    Parameters and errors as in `join_dtm`; `cut_terrain` fills them.
     """
-    dtm = join_dtm([part for part in parts if windows_meet(window_of(part), window)], window)
-    return fill_dtm(dtm) if np.isnan(dtm.z).any() else dtm
+    return join_dtm([part for part in parts if windows_meet(window_of(part), window)], window)
+
+
+def cut_terrain(dtm: Dtm, window: NodeWindow) -> Dtm:
+    """Cut terrain to a window, in which nodes of tiles that are absent are filled from those around.
+
+    Parameters
+    ----------
+    dtm : Dtm
+        Terrain, NaN at nodes of tiles that are absent.
+    window : NodeWindow
+        Nodes to return; those beyond the raster are left out.
+
+    Raises
+    ------
+    InputError
+        If no node of the window has a height.
+
+    Notes
+    -----
+    What is filled depends on the heights within the window and on no others. Two tasks that compute the same
+    column must therefore cut to the same window, however far each of them reads.
+
+    Examples
+    --------
+    >>> dtm = Dtm(np.array([[5.0, 3.0, np.nan, np.nan]]), 10, 0, 1.0)
+    >>> cut_terrain(dtm, NodeWindow(11, 0, 9, 1)).z
+    array([[3., 3., 3.]])
+    """
+    inner = grow_window(window, 0, within=window_of(dtm))
+    part = Dtm(cut_nodes(dtm.z, window_of(dtm), inner), inner.i0, inner.j0, dtm.spacing)
+    return fill_dtm(part) if np.isnan(part.z).any() else part
 
 
 def compute_dtm(cloud: PointCloud, bounds: tuple[float, float, float, float], *, spacing: float = 1.0) -> Dtm:

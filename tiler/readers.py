@@ -15,7 +15,7 @@ from pipeline.ground_filter import FILTER_REACH, classify_ground
 from pipeline.las_points import cut_units
 from pipeline.pointcloud import BUILDING, PointCloud
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
-from pipeline.terrain import join_terrain
+from pipeline.terrain import cut_terrain, join_terrain
 from stitch.grid import Bounds
 from tiler.cells import select_cells
 from tiler.footprint_index import FootprintRows, join_footprints, select_footprints
@@ -74,10 +74,15 @@ def read_cloud(task: Task, box: Box, *, ground_filter: bool = False) -> PointClo
 def read_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm:
     """Read the terrain of a box within the region, from the stage ``terrain``.
 
-    Nodes of tiles that are absent are filled from those around.
+    Nodes of tiles that are absent are filled from those in the box: tasks with other boxes see others there.
     """
     window = region_window(box, spacing, bounds)
-    return join_terrain(list(_read_rasters(task, "terrain")), window)
+    return cut_terrain(read_known_terrain(task, box, spacing=spacing, bounds=bounds), window)
+
+
+def read_known_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm:
+    """Read the terrain of a box within the region, NaN at nodes of tiles that are absent (see `cut_terrain`)."""
+    return join_terrain(list(_read_rasters(task, "terrain")), region_window(box, spacing, bounds))
 
 
 def region_window(box: Box, spacing: float, bounds: Bounds) -> NodeWindow:

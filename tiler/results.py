@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.mesh import ColumnMesh, PlaneMesh
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window, sample_dtm
-from pipeline.terrain import join_terrain
+from pipeline.terrain import cut_terrain, join_terrain
 from tiler.store import Store
 
 COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom")
@@ -80,7 +80,7 @@ class StoredTerrain:
         begin, end = (window.i0, window.j0), (window.i0 + window.nx, window.j0 + window.ny)
         met = ((low < end) & (low + size > begin) & (size > 0)).all(axis=1)
         parts = [self._chunk(k) for k in np.flatnonzero(met).tolist()]
-        return sample_dtm(join_terrain(parts, window), xy)
+        return sample_dtm(cut_terrain(join_terrain(parts, window), window), xy)
 
     def _chunk(self, k: int) -> Dtm:
         name = str(self._names[k])

@@ -17,15 +17,16 @@ from pipeline.notes import Note
 from pipeline.planar import join_pairs
 from pipeline.point_fidelity import HouseFidelity, measure_houses
 from pipeline.pointcloud import PointCloud
-from pipeline.raster import Dtm
+from pipeline.raster import Dtm, window_of
 from pipeline.roof_points import locate_roof_points
 from pipeline.simplify import raise_buildings
+from pipeline.terrain import cut_terrain
 from pipeline.tile import measure_city, prepare_footprints
 from stitch.grid import Key
 from tiler.config import Config
 from tiler.context import find_owned, region_around, tile_key
 from tiler.options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
-from tiler.readers import grow, read_cloud, read_terrain
+from tiler.readers import grow, read_cloud, read_known_terrain
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import (
@@ -106,7 +107,7 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *GROUND, *mesh))
+    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *GROUND, *mesh), version=2)
 
 
 def chooses_layers_later(config: Config) -> bool:
@@ -127,7 +128,8 @@ def make_houses(task: Task) -> Facts:
     task.notes(note for note, mine in zip(notes, find_owned(task.box, bounds, places), strict=True) if mine)
     extent = _extent(own.polygons)
     cloud, dtm = _surroundings(task, extent, options.ground_margin, 2 * spacing)
-    city = measure_city(cloud, own, dtm, options, building_class=True, trace=task.step)
+    terrain = cut_terrain(dtm, window_of(dtm))
+    city = measure_city(cloud, own, terrain, options, building_class=True, trace=task.step)
     task.notes(city.notes)
     with task.step("2.0 split levels"):
         houses = divide_houses(city, cloud, options, building_class=True)
@@ -253,7 +255,8 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     extent = _extent(shapes.polygons)
     cloud, dtm = _surroundings(task, extent, options.ground_margin, reach + 2 * given.dtm_spacing)
     reserved = {name for result in task.read("reserved", ()) for name in result.facts["names"]}
-    city = raise_buildings(gathered.houses, shapes, dtm, options, reserved=reserved, trace=task.step)
+    terrain = cut_terrain(dtm, window_of(dtm))
+    city = raise_buildings(gathered.houses, shapes, terrain, options, reserved=reserved, trace=task.step)
     task.notes(city.notes)
     model = city.model
     layers, parted = np.zeros(len(model), np.int32), 0
@@ -300,14 +303,17 @@ def _owned(task: Task, footprints: Footprints) -> Footprints:
 
 
 def _surroundings(task: Task, extent: Box | None, margin: float, reach: float) -> tuple[PointCloud, Dtm]:
-    """Points and terrain of a box; none and any where there is no house to ask for them."""
+    """Points and terrain of a box; none and any where there is no house to ask for them.
+
+    The terrain is NaN at nodes of tiles that are absent.
+    """
     given, bounds = task.parameters, task.context.bounds
     if extent is None:
         nothing = PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
         return nothing, Dtm(np.zeros((1, 1)), 0, 0, given.dtm_spacing)
     with task.step("1.1 points of houses"):
         cloud = read_cloud(task, grow(extent, margin), ground_filter=given.ground_filter)
-    return cloud, read_terrain(task, grow(extent, reach), spacing=given.dtm_spacing, bounds=bounds)
+    return cloud, read_known_terrain(task, grow(extent, reach), spacing=given.dtm_spacing, bounds=bounds)
 
 
 def _fit(cloud: PointCloud, city: City) -> HouseFidelity:

@@ -11,7 +11,7 @@ from pipeline.notes import Note
 from tiler.config import Config
 from tiler.domain import GUIDELINE, Domain, height_in_metres, is_low
 from tiler.options import layer_parameters, mesh_options
-from tiler.readers import grow, read_terrain
+from tiler.readers import grow, read_known_terrain
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.city import chooses_layers_later
 from tiler.tables import unpack_buildings, unpack_polygons
@@ -96,7 +96,7 @@ def choose_tile_layers(task: Task) -> Facts:
         buildings.wall_ground,
         buildings.group.astype(np.int32),
         adjacent_houses(model.polygons),
-        read_terrain(task, grow(tuple(extent), reach), spacing=given.dtm_spacing, bounds=bounds),
+        read_known_terrain(task, grow(tuple(extent), reach), spacing=given.dtm_spacing, bounds=bounds),
         bounds,
         options,
     )

@@ -14,13 +14,14 @@ from pipeline.layered import mesh_layers, terrain_reach
 from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.nodes import Levels
 from pipeline.notes import Note
-from pipeline.raster import Dtm, sample_dtm
+from pipeline.raster import Dtm, sample_dtm, window_of
 from pipeline.sizes import SizeField, size_field
 from pipeline.spacing import top_reach
+from pipeline.terrain import cut_terrain
 from pipeline.underground import SoilOptions
 from stitch.corners import Corner, place_corner
 from stitch.facets import Side, find_seam_edges
-from stitch.grid import Bounds, SeamKey, ends_of_seam, is_pinched, seams_of_tile
+from stitch.grid import Bounds, Key, SeamKey, ends_of_seam, is_pinched, nominal_corner, seams_of_tile
 from stitch.layered_seams import fill_corner_layers, fill_seam_layers
 from stitch.numbering import corner_part, count_inner_points, count_points, first_id, seam_ids
 from stitch.patches import mesh_patch
@@ -42,7 +43,7 @@ from tiler.options import (
     size_rule,
     soil_options,
 )
-from tiler.readers import grow, read_buildings, read_terrain
+from tiler.readers import grow, read_buildings, read_known_terrain, region_window
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.city import chooses_layers_later
 from tiler.stages.soil import lay_soil, unpack_pinched_soil, unpack_soil
@@ -65,7 +66,7 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
         (make_seam_with_soil, make_columns_with_soil) if config.underground else (make_seam, make_columns)
     )
     return [
-        Stage("seams", Scope.SEAM, seams, tuple(reads), parameters),
+        Stage("seams", Scope.SEAM, seams, tuple(reads), parameters, version=2),
         Stage("columns", Scope.TILE, columns, (*reads, Read("seams", beside=True)), parameters, version=2),
     ]
 
@@ -128,16 +129,20 @@ def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
         pinched = _fill_pinched(key, (start, end), dtm, buildings, walls, sizes, soil, task)
         return facts | {"pinched": pinched}
     with task.step("3.2-3.5 columns of seams"):
-        first, last = (_fill_corner(corner, dtm, buildings, walls, sizes, task) for corner in (start, end))
-        levels = _fill(seam, (first, last), dtm, buildings, sizes, task)
+        first, last = (
+            _fill_corner(place, corner, dtm, buildings, walls, sizes, task)
+            for place, corner in zip((start, end), ends_of_seam(key), strict=True)
+        )
+        terrain = cut_terrain(dtm, window_of(dtm))
+        levels = _fill(seam, (first, last), terrain, buildings, sizes, task)
     task.put(level_start=levels.start, level_z=levels.z, level_surface=levels.surface)
     if soil is not None:
         with task.step("soil of seams"):
             low, high = (
-                fill_corner_soil(*corner, dtm, soil, sizes=sizes)
-                for corner in zip((start, end), (first, last), strict=True)
+                fill_corner_soil(place, air, _terrain_around(corner, dtm, task), soil, sizes=sizes)
+                for place, air, corner in zip((start, end), (first, last), ends_of_seam(key), strict=True)
             )
-            below = fill_seam_soil(seam, (low, high), levels, dtm, soil, sizes=sizes)
+            below = fill_seam_soil(seam, (low, high), levels, terrain, soil, sizes=sizes)
         task.put(soil_start=below.start, soil_z=below.z)
         levels = join_seam(below, levels)
     return facts | {"points": count_points(levels)}
@@ -166,7 +171,8 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
         plane, [Side(sides[k], left=k < 2) for k in inner], seam_columns, model.roof, model.numbers
     )
     with task.step("3.2-3.5 columns"):
-        columns, report = _mesh(plane, dtm, buildings, options, seam_columns, sizes, task)
+        terrain = cut_terrain(dtm, window_of(dtm))
+        columns, report = _mesh(plane, terrain, buildings, options, seam_columns, sizes, task)
     _check(columns)
     shared = [find_vertices(plane.xy, seam.xy) for seam, _ in (*given_columns, *pinched)]
     cells, n_cells = count_cells(columns), 0
@@ -174,7 +180,7 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
         below = [unpack_soil(found[names[k]].arrays) for k in inner]
         below += [part for name in names for part in unpack_pinched_soil(found[name])]
         with task.step("soil"):
-            ground = sample_dtm(dtm, plane.xy)
+            ground = sample_dtm(terrain, plane.xy)
             columns, edges, n_cells = lay_soil(
                 columns, ground, edges, shared, seam_columns, below, soil, sizes, task
             )
@@ -287,24 +293,40 @@ def _sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
 
 
 def _surroundings(task: Task) -> tuple[Buildings, Dtm]:
+    """Read what counts for a tile or a seam; the terrain is NaN at nodes of tiles that are absent."""
     given = task.parameters
     halo, see = _halos(given, graded=task.context.open_size > 0)
     buildings = read_buildings(task, grow(task.box, see))
     reach = grow(task.box, halo + terrain_halo(given))
-    return buildings, read_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
+    return buildings, read_known_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
+
+
+def _terrain_around(key: Key, dtm: Dtm, task: Task) -> Dtm:
+    """Terrain that counts for a corner: the same nodes in all tasks that compute its column.
+
+    All of them read `terrain_halo` and more around it. The window ends two nodes short of that: the closest nodes
+    beyond a tile towards an absent one are the tile's, and a task may see them without reading that tile.
+    """
+    given = task.parameters
+    x, y = nominal_corner(task.context.grid, key)
+    halo, _ = _halos(given, graded=task.context.open_size > 0)
+    reach = halo + terrain_halo(given) - 2 * given.dtm_spacing
+    return cut_terrain(dtm, region_window(grow((x, y, x, y), reach), given.dtm_spacing, task.context.bounds))
 
 
 def _fill_corner(
     corner: Corner,
+    key: Key,
     dtm: Dtm,
     buildings: Buildings,
     walls: NDArray[np.float64],
     sizes: SizeField | None,
     task: Task,
 ) -> Levels:
-    """Column of a corner, of the mesher that is chosen."""
+    """Column of a corner, of the mesher that is chosen: all seams that end there find the same one."""
     given, bounds = task.parameters, task.context.bounds
     options, model = mesh_options(given), buildings.model
+    dtm = _terrain_around(key, dtm, task)
     if isinstance(options, AdaptiveOptions):
         return fill_corner(corner, dtm, model.roof, model.ids, options, sizes=sizes)
     angle = plane_options(given)["min_angle"]
@@ -344,10 +366,10 @@ def _fill_pinched(
     pinched = []
     for k, (corner, place) in enumerate(zip(ends_of_seam(key), ends, strict=True)):
         if is_pinched(task.context.grid, corner):
-            levels = _fill_corner(place, dtm, buildings, walls, sizes, task)
+            levels = _fill_corner(place, corner, dtm, buildings, walls, sizes, task)
             task.put(**{f"end{k}_start": levels.start, f"end{k}_z": levels.z, f"end{k}_surface": levels.surface})
             if soil is not None:
-                below = fill_corner_soil(place, levels, dtm, soil, sizes=sizes)
+                below = fill_corner_soil(place, levels, _terrain_around(corner, dtm, task), soil, sizes=sizes)
                 task.put(**{f"end{k}_soil_start": below.start, f"end{k}_soil_z": below.z})
                 levels = join_seam(below, levels)
             pinched.append([k, len(levels.z)])
