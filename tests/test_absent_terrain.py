@@ -64,6 +64,17 @@ def test_seams_beside_absent_tiles_find_the_same_corners(tmp_path: Path) -> None
     assert corners > 4
 
 
+@pytest.mark.parametrize("mesher", ["adaptive", pytest.param("layered", marks=pytest.mark.long)])
+def test_tiles_that_meet_in_corners_alone_are_proved(mesher: str, tmp_path: Path) -> None:
+    region: Bounds = (318_080.0, 6_399_120.0, 318_500.0, 6_399_540.0)  # three tiles each way
+    town = make_town(region, crowded_blocks(region, 90, seed=4), relief=10)
+    values = write_town(tmp_path / "town", town, files=(3, 3), without=[(0, 2), (1, 1), (2, 0)])
+    record = run_of(values, tmp_path / "out", tile_size=140.0, domain_height=50.0, mesher=mesher)
+    report = check_run(tmp_path / "out", StoredTerrain)
+    assert report.ok, "\n".join(report.lines())
+    assert record["counts"]["tiles"] == 6
+
+
 def test_a_place_beside_absent_tiles_depends_on_its_own_window_alone() -> None:
     bounds = (0.0, 0.0, 1000.0, 1000.0)
     dtm = hilly_dtm(bounds, relief=40.0, length=80.0)

@@ -291,7 +291,11 @@ def test_soil_depends_on_the_surroundings_of_its_tile_alone(mesher: str, tmp_pat
 
 @pytest.mark.parametrize(
     ("mesher", "gone"),
-    [("adaptive", [(0, 2), (1, 1), (2, 0)]), pytest.param("layered", [(1, 1)], marks=pytest.mark.long)],
+    [
+        ("adaptive", [(0, 2), (1, 1), (2, 0)]),
+        pytest.param("layered", [(1, 1)], marks=pytest.mark.long),
+        pytest.param("layered", [(0, 2), (1, 1), (2, 0)], marks=pytest.mark.long),
+    ],
 )
 def test_soil_ends_at_tiles_that_are_absent(mesher: str, gone: list[tuple[int, int]], tmp_path: Path) -> None:
     """Tiles that meet in a corner alone share its column of soil too."""
