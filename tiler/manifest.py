@@ -54,8 +54,8 @@ def write_manifest(path: Path, records: Records, files: Mapping[str, Any]) -> No
     crc = 0
     with replacing(path, durable=True) as part, part.open("wb") as file:
         for stage, name in sorted(records):
-            stated = records.kept_facts(stage, name).get(FILES, {})
-            entry = [stage, name, records.made(stage, name)[0], records.digest(stage, name), stated]
+            key, _ = records.made(stage, name)
+            entry = [stage, name, key, records.digest(stage, name), records.files(stage, name)]
             line = json.dumps(entry, sort_keys=True).encode() + b"\n"
             crc = zlib.crc32(line, crc)
             file.write(line)

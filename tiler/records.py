@@ -7,7 +7,6 @@ from the store otherwise.
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from pipeline.notes import count_notes
@@ -16,17 +15,24 @@ from tiler.store import Store
 from tiler.task import Record, notes_from_json
 from tiler.written import FILES
 
-# Facts that reads go by, see `tiler.stage.Read`, and the files that the manifest lists.
-KEPT = ("extent", "names", FILES)
+# Facts that reads go by, see `tiler.stage.Read`.
+KEPT = ("extent", "names")
+REUSED, NOTED, FILED = 1, 2, 4
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Kept:
-    key: bytes
-    digest: bytes
-    reused: bool
-    noted: bool
-    facts: Facts | None
+def _pack(record: Record) -> bytes:
+    """Key, digest and what else must be known, in one object: there are some 30 results a tile."""
+    flags = REUSED * record.reused | NOTED * bool(record.notes) | FILED * (FILES in record.facts)
+    key = bytes.fromhex(record.key)
+    return bytes((flags, len(key))) + key + bytes.fromhex(record.digest)
+
+
+def _key(packed: bytes) -> str:
+    return packed[2 : 2 + packed[1]].hex()
+
+
+def _digest(packed: bytes) -> str:
+    return packed[2 + packed[1] :].hex()
 
 
 class Records(Mapping[tuple[str, str], Record]):
@@ -52,17 +58,18 @@ class Records(Mapping[tuple[str, str], Record]):
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._stages: dict[str, dict[str, _Kept]] = {}
+        self._stages: dict[str, dict[str, bytes]] = {}
+        self._facts: dict[tuple[str, str], Facts] = {}
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self.peak_memory = 0
         self.damage: dict[tuple[str, str], str] = {}
 
     def add(self, record: Record) -> None:
         """Keep a record, in place of an earlier one of that item."""
-        facts = {name: _intern(record.facts[name]) for name in KEPT if name in record.facts}
-        key, digest = bytes.fromhex(record.key), bytes.fromhex(record.digest)
-        kept = _Kept(key, digest, record.reused, bool(record.notes), facts or None)
-        self._stages.setdefault(record.stage, {})[sys.intern(record.name)] = kept
+        self._stages.setdefault(record.stage, {})[sys.intern(record.name)] = _pack(record)
+        self._facts.pop((record.stage, record.name), None)
+        if facts := {name: _intern(record.facts[name]) for name in KEPT if name in record.facts}:
+            self._facts[record.stage, record.name] = facts
         if record.damage:
             self.damage[record.stage, record.name] = record.damage
         self.peak_memory = max(self.peak_memory, record.peak_memory)
@@ -72,19 +79,28 @@ class Records(Mapping[tuple[str, str], Record]):
     def forget(self, stage: str, name: str) -> None:
         """Forget a record; nothing happens if it is not there."""
         self._stages.get(stage, {}).pop(name, None)
+        self._facts.pop((stage, name), None)
 
     def digest(self, stage: str, name: str) -> str:
         """Digest of a result's content, 32 hexadecimal digits; KeyError if there is no record."""
-        return self._stages[stage][name].digest.hex()
+        return _digest(self._stages[stage][name])
 
     def made(self, stage: str, name: str) -> tuple[str, bool]:
         """Key of a result, and whether it was computed; KeyError if there is no record."""
-        kept = self._stages[stage][name]
-        return kept.key.hex(), not kept.reused
+        packed = self._stages[stage][name]
+        return _key(packed), not packed[0] & REUSED
 
     def kept_facts(self, stage: str, name: str) -> Facts:
         """Those facts of a result that reads go by; KeyError if there is no record."""
-        return self._stages[stage][name].facts or {}
+        self._stages[stage][name]
+        return self._facts.get((stage, name), {})
+
+    def files(self, stage: str, name: str) -> dict[str, Any]:
+        """Files beside the store that a result states: read from the store; KeyError if there is no record."""
+        stated: dict[str, Any] = {}
+        if self._stages[stage][name][0] & FILED:
+            stated = self._store.attributes(stage, name)["facts"][FILES]
+        return stated
 
     def of(self, stage: str) -> Iterator[Record]:
         """Read the records of one stage, one at a time, by name."""
@@ -96,7 +112,7 @@ class Records(Mapping[tuple[str, str], Record]):
 
     def noted(self) -> list[tuple[str, str]]:
         """List the items whose results have notes, sorted."""
-        items = ((stage, name) for stage, kept in self._stages.items() for name in kept if kept[name].noted)
+        items = ((stage, name) for stage, kept in self._stages.items() for name in kept if kept[name][0] & NOTED)
         return sorted(items)
 
     def count_reused(self) -> dict[str, int]:
@@ -108,22 +124,25 @@ class Records(Mapping[tuple[str, str], Record]):
         return self._count(reused=False)
 
     def _count(self, *, reused: bool) -> dict[str, int]:
-        counts = {s: sum(kept.reused is reused for kept in items.values()) for s, items in self._stages.items()}
+        counts = {
+            s: sum(bool(packed[0] & REUSED) is reused for packed in items.values())
+            for s, items in self._stages.items()
+        }
         return {stage: n for stage, n in sorted(counts.items()) if n}
 
     def __getitem__(self, item: tuple[str, str]) -> Record:
         stage, name = item
-        kept = self._stages[stage][name]
+        packed = self._stages[stage][name]
         attributes: dict[str, Any] = self._store.attributes(stage, name)
         notes = count_notes(notes_from_json(attributes["notes"]))
         return Record(
             stage,
             name,
-            kept.key.hex(),
-            kept.digest.hex(),
+            _key(packed),
+            _digest(packed),
             attributes["facts"],
             notes,
-            reused=kept.reused,
+            reused=bool(packed[0] & REUSED),
             damage=self.damage.get(item, ""),
         )
 
@@ -139,6 +158,4 @@ class Records(Mapping[tuple[str, str], Record]):
 
 def _intern(value: Any) -> Any:
     """Names of items are many, and mostly the same few: keep each once."""
-    if isinstance(value, dict):
-        return value
     return tuple(map(sys.intern, value)) if value and all(type(v) is str for v in value) else value
