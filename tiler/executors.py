@@ -251,7 +251,7 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
     limits = limits or Limits(memory=share_memory(workers))
     # Everything is bound to this machine, on free ports: two runs do not meet. A dead process shows by its closed
     # connection, so a worker that is silent because its task holds the interpreter is let live. No array is in
-    # Dask's hands, so there is nothing to spill and nothing to pause for. Dask's logs of transitions and of its own
+    # Dask's hands, so there is nothing to spill and nothing to pause for. Dask's logs of transitions and its own
     # load hold on to memory: they are kept short. A process that dies is started again by its nanny: the cluster
     # would give up one whose process is just starting 15 s after an earlier one died.
     settings = {
