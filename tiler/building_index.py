@@ -227,23 +227,17 @@ def _read_objects(path: Path, vertices: Vertices, file: IO[bytes]) -> BuildingIn
     """Read the objects of a CityJSON file that have no parts, and write their heights and footprints."""
     numbers, boxes, starts, sizes = array("q"), array("f"), array("q"), array("i")
     start = 0
-    with opened_json(path) as stream:
-        for key in stream.members():
-            if key != "CityObjects":
-                stream.skip()
-                continue
-            for name in stream.members():
-                thing = stream.value()
-                if has_parts(path, thing):
-                    continue
-                number, ground, roof, footprint = read_building(path, name, thing, vertices)
-                data = np.array([(ground, roof)], HEAD).tobytes() + shapely.to_wkb(footprint)
-                _write(file, data)
-                numbers.append(number)
-                boxes.extend(shapely.bounds(footprint).tolist())
-                starts.append(start)
-                sizes.append(len(data))
-                start += len(data)
+    for name, thing in read_objects(path):
+        if has_parts(path, thing):
+            continue
+        number, ground, roof, footprint = read_building(path, name, thing, vertices)
+        data = np.array([(ground, roof)], HEAD).tobytes() + shapely.to_wkb(footprint)
+        _write(file, data)
+        numbers.append(number)
+        boxes.extend(shapely.bounds(footprint).tolist())
+        starts.append(start)
+        sizes.append(len(data))
+        start += len(data)
     order = np.argsort(np.frombuffer(numbers, np.int64), kind="stable")
     return BuildingIndex(
         np.frombuffer(numbers, np.int64)[order],
@@ -252,6 +246,17 @@ def _read_objects(path: Path, vertices: Vertices, file: IO[bytes]) -> BuildingIn
         np.frombuffer(sizes, np.int32)[order],
         file,
     )
+
+
+def read_objects(path: Path) -> Iterator[tuple[str, Any]]:
+    """Read the objects of a CityJSON file one at a time, by name; InputError if it is missing or no JSON."""
+    with opened_json(path) as stream:
+        for key in stream.members():
+            if key != "CityObjects":
+                stream.skip()
+                continue
+            for name in stream.members():
+                yield name, stream.value()
 
 
 def has_parts(path: Path, thing: Any) -> bool:

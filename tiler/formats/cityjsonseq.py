@@ -10,8 +10,8 @@ import numpy as np
 
 from pipeline.errors import InputError
 from tiler.atomic import replacing
-from tiler.building_index import Vertices, has_parts, spool_vertices
-from tiler.run_folder import WRONG_FIELD, broken_field, opened_json
+from tiler.building_index import Vertices, has_parts, read_objects, spool_vertices
+from tiler.run_folder import WRONG_FIELD, broken_field
 
 CITY_MODEL = "citymodel.city.json"  # of a run: the one that was meshed
 
@@ -88,21 +88,15 @@ def _features(model: Path, parts: IO[bytes]) -> Iterator[tuple[str, dict[str, An
     """Give each building with its parts, as objects by id."""
     place: dict[str, tuple[int, int]] = {}
     houses: dict[str, Any] = {}
-    with opened_json(model) as stream:
-        for key in stream.members():
-            if key != "CityObjects":
-                stream.skip()
-                continue
-            for name in stream.members():
-                thing = stream.value()
-                if has_parts(model, thing):
-                    houses[name] = thing
-                elif "parents" in thing:
-                    data = _line(thing)
-                    place[name] = parts.tell(), len(data)
-                    parts.write(data)
-                else:
-                    yield name, {name: thing}
+    for name, thing in read_objects(model):
+        if has_parts(model, thing):
+            houses[name] = thing
+        elif "parents" in thing:
+            data = _line(thing)
+            place[name] = parts.tell(), len(data)
+            parts.write(data)
+        else:
+            yield name, {name: thing}
     for name, house in houses.items():
         objects = {name: house}
         try:

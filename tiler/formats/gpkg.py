@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import OutputError
 from tiler.atomic import replacing
-from tiler.building_index import has_parts, read_building, spool_vertices
+from tiler.building_index import has_parts, read_building, read_objects, spool_vertices
 from tiler.export import RUN_RECORD
 from tiler.formats.cityjsonseq import CITY_MODEL
-from tiler.run_folder import opened_json, read_crs
+from tiler.run_folder import read_crs
 
 LAYER = "buildings"
 BATCH = 5000  # rows that are written at once
@@ -85,15 +85,7 @@ def write_gpkg(path: Path, model: Path, *, crs: str) -> None:
 
 
 def _objects(model: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    with opened_json(model) as stream:
-        for key in stream.members():
-            if key != "CityObjects":
-                stream.skip()
-                continue
-            for name in stream.members():
-                thing = stream.value()
-                if not has_parts(model, thing):
-                    yield name, thing
+    return ((name, thing) for name, thing in read_objects(model) if not has_parts(model, thing))
 
 
 def _survey(model: Path) -> Kinds:
