@@ -128,11 +128,14 @@ def children(process: "subprocess.Popen[bytes]") -> list[psutil.Process]:
 
 
 def workers(process: "subprocess.Popen[bytes]") -> list[psutil.Process]:
-    """List the worker processes of a run that lives."""
-    found = []
+    """List the worker processes of a run that lives: forked, or begun from nothing where systems cannot fork."""
+    found, servers = [], set()
     for child in children(process):
         try:
-            if any("spawn_main" in word for word in child.cmdline()):
+            words = " ".join(child.cmdline())
+            if "multiprocessing.forkserver" in words and child.ppid() == process.pid:
+                servers.add(child.pid)
+            elif child.ppid() in servers or "spawn_main" in words:
                 found.append(child)
         except psutil.NoSuchProcess:
             continue

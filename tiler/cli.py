@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import CityError, ConfigError
+from tiler import fork_server
 from tiler.config import Config, annotated_defaults, check_reach, load_config, make_config
 from tiler.domain import Height
 from tiler.export import FORMATS
@@ -228,6 +229,8 @@ def with_file(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _run_config(config: Config) -> int:
+    if config.workers and not config.scheduler:
+        fork_server.begin()
     from tiler.run import run
     from tiler.terminal import print_step, print_summary
 

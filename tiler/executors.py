@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from typing import Any, Protocol
 
 from pipeline.errors import CityError
+from tiler import fork_server
 from tiler.limits import Limits, WorkerError, machine_memory, run_guarded, tell_death, tell_memory
 from tiler.stage import Facts
 from tiler.task import Failure, Record, Task, run_task
@@ -243,6 +244,7 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
         What a task may take; by default its share of the machine's memory, and any time. A worker that dies is
         replaced.
     """
+    fork_server.begin()
     from dask import config
     from distributed import Client, LocalCluster
 
@@ -255,6 +257,8 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
     # load hold on to memory: they are kept short. A process that dies is started again by its nanny: the cluster
     # would give up one whose process is just starting 15 s after an earlier one died.
     settings = {
+        "distributed.nanny.pre-spawn-environ": dict(fork_server.ENVIRONMENT),
+        "distributed.worker.multiprocessing-method": fork_server.METHOD,
         "distributed.worker.daemon": False,
         "distributed.scheduler.worker-ttl": None,
         "distributed.scheduler.allowed-failures": 0,

@@ -1,0 +1,40 @@
+"""Worker processes are forked from one that has imported what they need, and keep the memory that they had."""
+
+import os
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.test_engine import grid_layout, make
+from tiler import fork_server
+from tiler.executors import local
+from tiler.limits import Limits
+from tiler.stage import Facts, Scope, Stage
+from tiler.task import Task
+
+pytestmark = pytest.mark.skipif(fork_server.METHOD != "forkserver", reason="workers are forked on Linux alone")
+
+
+def look(task: Task) -> Facts:
+    """Tell what a worker is: who its parent is, and what it was born with."""
+    born = Path("/proc/self/environ").read_bytes().decode().split("\0")
+    kept = [word for word in born if word.partition("=")[0] in fork_server.ENVIRONMENT]
+    return {
+        "environment": sorted(kept),
+        "server": psutil.Process(os.getppid()).cmdline()[-1].startswith("from multiprocessing.forkserver"),
+        "imported": "tiler.stages.mesh" in sys.modules,
+    }
+
+
+def test_workers_are_forked_with_their_settings_and_the_driver_keeps_its_own(tmp_path: Path) -> None:
+    earlier = dict(os.environ)
+    fork_server.begin()
+    assert dict(os.environ) == earlier
+    with local(1, Limits(memory=2**30)) as executor:
+        engine = make(tmp_path, executor, layout=grid_layout())
+        engine.run(Stage("looks", Scope.REGION, look))
+    facts = engine.records["looks", "region"].facts
+    expected = sorted(f"{name}={value}" for name, value in fork_server.ENVIRONMENT.items())
+    assert facts == {"environment": expected, "server": True, "imported": True}
