@@ -5,6 +5,7 @@ Both are functions of a place and its neighbourhood alone, so that a tile gets t
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -109,16 +110,28 @@ def domain_top(dtm: Dtm, xy: NDArray[np.float64], *, domain_height: float) -> ND
     half = max(round(top_reach(domain_height) / TOP_PASSES / dtm.spacing), 1)
     units = np.rint(dtm.z / HEIGHT_UNIT).astype(np.int64)
     for _ in range(TOP_PASSES):
-        units = _average(_average(units, half).T, half).T
+        across = np.ascontiguousarray(_average(units, half).T)
+        units = np.ascontiguousarray(_average(across, half).T)
     smooth = Dtm(np.multiply(units, HEIGHT_UNIT, dtype=np.float64), dtm.i0, dtm.j0, dtm.spacing)
     return domain_height + sample_dtm(smooth, xy)
 
 
+@numba.njit(cache=True, nogil=True)
 def _average(units: NDArray[np.int64], half: int) -> NDArray[np.int64]:
     """Moving average down the columns over ``2 half + 1`` rows, fewer at the border, rounded down."""
-    rows = len(units)
-    total = np.concatenate((np.zeros((1, units.shape[1]), np.int64), np.cumsum(units, axis=0)))
-    low = np.maximum(np.arange(rows) - half, 0)
-    high = np.minimum(np.arange(rows) + half + 1, rows)
-    average: NDArray[np.int64] = (total[high] - total[low]) // (high - low)[:, None]
+    rows, columns = units.shape
+    average = np.empty((rows, columns), np.int64)
+    total = np.zeros(columns, np.int64)
+    for row in range(min(half, rows)):
+        for column in range(columns):
+            total[column] += units[row, column]
+    for row in range(rows):
+        enters, leaves = row + half, row - half - 1
+        n = min(enters + 1, rows) - max(leaves + 1, 0)
+        for column in range(columns):
+            if enters < rows:
+                total[column] += units[enters, column]
+            if leaves >= 0:
+                total[column] -= units[leaves, column]
+            average[row, column] = total[column] // n
     return average

@@ -6,6 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.inside import find_inside
 from pipeline.sizes import SizeField, local_sizes, wall_distances
 from stitch.grid import (
     CORNER_SHARE,
@@ -132,6 +133,6 @@ def _clearance(walls: NDArray[np.float64], xy: NDArray[np.float64], reach: float
 
 def _building_at(polygons: NDArray[np.object_], xy: NDArray[np.float64]) -> NDArray[np.int64]:
     building = np.full(len(xy), -1)
-    row, inside = shapely.STRtree(polygons).query(shapely.points(xy), predicate="within")
+    inside, row = find_inside(xy, polygons)
     building[row] = inside
     return building

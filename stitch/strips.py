@@ -7,6 +7,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.improve_plane import improve_plane
+from pipeline.inside import find_inside
 from pipeline.plane import collect_graph, triangulate_plane
 from pipeline.sizes import SizeField, largest_size, local_sizes
 from stitch.corners import Corner
@@ -122,9 +123,8 @@ def label_triangles(
     xy: NDArray[np.float64], triangles: NDArray[np.int32], polygons: NDArray[np.object_]
 ) -> NDArray[np.int32]:
     """Row of the building around the centre of each triangle, -1 where none; int32, (m,)."""
-    centre = _centres(xy, triangles)
     label = np.full(len(triangles), -1, np.int32)
-    row, building = shapely.STRtree(polygons).query(shapely.points(centre), predicate="within")
+    building, row = find_inside(_centres(xy, triangles), polygons)
     label[row] = building
     return label
 
