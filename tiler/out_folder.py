@@ -15,10 +15,10 @@ from tiler.store import MANIFEST
 # What a run writes, and all that --overwrite removes; the record is replaced.
 INDEXES = ("mesh.pvtu", "boundary.pvtp")
 PIECES = {"mesh": ".vtu", "boundary": ".vtp"}
-RUN_RECORD, PROGRESS, STORE = "run.json", "progress.json", "store.zarr"
+RUN_RECORD, PROGRESS, EVENTS, STORE = "run.json", "progress.json", "events.jsonl", "store.zarr"
 MANIFEST_PATH = f"{STORE}/{MANIFEST}"
 RESULTS = (
-    *(RUN_RECORD, PROGRESS, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
+    *(RUN_RECORD, PROGRESS, EVENTS, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
     *(*INDEXES, *PIECES, STORE, TASKS, "only"),
 )
 # A file on its way to its place, of a writer that was killed: see `tiler.atomic`.
@@ -146,11 +146,20 @@ def refuse_inputs_within(out: Path, inputs: Iterable[Path]) -> None:
     ConfigError
         With the first such input.
     """
-    own = [Path(os.path.realpath(out / name)) for name in RESULTS]
     for path in inputs:
-        real = Path(os.path.realpath(path))
-        if any(real.is_relative_to(place) for place in own):
+        if _is_result(out, path):
             raise ConfigError(f"{path}: an input lies among the results in {out}; move it, or give another --out")
+
+
+def refuse_result(out: Path, log: Path) -> None:
+    """Refuse a file for `--log-json` that a run writes or removes itself; ConfigError with its name."""
+    if _is_result(out, log):
+        raise ConfigError(f"--log-json {log}: lies among the results in {out}; give another file")
+
+
+def _is_result(out: Path, path: Path) -> bool:
+    real = Path(os.path.realpath(path))
+    return any(real.is_relative_to(os.path.realpath(out / name)) for name in RESULTS)
 
 
 def _is_ours(out: Path) -> bool:
