@@ -16,7 +16,7 @@ from stitch.grid import seams_of_tile
 from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.config import Config
-from tiler.context import RunContext, pack_tiles, seam_name, tile_key
+from tiler.context import RunContext, make_layout, pack_tiles, seam_name, tile_key
 from tiler.engine import Engine, Progress, StoppedError
 from tiler.executors import Executor, connect, local, serial, share_memory
 from tiler.failures import Policy
@@ -37,18 +37,29 @@ from tiler.out_folder import (
     refuse_inputs_within,
     remove_strangers,
 )
-from tiler.own_stages import OwnStages, check_own, list_stages, run_own_stages
+from tiler.own_stages import OwnStages, check_own, list_stages, run_own_stages, stages_of_pad
+from tiler.pad import Pad
+from tiler.padding import (
+    CORE_STAGE,
+    Alone,
+    core_part,
+    pad_around,
+    pad_plan,
+    store_of_run,
+)
 from tiler.planning import Plan, check_sources, identify, make_plan
 from tiler.progress import Announce, RunProgress
 from tiler.quarantine import (
     HolesError,
     Missing,
+    bounds_around,
     config_alone,
     find_missing,
     leave_holes,
     save_config,
     stop_at_holes,
 )
+from tiler.region import find_pad, foresee_pad
 from tiler.seal import seal
 from tiler.settling import domain_of_run, settle_domain, take_domain
 from tiler.stage import REGION_ITEM, Stage
@@ -56,7 +67,7 @@ from tiler.stages.city import first_round, house_stage, later_round, model_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
-from tiler.stages.pieces import piece_stages
+from tiler.stages.pieces import fit_stage, piece_stages
 from tiler.stopping import stops
 from tiler.summary import describe_tasks, summarise_run
 from tiler.task import peak_memory
@@ -203,8 +214,10 @@ def _mesh_region(
                     plan, missing = leave_holes(plan, missing, engine)
                     say(f"left out so far: {', '.join(sorted(missing.tiles))}; going on with the rest")
                     continue
-                run_own_stages(engine, own)
+                run_own_stages(engine, own, config)
             break
+    if config.padded:
+        plan = pad_plan(plan, Pad(plan.region.bounds, engine.context.grid))
     missing = find_missing(plan, missing, engine)
     remade = {
         f"{STORE}/{stage}/{name}": what
@@ -283,7 +296,19 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
         What its stages raise; any other error likewise, its type kept.
     """
     check_sources(config)
-    alone = config_alone(config, make_plan(config, _silent), tile)
+    whole = make_plan(config, _silent)
+    domain, tallest = domain_of_run(config)
+    pad, taken = None, None
+    if config.padded:
+        around = find_pad(whole.grid, config, tallest)
+        wide = pad_plan(whole, around)
+        alone = config_alone(config, wide, tile)
+        box = bounds_around(wide, tile)
+        pad = pad_around(around, whole.grid, box, config)
+        taken = Alone(pad, store_of_run(config))
+        alone = dataclasses.replace(alone, bounds=core_part(box, around.core, config.tile_size))
+    else:
+        alone = config_alone(config, whole, tile)
     out = Path(alone.out)
     out.mkdir(parents=True, exist_ok=True)
     with only_run(out, say):
@@ -294,8 +319,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
             engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
             run_city_stages(engine, alone)
             seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
-            domain = domain_of_run(config)
-            take_domain(engine, alone, domain)
+            take_domain(engine, alone, domain, pad, taken)
             engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
             (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
             engine.run(pieces, items={"pieces": [tile]})
@@ -314,7 +338,14 @@ def run_stages(engine: Engine, config: Config) -> int:
     """
     rounds = run_city_stages(engine, config)
     domain = settle_domain(engine, config)
-    engine.run(*city_model_stages(), *mesh_stages(config, domain))
+    if config.padded:
+        both = engine.layout, engine.context
+        engine.lay_out(*engine.laid_out(CORE_STAGE))
+        engine.run(*city_model_stages(), fit_stage(config))
+        engine.lay_out(*both)
+        engine.run(*mesh_stages(config, domain))
+    else:
+        engine.run(*city_model_stages(), *mesh_stages(config, domain))
     engine.run(*piece_stages(config))
     # Beside a tile without a piece, others were written as if they had a neighbour.
     while lost := [name for stage, name in engine.set_aside if stage == "pieces"]:
@@ -374,6 +405,9 @@ def _begin_progress(
     """Begin to tell how far a run is, with all stages that are known from the start."""
     stages = [*list_stages(config), *own.stages]
     expected = {stage.name: len(plan.layout.boxes(stage.scope)) for stage in stages}
+    if wide := stages_of_pad(config):
+        layout = make_layout(foresee_pad(plan.grid, config), {}, identity="")
+        expected |= {stage.name: len(layout.boxes(stage.scope)) for stage in stages if stage.name in wide}
     command = "" if own.stages else None  # stages of the user's own are not given by a command
     return RunProgress(out, config, expected, announce=announce, command=command)
 
