@@ -16,6 +16,7 @@ from pipeline.raster import NodeWindow, cut_nodes, window_of
 from pipeline.sizes import SizeRule, local_sizes, size_field_around
 from stitch.grid import Key, has_tile, make_grid, tile_box, tile_keys
 from tests.cities import crowded_blocks
+from tests.faults import injected, raises
 from tests.programs import mesh_is_ok, read_check, run_foam
 from tests.tiles import hash_files, make_town, run_of, write_footprints, write_town
 from tiler.check import check_run
@@ -228,7 +229,7 @@ def test_no_pad_is_no_pad(tmp_path: Path) -> None:
 
 def test_the_size_in_the_pad_is_three_times_that_of_the_mesh_as_far_as_tiles_allow() -> None:
     assert make_config({"pad": [100.0]}).graded_size == 30.0
-    assert make_config({"pad": [100.0], "tile_size": 280.0}).graded_size == 20.0
+    assert make_config({"pad": [100.0], "tile_size": 280.0}).graded_size == pytest.approx(20.0)
     assert make_config({"pad": [100.0], "tile_size": 140.0}).graded_size == 0.0
     assert make_config({"pad": [100.0], "domain_height": 40.0}).graded_size == pytest.approx(25.0)
     assert make_config({"pad": [100.0], "domain_height": 40.0, "mesher": "layered"}).graded_size == 30.0
@@ -334,6 +335,25 @@ def test_absent_tiles_of_the_region_stay_absent_in_its_pad(tmp_path: Path) -> No
         assert len(record["region"]["absent"]) >= 3
         assert record["counts"]["border nodes without terrain"] > 0
         prove(tmp_path / mesher)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("stage", "of"), [("ground", "terrain"), ("columns", "columns"), ("fit", "terrain")])
+def test_a_tile_that_fails_leaves_a_hole_and_is_mended(
+    stage: str, of: str, padded: tuple[dict[str, Any], Path], core: dict[str, Any], tmp_path: Path
+) -> None:
+    whole, out = padded[0], tmp_path / "out"
+    tile = Store(padded[1] / "store.zarr").names(of)[0]
+    with injected({stage: {tile: raises}}):
+        record = run_of(core, out, pad=PAD, retries=0)
+    assert record["exit_code"] == 3
+    assert set(record["missing"]) == ({tile} if stage != "fit" else set())
+    assert [entry["stage"] for entry in record["set_aside"]] == (["fit"] if stage == "fit" else [])
+    lost = set(whole["tiles"]) - set(record["tiles"])
+    assert lost == {*record["missing"], *record["region"]["absent"]}
+    prove(out)
+    assert run_of(core, out, pad=PAD)["exit_code"] == 0
+    assert hash_files(out) == hash_files(padded[1])
 
 
 @pytest.mark.long

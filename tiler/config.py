@@ -262,9 +262,10 @@ class Config:
         """
         if self.open_size or not self.padded:
             return self.open_size
-        size = min(PAD_COARSENING * self.mesh_size, self.tile_size / LEAST_TILE)
+        most = self.tile_size / LEAST_TILE
         if self.mesher == "adaptive" and not isinstance(self.domain_height, str):
-            size = min(size, self.domain_height / (2 * self.most_spacing) * (1 - ROUNDING))
+            most = min(most, self.domain_height / (2 * self.most_spacing))
+        size = min(PAD_COARSENING * self.mesh_size, most * (1 - ROUNDING))
         return size if size > self.mesh_size else 0.0
 
     @property

@@ -44,7 +44,7 @@ def find_rim(task: Task) -> Facts:
     window = node_window(task.parameters.core_bounds, task.parameters.dtm_spacing)
     nodes = border_nodes(window)
     z = np.full(len(nodes), np.nan)
-    inner = NodeWindow(window.i0 + 1, window.j0 + 1, window.nx - 2, window.ny - 2)
+    inner = _within(window)
     for result in task.read("terrain", ()):
         part = NodeWindow(*(result.facts[name] for name in ("i0", "j0", "nx", "ny")))
         if grow_window(part, 0, within=inner) != part:
@@ -71,13 +71,21 @@ def lay_approach(task: Task) -> Facts:
     (rim,) = task.read(RIM)
     border = Border(rim.arrays["z"], float(rim.facts["rim"]), window)
     own = own_window(task)
-    z = approach_terrain(border, own, node_window(bounds, spacing), spacing=spacing).z
+    if grow_window(own, 0, within=_within(window)) == own:
+        z = np.full((own.ny, own.nx), np.nan)
+    else:
+        z = approach_terrain(border, own, node_window(bounds, spacing), spacing=spacing).z
     known = join_rasters(task, "terrain", grow_window(own, 0, within=window), spacing)
     if known.z.size:
         part = cut_nodes(z, own, window_of(known))
         np.copyto(part, known.z, where=~np.isnan(known.z))
     task.put(z=z)
     return {"i0": own.i0, "j0": own.j0, "nx": own.nx, "ny": own.ny, "spacing": spacing}
+
+
+def _within(window: NodeWindow) -> NodeWindow:
+    """Nodes of a window without the outermost ones."""
+    return NodeWindow(window.i0 + 1, window.j0 + 1, window.nx - 2, window.ny - 2)
 
 
 def _take_nodes(
