@@ -121,7 +121,7 @@ def approach_terrain(border: Border, nodes: NodeWindow, outer: NodeWindow, *, sp
     --------
     >>> border = make_border(np.array([9.0, 9.0, 1.0, 1.0]), NodeWindow(10, 0, 2, 2))
     >>> approach_terrain(border, NodeWindow(6, 0, 5, 1), NodeWindow(6, 0, 6, 2), spacing=1.0).z.round(2)
-    array([[5.  , 5.  , 5.  , 5.  , 7.  ]])
+    array([[5.  , 5.  , 5.  , 6.48, 7.  ]])
     """
     height = np.concatenate(([0.0], np.cumsum((_next(border.z) + border.z) / 2 - border.rim)))
     i = np.arange(nodes.i0, nodes.i0 + nodes.nx)

@@ -214,6 +214,7 @@ def test_a_pad_in_heights_needs_a_building() -> None:
     with pytest.raises(ConfigError, match="pad = 5 m: must be 0"):
         find_pad(grid, config, 1.0)
     assert widths_in_metres((50.0,), 0.0) == (50.0,) * 4
+    assert widths_in_metres((50.5, "2H", 0.0, "1H"), 20.3) == (50.5, 41.0, 0.0, 21.0)
 
 
 def test_no_pad_is_no_pad(tmp_path: Path) -> None:

@@ -1,10 +1,10 @@
 """From the city model to the seams of a padded region: the larger layout, and the ground of the pad."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import InputError
-from stitch.grid import Bounds, TileGrid
+from stitch.grid import Bounds
 from tiler.config import Config
 from tiler.context import make_layout, pack_tiles
 from tiler.domain import Domain
@@ -12,7 +12,8 @@ from tiler.engine import Engine
 from tiler.out_folder import STORE
 from tiler.pad import Pad, pad_grid
 from tiler.planning import Plan
-from tiler.quarantine import as_error, stop_at_holes
+from tiler.quarantine import as_error, bounds_around, config_alone, stop_at_holes
+from tiler.region import find_pad
 from tiler.stage import REGION_ITEM
 from tiler.stages.approach import RIM, approach_stages, known_rim
 from tiler.stages.domain import layer_stages
@@ -21,23 +22,7 @@ from tiler.store import Store
 CORE_STAGE = "model"  # one that has the items of the region without its pad
 
 
-@dataclass(frozen=True)
-class Alone:
-    """What a tile that is run alone takes of the run of the whole region.
-
-    Attributes
-    ----------
-    pad : Pad
-        The region in its pad, with the tiles around the one alone.
-    store : Path
-        Store of the whole run, which has the rim.
-    """
-
-    pad: Pad
-    store: Path
-
-
-def lay_pad(engine: Engine, config: Config, domain: Domain, pad: Pad, alone: Alone | None = None) -> None:
+def lay_pad(engine: Engine, config: Config, domain: Domain, pad: Pad, rim_store: Path | None = None) -> None:
     """Go on over region and pad: lay the ground of the pad, and choose the layers of roofs over it.
 
     Parameters
@@ -50,8 +35,8 @@ def lay_pad(engine: Engine, config: Config, domain: Domain, pad: Pad, alone: Alo
         Height and top of the domain.
     pad : Pad
         The region in its pad.
-    alone : Alone, optional
-        For a tile that is run alone: the rim is that of the whole run.
+    rim_store : Path, optional
+        For a tile that is run alone: the store of the whole run, whose rim it takes.
 
     Raises
     ------
@@ -66,8 +51,8 @@ def lay_pad(engine: Engine, config: Config, domain: Domain, pad: Pad, alone: Alo
     engine.add_parameters(core_bounds=pad.core)
     engine.lay_out(layout, wider)
     stages = approach_stages(config)
-    if alone is not None:
-        engine.add_parameters(rim_store=str(alone.store), rim_digest=_digest_rim(alone.store))
+    if rim_store is not None:
+        engine.add_parameters(rim_store=str(rim_store), rim_digest=_digest_rim(rim_store))
         stages = [known_rim() if stage.name == RIM else stage for stage in stages]
     engine.run(*stages)
     if engine.set_aside:
@@ -84,10 +69,41 @@ def pad_plan(plan: Plan, pad: Pad) -> Plan:
     return replace(plan, region=replace(plan.region, bounds=pad.grid.bounds), grid=pad.grid, layout=layout)
 
 
-def pad_around(pad: Pad, core: TileGrid, box: Bounds, config: Config) -> Pad:
-    """Take the part of a padded region within a box on lines of its tiles, for a tile alone."""
-    grid = pad_grid(core, box, mesh_size=config.mesh_size, open_size=config.graded_size)
-    return Pad(pad.core, grid)
+def plan_alone(config: Config, whole: Plan, tile: str, tallest: float) -> tuple[Config, Pad, Path]:
+    """Plan a run of the tiles around one of a padded region.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the whole run.
+    whole : Plan
+        Its plan, of the region without its pad.
+    tile : str
+        Name of the tile.
+    tallest : float
+        Height of the tallest building (m).
+
+    Returns
+    -------
+    Config
+        Parameters of that run: its bounds are the part of the region that is needed.
+    Pad
+        The region in its pad, with the tiles around the one.
+    Path
+        Store of the whole run.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such tile.
+    """
+    pad = find_pad(whole.grid, config, tallest)
+    wide = pad_plan(whole, pad)
+    alone = config_alone(config, wide, tile)
+    box = bounds_around(wide, tile)
+    grid = pad_grid(whole.grid, box, mesh_size=config.mesh_size, open_size=config.graded_size)
+    alone = replace(alone, bounds=core_part(box, pad.core, config.tile_size))
+    return alone, Pad(pad.core, grid), Path(config.out) / STORE
 
 
 def core_part(box: Bounds, core: Bounds, tile_size: float) -> Bounds:
@@ -110,11 +126,6 @@ def core_part(box: Bounds, core: Bounds, tile_size: float) -> Bounds:
         low.append(first)
         high.append(last)
     return low[0], low[1], high[0], high[1]
-
-
-def store_of_run(config: Config) -> Path:
-    """Store of the run of the whole region."""
-    return Path(config.out) / STORE
 
 
 def _digest_rim(store: Path) -> str:

@@ -39,27 +39,19 @@ from tiler.out_folder import (
 )
 from tiler.own_stages import OwnStages, check_own, list_stages, run_own_stages, stages_of_pad
 from tiler.pad import Pad
-from tiler.padding import (
-    CORE_STAGE,
-    Alone,
-    core_part,
-    pad_around,
-    pad_plan,
-    store_of_run,
-)
+from tiler.padding import CORE_STAGE, pad_plan, plan_alone
 from tiler.planning import Plan, check_sources, identify, make_plan
 from tiler.progress import Announce, RunProgress
 from tiler.quarantine import (
     HolesError,
     Missing,
-    bounds_around,
     config_alone,
     find_missing,
     leave_holes,
     save_config,
     stop_at_holes,
 )
-from tiler.region import find_pad, foresee_pad
+from tiler.region import foresee_pad
 from tiler.seal import seal
 from tiler.settling import domain_of_run, settle_domain, take_domain
 from tiler.stage import REGION_ITEM, Stage
@@ -298,15 +290,9 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
     check_sources(config)
     whole = make_plan(config, _silent)
     domain, tallest = domain_of_run(config)
-    pad, taken = None, None
+    pad, store = None, None
     if config.padded:
-        around = find_pad(whole.grid, config, tallest)
-        wide = pad_plan(whole, around)
-        alone = config_alone(config, wide, tile)
-        box = bounds_around(wide, tile)
-        pad = pad_around(around, whole.grid, box, config)
-        taken = Alone(pad, store_of_run(config))
-        alone = dataclasses.replace(alone, bounds=core_part(box, around.core, config.tile_size))
+        alone, pad, store = plan_alone(config, whole, tile, tallest)
     else:
         alone = config_alone(config, whole, tile)
     out = Path(alone.out)
@@ -319,7 +305,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
             engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
             run_city_stages(engine, alone)
             seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
-            take_domain(engine, alone, domain, pad, taken)
+            take_domain(engine, alone, domain, pad, store)
             engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
             (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
             engine.run(pieces, items={"pieces": [tile]})

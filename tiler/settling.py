@@ -10,7 +10,7 @@ from tiler.engine import Engine
 from tiler.options import needs_region
 from tiler.out_folder import STORE
 from tiler.pad import Pad
-from tiler.padding import Alone, lay_pad
+from tiler.padding import lay_pad
 from tiler.quarantine import stop_at_holes
 from tiler.region import find_pad
 from tiler.stage import REGION_ITEM
@@ -37,15 +37,15 @@ def settle_domain(engine: Engine, config: Config) -> Domain:
     """
     engine.run(*domain_stages(config))
     stop_at_holes(engine)
-    domain = settle(config.domain_height, config.top, engine.records["domain", REGION_ITEM].facts)
     found = engine.records["domain", REGION_ITEM].facts
+    domain = settle(config.domain_height, config.top, found)
     pad = find_pad(engine.context.grid, config, float(found["tallest"])) if config.padded else None
     take_domain(engine, config, domain, pad)
     return domain
 
 
 def take_domain(
-    engine: Engine, config: Config, domain: Domain, pad: Pad | None = None, alone: Alone | None = None
+    engine: Engine, config: Config, domain: Domain, pad: Pad | None = None, rim_store: Path | None = None
 ) -> None:
     """Give the stages after the city model the height and top of the domain, and choose the layers that need them.
 
@@ -55,7 +55,7 @@ def take_domain(
     check_height(config, domain.height)
     engine.add_parameters(domain_height=domain.height, top_elevation=domain.top)
     if pad is not None:
-        lay_pad(engine, config, domain, pad, alone)
+        lay_pad(engine, config, domain, pad, rim_store)
         return
     engine.run(*layer_stages(config, domain))
     stop_at_holes(engine)
