@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from tiler.region import find_pad
 from tiler.results import StoredTerrain
 from tiler.run import run, run_alone
 from tiler.stage import Facts, Read, Scope, Stage
+from tiler.stages.mesh import find_sizes
 from tiler.store import Store
 from tiler.task import Task
 from tiler.vtk_files import read_vtu
@@ -324,6 +326,17 @@ def test_the_check_tells_a_rim_that_is_uneven_and_a_house_in_the_pad(
     shutil.copytree(padded[1], out)
     edit_record(out, **region)
     assert {fault.kind for fault in check_run(out, StoredTerrain).faults} == {kind}
+
+
+def test_with_a_pad_alone_sizes_count_from_the_region_and_with_an_open_size_from_walls() -> None:
+    walls = np.array([[[CORE[0], CORE[1]], [CORE[0], CORE[3]]]])
+    xy = np.array([[CORE[0] + 200.0, CORE[1] + 100.0], [CORE[0] - 50.0, CORE[1] + 100.0]])
+    found = []
+    for open_size in (0.0, 30.0):
+        given = SimpleNamespace(mesh_size=10.0, open_size=open_size, grading=0.2, core_bounds=CORE)
+        task: Any = SimpleNamespace(parameters=given, context=SimpleNamespace(open_size=30.0))
+        found.append(local_sizes(find_sizes(walls, task), xy, mesh_size=10.0).tolist())
+    assert found == [[10.0, 20.0], [30.0, 20.0]]
 
 
 @pytest.mark.long

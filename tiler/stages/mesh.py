@@ -111,7 +111,7 @@ def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
     buildings, dtm = _surroundings(task)
     polygons = buildings.model.polygons
     walls = cut_walls(polygons, mesh_size=given.mesh_size)
-    sizes = _sizes(walls, task)
+    sizes = find_sizes(walls, task)
     with task.step("3.1 seams"):
         start, end = (
             place_corner(grid, corner, polygons, walls, mesh_size=given.mesh_size, sizes=sizes)
@@ -160,7 +160,7 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
     buildings, dtm = _surroundings(task)
     model = buildings.model
     walls = cut_walls(model.polygons, mesh_size=given.mesh_size)
-    sizes = _sizes(walls, task)
+    sizes = find_sizes(walls, task)
     names = [seam_name(key) for key in seams_of_tile(tile_key(task.name))]
     found = {result.name: result for result in task.read("seams") if result.name in names}
     sides = tuple(unpack_seam(found[name].arrays, model.numbers) for name in names)
@@ -300,7 +300,7 @@ def _halos_of(task: Task) -> tuple[float, float]:
     return _halos(task.parameters, largest, around_walls=largest > 0 and task.parameters.open_size > 0)
 
 
-def _sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
+def find_sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
     """Sizes around walls, or with a pad alone around the region; None where they are the same everywhere."""
     given, largest = task.parameters, task.context.open_size
     if not largest:
