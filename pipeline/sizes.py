@@ -44,7 +44,8 @@ class SizeField:
     rule : SizeRule
         The rule.
     walls : STRtree
-        Walls as lines, at least all within the rule's reach of the places that are asked for.
+        What distances count from: walls as lines, at least all within the rule's reach of the places that are
+        asked for.
     """
 
     rule: SizeRule
@@ -54,6 +55,18 @@ class SizeField:
 def size_field(walls: NDArray[np.float64], rule: SizeRule) -> SizeField:
     """Make the sizes around walls: float64 (w, 2, 2), start and end of each (m); there may be none."""
     return SizeField(rule, shapely.STRtree(shapely.linestrings(walls)))
+
+
+def size_field_around(box: tuple[float, float, float, float], rule: SizeRule) -> SizeField:
+    """Make sizes that grow away from a box (xmin, ymin, xmax, ymax) (m), and are those at walls within it.
+
+    Examples
+    --------
+    >>> field = size_field_around((0.0, 0.0, 9.0, 9.0), SizeRule(10.0, 40.0, 0.5))
+    >>> local_sizes(field, np.array([[4.0, 4.0], [12.0, 13.0]]), mesh_size=10.0)
+    array([10. , 12.5])
+    """
+    return SizeField(rule, shapely.STRtree([shapely.box(*box)]))
 
 
 def wall_distances(field: SizeField, xy: NDArray[np.float64]) -> NDArray[np.float64]:

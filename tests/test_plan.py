@@ -74,7 +74,7 @@ def country(n: int, size: float = 1000.0) -> Survey:
         if not n // 3 <= 5 * i < 2 * n // 3 or not n // 3 <= 5 * j < 2 * n // 3
     ]
     grid = choose_tiles(make_grid(bounds, tile_size=size, mesh_size=5.0), [cloud.bounds[:4] for cloud in clouds])
-    return Survey(Region(bounds, CRS, size), clouds, clouds, [], {}, grid)
+    return Survey(Region(bounds, CRS, size), clouds, clouds, [], {}, grid, grid)
 
 
 def test_cells_points_disk_and_memory_are_as_a_run_has_them(city: Config, record: dict[str, Any]) -> None:
@@ -182,7 +182,7 @@ def test_points_of_files_are_dealt_out_by_area() -> None:
         CloudHeader(Path("b"), 100, (-200.0, 0.0, 200.0, 200.0, 0.0, 1.0), None),
         CloudHeader(Path("c"), 7, (300.0, 300.0, 300.0, 300.0, 0.0, 1.0), None),
     ]
-    np.testing.assert_allclose(spread_points(grid, headers), [[300 + 50, 0], [600, 7]])
+    np.testing.assert_allclose(spread_points(grid, headers, grid.bounds), [[300 + 50, 0], [600, 7]])
 
 
 def test_walls_shorter_than_the_mesh_count() -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.mesh import Marker
 from stitch.frontier import Settled, add_rim, close_frontier, start_frontier
-from tiler import city_proofs, proofs, soil_proofs
+from tiler import city_proofs, pad_proofs, proofs, soil_proofs
 from tiler.building_index import BuildingIndex, index_buildings
 from tiler.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
 from tiler.out_folder import RUN_RECORD, STORE
@@ -129,17 +129,20 @@ class _Sums:
         surface = piece.surface
         rows = _find_buildings(index, piece)
         buildings = index.take(rows)
+        ground = take_vertices(piece, Marker.GROUND, GROUND, fresh)
         found = {
             "same": piece.same_boundary,
             "closed": piece.closed,
             "marks": city_proofs.check_marks(surface, buildings, soil=record.depth > 0),
             "box": proofs.check_box(surface, record.bounds, piece.rim.edges),
             "top": proofs.check_top(take_vertices(piece, Marker.TOP, TOP, fresh), record.top),
-            "ground": proofs.check_ground(take_vertices(piece, Marker.GROUND, GROUND, fresh), dtm),
+            "ground": proofs.check_ground(ground, dtm),
             "roofs": city_proofs.check_roofs(surface, buildings),
             "walls": city_proofs.check_walls(surface, buildings),
             "sizes": proofs.check_sizes(surface, piece.outline, piece.air),
         }
+        if record.core is not None:
+            found["pad"] = pad_proofs.check_pad(surface, ground, record.bounds, record.core, record.rim)
         if record.depth:
             found |= {
                 "between": piece.ground,
@@ -201,6 +204,8 @@ def _conclude(
         proofs.prove_volume(found["sizes"]),
         proofs.prove_record(record, sums.counts, partial=partial),
     )
+    if record.core is not None:
+        claims += (pad_proofs.prove_pad(found["pad"], record.core, record.rim),)
     if record.depth:
         claims += (
             soil_proofs.prove_between(found["between"]),

@@ -158,6 +158,8 @@ def _add_parameters(parser: argparse.ArgumentParser) -> None:
         words: dict[str, Any] = {"dest": entry.name, "default": argparse.SUPPRESS, "help": _help(entry)}
         if wanted is bool:
             words["action"] = argparse.BooleanOptionalAction
+        elif get_origin(wanted) is tuple and get_args(wanted)[0] == Height:
+            words |= {"type": str, "nargs": "+", "metavar": "M|nH"}
         elif get_origin(wanted) is tuple:
             words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
         elif wanted == Height:

@@ -12,13 +12,16 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import ConfigError
-from tiler.domain import EXPECTED_TALLEST, Height, height_in_metres, read_height
+from stitch.grid import LEAST_TILE
+from tiler.domain import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
+from tiler.pad import check_widths
 from tiler.plain_text import shorten
 
 MAX_CONFIG_BYTES = 1_000_000
 MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
 MAX_INT = 2**53
 UNSET = ""
+PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is given for the open
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
 
@@ -147,8 +150,14 @@ class Config:
         "mesh_size everywhere", unit="m", least=0,
     )  # fmt: skip
     grading: float = _parameter(
-        0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size", above=0, most=1
-    )
+        0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size or pad", above=0,
+        most=1,
+    )  # fmt: skip
+    pad: tuple[float | str, ...] = _parameter(
+        (), "mesh", "width of a margin of bare ground around the region, which flattens outwards and has coarser "
+        "cells: one for all sides, or west east south north; metres, or 5H for five times the height of the "
+        "tallest building; empty: none", unit="m",
+    )  # fmt: skip
     min_angle: float = _parameter(
         0.0, "mesh", "least angle of the plane mesh, but at sharp corners; 0 takes the mesher's own: 28 adaptive, "
         "25 layered", unit="degrees", source="paper, step 3.1", least=0, most=32,
@@ -235,9 +244,29 @@ class Config:
     )
 
     @property
+    def padded(self) -> bool:
+        """Whether there is a pad around the region."""
+        return any(width != 0 for width in self.pad)
+
+    @property
     def largest_size(self) -> float:
-        """Largest target edge length (m)."""
+        """Largest target edge length within the region (m)."""
         return self.open_size or self.mesh_size
+
+    @property
+    def graded_size(self) -> float:
+        """Largest target edge length of region and pad where sizes are graded (m); 0 where all are the same.
+
+        Without ``open_size`` that of the pad is three times the mesh size, or as much as the size of tiles allows
+        and, with the adaptive mesher, a height of the domain in metres.
+        """
+        if self.open_size or not self.padded:
+            return self.open_size
+        most = self.tile_size / LEAST_TILE
+        if self.mesher == "adaptive" and not isinstance(self.domain_height, str):
+            most = min(most, self.domain_height / (2 * self.most_spacing))
+        size = min(PAD_COARSENING * self.mesh_size, most * (1 - ROUNDING))
+        return size if size > self.mesh_size else 0.0
 
     @property
     def layer_height_or_default(self) -> float:
@@ -285,7 +314,7 @@ def idle_parameters(config: Config) -> list[str]:
         and getattr(config, other) != value
         and not (config.underground and name in SOIL)
     ]
-    if config.grading != default.grading and not config.open_size:
+    if config.grading != default.grading and not config.graded_size:
         idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
     if config.layer_growth != default.layer_growth and not config.first_layer:
         idle.append(f"layer_growth = {config.layer_growth:g} has no effect: it counts with first_layer above 0")
@@ -424,7 +453,7 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
     if wanted == Height:
         wanted = str if isinstance(value, str) else float
         converted = _convert(name, value, wanted)
-        return read_height(converted)
+        return read_height(converted, name)
     if get_origin(wanted) is tuple:
         if isinstance(value, str) or not isinstance(value, (list, tuple)):
             value = [value]
@@ -501,9 +530,10 @@ def _check_together(config: Config) -> None:
             f"underground = {config.underground:g} m: at least {least:g} m (least_spacing x mesh_size), the least "
             "height of a cell; raise it, lower --least-spacing, or give 0 for no soil"
         )
-    spacing = largest_spacing(config)
+    spacing = largest_spacing(config, config.largest_size)
     if config.first_layer > spacing:
-        source = "layer_height" if config.mesher == "layered" else f"most_spacing x {_size_name(config)}"
+        size = "open_size" if config.open_size else "mesh_size"
+        source = "layer_height" if config.mesher == "layered" else f"most_spacing x {size}"
         raise ConfigError(
             f"first_layer = {config.first_layer:g} m: at most the largest vertical spacing, {spacing:g} m "
             f"({source}); lower --first-layer"
@@ -513,19 +543,25 @@ def _check_together(config: Config) -> None:
             f"first_layer = {config.first_layer:g} m: at least {LEAST_FIRST_LAYER:g} of mesh_size = "
             f"{config.mesh_size:g} m; raise --first-layer or lower --mesh-size"
         )
+    _check_pad(config)
     if not isinstance(config.domain_height, str):
         check_height(config, config.domain_height)
 
 
-def largest_spacing(config: Config) -> float:
-    """Largest vertical spacing (m), of either mesher."""
+def _check_pad(config: Config) -> None:
+    if len(config.pad) not in (0, 1, 4):
+        raise ConfigError(
+            f"pad: {len(config.pad)} widths; give one for all sides, or four: west east south north (on the "
+            "command line behind the point clouds)"
+        )
+    check_widths(config.pad, mesh_size=config.mesh_size, dtm_spacing=config.dtm_spacing)
+
+
+def largest_spacing(config: Config, largest_size: float) -> float:
+    """Largest vertical spacing (m), of either mesher, where edges are as long as that (m)."""
     if config.mesher == "layered":
         return config.layer_height_or_default
-    return config.most_spacing * config.largest_size
-
-
-def _size_name(config: Config) -> str:
-    return "open_size" if config.open_size else "mesh_size"
+    return config.most_spacing * largest_size
 
 
 def check_height(config: Config, height: float) -> None:
@@ -536,7 +572,7 @@ def check_height(config: Config, height: float) -> None:
     ConfigError
         With the spacing against the height (m).
     """
-    spacing = largest_spacing(config)
+    spacing = largest_spacing(config, max(config.largest_size, config.graded_size))
     if spacing <= height / 2:
         return
     shown = f"domain_height = {height:g} m"
@@ -546,10 +582,13 @@ def check_height(config: Config, height: float) -> None:
         raise ConfigError(
             f"layer height {spacing:g} m: at most half of {shown}; lower --layer-height or raise --domain-height"
         )
-    name = _size_name(config)
+    name = "open_size" if config.open_size else "mesh_size"
+    move = f"lower --most-spacing or --{name.replace('_', '-')}"
+    if config.graded_size and not config.open_size:
+        name, move = f"the pad's size of {config.graded_size:g} m", "lower --most-spacing, give an --open-size"
     raise ConfigError(
-        f"vertical spacing of up to {spacing:g} m (most_spacing x {name}): at most half of {shown}; lower "
-        f"--most-spacing or --{name.replace('_', '-')}, or raise --domain-height"
+        f"vertical spacing of up to {spacing:g} m (most_spacing x {name}): at most half of {shown}; {move}, or "
+        "raise --domain-height"
     )
 
 

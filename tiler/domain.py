@@ -37,8 +37,8 @@ class Domain:
     top: float | None
 
 
-def read_height(value: Height) -> Height:
-    """Read a height: metres as a number, or a multiple of the tallest building as a text.
+def read_height(value: Height, name: str = "domain_height") -> Height:
+    """Read a length: metres as a number, or a multiple of the height of the tallest building as a text.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def read_height(value: Height) -> Height:
         return float(text)
     except ValueError:
         raise ConfigError(
-            f"domain_height = {text[:40]!r}: expected metres, or a multiple of the tallest building's height as 6H"
+            f"{name} = {text[:40]!r}: expected metres, or a multiple of the tallest building's height as 6H"
         ) from None
 
 

@@ -44,6 +44,9 @@ Item = tuple[str, str]  # stage and name
 class Watch(Protocol):
     """What else a progress may want to know."""
 
+    def laid_out(self, layout: Layout) -> None:
+        """Take note of the items of another layout."""
+
     def planned(self, stage: str, scope: Scope, total: int) -> None:
         """Take note of how many items a stage has."""
 
@@ -102,6 +105,8 @@ class Engine:
 
     Attributes
     ----------
+    layout, context : Layout, object
+        Of what is run next.
     records : Records
         What came of each stage and item so far.
     set_aside : dict of (str, str) to SetAside
@@ -131,7 +136,7 @@ class Engine:
         self._policy = policy or Policy()
         self._stop = False
         self._absent = np.array(layout.absent).reshape(-1, 4)
-        self._parameters, self._context = parameters, context
+        self._parameters, self.context = parameters, context
         self._executor, self._progress = executor, progress
         watch: object = progress
         self._watch = watch if isinstance(watch, Watch) else None
@@ -140,6 +145,7 @@ class Engine:
         if self._window < 1:
             raise ValueError(f"window {self._window}, expected 1 or more")
         self._items: dict[str, tuple[Scope, Items]] = {}
+        self._laid_out: dict[str, tuple[Layout, Any]] = {}
 
     def run(self, *stages: Stage, items: Mapping[str, Collection[str]] | None = None) -> None:
         """Run stages whose reads are among them or were run before.
@@ -171,6 +177,7 @@ class Engine:
         if unknown:
             raise ValueError(f"items are given for stages that are not: {', '.join(unknown)}")
         order = order_stages(stages, self._items.keys())
+        self._laid_out |= {stage.name: (self.layout, self.context) for stage in order}
         plan = self._plan(order, items or {})
         for planned in plan:
             self._items[planned.stage.name] = (planned.stage.scope, planned.items)
@@ -186,6 +193,28 @@ class Engine:
     def add_parameters(self, **values: Any) -> None:
         """Give values to parameters that only what was run so far decides; those of the same name are replaced."""
         self._parameters = SimpleNamespace(**(vars(self._parameters) | values))
+
+    def lay_out(self, layout: Layout, context: Any) -> None:
+        """Go on over another layout: what is run from now on has its items, what was run keeps its own.
+
+        Parameters
+        ----------
+        layout : Layout
+            Items of every scope; a stage reads those of another layout by their boxes there, as ever.
+        context : object
+            Given to every task from now on.
+        """
+        self.layout, self.context = layout, context
+        self._absent = np.array(layout.absent).reshape(-1, 4)
+
+    def tell_layout(self) -> None:
+        """Tell a `Watch` the items of the layout, where they are not those that the run began with."""
+        if self._watch is not None:
+            self._watch.laid_out(self.layout)
+
+    def laid_out(self, stage: str) -> tuple[Layout, Any]:
+        """Layout and context that a stage was run with, for `lay_out`."""
+        return self._laid_out[stage]
 
     def stop(self) -> None:
         """Let what runs end, start nothing more, and end `run` with `StoppedError`."""
@@ -294,7 +323,7 @@ class Engine:
             here = self._extents(here, first.around)
         if True in by_extent:
             return find_refs(stage, here, source, self._extents(run, source), everything=everything)
-        boxes = self.layout.boxes(scope)
+        boxes = self._laid_out[source][0].boxes(scope)
         names = tuple(sorted(boxes))
         reach = run
         if len(names) != len(run.names):
@@ -364,7 +393,7 @@ class _Run:
             for source, names in refs.items()
         )
         key = item_key(planned.digest, name, box, identity, found, engine._gaps(stage.scope, box, refs))
-        parameters, context, store = planned.parameters, engine._context, engine.store
+        parameters, context, store = planned.parameters, engine.context, engine.store
         self.tasks[ticket] = Task(
             stage.name, name, stage.scope, box, parameters, context, path, store, refs, key, engine._folder
         )

@@ -13,7 +13,7 @@ from typing import Any
 
 from pipeline.errors import ConfigError, InputError, OutputError
 from tiler.atomic import replacing
-from tiler.stage import Facts, Scope
+from tiler.stage import Box, Facts, Layout, Scope
 from tiler.task import Record
 from tiler.watching import Item, RunStart, Watcher, tell_command
 
@@ -79,12 +79,13 @@ class EventLog(Watcher):
         """Write what the run is, its tiles and seams, and the stages that it will have."""
         self._start = start
         self._tell_run("running", "")
-        for kind, boxes in (("tiles", start.tiles), ("seams", start.seams)):
-            places = ((name, *box) for name, box in boxes.items())
-            while chunk := list(islice(places, CHUNK)):
-                self._add(kind, **{kind: chunk})
+        self._tell_boxes(start.tiles, start.seams)
         for stage, (scope, total) in start.expected.items():
             self.planned(stage, scope, total)
+
+    def laid_out(self, layout: Layout) -> None:
+        """Write the tiles and seams of another layout; those that were there keep their boxes."""
+        self._tell_boxes(layout.tiles, layout.seams)
 
     def planned(self, stage: str, scope: Scope, total: int) -> None:
         """Write how many items a stage has."""
@@ -133,6 +134,12 @@ class EventLog(Watcher):
             self._raise()
         finally:
             os.close(self._file)
+
+    def _tell_boxes(self, tiles: Mapping[str, Box], seams: Mapping[str, Box]) -> None:
+        for kind, boxes in (("tiles", tiles), ("seams", seams)):
+            places = ((name, *box) for name, box in boxes.items())
+            while chunk := list(islice(places, CHUNK)):
+                self._add(kind, **{kind: chunk})
 
     def _tell_run(self, status: str, error: str) -> None:
         start = self._start

@@ -7,21 +7,23 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.sizes import SizeField, local_sizes
-from stitch.grid import LEAST_TILE, TileGrid, seams_present, tiles_present
+from pipeline.sizes import SizeField, local_sizes, size_field_around
+from stitch.grid import LEAST_TILE, Bounds, TileGrid, seams_present, tiles_present
 from tiler.clouds import CloudHeader
 from tiler.config import Config
 from tiler.domain import Domain
 from tiler.footprint_sample import FootprintSample
 from tiler.options import expected_levels, size_rule
+from tiler.own_stages import stages_of_pad
 from tiler.planning import Survey
 from tiler.stage import Scope, Stage
+from tiler.stages.approach import approach_stages
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.domain import domain_stages, layer_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
-from tiler.stages.pieces import piece_stages
+from tiler.stages.pieces import fit_stage, piece_stages
 
 # Measured on synthetic cities and Amsterdam with mesh sizes of 4 to 20 m: see docs/plan.md.
 TRIANGLES = 3.07  # on open ground, in one squared mesh size
@@ -161,14 +163,22 @@ def forecast_run(
 
 def count_tasks(survey: Survey, config: Config) -> list[Tasks]:
     """Count the tasks of each stage of a run whose clusters are joined in one later round at most."""
-    seams = seams_present(survey.grid)
-    items = {
-        Scope.FILE: len(survey.clouds),
-        Scope.TILE: int(tiles_present(survey.grid).sum()),
+    wide = stages_of_pad(config)
+    core, both = (_count_items(grid, len(survey.clouds)) for grid in (survey.grid, survey.meshed))
+    return [
+        Tasks(stage.name, stage.scope, (both if stage.name in wide else core)[stage.scope])
+        for stage in list_stages(config)
+    ]
+
+
+def _count_items(grid: TileGrid, n_files: int) -> dict[Scope, int]:
+    seams = seams_present(grid)
+    return {
+        Scope.FILE: n_files,
+        Scope.TILE: int(tiles_present(grid).sum()),
         Scope.SEAM: int(seams[0].sum() + seams[1].sum()),
         Scope.REGION: 1,
     }
-    return [Tasks(stage.name, stage.scope, items[stage.scope]) for stage in list_stages(config)]
 
 
 def list_stages(config: Config) -> list[Stage]:
@@ -181,15 +191,19 @@ def list_stages(config: Config) -> list[Stage]:
         *later_round(config, 1),
         model_stage(config, 0),
         *domain_stages(config),
+        *approach_stages(config),
         *layer_stages(config, Domain(config.expected_height, None)),
         *city_model_stages(),
+        *([fit_stage(config)] if config.padded else []),
         *mesh_stages(config),
         *piece_stages(config),
     ]
 
 
-def spread_points(grid: TileGrid, clouds: Sequence[CloudHeader]) -> NDArray[np.float64]:
+def spread_points(grid: TileGrid, clouds: Sequence[CloudHeader], core: Bounds) -> NDArray[np.float64]:
     """Deal the LiDAR points of files out to tiles, as if they lay evenly in the box of their header.
+
+    Points beyond the region without its pad, `core`, are not counted.
 
     Returns
     -------
@@ -199,28 +213,31 @@ def spread_points(grid: TileGrid, clouds: Sequence[CloudHeader]) -> NDArray[np.f
     x, y = grid.lines
     points = np.zeros((len(x) - 1, len(y) - 1))
     for cloud in clouds:
-        columns, across = _shares(x, cloud.bounds[0], cloud.bounds[2])
-        rows, along = _shares(y, cloud.bounds[1], cloud.bounds[3])
+        columns, across = _shares(x, (core[0], core[2]), cloud.bounds[0], cloud.bounds[2])
+        rows, along = _shares(y, (core[1], core[3]), cloud.bounds[1], cloud.bounds[3])
         points[columns, rows] += cloud.n_points * np.multiply.outer(across, along)
     return points
 
 
-def _shares(lines: NDArray[np.float64], low: float, high: float) -> tuple[slice, NDArray[np.float64]]:
-    """Which intervals between lines an interval meets, and the share of it in each."""
+def _shares(
+    lines: NDArray[np.float64], core: tuple[float, float], low: float, high: float
+) -> tuple[slice, NDArray[np.float64]]:
+    """Which intervals between lines an interval meets, and the share of it within another one in each."""
     first = max(int(np.searchsorted(lines, low, side="right")) - 1, 0)
     last = max(min(int(np.searchsorted(lines, high, side="left")), len(lines) - 1), first + 1)
-    ends = np.clip(lines[first : last + 1], low, high)
+    ends = np.clip(np.clip(lines[first : last + 1], *core), low, high)
     shares = np.diff(ends) / (high - low) if high > low else np.full(last - first, 1 / (last - first))
     return slice(first, last), shares
 
 
 def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> TileLoads:
-    grid, there = survey.grid, tiles_present(survey.grid)
+    grid, there = survey.meshed, tiles_present(survey.meshed)
     area = np.multiply.outer(*(np.diff(axis) for axis in grid.lines))
     h, height = config.mesh_size, config.expected_height
     houses, built, detail, octaves = (np.zeros_like(area) for _ in range(4))
     if sample is not None and len(sample):
-        houses, built, detail, octaves = _house_sums(grid, sample, np.where(there, area, 0.0))
+        inner = _core_area(grid, survey.region.bounds)
+        houses, built, detail, octaves = _house_sums(grid, sample, np.where(there, inner, 0.0))
     thin = _thinning(survey, sample, config)
     volume = np.maximum(area * height - built * min(BUILT_HEIGHT, height), 0.0)
     if config.mesher == "adaptive":
@@ -236,7 +253,7 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
         open_ground = 3 * TRIANGLES * area / (h**2 * spacing)
         cells = cells + config.underground * (open_ground + CELLS_AT_WALLS * detail)
     index = np.argwhere(there) + grid.first
-    points = spread_points(grid, survey.clouds)
+    points = spread_points(grid, survey.clouds, survey.region.bounds)
     return TileLoads(index, *(values[there] for values in (area, points, houses, cells)))
 
 
@@ -245,20 +262,31 @@ def _thinning(survey: Survey, sample: FootprintSample | None, config: Config) ->
 
     Sizes are looked up in some places of each tile. Footprints that are not known are taken to be everywhere.
     """
-    x, y = survey.grid.lines
+    x, y = survey.meshed.lines
     shape = len(x) - 1, len(y) - 1
     known = sample.complete if sample is not None else not config.footprints
-    if not config.open_size or not known:
+    if not config.graded_size or (config.open_size and not known):
         return np.ones(shape)
     side = int(np.clip(np.sqrt(MOST_LOOKS / (shape[0] * shape[1])), 2, LOOKS_A_SIDE))
     places = (np.arange(side) + 0.5) / side
     columns, rows = ((axis[:-1, None] + np.diff(axis)[:, None] * places).ravel() for axis in (x, y))
     xy = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1).reshape(-1, 2)
-    houses = shapely.STRtree(sample.polygons if sample is not None else [])
-    size = local_sizes(SizeField(size_rule(config), houses), xy, mesh_size=config.mesh_size)
+    rule = size_rule(config, config.graded_size)
+    if config.open_size:
+        field = SizeField(rule, shapely.STRtree(sample.polygons if sample is not None else []))
+    else:
+        field = size_field_around(survey.region.bounds, rule)
+    size = local_sizes(field, xy, mesh_size=config.mesh_size)
     share = (config.mesh_size / size) ** (3 if config.mesher == "adaptive" else 2)
     mean: NDArray[np.float64] = share.reshape(shape[0], side, shape[1], side).mean(axis=(1, 3))
     return mean
+
+
+def _core_area(grid: TileGrid, core: Bounds) -> NDArray[np.float64]:
+    """Area of each tile within the region without its pad (m2): float64 (nx, ny)."""
+    across, along = (np.diff(np.clip(axis, core[k], core[k + 2])) for k, axis in enumerate(grid.lines))
+    area: NDArray[np.float64] = np.multiply.outer(across, along)
+    return area
 
 
 def _house_sums(

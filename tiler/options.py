@@ -24,6 +24,8 @@ CITY_PARAMETERS = (
 PLANE_PARAMETERS = ("mesh_size", "min_angle", "mesher")
 # Further ones of both where sizes are graded.
 SIZE_PARAMETERS = ("open_size", "grading")
+# Further ones of both where there is a pad; the first also of what reads its terrain.
+PAD_PARAMETERS = ("core_bounds", "graded_size")
 # Parameters of the columns.
 LAYER_PARAMETERS = (
     *("mesh_size", "mesher", "domain_height", "least_spacing", "most_spacing", "stagger", "improve_passes"),
@@ -36,20 +38,22 @@ SOIL_PARAMETERS = ("underground", "mesh_size", "least_spacing", "most_spacing", 
 def derived_parameters(config: Config) -> dict[str, float]:
     """Parameters that follow from others, by name: a stage that declares one does not depend on the others.
 
+    ``graded_size`` is the largest target edge length of region and pad (m).
     ``roof_clearance_or_spacing`` and ``roof_group_or_spacing`` (m) are at least the least vertical spacing of the
     adaptive mesher: heights closer than that cannot both be exact in a column.
     """
     spacing = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
     return {
         "layer_height_or_default": config.layer_height_or_default,
+        "graded_size": config.graded_size,
         "roof_clearance_or_spacing": max(config.roof_clearance, spacing),
         "roof_group_or_spacing": max(config.roof_group, spacing),
     }
 
 
 def needs_region(config: Config) -> bool:
-    """Whether height and top of the domain follow from what the whole region holds."""
-    return config.top == "flat" or isinstance(config.domain_height, str)
+    """Whether height, top or pad of the domain follow from what the whole region holds."""
+    return config.padded or config.top == "flat" or isinstance(config.domain_height, str)
 
 
 def layer_parameters(config: Config) -> tuple[str, ...]:
@@ -114,9 +118,9 @@ def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | A
     )
 
 
-def size_rule(given: Any) -> SizeRule:
-    """Rule of the sizes in the plane, where ``open_size`` is given."""
-    return SizeRule(given.mesh_size, given.open_size, given.grading)
+def size_rule(given: Any, largest: float) -> SizeRule:
+    """Rule of the sizes in the plane, with the largest one (m), where they are graded."""
+    return SizeRule(given.mesh_size, largest, given.grading)
 
 
 def soil_options(given: Any) -> SoilOptions:

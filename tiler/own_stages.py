@@ -9,13 +9,15 @@ from tiler.config import Config
 from tiler.domain import Domain
 from tiler.engine import Engine
 from tiler.options import derived_parameters
+from tiler.padding import CORE_STAGE
 from tiler.stage import Stage
+from tiler.stages.approach import approach_stages
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.domain import domain_stages, layer_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
-from tiler.stages.pieces import piece_stages
+from tiler.stages.pieces import fit_stage, piece_stages
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,16 @@ def list_stages(config: Config) -> list[Stage]:
     """List the stages of a run in their order, as if its clusters of houses were simplified once."""
     stages = [*input_stages(config), house_stage(config), *first_round(config), shape_stage(0)]
     stages += [*later_round(config, 1), model_stage(config, 0), *domain_stages(config)]
-    stages += [*layer_stages(config, Domain(config.expected_height, None)), *city_model_stages()]
+    stages += [*approach_stages(config), *layer_stages(config, Domain(config.expected_height, None))]
+    stages += [*city_model_stages(), *([fit_stage(config)] if config.padded else [])]
     return [*stages, *mesh_stages(config), *piece_stages(config)]
+
+
+def stages_of_pad(config: Config) -> set[str]:
+    """Names of the stages that are run over region and pad; none without a pad."""
+    if not config.padded:
+        return set()
+    return {stage.name for stage in [*approach_stages(config), *mesh_stages(config), *piece_stages(config)]}
 
 
 def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, Any] | None) -> OwnStages:
@@ -57,12 +67,29 @@ def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, 
     if taken:
         raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")
     given = {*dataclasses.asdict(config), *derived_parameters(config), "footprints_identity", "top_elevation"}
+    given |= {"core_bounds", "rim_store", "rim_digest"}
     clash = sorted(own.parameters.keys() & given)
     if clash:
         raise ValueError(f"parameter {', '.join(clash)}: the run has one of this name; name yours otherwise")
     return own
 
 
-def run_own_stages(engine: Engine, own: OwnStages) -> None:
-    """Run them; all of ours were run."""
-    engine.run(*own.stages)
+def run_own_stages(engine: Engine, own: OwnStages, config: Config) -> None:
+    """Run them; all of ours were run.
+
+    Where the region has a pad, those that read what is made of both, or another one that does, are run over both;
+    the others, which may read points and terrain, over the region alone.
+    """
+    wide = stages_of_pad(config)
+    if not wide:
+        engine.run(*own.stages)
+        return
+    names: set[str] = set()
+    while more := {s.name for s in own.stages if wide & {read.stage for read in s.reads}} - names:
+        names |= more
+        wide |= more
+    both = engine.layout, engine.context
+    engine.lay_out(*engine.laid_out(CORE_STAGE))
+    engine.run(*(stage for stage in own.stages if stage.name not in names))
+    engine.lay_out(*both)
+    engine.run(*(stage for stage in own.stages if stage.name in names))

@@ -84,7 +84,7 @@ def draw_plan(survey: Survey, sample: FootprintSample | None, path: Path) -> Non
     except ImportError as error:
         raise ConfigError("pictures need pillow: pip install citystitch[pictures]") from error
     files = np.array([cloud.bounds[:4] for cloud in survey.clouds]).reshape(-1, 4)
-    view = _Map(np.array([survey.grid.bounds]))
+    view = _Map(np.array([survey.meshed.bounds]))
     image = Image.fromarray(_paint_tiles(view, survey))
     draw = ImageDraw.Draw(image)
     _draw_houses(image, draw, view, sample)
@@ -101,7 +101,7 @@ def draw_plan(survey: Survey, sample: FootprintSample | None, path: Path) -> Non
 
 
 def _paint_tiles(view: _Map, survey: Survey) -> NDArray[np.uint8]:
-    grid, there = survey.grid, tiles_present(survey.grid)
+    grid, there = survey.meshed, tiles_present(survey.meshed)
     x = (np.arange(view.width) + 0.5 - view.left) / view.scale + view.low[0]
     y = (view.bottom - np.arange(view.height) - 0.5) / view.scale + view.low[1]
     column, row = (np.searchsorted(axis, at) - 1 for axis, at in zip(grid.lines, (x, y), strict=True))
@@ -143,11 +143,11 @@ def _clip_dots(draw: "ImageDraw.ImageDraw", view: _Map, dots: NDArray[np.float64
 
 
 def _tile_pixels(view: _Map, survey: Survey) -> float:
-    return survey.grid.tile_size * view.scale / SAMPLES
+    return survey.meshed.tile_size * view.scale / SAMPLES
 
 
 def _draw_lines(draw: "ImageDraw.ImageDraw", view: _Map, survey: Survey) -> None:
-    x, y = survey.grid.lines
+    x, y = survey.meshed.lines
     inner = _tile_pixels(view, survey) >= LINE_TILES
     for at in (x if inner else x[[0, -1]]).tolist():
         draw.line(view.box(np.array([at, y[0], at, y[-1]])), fill=TILE_LINE, width=SAMPLES)
@@ -158,7 +158,7 @@ def _draw_lines(draw: "ImageDraw.ImageDraw", view: _Map, survey: Survey) -> None
 def _draw_names(draw: "ImageDraw.ImageDraw", view: _Map, survey: Survey) -> None:
     if _tile_pixels(view, survey) < NAME_TILES:
         return
-    (x, y), first = survey.grid.lines, survey.grid.first
+    (x, y), first = survey.meshed.lines, survey.meshed.first
     for i, j in np.ndindex(len(x) - 1, len(y) - 1):
         (place,) = view.pixels(np.array([[(x[i] + x[i + 1]) / 2, (y[j] + y[j + 1]) / 2]])).tolist()
         _write(draw, place, f"{first.i + i}_{first.j + j}", 13, anchor="mm", halo=True)
@@ -166,9 +166,9 @@ def _draw_names(draw: "ImageDraw.ImageDraw", view: _Map, survey: Survey) -> None
 
 def _draw_words(draw: "ImageDraw.ImageDraw", view: _Map, survey: Survey, sample: FootprintSample | None) -> None:
     """Title above, and below it the legend; a scale bar at the lower left."""
-    there = tiles_present(survey.grid)
+    there = tiles_present(survey.meshed)
     n_absent = int((~there).sum())
-    title = f"{int(there.sum()):,} tiles of {survey.grid.tile_size:g} m" + (
+    title = f"{int(there.sum()):,} tiles of {survey.meshed.tile_size:g} m" + (
         f", {n_absent:,} absent" if n_absent else ""
     )
     title += f"; {len(survey.clouds):,} files" + (f"; {sample.total:,} footprints" if sample is not None else "")

@@ -79,7 +79,7 @@ def describe_plan(
     survey: Survey, sample: FootprintSample | None, forecast: Forecast, config: Config, memory: float | None
 ) -> dict[str, Any]:
     """Put a plan into plain values, for JSON; parameters as `plan_run` makes them."""
-    loads, grid = forecast.loads, survey.grid
+    loads, grid = forecast.loads, survey.meshed
     there = tiles_present(grid)
     numbers = sorted({*WORKERS, max(config.workers, 1)})
     names = [f"{i}_{j}" for i, j in loads.index[np.argsort(-loads.cells, kind="stable")[:BUSIEST]].tolist()]
@@ -89,7 +89,8 @@ def describe_plan(
             "bounds": list(grid.bounds),
             "crs": survey.region.crs,
             "area": float(loads.area.sum()),
-        },
+        }
+        | ({"core": list(survey.region.bounds)} if config.padded else {}),
         "tiles": {
             "size": config.tile_size,
             "present": len(loads),
@@ -160,6 +161,9 @@ def _print_plan(plan: dict[str, Any], console: Console) -> None:
     rows = [
         ("region", f"{_km(xmax - xmin)} x {_km(ymax - ymin)}, {xmin:.0f} {ymin:.0f} {xmax:.0f} {ymax:.0f}, {crs}")
     ]
+    if "core" in region:
+        xmin, ymin, xmax, ymax = region["core"]
+        rows.append(("", f"of these {_km(xmax - xmin)} x {_km(ymax - ymin)} without the pad"))
     absent = f", {tiles['absent']:,} absent (no point cloud)" if tiles["absent"] else ""
     rows.append(
         ("tiles", f"{tiles['present']:,} of {tiles['size']:g} m{absent}; {tiles['inner_seams']:,} seams between")
@@ -206,10 +210,9 @@ def _print_plan(plan: dict[str, Any], console: Console) -> None:
 
 
 def _task_rows(tasks: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
-    """One line for all tasks, one with the stages of each scope."""
-    number = {entry["scope"]: entry["number"] for entry in tasks.values()}
-    stages = Counter(entry["scope"] for entry in tasks.values())
-    parts = [f"{stages[scope]} x {number[scope]:,} {scope}{'s' * (number[scope] != 1)}" for scope in stages]
+    """One line for all tasks, one with the stages of each scope, and of each number where a pad makes two."""
+    stages = Counter((entry["scope"], entry["number"]) for entry in tasks.values())
+    parts = [f"{n} x {number:,} {scope}{'s' * (number != 1)}" for (scope, number), n in stages.items()]
     total = sum(entry["number"] for entry in tasks.values())
     return [
         ("tasks", f"{total:,}: stages {', '.join(parts)}"),

@@ -13,7 +13,15 @@ from tiler.clouds import CloudHeader, find_clouds, read_header
 from tiler.config import Config, idle_parameters
 from tiler.context import choose_tiles, make_layout, tile_key
 from tiler.crs import resolve_crs
-from tiler.region import Region, check_region, check_sizes, choose_bounds, describe_overhang
+from tiler.region import (
+    Region,
+    check_region,
+    check_sizes,
+    choose_bounds,
+    describe_overhang,
+    describe_pad,
+    foresee_pad,
+)
 from tiler.stage import FileItem, Layout
 from tiler.vectors import read_footprint_crs
 
@@ -67,6 +75,9 @@ class Survey:
         Files left out, with the reason.
     grid : TileGrid
         Tiles, those without any point cloud left out.
+    meshed : TileGrid
+        The same, and those of the pad where there is one; where its width follows from the tallest building, that
+        of an expected one counts.
     """
 
     region: Region
@@ -75,6 +86,7 @@ class Survey:
     messages: list[str]
     unreadable: dict[str, str]
     grid: TileGrid
+    meshed: TileGrid
 
 
 def check_sources(config: Config) -> None:
@@ -145,13 +157,14 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
             f"or --tile-size {2 * side}"
         )
     messages += [*describe_overhang(region.bounds, headers), *idle_parameters(config)]
+    messages += describe_pad(region.bounds, headers) if config.padded else []
     if n_absent:
         messages.append(f"{n_absent} of {n_absent + n_tiles} tiles have no point cloud and are left out")
     if not config.footprints:
         messages.append("no footprints given: the mesh has terrain only")
     for message in messages:
         say(message)
-    return Survey(region, headers, clouds, messages, unreadable, grid)
+    return Survey(region, headers, clouds, messages, unreadable, grid, foresee_pad(grid, config))
 
 
 def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:

@@ -14,7 +14,15 @@ from pipeline.citymodel import Footprints
 from pipeline.ground_filter import FILTER_REACH, classify_ground
 from pipeline.las_points import cut_units
 from pipeline.pointcloud import BUILDING, PointCloud
-from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
+from pipeline.raster import (
+    Dtm,
+    NodeWindow,
+    grow_window,
+    join_dtm,
+    node_window,
+    window_of,
+    windows_meet,
+)
 from pipeline.terrain import cut_terrain, join_terrain
 from stitch.grid import Bounds
 from tiler.cells import select_cells
@@ -81,8 +89,20 @@ def read_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm
 
 
 def read_known_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm:
-    """Read the terrain of a box within the region, NaN at nodes of tiles that are absent (see `cut_terrain`)."""
-    return join_terrain(list(_read_rasters(task, "terrain")), region_window(box, spacing, bounds))
+    """Read the terrain of a box within the region, NaN at nodes of tiles that are absent (see `cut_terrain`).
+
+    Where the task reads the stage ``approach``, it is that of region and pad.
+    """
+    stage = "approach" if "approach" in task.refs else "terrain"
+    return join_terrain(list(_read_rasters(task, stage)), region_window(box, spacing, bounds))
+
+
+def join_rasters(task: Task, stage: str, window: NodeWindow, spacing: float) -> Dtm:
+    """Read the nodes of a window from the rasters of a stage; NaN where none has them, there may be no raster."""
+    parts = [part for part in _read_rasters(task, stage) if windows_meet(window_of(part), window)]
+    if not parts:
+        return Dtm(np.full((window.ny, window.nx), np.nan), window.i0, window.j0, spacing)
+    return join_dtm(parts, window)
 
 
 def region_window(box: Box, spacing: float, bounds: Bounds) -> NodeWindow:

@@ -5,16 +5,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.errors import ConfigError, InputError
-from stitch.grid import LEAST_TILE
+from stitch.grid import LEAST_TILE, TileGrid
 from stitch.numbering import MOST_TILES
 from tiler.clouds import CloudHeader
 from tiler.config import Config
+from tiler.domain import EXPECTED_TALLEST
 from tiler.options import expected_levels
+from tiler.pad import Pad, check_widths, pad_bounds, pad_grid, widths_in_metres
 
 ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray points ...
 MOST_IN_ALL = 10_000_000  # tiles of the region's box; half a million make a country
 MOST_NODES = 400_000_000  # of the terrain of one tile, 8 bytes each
 MOST_CELLS = 2**31  # of one tile, whose local indices have 32 bits
+PAST = 1.0  # m that a file reaches beyond a region before anything is said of it
 SPARSEST = 100.0  # m2; ... where it has fewer points than one in this area
 
 Bounds = tuple[float, float, float, float]
@@ -62,6 +65,20 @@ def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Boun
             f"{_words((xmin, ymin, xmax, ymax))}; correct --bounds"
         )
     return asked[0], asked[1], asked[2], asked[3]
+
+
+def describe_pad(core: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
+    """Say how many files have points beyond a region, where its pad takes no account of them."""
+    boxes = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
+    beyond = sum(
+        min(box[0] - core[0], box[1] - core[1], core[2] - box[2], core[3] - box[3]) <= -PAST for box in boxes
+    )
+    if not beyond:
+        return []
+    return [
+        f"{beyond} of {len(boxes)} point clouds reach beyond the region {_words(core)}: its pad is bare ground, "
+        "whatever points and footprints there are"
+    ]
 
 
 def describe_overhang(bounds: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
@@ -153,6 +170,28 @@ def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]
             f"region {_words(region.bounds)}: more than {MOST_TILES - 1} tiles of {region.tile_size:g} m to a "
             f"side; give --tile-size {least} or more, or smaller --bounds"
         )
+
+
+def find_pad(core: TileGrid, config: Config, tallest: float) -> Pad:
+    """Lay the pad around a region, given the height of its tallest building (m).
+
+    Raises
+    ------
+    ConfigError
+        If the pad needs buildings and there are none, or it makes the region too large.
+    """
+    widths = widths_in_metres(config.pad, tallest)
+    check_widths(widths, mesh_size=config.mesh_size, dtm_spacing=config.dtm_spacing)
+    bounds = pad_bounds(core.bounds, widths)
+    region = Region(bounds, "", config.tile_size)
+    check_region(region, config.mesh_size, [])
+    check_sizes(region, config)
+    return Pad(core.bounds, pad_grid(core, bounds, mesh_size=config.mesh_size, open_size=config.graded_size))
+
+
+def foresee_pad(core: TileGrid, config: Config) -> TileGrid:
+    """Tiles of a region and its pad before there is a city model: multiples are those of an expected building."""
+    return find_pad(core, config, EXPECTED_TALLEST).grid if config.padded else core
 
 
 def _words(bounds: Sequence[float]) -> str:

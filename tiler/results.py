@@ -14,6 +14,7 @@ from pipeline.terrain import cut_terrain, join_terrain
 from tiler.store import Store
 
 COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom")
+APPROACH = "approach"
 KEPT_CHUNKS = 9  # tiles of terrain that stay in memory
 
 
@@ -56,12 +57,14 @@ class StoredTerrain:
 
     def __init__(self, path: Path) -> None:
         self._store = Store(path)
-        self._names = np.array(self._store.names("terrain"), np.str_)
+        pad = self._store.names(APPROACH)  # with a pad, what has the terrain of both
+        self._stage = APPROACH if pad else "terrain"
+        self._names = np.array(pad or self._store.names("terrain"), np.str_)
         if not len(self._names):
             raise InputError(f"{path}: holds no terrain; run citystitch again")
         self._windows = np.empty((len(self._names), 4), np.int64)  # i0, j0, nx, ny
         for k, name in enumerate(self._names.tolist()):
-            facts = self._store.attributes("terrain", name)["facts"]
+            facts = self._store.attributes(self._stage, name)["facts"]
             self._windows[k] = [facts[part] for part in ("i0", "j0", "nx", "ny")]
         self._spacing = float(facts["spacing"])
         some = self._windows[(self._windows[:, 2:] > 0).all(axis=1)]
@@ -89,6 +92,6 @@ class StoredTerrain:
             while len(self._chunks) >= KEPT_CHUNKS:
                 del self._chunks[next(iter(self._chunks))]
             i0, j0 = self._windows[k, :2].tolist()
-            chunk = Dtm(self._store.read("terrain", name)[0]["z"], i0, j0, self._spacing)
+            chunk = Dtm(self._store.read(self._stage, name)[0]["z"], i0, j0, self._spacing)
         self._chunks[name] = chunk  # the youngest is the last
         return chunk

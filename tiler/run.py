@@ -38,6 +38,8 @@ from tiler.out_folder import (
     remove_strangers,
 )
 from tiler.own_stages import OwnStages, check_own, run_own_stages
+from tiler.pad import Pad
+from tiler.padding import CORE_STAGE, pad_plan, plan_alone
 from tiler.planning import Plan, check_sources, identify, make_plan
 from tiler.progress import Announce
 from tiler.quarantine import (
@@ -57,7 +59,7 @@ from tiler.stages.city import first_round, house_stage, later_round, model_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
-from tiler.stages.pieces import piece_stages
+from tiler.stages.pieces import fit_stage, piece_stages
 from tiler.stopping import stops
 from tiler.summary import describe_tasks, summarise_run
 from tiler.task import peak_memory
@@ -210,8 +212,10 @@ def _mesh_region(
                     plan, missing = leave_holes(plan, missing, engine)
                     watchers.say(f"left out so far: {', '.join(sorted(missing.tiles))}; going on with the rest")
                     continue
-                run_own_stages(engine, own)
+                run_own_stages(engine, own, config)
             break
+    if config.padded:
+        plan = pad_plan(plan, Pad(plan.region.bounds, engine.context.grid))
     missing = find_missing(plan, missing, engine)
     remade = {
         f"{STORE}/{stage}/{name}": what
@@ -290,7 +294,13 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
         What its stages raise; any other error likewise, its type kept.
     """
     check_sources(config)
-    alone = config_alone(config, make_plan(config, _silent), tile)
+    whole = make_plan(config, _silent)
+    domain, tallest = domain_of_run(config)
+    pad, store = None, None
+    if config.padded:
+        alone, pad, store = plan_alone(config, whole, tile, tallest)
+    else:
+        alone = config_alone(config, whole, tile)
     out = Path(alone.out)
     out.mkdir(parents=True, exist_ok=True)
     with only_run(out, say):
@@ -301,8 +311,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
             engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
             run_city_stages(engine, alone)
             seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
-            domain = domain_of_run(config)
-            take_domain(engine, alone, domain)
+            take_domain(engine, alone, domain, pad, store)
             engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
             (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
             engine.run(pieces, items={"pieces": [tile]})
@@ -321,7 +330,15 @@ def run_stages(engine: Engine, config: Config) -> int:
     """
     rounds = run_city_stages(engine, config)
     domain = settle_domain(engine, config)
-    engine.run(*city_model_stages(), *mesh_stages(config, domain))
+    if config.padded:
+        engine.tell_layout()
+        both = engine.layout, engine.context
+        engine.lay_out(*engine.laid_out(CORE_STAGE))
+        engine.run(*city_model_stages(), fit_stage(config))
+        engine.lay_out(*both)
+        engine.run(*mesh_stages(config, domain))
+    else:
+        engine.run(*city_model_stages(), *mesh_stages(config, domain))
     engine.run(*piece_stages(config))
     # Beside a tile without a piece, others were written as if they had a neighbour.
     while lost := [name for stage, name in engine.set_aside if stage == "pieces"]:

@@ -44,6 +44,10 @@ class RunRecord:
         Boxes of the tiles by name (m), as far as they are stated.
     depth : float
         Depth of the soil below the terrain (m), 0 where there is none.
+    core : tuple of 4 floats or None
+        The region without its pad (m); None without a pad.
+    rim : float
+        Height of the ground along the outer sides of the pad (m), NaN without one.
     """
 
     status: str
@@ -52,6 +56,8 @@ class RunRecord:
     counts: Mapping[str, int]
     tiles: Mapping[str, tuple[float, ...] | None] = field(default_factory=dict)
     depth: float = 0.0
+    core: tuple[float, float, float, float] | None = None
+    rim: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +110,22 @@ def read_run_record(path: Path) -> RunRecord:
         counts = {name: int(record["counts"][name]) for name in names}
         status = str(record["status"])
         depth = float(record.get("parameters", {}).get("underground", 0.0))
+        core, rim = _read_pad(record["region"])
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
     if not (west < east and south < north and math.isfinite(west + south + east + north)):
         raise InputError(f"{path}: region bounds {west, south, east, north} are no box; run again")
     if not 0 <= depth < math.inf:
         raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
-    return RunRecord(status, (west, south, east, north), top, counts, record.get(TILES) or {}, depth)
+    tiles = record.get(TILES) or {}
+    return RunRecord(status, (west, south, east, north), top, counts, tiles, depth, core, rim)
+
+
+def _read_pad(region: Mapping[str, Any]) -> tuple[tuple[float, float, float, float] | None, float]:
+    if "core" not in region:
+        return None, math.nan
+    west, south, east, north = (float(value) for value in region["core"])
+    return (west, south, east, north), float(region["rim"])
 
 
 def read_crs(path: Path) -> str:

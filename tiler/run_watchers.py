@@ -3,11 +3,13 @@
 from pathlib import Path
 
 from tiler.config import Config
+from tiler.context import make_layout
 from tiler.events import EventLog, begin_file
 from tiler.out_folder import EVENTS
-from tiler.own_stages import OwnStages, list_stages
+from tiler.own_stages import OwnStages, list_stages, stages_of_pad
 from tiler.planning import Plan
 from tiler.progress import Announce, RunProgress, command_line
+from tiler.region import foresee_pad
 from tiler.watching import RunStart, Watchers
 
 NOT_ALONE = ("proofs", "fit")  # stages of tiles and seams that `tiler.run.run_alone` does without
@@ -40,6 +42,12 @@ def begin_watching(
     """
     stages = [*list_stages(config), *own.stages]
     expected = {stage.name: (stage.scope, len(plan.layout.boxes(stage.scope))) for stage in stages}
+    layout = plan.layout
+    if wide := stages_of_pad(config):
+        padded = make_layout(foresee_pad(plan.grid, config), {}, identity="")
+        expected |= {s.name: (s.scope, len(padded.boxes(s.scope))) for s in stages if s.name in wide}
+        if all(isinstance(width, float) for width in config.pad):  # else it is a guess, and told when it is known
+            layout = padded
     command = "" if own.stages else command_line(config)  # stages of the user's own are not given by a command
     totals = {name: total for name, (_, total) in expected.items()}
     progress = RunProgress(out, config, totals, announce=announce, command=command)
@@ -52,8 +60,8 @@ def begin_watching(
         crs=plan.region.crs,
         tile_size=config.tile_size,
         workers=0 if config.scheduler else max(config.workers, 1),
-        tiles=plan.layout.tiles,
-        seams=plan.layout.seams,
+        tiles=layout.tiles,
+        seams=layout.seams,
         expected=expected,
         whole=frozenset({*NOT_ALONE, *(stage.name for stage in own.stages)}),
     )

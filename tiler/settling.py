@@ -1,5 +1,6 @@
 """Between the city model and the seams: height and top of the domain become parameters of all that follows."""
 
+import math
 from pathlib import Path
 
 from pipeline.errors import InputError
@@ -8,7 +9,10 @@ from tiler.domain import Domain, settle
 from tiler.engine import Engine
 from tiler.options import needs_region
 from tiler.out_folder import STORE
+from tiler.pad import Pad
+from tiler.padding import lay_pad
 from tiler.quarantine import stop_at_holes
+from tiler.region import find_pad
 from tiler.stage import REGION_ITEM
 from tiler.stages.domain import domain_stages, layer_stages
 from tiler.store import Store
@@ -33,23 +37,31 @@ def settle_domain(engine: Engine, config: Config) -> Domain:
     """
     engine.run(*domain_stages(config))
     stop_at_holes(engine)
-    domain = settle(config.domain_height, config.top, engine.records["domain", REGION_ITEM].facts)
-    take_domain(engine, config, domain)
+    found = engine.records["domain", REGION_ITEM].facts
+    domain = settle(config.domain_height, config.top, found)
+    pad = find_pad(engine.context.grid, config, float(found["tallest"])) if config.padded else None
+    take_domain(engine, config, domain, pad)
     return domain
 
 
-def take_domain(engine: Engine, config: Config, domain: Domain) -> None:
+def take_domain(
+    engine: Engine, config: Config, domain: Domain, pad: Pad | None = None, rim_store: Path | None = None
+) -> None:
     """Give the stages after the city model the height and top of the domain, and choose the layers that need them.
 
-    Parameters and errors as for `settle_domain`.
+    Where the region has a pad, the engine goes on over both. Other parameters and errors as for `settle_domain`
+    and `lay_pad`.
     """
     check_height(config, domain.height)
     engine.add_parameters(domain_height=domain.height, top_elevation=domain.top)
+    if pad is not None:
+        lay_pad(engine, config, domain, pad, rim_store)
+        return
     engine.run(*layer_stages(config, domain))
     stop_at_holes(engine)
 
 
-def domain_of_run(config: Config) -> Domain:
+def domain_of_run(config: Config) -> tuple[Domain, float]:
     """Take height and top of the domain of a whole run, for one of its tiles alone.
 
     Parameters
@@ -57,13 +69,20 @@ def domain_of_run(config: Config) -> Domain:
     config : Config
         Parameters of the whole run; where height and top follow from all of the region, its store has them.
 
+    Returns
+    -------
+    Domain
+        Height and top.
+    float
+        Height of the tallest building (m); NaN where nothing follows from it.
+
     Raises
     ------
     InputError
         If it has not.
     """
     if not needs_region(config):
-        return Domain(config.expected_height, None)
+        return Domain(config.expected_height, None), math.nan
     try:
         facts = Store(Path(config.out) / STORE).attributes("domain", REGION_ITEM)["facts"]
     except InputError as error:
@@ -71,4 +90,4 @@ def domain_of_run(config: Config) -> Domain:
             f"{config.out}: the height of the domain follows from the whole region, and its run has not come that "
             f"far ({error}); run it without --only first"
         ) from None
-    return settle(config.domain_height, config.top, facts)
+    return settle(config.domain_height, config.top, facts), float(facts["tallest"])

@@ -12,9 +12,11 @@ from tiler.config import Config
 from tiler.context import absent_tiles, tile_name
 from tiler.domain import settle
 from tiler.engine import Engine
+from tiler.padding import CORE_STAGE
 from tiler.planning import Plan
 from tiler.quarantine import Missing, describe_missing
 from tiler.stage import REGION_ITEM, Facts
+from tiler.stages.approach import RIM
 from tiler.stages.domain import LOW_DOMAIN
 from tiler.task import read_notes
 
@@ -70,7 +72,8 @@ def summarise_run(
             "tile_size": plan.region.tile_size,
             "absent": sorted(absent),
         }
-        | ({} if domain.top is None else {"top": domain.top}),
+        | ({} if domain.top is None else {"top": domain.top})
+        | (_describe_pad(engine) if config.padded else {}),
         "domain": {"height (m)": domain.height, "tallest building (m)": found["tallest"]},
         "tiles": {
             name: {
@@ -94,6 +97,12 @@ def summarise_run(
         "unreadable": unreadable,
         "notes": group_notes(notes),
     }
+
+
+def _describe_pad(engine: Engine) -> dict[str, Any]:
+    """Tell the region without its pad, and the height of the ground at the outer sides."""
+    core, _ = engine.laid_out(CORE_STAGE)
+    return {"core": list(core.bounds), "rim": engine.records[RIM, REGION_ITEM].facts["rim"]}
 
 
 def describe_tasks(tasks: Mapping[str, int]) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from stitch.grid import tiles_of_seam
 from tiler.context import seam_key, tile_name
 from tiler.quarantine import command_alone
-from tiler.stage import Box, Scope
+from tiler.stage import Box, Layout, Scope
 from tiler.task import Record
 
 Item = tuple[str, str]  # stage and name
@@ -64,6 +64,9 @@ class Watcher:
 
     def begin(self, start: RunStart) -> None:
         """Take note that the run begins: its inputs are there, and its folder is its own."""
+
+    def laid_out(self, layout: Layout) -> None:
+        """Take note of tiles and seams that the run did not begin with, beside those that it did."""
 
     def planned(self, stage: str, scope: Scope, total: int) -> None:
         """Take note of how many items a stage has."""
@@ -122,6 +125,11 @@ class Watchers(Watcher):
             for text in self._said:
                 watcher.say(text)
         self._all, self._late, self._begun = [*self._all, *self._late], [], True
+
+    def laid_out(self, layout: Layout) -> None:
+        """Tell all."""
+        for watcher in self._all:
+            watcher.laid_out(layout)
 
     def planned(self, stage: str, scope: Scope, total: int) -> None:
         """Tell all."""

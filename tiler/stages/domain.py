@@ -10,9 +10,10 @@ from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
 from tiler.config import Config
 from tiler.domain import GUIDELINE, Domain, height_in_metres, is_low
-from tiler.options import layer_parameters, mesh_options
+from tiler.options import PAD_PARAMETERS, layer_parameters, mesh_options
 from tiler.readers import grow, read_known_terrain
 from tiler.stage import Facts, Read, Scope, Stage
+from tiler.stages.approach import terrain_stage
 from tiler.stages.city import chooses_layers_later
 from tiler.tables import unpack_buildings, unpack_polygons
 from tiler.task import Task
@@ -36,8 +37,8 @@ def layer_stages(config: Config, domain: Domain) -> list[Stage]:
     if not chooses_layers_later(config):
         return []
     reach = mesh_reach(config, domain) + 2 * config.dtm_spacing
-    reads = (Read("model", own=True), Read("terrain", reach, around="model"))
-    parameters = (*layer_parameters(config), "dtm_spacing")
+    reads = (Read("model", own=True), Read(terrain_stage(config), reach, around="model"))
+    parameters = (*layer_parameters(config), "dtm_spacing", *(PAD_PARAMETERS[:1] if config.padded else ()))
     return [Stage("layers", Scope.TILE, choose_tile_layers, reads, parameters)]
 
 

@@ -15,7 +15,7 @@ from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.nodes import Levels
 from pipeline.notes import Note
 from pipeline.raster import Dtm, sample_dtm, window_of
-from pipeline.sizes import SizeField, size_field
+from pipeline.sizes import SizeField, size_field, size_field_around
 from pipeline.spacing import top_reach
 from pipeline.terrain import cut_terrain
 from pipeline.underground import SoilOptions
@@ -34,6 +34,7 @@ from tiler.config import Config
 from tiler.context import seam_key, seam_name, tile_key
 from tiler.domain import Domain
 from tiler.options import (
+    PAD_PARAMETERS,
     PLANE_PARAMETERS,
     SIZE_PARAMETERS,
     SOIL_PARAMETERS,
@@ -45,6 +46,7 @@ from tiler.options import (
 )
 from tiler.readers import grow, read_buildings, read_known_terrain, region_window
 from tiler.stage import Facts, Read, Scope, Stage
+from tiler.stages.approach import terrain_stage
 from tiler.stages.city import chooses_layers_later
 from tiler.stages.soil import lay_soil, unpack_pinched_soil, unpack_soil
 from tiler.tables import Buildings
@@ -55,12 +57,16 @@ NO_PLANE = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, n
 
 def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     """Stages of seams and columns, with the halos of a domain as it is settled; as it is expected without one."""
-    halo, see = _halos(config, graded=config.open_size > 0)
+    halo, see = _halos(config, config.graded_size, around_walls=config.open_size > 0)
     domain = domain or Domain(config.expected_height, None)
-    reads = [Read("model", see, by_extent=True), Read("terrain", halo + terrain_halo(config, domain))]
+    reads = [
+        Read("model", see, by_extent=True),
+        Read(terrain_stage(config), halo + terrain_halo(config, domain)),
+    ]
     reads += [Read("layers", see, by_extent=True)] if chooses_layers_later(config) else []
     parameters = (*PLANE_PARAMETERS, *layer_parameters(config), "dtm_spacing", "tile_size")
-    parameters += SIZE_PARAMETERS if config.open_size else ()
+    parameters += SIZE_PARAMETERS if config.graded_size else ()
+    parameters += PAD_PARAMETERS if config.padded else ()
     parameters += SOIL_PARAMETERS if config.underground else ()
     seams, columns = (
         (make_seam_with_soil, make_columns_with_soil) if config.underground else (make_seam, make_columns)
@@ -105,7 +111,7 @@ def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
     buildings, dtm = _surroundings(task)
     polygons = buildings.model.polygons
     walls = cut_walls(polygons, mesh_size=given.mesh_size)
-    sizes = _sizes(walls, task)
+    sizes = find_sizes(walls, task)
     with task.step("3.1 seams"):
         start, end = (
             place_corner(grid, corner, polygons, walls, mesh_size=given.mesh_size, sizes=sizes)
@@ -154,7 +160,7 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
     buildings, dtm = _surroundings(task)
     model = buildings.model
     walls = cut_walls(model.polygons, mesh_size=given.mesh_size)
-    sizes = _sizes(walls, task)
+    sizes = find_sizes(walls, task)
     names = [seam_name(key) for key in seams_of_tile(tile_key(task.name))]
     found = {result.name: result for result in task.read("seams") if result.name in names}
     sides = tuple(unpack_seam(found[name].arrays, model.numbers) for name in names)
@@ -278,24 +284,35 @@ def pack_columns(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> dict[str, NDAr
     }
 
 
-def _halos(given: Any, *, graded: bool) -> tuple[float, float]:
-    """How far beyond a box terrain is sampled, and buildings count (m)."""
-    if not graded:
+def _halos(given: Any, largest: float, *, around_walls: bool) -> tuple[float, float]:
+    """How far beyond a box terrain is sampled, and buildings count (m); the largest size is 0 without grading."""
+    if not largest:
         halo = tile_halo(given.tile_size, given.mesh_size)
         return halo, halo
-    rule = size_rule(given)
-    return tile_halo(given.tile_size, given.mesh_size, rule), sizes_halo(given.tile_size, rule)
+    rule = size_rule(given, largest)
+    halo = tile_halo(given.tile_size, given.mesh_size, rule)
+    return halo, sizes_halo(given.tile_size, rule) if around_walls else halo
 
 
-def _sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
-    """Sizes around walls; None where they are the same everywhere."""
-    return size_field(walls, size_rule(task.parameters)) if task.context.open_size else None
+def _halos_of(task: Task) -> tuple[float, float]:
+    """How far beyond the box of a task terrain is sampled, and buildings count (m)."""
+    largest = task.context.open_size
+    return _halos(task.parameters, largest, around_walls=largest > 0 and task.parameters.open_size > 0)
+
+
+def find_sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
+    """Sizes around walls, or with a pad alone around the region; None where they are the same everywhere."""
+    given, largest = task.parameters, task.context.open_size
+    if not largest:
+        return None
+    rule = size_rule(given, largest)
+    return size_field(walls, rule) if given.open_size else size_field_around(given.core_bounds, rule)
 
 
 def _surroundings(task: Task) -> tuple[Buildings, Dtm]:
     """Read what counts for a tile or a seam; the terrain is NaN at nodes of tiles that are absent."""
     given = task.parameters
-    halo, see = _halos(given, graded=task.context.open_size > 0)
+    halo, see = _halos_of(task)
     buildings = read_buildings(task, grow(task.box, see))
     reach = grow(task.box, halo + terrain_halo(given))
     return buildings, read_known_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
@@ -309,7 +326,7 @@ def _terrain_around(key: Key, dtm: Dtm, task: Task) -> Dtm:
     """
     given = task.parameters
     x, y = nominal_corner(task.context.grid, key)
-    halo, _ = _halos(given, graded=task.context.open_size > 0)
+    halo, _ = _halos_of(task)
     reach = halo + terrain_halo(given) - 2 * given.dtm_spacing
     return cut_terrain(dtm, region_window(grow((x, y, x, y), reach), given.dtm_spacing, task.context.bounds))
 

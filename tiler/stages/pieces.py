@@ -43,14 +43,19 @@ EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_sea
 ID_ARRAYS = ("shared", "shared_id")
 
 
-def piece_stages(config: Config) -> list[Stage]:
-    """Stages from columns to files."""
-    fit = (
+def fit_stage(config: Config) -> Stage:
+    """Stage that holds the points against the city model: with a pad, that of the tiles of the region alone."""
+    reads = (
         Read("points", halo_of_points(config, 0.0)),
         Read("terrain", 2 * config.dtm_spacing),
         Read("model", by_extent=True),
         Read("houses", by_extent=True),
     )
+    return Stage("fit", Scope.TILE, measure_fit, reads, ("dtm_spacing", "ground_filter"))
+
+
+def piece_stages(config: Config) -> list[Stage]:
+    """Stages from columns to files; where there is a pad, without that of the fit."""
     meshed = (Read("seams", optional=True), Read("columns", optional=True))
     beside = (Read("columns", beside=True, others_by_name=True, optional=True),)
     return [
@@ -58,7 +63,7 @@ def piece_stages(config: Config) -> list[Stage]:
         # Of the tiles around it a piece asks only which of them there are.
         Stage("pieces", Scope.TILE, write_piece, beside, version=2),
         Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces", beside=True, optional=True),)),
-        Stage("fit", Scope.TILE, measure_fit, fit, ("dtm_spacing", "ground_filter")),
+        *([] if config.padded else [fit_stage(config)]),
         Stage("report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True))),
     ]
 
