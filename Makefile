@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-long lint bench bench-tiles bench-exports studies quality reliability clean
+.PHONY: demo test test-long lint bench bench-tiles bench-exports simulate studies quality reliability clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("citystitch needs Python 3.11 or newer, this is " + sys.version) if sys.version_info < (3, 11) else None'
@@ -39,6 +39,10 @@ studies: $(STAMP)
 
 bench-exports: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.exports
+
+simulate: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.simulate virtual netherlands 1000
+	$(BIN)/python -m tests.benchmarks.simulate dask netherlands 64 --workers 2
 
 quality: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.quality

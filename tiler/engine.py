@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipeline.errors import CityError
 from tiler.executors import Executor
 from tiler.failures import Policy, SetAside, ends_the_run, tell_reason, tries
+from tiler.gaps import Gaps
 from tiler.keys import declared_values, file_identity, item_key, stage_digest
 from tiler.plan import (
     Items,
@@ -26,6 +27,7 @@ from tiler.plan import (
     find_refs,
     invert,
     joined_reads,
+    list_all,
     list_items,
     list_refs,
     order_stages,
@@ -135,7 +137,7 @@ class Engine:
         self.blocked: dict[Item, Item] = {}
         self._policy = policy or Policy()
         self._stop = False
-        self._absent = np.array(layout.absent).reshape(-1, 4)
+        self._gaps = Gaps(layout.absent)
         self._parameters, self.context = parameters, context
         self._executor, self._progress = executor, progress
         watch: object = progress
@@ -146,6 +148,7 @@ class Engine:
             raise ValueError(f"window {self._window}, expected 1 or more")
         self._items: dict[str, tuple[Scope, Items]] = {}
         self._laid_out: dict[str, tuple[Layout, Any]] = {}
+        self._whole: dict[tuple[int, Scope], tuple[Layout, Items]] = {}
 
     def run(self, *stages: Stage, items: Mapping[str, Collection[str]] | None = None) -> None:
         """Run stages whose reads are among them or were run before.
@@ -205,7 +208,7 @@ class Engine:
             Given to every task from now on.
         """
         self.layout, self.context = layout, context
-        self._absent = np.array(layout.absent).reshape(-1, 4)
+        self._gaps = Gaps(layout.absent)
 
     def tell_layout(self) -> None:
         """Tell a `Watch` the items of the layout, where they are not those that the run began with."""
@@ -260,6 +263,8 @@ class Engine:
         """Keep of the items those of which something came, which are all unless the run ended early."""
         names = planned.items.names
         rows = [k for k, name in enumerate(names) if self._settled((planned.stage.name, name))]
+        if len(rows) == len(names):
+            return planned.items
         return Items(tuple(names[k] for k in rows), planned.items.boxes[rows])
 
     def _plan(self, order: list[Stage], only: Mapping[str, Collection[str]]) -> list[_Planned]:
@@ -267,7 +272,10 @@ class Engine:
         plan: list[_Planned] = []
         first = 0
         for stage in order:
-            here = list_items(stage, self.layout, self._wanted(stage, only.get(stage.name)))
+            wanted = self._wanted(stage, only.get(stage.name))
+            here = (
+                self._all(self.layout, stage.scope) if wanted is None else list_items(stage, self.layout, wanted)
+            )
             refs = tuple(self._refs(stage, here, source, known) for source, _ in joined_reads(stage))
             values = declared_values(stage, self._parameters)
             digest = stage_digest(stage, values, self.layout)
@@ -276,10 +284,18 @@ class Engine:
             first += len(here.names)
         return plan
 
+    def _all(self, layout: Layout, scope: Scope) -> Items:
+        """All items of a scope in a layout: the same object for all stages, as a country has many."""
+        place = id(layout), scope
+        if place not in self._whole:
+            self._whole[place] = layout, list_all(layout.boxes(scope))
+        return self._whole[place][1]
+
     def _wanted(self, stage: Stage, only: Collection[str] | None) -> Collection[str] | None:
         """Add what ran in earlier calls: it stays an item, and its records stay."""
-        earlier = set(self._items[stage.name][1].names) if stage.name in self._items else set()
-        return None if only is None else earlier.union(only)
+        if only is None:
+            return None
+        return set(only).union(self._items[stage.name][1].names if stage.name in self._items else ())
 
     def _extents(self, items: Items, stage: str) -> Items:
         """Take extents for boxes; what has no result keeps its box."""
@@ -295,16 +311,14 @@ class Engine:
         names: Iterable[str] = self.records.kept_facts(stage, item)["names"] if there else ()
         return names
 
-    def _gaps(self, scope: Scope, box: Box, refs: Mapping[str, Iterable[str]]) -> list[Box]:
+    def _find_gaps(self, scope: Scope, box: Box, refs: Mapping[str, Iterable[str]]) -> list[Box]:
         """List the absent tiles near an item: near its box, and the extents of what it reads."""
         layout = self.layout
         if not layout.absent or scope not in (Scope.TILE, Scope.SEAM):
             return []
         facts = [self.records.kept_facts(stage, name) for stage, names in refs.items() for name in names]
         boxes = np.array([box, *(found["extent"] for found in facts if found.get("extent"))])
-        low, high = boxes[:, :2].min(axis=0) - layout.near, boxes[:, 2:].max(axis=0) + layout.near
-        close = (self._absent[:, :2] <= high).all(axis=1) & (self._absent[:, 2:] >= low).all(axis=1)
-        return [layout.absent[k] for k in np.flatnonzero(close).tolist()]
+        return self._gaps.near(boxes[:, :2].min(axis=0) - layout.near, boxes[:, 2:].max(axis=0) + layout.near)
 
     def _refs(self, stage: Stage, here: Items, source: str, known: Mapping[str, tuple[Scope, Items]]) -> Refs:
         """Find refs among all items of the layout first: one that is read but not run is an error, not a gap."""
@@ -323,11 +337,8 @@ class Engine:
             here = self._extents(here, first.around)
         if True in by_extent:
             return find_refs(stage, here, source, self._extents(run, source), everything=everything)
-        boxes = self._laid_out[source][0].boxes(scope)
-        names = tuple(sorted(boxes))
-        reach = run
-        if len(names) != len(run.names):
-            reach = Items(names, np.array([boxes[name] for name in names]).reshape(-1, 4))
+        whole = self._all(self._laid_out[source][0], scope)
+        reach = run if len(whole.names) == len(run.names) else whole
         found = find_refs(stage, here, source, reach, everything=everything)
         return found if reach is run else _among(found, reach, run, stage)
 
@@ -392,7 +403,7 @@ class _Run:
             (source, [(n, "" if source in by_name and n != name else digest(source, n)) for n in names])
             for source, names in refs.items()
         )
-        key = item_key(planned.digest, name, box, identity, found, engine._gaps(stage.scope, box, refs))
+        key = item_key(planned.digest, name, box, identity, found, engine._find_gaps(stage.scope, box, refs))
         parameters, context, store = planned.parameters, engine.context, engine.store
         self.tasks[ticket] = Task(
             stage.name, name, stage.scope, box, parameters, context, path, store, refs, key, engine._folder

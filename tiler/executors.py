@@ -19,6 +19,7 @@ from tiler.task import Failure, Record, Task, run_task
 
 Function = Callable[[Task], Facts]
 
+FORGET = 1000  # tasks after which Dask's table of the names of tasks is emptied, which would hold 100,000
 BYSTANDER = 20  # how often a task may wait in a process that dies of another one, before it is an error
 LOOK = 5.0  # s without a word of the scheduler, after which it is asked whether it has workers
 NO_WORKERS = 300.0  # s without any worker, after which a run ends; a busy machine starts them slowly
@@ -99,11 +100,13 @@ class Dask:
         self._completed = as_completed()
         self._flying: dict[str, tuple[int, Function, Task]] = {}
         self._sent: Counter[int] = Counter()
+        self._submitted = 0
         self._lost = False
 
     def submit(self, ticket: int, function: Function, task: Task) -> None:
         """Take a task; ClusterError if the scheduler is lost."""
         self._check_scheduler()
+        self._forget_names()
         key = f"{task.stage}-{uuid.uuid4().hex}"  # never met again, not even by a second try
         future = self._client.submit(
             run_guarded, function, task, self._limits.seconds, key=key, pure=False, retries=0
@@ -147,6 +150,13 @@ class Dask:
         self._flying.clear()
         self._completed.clear()
         return dropped
+
+    def _forget_names(self) -> None:
+        from dask.utils import key_split
+
+        self._submitted += 1
+        if self._submitted % FORGET == 0:
+            key_split.cache_clear()
 
     def _wait_for_one(self) -> None:
         """Wait until a future is done. Dask waits for ever, or takes up a new scheduler without our tasks."""
@@ -253,9 +263,9 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
     limits = limits or Limits(memory=share_memory(workers))
     # Everything is bound to this machine, on free ports: two runs do not meet. A dead process shows by its closed
     # connection, so a worker that is silent because its task holds the interpreter is let live. No array is in
-    # Dask's hands, so there is nothing to spill and nothing to pause for. Dask's logs of transitions and its own
-    # load hold on to memory: they are kept short. A process that dies is started again by its nanny: the cluster
-    # would give up one whose process is just starting 15 s after an earlier one died.
+    # Dask's hands, so there is nothing to spill and nothing to pause for. Dask's logs of transitions, of its own
+    # load and of what was submitted hold on to memory: they are kept short. A process that dies is started again
+    # by its nanny: the cluster would give up one whose process is just starting 15 s after an earlier one died.
     settings = {
         "distributed.nanny.pre-spawn-environ": dict(fork_server.ENVIRONMENT),
         "distributed.worker.multiprocessing-method": fork_server.METHOD,
@@ -265,6 +275,7 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.admin.low-level-log-length": 100,
         "distributed.admin.system-monitor.log-length": 600,
+        "distributed.diagnostics.computations.max-history": 1,
         "distributed.deploy.lost-worker-timeout": "3650 days",
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,

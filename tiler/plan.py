@@ -92,7 +92,12 @@ def list_items(stage: Stage, layout: Layout, only: Collection[str] | None) -> It
     unknown = sorted(set(only or ()) - set(boxes))
     if unknown:
         raise ValueError(f"stage {stage.name}: no {stage.scope.value} {', '.join(unknown)} in the layout")
-    names = tuple(sorted(boxes if only is None else set(only)))
+    return list_all(boxes if only is None else {name: boxes[name] for name in set(only)})
+
+
+def list_all(boxes: Mapping[str, Box]) -> Items:
+    """List items by their boxes."""
+    names = tuple(sorted(boxes))
     return Items(names, np.array([boxes[name] for name in names], dtype=np.float64).reshape(-1, 4))
 
 

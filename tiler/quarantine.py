@@ -2,16 +2,17 @@
 
 import dataclasses
 import shlex
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipeline.errors import CityError, ConfigError
-from stitch.grid import Bounds, tile_box
+from stitch.grid import Bounds, Key
 from tiler.atomic import replacing
 from tiler.config import Config, write_config
-from tiler.context import SHARED, tile_key
+from tiler.context import SHARED, tile_key, tile_name
 from tiler.engine import Engine
 from tiler.failures import SetAside
 from tiler.planning import Plan, leave_out
@@ -89,7 +90,8 @@ def find_missing(plan: Plan, missing: Missing, engine: Engine) -> Missing:
     if len(lost) == len(plan.layout.tiles):
         raise as_error(failed[0])
     tiles = {tile: _cause(engine, tile) for tile in lost}
-    others = tuple(one for one in failed if one not in tiles.values())
+    causes = set(map(id, tiles.values()))
+    others = tuple(one for one in failed if id(one) not in causes)
     return Missing(missing.tiles | tiles, missing.files, others)
 
 
@@ -164,9 +166,12 @@ def _cause(engine: Engine, tile: str) -> SetAside:
     return engine.set_aside[item]
 
 
-def _tiles_below(plan: Plan, box: Box) -> Iterable[str]:
-    xmin, ymin, xmax, ymax = box
-    for name in sorted(plan.layout.tiles):
-        x0, y0, x1, y1 = tile_box(plan.grid, tile_key(name))
-        if min(xmax, x1) - max(xmin, x0) > SHARED and min(ymax, y1) - max(ymin, y0) > SHARED:
-            yield name
+def _tiles_below(plan: Plan, box: Box) -> list[str]:
+    """List the tiles that share area with a box, sorted."""
+    columns, rows = (
+        np.flatnonzero(np.minimum(box[axis + 2], lines[1:]) - np.maximum(box[axis], lines[:-1]) > SHARED)
+        for axis, lines in enumerate(plan.grid.lines)
+    )
+    first = plan.grid.first
+    names = [tile_name(Key(first.i + i, first.j + j)) for i in columns.tolist() for j in rows.tolist()]
+    return sorted(name for name in names if name in plan.layout.tiles)

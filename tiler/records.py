@@ -4,6 +4,7 @@ A country has some ten million results. Facts are kept in memory where the engin
 from the store otherwise.
 """
 
+import struct
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -17,22 +18,43 @@ from tiler.written import FILES
 
 # Facts that reads go by, see `tiler.stage.Read`.
 KEPT = ("extent", "names")
-REUSED, NOTED, FILED = 1, 2, 4
+REUSED, NOTED, FILED, EXTENT, NO_EXTENT = 1, 2, 4, 8, 16
+BOX = struct.Struct("<4d")
 
 
 def _pack(record: Record) -> bytes:
     """Key, digest and what else must be known, in one object: there are some 30 results a tile."""
     flags = REUSED * record.reused | NOTED * bool(record.notes) | FILED * (FILES in record.facts)
+    extent = b""
+    if "extent" in record.facts:
+        found = record.facts["extent"]
+        if found is None:
+            flags |= NO_EXTENT
+        elif _is_box(found):
+            flags |= EXTENT
+            extent = BOX.pack(*found)
     key = bytes.fromhex(record.key)
-    return bytes((flags, len(key))) + key + bytes.fromhex(record.digest)
+    return bytes((flags, len(key), len(extent))) + key + extent + bytes.fromhex(record.digest)
 
 
 def _key(packed: bytes) -> str:
-    return packed[2 : 2 + packed[1]].hex()
+    return packed[3 : 3 + packed[1]].hex()
 
 
 def _digest(packed: bytes) -> str:
-    return packed[2 + packed[1] :].hex()
+    return packed[3 + packed[1] + packed[2] :].hex()
+
+
+def _extent(packed: bytes) -> Facts:
+    """Facts on the extent, as they were."""
+    if packed[0] & EXTENT:
+        return {"extent": list(BOX.unpack_from(packed, 3 + packed[1]))}
+    return {"extent": None} if packed[0] & NO_EXTENT else {}
+
+
+def _is_box(value: Any) -> bool:
+    """Whether an extent can be packed; any other one stays as it is, and is refused where it is read."""
+    return isinstance(value, list) and [type(v) for v in value] == 4 * [float]
 
 
 class Records(Mapping[tuple[str, str], Record]):
@@ -59,17 +81,21 @@ class Records(Mapping[tuple[str, str], Record]):
     def __init__(self, store: Store) -> None:
         self._store = store
         self._stages: dict[str, dict[str, bytes]] = {}
-        self._facts: dict[tuple[str, str], Facts] = {}
+        self._facts: dict[str, dict[str, Facts]] = {}
+        self._shared: dict[tuple[str, ...], Facts] = {}
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self.peak_memory = 0
         self.damage: dict[tuple[str, str], str] = {}
 
     def add(self, record: Record) -> None:
         """Keep a record, in place of an earlier one of that item."""
-        self._stages.setdefault(record.stage, {})[sys.intern(record.name)] = _pack(record)
-        self._facts.pop((record.stage, record.name), None)
-        if facts := {name: _intern(record.facts[name]) for name in KEPT if name in record.facts}:
-            self._facts[record.stage, record.name] = facts
+        self.forget(record.stage, record.name)
+        packed = _pack(record)
+        name = sys.intern(record.name)
+        self._stages.setdefault(record.stage, {})[name] = packed
+        apart = KEPT[1:] if packed[0] & (EXTENT | NO_EXTENT) else KEPT
+        if facts := {fact: record.facts[fact] for fact in apart if fact in record.facts}:
+            self._facts.setdefault(record.stage, {})[name] = self._share(facts)
         if record.damage:
             self.damage[record.stage, record.name] = record.damage
         self.peak_memory = max(self.peak_memory, record.peak_memory)
@@ -79,7 +105,7 @@ class Records(Mapping[tuple[str, str], Record]):
     def forget(self, stage: str, name: str) -> None:
         """Forget a record; nothing happens if it is not there."""
         self._stages.get(stage, {}).pop(name, None)
-        self._facts.pop((stage, name), None)
+        self._facts.get(stage, {}).pop(name, None)
 
     def digest(self, stage: str, name: str) -> str:
         """Digest of a result's content, 32 hexadecimal digits; KeyError if there is no record."""
@@ -92,8 +118,7 @@ class Records(Mapping[tuple[str, str], Record]):
 
     def kept_facts(self, stage: str, name: str) -> Facts:
         """Those facts of a result that reads go by; KeyError if there is no record."""
-        self._stages[stage][name]
-        return self._facts.get((stage, name), {})
+        return _extent(self._stages[stage][name]) | self._facts.get(stage, {}).get(name, {})
 
     def files(self, stage: str, name: str) -> dict[str, Any]:
         """Files beside the store that a result states: read from the store; KeyError if there is no record."""
@@ -122,6 +147,14 @@ class Records(Mapping[tuple[str, str], Record]):
     def count_ran(self) -> dict[str, int]:
         """Count by stage the results that were made."""
         return self._count(reused=False)
+
+    def _share(self, facts: Facts) -> Facts:
+        """Lists of names are many, and mostly the same few from stage to stage: keep each once."""
+        names = facts.get("names")
+        if set(facts) != {"names"} or not all(type(name) is str for name in names or ()):
+            return facts
+        key = tuple(map(sys.intern, names or ()))
+        return self._shared.setdefault(key, {"names": key})
 
     def _count(self, *, reused: bool) -> dict[str, int]:
         counts = {
@@ -154,8 +187,3 @@ class Records(Mapping[tuple[str, str], Record]):
 
     def __len__(self) -> int:
         return sum(map(len, self._stages.values()))
-
-
-def _intern(value: Any) -> Any:
-    """Names of items are many, and mostly the same few: keep each once."""
-    return tuple(map(sys.intern, value)) if value and all(type(v) is str for v in value) else value
