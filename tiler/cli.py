@@ -1,4 +1,4 @@
-"""The command line: `citystitch run | plan | check | status | synth | demo | render | export | config`."""
+"""The command line: `citystitch run | plan | check | status | dashboard | render | export` and others."""
 
 import argparse
 import dataclasses
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 from pipeline.errors import CityError, ConfigError
 from tiler.config import Config, annotated_defaults, check_reach, load_config, make_config
 from tiler.domain import Height
+from tiler.executors import ANYWHERE
 from tiler.export import FORMATS
 from tiler.plain_text import printable
 
@@ -95,6 +96,13 @@ def make_parser() -> argparse.ArgumentParser:
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
     )
     _add_parameters(run)
+    run.add_argument(
+        "--dashboard-address",
+        default=ANYWHERE,
+        metavar="HOST:PORT",
+        help="where the page of the run is shown while it is at work (default: a free port of 127.0.0.1)",
+    )
+    run.add_argument("--no-dashboard", action="store_true", help="show no page of the run")
     run.add_argument("--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure")
     plan = command("plan", _plan, "tell what a run would do and take, without doing it")
     plan.add_argument(
@@ -111,6 +119,14 @@ def make_parser() -> argparse.ArgumentParser:
     status = command("status", _status, "tell how far a run is, whether it is alive, and how to go on")
     status.add_argument("directory", type=Path, help="folder of a run")
     status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
+    board = command("dashboard", _dashboard, "show the page of a run, at work, ended or dead, from its folder")
+    board.add_argument("directory", type=Path, help="folder of a run")
+    board.add_argument(
+        "--port", type=int, default=0, metavar="N", help="port to listen at; 0: a free one (default)"
+    )
+    board.add_argument(
+        "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
+    )
     synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
     synth.add_argument("directory", type=Path, help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
@@ -199,7 +215,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     config = make_config(with_file(vars(options)))
     if options.only is None:
-        return _run_config(config)
+        return _run_config(config, None if options.no_dashboard else options.dashboard_address)
     from tiler.run import run_alone
 
     print(run_alone(config, options.only, say=print))
@@ -227,11 +243,11 @@ def with_file(options: dict[str, Any]) -> dict[str, Any]:
     return given | ({POSITIONAL: clouds} if clouds else {}) | values
 
 
-def _run_config(config: Config) -> int:
+def _run_config(config: Config, dashboard: str | None = None) -> int:
     from tiler.run import run
     from tiler.terminal import print_step, print_summary
 
-    record = run(config, announce=print_step, say=say)
+    record = run(config, announce=print_step, say=say, dashboard=dashboard)
     print_summary(record, Path(config.out))
     code: int = record["exit_code"]
     return code
@@ -272,6 +288,13 @@ def _status(options: argparse.Namespace) -> int:
         print(json.dumps(status, indent=1))
     else:
         print_status(options.directory, status, Console(highlight=False))
+    return 0
+
+
+def _dashboard(options: argparse.Namespace) -> int:
+    from tiler.dashboard.server import show_folder
+
+    show_folder(options.directory, f"{options.host}:{options.port}", say)
     return 0
 
 

@@ -22,6 +22,7 @@ BYSTANDER = 20  # how often a task may wait in a process that dies of another on
 LOOK = 5.0  # s without a word of the scheduler, after which it is asked whether it has workers
 NO_WORKERS = 300.0  # s without any worker, after which a run ends; a busy machine starts them slowly
 MEMORY_SHARE = 0.9  # of the machine, for all workers together
+ANYWHERE = "127.0.0.1:0"  # a free port of this machine, for this machine
 REFUSE_AT, KILL_AT = 0.9, 0.95  # of the limit: no more is given; a process is ended whose memory was not counted
 
 
@@ -82,6 +83,8 @@ class Dask:
         Number of threads that run tasks.
     limits : Limits
         What a task may take.
+    scheduler : distributed.Scheduler, optional
+        The scheduler, where it is in this process: its HTTP server shows the page of the run.
 
     Notes
     -----
@@ -89,10 +92,12 @@ class Dask:
     tells (`tiler.limits`); the others are sent again.
     """
 
-    def __init__(self, client: Any, workers: int, limits: Limits | None = None) -> None:
+    def __init__(
+        self, client: Any, workers: int, limits: Limits | None = None, scheduler: Any | None = None
+    ) -> None:
         from distributed import as_completed
 
-        self.workers = workers
+        self.workers, self.scheduler = workers, scheduler
         self._limits = limits or Limits()
         self._client = client
         self._completed = as_completed()
@@ -232,7 +237,7 @@ def serial() -> Iterator[Executor]:
 
 
 @contextmanager
-def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
+def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHERE) -> Iterator[Executor]:
     """Run tasks in worker processes of one thread each on this machine; they end with the context.
 
     Parameters
@@ -242,6 +247,8 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
     limits : Limits, optional
         What a task may take; by default its share of the machine's memory, and any time. A worker that dies is
         replaced.
+    dashboard : str
+        Where the HTTP server of the scheduler listens, ``HOST:PORT``.
     """
     from dask import config
     from distributed import Client, LocalCluster
@@ -274,7 +281,7 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
+            dashboard_address=dashboard,
             memory_limit=limits.memory,
             silence_logs="CRITICAL",
         ) as cluster,
@@ -282,7 +289,7 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
     ):
         client.register_plugin(WorkerSetup(int(REFUSE_AT * limits.memory)))
         try:
-            yield Dask(client, workers, limits)
+            yield Dask(client, workers, limits, cluster.scheduler)
         except KeyboardInterrupt:  # at once: nobody waits for what workers are at
             _kill_workers(cluster)
             raise

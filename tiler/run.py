@@ -17,8 +17,9 @@ from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.config import Config
 from tiler.context import RunContext, pack_tiles, seam_name, tile_key
+from tiler.dashboard.server import read_address, watched
 from tiler.engine import Engine, Progress, StoppedError
-from tiler.executors import Executor, connect, local, serial, share_memory
+from tiler.executors import ANYWHERE, Executor, connect, local, serial, share_memory
 from tiler.failures import Policy
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
@@ -73,6 +74,7 @@ def run(
     say: Callable[[str], None] | None = None,
     stages: Sequence[Stage] = (),
     parameters: Mapping[str, Any] | None = None,
+    dashboard: str | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -88,6 +90,9 @@ def run(
         Further stages, run after ours; they may read these and each other.
     parameters : mapping, optional
         Parameters that further stages declare, besides those of `config`.
+    dashboard : str, optional
+        Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
+        default. `say` is told its URL.
 
     Returns
     -------
@@ -109,13 +114,15 @@ def run(
     (``damaged-artefact``).
     """
     check_sources(config)
+    if dashboard is not None:
+        read_address(dashboard)
     out = Path(config.out)
     own = check_own(config, stages, parameters)
     check_folder(out, overwrite=config.overwrite)
     with only_run(out, say):
         earlier = check_folder(out, overwrite=config.overwrite)
         damage = _find_damage(out) if earlier and not config.overwrite else {}
-        return _run(config, out, earlier, damage, own, announce, say or _silent)
+        return _run(config, out, earlier, damage, own, announce, say or _silent, dashboard)
 
 
 def _run(
@@ -126,6 +133,7 @@ def _run(
     own: OwnStages,
     announce: Announce | None,
     say: Callable[[str], None],
+    dashboard: str | None,
 ) -> dict[str, Any]:
     start, untouched = time.perf_counter(), bool(earlier)
     record: dict[str, Any] = {
@@ -152,7 +160,7 @@ def _run(
         shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(config, out)
         progress = _begin_progress(config, out, plan, own, announce)
-        record |= _mesh_region(config, out, plan, own, progress, damage, say)
+        record |= _mesh_region(config, out, plan, own, progress, damage, say, dashboard)
         for message in record["messages"][len(plan.messages) :]:
             say(message)
         record["status"] = "done"
@@ -186,6 +194,7 @@ def _mesh_region(
     progress: RunProgress,
     damage: Mapping[str, str],
     say: Callable[[str], None],
+    dashboard: str | None,
 ) -> dict[str, Any]:
     """Run all stages, and write the indexes of their pieces and the manifest.
 
@@ -193,7 +202,10 @@ def _mesh_region(
     does not touch has its result already. Where one fails later, its neighbours keep the seam with it.
     """
     missing = Missing()
-    with _executor(config) as executor:
+    with (
+        _executor(config, dashboard or ANYWHERE) as executor,
+        watched(out, dashboard, getattr(executor, "scheduler", None), say),
+    ):
         while True:
             engine = make_engine(config, out, plan, executor, own, progress)
             with stops(engine.stop, say):
@@ -355,13 +367,13 @@ def run_city_stages(engine: Engine, config: Config) -> int:
 
 
 @contextmanager
-def _executor(config: Config) -> Iterator[Executor]:
+def _executor(config: Config, dashboard: str) -> Iterator[Executor]:
     if config.scheduler:
         with connect(config.scheduler, Limits(config.time_limit)) as executor:
             yield executor
     elif config.workers:
         memory = int(config.memory_limit * 2**30) or share_memory(config.workers)
-        with local(config.workers, Limits(config.time_limit, memory)) as executor:
+        with local(config.workers, Limits(config.time_limit, memory), dashboard=dashboard) as executor:
             yield executor
     else:
         with serial() as executor:
