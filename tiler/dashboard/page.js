@@ -63,6 +63,7 @@ function show(answer) {
   showTime(answer);
   showTrouble(answer);
   document.body.dataset.version = answer.version;
+  window.citystitch.read = answer.read;
 }
 
 function showHead({ head, stages, read, dask }) {
