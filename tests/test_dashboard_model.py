@@ -12,11 +12,12 @@ from pipeline.errors import InputError
 from tests.simulated_runs import simulate, write_events
 from tiler.dashboard.answer import tell
 from tiler.dashboard.codes import STATES, State
-from tiler.dashboard.follow import EVENTS, Follower
+from tiler.dashboard.follow import Follower
 from tiler.dashboard.map_view import MOST_SHOWN, Question, tell_map
 from tiler.dashboard.metrics import families, write_text
 from tiler.dashboard.model import TILE, RunModel
 from tiler.dashboard.series import MOST, Series
+from tiler.out_folder import EVENTS
 
 
 def fold(*events: object) -> RunModel:

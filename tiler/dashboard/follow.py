@@ -11,9 +11,8 @@ from typing import Any
 from pipeline.errors import CityError, InputError
 from tiler.dashboard.model import RunModel
 from tiler.folder_lock import is_held
-from tiler.out_folder import RUN_RECORD
+from tiler.out_folder import EVENTS, RUN_RECORD
 
-EVENTS = "events.jsonl"
 CHUNK = 2**20  # bytes that are read at once
 LONGEST = 2**24  # bytes of a line; a longer one is no event
 PATIENCE = 0.5  # s that one question may spend on reading; the next goes on
