@@ -48,9 +48,8 @@ def families(model: RunModel, *, alive: bool, share: float = 1.0) -> list[Family
     share : float
         How much of its events is read, 0 to 1.
     """
-    status = model.status if model.status in RUN_STATES else "unknown"
-    if status == "running" and not alive:
-        status = "dead"
+    standing = model.standing(alive=alive)
+    status = standing if standing in RUN_STATES else "unknown"
     tiles, seams = model.items[TILE], model.items[SEAM]
     stages = model.stages.items()
     found = [

@@ -107,6 +107,12 @@ class RunModel:
         """What the run said of itself last."""
         return str(self.head.get("status", ""))
 
+    def standing(self, *, alive: bool) -> str:
+        """What the run is, by what it said and whether it is at work: ``"dead"`` if it ended without a word."""
+        if alive:
+            return "running" if self.status in {"", "running"} else self.status
+        return "dead" if self.status == "running" else self.status or "unknown"
+
     def fold(self, event: object) -> None:
         """Take note of an event; one that is not of the known form is counted in `ignored`."""
         self.version += 1
