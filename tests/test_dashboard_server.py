@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 import urllib.parse
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,9 +18,12 @@ import pytest
 from pipeline.errors import ConfigError
 from tests.simulated_runs import simulate, write_events
 from tiler.cli import main
+from tiler.config import make_config
 from tiler.dashboard.codes import State
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.server import read_address, serve
+from tiler.run import run
+from tiler.synth import write_city
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +165,40 @@ def test_the_command_serves_until_it_is_interrupted(folder: Path) -> None:
             assert job.wait(timeout=30) == 0
         finally:
             job.kill()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_run_shows_its_page_and_its_bytes_stay(tmp_path: Path, small_run: Path, workers: int) -> None:
+    """On Dask's own server where there is one; Dask's metrics have ours among them."""
+    files = write_city(tmp_path / "city", size=300, buildings=15, density=1.0)
+    given = {
+        "pointcloud": [str(path) for path in files.clouds],
+        "footprints": str(files.footprints),
+        "out": str(tmp_path / "out"),
+        "tile_size": 150.0,
+        "domain_height": 60.0,
+        "workers": workers,
+    }
+    answers, metrics, told = [], [], []
+
+    def say(text: str) -> None:
+        told.append(text)
+
+    def announce(stage: str, _: float) -> None:
+        port = int(told[0].split(":")[3].split("/")[0])
+        time.sleep(1.1 if stage.startswith("model ") else 0.0)  # what happened is written once a second
+        answers.append(json.loads(ask(port, "/citystitch/api/state")[2]))
+        metrics.append(ask(port, "/metrics")[2].decode())
+
+    run(make_config(given), announce=announce, say=say, dashboard="127.0.0.1:0")
+    assert told[0].startswith("dashboard: http://127.0.0.1:")
+    assert {answer["head"]["status"] for answer in answers} == {"running"}
+    assert {answer["dask"] for answer in answers} == {workers > 0}
+    assert any(stage["name"] == "houses" and stage["done"] == 4 for stage in answers[-1]["stages"])
+    assert 'citystitch_items{scope="tile",stage="houses",state="done"} 4' in metrics[-1].replace(
+        'stage="houses",scope="tile"', 'scope="tile",stage="houses"'
+    ).replace(".0\n", "\n")
+    assert ("dask_scheduler_workers" in metrics[-1]) == (workers > 0)
+    for piece in sorted((small_run / "mesh").iterdir()):
+        assert (tmp_path / "out" / "mesh" / piece.name).read_bytes() == piece.read_bytes()
