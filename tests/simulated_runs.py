@@ -75,7 +75,7 @@ def simulate(
         scope = {"points": "file", "seams": "seam"}.get(stage, "tile")
         yield {"t": t, "event": "planned", "stage": stage, "scope": scope, "total": total}
     n_done = round(done * n)
-    order = rng.permutation(n)[:n_done] if done < 1 else np.arange(n)
+    order = np.argsort(np.arange(n) + rng.normal(0.0, 1.5 * width, n))[:n_done] if done < 1 else np.arange(n)
     whole = set(order.tolist()) - set(range(failed))
     begun = [k for k in range(failed, n) if k not in whole][: n // 10 if done < 1 else 0]
     used = set(list(whole)[: round(reused * len(whole))])

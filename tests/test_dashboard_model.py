@@ -57,6 +57,7 @@ def test_a_tile_goes_from_waiting_to_done() -> None:
     assert seen == ["waiting", "running", "begun", "running", "done"]
     model = begun(*events)
     assert states(model) == ["done", "waiting"]
+    assert [begun(*events[:k]).items[TILE].values("progress", "")[0] for k in (0, 2, 4)] == [0.0, 50.0, 100.0]
     assert model.items[TILE].values("seconds", "")[0] == 3.0
     assert model.items[TILE].values("seconds", "pieces")[0] == 1.0
     assert np.isnan(model.items[TILE].values("seconds", "")[1])
@@ -221,6 +222,8 @@ def test_what_is_left_follows_from_measured_times(tmp_path: Path) -> None:
         item("done", "houses", "0_0", seconds=4.0, total=2), item("done", "pieces", "0_0", seconds=2.0, total=2)
     )
     assert tell(follower, Question())["head"]["left"] == (4.0 + 2.0) / 2
+    follower.model.fold({"event": "planned", "stage": "proofs", "scope": "seam", "total": 2})
+    assert tell(follower, Question())["head"]["left"] is None, "a stage that nobody has measured"
 
 
 def test_intervals_are_bounded_and_lose_nothing() -> None:

@@ -26,7 +26,7 @@ def run_browser(script: str, url: str, out: Path, *more: str) -> "subprocess.Pop
     root = subprocess.run(["npm", "root", "--global"], capture_output=True, text=True, check=True).stdout.strip()
     if not Path(root, "playwright-core").is_dir():
         pytest.fail(f"no playwright-core: {NEEDED}")
-    words = ["node", str(Path(__file__).with_name(script)), url, str(programs["chromium"]), str(out), *more]
+    words = ["node", str(Path(__file__).parent / script), url, str(programs["chromium"]), str(out), *more]
     return subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ | {"NODE_PATH": root})
 
 

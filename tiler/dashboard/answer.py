@@ -10,12 +10,15 @@ from tiler.dashboard.map_view import Question, tell_map
 from tiler.dashboard.model import RunModel, StageState
 
 SHOWN_FAILURES, SHOWN_AT_WORK = 200, 12
-TITLES = {
+TITLES = {  # of the values that come first; a fact has its name
+    "progress": "% of its stages done",
     "seconds": "seconds",
     "cells": "cells",
+    "worst_ratio": "worst radius ratio",
     "dropped": "dropped buildings",
     "notes": "notes",
-}  # titles of values; a fact has its name
+}
+COUNTED = ("progress", "seconds", "dropped", "notes")  # values that are no facts of stages
 
 
 def tell(follower: Follower, question: Question) -> dict[str, Any]:
@@ -72,21 +75,27 @@ def tell_head(model: RunModel, *, alive: bool) -> dict[str, Any]:
 
 def list_values(model: RunModel) -> list[list[str]]:
     """List the values that the map can be coloured by: name and title."""
-    facts = dict.fromkeys(fact for items in model.items.values() for fact in items.facts)
-    names = dict.fromkeys(["seconds", *facts, "dropped", "notes"])
+    facts = {fact for items in model.items.values() for fact in items.facts}
+    first = [name for name in TITLES if name in COUNTED or name in facts]
+    names = [*first, *sorted(facts - TITLES.keys())]
     return [[name, TITLES.get(name, name.replace("_", " "))] for name in names]
 
 
 def _estimate(model: RunModel) -> float | None:
-    """Seconds that the rest takes, from the mean time of what was computed, stage by stage, on all workers."""
-    work, known = 0.0, False
+    """Seconds that the rest takes, from the mean time of what was computed, stage by stage, on all workers.
+
+    None as long as a stage of many items has not been measured: it may be the longest one.
+    """
+    work = 0.0
     for stage in model.stages.values():
         computed = stage.counts[State.DONE]
         left = max(stage.total - stage.done - stage.counts[State.FAILED], 0)
         if computed:
-            known, work = True, work + left * stage.seconds / computed
+            work += left * stage.seconds / computed
+        elif left > 1:
+            return None
     workers = model.head.get("workers") or 1
-    return round(work / max(int(workers), 1), 1) if known else None
+    return round(work / max(int(workers), 1), 1)
 
 
 def _tell_stage(name: str, stage: StageState) -> dict[str, Any]:

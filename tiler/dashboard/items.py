@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tiler.dashboard.codes import Codes, State, combine
 
 GROWTH = 1024  # items that are made room for at least
-MOST_FACTS = 32  # kinds of values that are kept; a stage of the user's own may tell anything
+MOST_FACTS = 64  # kinds of values that are kept; a stage of the user's own may tell anything
 
 # Notes that say of something in the input that it is not in the mesh.
 DROPPED = frozenset(
@@ -19,6 +19,17 @@ DROPPED = frozenset(
         *("footprint-too-many-vertices", "footprint-lost"),
     }
 )
+
+
+def is_drop(kind: str) -> bool:
+    """Tell whether a kind of note says that something in the input is not in the mesh.
+
+    Examples
+    --------
+    >>> is_drop("footprint-on-border-dropped"), is_drop("building-lost"), is_drop("courtyard-filled")
+    (True, True, False)
+    """
+    return kind in DROPPED or kind.endswith("-dropped")
 
 
 class Column:
@@ -154,13 +165,16 @@ class Items:
         Parameters
         ----------
         value : str
-            ``"seconds"``, ``"notes"``, ``"dropped"``, or the name of a fact.
+            ``"progress"``, the share of the stages that are done (%); ``"seconds"``, ``"notes"``, ``"dropped"``,
+            or the name of a fact.
         stage : str
             Of this stage alone, or of all where it is empty; facts are of the item, whatever the stage.
         """
         n = len(self)
         if value in self.facts:
             return self.facts[value].take(n)
+        if value == "progress":
+            return self._progress(stage)
         total, known = np.zeros(n), np.zeros(n, np.bool_)
         if value in {"seconds", "notes", "dropped"}:
             for name, columns in self.stages.items():
@@ -170,3 +184,11 @@ class Items:
                     known |= ((codes == State.DONE) | (codes == State.REUSED)) & np.isfinite(found)
                     total += np.nan_to_num(found)
         return np.where(known, total, np.nan)
+
+    def _progress(self, stage: str) -> NDArray[np.float64]:
+        chosen = [columns for name, columns in self.stages.items() if stage in {"", name}]
+        done = np.zeros(len(self))
+        for columns in chosen:
+            codes = columns.codes.take(len(self))
+            done += (codes == State.DONE) | (codes == State.REUSED)
+        return 100.0 * done / max(len(chosen), 1)

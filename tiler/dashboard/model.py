@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from tiler.dashboard.codes import State
-from tiler.dashboard.items import DROPPED, Items
+from tiler.dashboard.items import Items, is_drop
 from tiler.dashboard.series import Series
 
 TILE, SEAM = "tile", "seam"
@@ -225,7 +225,7 @@ class RunModel:
         columns.seconds[k] = seconds
         if notes:
             columns.notes[k] = sum(notes.values())
-            columns.dropped[k] = sum(n for kind, n in notes.items() if kind in DROPPED)
+            columns.dropped[k] = sum(n for kind, n in notes.items() if is_drop(kind))
         for fact, value in facts.items():
             if isinstance(value, (int, float)) and math.isfinite(value):
                 items.tell(k, str(fact), float(value))

@@ -4,7 +4,7 @@ import { FAILED, Palette, RegionMap, STATES, drawCross, rampColour } from "./map
 import { amount, duration, element, memory, showCurve, showFailures, showList, showStages } from "./tables.js";
 
 const BUSY = 1000, IDLE = 5000; // ms between two questions, at work and when it is over
-const TITLES = { waiting: "waiting", begun: "some stages done", running: "at work", done: "done", reused: "used again", failed: "failed" };
+const TITLES = { waiting: "waiting", begun: "some stages done", running: "in hand", done: "done", reused: "used again", failed: "failed" };
 const $ = (id) => document.getElementById(id);
 const asked = { stage: "", value: "", view: null, since: 0, key: "" };
 let last = null;
@@ -156,7 +156,7 @@ function showTime({ series, head, at_work: atWork }) {
   showCurve($("rate"), $("c-rate"), "Items a minute", series.rows.map(([done]) => (60 * done) / series.width), { tell: (value) => amount(Math.round(value)), seconds });
   showCurve($("memory"), $("c-memory"), "Largest worker process", series.rows.map((row) => row[2]), { tell: memory, seconds });
   const lines = atWork.map(([stage, name, since]) => `${stage} ${name}, ${duration(since)}`);
-  $("h-work").textContent = head.status === "dead" ? "At work when it died" : "At work for longest";
+  $("h-work").textContent = head.status === "dead" ? "In hand when it died" : "In the workers' hands for longest";
   showList($("work"), lines.length ? lines : [head.status === "running" ? "Nothing yet." : "Nothing: the run is over."]);
 }
 
