@@ -126,6 +126,10 @@ def test_the_map_tells_what_changed_and_nothing_else() -> None:
     later = tell_map(model, "r", Question(since=since, key=first["key"]))
     assert not later["whole"]
     assert later["rows"] == [[1, State.BEGUN, None]]
+    model.fold({"event": "planned", "stage": "late", "scope": "tile", "total": 2})
+    assert tell_map(model, "r", Question(since=model.version + 1, key=first["key"]))["whole"], (
+        "done is done no more"
+    )
     assert tell_map(model, "another", Question(since=since, key=first["key"]))["whole"]
 
 

@@ -88,6 +88,8 @@ class Items:
         What each stage of this scope has done.
     facts : dict of str to Column
         What stages tell of items, by the name of the fact.
+    views : dict
+        What a map keeps of parts of the region, see `tiler.dashboard.map_view`; void when an item is added.
     """
 
     def __init__(self) -> None:
@@ -95,6 +97,8 @@ class Items:
         self.layout = 0
         self.stages: dict[str, StageColumns] = {}
         self.facts: dict[str, Column] = {}
+        self.views: dict[Any, Any] = {}
+        self._tally: NDArray[np.int16] = np.zeros((0, len(State)), np.int16)  # stages of each item in each state
         self._boxes: list[tuple[float, float, float, float]] = []
         self._index: dict[str, int] = {}
         self._changed = Column(np.int64, 0)
@@ -113,14 +117,27 @@ class Items:
             self._changed[len(self.names)] = version
             self.names.append(str(name))
             self._boxes.append((xmin, ymin, xmax, ymax))
-        self.layout = len(self.names)
+        if self.layout != len(self.names):
+            self.layout = len(self.names)
+            self.views.clear()
+            more = np.zeros((max(self.layout, GROWTH), len(State)), np.int16)
+            if self.layout > len(self._tally):
+                self._tally = np.concatenate([self._tally, more])
 
     def find(self, name: str) -> int | None:
         """Place of an item in the order, or None."""
         return self._index.get(name)
 
-    def touch(self, k: int, version: int) -> None:
-        """Take note that an item has changed."""
+    def code(self, k: int, stage: str) -> int:
+        """State of an item in a stage."""
+        return int(self.stage(stage).codes.get(k))
+
+    def set_code(self, k: int, stage: str, code: int, version: int) -> None:
+        """Change the state of an item in a stage."""
+        codes = self.stage(stage).codes
+        self._tally[k, codes.get(k)] -= 1
+        self._tally[k, code] += 1
+        codes[k] = code
         self._changed[k] = version
 
     def stage(self, name: str) -> StageColumns:
@@ -153,10 +170,8 @@ class Items:
             return (
                 self.stages[stage].codes.take(len(self)) if stage in self.stages else np.zeros(len(self), np.uint8)
             )
-        counts = np.zeros((len(self), len(State)), np.int64)
-        rows = np.arange(len(self))
-        for columns in self.stages.values():
-            counts[rows, columns.codes.take(len(self))] += 1
+        counts = self._tally[: len(self)].astype(np.int64)
+        counts[:, State.WAITING] += len(self.stages)  # of which those in another state were taken away
         return combine(counts)
 
     def values(self, value: str, stage: str) -> NDArray[np.float64]:
@@ -186,9 +201,8 @@ class Items:
         return np.where(known, total, np.nan)
 
     def _progress(self, stage: str) -> NDArray[np.float64]:
-        chosen = [columns for name, columns in self.stages.items() if stage in {"", name}]
-        done = np.zeros(len(self))
-        for columns in chosen:
-            codes = columns.codes.take(len(self))
-            done += (codes == State.DONE) | (codes == State.REUSED)
-        return 100.0 * done / max(len(chosen), 1)
+        if stage:
+            codes = self.codes(stage)
+            return np.where((codes == State.DONE) | (codes == State.REUSED), 100.0, 0.0)
+        done = self._tally[: len(self), [State.DONE, State.REUSED]].sum(axis=1)
+        return np.asarray(100.0 * done / max(len(self.stages), 1))

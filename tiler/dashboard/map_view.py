@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.dashboard.codes import Codes, combine, tally
+from tiler.dashboard.codes import Codes, State, combine, tally
 from tiler.dashboard.items import Items
 from tiler.dashboard.model import SEAM, TILE, RunModel
 
+KEPT_VIEWS = 8
 MOST_SHOWN = 4096  # tiles, or cells of tiles, that a map has at most
 LOWEST = re.compile("quality|ratio|angle|worst|least|smallest")  # values of which the worst is the lowest
 Box = tuple[float, float, float, float]
@@ -71,38 +72,34 @@ def tell_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
     A cell has the state of `combine`, and the mean of its tiles' values, or the lowest where low is bad.
     """
     tiles = model.items[TILE]
-    boxes = tiles.boxes()
-    inside = _find_inside(boxes, question.view)
-    codes, changed = tiles.codes(question.stage)[inside], tiles.changed()[inside]
-    values = tiles.values(question.value, question.stage)[inside]
-    column, row = _place_in_grid(boxes)
-    level = _choose_level(column[inside], row[inside])
-    layout = f"{tiles.layout}.{model.items[SEAM].layout}"
-    key = "|".join([run, layout, str(level), question.stage, question.value, str(question.view)])
+    part = _choose_part(tiles, question.view)
+    codes, changed = tiles.codes(question.stage)[part.inside], tiles.changed()[part.inside]
+    values = tiles.values(question.value, question.stage)[part.inside]
+    # A stage that is new changes the state of tiles that nothing happened to.
+    layout = ".".join(f"{items.layout}.{len(items.stages)}" for items in model.items.values())
+    key = "|".join([run, layout, str(part.level), question.stage, question.value, str(question.view)])
     whole = key != question.key
     since = 0 if whole else question.since
     answer: dict[str, Any] = {
         "key": key,
         "whole": whole,
-        "level": level,
-        "bounds": _outline(boxes),
-        "tiles": tally(codes, np.zeros(len(codes), np.int64), 1)[0].tolist(),
+        "level": part.level,
+        "bounds": _outline(tiles.boxes()),
+        "tiles": np.bincount(codes, minlength=len(State)).tolist(),
         "range": _range(values),
     }
-    if level == 1:
-        rows, names = _rows(codes, values, changed >= since), [tiles.names[k] for k in inside.tolist()]
-        shown = boxes[inside]
+    if part.level == 1:
+        rows, names = _rows(codes, values, changed >= since), [tiles.names[k] for k in part.inside.tolist()]
         answer |= _tell_seams(model.items[SEAM], question, since, whole=whole)
     else:
-        found = _gather(
-            column[inside] // level, row[inside] // level, boxes[inside], codes, values, changed, question
-        )
-        shown, names = found.boxes, []
-        rows = _rows(combine(found.counts), found.values, found.changed >= since)
+        names = []
+        counts = tally(codes, part.group, len(part.first))
+        last = np.maximum.reduceat(changed[part.order], part.first)
+        rows = _rows(combine(counts), _gather(part, values, question.value), last >= since)
         for one in rows:
-            one.append(found.counts[one[0]].tolist())
+            one.append(counts[one[0]].tolist())
     if whole:
-        answer |= {"boxes": _rounded(shown), "names": names}
+        answer |= {"boxes": _rounded(part.boxes), "names": names}
     return answer | {"rows": rows}
 
 
@@ -122,59 +119,78 @@ def _tell_seams(seams: Items, question: Question, since: int, *, whole: bool) ->
 
 
 @dataclass(frozen=True, eq=False)
-class _Cells:
-    """Cells of tiles: boxes (m) (n, 4), counts by state (n, 6), values (n,), last versions (n,)."""
+class _Part:
+    """A part of the region, and its cells.
 
+    Attributes
+    ----------
+    inside : intp, (n,)
+        Its tiles.
+    level : int
+        Tiles along the side of a cell; 1 where tiles are themselves.
+    boxes : float64, (n or m, 4)
+        Boxes of tiles or cells (m).
+    group : int64, (n,)
+        Cell of each tile; this and the others only where there are cells.
+    order : intp, (n,)
+        Tiles by cell.
+    first : intp, (m,)
+        Where each cell begins in `order`.
+    """
+
+    inside: NDArray[np.intp]
+    level: int
     boxes: NDArray[np.float64]
-    counts: NDArray[np.int64]
-    values: NDArray[np.float64]
-    changed: NDArray[np.int64]
+    group: NDArray[np.int64]
+    order: NDArray[np.intp]
+    first: NDArray[np.intp]
 
 
-def _gather(
-    column: NDArray[np.int64],
-    row: NDArray[np.int64],
-    boxes: NDArray[np.float64],
-    codes: Codes,
-    values: NDArray[np.float64],
-    changed: NDArray[np.int64],
-    question: Question,
-) -> _Cells:
-    """Bring tiles together by the column and row of their cell."""
-    _, group = np.unique(column * (row.max() + 1) + row, return_inverse=True)
+def _choose_part(tiles: Items, view: Box | None) -> _Part:
+    """Choose tiles or cells for a view; kept until a tile is added, as a page asks again and again."""
+    found: _Part | None = tiles.views.get(view)
+    if found is None:
+        if len(tiles.views) >= KEPT_VIEWS:
+            tiles.views.clear()
+        found = tiles.views[view] = _make_part(tiles.boxes(), view)
+    return found
+
+
+def _make_part(boxes: NDArray[np.float64], view: Box | None) -> _Part:
+    inside = _find_inside(boxes, view)
+    none = np.empty(0, np.intp)
+    if len(inside) <= MOST_SHOWN:
+        return _Part(inside, 1, boxes[inside], none.astype(np.int64), none, none)
+    column, row = (axis[inside] for axis in _place_in_grid(boxes))
+    level = math.ceil(math.sqrt(len(inside) / MOST_SHOWN)) - 1
+    cells = none
+    while not 0 < len(cells) <= MOST_SHOWN:
+        level += 1
+        cells, group = np.unique(column // level * (row.max() + 1) + row // level, return_inverse=True)
     group = group.reshape(-1).astype(np.int64)
-    n = int(group.max()) + 1
     order = np.argsort(group, kind="stable")
-    first = np.searchsorted(group[order], np.arange(n))
-    low = np.minimum.reduceat(boxes[order, :2], first, axis=0)
-    high = np.maximum.reduceat(boxes[order, 2:], first, axis=0)
-    known = np.isfinite(values)
-    if LOWEST.search(question.value):
-        filled = np.where(known, values, np.inf)
-        found = np.minimum.reduceat(filled[order], first)
-        found = np.where(np.isfinite(found), found, np.nan)
-    else:
-        number = np.bincount(group[known], minlength=n)
-        total = np.bincount(group[known], values[known], minlength=n)
-        found = np.divide(total, number, out=np.full(n, np.nan), where=number > 0)
-    last = np.maximum.reduceat(changed[order], first)
-    return _Cells(np.hstack([low, high]), tally(codes, group, n), found, last)
+    first = np.searchsorted(group[order], np.arange(len(cells)))
+    low = np.minimum.reduceat(boxes[inside][order, :2], first, axis=0)
+    high = np.maximum.reduceat(boxes[inside][order, 2:], first, axis=0)
+    return _Part(inside, level, np.hstack([low, high]), group, order, first)
+
+
+def _gather(part: _Part, values: NDArray[np.float64], value: str) -> NDArray[np.float64]:
+    """Value of each cell: the mean of its tiles, or the lowest where low is bad; NaN where none is known."""
+    known, n = np.isfinite(values), len(part.first)
+    if LOWEST.search(value):
+        found = np.minimum.reduceat(np.where(known, values, np.inf)[part.order], part.first)
+        return np.where(np.isfinite(found), found, np.nan)
+    number = np.bincount(part.group[known], minlength=n)
+    total = np.bincount(part.group[known], values[known], minlength=n)
+    means: NDArray[np.float64] = np.divide(total, number, out=np.full(n, np.nan), where=number > 0)
+    return means
 
 
 def _place_in_grid(boxes: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Column and row of each box, by the order of their lower left corners: sides of tiles are lines of a grid."""
     places = [np.unique(boxes[:, axis].round(3), return_inverse=True)[1].reshape(-1) for axis in (0, 1)]
     return places[0].astype(np.int64), places[1].astype(np.int64)
-
-
-def _choose_level(column: NDArray[np.int64], row: NDArray[np.int64]) -> int:
-    """Smallest number of tiles along the side of a cell, such that there are few enough cells."""
-    level = math.ceil(math.sqrt(len(column) / MOST_SHOWN))
-    if level <= 1:
-        return 1
-    while len(np.unique(column // level * (row.max() + 1) + row // level)) > MOST_SHOWN:
-        level += 1
-    return level
 
 
 def _find_inside(boxes: NDArray[np.float64], view: Box | None) -> NDArray[np.intp]:

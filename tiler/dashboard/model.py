@@ -204,15 +204,14 @@ class RunModel:
     def _code(place: "_Place") -> int:
         if place.items is None:
             return place.stage.codes.get(place.key[1], State.WAITING)
-        return int(place.items.stage(place.key[0]).codes.get(place.k))
+        return place.items.code(place.k, place.key[0])
 
     def _set(self, place: "_Place", code: State) -> None:
         counts, old = place.stage.counts, self._code(place)
         if place.items is None:
             place.stage.codes[place.key[1]] = code
         else:
-            place.items.stage(place.key[0]).codes[place.k] = code
-            place.items.touch(place.k, self.version)
+            place.items.set_code(place.k, place.key[0], code, self.version)
         counts[old] -= old != State.WAITING
         counts[code] += code != State.WAITING
 
