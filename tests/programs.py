@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-PACKAGES = "apt-get install -y openfoam gmsh python3-dolfinx cgns-convert"  # Debian 12; see .ci/run
+PACKAGES = "apt-get install -y openfoam gmsh python3-dolfinx cgns-convert tmux"  # Debian 12; see .ci/run
 FOAM = "/usr/share/openfoam"
 MPI = ("mpirun", "--allow-run-as-root", "--oversubscribe", "-np")
 

@@ -83,6 +83,9 @@ def test_a_tile_that_is_taken_again_around_a_hole_counts_once() -> None:
     assert model.notes == {"footprint-sliver": 3}
     assert model.stages["houses"].done == 1
     assert model.items[TILE].values("dropped", "")[0] == 3
+    reused = begun(done | {"reused": True, "seconds": 0.0})
+    assert np.isnan(reused.items[TILE].values("seconds", "")[0]), "no time of this run"
+    assert reused.items[TILE].values("dropped", "")[0] == 3
 
 
 def test_what_a_run_that_ends_has_in_hand_is_given_up() -> None:

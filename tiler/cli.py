@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
@@ -42,6 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Without the program's name; those of the process if not given.
     """
     _find_cache()
+    if arguments is None:
+        _silence_libraries()
     parser = make_parser()
     options = parser.parse_args(arguments)
     handler: Callable[[argparse.Namespace], int] = options.handler
@@ -75,6 +78,13 @@ def _find_cache() -> None:
         os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"citystitch-{os.getuid()}")
 
 
+def _silence_libraries() -> None:
+    """Keep the warnings of libraries from the user, who can do nothing about them, here and in workers."""
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        os.environ["PYTHONWARNINGS"] = "ignore"
+
+
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of all commands; the parameters of a run come from `Config`."""
     common = argparse.ArgumentParser(add_help=False)
@@ -104,6 +114,10 @@ def make_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--no-dashboard", action="store_true", help="show no page of the run")
     run.add_argument("--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure")
+    words = run.add_mutually_exclusive_group()
+    words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
+    words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
+    run.add_argument("--log-json", type=Path, metavar="FILE", help="write what happens, a JSON object a line")
     plan = command("plan", _plan, "tell what a run would do and take, without doing it")
     plan.add_argument(
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
@@ -215,10 +229,14 @@ def _add_export(export: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     config = make_config(with_file(vars(options)))
     if options.only is None:
-        return _run_config(config, None if options.no_dashboard else options.dashboard_address)
+        dashboard = None if options.no_dashboard else options.dashboard_address
+        words = {"quiet": options.quiet, "verbose": options.verbose, "log": options.log_json}
+        return _run_config(config, dashboard=dashboard, **words)
+    if options.log_json is not None:
+        raise ConfigError("--log-json tells of a whole run; leave out it or --only")
     from tiler.run import run_alone
 
-    print(run_alone(config, options.only, say=print))
+    print(run_alone(config, options.only, say=None if options.quiet else say))
     return 0
 
 
@@ -243,12 +261,29 @@ def with_file(options: dict[str, Any]) -> dict[str, Any]:
     return given | ({POSITIONAL: clouds} if clouds else {}) | values
 
 
-def _run_config(config: Config, dashboard: str | None = None) -> int:
+def _run_config(
+    config: Config,
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+    log: Path | None = None,
+    dashboard: str | None = None,
+) -> int:
+    from tiler.events import EventLog, open_log
+    from tiler.out_folder import refuse_result
     from tiler.run import run
-    from tiler.terminal import print_step, print_summary
+    from tiler.terminal import make_views, print_last_line, print_summary
 
-    record = run(config, announce=print_step, say=say, dashboard=dashboard)
-    print_summary(record, Path(config.out))
+    out = Path(config.out)
+    watchers = make_views(quiet=quiet, verbose=verbose)
+    if log is not None:
+        refuse_result(out, log)
+        watchers.append(EventLog(log, open_log(log), every=0.0))
+    record = run(config, watchers=watchers, dashboard=dashboard)
+    if quiet:
+        print_last_line(record, out)
+    else:
+        print_summary(record, out)
     code: int = record["exit_code"]
     return code
 

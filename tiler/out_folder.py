@@ -146,11 +146,20 @@ def refuse_inputs_within(out: Path, inputs: Iterable[Path]) -> None:
     ConfigError
         With the first such input.
     """
-    own = [Path(os.path.realpath(out / name)) for name in RESULTS]
     for path in inputs:
-        real = Path(os.path.realpath(path))
-        if any(real.is_relative_to(place) for place in own):
+        if _is_result(out, path):
             raise ConfigError(f"{path}: an input lies among the results in {out}; move it, or give another --out")
+
+
+def refuse_result(out: Path, log: Path) -> None:
+    """Refuse a file for `--log-json` that a run writes or removes itself; ConfigError with its name."""
+    if _is_result(out, log):
+        raise ConfigError(f"--log-json {log}: lies among the results in {out}; give another file")
+
+
+def _is_result(out: Path, path: Path) -> bool:
+    real = Path(os.path.realpath(path))
+    return any(real.is_relative_to(os.path.realpath(out / name)) for name in RESULTS)
 
 
 def _is_ours(out: Path) -> bool:

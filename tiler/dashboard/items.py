@@ -196,7 +196,10 @@ class Items:
                 if stage in {"", name}:
                     codes = columns.codes.take(n)
                     found = getattr(columns, value).take(n).astype(np.float64)
-                    known |= ((codes == State.DONE) | (codes == State.REUSED)) & np.isfinite(found)
+                    finished = codes == State.DONE
+                    if value != "seconds":  # what an earlier run had done has no time in this one
+                        finished |= codes == State.REUSED
+                    known |= finished & np.isfinite(found)
                     total += np.nan_to_num(found)
         return np.where(known, total, np.nan)
 

@@ -5,6 +5,7 @@ export const FAILED = 5;
 // Colours of the scale of values, from low to high: lightness rises evenly, so that grey keeps the order.
 const RAMP = [[0, 32, 77], [44, 64, 110], [87, 93, 109], [118, 119, 121], [149, 144, 118], [188, 172, 97], [228, 203, 67], [255, 234, 70]];
 const LEAST_MARK = 7; // px of a failed tile, however small its square is
+const LEAST_SEAM = 14; // px of a tile's side, below which seams would hide the tiles
 const FADED = 0.13;
 
 export function rampColour(share) {
@@ -211,7 +212,8 @@ export class RegionMap {
     const some = seams.boxes[0];
     if (!some) return;
     const side = Math.max(some[2] - some[0], some[3] - some[1]) * k;
-    if (side < 9) return;
+    this.seamsShown = side >= LEAST_SEAM;
+    if (!this.seamsShown) return;
     const broad = Math.min(Math.max(side / 12, 2.5), 7);
     for (let n = 0; n < seams.boxes.length; n++) {
       const code = seams.codes[n] || 0;

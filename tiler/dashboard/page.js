@@ -140,7 +140,8 @@ function showLegend(tiles) {
 }
 
 function showScale({ range, level }) {
-  $("hint").textContent = level > 1 ? `squares of ${level} × ${level} tiles; zoom in for tiles and seams` : "";
+  $("hint").textContent = level > 1 ? `squares of ${level} × ${level} tiles; zoom in for tiles and seams`
+    : map.seams.boxes.length && !map.seamsShown ? "zoom in for seams" : "";
   $("scale").hidden = !asked.value || !range;
   if ($("scale").hidden) return;
   $("low").textContent = amount(range[0]);
