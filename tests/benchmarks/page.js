@@ -34,7 +34,7 @@ const move = (page, zoom) => page.evaluate(async (factor) => {
     await page.waitForFunction(() => document.body.dataset.firstDraw && window.citystitch.read === 1, null, { timeout: 300000 });
     const first = Number(await page.evaluate(() => document.body.dataset.firstDraw));
     const whole = await move(page, 1);
-    const near = await move(page, 6);
+    const near = await move(page, 12);
     await page.evaluate(() => window.citystitch.map.fit());
     await page.waitForTimeout(3000);
     await page.screenshot({ path: `${folder}/${name}.png`, fullPage: true });

@@ -2,7 +2,9 @@
 
 Runs a synthetic city of 1 km2 in pairs, without a page and with one that is asked every second as an open browser
 does, and scraped as often as Prometheus does; the order changes from pair to pair. What is compared is processor
-time, user and system, of the run and all its processes: wall time tells more of the machine's other users.
+time, user and system, of the run and all its processes: wall time tells more of the machine's other users. As the
+difference is less than what one run differs from the next, a row tells what an answer takes the server of the
+finished run, too: asked every second, that is the page's share of one core.
 """
 
 import argparse
@@ -49,28 +51,58 @@ def run_once(words: Sequence[str], *, watched: bool) -> tuple[float, int]:
     return end.children_user + end.children_system - begin.children_user - begin.children_system, asked
 
 
+def cost_of_answer(out: Path, asked: int = 300) -> float:
+    """Processor time (s) that the server of a run's folder takes to answer a page that is open."""
+    words = [sys.executable, "-m", "tiler.cli", "dashboard", str(out)]
+    place = os.environ | {"PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=place) as job:
+        assert job.stdout is not None
+        found = re.search(r"dashboard: (http://\S+)", job.stdout.readline())
+        assert found
+        reader = Reader(found[1], threading.Event())
+        for _ in range(10):
+            reader.ask()
+        begin = time_of(job.pid)
+        for _ in range(asked):
+            reader.ask()
+        taken = time_of(job.pid) - begin
+        job.terminate()
+    return taken / asked
+
+
+def time_of(pid: int) -> float:
+    """Processor time (s) of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 class Reader(threading.Thread):
     """Asks as a browser does, once a second for what is new, and as Prometheus does."""
 
     def __init__(self, url: str, over: threading.Event) -> None:
         super().__init__(daemon=True)
         self.url, self.over, self.asked = url, over, 0
+        self.since, self.key = 0, ""
 
     def run(self) -> None:
         """Ask until the run is over."""
-        since, key, scraped = 0, "", time.monotonic()
+        scraped = time.monotonic()
         while not self.over.wait(1.0):
             try:
-                words = urllib.parse.urlencode({"since": since, "key": key})
-                with urllib.request.urlopen(f"{self.url}api/state?{words}", timeout=10) as reply:
-                    answer = json.load(reply)
-                since, key = answer["version"], answer["map"]["key"]
+                self.ask()
                 if time.monotonic() - scraped > SCRAPE:
                     scraped = time.monotonic()
                     urllib.request.urlopen(f"{self.url}metrics", timeout=10).read()
-                self.asked += 1
             except OSError:
                 continue
+
+    def ask(self) -> None:
+        """Ask for what is new, as the page does."""
+        words = urllib.parse.urlencode({"since": self.since, "key": self.key})
+        with urllib.request.urlopen(f"{self.url}api/state?{words}", timeout=10) as reply:
+            answer = json.load(reply)
+        self.since, self.key = answer["version"], answer["map"]["key"]
+        self.asked += 1
 
 
 def main() -> None:
@@ -109,6 +141,8 @@ def main() -> None:
             before, after = (statistics.mean(pair[side] for pair in pairs) for side in (0, 1))
             told = f"{statistics.mean(shares):+.2f} ± {spread:.2f} %"
             print(f"| {workers} | {len(pairs)} | {before:.2f} | {after:.2f} | {told} | {asked} |", flush=True)
+        cost = cost_of_answer(out)
+        print(f"\nAn answer takes {1000 * cost:.1f} ms of CPU: asked every second, {100 * cost:.2f} % of a core.")
 
 
 if __name__ == "__main__":
