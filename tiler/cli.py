@@ -1,4 +1,4 @@
-"""The command line: `citystitch run | plan | check | status | synth | demo | render | export | config`."""
+"""The command line: `citystitch run | plan | check | status | dashboard | render | export` and others."""
 
 import argparse
 import dataclasses
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import CityError, ConfigError
 from tiler import fork_server
+from tiler.addresses import ANYWHERE
 from tiler.config import Config, annotated_defaults, check_reach, load_config, make_config
 from tiler.domain import Height
 from tiler.export import FORMATS
@@ -106,6 +107,13 @@ def make_parser() -> argparse.ArgumentParser:
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
     )
     _add_parameters(run)
+    run.add_argument(
+        "--dashboard-address",
+        default=ANYWHERE,
+        metavar="HOST:PORT",
+        help="where the page of the run is shown while it is at work (default: a free port of 127.0.0.1)",
+    )
+    run.add_argument("--no-dashboard", action="store_true", help="show no page of the run")
     run.add_argument("--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure")
     words = run.add_mutually_exclusive_group()
     words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
@@ -126,6 +134,14 @@ def make_parser() -> argparse.ArgumentParser:
     status = command("status", _status, "tell how far a run is, whether it is alive, and how to go on")
     status.add_argument("directory", type=Path, help="folder of a run")
     status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
+    board = command("dashboard", _dashboard, "show the page of a run, at work, ended or dead, from its folder")
+    board.add_argument("directory", type=Path, help="folder of a run")
+    board.add_argument(
+        "--port", type=int, default=0, metavar="N", help="port to listen at; 0: a free one (default)"
+    )
+    board.add_argument(
+        "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
+    )
     synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
     synth.add_argument("directory", type=Path, help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
@@ -216,7 +232,9 @@ def _add_export(export: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     config = make_config(with_file(vars(options)))
     if options.only is None:
-        return _run_config(config, quiet=options.quiet, verbose=options.verbose, log=options.log_json)
+        dashboard = None if options.no_dashboard else options.dashboard_address
+        words = {"quiet": options.quiet, "verbose": options.verbose, "log": options.log_json}
+        return _run_config(config, dashboard=dashboard, **words)
     if options.log_json is not None:
         raise ConfigError("--log-json tells of a whole run; leave out it or --only")
     from tiler.run import run_alone
@@ -246,7 +264,14 @@ def with_file(options: dict[str, Any]) -> dict[str, Any]:
     return given | ({POSITIONAL: clouds} if clouds else {}) | values
 
 
-def _run_config(config: Config, *, quiet: bool = False, verbose: bool = False, log: Path | None = None) -> int:
+def _run_config(
+    config: Config,
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+    log: Path | None = None,
+    dashboard: str | None = None,
+) -> int:
     if config.workers and not config.scheduler:
         fork_server.begin()
     from tiler.events import EventLog, open_log
@@ -259,7 +284,7 @@ def _run_config(config: Config, *, quiet: bool = False, verbose: bool = False, l
     if log is not None:
         refuse_result(out, log)
         watchers.append(EventLog(log, open_log(log), every=0.0))
-    record = run(config, watchers=watchers)
+    record = run(config, watchers=watchers, dashboard=dashboard)
     if quiet:
         print_last_line(record, out)
     else:
@@ -303,6 +328,13 @@ def _status(options: argparse.Namespace) -> int:
         print(json.dumps(status, indent=1))
     else:
         print_status(options.directory, status, Console(highlight=False))
+    return 0
+
+
+def _dashboard(options: argparse.Namespace) -> int:
+    from tiler.dashboard.server import show_folder
+
+    show_folder(options.directory, f"{options.host}:{options.port}", say)
     return 0
 
 

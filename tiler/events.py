@@ -16,6 +16,7 @@ from tiler.atomic import replacing
 from tiler.stage import Box, Facts, Layout, Scope
 from tiler.task import Record
 from tiler.watching import Item, RunStart, Watcher, tell_command
+from tiler.written import FILES
 
 EVERY = 1.0  # s between two writes
 CHUNK = 1000  # tiles or seams a line
@@ -250,6 +251,8 @@ def numbers(facts: Facts) -> dict[str, float]:
     --------
     >>> numbers({"counts": {"cells": 12, "facets": 0}, "facts": {"worst_ratio": [0.2, 0.4]}, "order": "heights"})
     {'cells': 12, 'worst_ratio': 0.4}
+    >>> numbers({"files": {"mesh/0_0.vtu": [700, 1], "boundary/0_0.vtp": [55, 2]}})
+    {'bytes': 755}
     """
     found: dict[str, float] = {}
     groups: list[Mapping[str, Any]] = [facts, *(facts[group] for group in GROUPS if group in facts)]
@@ -258,6 +261,8 @@ def numbers(facts: Facts) -> dict[str, float]:
         last = value[-1] if name == "worst_ratio" and value else value
         if type(last) in (int, float) and last and math.isfinite(last) and name not in PLACING:
             found[name] = last
+    if written := sum(size for size, _ in facts.get(FILES, {}).values()):
+        found["bytes"] = written
     return found
 
 

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from pipeline.errors import CityError
 from tiler import fork_server
+from tiler.addresses import ANYWHERE
 from tiler.limits import Limits, WorkerError, machine_memory, run_guarded, tell_death, tell_memory
 from tiler.stage import Facts
 from tiler.task import Failure, Record, Task, run_task
@@ -84,6 +85,8 @@ class Dask:
         Number of threads that run tasks.
     limits : Limits
         What a task may take.
+    scheduler : distributed.Scheduler, optional
+        The scheduler, where it is in this process: its HTTP server shows the page of the run.
 
     Notes
     -----
@@ -91,10 +94,12 @@ class Dask:
     tells (`tiler.limits`); the others are sent again.
     """
 
-    def __init__(self, client: Any, workers: int, limits: Limits | None = None) -> None:
+    def __init__(
+        self, client: Any, workers: int, limits: Limits | None = None, scheduler: Any | None = None
+    ) -> None:
         from distributed import as_completed
 
-        self.workers = workers
+        self.workers, self.scheduler = workers, scheduler
         self._limits = limits or Limits()
         self._client = client
         self._completed = as_completed()
@@ -243,7 +248,7 @@ def serial() -> Iterator[Executor]:
 
 
 @contextmanager
-def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
+def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHERE) -> Iterator[Executor]:
     """Run tasks in worker processes of one thread each on this machine; they end with the context.
 
     Parameters
@@ -253,6 +258,8 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
     limits : Limits, optional
         What a task may take; by default its share of the machine's memory, and any time. A worker that dies is
         replaced.
+    dashboard : str
+        Where the HTTP server of the scheduler listens, ``HOST:PORT``.
     """
     fork_server.begin()
     from dask import config
@@ -289,7 +296,7 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
+            dashboard_address=dashboard,
             memory_limit=limits.memory,
             silence_logs="CRITICAL",
         ) as cluster,
@@ -297,7 +304,7 @@ def local(workers: int, limits: Limits | None = None) -> Iterator[Executor]:
     ):
         client.register_plugin(WorkerSetup(int(REFUSE_AT * limits.memory)))
         try:
-            yield Dask(client, workers, limits)
+            yield Dask(client, workers, limits, cluster.scheduler)
         except KeyboardInterrupt:  # at once: nobody waits for what workers are at
             _kill_workers(cluster)
             raise

@@ -17,8 +17,9 @@ from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.config import Config
 from tiler.context import RunContext, pack_tiles, seam_name, tile_key
+from tiler.dashboard.server import read_address, watched
 from tiler.engine import Engine, Progress, StoppedError
-from tiler.executors import Executor, connect, local, serial, share_memory
+from tiler.executors import ANYWHERE, Executor, connect, local, serial, share_memory
 from tiler.failures import Policy
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
@@ -78,6 +79,7 @@ def run(
     stages: Sequence[Stage] = (),
     parameters: Mapping[str, Any] | None = None,
     watchers: Sequence[Watcher] = (),
+    dashboard: str | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -95,6 +97,9 @@ def run(
         Parameters that further stages declare, besides those of `config`.
     watchers : sequence of Watcher
         Told what is planned, begun, done and said; of the end too, if the run fails before it has begun.
+    dashboard : str, optional
+        Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
+        default. `say` is told its URL.
 
     Returns
     -------
@@ -118,13 +123,15 @@ def run(
     told = Watchers(watchers if say is None else [*watchers, Listener(say)])
     try:
         check_sources(config)
+        if dashboard is not None:
+            read_address(dashboard)
         out = Path(config.out)
         own = check_own(config, stages, parameters)
         check_folder(out, overwrite=config.overwrite)
         with only_run(out, told.say):
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
-            return _run(config, out, earlier, damage, own, announce, told)
+            return _run(config, out, earlier, damage, own, announce, told, dashboard)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
             told.end("failed", tell_error(error))
@@ -139,6 +146,7 @@ def _run(
     own: OwnStages,
     announce: Announce | None,
     watchers: Watchers,
+    dashboard: str | None,
 ) -> dict[str, Any]:
     say = watchers.say
     start, untouched = time.perf_counter(), bool(earlier)
@@ -165,7 +173,7 @@ def _run(
         shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(config, out)
         progress = begin_watching(config, out, plan, own, watchers, announce=announce)
-        record |= _mesh_region(config, out, plan, own, watchers, damage)
+        record |= _mesh_region(config, out, plan, own, watchers, damage, dashboard)
         record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:
             say(message)
@@ -195,6 +203,7 @@ def _mesh_region(
     own: OwnStages,
     watchers: Watchers,
     damage: Mapping[str, str],
+    dashboard: str | None,
 ) -> dict[str, Any]:
     """Run all stages, and write the indexes of their pieces and the manifest.
 
@@ -202,7 +211,10 @@ def _mesh_region(
     does not touch has its result already. Where one fails later, its neighbours keep the seam with it.
     """
     missing = Missing()
-    with _executor(config) as executor:
+    with (
+        _executor(config, dashboard or ANYWHERE) as executor,
+        watched(out, dashboard, getattr(executor, "scheduler", None), watchers.say),
+    ):
         while True:
             engine = make_engine(config, out, plan, executor, own, watchers)
             with stops(engine.stop, watchers.say):
@@ -379,13 +391,13 @@ def run_city_stages(engine: Engine, config: Config) -> int:
 
 
 @contextmanager
-def _executor(config: Config) -> Iterator[Executor]:
+def _executor(config: Config, dashboard: str) -> Iterator[Executor]:
     if config.scheduler:
         with connect(config.scheduler, Limits(config.time_limit)) as executor:
             yield executor
     elif config.workers:
         memory = int(config.memory_limit * 2**30) or share_memory(config.workers)
-        with local(config.workers, Limits(config.time_limit, memory)) as executor:
+        with local(config.workers, Limits(config.time_limit, memory), dashboard=dashboard) as executor:
             yield executor
     else:
         with serial() as executor:

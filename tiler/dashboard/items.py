@@ -1,0 +1,211 @@
+"""What is known of the tiles or of the seams of a run: boxes, states by stage, and values to colour by."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tiler.dashboard.codes import Codes, State, combine
+
+GROWTH = 1024  # items that are made room for at least
+MOST_FACTS = 64  # kinds of values that are kept; a stage of the user's own may tell anything
+
+# Notes that say of something in the input that it is not in the mesh.
+DROPPED = frozenset(
+    {
+        *("building-lost", "building-covered-by-others", "building-beyond-region", "footprint-empty"),
+        *("footprint-not-finite", "footprint-too-small", "footprint-sliver", "footprint-duplicate"),
+        *("footprint-too-many-vertices", "footprint-lost"),
+    }
+)
+
+
+def is_drop(kind: str) -> bool:
+    """Tell whether a kind of note says that something in the input is not in the mesh.
+
+    Examples
+    --------
+    >>> is_drop("footprint-on-border-dropped"), is_drop("building-lost"), is_drop("courtyard-filled")
+    (True, True, False)
+    """
+    return kind in DROPPED or kind.endswith("-dropped")
+
+
+class Column:
+    """One number an item, with room for more items.
+
+    Parameters
+    ----------
+    dtype : dtype
+        Its type.
+    empty : float
+        Value of an item of which nothing is known.
+    """
+
+    def __init__(self, dtype: Any, empty: float) -> None:
+        self._empty = empty
+        self._values: NDArray[Any] = np.empty(0, dtype)
+
+    def __setitem__(self, k: int, value: float) -> None:
+        if k >= len(self._values):
+            more = np.full(max(GROWTH, k + 1), self._empty, self._values.dtype)
+            self._values = np.concatenate([self._values, more])
+        self._values[k] = value
+
+    def get(self, k: int) -> Any:
+        """Value of an item."""
+        return self._values[k] if k < len(self._values) else self._empty
+
+    def take(self, n: int) -> NDArray[Any]:
+        """Values of the first `n` items, (n,)."""
+        found = np.full(n, self._empty, self._values.dtype)
+        m = min(n, len(self._values))
+        found[:m] = self._values[:m]
+        return found
+
+
+class StageColumns:
+    """What one stage has done for the items of its scope."""
+
+    def __init__(self) -> None:
+        self.codes = Column(np.uint8, State.WAITING)
+        self.seconds = Column(np.float32, np.nan)
+        self.notes = Column(np.int32, 0)
+        self.dropped = Column(np.int32, 0)
+
+
+class Items:
+    """The items of a scope.
+
+    Attributes
+    ----------
+    names : list of str
+        Their names, in the order in which they were told.
+    layout : int
+        Rises when an item is added.
+    stages : dict of str to StageColumns
+        What each stage of this scope has done.
+    facts : dict of str to Column
+        What stages tell of items, by the name of the fact.
+    views : dict
+        What a map keeps of parts of the region, see `tiler.dashboard.map_view`; void when an item is added.
+    """
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.layout = 0
+        self.stages: dict[str, StageColumns] = {}
+        self.facts: dict[str, Column] = {}
+        self.views: dict[Any, Any] = {}
+        self._tally: NDArray[np.int16] = np.zeros((0, len(State)), np.int16)  # stages of each item in each state
+        self._boxes: list[tuple[float, float, float, float]] = []
+        self._index: dict[str, int] = {}
+        self._changed = Column(np.int64, 0)
+        self._known: tuple[int, NDArray[np.float64]] = (0, np.empty((0, 4)))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def add(self, rows: Iterable[Sequence[Any]], version: int) -> None:
+        """Add items as (name, xmin, ymin, xmax, ymax), boxes in metres; one that is there stays as it is."""
+        for name, *box in rows:
+            xmin, ymin, xmax, ymax = map(float, box)
+            if str(name) in self._index:
+                continue
+            self._index[str(name)] = len(self.names)
+            self._changed[len(self.names)] = version
+            self.names.append(str(name))
+            self._boxes.append((xmin, ymin, xmax, ymax))
+        if self.layout != len(self.names):
+            self.layout = len(self.names)
+            self.views.clear()
+            more = np.zeros((max(self.layout, GROWTH), len(State)), np.int16)
+            if self.layout > len(self._tally):
+                self._tally = np.concatenate([self._tally, more])
+
+    def find(self, name: str) -> int | None:
+        """Place of an item in the order, or None."""
+        return self._index.get(name)
+
+    def code(self, k: int, stage: str) -> int:
+        """State of an item in a stage."""
+        return int(self.stage(stage).codes.get(k))
+
+    def set_code(self, k: int, stage: str, code: int, version: int) -> None:
+        """Change the state of an item in a stage."""
+        codes = self.stage(stage).codes
+        self._tally[k, codes.get(k)] -= 1
+        self._tally[k, code] += 1
+        codes[k] = code
+        self._changed[k] = version
+
+    def stage(self, name: str) -> StageColumns:
+        """Columns of a stage."""
+        if name not in self.stages:
+            self.stages[name] = StageColumns()
+        return self.stages[name]
+
+    def tell(self, k: int, fact: str, value: float) -> None:
+        """Keep a fact of an item."""
+        if fact not in self.facts:
+            if len(self.facts) >= MOST_FACTS:
+                return
+            self.facts[fact] = Column(np.float64, np.nan)
+        self.facts[fact][k] = value
+
+    def boxes(self) -> NDArray[np.float64]:
+        """Boxes (m), (n, 4)."""
+        if self._known[0] != len(self._boxes):
+            self._known = len(self._boxes), np.array(self._boxes, np.float64).reshape(-1, 4)
+        return self._known[1]
+
+    def changed(self) -> NDArray[np.int64]:
+        """Version in which each item last changed, (n,)."""
+        return self._changed.take(len(self))
+
+    def codes(self, stage: str) -> Codes:
+        """State of each item, (n,): in one stage, or in all where `stage` is empty."""
+        if stage:
+            return (
+                self.stages[stage].codes.take(len(self)) if stage in self.stages else np.zeros(len(self), np.uint8)
+            )
+        counts = self._tally[: len(self)].astype(np.int64)
+        counts[:, State.WAITING] += len(self.stages)  # of which those in another state were taken away
+        return combine(counts)
+
+    def values(self, value: str, stage: str) -> NDArray[np.float64]:
+        """A value of each item, (n,), NaN where it is not known.
+
+        Parameters
+        ----------
+        value : str
+            ``"progress"``, the share of the stages that are done (%); ``"seconds"``, ``"notes"``, ``"dropped"``,
+            or the name of a fact.
+        stage : str
+            Of this stage alone, or of all where it is empty; facts are of the item, whatever the stage.
+        """
+        n = len(self)
+        if value in self.facts:
+            return self.facts[value].take(n)
+        if value == "progress":
+            return self._progress(stage)
+        total, known = np.zeros(n), np.zeros(n, np.bool_)
+        if value in {"seconds", "notes", "dropped"}:
+            for name, columns in self.stages.items():
+                if stage in {"", name}:
+                    codes = columns.codes.take(n)
+                    found = getattr(columns, value).take(n).astype(np.float64)
+                    finished = codes == State.DONE
+                    if value != "seconds":  # what an earlier run had done has no time in this one
+                        finished |= codes == State.REUSED
+                    known |= finished & np.isfinite(found)
+                    total += np.nan_to_num(found)
+        return np.where(known, total, np.nan)
+
+    def _progress(self, stage: str) -> NDArray[np.float64]:
+        if stage:
+            codes = self.codes(stage)
+            return np.where((codes == State.DONE) | (codes == State.REUSED), 100.0, 0.0)
+        done = self._tally[: len(self), [State.DONE, State.REUSED]].sum(axis=1)
+        return np.asarray(100.0 * done / max(len(self.stages), 1))

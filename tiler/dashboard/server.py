@@ -1,0 +1,244 @@
+"""Serve the page of a run: on the HTTP server of its Dask scheduler, or by a small one of its own."""
+
+import asyncio
+import ipaddress
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import ConfigError
+from tiler.addresses import ANYWHERE
+from tiler.dashboard.follow import Follower
+from tiler.dashboard.metrics import Collector
+
+PREFIX = "/citystitch"
+MOST_BODY = 0  # bytes of a body that is taken: nobody has anything to send
+
+
+def read_address(text: str) -> tuple[str, int]:
+    """Read an address to listen at.
+
+    Parameters
+    ----------
+    text : str
+        ``HOST:PORT``; port 0 is a free one, a port alone is of 127.0.0.1.
+
+    Raises
+    ------
+    ConfigError
+        If it is none, or another program listens there.
+
+    Examples
+    --------
+    >>> read_address("127.0.0.1:0"), read_address("[::1]:0")
+    (('127.0.0.1', 0), ('::1', 0))
+    """
+    host, port = _host(text), text.rpartition(":")[2]
+    if not port.isascii() or not port.isdigit() or int(port) > 65535:
+        raise ConfigError(
+            f"dashboard address {text!r}: is not HOST:PORT, port 0 to 65535; give 127.0.0.1:8787, say"
+        )
+    try:
+        family, kind, protocol, _, place = socket.getaddrinfo(host, int(port), type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind(place)
+    except OSError as error:
+        raise ConfigError(
+            f"dashboard address {text}: cannot be listened at ({error.strerror}); give another port, or port 0 "
+            "for a free one"
+        ) from error
+    return host, int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether only this machine reaches an address.
+
+    Examples
+    --------
+    >>> is_loopback("127.0.0.1"), is_loopback("localhost"), is_loopback("0.0.0.0")
+    (True, True, False)
+    """
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+@contextmanager
+def serve(follower: Follower, address: str = ANYWHERE) -> Iterator[str]:
+    """Serve the page of a run by a server of its own, in a thread; gives its URL.
+
+    Parameters
+    ----------
+    follower : Follower
+        The run.
+    address : str
+        Where to listen, see `read_address`.
+
+    Raises
+    ------
+    ConfigError
+        If nobody can listen there.
+    """
+    from tornado.httpserver import HTTPServer
+    from tornado.netutil import bind_sockets
+    from tornado.web import Application
+
+    from tiler.dashboard.handlers import make_rules
+
+    host, port = read_address(address)
+    rules = make_rules(follower, loopback=is_loopback(host), dask=False, root=True)
+    app = Application(rules, log_function=_silent)
+    sockets = bind_sockets(port, host)
+    loop = asyncio.new_event_loop()
+    ready = threading.Event()
+
+    async def begin() -> HTTPServer:
+        server = HTTPServer(app, max_body_size=MOST_BODY)
+        server.add_sockets(sockets)
+        ready.set()
+        return server
+
+    def work() -> None:
+        asyncio.set_event_loop(loop)
+        server = loop.run_until_complete(begin())
+        loop.run_forever()
+        server.stop()
+        loop.run_until_complete(server.close_all_connections())
+        loop.run_until_complete(loop.shutdown_default_executor())
+        loop.close()
+
+    thread = threading.Thread(target=work, name="dashboard", daemon=True)
+    thread.start()
+    ready.wait()
+    try:
+        yield _url(host, sockets[0].getsockname()[1])
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+
+
+@contextmanager
+def mounted(follower: Follower, scheduler: Any, address: str) -> Iterator[str]:
+    """Show the page of a run on the HTTP server of its Dask scheduler, in this process; gives its URL.
+
+    Parameters
+    ----------
+    follower : Follower
+        The run.
+    scheduler : distributed.Scheduler
+        The scheduler.
+    address : str
+        Where it was told to listen.
+
+    Notes
+    -----
+    Where ``prometheus_client`` is there, Dask shows the metrics of its registry at ``/metrics``: ours are among
+    them.
+    """
+    from tiler.dashboard.handlers import make_rules
+
+    host = _host(address)
+    rules = make_rules(follower, loopback=is_loopback(host), dask=True)
+    scheduler.http_application.add_handlers(".*", rules)
+    with _registered(follower):
+        yield _url(host, scheduler.http_server.port)
+
+
+@contextmanager
+def watched(out: Path, address: str | None, scheduler: Any | None, say: Callable[[str], None]) -> Iterator[None]:
+    """Show the page of the run that this process drives, and tell its URL.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the run.
+    address : str or None
+        Where to listen; None shows nothing.
+    scheduler : distributed.Scheduler or None
+        The scheduler in this process, which listens there already, if there is one.
+    say : callable
+        Called with the URL, and a warning where others reach it.
+    """
+    if address is None:
+        yield
+        return
+    follower = Follower(out, lambda: True)
+    page = serve(follower, address) if scheduler is None else mounted(follower, scheduler, address)
+    with page as url:
+        say(f"dashboard: {url}")
+        _warn_of_others(address, say)
+        yield
+
+
+def _warn_of_others(address: str, say: Callable[[str], None]) -> None:
+    if not is_loopback(_host(address)):
+        say(f"the dashboard at {address} shows names and paths of this run to whoever reaches that address")
+
+
+def _host(address: str) -> str:
+    return address.rpartition(":")[0].strip("[]") or "127.0.0.1"
+
+
+def show_folder(folder: Path, address: str, say: Callable[[str], None]) -> None:
+    """Show the page of the run in a folder until the process is interrupted.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of a run, at work, ended or dead.
+    address : str
+        Where to listen.
+    say : callable
+        Called with the URL.
+
+    Raises
+    ------
+    InputError
+        If the folder is not that of a run.
+    ConfigError
+        If nobody can listen there.
+    """
+    follower = Follower(folder)
+    with follower.lock:
+        follower.advance(0.0)
+    with watched_folder(follower, address, say), suppress(KeyboardInterrupt):
+        threading.Event().wait()
+
+
+@contextmanager
+def watched_folder(follower: Follower, address: str, say: Callable[[str], None]) -> Iterator[str]:
+    """Show the page of a run by a server of its own, and tell its URL."""
+    with serve(follower, address) as url:
+        say(f"dashboard: {url} (Ctrl-C ends it)")
+        _warn_of_others(address, say)
+        yield url
+
+
+@contextmanager
+def _registered(follower: Follower) -> Iterator[None]:
+    try:
+        from prometheus_client import REGISTRY
+    except ImportError:
+        yield
+        return
+    collector = Collector(follower)
+    REGISTRY.register(collector)
+    try:
+        yield
+    finally:
+        with suppress(KeyError):
+            REGISTRY.unregister(collector)
+
+
+def _url(host: str, port: int) -> str:
+    name = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    return f"http://{name}:{port}{PREFIX}/"
+
+
+def _silent(_: Any) -> None:
+    """Log no requests."""
