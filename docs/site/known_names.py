@@ -1,0 +1,48 @@
+"""A docstring that names something of ours which is not there: a warning, and so an error of the build."""
+
+from importlib import import_module
+from typing import Any
+
+from pages import PACKAGES
+from sphinx.application import Sphinx
+from sphinx.util import logging
+
+logger = logging.getLogger(__name__)
+
+
+def exists(name: str) -> bool:
+    """Tell whether a dotted name is that of a module, or of something in one.
+
+    Examples
+    --------
+    >>> exists("tiler.run.run"), exists("tiler.run.walk")
+    (True, False)
+    """
+    parts = name.split(".")
+    for n in range(len(parts), 0, -1):
+        try:
+            thing: Any = import_module(".".join(parts[:n]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[n:]:
+            fields = getattr(thing, "__dataclass_fields__", {})
+            if part in fields and part == parts[-1]:
+                return True
+            if not hasattr(thing, part):
+                return False
+            thing = getattr(thing, part)
+        return True
+    return False
+
+
+def tell_unknown(app: Sphinx, env: Any, node: Any, contnode: Any) -> None:
+    """Warn of a name of ours that leads nowhere; those that no page describes are left as text."""
+    target = node.get("reftarget", "")
+    if target.split(".")[0] in PACKAGES and "." in target and not exists(target):
+        logger.warning("there is no %s", target, location=node, type="ref", subtype="ours")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Listen to references that Sphinx does not find."""
+    app.connect("missing-reference", tell_unknown)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
