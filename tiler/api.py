@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
 from tiler.config import Config, check_reach, load_config, make_config
+from tiler.plain_text import printable
 
 if TYPE_CHECKING:
     from tiler.city_mesh import CityMesh
@@ -78,7 +79,7 @@ def mesh(
     from tiler.run import run
 
     config = _configure(pointcloud, footprints, parameters)
-    run(config, stages=stages, parameters=stage_parameters)
+    run(config, stages=stages, parameters=stage_parameters, **_show(progress))
     return CityMesh(config.out)
 
 
@@ -181,6 +182,19 @@ def with_file(options: Mapping[str, Any]) -> dict[str, Any]:
     if files:
         check_reach(Path(files[0]), {name: value for name, value in given.items() if name not in values})
     return given | ({POSITIONAL: clouds} if clouds else {}) | values
+
+
+def _show(progress: bool) -> dict[str, Any]:
+    """Choose who tells how far a run is."""
+    from tiler.notebook_progress import NotebookProgress, in_notebook
+
+    if not progress:
+        return {}
+    if in_notebook():
+        return {"watchers": [NotebookProgress()]}
+    from tiler.terminal import print_step
+
+    return {"announce": print_step, "say": lambda text: print(printable(text))}
 
 
 def _configure(pointcloud: Source | Sequence[Source], footprints: Source, parameters: Mapping[str, Any]) -> Config:

@@ -29,6 +29,7 @@ MOST_CELLS = 5_000_000  # of a mesh that is put together in memory, some 0.5 GB
 MOST_SHOWN = 1_000_000
 SHOWN_SIZE = (960, 600)  # pixels
 JPEG_QUALITY = 85
+MOST_TOLD = 10  # missing tiles, and failed items, that the table lists
 NO_BUILDING = -1
 
 
@@ -137,6 +138,11 @@ class CityMesh:
     def missing(self) -> dict[str, str]:
         """Tiles that failed and were left out, and why; run again once the cause is mended."""
         return {tile: str(found["reason"]) for tile, found in self.record["missing"].items()}
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Other items that failed, as ``"stage name"``, and why: stages of your own, say."""
+        return {f"{found['stage']} {found['name']}": str(found["reason"]) for found in self.record["set_aside"]}
 
     def __len__(self) -> int:
         """Give the number of tiles."""
@@ -323,8 +329,10 @@ class CityMesh:
                 yield Building(name, house, number, ground, roof, footprint, thing["attributes"])
 
     def __repr__(self) -> str:
-        left_out = f", {len(self.missing):,} tiles missing" if self.missing else ""
-        return f"CityMesh({str(self.folder)!r}): {', '.join(f'{b} {a}' for a, b in self._facts()[:4])}{left_out}"
+        facts = [f"{number} {name}" for name, number in self._facts()]
+        facts += [f"{len(self.missing):,} tiles missing"] if self.missing else []
+        facts += [f"{len(self.failed):,} items failed"] if self.failed else []
+        return f"CityMesh({str(self.folder)!r}): {', '.join(facts)}"
 
     def _repr_html_(self) -> str:
         """Show a picture and what there is, once."""
@@ -358,7 +366,8 @@ class CityMesh:
         ]
         changed = sum(group["count"] for group in self.record["notes"].values())
         rows += [("dropped, repaired, defaulted", f"{changed:,}; see record['notes']")] if changed else []
-        return rows + [("missing", f"tile {tile}: {reason}") for tile, reason in self.missing.items()][:10]
+        rows += [("missing", f"tile {tile}: {reason}") for tile, reason in self.missing.items()][:MOST_TOLD]
+        return rows + [("failed", f"{item}: {reason}") for item, reason in self.failed.items()][:MOST_TOLD]
 
     def _draw(self) -> str:
         """Give the picture as HTML, or say why there is none."""
@@ -376,7 +385,7 @@ class CityMesh:
 
 
 def _shrink(png: bytes) -> bytes:
-    """Write a PNG file as JPEG: a notebook keeps what it shows, and this is a tenth."""
+    """Write a PNG file as JPEG: a notebook keeps what it shows, and this is far smaller."""
     from PIL import Image
 
     small = BytesIO()

@@ -57,5 +57,7 @@ def _plan(config: Config, picture: Path | None) -> tuple[dict[str, Any], str]:
     from tiler.plan_report import WIDTH, plan_run
 
     text = StringIO()
-    facts = plan_run(config, picture=picture, console=Console(file=text, width=WIDTH, highlight=False))
+    # Rich would write colours, or to the notebook itself.
+    console = Console(file=text, width=WIDTH, highlight=False, color_system=None, force_jupyter=False)
+    facts = plan_run(config, picture=picture, console=console)
     return facts, text.getvalue()
