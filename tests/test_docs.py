@@ -163,6 +163,12 @@ def test_a_broken_link_or_name_ends_the_build(tmp_path: Path) -> None:
     assert "tiler.run.run" not in done.stderr
 
 
+def test_examples_of_the_build_hold() -> None:
+    command = [sys.executable, "-m", "doctest", str(SITE / "known_names.py")]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment(), check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
 def test_links_that_leave_the_pages_become_text() -> None:
     """Those to notebooks lead to their pages, those to what is not there stay, to be told by Sphinx."""
     code = (

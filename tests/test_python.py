@@ -28,7 +28,10 @@ def city(small_run: Path) -> CityMesh:
     return tiler.open(small_run)
 
 
-@pytest.mark.parametrize("command", ["import tiler; tiler.CityError", "import tiler.api"])
+@pytest.mark.parametrize(
+    "command",
+    ["import tiler; tiler.CityError", "import tiler.api", "from tiler.cli import make_parser; make_parser()"],
+)
 def test_the_import_is_light(command: str) -> None:
     code = f"{command}; import sys; print(*(name for name in {HEAVY} if name in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
