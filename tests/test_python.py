@@ -77,6 +77,16 @@ def test_arguments_that_are_no_parameters() -> None:
         tiler.open("nowhere")
 
 
+@pytest.mark.parametrize(("guard", "refused"), [("", True), ('if __name__ == "__main__":\n    ', False)])
+def test_a_script_that_its_workers_would_run_is_refused(tmp_path: Path, guard: str, refused: bool) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(f"import tiler\n{guard}tiler.mesh('nowhere.laz', workers=2)\n")
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, cwd=tmp_path)
+    found = done.stderr.splitlines()[-1]
+    assert ("workers = 2: each imports" in found) == refused
+    assert ("nowhere.laz" in found) != refused
+
+
 def test_tiles_are_read_as_arrays(city: CityMesh) -> None:
     assert len(city) == len(city.tiles) == 4
     pieces = list(city)

@@ -1,6 +1,7 @@
 """The Python interface, as `import tiler` gives it: the command line calls the same functions."""
 
 import dataclasses
+import sys
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -58,7 +59,8 @@ def mesh(
     TypeError
         If a parameter is unknown.
     ConfigError
-        If a value is of the wrong type or out of bounds.
+        If a value is of the wrong type or out of bounds; if a script asks for workers and does not
+        keep its calls below ``if __name__ == "__main__":``.
     CityError
         If nothing could be made of the input.
 
@@ -79,6 +81,7 @@ def mesh(
     from tiler.run import run
 
     config = _configure(pointcloud, footprints, parameters)
+    _check_script(config.workers)
     run(config, stages=stages, parameters=stage_parameters, **_show(progress))
     return CityMesh(config.out)
 
@@ -182,6 +185,16 @@ def with_file(options: Mapping[str, Any]) -> dict[str, Any]:
     if files:
         check_reach(Path(files[0]), {name: value for name, value in given.items() if name not in values})
     return given | ({POSITIONAL: clouds} if clouds else {}) | values
+
+
+def _check_script(workers: int) -> None:
+    """Refuse a script that its own workers would run again: they are processes that import it."""
+    path = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+    if workers and path.suffix == ".py" and path.is_file() and "__name__" not in path.read_text(errors="replace"):
+        raise ConfigError(
+            f"workers = {workers}: each imports {path}, which would mesh again; put its calls below "
+            'if __name__ == "__main__":, or give workers=0'
+        )
 
 
 def _show(progress: bool) -> dict[str, Any]:
