@@ -192,9 +192,13 @@ def rows(city: CityMesh) -> list[tuple[str, str]]:
     return re.findall("<tr><th>(.*?)</th><td>(.*?)</td></tr>", city._repr_html_())
 
 
-def test_a_plan_is_that_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plan_is_that_of_the_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     files = tiler.write_city(tmp_path / "city", size=300, buildings=4, density=0.5)
-    plan = tiler.plan(files.clouds, files.footprints, tile_size=150)
+    with monkeypatch.context() as patch:
+        patch.setenv("FORCE_COLOR", "1")
+        plan = tiler.plan(files.clouds, files.footprints, tile_size=150)
     assert capsys.readouterr().out == ""
     assert main(["plan", str(files.clouds[0]), "--footprints", str(files.footprints), "--tile-size", "150"]) == 0
     assert [line.split() for line in repr(plan).splitlines()] == [
