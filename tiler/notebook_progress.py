@@ -112,4 +112,5 @@ def _bar(title: str, done: int, total: int) -> str:
 def _list(title: str, lines: list[str]) -> str:
     more = [f"and {len(lines) - LISTED:,} before"] if len(lines) > LISTED else []
     items = "".join(f"<li>{html.escape(line)}</li>" for line in [*more, *lines[-LISTED:]])
-    return f"{html.escape(title)}<ul>{items}</ul>"
+    heading = f"<b>{html.escape(title)}</b>" if title else ""
+    return f"{heading}<ul>{items}</ul>"
