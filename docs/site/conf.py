@@ -8,7 +8,7 @@ sys.path.insert(0, str(Path(__file__).parent))  # the extension beside this file
 project = "citystitch"
 copyright = "the citystitch authors"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "known_names", "mathml"]
-# A short name that several rooms have is a link to one of them; unknown names of ours are told by known_names.
+# A name that its module does not have may be of several rooms; known_names tells of those that are nowhere.
 suppress_warnings = ["ref.python"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 default_role = "py:obj"  # a name in single backticks is a link where it is known

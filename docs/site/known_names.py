@@ -1,9 +1,11 @@
-"""A docstring that names something of ours which is not there: a warning, and so an error of the build."""
+"""Names in docstrings: each leads to what its module means by it; one of ours that is not there is an error."""
 
+import sys
 from importlib import import_module
 from typing import Any
 
 from pages import PACKAGES
+from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.util import logging
 
@@ -35,6 +37,20 @@ def exists(name: str) -> bool:
     return False
 
 
+def settle_names(app: Sphinx, doctree: Any) -> None:
+    """Give types their full names; a word in lower case, as the n of ``float64, (n, 2)``, is none."""
+    for node in list(doctree.findall(pending_xref)):
+        target, module = node.get("reftarget", ""), node.get("py:module")
+        if node.get("refdomain") != "py" or node.get("reftype") not in ("class", "exc") or "." in target:
+            continue
+        if not target[:1].isupper():
+            node.replace_self(node.children)
+        elif module:
+            meant = getattr(sys.modules.get(module), target, None)
+            if isinstance(meant, type):
+                node["reftarget"] = f"{meant.__module__}.{meant.__qualname__}"
+
+
 def tell_unknown(app: Sphinx, env: Any, node: Any, contnode: Any) -> None:
     """Warn of a name of ours that leads nowhere; those that no page describes are left as text."""
     target = node.get("reftarget", "")
@@ -43,6 +59,7 @@ def tell_unknown(app: Sphinx, env: Any, node: Any, contnode: Any) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Listen to references that Sphinx does not find."""
+    """Look at all names once they are read, and at those that Sphinx does not find."""
+    app.connect("doctree-read", settle_names)
     app.connect("missing-reference", tell_unknown)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
