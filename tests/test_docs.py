@@ -129,7 +129,7 @@ def test_a_browser_shows_the_pages(site: Path, tmp_path: Path, width: int) -> No
         assert "citystitch" in found["title"]
         assert found["width"] <= width, found["url"]
         if "first_poisson" in found["url"]:
-            assert found["formulas"] == 4
+            assert found["formulas"] == 1
 
 
 def open_pages(paths: list[Path], width: int, folder: Path) -> list[dict[str, Any]]:
