@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-long lint bench bench-tiles bench-exports simulate studies quality reliability clean
+.PHONY: demo docs test test-long lint bench bench-tiles bench-exports simulate studies quality reliability clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("citystitch needs Python 3.11 or newer, this is " + sys.version) if sys.version_info < (3, 11) else None'
@@ -15,6 +15,9 @@ $(STAMP): pyproject.toml
 
 demo: $(STAMP)
 	$(BIN)/citystitch demo --out demo
+
+docs: $(STAMP)
+	$(BIN)/python docs/site/build.py docs/_build
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 -m 'not long'
@@ -51,4 +54,4 @@ reliability: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.reliability
 
 clean:
-	rm -rf $(VENV) demo out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) demo out docs/_build .pytest_cache .mypy_cache .ruff_cache

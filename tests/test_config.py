@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from tiler.cli import make_parser, with_file
+from tiler.api import with_file
+from tiler.cli import make_parser
 from tiler.config import Config, annotated_defaults, load_config, make_config
 
 

@@ -15,7 +15,8 @@ import pytest
 
 from pipeline.errors import CityError, ConfigError, InputError, OutputError
 from tests.towns import Town, make_town
-from tiler.cli import make_parser, with_file
+from tiler.api import with_file
+from tiler.cli import make_parser
 from tiler.config import make_config
 from tiler.events import EventLog, begin_file, numbers, open_log, read_events
 from tiler.run import run

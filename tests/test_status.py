@@ -21,7 +21,8 @@ import pytest
 from pipeline.errors import CityError, ConfigError, InputError
 from tests.test_run import hashes
 from tests.towns import Town, make_town
-from tiler.cli import main, make_parser, with_file
+from tiler.api import with_file
+from tiler.cli import main, make_parser
 from tiler.config import make_config
 from tiler.folder_lock import LOCK, is_held, only_run
 from tiler.progress import RunProgress, command_line

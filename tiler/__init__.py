@@ -1,1 +1,59 @@
-"""Everything with a clock, a disk or a process: region, files, runs, the command line."""
+"""Everything with a clock, a disk or a process: region, files, runs, the command line, and the Python interface.
+
+    import tiler
+
+    city = tiler.mesh("tiles/*.laz", "buildings.gpkg", out="out")
+
+What stands in ``__all__`` is the interface. It is loaded when it is first used, so that the import is cheap.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.errors import CityError
+    from tiler.api import mesh, plan, write_city
+    from tiler.api import open_folder as open
+    from tiler.city_mesh import Building, CityMesh, Picture
+    from tiler.mesh_pieces import MeshPiece
+    from tiler.plan_view import RunPlan
+
+__all__ = [
+    "Building",
+    "CityError",
+    "CityMesh",
+    "MeshPiece",
+    "Picture",
+    "RunPlan",
+    "mesh",
+    "open",
+    "plan",
+    "write_city",
+]
+
+# Where each name is, and what it is called there. None may be that of a module of this package: importing the
+# module would take its place.
+_PLACES = {
+    "Building": ("tiler.city_mesh", "Building"),
+    "CityError": ("pipeline.errors", "CityError"),
+    "CityMesh": ("tiler.city_mesh", "CityMesh"),
+    "MeshPiece": ("tiler.mesh_pieces", "MeshPiece"),
+    "Picture": ("tiler.city_mesh", "Picture"),
+    "RunPlan": ("tiler.plan_view", "RunPlan"),
+    "mesh": ("tiler.api", "mesh"),
+    "open": ("tiler.api", "open_folder"),
+    "plan": ("tiler.api", "plan"),
+    "write_city": ("tiler.api", "write_city"),
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'tiler' has no attribute {name!r}")
+    place, there = _PLACES[name]
+    globals()[name] = value = getattr(import_module(place), there)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 from pipeline.errors import CityError, ConfigError
 from tiler import fork_server
 from tiler.addresses import ANYWHERE
-from tiler.config import Config, annotated_defaults, check_reach, load_config, make_config
+from tiler.api import POSITIONAL, with_file
+from tiler.config import Config, annotated_defaults, make_config
 from tiler.domain import Height
 from tiler.export import FORMATS
 from tiler.plain_text import printable
@@ -28,7 +29,6 @@ EXIT_CODES = (
 )
 METAVARS = {str: "NAME", float: "NUMBER", int: "NUMBER"}
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
-POSITIONAL = "pointcloud"
 DEMO_TILES = 3  # tiles along each side of the demo's city, fewer where they would be too small
 LEAST_DEMO_TILE = 150.0  # m
 EXPORT_OPTIONS = {option for kind in FORMATS.values() for option in kind.options}
@@ -241,27 +241,6 @@ def _run(options: argparse.Namespace) -> int:
 
     print(run_alone(config, options.only, say=None if options.quiet else say))
     return 0
-
-
-def with_file(options: dict[str, Any]) -> dict[str, Any]:
-    """Put the parameters of a configuration file below those of the command line.
-
-    Parameters
-    ----------
-    options : dict
-        What the parser found; what is no parameter of a run is passed over.
-    """
-    names = {entry.name for entry in dataclasses.fields(Config)}
-    values = {name: value for name, value in options.items() if name in names}
-    sources: list[str] = values.pop(POSITIONAL)
-    files = [source for source in sources if source.lower().endswith(".toml")]
-    if len(files) > 1:
-        raise ConfigError(f"{len(files)} configuration files given ({', '.join(files)}); give one")
-    clouds = [source for source in sources if source not in files]
-    given = load_config(Path(files[0])) if files else {}
-    if files:
-        check_reach(Path(files[0]), {name: value for name, value in given.items() if name not in values})
-    return given | ({POSITIONAL: clouds} if clouds else {}) | values
 
 
 def _run_config(

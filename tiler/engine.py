@@ -20,7 +20,11 @@ from tiler.executors import Executor
 from tiler.failures import Policy, SetAside, ends_the_run, tell_reason, tries
 from tiler.gaps import Gaps
 from tiler.keys import declared_values, file_identity, item_key, stage_digest
-from tiler.plan import (
+from tiler.records import Records
+from tiler.stage import Box, Layout, Scope, Stage
+from tiler.store import Store
+from tiler.task import Declared, Failure, Record, Task
+from tiler.task_graph import (
     Items,
     Refs,
     extents,
@@ -33,10 +37,6 @@ from tiler.plan import (
     order_stages,
     reads_everything,
 )
-from tiler.records import Records
-from tiler.stage import Box, Layout, Scope, Stage
-from tiler.store import Store
-from tiler.task import Declared, Failure, Record, Task
 
 Progress = Callable[[str, int, int, Record], None]
 Item = tuple[str, str]  # stage and name

@@ -13,13 +13,14 @@ from typing import Any
 
 from pipeline.errors import CityError, OutputError
 from stitch.grid import seams_of_tile
+from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.config import Config
 from tiler.context import RunContext, pack_tiles, seam_name, tile_key
 from tiler.dashboard.server import read_address, watched
 from tiler.engine import Engine, Progress, StoppedError
-from tiler.executors import ANYWHERE, Executor, connect, local, serial, share_memory
+from tiler.executors import Executor, connect, local, serial, share_memory
 from tiler.failures import Policy
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
