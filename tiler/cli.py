@@ -1,4 +1,4 @@
-"""The command line: `citystitch run | plan | check | status | synth | demo | render | export | config`."""
+"""The command line: `citystitch run | plan | check | status | report | synth | demo | render | export | ...`."""
 
 import argparse
 import dataclasses
@@ -96,6 +96,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     _add_parameters(run)
     run.add_argument("--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure")
+    run.add_argument(
+        "--no-report", action="store_false", dest="report", help="do not write report.html at the end"
+    )
     plan = command("plan", _plan, "tell what a run would do and take, without doing it")
     plan.add_argument(
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
@@ -111,6 +114,8 @@ def make_parser() -> argparse.ArgumentParser:
     status = command("status", _status, "tell how far a run is, whether it is alive, and how to go on")
     status.add_argument("directory", type=Path, help="folder of a run")
     status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
+    report = command("report", _report, "write report.html: what a run made, how good it is, what was left out")
+    report.add_argument("directory", type=Path, help="folder of a run")
     synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
     synth.add_argument("directory", type=Path, help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
@@ -122,9 +127,10 @@ def make_parser() -> argparse.ArgumentParser:
     render.add_argument("-o", "--output", type=Path, required=True, help="PNG file to write")
     render.add_argument(
         "--what",
-        choices=("boundary", "mesh", "overview", "tiles", "sizes"),
+        choices=("boundary", "mesh", "overview", "tiles", "sizes", "quality", "citymodel"),
         default="boundary",
-        help="what to draw; sizes: triangles from above, by the length of their edges",
+        help="what to draw; sizes: triangles from above, by the length of their edges; quality: the boundary by "
+        "the cells behind it; citymodel: blocks on the terrain",
     )
     _add_export(command("export", _export, "write the mesh of a run for other programs, each vertex once"))
     command("config", _config, "print all parameters of a run, annotated, as a configuration file")
@@ -199,7 +205,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     config = make_config(with_file(vars(options)))
     if options.only is None:
-        return _run_config(config)
+        return _run_config(config, report=options.report)
     from tiler.run import run_alone
 
     print(run_alone(config, options.only, say=print))
@@ -227,12 +233,14 @@ def with_file(options: dict[str, Any]) -> dict[str, Any]:
     return given | ({POSITIONAL: clouds} if clouds else {}) | values
 
 
-def _run_config(config: Config) -> int:
+def _run_config(config: Config, *, report: bool = True) -> int:
     from tiler.run import run
     from tiler.terminal import print_step, print_summary
 
     record = run(config, announce=print_step, say=say)
     print_summary(record, Path(config.out))
+    if report:
+        _report_run(Path(config.out))
     code: int = record["exit_code"]
     return code
 
@@ -273,6 +281,26 @@ def _status(options: argparse.Namespace) -> int:
     else:
         print_status(options.directory, status, Console(highlight=False))
     return 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from tiler.report import write_report
+
+    say(str(write_report(options.directory)))
+    return 0
+
+
+def _report_run(out: Path) -> None:
+    """Write the report of a run that has just ended; the mesh is there, whatever becomes of it."""
+    from tiler.report import write_report
+
+    try:
+        say(f"report: {write_report(out)}")
+    except CityError as error:
+        print(
+            f"citystitch: no report: {printable(str(error))}; citystitch report {printable(str(out))} tries again",
+            file=sys.stderr,
+        )
 
 
 def _synth(options: argparse.Namespace) -> int:
@@ -333,7 +361,7 @@ def _demonstrate(title: str, inputs: dict[str, Any], out: Path, pictures: dict[P
 def _render(options: argparse.Namespace) -> int:
     from tiler.render import render_run
 
-    render_run(options.directory, options.output, what=options.what)
+    render_run(options.directory, options.output, what=options.what, say=say)
     say(str(options.output))
     return 0
 
