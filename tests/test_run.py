@@ -84,7 +84,7 @@ def arguments(city: Path, out: Path, *others: str) -> list[str]:
     return ["run", str(city), "--footprints", str(city / "footprints.gpkg"), "--out", str(out), *others]
 
 
-TIMED = ("run.json", "progress.json", "config.toml", "report.html")
+TIMED = ("run.json", "progress.json", "events.jsonl", "config.toml", "report.html")
 
 
 def hashes(folder: Path) -> dict[str, str]:

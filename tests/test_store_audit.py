@@ -106,7 +106,7 @@ def test_a_sound_run_is_told_to_be_so(
     n = sum(1 for _ in (town.out / "store.zarr").glob("*/*/zarr.json"))
     assert re.search(rf": {n} results and 12 files beside the store, [\d.]+ MB: every byte is as it was", line)
     size = sum(path.stat().st_size for path in town.out.rglob("*") if path.is_file())
-    others = ("run.json", "progress.json", "config.toml", "store.zarr/manifest.jsonl")
+    others = ("run.json", "progress.json", "events.jsonl", "config.toml", "store.zarr/manifest.jsonl")
     beside = sum((town.out / name).stat().st_size for name in others)
     assert f" {(size - beside) / 1e6:.1f} MB" in line
 

@@ -44,14 +44,14 @@ Item = tuple[str, str]  # stage and name
 class Watch(Protocol):
     """What else a progress may want to know."""
 
-    def planned(self, stage: str, total: int) -> None:
+    def planned(self, stage: str, scope: Scope, total: int) -> None:
         """Take note of how many items a stage has."""
 
     def submitted(self, stage: str, name: str) -> None:
         """Take note of an item that was given to a worker."""
 
-    def failed(self, stage: str, name: str) -> None:
-        """Take note of an item that failed, or that is not run for want of one that did."""
+    def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
+        """Take note of an item that failed, or that is not run because it needs one that is not there."""
 
 
 PER_WORKER, LEAST_WINDOW = 4, 8  # tasks in flight
@@ -326,7 +326,7 @@ class _Run:
         self.tasks: dict[int, Task] = {}
         if engine._watch is not None:
             for planned in plan:
-                engine._watch.planned(planned.stage.name, len(planned.items.names))
+                engine._watch.planned(planned.stage.name, planned.stage.scope, len(planned.items.names))
 
     def drive(self) -> None:
         executor = self.engine._executor
@@ -352,7 +352,7 @@ class _Run:
         refs, lacking = self._find_reads(planned, item)
         if lacking:
             engine.blocked[stage.name, name] = lacking[0]
-            self._lose(ticket, name)
+            self._lose(ticket, name, f"not run: {' '.join(lacking[0])} is not there", lacking[0])
             return
         path, identity = file_identity(engine.layout, stage.scope, name)
         xmin, ymin, xmax, ymax = planned.items.boxes[item].tolist()
@@ -416,7 +416,7 @@ class _Run:
             return
         if ends_the_run(failure, stage.scope, engine._policy):
             if engine._watch is not None:
-                engine._watch.failed(stage.name, task.name)
+                engine._watch.failed(stage.name, task.name, tell_reason(failure.error))
             raise _named(failure.error, stage, task.name)
         engine.set_aside[stage.name, task.name] = SetAside(
             stage.name,
@@ -429,12 +429,12 @@ class _Run:
             task.refs,
             task.file,
         )
-        self._lose(ticket, task.name)
+        self._lose(ticket, task.name, tell_reason(failure.error))
 
-    def _lose(self, ticket: int, name: str) -> None:
+    def _lose(self, ticket: int, name: str, reason: str, needs: Item | None = None) -> None:
         """Go on without an item."""
         if self.engine._watch is not None:
-            self.engine._watch.failed(self.plan[self.rank[ticket]].stage.name, name)
+            self.engine._watch.failed(self.plan[self.rank[ticket]].stage.name, name, reason, needs)
         self._settle_one(ticket)
 
     def _settle_one(self, ticket: int) -> None:

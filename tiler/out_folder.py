@@ -15,12 +15,12 @@ from tiler.store import MANIFEST
 # What a run writes, and all that --overwrite removes; the record is replaced.
 INDEXES = ("mesh.pvtu", "boundary.pvtp")
 PIECES = {"mesh": ".vtu", "boundary": ".vtp"}
-RUN_RECORD, PROGRESS, STORE = "run.json", "progress.json", "store.zarr"
+RUN_RECORD, PROGRESS, EVENTS, STORE = "run.json", "progress.json", "events.jsonl", "store.zarr"
 MANIFEST_PATH = f"{STORE}/{MANIFEST}"
-EVENTS, REPORT = "events.jsonl", "report.html"
+REPORT = "report.html"
 STALE = (*INDEXES, REPORT)  # what an earlier run said of all of its mesh
 RESULTS = (
-    *(RUN_RECORD, PROGRESS, REPORT, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
+    *(RUN_RECORD, PROGRESS, EVENTS, REPORT, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
     *(*INDEXES, *PIECES, STORE, TASKS, "only"),
 )
 # A file on its way to its place, of a writer that was killed: see `tiler.atomic`.

@@ -15,7 +15,9 @@ from typing import Any
 from tiler.atomic import replacing
 from tiler.config import Config
 from tiler.out_folder import PROGRESS
+from tiler.stage import Scope
 from tiler.task import Record
+from tiler.watching import Item, Watcher
 
 SCHEMA = 1  # of progress.json
 EVERY = 2.0  # s between two writes of it
@@ -45,7 +47,7 @@ class StageProgress:
     finished: float | None = None
 
 
-class RunProgress:
+class RunProgress(Watcher):
     """The progress of a run, given to an `Engine`, which tells it what begins, ends and fails.
 
     Parameters
@@ -97,7 +99,7 @@ class RunProgress:
         """Seconds after the start at which each finished stage was done."""
         return {name: stage.finished for name, stage in self.stages.items() if stage.finished is not None}
 
-    def planned(self, stage: str, total: int) -> None:
+    def planned(self, stage: str, scope: Scope, total: int) -> None:
         """Take note of how many items a stage has."""
         self._stage(stage).total = total
 
@@ -106,7 +108,7 @@ class RunProgress:
         self._in_hand[stage, name] = time.time()
         self._write_sometimes()
 
-    def failed(self, stage: str, name: str) -> None:
+    def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
         """Take note of an item that ended in an error."""
         self._in_hand.pop((stage, name), None)
         self._stage(stage).failed += 1
@@ -125,6 +127,10 @@ class RunProgress:
         self._write_sometimes()
         if done == total and self._announce is not None:
             self._announce(f"{stage} ({total})", state.seconds)
+
+    def end(self, status: str, error: str = "") -> None:
+        """Write how the run ended."""
+        self.write(status, error)
 
     def write(self, status: str, error: str = "") -> None:
         """Write the file.

@@ -37,9 +37,9 @@ from tiler.out_folder import (
     refuse_inputs_within,
     remove_strangers,
 )
-from tiler.own_stages import OwnStages, check_own, list_stages, run_own_stages
+from tiler.own_stages import OwnStages, check_own, run_own_stages
 from tiler.planning import Plan, check_sources, identify, make_plan
-from tiler.progress import Announce, RunProgress
+from tiler.progress import Announce
 from tiler.quarantine import (
     HolesError,
     Missing,
@@ -49,6 +49,7 @@ from tiler.quarantine import (
     save_config,
     stop_at_holes,
 )
+from tiler.run_watchers import begin_watching
 from tiler.seal import seal
 from tiler.settling import domain_of_run, settle_domain, take_domain
 from tiler.stage import REGION_ITEM, Stage
@@ -61,6 +62,7 @@ from tiler.stopping import stops
 from tiler.summary import describe_tasks, summarise_run
 from tiler.task import peak_memory
 from tiler.vtk_files import write_pvtp, write_pvtu
+from tiler.watching import Listener, Watcher, Watchers
 from tiler.written import state_files
 
 SCHEMA = 1  # version of run.json's layout
@@ -73,6 +75,7 @@ def run(
     say: Callable[[str], None] | None = None,
     stages: Sequence[Stage] = (),
     parameters: Mapping[str, Any] | None = None,
+    watchers: Sequence[Watcher] = (),
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -88,6 +91,8 @@ def run(
         Further stages, run after ours; they may read these and each other.
     parameters : mapping, optional
         Parameters that further stages declare, besides those of `config`.
+    watchers : sequence of Watcher
+        Told what is planned, begun, done and said; of the end too, if the run fails before it has begun.
 
     Returns
     -------
@@ -108,14 +113,20 @@ def run(
     that is used again is held against its checksum first; what is damaged is computed anew and noted
     (``damaged-artefact``).
     """
-    check_sources(config)
-    out = Path(config.out)
-    own = check_own(config, stages, parameters)
-    check_folder(out, overwrite=config.overwrite)
-    with only_run(out, say):
-        earlier = check_folder(out, overwrite=config.overwrite)
-        damage = _find_damage(out) if earlier and not config.overwrite else {}
-        return _run(config, out, earlier, damage, own, announce, say or _silent)
+    told = Watchers(watchers if say is None else [*watchers, Listener(say)])
+    try:
+        check_sources(config)
+        out = Path(config.out)
+        own = check_own(config, stages, parameters)
+        check_folder(out, overwrite=config.overwrite)
+        with only_run(out, told.say):
+            earlier = check_folder(out, overwrite=config.overwrite)
+            damage = _find_damage(out) if earlier and not config.overwrite else {}
+            return _run(config, out, earlier, damage, own, announce, told)
+    except BaseException as error:
+        with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
+            told.end("failed", tell_error(error))
+        raise
 
 
 def _run(
@@ -125,8 +136,9 @@ def _run(
     damage: Mapping[str, str],
     own: OwnStages,
     announce: Announce | None,
-    say: Callable[[str], None],
+    watchers: Watchers,
 ) -> dict[str, Any]:
+    say = watchers.say
     start, untouched = time.perf_counter(), bool(earlier)
     record: dict[str, Any] = {
         "schema": SCHEMA,
@@ -135,7 +147,6 @@ def _run(
         "parameters": dataclasses.asdict(config),
         "versions": {"python": platform.python_version()} | dict(code_versions()),
     }
-    progress: RunProgress | None = None
     failed = True
     try:
         # Nothing of an earlier run is touched before the inputs are known to be there; then, before anything else
@@ -151,8 +162,9 @@ def _run(
         clear_folder(out, earlier, overwrite=config.overwrite)
         shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(config, out)
-        progress = _begin_progress(config, out, plan, own, announce)
-        record |= _mesh_region(config, out, plan, own, progress, damage, say)
+        progress = begin_watching(config, out, plan, own, watchers, announce=announce)
+        record |= _mesh_region(config, out, plan, own, watchers, damage)
+        record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:
             say(message)
         record["status"] = "done"
@@ -161,11 +173,8 @@ def _run(
     except StoppedError as error:
         record |= {"status": "stopped", "error": str(error)}
         raise
-    except CityError as error:
-        record |= {"status": "failed", "error": str(error)}
-        raise
     except BaseException as error:
-        record |= {"status": "failed", "error": f"{type(error).__name__}: {error}"}
+        record |= {"status": "failed", "error": tell_error(error)}
         raise
     finally:
         record["seconds_total"] = round(time.perf_counter() - start, 3)
@@ -173,8 +182,7 @@ def _run(
         with suppress(OutputError) if failed else nullcontext():
             if not untouched:
                 _write_record(out, record)
-            if progress is not None:
-                progress.write(record["status"], record.get("error", ""))
+            watchers.end(record["status"], record.get("error", ""))
     return record
 
 
@@ -183,9 +191,8 @@ def _mesh_region(
     out: Path,
     plan: Plan,
     own: OwnStages,
-    progress: RunProgress,
+    watchers: Watchers,
     damage: Mapping[str, str],
-    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Run all stages, and write the indexes of their pieces and the manifest.
 
@@ -195,13 +202,13 @@ def _mesh_region(
     missing = Missing()
     with _executor(config) as executor:
         while True:
-            engine = make_engine(config, out, plan, executor, own, progress)
-            with stops(engine.stop, say):
+            engine = make_engine(config, out, plan, executor, own, watchers)
+            with stops(engine.stop, watchers.say):
                 try:
                     rounds = run_stages(engine, config)
                 except HolesError:
                     plan, missing = leave_holes(plan, missing, engine)
-                    say(f"left out so far: {', '.join(sorted(missing.tiles))}; going on with the rest")
+                    watchers.say(f"left out so far: {', '.join(sorted(missing.tiles))}; going on with the rest")
                     continue
                 run_own_stages(engine, own)
             break
@@ -219,7 +226,7 @@ def _mesh_region(
     indexes = state_files(out, [out / name for name in INDEXES])
     write_manifest(out / MANIFEST_PATH, engine.records, indexes)
     summary = summarise_run(engine, plan, config, rounds, missing, dict(damage) | remade)
-    return summary | {"finished": progress.finished, "driver_memory_bytes": peak_memory()}
+    return summary | {"driver_memory_bytes": peak_memory()}
 
 
 def make_engine(
@@ -368,16 +375,6 @@ def _executor(config: Config) -> Iterator[Executor]:
             yield executor
 
 
-def _begin_progress(
-    config: Config, out: Path, plan: Plan, own: OwnStages, announce: Announce | None
-) -> RunProgress:
-    """Begin to tell how far a run is, with all stages that are known from the start."""
-    stages = [*list_stages(config), *own.stages]
-    expected = {stage.name: len(plan.layout.boxes(stage.scope)) for stage in stages}
-    command = "" if own.stages else None  # stages of the user's own are not given by a command
-    return RunProgress(out, config, expected, announce=announce, command=command)
-
-
 def _find_damage(out: Path) -> dict[str, str]:
     """Say what is wrong with the files of a finished run that belong to no result.
 
@@ -389,6 +386,11 @@ def _find_damage(out: Path) -> dict[str, str]:
 def _foresee(plan: Plan, config: Config) -> list[str]:
     """Say which tiles may not fit into the memory of this machine."""
     return [] if config.scheduler else warn_of_memory(plan.survey, config, memory=machine_memory())
+
+
+def tell_error(error: BaseException) -> str:
+    """What an error that ends a run is, for its record."""
+    return str(error) if isinstance(error, CityError) else f"{type(error).__name__}: {error}"
 
 
 def _write_record(out: Path, record: dict[str, Any]) -> None:

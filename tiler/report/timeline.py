@@ -1,15 +1,15 @@
 """When the stages of a run worked: from the events of its tasks, or from the totals of its record."""
 
-import json
 import math
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tiler.events import read_events
 
 BINS = 240  # columns of the Gantt chart
 
@@ -107,24 +107,15 @@ def _tasks(path: Path) -> Iterator[tuple[dict[str, Any], str, float, float]]:
     """Give the tasks that ended: event, stage, time of the end, and what it took (s)."""
     if not path.is_file():
         return
-    for event in _events(path):
+    for event in read_events(path):
+        if event.get("event") not in ("done", "failed"):
+            continue
         try:
             end, seconds = float(event["t"]), float(event.get("seconds") or 0.0)
         except (KeyError, TypeError, ValueError):
             continue
         if math.isfinite(end) and 0 <= seconds < math.inf:
             yield event, str(event.get("stage", "")), end, seconds
-
-
-def _events(path: Path) -> Iterator[dict[str, Any]]:
-    with path.open("rb") as file:
-        for line in file:
-            if not line.startswith(b"{") or not (b'"done"' in line or b'"failed"' in line):
-                continue
-            with suppress(ValueError):
-                event = json.loads(line)
-                if event.get("event") in ("done", "failed"):
-                    yield event
 
 
 def _add(busy: NDArray[np.float64], start: float, end: float) -> None:

@@ -1,0 +1,61 @@
+"""Who watches every run: ``progress.json`` and ``events.jsonl`` in its folder, and those of its caller."""
+
+from pathlib import Path
+
+from tiler.config import Config
+from tiler.events import EventLog, begin_file
+from tiler.out_folder import EVENTS
+from tiler.own_stages import OwnStages, list_stages
+from tiler.planning import Plan
+from tiler.progress import Announce, RunProgress, command_line
+from tiler.watching import RunStart, Watchers
+
+NOT_ALONE = ("proofs", "fit")  # stages of tiles and seams that `tiler.run.run_alone` does without
+
+
+def begin_watching(
+    config: Config, out: Path, plan: Plan, own: OwnStages, watchers: Watchers, *, announce: Announce | None = None
+) -> RunProgress:
+    """Begin to tell how far a run is, with all stages that are known from the start.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the run.
+    out : Path
+        Its folder.
+    plan : Plan
+        Its region, tiles and files.
+    own : OwnStages
+        Stages of the user's own.
+    watchers : Watchers
+        Those that the caller brings; the files' are added.
+    announce : callable, optional
+        As for `RunProgress`.
+
+    Raises
+    ------
+    OutputError
+        If one of the files cannot be written.
+    """
+    stages = [*list_stages(config), *own.stages]
+    expected = {stage.name: (stage.scope, len(plan.layout.boxes(stage.scope))) for stage in stages}
+    command = "" if own.stages else command_line(config)  # stages of the user's own are not given by a command
+    totals = {name: total for name, (_, total) in expected.items()}
+    progress = RunProgress(out, config, totals, announce=announce, command=command)
+    watchers.add(progress)
+    watchers.add(EventLog(out / EVENTS, begin_file(out / EVENTS)))
+    start = RunStart(
+        out=out,
+        command=command,
+        bounds=plan.region.bounds,
+        crs=plan.region.crs,
+        tile_size=config.tile_size,
+        workers=0 if config.scheduler else max(config.workers, 1),
+        tiles=plan.layout.tiles,
+        seams=plan.layout.seams,
+        expected=expected,
+        whole=frozenset({*NOT_ALONE, *(stage.name for stage in own.stages)}),
+    )
+    watchers.begin(start)
+    return progress
