@@ -85,7 +85,7 @@ def test_the_report_says_what_the_run_made(copy: Path) -> None:
     tiles = [
         attributes for tag, attributes in page.elements if tag == "rect" and "shade" in (attributes["class"] or "")
     ]
-    assert len(tiles) == 2 * len(record["tiles"])  # by quality, and by cells
+    assert len(tiles) == 3 * len(record["tiles"])  # by quality, cells and time
 
 
 def test_the_report_needs_no_other_file(copy: Path) -> None:

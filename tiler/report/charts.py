@@ -11,7 +11,7 @@ from tiler.report.page import text
 
 WIDTH, HEIGHT = 620, 230  # units of a histogram
 LEFT, RIGHT, TOP, FOOT = 46, 12, 12, 38
-GANTT_LEFT, GANTT_ROW = 128, 18
+GANTT_LEFT, GANTT_ROW = 134, 18
 
 
 @dataclass(frozen=True, eq=False)

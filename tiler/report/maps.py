@@ -16,6 +16,7 @@ from tiler.report.page import text
 SIDE = 900.0  # units of the longer side
 MOST_CELLS = 2_500  # rectangles of a map
 SHADES = 7
+FOOT = 44.0  # units below a map, for its scale
 FOOTPRINTS = "footprints"  # id of the image that further maps show again
 
 
@@ -138,7 +139,7 @@ def draw_map(
     for box, k, value, label in zip(
         mapped.box.tolist(), shades.tolist(), mapped.value.tolist(), mapped.label, strict=True
     ):
-        words = f"{label}: not known" if math.isnan(value) else f"{label}: {value:,.4g}{unit}"
+        words = f"{label}: not known" if math.isnan(value) else f"{label}: {tell(value)}{unit}"
         parts.append(rect(box, f"shade{k}" if k >= 0 else "unknown", words))
     parts.append(_footprints(footprints, width, height))
     parts += [rect(box, "missing", words) for box, words in missing]
@@ -149,7 +150,7 @@ def draw_map(
         )
         parts.append(f'<path class="{style}" d="{dots}"/>')
     parts.append(_scale_bar(width, height, scale))
-    chart = wrap_svg(title, (round(width, 1), round(height + 34, 1)), "".join(parts))
+    chart = wrap_svg(title, (round(width, 1), round(height + FOOT, 1)), "".join(parts))
     covered = float(((mapped.box[:, 2:] - mapped.box[:, :2]).prod(axis=1)).sum()) if len(mapped.box) else 0.0
     kinds = {
         "unknown": ("not known", bool((shades < 0).any())),
@@ -173,6 +174,17 @@ def shade(value: NDArray[np.float64], limits: tuple[float, float]) -> NDArray[np
     place = np.floor((known - limits[0]) / (extent or 1.0) * SHADES).clip(0, SHADES - 1).astype(np.int64)
     found: NDArray[np.int64] = np.where(np.isnan(value), -1, place)
     return found
+
+
+def tell(value: float) -> str:
+    """Write a value of a map.
+
+    Examples
+    --------
+    >>> tell(1552034.0), tell(0.25254), tell(63.43)
+    ('1,552,034', '0.253', '63.4')
+    """
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def encode_png(alpha: NDArray[np.uint8], grey: int = 70) -> bytes:
@@ -214,14 +226,14 @@ def _scale_bar(width: float, height: float, scale: float) -> str:
     end = 2 + length * scale
     return (
         f'<path class="scale" d="M2 {height + 8:.1f}v8H{end:.1f}v-8"/>'
-        f'<text x="{end + 8:.1f}" y="{height + 18:.1f}">{words}</text>'
-        f'<text x="{width - 4:.1f}" y="{height + 18:.1f}" text-anchor="end">north is up</text>'
+        f'<text x="{end + 8:.1f}" y="{height + 26:.1f}">{words}</text>'
+        f'<text x="{width - 4:.1f}" y="{height + 26:.1f}" text-anchor="end">north is up</text>'
     )
 
 
 def _legend(limits: tuple[float, float], unit: str, keys: Sequence[tuple[str, str]]) -> str:
     shades = "".join(f'<span class="key shade{k}"></span>' for k in range(SHADES))
-    rows = [f"<li>{limits[0]:,.4g}{text(unit)} {shades} {limits[1]:,.4g}{text(unit)}</li>"]
+    rows = [f"<li>{tell(limits[0])}{text(unit)} {shades} {tell(limits[1])}{text(unit)}</li>"]
     for style, words in (("footprint", "footprint"), *keys):
         rows.append(f'<li><span class="key {style}"></span> {words}</li>')
     return f'<ul class="legend">{"".join(rows)}</ul>'

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.histograms import Histogram, percentile
 from pipeline.point_fidelity import KINDS
+from pipeline.residuals import ResidualSums, conclude
 from stitch.grid import make_grid, tile_box
 from tiler.config import Config
 from tiler.context import tile_key
@@ -19,14 +20,26 @@ from tiler.report.maps import draw_map, gather_tiles
 from tiler.report.meanings import GROUPS, explain
 from tiler.report.page import figure, figures, folded, heading, number, paragraph, table, text
 from tiler.report.record import SHOWN, NoteGroup, RunFacts
+from tiler.report.samples import NEAR, Samples
 from tiler.report.timeline import Timeline
 from tiler.run_folder import WRONG_FIELD
 
 PERCENTILES = (0, 0.1, 1, 5, 50, 95, 100)
+
+
+@dataclasses.dataclass(frozen=True)
+class Measure:
+    """How a measure of quality is shown: its name, what is good, and the bins of its histogram."""
+
+    title: str
+    words: str
+    bins: int
+
+
 MEASURES = {
-    "radius_ratio": ("radius ratio", "1 for a regular tetrahedron, 0 for a flat one", 0.4, 2_000, 40),
-    "min_dihedral": ("least dihedral angle (degrees)", "70.5 for a regular tetrahedron", 10.0, 9_000, 60),
-    "aspect_ratio": ("aspect ratio", "1 for a regular tetrahedron, more for a flat one", None, 1_000, 50),
+    "radius_ratio": Measure("radius ratio", "1 for a regular tetrahedron, 0 for a flat one", 40),
+    "min_dihedral": Measure("least dihedral angle (degrees)", "70.5 for a regular tetrahedron", 45),
+    "aspect_ratio": Measure("aspect ratio", "1 for a regular tetrahedron, more for a flat one", 50),
 }
 SHORTEST = 0.01  # s, of a stage that has a bar
 WORST_SHADE = 0.7  # radius ratio of the lightest shade of the map
@@ -36,6 +49,17 @@ POINT_KINDS = {
     "missed": "roof points of footprints where the model has no building, against the terrain",
     "ground": "ground points outside buildings, against the terrain",
     "swallowed": "ground points that were built over, against the roof",
+}
+
+
+POINT_COLUMNS = ("rmse", "p50", "p95", "bias")
+SURFACES = {
+    "roof on roof": "roof points over roofs",
+    "ground on ground": "ground points over ground",
+    "water on ground": "water points over ground",
+    "roof on ground": "roof points over ground: buildings that were dropped, or have no footprint",
+    "ground on roof": "ground points under roofs: floors, passages, what was built over",
+    "water on roof": "water points under roofs",
 }
 
 
@@ -111,22 +135,37 @@ def tell_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -> It
     yield f'<div class="pair">{"".join(maps)}</div>'
 
 
-def tell_quality(facts: RunFacts, numbers: Numbers) -> Iterator[str]:
-    """Show percentiles and histograms of the quality of cells."""
-    rows = [[MEASURES[name][0], *_percentiles(found)] for name, found in numbers.quality.items()]
-    head = ["all cells, percentile", *(f"{p:g}" for p in PERCENTILES)]
+def tell_quality(facts: RunFacts, numbers: Numbers, samples: Samples) -> Iterator[str]:
+    """Show percentiles and histograms of the quality of cells: of all, and of those near seams."""
+    head = ["percentile", *(f"{p:g}" for p in PERCENTILES)]
+    near = f"cells within {NEAR:g} m of seams"
+    rows = []
+    for name, found in numbers.quality.items():
+        rows.append([f"{MEASURES[name].title}, all cells", *_percentiles(found)])
+        if samples.near:
+            rows.append([f"{MEASURES[name].title}, {near}", *_percentiles(samples.near[name])])
     yield table(f"Quality of {number(facts.members['counts']['cells'])} cells", head, rows)
-    charts = [
-        figure(_draw_quality(name, found), MEASURES[name][1].capitalize() + ".")
-        for name, found in numbers.quality.items()
-    ]
+    if samples.near:
+        n = int(samples.near["radius_ratio"].counts.sum())
+        yield paragraph(f"Near seams are {n:,} cells of air{_chosen(samples)}.")
+    else:
+        yield paragraph("There are no seams between tiles.")
+    charts = []
+    for name, found in numbers.quality.items():
+        measure = MEASURES[name]
+        series = [Series("all cells", rebin(found.counts, measure.bins))]
+        if samples.near:
+            series.append(Series(near, rebin(samples.near[name].counts, measure.bins)))
+        chart = draw_histogram(f"Histogram: {measure.title}", measure.title, (found.low, found.high), series)
+        charts.append(figure(chart, f"{measure.words}."))
     yield f'<div class="pair">{"".join(charts)}</div>'
 
 
 def tell_heights(facts: RunFacts, numbers: Numbers) -> Iterator[str]:
     """Show heights of buildings and terrain."""
     if domain := facts.members.get("domain"):
-        yield figures([(name, number(value, 1)) for name, value in domain.items()])
+        names = {"height (m)": "height of the domain (m)"}
+        yield figures([(names.get(name, name), number(value, 1)) for name, value in domain.items()])
     charts = []
     for bins, title, axis in (
         (numbers.buildings, "buildings", "height of buildings above their ground (m)"),
@@ -145,15 +184,28 @@ def tell_heights(facts: RunFacts, numbers: Numbers) -> Iterator[str]:
     yield f'<div class="pair">{"".join(charts)}</div>'
 
 
-def tell_fidelity(facts: RunFacts) -> Iterator[str]:
-    """Show how far points and footprints are from the city model."""
+def tell_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
+    """Show how far points are from the mesh and from the city model, and outlines from the footprints."""
+    rows = [
+        [words, number(samples.points[kind].n), *_residuals(samples.points[kind])]
+        for kind, words in SURFACES.items()
+        if kind in samples.points and samples.points[kind].n
+    ]
+    head = ["points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "99 % below (m)", "bias (m)"]
+    yield heading("The mesh's surface")
+    yield paragraph(
+        f"Height of ground and roofs of the mesh over LiDAR points by class{_chosen(samples)}; percentiles are of "
+        "absolute values, outliers count. A roof is one height a part, so slopes and dormers show here."
+    )
+    yield table("Heights of the mesh over LiDAR points", head, rows)
     found = facts.members["fidelity"]
     rows = [
         [POINT_KINDS[kind], number(found[kind]["n"]), *(number(found[kind].get(name)) for name in POINT_COLUMNS)]
         for kind in KINDS
         if kind in found
     ]
-    head = ("points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "bias (m)")
+    head = ["points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "bias (m)"]
+    yield heading("The city model and its terrain")
     yield table("Heights of the city model over LiDAR points, all points, outliers too", head, rows)
     if outline := found.get("outline"):
         names = (
@@ -162,9 +214,6 @@ def tell_fidelity(facts: RunFacts) -> Iterator[str]:
             ("sharpest corner", f"{outline['sharpest']:.1f}°"),
         )
         yield figures(names)
-
-
-POINT_COLUMNS = ("rmse", "p50", "p95", "bias")
 
 
 def tell_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:
@@ -268,11 +317,16 @@ def _find_missing(facts: RunFacts) -> Iterator[tuple[tuple[float, float, float, 
         yield tile_box(grid, tile_key(name)), f"{name} failed: stage {failure['stage']}: {failure['reason']}"
 
 
-def _draw_quality(name: str, found: Histogram) -> str:
-    title, _, _, bins, coarse = MEASURES[name]
-    limits = (found.low, found.high)
-    share = rebin(found.counts, bins // (bins // coarse) if bins % coarse == 0 else coarse)
-    return draw_histogram(f"Histogram of the {title}", title, limits, [Series("all cells", share)])
+def _residuals(sums: ResidualSums) -> list[str]:
+    found = conclude(sums)
+    values = (found.rmse, found.p50, found.p95, percentile(sums.absolute, 99), found.bias)
+    return [number(value) for value in values]
+
+
+def _chosen(samples: Samples) -> str:
+    if samples.tiles == samples.all_tiles:
+        return ""
+    return f", of {samples.tiles:,} of {samples.all_tiles:,} tiles, evenly chosen"
 
 
 def _percentiles(found: Histogram) -> list[str]:

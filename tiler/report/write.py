@@ -10,6 +10,7 @@ from tiler.report.collect import collect_numbers
 from tiler.report.page import Page, paragraph
 from tiler.report.pictures import tell_pictures
 from tiler.report.record import RunFacts, read_run_facts
+from tiler.report.samples import measure_samples
 from tiler.report.timeline import read_timeline
 from tiler.run_folder import WRONG_FIELD, broken_field
 from tiler.store import Store
@@ -62,11 +63,14 @@ def _fill(directory: Path, facts: RunFacts) -> Page:
         if not (directory / STORE).is_dir():
             raise InputError(f"{directory / STORE}: is missing; run again")
         numbers = collect_numbers(Store(directory / STORE), facts)
+        assert facts.bounds is not None  # as of every run that is done
+        filtered = bool(facts.members["parameters"]["ground_filter"])
+        samples = measure_samples(directory, facts.bounds, ground_filter=filtered)
         page.section("pictures", "Pictures", tell_pictures(directory))
         page.section("map", "Map", sections.tell_map(facts, numbers, timeline))
-        page.section("quality", "Quality of cells", sections.tell_quality(facts, numbers))
+        page.section("quality", "Quality of cells", sections.tell_quality(facts, numbers, samples))
         page.section("heights", "Heights", sections.tell_heights(facts, numbers))
-        page.section("fidelity", "Fidelity to the input", sections.tell_fidelity(facts))
+        page.section("fidelity", "Fidelity to the input", sections.tell_fidelity(facts, samples))
     page.section("time", "Time", sections.tell_time(facts, timeline))
     page.section("notes", "Dropped, repaired, defaulted", sections.tell_notes(facts))
     page.section("parameters", "Parameters and versions", sections.tell_parameters(facts))
