@@ -53,6 +53,7 @@ class SparseCity:
             "-m",
             "tiler.cli",
             "run",
+            "--no-report",
             *given["pointcloud"],
             "--footprints",
             given["footprints"],

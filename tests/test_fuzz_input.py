@@ -278,7 +278,7 @@ def play(originals: Path, tmp_path: Path, worker: Worker, n: int, families: list
             name = cloud or houses
             change(case / name, np.random.default_rng([number, k]))
             inputs = [str(case / (cloud or "cloud.laz")), "--footprints", str(case / (houses or "house.gpkg"))]
-            command = ["run", *inputs, "--out", str(case / "out"), *QUICK, "--id-attribute", "id"]
+            command = ["run", *inputs, "--out", str(case / "out"), *QUICK, "--id-attribute", "id", "--no-report"]
             if k % 3 == 1:
                 command += ["--bounds", *map(str, (BOUNDS[0] + 3, BOUNDS[1] + 3, BOUNDS[0] + 25, BOUNDS[3] - 3))]
             tally.call(worker, case, family, k, command)

@@ -19,7 +19,7 @@ from tiler.cli import main
 from tiler.coarsening import Facets, coarsen, join_facets
 from tiler.facet_quality import measure_facets
 from tiler.paint import SUN, Scene, View, fill_polygons, paint
-from tiler.painted_pictures import paint_blocks
+from tiler.painted_pictures import paint_blocks, paint_cut
 from tiler.picture_data import find_middle, load_city
 from tiler.render import render_run
 from tiler.scenes import QUALITY_COLOURS, block_scene, quality_colours
@@ -169,6 +169,21 @@ def test_blocks_stand_on_the_terrain(small_run: Path, monkeypatch: pytest.Monkey
     image, words = paint_blocks(small_run, (160, 100))
     assert image.shape == (100, 160, 3)
     assert words == f"the largest 5 of {found.n_buildings} buildings are drawn"
+
+
+def test_a_cut_shows_cells_of_air(small_run: Path) -> None:
+    city = load_city(small_run)
+    image = paint_cut(small_run, city, (320, 200)).astype(int)
+    red, green, blue = np.moveaxis(image, -1, 0)
+    assert ((blue > red + 20) & (blue > green)).mean() > 0.2  # air, in the upper half
+    assert ((red > green + 40) & (green > blue)).mean() > 0.01  # roofs
+    assert image[-1, 160].sum() < 3 * 250  # ground, where the sky would be white
+
+
+def test_what_reaches_behind_the_camera_is_left_out() -> None:
+    ahead = square(0, 20, (0, 200, 0))
+    behind = Scene(ahead.corners + np.array([0, 0, 99.5]), ahead.rgb, ahead.lined)
+    assert (paint(join(ahead, behind), DOWN, sky=SKY)[40, 50] > 0).tolist() == [False, True, False]
 
 
 def test_render_paints_quality_and_the_city_model(

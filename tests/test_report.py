@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import struct
+import sys
 import zlib
 from html.parser import HTMLParser
 from pathlib import Path
@@ -182,6 +183,39 @@ def test_the_command_writes_it_and_refuses_other_folders(
     shutil.rmtree(copy / "store.zarr")
     assert main(["report", str(copy)]) == 1
     assert "run again" in capsys.readouterr().err
+
+
+def test_a_run_ends_with_its_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    city, out = tmp_path / "city", tmp_path / "out"
+    assert main(["synth", str(city), "--size", "120", "--buildings", "3"]) == 0
+    words = ["run", str(city / "tiles"), "--footprints", str(city / "footprints.shp"), "--out", str(out)]
+    assert main(words) == 0
+    assert f"report: {out / 'report.html'}" in capsys.readouterr().out
+    before = hash_files(out)
+    page = read(out / "report.html")
+    assert [a["id"] for tag, a in page.elements if tag == "section"][:3] == ["summary", "pictures", "map"]
+    assert "When each stage worked; the darker the more of its tasks at a time." in page.words
+    assert main([*words, "--no-report"]) == 0
+    assert not (out / "report.html").exists()  # it told of an earlier run
+    assert hash_files(out) == before
+    assert main(["check", str(out), "--store"]) == 0
+    monkeypatch.setattr("tiler.report.write.collect_numbers", _fail)
+    capsys.readouterr()
+    assert main(words) == 0  # the mesh is there
+    assert "no report: it is night; citystitch report" in capsys.readouterr().err
+
+
+def _fail(*_: object) -> None:
+    raise InputError("it is night")
+
+
+def test_without_pillow_the_page_says_so(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    page = read(write_report(copy))
+    assert [words for words in page.words if "pip install citystitch[pictures]" in words]
+    assert not [tag for tag, _ in page.elements if tag == "img"]
 
 
 def test_every_kind_of_note_is_explained() -> None:

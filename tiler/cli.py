@@ -296,9 +296,10 @@ def _report_run(out: Path) -> None:
 
     try:
         say(f"report: {write_report(out)}")
-    except CityError as error:
+    except Exception as error:
+        reason = str(error) if isinstance(error, CityError) else f"{type(error).__name__}: {error}"
         print(
-            f"citystitch: no report: {printable(str(error))}; citystitch report {printable(str(out))} tries again",
+            f"citystitch: no report: {printable(reason)}; citystitch report {printable(str(out))} tries again",
             file=sys.stderr,
         )
 

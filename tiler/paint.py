@@ -22,6 +22,7 @@ SUN_SIDE, SKY_SIDE = 1536, 640  # pixels of the maps of what the sun and each li
 SKY_DIRECTIONS = 8  # lights that stand for the sky
 LINE = np.array([60.0, 53.0, 48.0])
 NOTHING = -1
+NEAREST = 0.02  # distances to the middle of the picture; what is closer to the camera is not drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +142,7 @@ def paint(
     scene : Scene
         What to paint; facets are seen from both sides.
     view : View
-        The camera; every facet must be before it.
+        The camera; facets that reach behind it are left out.
     sky : (str, str)
         Colours at the bottom and at the top, ``"#rrggbb"``.
     lighting : Lighting, optional
@@ -161,6 +162,10 @@ def paint(
     width, height = (side * SAMPLES for side in view.size)
     frame = _frame(view)
     seen = (scene.corners - view.position) @ frame.T
+    before = seen[..., 2].min(axis=1) > NEAREST * float(np.linalg.norm(view.focal - view.position))
+    if not before.all():
+        lighting = lighting or cast_lights(scene)
+        scene, seen = Scene(scene.corners[before], scene.rgb[before], scene.lined[before]), seen[before]
     scale = height / 2 / np.tan(np.radians(view.view_angle) / 2)
     nearness = 1 / seen[..., 2]
     plane = seen[..., :2] * nearness[..., None] * (scale, -scale) + (width / 2, height / 2)

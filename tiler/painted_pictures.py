@@ -13,6 +13,7 @@ from tiler.run_folder import read_run_record
 from tiler.scenes import QUALITY_COLOURS, QUALITY_LIMITS, block_scene, city_scene, cut_scene
 
 PAINTED = ("quality", "citymodel")  # pictures of `render` that are painted
+CLOSE = 240.0  # m of a cut that are shown, so that its cells are seen
 LEGEND = 46  # pixels below a picture of quality
 Image = NDArray[np.uint8]
 
@@ -45,9 +46,19 @@ def light_city(city: City) -> Lighting:
 
 
 def paint_cut(directory: Path, city: City, size: tuple[int, int], *, lighting: Lighting | None = None) -> Image:
-    """Paint the mesh cut open from west to east through the middle of a city; errors as of `cut_scene`."""
-    scene = join_scenes([city_scene(city), cut_scene(directory, city)])
-    return _paint(scene, size, view=CUT_VIEW, lighting=lighting or light_city(city))
+    """Paint the middle of the mesh, cut open from west to east; errors as of `cut_scene`."""
+    cut = cut_scene(directory, city)
+    rows = cut.corners.reshape(-1, 3)
+    side = min(CLOSE, float(np.ptp(rows[:, 0]))) / 2
+    x, (low, top) = float(rows[:, 0].min() + rows[:, 0].max()) / 2, np.percentile(rows[:, 2], (0, 100))
+    framed = np.array([(x + i * side, j * side, z) for i in (-1, 1) for j in (-0.5, 0.0) for z in (low, top)])
+    return _paint(
+        join_scenes([city_scene(city), cut]),
+        size,
+        view=CUT_VIEW,
+        lighting=lighting or light_city(city),
+        framed=framed,
+    )
 
 
 def paint_blocks(directory: Path, size: tuple[int, int]) -> tuple[Image, str]:
@@ -65,10 +76,10 @@ def _paint(
     *,
     view: tuple[float, float] = VIEW,
     lighting: Lighting | None = None,
+    framed: NDArray[np.float64] | None = None,
 ) -> Image:
-    corners = scene.corners.reshape(-1, 3)
     position, focal = fit_camera(
-        corners,
+        scene.corners.reshape(-1, 3) if framed is None else framed,
         azimuth=view[0],
         elevation=view[1],
         view_angle=VIEW_ANGLE / MARGIN,
