@@ -44,14 +44,10 @@ def tell_pictures(directory: Path) -> Iterator[str]:
     )
     middle = find_middle(directory)
     if middle is None and not city.step:
-        image, words = paint_cut(directory, city, SIZE, lighting=lighting), ""
+        image = paint_cut(directory, city, SIZE, lighting=lighting)
     else:
-        part = load_city(directory, only=middle)
-        image = paint_cut(directory, part, SIZE)
-        words = f" {len(part.names)} of {len(city.names)} tiles, those in the middle, are shown."
-    yield _embed(
-        image, f"The mesh cut open from west to east: cells behind the cut, and the top of the air.{words}"
-    )
+        image = paint_cut(directory, load_city(directory, only=middle), SIZE)
+    yield _embed(image, "The mesh in the middle of the region, cut open from west to east.")
     yield _embed(
         paint_city(city, SIZE, quality=True, lighting=lighting),
         f"Radius ratio of the cell behind each facet of the boundary, the darker the worse.{coarse}",
