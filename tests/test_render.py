@@ -17,6 +17,7 @@ from PIL import Image
 from pipeline.errors import ConfigError, InputError, OutputError
 from pipeline.mesh import Boundary, Marker
 from tests.scene import PIECES, write_scene
+from tiler.camera import fit_camera
 from tiler.picture_data import City, load_air, load_city
 from tiler.picture_parts import (
     TILE_COLOURS,
@@ -27,7 +28,7 @@ from tiler.picture_parts import (
     heights_above_ground,
     tile_colours,
 )
-from tiler.render import SIZES, fit_camera, render_run
+from tiler.render import SIZES, render_run
 from tiler.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
 
 SIDE = 240.0
@@ -194,13 +195,17 @@ def test_pieces_make_no_difference_but_in_their_names(run: Path, copy: Path) -> 
         assert getattr(city, name).tobytes() == getattr(joined, name).tobytes()
 
 
-def test_more_facets_than_the_bound_are_refused(run: Path) -> None:
-    n = len(load_city(run).facets)
-    assert len(load_city(run, most=n).facets) == n
-    with pytest.raises(InputError, match=rf"after 2 of 2 pieces there are {n} facets to draw, more than {n - 1}"):
-        load_city(run, most=n - 1)
-    with pytest.raises(InputError, match="after 1 of 2 pieces"):
-        load_city(run, most=9)
+def test_more_facets_than_the_bound_are_made_coarser(run: Path) -> None:
+    fine = load_city(run)
+    n = len(fine.facets)
+    assert (len(load_city(run, most=n).facets), fine.step) == (n, 0.0)
+    coarse = load_city(run, most=n // 3)
+    assert 0 < len(coarse.facets) <= n // 3
+    assert coarse.step >= 2.0
+    assert set(coarse.marker.tolist()) == {Marker.GROUND, Marker.WALL, Marker.ROOF}
+    middle = fine.points + fine.origin - coarse.origin
+    assert np.abs(coarse.points.max(axis=0) - middle.max(axis=0)).max() <= coarse.step
+    assert np.abs(coarse.points.min(axis=0) - middle.min(axis=0)).max() <= coarse.step
 
 
 def test_walls_and_ground_of_a_tile_are_paler_than_its_roofs(run: Path) -> None:

@@ -189,7 +189,8 @@ def hash_files(folder: Path, *, besides: Callable[[Path], bool] = lambda _: Fals
     files = sorted(
         path
         for path in folder.rglob("*")
-        if path.is_file() and path.name not in ("run.json", "progress.json", "events.jsonl", "config.toml")
+        if path.is_file()
+        and path.name not in ("run.json", "progress.json", "events.jsonl", "config.toml", "report.html")
     )
     return {
         str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""The command line: `citystitch run | plan | check | status | dashboard | render | export` and others."""
+"""The command line: `citystitch run | plan | check | status | report | render | export` and others."""
 
 import argparse
 import dataclasses
@@ -119,6 +119,12 @@ def make_parser() -> argparse.ArgumentParser:
     words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
     words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
     run.add_argument("--log-json", type=Path, metavar="FILE", help="write what happens, a JSON object a line")
+    run.add_argument(
+        "--report",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="write report.html at the end, as `citystitch report` does",
+    )
     plan = command("plan", _plan, "tell what a run would do and take, without doing it")
     plan.add_argument(
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
@@ -142,6 +148,8 @@ def make_parser() -> argparse.ArgumentParser:
     board.add_argument(
         "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
     )
+    report = command("report", _report, "write report.html: what a run made, how good it is, what was left out")
+    report.add_argument("directory", type=Path, help="folder of a run")
     synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
     synth.add_argument("directory", type=Path, help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
@@ -153,9 +161,10 @@ def make_parser() -> argparse.ArgumentParser:
     render.add_argument("-o", "--output", type=Path, required=True, help="PNG file to write")
     render.add_argument(
         "--what",
-        choices=("boundary", "mesh", "overview", "tiles", "sizes"),
+        choices=("boundary", "mesh", "overview", "tiles", "sizes", "quality", "citymodel"),
         default="boundary",
-        help="what to draw; sizes: triangles from above, by the length of their edges",
+        help="what to draw; sizes: triangles from above, by the length of their edges; quality: the boundary by "
+        "the cells behind it; citymodel: blocks on the terrain",
     )
     _add_export(command("export", _export, "write the mesh of a run for other programs, each vertex once"))
     command("config", _config, "print all parameters of a run, annotated, as a configuration file")
@@ -234,7 +243,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.only is None:
         dashboard = None if options.no_dashboard else options.dashboard_address
         words = {"quiet": options.quiet, "verbose": options.verbose, "log": options.log_json}
-        return _run_config(config, dashboard=dashboard, **words)
+        return _run_config(config, dashboard=dashboard, report=options.report, **words)
     if options.log_json is not None:
         raise ConfigError("--log-json tells of a whole run; leave out it or --only")
     from tiler.run import run_alone
@@ -250,6 +259,7 @@ def _run_config(
     verbose: bool = False,
     log: Path | None = None,
     dashboard: str | None = None,
+    report: bool = False,
 ) -> int:
     if config.workers and not config.scheduler:
         fork_server.begin()
@@ -264,6 +274,8 @@ def _run_config(
         refuse_result(out, log)
         watchers.append(EventLog(log, open_log(log), every=0.0))
     record = run(config, watchers=watchers, dashboard=dashboard)
+    if report:
+        _report_run(out, quiet=quiet)
     if quiet:
         print_last_line(record, out)
     else:
@@ -317,6 +329,29 @@ def _dashboard(options: argparse.Namespace) -> int:
     return 0
 
 
+def _report(options: argparse.Namespace) -> int:
+    from tiler.report import write_report
+
+    say(str(write_report(options.directory)))
+    return 0
+
+
+def _report_run(out: Path, *, quiet: bool) -> None:
+    """Write the report of a run that has just ended; the mesh is there, whatever becomes of it."""
+    from tiler.report import write_report
+
+    try:
+        path = write_report(out)
+        if not quiet:
+            say(f"report: {path}")
+    except Exception as error:
+        reason = str(error) if isinstance(error, CityError) else f"{type(error).__name__}: {error}"
+        print(
+            f"citystitch: no report: {printable(reason)}; citystitch report {printable(str(out))} tries again",
+            file=sys.stderr,
+        )
+
+
 def _synth(options: argparse.Namespace) -> int:
     _write_city(options.directory, options)
     return 0
@@ -363,7 +398,7 @@ def _demonstrate(title: str, inputs: dict[str, Any], out: Path, pictures: dict[P
     from tiler.render import render_run
 
     print(f"\n{title}")
-    _run_config(make_config(inputs | {"out": str(out), "overwrite": True}))
+    _run_config(make_config(inputs | {"out": str(out), "overwrite": True}), report=True)
     code = _check_folder(out)
     for picture, what in pictures.items():
         render_run(out, picture, what=what)
@@ -375,7 +410,7 @@ def _demonstrate(title: str, inputs: dict[str, Any], out: Path, pictures: dict[P
 def _render(options: argparse.Namespace) -> int:
     from tiler.render import render_run
 
-    render_run(options.directory, options.output, what=options.what)
+    render_run(options.directory, options.output, what=options.what, say=say)
     say(str(options.output))
     return 0
 

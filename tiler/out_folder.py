@@ -17,8 +17,10 @@ INDEXES = ("mesh.pvtu", "boundary.pvtp")
 PIECES = {"mesh": ".vtu", "boundary": ".vtp"}
 RUN_RECORD, PROGRESS, EVENTS, STORE = "run.json", "progress.json", "events.jsonl", "store.zarr"
 MANIFEST_PATH = f"{STORE}/{MANIFEST}"
+REPORT = "report.html"
+STALE = (*INDEXES, REPORT)  # what an earlier run said of all of its mesh
 RESULTS = (
-    *(RUN_RECORD, PROGRESS, EVENTS, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
+    *(RUN_RECORD, PROGRESS, EVENTS, REPORT, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
     *(*INDEXES, *PIECES, STORE, TASKS, "only"),
 )
 # A file on its way to its place, of a writer that was killed: see `tiler.atomic`.
@@ -67,7 +69,7 @@ def check_folder(out: Path, *, overwrite: bool) -> list[str]:
 
 
 def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
-    """Make the folders of a run, and take away the indexes of an earlier one: what they name is about to change.
+    """Make the folders of a run; take away indexes and report of an earlier one, whose mesh is about to change.
 
     ``run.json`` stays: it must say before this that a run is at work. Other results are used again.
 
@@ -87,7 +89,7 @@ def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
     """
     refuse_links(out)
     try:
-        for name in RESULTS if overwrite else INDEXES:
+        for name in RESULTS if overwrite else STALE:
             path = out / name
             if name == RUN_RECORD or name not in earlier:
                 continue

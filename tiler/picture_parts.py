@@ -5,11 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
 from pipeline.mesh import Marker
-from stitch.grid import Key
-from tiler.context import tile_key
-from tiler.picture_data import Air, City
+from tiler.picture_data import Air, City, read_key
 
 # Edges are drawn while a triangle has this many pixels in the mean, strongest from four times as many.
 EDGE_PIXELS = 8.0
@@ -55,7 +52,7 @@ def tile_keys(city: City) -> NDArray[np.int64]:
     InputError
         If a piece is not named after a tile.
     """
-    return np.array([_read_key(name) for name in city.names], np.int64)
+    return np.array([read_key(name) for name in city.names], np.int64)
 
 
 def tile_colours(city: City) -> NDArray[np.uint8]:
@@ -137,13 +134,6 @@ def blend(share: NDArray[np.float64], colours: tuple[str, ...]) -> NDArray[np.ui
     channels = [np.interp(share, steps, channel) for channel in stops.T]
     rgb: NDArray[np.uint8] = np.rint(np.column_stack(channels)).astype(np.uint8)
     return rgb
-
-
-def _read_key(name: str) -> Key:
-    try:
-        return tile_key(name)
-    except ValueError:
-        raise InputError(f"the piece {name!r} is not named after a tile, as '60_243' is; run again") from None
 
 
 def _skirt(city: City) -> Any:

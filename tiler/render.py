@@ -1,5 +1,6 @@
 """Pictures of a run's boundary and volume mesh, drawn off-screen (step 3.6)."""
 
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,7 +10,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError
 from tiler.atomic import replacing
-from tiler.picture_data import City, load_air, load_city
+from tiler.camera import CUT_VIEW, MARGIN, SKY, VIEW, VIEW_ANGLE, fit_camera
+from tiler.painted_pictures import LEGEND, PAINTED, paint_blocks, paint_city
+from tiler.picture_data import City, find_middle, load_air, load_city
 from tiler.picture_parts import add_air, add_houses, add_terrain
 from tiler.plain_picture import PlainPlotter, has_graphics
 from tiler.sizes_picture import draw_sizes
@@ -21,16 +24,12 @@ SIZES = {
     "overview": (2000, 640),
     "tiles": (1600, 1000),
     "sizes": (1000, 1046),
+    "quality": (1600, 1000),
+    "citymodel": (1600, 1000),
 }
-# Compass direction that the camera stands in, and its angle over the horizon (degrees).
-VIEW = (215.0, 35.0)
-# The cut through the volume, which looks south, is seen more squarely.
-CUT_VIEW = (200.0, 27.0)
-VIEW_ANGLE = 22.0
-MARGIN = 1.04
+CELL_BY_CELL = ("mesh", "overview", "sizes")  # pictures that show each cell or triangle
 # Length up to which one surface darkens another (m), in regions below 2 km.
 OCCLUSION_RADIUS = 20.0
-SKY = ("#ffffff", "#c9dff0")
 
 
 def render_run(
@@ -39,6 +38,7 @@ def render_run(
     *,
     what: str = "boundary",
     size: tuple[int, int] | None = None,
+    say: Callable[[str], object] = str,
 ) -> None:
     """Draw a run to a PNG file, without a display.
 
@@ -53,41 +53,55 @@ def render_run(
         through the middle the tetrahedra of the northern half. ``"overview"``: both side by side.
         ``"tiles"``: as ``"boundary"``, but coloured by tile: neighbours differ.
         ``"sizes"``: triangles from above, coloured by the length of their edges, and by tile.
+        ``"quality"``: as ``"boundary"``, but coloured by the radius ratio of the cell behind each facet.
+        ``"citymodel"``: the city model as blocks on its terrain, from the run's store.
     size : (int, int), optional
         Width and height (pixels); 1600 x 1000, for the overview 2000 x 640, for the sizes 1000 x 1046.
+    say : callable, optional
+        Called with what is not drawn as it is, since the region is large.
 
     Raises
     ------
     ValueError
         If `what` is none of these, or `size` is less than 2 x 2.
     ConfigError
-        If pyvista is not installed.
+        If pyvista or, for ``"quality"`` and ``"citymodel"``, pillow is not installed.
     OutputError
         If the picture cannot be written.
     InputError
-        If a file of the run is missing, damaged, or has no ground; if there are more facets than a picture may
-        have (`tiler.picture_data.MOST_FACETS`); if, for ``"tiles"`` and ``"sizes"``, a piece is not named after a
-        tile.
+        If a file of the run is missing, damaged, or has no ground; if, for ``"tiles"`` and ``"sizes"``, or in a
+        large region, a piece is not named after a tile.
 
     Notes
     -----
     The camera follows from the region alone, but VTK samples the shade between houses at random: two
     pictures of one run differ by more than 3 of 255 grey levels in some 6 % of the pixels, so their bytes
     differ. Where VTK has no OpenGL to draw with, the same is painted facet by facet (`tiler.plain_picture`).
+    ``"quality"`` and ``"citymodel"`` are painted without VTK (`tiler.paint`) and have the same bytes every time.
+    Memory is bounded: facets beyond `tiler.picture_data.MOST_FACETS` are made coarser, and what is shown cell by
+    cell, ``"mesh"``, ``"overview"`` and ``"sizes"``, is the middle of a larger region (`find_middle`).
     Edges fade out as triangles get small on the picture. Everything is moved to the origin first,
     since graphics cards compute in single precision.
     """
     if what not in SIZES:
         raise ValueError(f"picture {what!r} must be one of {', '.join(SIZES)}")
     columns, rows = size or SIZES[what]
-    if min(columns, rows) < 2:
-        raise ValueError(f"size {columns} x {rows} must be at least 2 x 2")
+    least = LEGEND + 2 if what == "quality" else 2
+    if columns < 2 or rows < least:
+        raise ValueError(f"size {columns} x {rows} must be at least 2 x {least}")
+    if what in PAINTED:
+        _save(_paint(directory, what, (columns, rows), say), output)
+        return
     pv = _pyvista()
     left = columns // 2
     panels = (("boundary", left), ("mesh", columns - left)) if what == "overview" else ((what, columns),)
     # VTK says aloud that there is no display before it takes the way without one.
     with pv.vtk_verbosity("off"):
-        city = load_city(directory)
+        middle = find_middle(directory) if what in CELL_BY_CELL else None
+        if middle is not None:
+            say(f"of this large region, {len(middle)} tiles around the middle are drawn")
+        city = load_city(directory, only=middle)
+        _tell_step(city, say)
         if what == "sizes":
             _save(draw_sizes(city, (columns, rows)), output)
             return
@@ -95,47 +109,28 @@ def render_run(
     _save(np.hstack(images), output)
 
 
-def fit_camera(
-    points: NDArray[np.float64], *, azimuth: float, elevation: float, view_angle: float, aspect: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Place a camera such that points just fill the picture.
+def _paint(directory: Path, what: str, size: tuple[int, int], say: Callable[[str], object]) -> NDArray[np.uint8]:
+    _need_pillow()
+    if what == "citymodel":
+        image, left_out = paint_blocks(directory, size)
+        if left_out:
+            say(left_out)
+        return image
+    city = load_city(directory, quality=True)
+    _tell_step(city, say)
+    return paint_city(city, size, quality=True)
 
-    Parameters
-    ----------
-    points : float64, (n, 3)
-        What to show (m); corners of its box will do.
-    azimuth, elevation : float
-        Compass direction in which the camera stands, and its angle over the horizon (degrees).
-    view_angle : float
-        Vertical opening angle (degrees).
-    aspect : float
-        Width over height of the picture.
 
-    Returns
-    -------
-    position, focal_point : float64, (3,)
-        Of the camera (m); up is up.
+def _tell_step(city: City, say: Callable[[str], object]) -> None:
+    if city.step:
+        say(f"of this large region, vertices within {city.step:g} m are drawn as one")
 
-    Examples
-    --------
-    >>> corners = np.array([(x, 0.0, z) for x in (-1, 1) for z in (-1, 1)])
-    >>> fit_camera(corners, azimuth=180, elevation=0, view_angle=90, aspect=1)[0].round(6)
-    array([ 0., -1.,  0.])
-    """
-    turn, rise = np.radians(azimuth), np.radians(elevation)
-    towards = np.array([np.sin(turn) * np.cos(rise), np.cos(turn) * np.cos(rise), np.sin(rise)])
-    right = np.array([-np.cos(turn), np.sin(turn), 0.0])
-    up = np.cross(towards, right)
-    slope = np.tan(np.radians(view_angle) / 2) * np.array([aspect, 1.0])
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    depth, seen = (points - middle) @ towards, (points - middle) @ np.column_stack([right, up])
-    # A point is inside if |seen - centre| <= slope * (distance - depth), for both signs and axes.
-    least, most = (seen - slope * depth[:, None]), (seen + slope * depth[:, None])
-    low, high = least.min(axis=0), most.max(axis=0)
-    distance = float(((high - low) / (2 * slope)).max())
-    centre = (high + low) / 2
-    focal = middle + centre[0] * right + centre[1] * up
-    return focal + distance * towards, focal
+
+def _need_pillow() -> None:
+    try:
+        import PIL  # noqa: F401
+    except ImportError as error:
+        raise ConfigError("pictures need pillow: pip install citystitch[pictures]") from error
 
 
 def _pyvista() -> ModuleType:
@@ -178,7 +173,7 @@ def _add_parts(plotter: Any, directory: Path, city: City, what: str, size: tuple
     add_houses(plotter, city, size, by_tile=by_tile)
     shown = [city.points, add_terrain(plotter, city, size, by_tile=by_tile)]
     if what == "mesh":
-        shown.append(add_air(plotter, load_air(directory, city.origin), size))
+        shown.append(add_air(plotter, load_air(directory, city.origin, only=frozenset(city.names)), size))
     return np.vstack(shown)
 
 

@@ -71,8 +71,8 @@ def print_summary(record: dict[str, Any], out: Path, *, console: Console | None 
     if len(kinds) > LISTED_NOTES:
         console.print(f"         and {len(kinds) - LISTED_NOTES} more kinds")
     console.print(f"all of it with places: {plain(str(out / 'run.json'))}", soft_wrap=True)
-    for title, words in zip(("next:", "     ", "     "), next_commands(out), strict=True):
-        console.print(f"{title} {plain(shlex.join(words))}", soft_wrap=True)
+    for k, words in enumerate(next_commands(out)):
+        console.print(f"{'     ' if k else 'next:'} {plain(shlex.join(words))}", soft_wrap=True)
 
 
 def next_commands(out: Path) -> Sequence[Sequence[str]]:
@@ -80,6 +80,7 @@ def next_commands(out: Path) -> Sequence[Sequence[str]]:
     folder = str(out)
     return (
         ("citystitch", "check", folder),
+        ("citystitch", "report", folder),
         ("citystitch", "render", folder, "-o", "city.png"),
         ("citystitch", "export", folder, "--format", "openfoam", "-o", "case"),
     )

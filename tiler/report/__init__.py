@@ -1,0 +1,5 @@
+"""The report of a run: one page of what was made, how good it is, what was left out, and where the time went."""
+
+from tiler.report.write import write_report
+
+__all__ = ["write_report"]

@@ -1,0 +1,239 @@
+"""Maps of the region: tiles coloured by a value over the footprints, as SVG; of many tiles, blocks of some."""
+
+import base64
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tiler.report.charts import wrap_svg
+from tiler.report.page import text
+
+SIDE = 900.0  # units of the longer side
+MOST_CELLS = 2_500  # rectangles of a map
+SHADES = 7
+FOOT = 44.0  # units below a map, for its scale
+FOOTPRINTS = "footprints"  # id of the image that further maps show again
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """Tiles, or blocks of tiles, with what is told of them.
+
+    Attributes
+    ----------
+    box : float64, (n, 4)
+        xmin, ymin, xmax, ymax (m).
+    value : float64, (n,)
+        Least value of a block's tiles, or their sum; NaN where it is not known.
+    label : list of str
+        Name of the tile, or of the block.
+    tiles_along : int
+        Tiles along the side of a block; 1 where each is drawn.
+    """
+
+    box: NDArray[np.float64]
+    value: NDArray[np.float64]
+    label: list[str]
+    tiles_along: int
+
+
+def gather_tiles(
+    names: Sequence[str],
+    box: NDArray[np.float64],
+    value: NDArray[np.float64],
+    *,
+    tile_size: float,
+    least: bool,
+    most: int = MOST_CELLS,
+) -> Mapped:
+    """Put tiles together to blocks until there are few enough to draw.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of tiles, (n,).
+    box : float64, (n, 4)
+        Their boxes (m).
+    value : float64, (n,)
+        What the map shows.
+    tile_size : float
+        Side of a tile (m).
+    least : bool
+        Whether a block shows the least value of its tiles; else their sum.
+    most : int
+        Rectangles that there may be.
+    """
+    if len(names) <= most:
+        return Mapped(box, value, list(names), 1)
+    along = 1
+    middle = (box[:, :2] + box[:, 2:]) / 2
+    while True:
+        along *= 2
+        place = np.floor(middle / (along * tile_size)).astype(np.int64)
+        blocks, row = np.unique(place, axis=0, return_inverse=True)
+        if len(blocks) <= most:
+            break
+    row = row.reshape(-1)
+    joined = np.full((len(blocks), 4), np.inf)
+    for k, function, sign in ((0, np.minimum, 1), (1, np.minimum, 1), (2, np.minimum, -1), (3, np.minimum, -1)):
+        function.at(joined[:, k], row, sign * box[:, k])
+        joined[:, k] *= sign
+    if least:
+        found = np.full(len(blocks), np.inf)
+        np.minimum.at(found, row, np.where(np.isnan(value), np.inf, value))
+        found[np.isinf(found)] = np.nan
+    else:
+        found = np.bincount(row, np.nan_to_num(value), len(blocks))
+    number = np.bincount(row, minlength=len(blocks))
+    return Mapped(joined, found, [f"{n} tiles" for n in number.tolist()], along)
+
+
+def draw_map(
+    title: str,
+    bounds: tuple[float, float, float, float],
+    mapped: Mapped,
+    *,
+    limits: tuple[float, float],
+    unit: str,
+    footprints: NDArray[np.uint8] | None,
+    missing: Sequence[tuple[Sequence[float], str]] = (),
+    marks: Sequence[tuple[NDArray[np.float64], str]] = (),
+) -> str:
+    """Draw tiles by value, from light for the first limit to dark for the second, with a legend.
+
+    Parameters
+    ----------
+    title : str
+        What it shows.
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    mapped : Mapped
+        Tiles or blocks.
+    limits : (light, dark)
+        Values of the first and the last shade; the second may be less than the first.
+    unit : str
+        What is written after a value.
+    footprints : uint8, (rows, columns), or None
+        To draw over the tiles, row 0 in the north; None to show those of the page's first map again.
+    missing : sequence of (box, words)
+        Tiles that failed, and what is told of them. Where there is no tile the ground is hatched.
+    marks : sequence of (places, class)
+        Places (n, 2) to mark (m).
+    """
+    west, south, east, north = bounds
+    scale = SIDE / max(east - west, north - south)
+    width, height = (east - west) * scale, (north - south) * scale
+    parts = [f'<rect class="absent" width="{width:.1f}" height="{height:.1f}"/>']
+
+    def rect(box: Sequence[float], style: str, words: str) -> str:
+        x, y = (box[0] - west) * scale, (north - box[3]) * scale
+        size = f'width="{(box[2] - box[0]) * scale:.1f}" height="{(box[3] - box[1]) * scale:.1f}"'
+        return f'<rect class="{style}" x="{x:.1f}" y="{y:.1f}" {size}><title>{text(words)}</title></rect>'
+
+    shades = shade(mapped.value, limits)
+    for box, k, value, label in zip(
+        mapped.box.tolist(), shades.tolist(), mapped.value.tolist(), mapped.label, strict=True
+    ):
+        words = f"{label}: not known" if math.isnan(value) else f"{label}: {tell(value)}{unit}"
+        parts.append(rect(box, f"shade{k}" if k >= 0 else "unknown", words))
+    parts.append(_footprints(footprints, width, height))
+    parts += [rect(box, "missing", words) for box, words in missing]
+    for places, style in marks:
+        inside = ((places >= (west, south)) & (places <= (east, north))).all(axis=1)
+        dots = "".join(
+            f"M{(x - west) * scale:.1f} {(north - y) * scale:.1f}h0" for x, y in places[inside].tolist()
+        )
+        parts.append(f'<path class="{style}" d="{dots}"/>')
+    parts.append(_scale_bar(width, height, scale))
+    chart = wrap_svg(title, (round(width, 1), round(height + FOOT, 1)), "".join(parts))
+    covered = float(((mapped.box[:, 2:] - mapped.box[:, :2]).prod(axis=1)).sum()) if len(mapped.box) else 0.0
+    kinds = {
+        "unknown": ("not known", bool((shades < 0).any())),
+        "absent": ("no tile: no data there", covered < 0.999 * (east - west) * (north - south)),
+        "missing": ("tile that failed", len(missing) > 0),
+    }
+    keys = [(style, words) for style, (words, there) in kinds.items() if there]
+    return f'<div class="map">{chart}</div>' + _legend(limits, unit, keys)
+
+
+def shade(value: NDArray[np.float64], limits: tuple[float, float]) -> NDArray[np.int64]:
+    """Give the shade of each value, 0 to `SHADES` - 1; -1 where it is not known.
+
+    Examples
+    --------
+    >>> shade(np.array([0.6, 0.2, np.nan]), (0.5, 0.1)).tolist()
+    [0, 5, -1]
+    """
+    known = np.nan_to_num(value, nan=limits[0])
+    extent = limits[1] - limits[0]
+    place = np.floor((known - limits[0]) / (extent or 1.0) * SHADES).clip(0, SHADES - 1).astype(np.int64)
+    found: NDArray[np.int64] = np.where(np.isnan(value), -1, place)
+    return found
+
+
+def tell(value: float) -> str:
+    """Write a value of a map.
+
+    Examples
+    --------
+    >>> tell(1552034.0), tell(0.25254), tell(63.43)
+    ('1,552,034', '0.253', '63.4')
+    """
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def encode_png(alpha: NDArray[np.uint8], grey: int = 70) -> bytes:
+    """Write a picture of one grey, as opaque as each pixel says, as PNG.
+
+    Parameters
+    ----------
+    alpha : uint8, (rows, columns)
+        Opacity, row 0 at the top.
+    grey : int
+        0 to 255.
+    """
+    rows, columns = alpha.shape
+    lines = np.zeros((rows, 1 + 2 * columns), np.uint8)
+    lines[:, 1::2] = np.where(alpha > 0, grey, 0)
+    lines[:, 2::2] = alpha
+    head = struct.pack(">IIBBBBB", columns, rows, 8, 4, 0, 0, 0)
+    content = b"\x89PNG\r\n\x1a\n"
+    for kind, data in ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b"")):
+        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return content
+
+
+def _footprints(footprints: NDArray[np.uint8] | None, width: float, height: float) -> str:
+    if footprints is None:
+        return f'<use href="#{FOOTPRINTS}"/>'
+    data = base64.b64encode(encode_png(footprints)).decode()
+    return (
+        f'<image id="{FOOTPRINTS}" class="footprints" width="{width:.1f}" height="{height:.1f}" '
+        f'preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
+    )
+
+
+def _scale_bar(width: float, height: float, scale: float) -> str:
+    about = 0.3 * width / scale
+    power = 10.0 ** math.floor(math.log10(about))
+    length = max(step for step in (1.0, 2.0, 5.0) if step * power <= about) * power
+    words = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
+    end = 2 + length * scale
+    return (
+        f'<path class="scale" d="M2 {height + 8:.1f}v8H{end:.1f}v-8"/>'
+        f'<text x="{end + 8:.1f}" y="{height + 26:.1f}">{words}</text>'
+        f'<text x="{width - 4:.1f}" y="{height + 26:.1f}" text-anchor="end">north is up</text>'
+    )
+
+
+def _legend(limits: tuple[float, float], unit: str, keys: Sequence[tuple[str, str]]) -> str:
+    shades = "".join(f'<span class="key shade{k}"></span>' for k in range(SHADES))
+    rows = [f"<li>{tell(limits[0])}{text(unit)} {shades} {tell(limits[1])}{text(unit)}</li>"]
+    for style, words in (("footprint", "footprint"), *keys):
+        rows.append(f'<li><span class="key {style}"></span> {words}</li>')
+    return f'<ul class="legend">{"".join(rows)}</ul>'

@@ -1,0 +1,66 @@
+"""Pictures of the mesh for the report: painted, compressed, and put into the page."""
+
+import base64
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tiler.painted_pictures import light_city, paint_city, paint_cut
+from tiler.picture_data import find_middle, load_city
+from tiler.report.page import figure, paragraph, text
+
+SIZE = (1120, 700)
+QUALITY = 84  # of JPEG
+MISSING = "There are no pictures: they need pillow (pip install citystitch[pictures])."
+
+
+def tell_pictures(directory: Path) -> Iterator[str]:
+    """Show the city, the mesh cut open, and the quality of cells at the boundary.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of a run that is done.
+
+    Raises
+    ------
+    InputError
+        If a file of the run is missing or damaged.
+    """
+    try:
+        import PIL  # noqa: F401
+    except ImportError:
+        yield paragraph(MISSING, "bad")
+        return
+    city = load_city(directory, quality=True)
+    lighting = light_city(city)
+    coarse = f" Vertices within {city.step:g} m are drawn as one." if city.step else ""
+    yield _embed(
+        paint_city(city, SIZE, lighting=lighting),
+        f"The boundary from the south-west: ground by height, roofs by height above ground.{coarse}",
+    )
+    middle = find_middle(directory)
+    if middle is None and not city.step:
+        image = paint_cut(directory, city, SIZE, lighting=lighting)
+    else:
+        image = paint_cut(directory, load_city(directory, only=middle), SIZE)
+    yield _embed(image, "The mesh in the middle of the region, cut open from west to east.")
+    yield _embed(
+        paint_city(city, SIZE, quality=True, lighting=lighting),
+        f"Radius ratio of the cell behind each facet of the boundary, the darker the worse.{coarse}",
+    )
+
+
+def _embed(image: NDArray[np.uint8], words: str) -> str:
+    from PIL import Image
+
+    file = BytesIO()
+    Image.fromarray(image).save(file, format="JPEG", quality=QUALITY, optimize=True)
+    data = base64.b64encode(file.getvalue()).decode()
+    height, width = image.shape[:2]
+    return figure(
+        f'<img alt="{text(words)}" width="{width}" height="{height}" src="data:image/jpeg;base64,{data}">', words
+    )

@@ -1,0 +1,150 @@
+"""What the report measures itself, on all tiles or an even choice: cells near seams, points over the mesh."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.columns import expand_cells
+from pipeline.histograms import Histogram, merge_histograms, quality_histograms
+from pipeline.mesh import ColumnMesh, PlaneMesh
+from pipeline.pointcloud import BUILDING, GROUND, WATER
+from pipeline.quality import measure_cells
+from pipeline.residuals import ResidualSums, merge_residuals, sum_residuals
+from pipeline.surface_points import NOWHERE, measure_surface
+from tiler.ingest import CELL
+from tiler.out_folder import STORE
+from tiler.readers import read_cloud
+from tiler.results import COLUMN_ARRAYS, unpack_columns
+from tiler.stage import Box, Scope
+from tiler.store import Store
+from tiler.task import Task
+
+MOST_TILES = 32  # that are looked at
+NEAR = 20.0  # m from a seam
+MOST_POINTS = 400_000  # of a tile; of more, evenly chosen ones
+CLASSES = {BUILDING: "roof", GROUND: "ground", WATER: "water"}
+KINDS = (
+    "roof on roof",
+    "ground on ground",
+    "water on ground",
+    "roof on ground",
+    "ground on roof",
+    "water on roof",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """What was measured.
+
+    Attributes
+    ----------
+    tiles, all_tiles : int
+        Tiles that were looked at, and all.
+    near : dict of str to Histogram
+        Quality of the cells of air whose triangle's centre is within `NEAR` of a seam; empty where there is none.
+    points : dict of str to ResidualSums
+        Heights of the mesh's lower surface over points, by class and by what the surface is: ``"roof on ground"``.
+    """
+
+    tiles: int
+    all_tiles: int
+    near: dict[str, Histogram]
+    points: dict[str, ResidualSums]
+
+
+def measure_samples(directory: Path, bounds: Box, *, ground_filter: bool) -> Samples:
+    """Measure cells near seams, and the distance of points to the mesh.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of a run; its store is read.
+    bounds : (xmin, ymin, xmax, ymax)
+        Its region (m).
+    ground_filter : bool
+        Whether ground points were found by our own filter.
+
+    Raises
+    ------
+    InputError
+        If a result is missing or damaged.
+
+    Notes
+    -----
+    At most `MOST_TILES` tiles are looked at, evenly chosen by name, so the time is bounded; memory is that of one.
+    """
+    store = Store(directory / STORE)
+    names = store.names("columns")
+    chosen = [names[k] for k in np.unique(np.linspace(0, len(names) - 1, min(len(names), MOST_TILES)).astype(int))]
+    files = _find_files(store)
+    near: dict[str, Histogram] = {}
+    points: dict[str, ResidualSums] = {}
+    for name in chosen:
+        arrays, attributes = store.read("columns", name, names=(*COLUMN_ARRAYS, "edge", "edge_missing"))
+        mesh, _ = unpack_columns(arrays, attributes["facts"]["order"])
+        for key, part in _measure_near(mesh, arrays["edge"][~arrays["edge_missing"]]).items():
+            near[key] = merge_histograms([near[key], part]) if key in near else part
+        refs: dict[str, tuple[str, ...]] = {"points": ()}
+        context = SimpleNamespace(bounds=bounds)
+        task = Task("report", name, Scope.TILE, bounds, None, context, "", store, refs, "", directory)
+        for key, sums in _measure_points(mesh, task, files, ground_filter).items():
+            points[key] = merge_residuals([points[key], sums]) if key in points else sums
+    return Samples(len(chosen), len(names), near, points)
+
+
+def _measure_near(mesh: ColumnMesh, edges: NDArray[np.int32]) -> dict[str, Histogram]:
+    """Quality of the cells near a tile's seams."""
+    if not len(edges):
+        return {}
+    plane = mesh.plane
+    seams = shapely.linestrings(plane.xy[edges])
+    centres = shapely.STRtree(shapely.points(plane.xy[plane.triangles].mean(axis=1)))
+    rows = np.unique(centres.query(seams, predicate="dwithin", distance=NEAR)[1])
+    part = PlaneMesh(plane.xy, plane.triangles[rows], plane.building[rows])
+    cells = expand_cells(ColumnMesh(part, mesh.z_start, mesh.z, mesh.bottom[rows], mesh.order))
+    return quality_histograms(measure_cells(cells))
+
+
+def _find_files(store: Store) -> Mapping[str, Box]:
+    """Boxes of the cells that each file has points in."""
+    boxes = {}
+    for name in store.names("points"):
+        if store.attributes("points", name)["facts"]["unreadable"]:
+            continue
+        cell = store.read("points", name, names=("cell",))[0]["cell"]
+        if len(cell):
+            low, high = cell.min(axis=0) * CELL, (cell.max(axis=0) + 1) * CELL
+            boxes[name] = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return boxes
+
+
+def _measure_points(
+    mesh: ColumnMesh, task: Task, files: Mapping[str, Box], ground_filter: bool
+) -> dict[str, ResidualSums]:
+    """Heights of a tile's lower surface over the points on it; each point is on the mesh of one tile."""
+    low, high = mesh.plane.xy.min(axis=0).tolist(), mesh.plane.xy.max(axis=0).tolist()
+    box = (low[0], low[1], high[0], high[1])
+    task.refs["points"] = tuple(
+        name
+        for name, (west, south, east, north) in sorted(files.items())
+        if west <= box[2] and east >= box[0] and south <= box[3] and north >= box[1]
+    )
+    cloud = read_cloud(task, box, ground_filter=ground_filter)
+    kept = np.flatnonzero(np.isin(cloud.classification, list(CLASSES)))
+    kept = kept[:: max(1, -(-len(kept) // MOST_POINTS))]
+    xyz, kind = cloud.xyz[kept], cloud.classification[kept]
+    triangle, residual = measure_surface(mesh, xyz)
+    there = triangle != NOWHERE
+    built = mesh.plane.building[triangle] >= 0
+    found: dict[str, Any] = {}
+    for number, word in CLASSES.items():
+        for on_roof, surface in ((False, "ground"), (True, "roof")):
+            found[f"{word} on {surface}"] = sum_residuals(residual[there & (kind == number) & (built == on_roof)])
+    return found

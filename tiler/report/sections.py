@@ -1,0 +1,368 @@
+"""The sections of the report: which numbers, charts and tables it shows, and in which words."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.histograms import Histogram, percentile
+from pipeline.point_fidelity import KINDS
+from pipeline.residuals import ResidualSums, conclude
+from stitch.grid import make_grid, tile_box
+from tiler.config import Config
+from tiler.context import tile_key
+from tiler.progress import command_line
+from tiler.report.charts import Series, draw_bars, draw_gantt, draw_histogram, rebin
+from tiler.report.collect import Bins, Numbers
+from tiler.report.maps import draw_map, gather_tiles
+from tiler.report.meanings import GROUPS, explain
+from tiler.report.page import figure, figures, folded, heading, number, paragraph, table, text
+from tiler.report.record import SHOWN, NoteGroup, RunFacts
+from tiler.report.samples import NEAR, Samples
+from tiler.report.timeline import Timeline
+from tiler.run_folder import WRONG_FIELD
+
+PERCENTILES = (0, 0.1, 1, 5, 50, 95, 100)
+
+
+@dataclasses.dataclass(frozen=True)
+class Measure:
+    """How a measure of quality is shown: its name, what is good, and the bins of its histogram."""
+
+    title: str
+    words: str
+    bins: int
+
+
+MEASURES = {
+    "radius_ratio": Measure("radius ratio", "1 for a regular tetrahedron, 0 for a flat one", 40),
+    "min_dihedral": Measure("least dihedral angle (degrees)", "70.5 for a regular tetrahedron", 45),
+    "aspect_ratio": Measure("aspect ratio", "1 for a regular tetrahedron, more for a flat one", 50),
+}
+SHORTEST = 0.01  # s, of a stage that has a bar
+WORST_SHADE = 0.7  # radius ratio of the lightest shade of the map
+CHART_BINS = 40
+POINT_KINDS = {
+    "roof": "roof points inside buildings, against the roof",
+    "missed": "roof points of footprints where the model has no building, against the terrain",
+    "ground": "ground points outside buildings, against the terrain",
+    "swallowed": "ground points that were built over, against the roof",
+}
+
+
+POINT_COLUMNS = ("rmse", "p50", "p95", "bias")
+SURFACES = {
+    "roof on roof": "roof points over roofs",
+    "ground on ground": "ground points over ground",
+    "water on ground": "water points over ground",
+    "roof on ground": "roof points over ground: buildings that were dropped, or have no footprint",
+    "ground on roof": "ground points under roofs: floors, passages, what was built over",
+    "water on roof": "water points under roofs",
+}
+
+
+def tell_summary(facts: RunFacts) -> Iterator[str]:
+    """Say how the run ended, and its key figures."""
+    members = facts.members
+    status, counts, bounds = members["status"], members.get("counts", {}), facts.bounds
+    if status != "done":
+        yield paragraph(f"The run {status}: {members.get('error', '')}", "bad")
+    elif members.get("exit_code"):
+        yield paragraph("The mesh is whole but for parts that are listed below (exit code 3).", "bad")
+    else:
+        yield paragraph("The mesh is whole: nothing that the input has is missing but what is listed below.")
+    pairs = [("cells", "cells"), ("points", "points"), ("facets", "facets"), ("buildings", "buildings")]
+    shown = [(words, number(counts[name])) for words, name in pairs if name in counts]
+    if bounds is not None:
+        area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) / 1e6
+        shown += [("region", f"{area:,.3g} km²"), ("tiles", number(len(facts.tiles.names)))]
+    if "quality" in members:
+        shown.append(("worst radius ratio", number(members["quality"]["radius_ratio"]["0"])))
+    shown.append(("time", f"{members.get('seconds_total', 0.0):,.1f} s"))
+    if "peak_memory_bytes" in members:
+        shown.append(("peak memory of a process", f"{members['peak_memory_bytes'] / 2**20:,.0f} MiB"))
+    yield figures(shown)
+    if messages := members.get("messages"):
+        yield '<ul class="messages">' + "".join(f"<li>{text(message)}</li>" for message in messages) + "</ul>"
+
+
+def tell_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -> Iterator[str]:
+    """Show the tiles over the footprints, by quality, cells, and time where it is known."""
+    tiles, members, bounds = facts.tiles, facts.members, facts.bounds
+    assert bounds is not None
+    region = members["region"]
+    size = float(region["tile_size"])
+    missing = list(_find_missing(facts))
+    yield paragraph(
+        f"Region {', '.join(f'{value:,.10g}' for value in bounds)} in {region['crs']}, tiles of {size:g} m: "
+        f"{len(tiles.names):,} meshed, {len(region.get('absent', ())):,} absent, "
+        f"{facts.lengths.get('missing', 0):,} missing."
+    )
+    shown = gather_tiles(tiles.names, tiles.box, numbers.worst, tile_size=size, least=True)
+    if shown.tiles_along > 1:
+        yield paragraph(f"Blocks of {shown.tiles_along} x {shown.tiles_along} tiles are drawn as one.")
+    marks = [
+        (np.concatenate([np.empty((0, 2)), *(group.places for group in facts.notes)]), style)
+        for style in ("note", "note inner")
+    ]
+    least = float(np.nanmin(numbers.worst)) if np.isfinite(numbers.worst).any() else 0.0
+    worst = draw_map(
+        "Tiles by worst radius ratio, over footprints",
+        bounds,
+        shown,
+        limits=(WORST_SHADE, min(least, WORST_SHADE - 0.1)),
+        unit="",
+        footprints=numbers.footprints,
+        missing=missing,
+        marks=marks,
+    )
+    words = "Worst radius ratio of each tile; the darker the worse (lighter on a dark page)."
+    yield figure(worst, f"{words} Dots: where something was dropped, repaired or defaulted.")
+    others = [("cells", tiles.cells.astype(np.float64), "", "Cells of each tile.")]
+    if timeline is not None and timeline.by_tile:
+        spent = np.array([timeline.by_tile.get(name, np.nan) for name in tiles.names])
+        others.append(("time", spent, " s", "Time of all tasks of each tile."))
+    maps = []
+    for name, values, unit, caption in others:
+        shown = gather_tiles(tiles.names, tiles.box, values, tile_size=size, least=False)
+        limits = (0.0, float(np.nanmax(shown.value, initial=0.0)) or 1.0)
+        chart = draw_map(
+            f"Tiles by {name}", bounds, shown, limits=limits, unit=unit, footprints=None, missing=missing
+        )
+        maps.append(figure(chart, caption))
+    yield f'<div class="pair">{"".join(maps)}</div>'
+
+
+def tell_quality(facts: RunFacts, numbers: Numbers, samples: Samples) -> Iterator[str]:
+    """Show percentiles and histograms of the quality of cells: of all, and of those near seams."""
+    head = ["percentile", *(f"{p:g}" for p in PERCENTILES)]
+    near = f"cells within {NEAR:g} m of seams"
+    rows = []
+    for name, found in numbers.quality.items():
+        rows.append([f"{MEASURES[name].title}, all cells", *_percentiles(found)])
+        if samples.near:
+            rows.append([f"{MEASURES[name].title}, {near}", *_percentiles(samples.near[name])])
+    yield table(f"Quality of {number(facts.members['counts']['cells'])} cells", head, rows)
+    if samples.near:
+        n = int(samples.near["radius_ratio"].counts.sum())
+        yield paragraph(f"Near seams are {n:,} cells of air{_chosen(samples)}.")
+    else:
+        yield paragraph("There are no seams between tiles.")
+    charts = []
+    for name, found in numbers.quality.items():
+        measure = MEASURES[name]
+        series = [Series("all cells", rebin(found.counts, measure.bins))]
+        if samples.near:
+            series.append(Series(near, rebin(samples.near[name].counts, measure.bins)))
+        chart = draw_histogram(f"Histogram: {measure.title}", measure.title, (found.low, found.high), series)
+        charts.append(figure(chart, f"{measure.words}."))
+    yield f'<div class="pair">{"".join(charts)}</div>'
+
+
+def tell_heights(facts: RunFacts, numbers: Numbers) -> Iterator[str]:
+    """Show heights of buildings and terrain."""
+    if domain := facts.members.get("domain"):
+        names = {"height (m)": "height of the domain (m)"}
+        yield figures([(names.get(name, name), number(value, 1)) for name, value in domain.items()])
+    charts = []
+    for bins, title, axis in (
+        (numbers.buildings, "buildings", "height of buildings above their ground (m)"),
+        (numbers.terrain, "terrain", "height of the terrain (m)"),
+    ):
+        if not bins.n:
+            charts.append(paragraph(f"The run has no {title}."))
+            continue
+        low, high, share = _coarsen(bins)
+        chart = draw_histogram(f"Histogram: {axis}", axis, (low, high), [Series(title, share)])
+        words = (
+            f"{bins.n:,} {'terrain nodes' if title == 'terrain' else title}: {bins.minimum:,.1f} to "
+            f"{bins.maximum:,.1f} m, mean {bins.mean:,.1f} m."
+        )
+        charts.append(figure(chart, words))
+    yield f'<div class="pair">{"".join(charts)}</div>'
+
+
+def tell_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
+    """Show how far points are from the mesh and from the city model, and outlines from the footprints."""
+    rows = [
+        [words, number(samples.points[kind].n), *_residuals(samples.points[kind])]
+        for kind, words in SURFACES.items()
+        if kind in samples.points and samples.points[kind].n
+    ]
+    head = ["points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "99 % below (m)", "bias (m)"]
+    yield heading("The mesh's surface")
+    yield paragraph(
+        f"Height of ground and roofs of the mesh over LiDAR points by class{_chosen(samples)}; percentiles are of "
+        "absolute values, outliers count. A roof is one height a part, so slopes and dormers show here."
+    )
+    yield table("Heights of the mesh over LiDAR points", head, rows)
+    found = facts.members["fidelity"]
+    rows = [
+        [POINT_KINDS[kind], number(found[kind]["n"]), *(number(found[kind].get(name)) for name in POINT_COLUMNS)]
+        for kind in KINDS
+        if kind in found
+    ]
+    head = ["points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "bias (m)"]
+    yield heading("The city model and its terrain")
+    yield table("Heights of the city model over LiDAR points, all points, outliers too", head, rows)
+    if outline := found.get("outline"):
+        names = (
+            ("area that outlines gained or lost", f"{100 * outline['area_error']:.2f} %"),
+            ("least distance of walls", f"{outline['min_clearance']:.2f} m"),
+            ("sharpest corner", f"{outline['sharpest']:.1f}°"),
+        )
+        yield figures(names)
+
+
+def tell_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:
+    """Show where the time went: by stage, and when each stage worked."""
+    members = facts.members
+    seconds: dict[str, float] = members.get("seconds", {})
+    stages = {name: value for name, value in seconds.items() if ":" not in name}
+    if timeline is not None:
+        tips = [
+            f"{name}: {first:.2f} to {last:.2f} s, {n} tasks, {reused} used again, {failed} failed"
+            for name, first, last, n, reused, failed in zip(
+                timeline.stages, timeline.first, timeline.last, timeline.tasks, timeline.reused, timeline.failed,
+                strict=True,
+            )
+        ]  # fmt: skip
+        chart = draw_gantt("When each stage worked", timeline.duration, timeline.stages, timeline.busy, tips)
+        yield figure(
+            f'<div class="narrow">{chart}</div>',
+            "When each stage worked; the darker the more of its tasks at a time.",
+        )
+    else:
+        yield paragraph("When each task worked is not known: the folder has no events.jsonl.")
+    by_time = sorted(stages.items(), key=lambda stage: (-stage[1], stage[0]))
+    rows = [(name, value, f"{value:,.2f} s") for name, value in by_time if value >= SHORTEST]
+    bars = f'<div class="narrow">{draw_bars("Time of all tasks by stage", rows)}</div>'
+    yield figure(bars, "Time of all tasks of each stage, over all workers.")
+    ran, reused, finished = (members.get(name, {}) for name in ("ran", "reused", "finished"))
+    steps = [
+        [name, number(ran.get(name)), number(reused.get(name)), number(value, 2), number(finished.get(name), 1)]
+        for name, value in sorted(seconds.items())
+    ]
+    head = ("stage, and its steps", "tasks ran", "used again", "time (s)", "done after (s)")
+    yield folded("All stages and steps", table("Stages", head, steps))
+
+
+def tell_notes(facts: RunFacts) -> Iterator[str]:
+    """List what failed, was dropped, repaired or defaulted."""
+    members, lengths = facts.members, facts.lengths
+    if missing := members.get("missing"):
+        rows = [[name, f["stage"], f["name"], f["reason"], f["command"]] for name, f in _first(missing.items())]
+        yield heading("Tiles that failed")
+        yield table(
+            _first_of("tiles", lengths["missing"]), ("tile", "stage", "item", "reason", "alone"), rows, numbers=9
+        )
+    if others := members.get("set_aside"):
+        rows = [[f["name"], f["stage"], f["reason"]] for f in others[:SHOWN]]
+        yield heading("What else failed")
+        yield table(_first_of("items", lengths["set_aside"]), ("item", "stage", "reason"), rows, numbers=9)
+    if unreadable := members.get("unreadable"):
+        yield heading("Files that were left out")
+        yield table(
+            _first_of("files", lengths["unreadable"]), ("file", "reason"), _first(unreadable.items()), numbers=9
+        )
+    if not facts.notes:
+        yield paragraph("Nothing was dropped, repaired or defaulted.")
+        return
+    yield paragraph(f"Ids and places of up to {SHOWN} of each kind; run.json has the first 10,000, the store all.")
+    for group in GROUPS:
+        kinds = [notes for notes in facts.notes if explain(notes.kind)[0] == group]
+        if not kinds:
+            continue
+        yield heading(f"{group.capitalize()}: {sum(notes.count for notes in kinds):,}")
+        yield from (_list_notes(notes) for notes in sorted(kinds, key=lambda notes: (-notes.count, notes.kind)))
+
+
+def tell_parameters(facts: RunFacts) -> Iterator[str]:
+    """List parameters, those that are not the default's first, and versions."""
+    given: dict[str, Any] = facts.members.get("parameters", {})
+    changed: list[list[str]] = []
+    others: list[list[str]] = []
+    for entry in dataclasses.fields(Config):
+        if entry.name not in given:
+            continue
+        value, data = _as_tuple(given[entry.name]), entry.metadata
+        row = [entry.name, _tell_value(value), data["unit"], data["text"]]
+        (others if value == entry.default else changed).append(row)
+    head = ("parameter", "value", "unit", "meaning")
+    yield table("Parameters that are not the default's", head, changed, numbers=9)
+    yield folded(f"{len(others)} parameters that are", table("Parameters", head, others, numbers=9))
+    try:
+        config = Config(**{name: _as_tuple(value) for name, value in given.items()})
+        yield f"<p>The same again: <code>{text(command_line(config))}</code></p>"
+    except WRONG_FIELD:
+        yield paragraph("The parameters are those of another version.")
+    yield table("Versions", ("package", "version"), facts.members.get("versions", {}).items(), numbers=9)
+
+
+def _find_missing(facts: RunFacts) -> Iterator[tuple[tuple[float, float, float, float], str]]:
+    """Boxes of tiles that failed, as the grid of the run has them."""
+    found, bounds = facts.members.get("missing") or {}, facts.bounds
+    if not found or bounds is None:
+        return
+    given = facts.members["parameters"]
+    grid = make_grid(
+        bounds,
+        tile_size=float(facts.members["region"]["tile_size"]),
+        mesh_size=float(given["mesh_size"]),
+        open_size=float(given["open_size"]),
+    )
+    for name, failure in found.items():
+        yield tile_box(grid, tile_key(name)), f"{name} failed: stage {failure['stage']}: {failure['reason']}"
+
+
+def _residuals(sums: ResidualSums) -> list[str]:
+    found = conclude(sums)
+    values = (found.rmse, found.p50, found.p95, percentile(sums.absolute, 99), found.bias)
+    return [number(value) for value in values]
+
+
+def _chosen(samples: Samples) -> str:
+    if samples.tiles == samples.all_tiles:
+        return ""
+    return f", of {samples.tiles:,} of {samples.all_tiles:,} tiles, evenly chosen"
+
+
+def _percentiles(found: Histogram) -> list[str]:
+    return [number(percentile(found, p), 2 if found.high > 1 else 3) for p in PERCENTILES]
+
+
+def _coarsen(bins: Bins) -> tuple[float, float, NDArray[np.float64]]:
+    """Give range and shares of some `CHART_BINS` bins, each of a whole number of those counted."""
+    n = len(bins.counts)
+    each = -(-n // CHART_BINS)
+    counts = np.concatenate([bins.counts, np.zeros(-n % each, np.int64)])
+    return bins.low, bins.low + len(counts) * bins.width, rebin(counts, len(counts) // each)
+
+
+def _list_notes(notes: NoteGroup) -> str:
+    meaning = explain(notes.kind)[1]
+    rows = [
+        [item.get("subject", ""), number(item.get("x"), 1), number(item.get("y"), 1), item.get("detail", "")]
+        for item in notes.items
+    ]
+    head = ("id or file", "x (m)", "y (m)", "detail")
+    words = f"{notes.count:,} {notes.kind.replace('-', ' ')}" + (f": {meaning}" if meaning else "")
+    return folded(words, table(_first_of(notes.kind, notes.count), head, rows))
+
+
+def _first_of(what: str, count: int) -> str:
+    return f"{count:,} {what}" if count <= SHOWN else f"The first {SHOWN} of {count:,} {what}; run.json has more"
+
+
+def _first(items: Any) -> list[Sequence[Any]]:
+    return list(items)[:SHOWN]
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _tell_value(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)

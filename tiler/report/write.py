@@ -1,0 +1,78 @@
+"""Write the report of a run folder."""
+
+from pathlib import Path
+
+from pipeline.errors import ConfigError, InputError
+from tiler.atomic import replacing
+from tiler.out_folder import EVENTS, REPORT, RUN_RECORD, STORE
+from tiler.report import sections
+from tiler.report.collect import collect_numbers
+from tiler.report.page import Page, paragraph
+from tiler.report.pictures import tell_pictures
+from tiler.report.record import RunFacts, read_run_facts
+from tiler.report.samples import measure_samples
+from tiler.report.timeline import read_timeline
+from tiler.run_folder import WRONG_FIELD, broken_field
+from tiler.store import Store
+
+
+def write_report(directory: Path) -> Path:
+    """Write ``report.html`` of a run: one file that needs no other and no network.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of a run that is done, or that failed.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such folder.
+    InputError
+        If its record or a result is missing or damaged, or the run is at work.
+    OutputError
+        If the page cannot be written.
+
+    Notes
+    -----
+    It holds times: it is no result. Tiles are read one by one; memory is that of one of them, and of the page.
+    """
+    if not directory.is_dir():
+        raise ConfigError(f"{directory}: no such folder; give the folder of a run")
+    facts = read_run_facts(directory)
+    try:
+        page = _fill(directory, facts)
+    except WRONG_FIELD as error:
+        raise broken_field(directory / RUN_RECORD, error) from error
+    target = directory / REPORT
+    with replacing(target) as part:
+        part.write_text(page.finish(), encoding="utf-8")
+    return target
+
+
+def _fill(directory: Path, facts: RunFacts) -> Page:
+    timeline = read_timeline(directory / EVENTS, frozenset(facts.tiles.names))
+    page = Page(f"citystitch: {directory.resolve().name}")
+    page.section("summary", "Summary", sections.tell_summary(facts))
+    if facts.members["status"] == "done":
+        if not (directory / STORE).is_dir():
+            raise InputError(f"{directory / STORE}: is missing; run again")
+        numbers = collect_numbers(Store(directory / STORE), facts)
+        assert facts.bounds is not None  # as of every run that is done
+        filtered = bool(facts.members["parameters"]["ground_filter"])
+        samples = measure_samples(directory, facts.bounds, ground_filter=filtered)
+        page.section("pictures", "Pictures", tell_pictures(directory))
+        page.section("map", "Map", sections.tell_map(facts, numbers, timeline))
+        page.section("quality", "Quality of cells", sections.tell_quality(facts, numbers, samples))
+        page.section("heights", "Heights", sections.tell_heights(facts, numbers))
+        page.section("fidelity", "Fidelity to the input", sections.tell_fidelity(facts, samples))
+    page.section("time", "Time", sections.tell_time(facts, timeline))
+    page.section("notes", "Dropped, repaired, defaulted", sections.tell_notes(facts))
+    page.section("parameters", "Parameters and versions", sections.tell_parameters(facts))
+    page.lead = paragraph("What one run made, how good it is, what was left out, and where the time went.", "soft")
+    return page
