@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stitch.least import LEAST_TILE
+
 Bounds = tuple[float, float, float, float]
 
-LEAST_TILE = 14.0  # mesh sizes; below, strips would reach beyond a border tile of half a size
 CORNER_REACH = 25.0  # m; how far a corner may be from its nominal place
 BAND = 35.0  # m; how far a seam may be from its nominal line
 OPEN_BAND = 2.0  # open sizes; the same where sizes are graded, if that is more

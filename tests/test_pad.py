@@ -26,7 +26,8 @@ from tiler.config import Config, check_height, load_config, make_config
 from tiler.context import absent_tiles, choose_tiles
 from tiler.export import export_run
 from tiler.own_stages import list_stages
-from tiler.pad import pad_bounds, pad_grid, widths_in_metres
+from tiler.pad import pad_bounds, pad_grid
+from tiler.pad_widths import widths_in_metres
 from tiler.plan_report import plan_run
 from tiler.region import find_pad
 from tiler.results import StoredTerrain

@@ -303,8 +303,9 @@ def test_the_options_of_the_command(town: Town, tmp_path: Path, capsys: pytest.C
     assert "    columns 2271_45707  was there\n" in text
     assert "  columns (4)                      0.00 s\n" in text
     assert "\n0 of " in text, text
-    assert [line.strip() for line in text.splitlines()[-3:]] == [
+    assert [line.strip() for line in text.splitlines()[-4:]] == [
         f"next: citystitch check {out}",
+        f"citystitch report {out}",
         f"citystitch render {out} -o city.png",
         f"citystitch export {out} --format openfoam -o case",
     ]

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import ConfigError
-from stitch.grid import LEAST_TILE
+from stitch.least import LEAST_TILE
 from tiler.domain import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
-from tiler.pad import check_widths
+from tiler.pad_widths import check_widths
 from tiler.plain_text import shorten
 
 MAX_CONFIG_BYTES = 1_000_000

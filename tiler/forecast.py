@@ -8,7 +8,8 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.sizes import SizeField, local_sizes, size_field_around
-from stitch.grid import LEAST_TILE, Bounds, TileGrid, seams_present, tiles_present
+from stitch.grid import Bounds, TileGrid, seams_present, tiles_present
+from stitch.least import LEAST_TILE
 from tiler.clouds import CloudHeader
 from tiler.config import Config
 from tiler.domain import Domain

@@ -5,20 +5,14 @@ inlet and the sides, fifteen times behind (Franke et al., COST action 732, 2007)
 2008); both are cited in full in `tiler.domain`.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError
 from stitch.grid import Bounds, TileGrid, make_grid, tiles_present
 from tiler.context import SHARED
-from tiler.domain import Height, height_in_metres
-
-SIDES = ("west", "east", "south", "north")
-LEAST_NODES = 4  # of the terrain's grid, across a pad: the outermost ones are level
 
 
 @dataclass(frozen=True)
@@ -35,50 +29,6 @@ class Pad:
 
     core: Bounds
     grid: TileGrid
-
-
-def widths_in_metres(pad: Sequence[Height], tallest: float) -> tuple[float, float, float, float]:
-    """Widths of a pad to the west, east, south and north (m), given the height of the tallest building (m).
-
-    Raises
-    ------
-    ConfigError
-        If one is a multiple of the tallest building's height, and there is none.
-
-    Notes
-    -----
-    Multiples are rounded up to whole metres.
-
-    Examples
-    --------
-    >>> widths_in_metres(("5H",), 21.5), widths_in_metres((200.0, "15H", 0.0, 0.0), 21.5)
-    ((108.0, 108.0, 108.0, 108.0), (200.0, 323.0, 0.0, 0.0))
-    """
-    if tallest <= 0 and any(isinstance(width, str) for width in pad):
-        shown = " ".join(map(str, pad))
-        raise ConfigError(f"pad = {shown}: there are no buildings in the region; give it in metres")
-    metres = [
-        float(math.ceil(height_in_metres(width, tallest))) if isinstance(width, str) else width for width in pad
-    ]
-    west, east, south, north = metres * (4 // len(metres))
-    return west, east, south, north
-
-
-def check_widths(widths: Sequence[Height], *, mesh_size: float, dtm_spacing: float) -> None:
-    """Refuse a pad that is narrower than a cell, or too narrow for its ground.
-
-    Raises
-    ------
-    ConfigError
-        With the width against its bound (m); multiples of a height that is not known are not looked at.
-    """
-    least = max(mesh_size, LEAST_NODES * dtm_spacing)
-    for width in widths:
-        if not isinstance(width, str) and width != 0 and not (math.isfinite(width) and width >= least):
-            raise ConfigError(
-                f"pad = {width:g} m: must be 0 for none, or at least {least:g} m (mesh_size, and {LEAST_NODES} "
-                "times dtm_spacing)"
-            )
 
 
 def pad_bounds(core: Bounds, widths: Sequence[float]) -> Bounds:

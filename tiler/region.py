@@ -5,13 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.errors import ConfigError, InputError
-from stitch.grid import LEAST_TILE, TileGrid
+from stitch.grid import TileGrid
+from stitch.least import LEAST_TILE
 from stitch.numbering import MOST_TILES
 from tiler.clouds import CloudHeader
 from tiler.config import Config
 from tiler.domain import EXPECTED_TALLEST
 from tiler.options import expected_levels
-from tiler.pad import Pad, check_widths, pad_bounds, pad_grid, widths_in_metres
+from tiler.pad import Pad, pad_bounds, pad_grid
+from tiler.pad_widths import check_widths, widths_in_metres
 
 ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray points ...
 MOST_IN_ALL = 10_000_000  # tiles of the region's box; half a million make a country

@@ -211,7 +211,7 @@ def tell_duration(seconds: float) -> str:
     Examples
     --------
     >>> [tell_duration(seconds) for seconds in (0.2, 42.0, 100.0, 4000.0, 200000.0)]
-    ['1 s', '42 s', '2 min', '1 h 7 min', '2 d 8 h']
+    ['1 s', '42 s', '2 min', '1 h 7 min', '2 d 7 h']
     """
     minutes = round(seconds / 60)
     if seconds < 60:
