@@ -45,7 +45,7 @@ bench-exports: $(STAMP)
 
 simulate: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.simulate virtual netherlands 1000
-	$(BIN)/python -m tests.benchmarks.simulate dask netherlands 64 --workers 2
+	$(BIN)/python -m tests.benchmarks.simulate dask netherlands 64
 
 quality: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.quality

@@ -212,19 +212,19 @@ def main() -> None:
     parser.add_argument("what", choices=("virtual", "disk", "half", "dask", "record"))
     parser.add_argument("country", help=f"{' or '.join(COUNTRIES)}; for `record` the folder of a synthetic city")
     parser.add_argument("tiles", type=int, help="number of tiles; for `record` their side (m)")
-    parser.add_argument("--workers", type=int, default=64)
+    parser.add_argument("--workers", type=int, help="virtual ones, 64 by default; with dask processes, 2")
     parser.add_argument("--fail", type=float, default=0.0)
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "citystitch-simulate")
     given = parser.parse_args()
     folder = given.folder
     match given.what:
         case "virtual":
-            told = run_virtual(given.country, given.tiles, given.workers, given.fail, folder)
+            told = run_virtual(given.country, given.tiles, given.workers or 64, given.fail, folder)
         case "record":
             record_city(Path(given.country), given.tiles, folder)
             return
         case "dask":
-            told = run_dask(given.country, given.tiles, given.workers, folder)
+            told = run_dask(given.country, given.tiles, given.workers or 2, folder)
         case _:
             told = run_disk(given.country, given.tiles, folder, half=given.what == "half")
     told["peak_rss"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
