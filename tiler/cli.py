@@ -178,7 +178,7 @@ def _add_join(join: argparse.ArgumentParser) -> None:
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
     )
     _add_parameters(join)
-    join.add_argument("--member", default="", metavar="NAME", help="name of this process (default: HOST-PID)")
+    join.add_argument("--member", default="", metavar="NAME", help="its name (default: its element of an array)")
     join.add_argument(
         "--max-idle",
         type=float,

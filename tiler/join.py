@@ -51,6 +51,7 @@ from tiler.watching import Watcher
 
 MAX_IDLE = 600.0  # s that a member waits for a folder that another run holds
 MEMBERS = "members."
+ARRAY_INDEX = ("SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "PBS_ARRAYID", "SGE_TASK_ID", "LSB_JOBINDEX")
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 Say = Callable[[str], None]
 
@@ -90,7 +91,7 @@ def join(
         Parameters of the run, the same for all. ``workers`` is the number of worker processes of each member; 0
         is one.
     member : str
-        Name of this process for people: letters, digits, ``_``, ``.`` and ``-``; its host and number by default.
+        Name of this process for people, see `name_member`.
     max_idle : float
         How long (s) to wait for a folder in which another run is at work that is not to be joined.
     views : callable
@@ -112,9 +113,9 @@ def join(
         )
     if not max_idle > 0:
         raise ConfigError(f"--max-idle {max_idle:g} s: must be above 0 s")
-    name = member or f"{re.sub('[^A-Za-z0-9_-]', '-', socket.gethostname())[:50] or 'host'}-{os.getpid()}"
-    if not NAME.fullmatch(name):
-        raise ConfigError(f"--member {name!r}: 1 to 64 letters, digits, '_', '.' and '-', '.' and '-' not first")
+    if "://" in config.out:
+        raise ConfigError(f"{config.out}: members of a run share a folder; give one that all of them see as --out")
+    name = name_member(member)
     check_sources(config)
     check_folder(Path(config.out), overwrite=False)
     workers = max(config.workers, 1)
@@ -125,6 +126,22 @@ def join(
         return _Joining(config, me, crew, max_idle, views, say or _silent).go()
     finally:
         crew.close()
+
+
+def name_member(given: str) -> str:
+    """Name a process for people: as given, else by its element of a job array, else by host and number.
+
+    Raises
+    ------
+    ConfigError
+        If it is not 1 to 64 letters, digits, ``_``, ``.`` and ``-``, the last two not first.
+    """
+    if given and not NAME.fullmatch(given):
+        raise ConfigError(f"--member {given!r}: 1 to 64 letters, digits, '_', '.' and '-', '.' and '-' not first")
+    element = next((index for name in ARRAY_INDEX if (index := os.environ.get(name, "")).isdecimal()), "")
+    if given or element:
+        return given or f"element-{element}"
+    return f"{re.sub('[^A-Za-z0-9_.-]', '-', socket.gethostname()).strip('.-')[:50] or 'host'}-{os.getpid()}"
 
 
 class _Joining:
