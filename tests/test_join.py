@@ -39,6 +39,7 @@ from tiler.lease import (
 )
 from tiler.limits import Limits, trace_file
 from tiler.mailbox import GoneError, MailReader, MailWriter
+from tiler.member import Ended, _Service
 from tiler.spool import HOLDER, INBOX, OUTBOX, SPOOL, Spool
 from tiler.stage import Facts, Layout, Scope
 from tiler.store import Store
@@ -334,6 +335,25 @@ def test_all_is_given_up_when_another_process_drives(tmp_path: Path, spool: Spoo
     with pytest.raises(LostFolderError):
         spool.wait()
     assert spool.drop_waiting() == {7}
+
+
+def test_a_member_that_is_asked_to_stop_does_not_drive(tmp_path: Path) -> None:
+    """As where all elements of an array are cancelled at once, the driver among them."""
+    lease = taken(tmp_path, 1)
+    inbox = MailWriter(tmp_path / INBOX)
+    write_holder(tmp_path / HOLDER, holder())
+    service = _Service(tmp_path, lease.path, holder(), IdleCrew())
+    inbox.write([pickle.dumps(("context", 1)), pickle.dumps(("task", 3, give_one, make_task(tmp_path, "3"), 0))])
+    service.stop()
+    assert service.work() == Ended(130, "stopped as asked; the other members go on")
+    assert [pickle.loads(message) for message in MailReader(tmp_path / OUTBOX).read()] == [("back", [3])]
+    lease.close()
+    service._looked = -1e9
+    assert service.work() == Ended(130, "stopped as asked; the other members go on")
+    service._stop, service._looked = False, -1e9
+    assert service.work() is None
+    service.close()
+    assert not tmp_path.exists()
 
 
 @pytest.mark.long

@@ -110,7 +110,7 @@ class _Service:
                 if self._stop:
                     self._give_back()
                     if not self._crew.n_busy:
-                        return Ended(STOPPED, "stopped as asked; the other members go on")
+                        break
                 while self._waiting and self._crew.n_free:
                     self._crew.give(self._waiting.popleft())
                 done = self._crew.collect(pause.seconds)
@@ -120,6 +120,8 @@ class _Service:
             pass
         if self._crew.n_busy:
             self._crew.kill()
+        if self._ended is None and self._stop:
+            return Ended(STOPPED, "stopped as asked; the other members go on")
         return self._ended
 
     def _take(self, kind: str, *content: Any) -> None:
