@@ -151,7 +151,7 @@ def write_index(path: Path, pieces: Sequence[Path], kind: str) -> None:
         arrays = [f"      <PDataArray {array}/>" for array in declared[section]]
         lines += [f"    <P{section}>", *arrays, f"    </P{section}>"]
     for piece in pieces:
-        source = PurePath(os.path.relpath(piece, path.parent)).as_posix()
+        source = PurePath(os.path.relpath(str(piece), str(path.parent))).as_posix()
         lines.append(f"    <Piece Source={quoteattr(source)}/>")
     lines += [f"  </P{kind}>", "</VTKFile>", ""]
     with replacing(path) as part, part.open("wb") as file:
