@@ -141,7 +141,7 @@ def _judge(error: Exception) -> str:
     from obstore import exceptions
 
     text = str(error)
-    if isinstance(error, FileNotFoundError):
+    if isinstance(error, FileNotFoundError) or "NoSuchBucket" in text:  # listings give another error than reads
         bucket = "NoSuchBucket" in text
         raise FileNotFoundError(errno.ENOENT, "no such bucket" if bucket else "no such object") from None
     if isinstance(error, (exceptions.PreconditionError, exceptions.AlreadyExistsError)):
@@ -170,11 +170,12 @@ def _judge(error: Exception) -> str:
 
 def _client(root: str) -> Any:
     """Give obstore's store of a bucket or server; one for each process."""
-    return _make_client(root, os.getpid())
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL", "")
+    return _make_client(root, endpoint, os.getpid())
 
 
 @lru_cache(maxsize=32)
-def _make_client(root: str, _process: int) -> Any:
+def _make_client(root: str, endpoint: str, _process: int) -> Any:
     try:
         from obstore.store import HTTPStore, S3Store
     except ImportError:
@@ -183,7 +184,6 @@ def _make_client(root: str, _process: int) -> Any:
     options: Any = {"timeout": TIMEOUT, "connect_timeout": CONNECT_TIMEOUT}
     if not root.startswith("s3://"):
         return HTTPStore.from_url(root, client_options=options | {"allow_http": True}, retry_config=never)
-    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL", "")
     if endpoint.startswith("http://"):  # whoever names such an endpoint wants it
         options["allow_http"] = True
     given: dict[str, Any] = {"endpoint": endpoint} if endpoint else {}

@@ -10,7 +10,7 @@ from tiler.object_requests import ChangedError
 if TYPE_CHECKING:
     from tiler.object_path import ObjectPath
 
-LEAST = 1 << 16  # bytes of one request: headers and indexes are read in small pieces
+LEAST = 1 << 14  # bytes of one request: headers and indexes are read in small pieces
 MOST = 1 << 23  # of one that goes on where the last one ended; each is twice the one before
 
 
