@@ -153,16 +153,11 @@ class ObjectPath:
         return self.is_dir() or self.is_file()
 
     def read_bytes(self, at_most: int | None = None) -> bytes:
-        """Read the object; of one that is larger than `at_most`, so many bytes."""
+        """Read the object; of one that is larger than `at_most`, so many bytes. OSError for an empty one then."""
         import obstore
 
-        def read(store: Any) -> bytes:
-            found = obstore.get(store, self.key)
-            if at_most is not None and found.meta["size"] > at_most:
-                return bytes(obstore.get_range(store, self.key, start=0, end=at_most))
-            return bytes(found.bytes())
-
-        return self._ask(read)
+        options: Any = {} if at_most is None else {"range": (0, at_most)}
+        return self._ask(lambda store: bytes(obstore.get(store, self.key, options=options).bytes()))
 
     def read_range(self, start: int, stop: int, e_tag: str = "") -> bytes:
         """Read some bytes; ChangedError if the object has another tag by now."""
