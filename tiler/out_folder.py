@@ -11,6 +11,7 @@ from pipeline.errors import ConfigError, OutputError
 from tiler.limits import TASKS
 from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL
 from tiler.store import MANIFEST
+from tiler.terms import PROBE
 
 # What a run writes, and all that --overwrite removes; the record is replaced.
 INDEXES = ("mesh.pvtu", "boundary.pvtp")
@@ -122,7 +123,8 @@ def _remove_strangers(out: Path, tiles: Collection[str]) -> None:
         for path in (out / folder).glob(f"*{suffix}"):
             if path.stem not in tiles:
                 path.unlink()
-    for name in map(Path, RESULTS):
+    (out / PROBE).unlink(missing_ok=True)
+    for name in map(Path, (*RESULTS, PROBE)):
         for path in out.glob(PART.format(stem=name.stem, suffix=name.suffix)):
             if path.is_file():
                 path.unlink()

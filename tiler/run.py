@@ -16,11 +16,12 @@ from stitch.grid import seams_of_tile
 from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.audit import Audit
+from tiler.cluster import reach_cluster, spell_out
 from tiler.config import Config
 from tiler.context import RunContext, pack_tiles, seam_name, tile_key
 from tiler.dashboard.server import read_address, watched
 from tiler.engine import Engine, Progress, StoppedError
-from tiler.executors import Executor, connect, local, serial, share_memory
+from tiler.executors import Executor, local, serial, share_memory
 from tiler.failures import Policy
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
@@ -122,6 +123,7 @@ def run(
     (``damaged-artefact``).
     """
     told = Watchers(watchers if say is None else [*watchers, Listener(say)])
+    config = spell_out(config)
     try:
         check_sources(config)
         if dashboard is not None:
@@ -132,7 +134,8 @@ def run(
         with only_run(out, told.say):
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
-            return _run(config, out, earlier, damage, own, announce, told, dashboard)
+            with reach_cluster(config) as cluster:
+                return _run(config, out, earlier, damage, own, announce, told, dashboard, cluster)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
             told.end("failed", tell_error(error))
@@ -148,6 +151,7 @@ def _run(
     announce: Announce | None,
     watchers: Watchers,
     dashboard: str | None,
+    cluster: Executor | None,
 ) -> dict[str, Any]:
     say = watchers.say
     start, untouched = time.perf_counter(), bool(earlier)
@@ -174,7 +178,7 @@ def _run(
         shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(config, out)
         progress = begin_watching(config, out, plan, own, watchers, announce=announce)
-        record |= _mesh_region(config, out, plan, own, watchers, damage, dashboard)
+        record |= _mesh_region(config, out, plan, own, watchers, damage, dashboard, cluster)
         record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:
             say(message)
@@ -205,6 +209,7 @@ def _mesh_region(
     watchers: Watchers,
     damage: Mapping[str, str],
     dashboard: str | None,
+    cluster: Executor | None,
 ) -> dict[str, Any]:
     """Run all stages, and write the indexes of their pieces and the manifest.
 
@@ -213,7 +218,7 @@ def _mesh_region(
     """
     missing = Missing()
     with (
-        _executor(config, dashboard or ANYWHERE) as executor,
+        _executor(config, dashboard or ANYWHERE, cluster) as executor,
         watched(out, dashboard, getattr(executor, "scheduler", None), watchers.say),
     ):
         while True:
@@ -392,10 +397,9 @@ def run_city_stages(engine: Engine, config: Config) -> int:
 
 
 @contextmanager
-def _executor(config: Config, dashboard: str) -> Iterator[Executor]:
-    if config.scheduler:
-        with connect(config.scheduler, Limits(config.time_limit)) as executor:
-            yield executor
+def _executor(config: Config, dashboard: str, cluster: Executor | None) -> Iterator[Executor]:
+    if cluster is not None:
+        yield cluster
     elif config.workers:
         memory = int(config.memory_limit * 2**30) or share_memory(config.workers)
         with local(config.workers, Limits(config.time_limit, memory), dashboard=dashboard) as executor:
