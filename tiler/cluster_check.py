@@ -7,10 +7,10 @@ from typing import Any
 
 from pipeline.errors import ConfigError
 from tiler import versions
-from tiler.terms import GRACE, Files, Refusal, Terms, check_files
-from tiler.versions import TRANSPORT, tell_versions
+from tiler.terms import GRACE, Files, Refusal, Terms, check_files, own_versions
+from tiler.versions import TRANSPORT
 
-ANSWER = 60.0  # s that a worker may take to answer; a task may hold its interpreter that long
+ANSWER, LATE_ANSWER = 60.0, 5.0  # s that workers may take to answer, before a run and in it
 NAMED = 3  # workers that are named in a line; the others are counted
 
 # Runs the text of `tiler.versions` where there may be no citystitch.
@@ -24,6 +24,10 @@ ADVICE = (
 FILES_ADVICE = "workers must see output folder and inputs under the same paths: mount the shared file system there"
 
 Versions = dict[str, str]
+
+
+class UnansweredError(ConfigError):
+    """A worker has not answered in time: it is out of reach, or its task holds the interpreter."""
 
 
 class ClusterMismatchError(ConfigError):
@@ -52,19 +56,25 @@ def check_cluster(client: Any, address: str, terms: Terms, *, late: bool = False
     Raises
     ------
     ClusterMismatchError
-        If a version differs or a library is missing; if output folder or inputs are not there, or others; or if a
-        worker does not answer within `ANSWER` seconds.
+        If a version differs or a library is missing, or if output folder or inputs are not there, or others.
+    UnansweredError
+        If a worker does not answer within `ANSWER` or `LATE_ANSWER` seconds.
     """
-    here, source, head = tell_versions(), inspect.getsource(versions), f"{address}: {LATE if late else EARLY}"
+    here, source, head = own_versions(), inspect.getsource(versions), f"{address}: {LATE if late else EARLY}"
     carried = {name: here[name] for name in ("python", "citystitch", *TRANSPORT)}
-    there = _ask(client, address, client.run_on_scheduler, eval, PROBE, {"source": source, "only": TRANSPORT})
+    bound = LATE_ANSWER if late else ANSWER
+
+    def ask(function: Callable[..., Any], *given: Any, **named: Any) -> Any:
+        return _ask(client, address, bound, function, *given, **named)
+
+    there = ask(client.run_on_scheduler, eval, PROBE, {"source": source, "only": TRANSPORT})
     lines = compare_versions(carried, {f"scheduler {address}": there})
-    found = _ask(client, address, client.run, eval, PROBE, {"source": source, "only": None}, on_error="return")
+    found = ask(client.run, eval, PROBE, {"source": source, "only": None}, on_error="return")
     lines += compare_versions(here, found)
     if lines:
         raise ClusterMismatchError("\n".join([head, *lines, ADVICE]))
     end = time.monotonic() + GRACE
-    while lines := compare_files(_ask(client, address, client.run, check_files, terms, on_error="return")):
+    while lines := compare_files(ask(client.run, check_files, terms, on_error="return")):
         if time.monotonic() >= end:
             raise ClusterMismatchError("\n".join([head, *lines, FILES_ADVICE]))
         time.sleep(0.5)
@@ -72,7 +82,7 @@ def check_cluster(client: Any, address: str, terms: Terms, *, late: bool = False
 
 def tell_refusal(refusal: Refusal, address: str) -> ClusterMismatchError:
     """The error of a worker that joined while a run was at work."""
-    lines = compare_versions(tell_versions(), {refusal.worker: refusal.versions})
+    lines = compare_versions(own_versions(), {refusal.worker: refusal.versions})
     files = compare_files({refusal.worker: refusal.files})
     advice = [*([ADVICE] if lines else []), *([FILES_ADVICE] if files else [])]
     return ClusterMismatchError("\n".join([f"{address}: {LATE}", *lines, *files, *advice]))
@@ -120,15 +130,15 @@ def _name(places: list[str]) -> str:
     return ", ".join(places[:NAMED]) + more
 
 
-def _ask(client: Any, address: str, function: Callable[..., Any], *given: Any, **named: Any) -> Any:
+def _ask(client: Any, address: str, bound: float, function: Callable[..., Any], *given: Any, **named: Any) -> Any:
     """Ask scheduler or workers, for a bounded time."""
 
     async def ask() -> Any:
         return await function(*given, **named)
 
     try:
-        return client.sync(ask, callback_timeout=ANSWER)
+        return client.sync(ask, callback_timeout=bound)
     except TimeoutError as error:
-        raise ClusterMismatchError(
-            f"{address}: not all workers have answered within {ANSWER:g} s; look at their logs, and run again"
+        raise UnansweredError(
+            f"{address}: not all workers have answered within {bound:g} s; look at their logs, and run again"
         ) from error

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from pipeline.errors import CityError
 from tiler import fork_server
 from tiler.addresses import ANYWHERE
-from tiler.cluster_check import ClusterMismatchError, check_cluster, tell_refusal
+from tiler.cluster_check import ClusterMismatchError, UnansweredError, check_cluster, tell_refusal
 from tiler.limits import Limits, WorkerError, machine_memory, run_guarded, tell_death, tell_memory
 from tiler.stage import Facts
 from tiler.task import Failure, Record, Task, run_task
@@ -223,16 +223,26 @@ class Dask:
         return str(self._client.scheduler.address)
 
     def _find_mismatch(self) -> ClusterMismatchError | None:
-        """Ask somebody's workers again: one may have joined that cannot even read a task."""
+        """Ask somebody's workers again: one may have joined that cannot even read a task, and dies of it."""
         if self._terms is None:
             return None
         try:
             check_cluster(self._client, self._address, self._terms, late=True)
         except ClusterMismatchError as error:
             return error
+        except UnansweredError:  # one is out of reach: what the others run is theirs
+            return None
         except (OSError, RuntimeError, CancelledError):
             self._check_scheduler()
         return None
+
+    def _bystander(self, ticket: int) -> Failure | None:
+        """What came of a task that had not begun in a worker that died; None if it must be sent again."""
+        if mismatch := self._find_mismatch():
+            return Failure(mismatch)
+        if self._sent[ticket] < BYSTANDER:
+            return None
+        return Failure(WorkerError(f"{BYSTANDER} workers died before they began it; look at their logs"))
 
     def _cancel(self) -> set[int]:
         if self._is_lost():
@@ -261,11 +271,7 @@ class Dask:
             case Refusal():
                 return Failure(tell_refusal(found, self._address))
             case KilledWorker():
-                death = tell_death(task, self._limits)
-                if death is None and self._sent[ticket] >= BYSTANDER:
-                    words = f"{BYSTANDER} workers died before they began it; look at their logs"
-                    return Failure(WorkerError(words))
-                return death
+                return tell_death(task, self._limits) or self._bystander(ticket)
             case CancelledError():  # nobody but a lost scheduler does that
                 self._lost = True
                 self._check_scheduler()

@@ -96,9 +96,15 @@ def offer_terms(out: Path, inputs: Sequence[Path]) -> Iterator[Terms]:
             probe.unlink(missing_ok=True)
 
 
+@functools.cache
+def own_versions() -> dict[str, str]:
+    """Versions of this process, as they were when it was asked first: what is installed may change meanwhile."""
+    return tell_versions()
+
+
 def own_terms() -> Terms:
     """Terms of this process without files."""
-    return Terms(digest_versions(_own_versions()))
+    return Terms(digest_versions(own_versions()))
 
 
 def check_files(terms: Terms) -> Files:
@@ -135,18 +141,13 @@ def run_on_terms(
 @functools.lru_cache(maxsize=4)
 def _refuse(terms: Terms) -> Refusal | None:
     """Hold this process against the terms, once."""
-    versions = _own_versions()
+    versions = own_versions()
     end = time.monotonic() + GRACE
     while (files := check_files(terms)) and time.monotonic() < end:
         time.sleep(0.2)
     if digest_versions(versions) == terms.versions and not files:
         return None
     return Refusal(_address(), versions, files)
-
-
-@functools.cache
-def _own_versions() -> dict[str, str]:
-    return tell_versions()
 
 
 def _address() -> str:
