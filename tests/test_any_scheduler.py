@@ -29,7 +29,8 @@ from tiler.cluster_check import (
     compare_versions,
 )
 from tiler.config import Config
-from tiler.stage import Scope, Stage
+from tiler.stage import Facts, Scope, Stage
+from tiler.task import Task
 from tiler.terms import PROBE, Terms, check_files, offer_terms, own_terms
 from tiler.versions import LIBRARIES, MISSING, NATIVE, tell_versions
 
@@ -175,6 +176,27 @@ def test_a_task_is_refused_by_a_worker_that_joins_late(
     assert "0.1 there (inproc://" in line
     assert last.startswith("install the same versions there")
     assert engine.store.names("a") == []
+
+
+class Unsendable:
+    """A stage's function that cannot be pickled."""
+
+    def __call__(self, _: Task) -> Facts:
+        """Give nothing."""
+        return {}
+
+    def __reduce__(self) -> str:
+        """Refuse."""
+        raise ZeroDivisionError("a fault on purpose")
+
+
+def test_tasks_that_cannot_be_sent_end_a_run_and_nothing_waits_for_them(client: Client, tmp_path: Path) -> None:
+    with connect(client.scheduler.address) as executor:
+        engine = make(tmp_path, executor)
+        with pytest.raises(Exception, match=r"(?i)pickle|serialize|purpose"):
+            engine.run(Stage("a", Scope.TILE, Unsendable()))
+        engine.run(Stage("b", Scope.TILE, nothing))
+    assert len(engine.store.names("b")) == len(engine.layout.tiles)
 
 
 def test_paths_of_a_run_on_a_cluster_are_absolute() -> None:

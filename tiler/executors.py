@@ -111,6 +111,7 @@ class Dask:
         self.workers, self.scheduler = workers, scheduler
         self._limits = limits or Limits()
         self._client, self._terms = client, terms
+        self._unsent: list[tuple[int, Function, Task]] = []
         self._flying: dict[str, tuple[Any, int, Function, Task]] = {}
         self._ready: SimpleQueue[tuple[str, Any]] = SimpleQueue()  # key, and the result or the error
         self._sent: Counter[int] = Counter()
@@ -121,14 +122,7 @@ class Dask:
         """Take a task; ClusterError if the scheduler is lost."""
         self._check_scheduler()
         self._forget_names()
-        key = f"{task.stage}-{uuid.uuid4().hex}"  # never met again, not even by a second try
-        given: tuple[Any, ...] = function, task, self._limits.seconds
-        guard: Callable[..., Any] = run_guarded
-        if self._terms is not None:
-            guard, given = run_on_terms, (*given, self._terms)
-        future = self._client.submit(guard, *given, key=key, pure=False, retries=0)
-        self._flying[key] = (future, ticket, function, task)
-        self._client.loop.add_callback(self._follow, future)
+        self._unsent.append((ticket, function, task))
 
     def wait(self) -> tuple[int, Record | Failure]:
         """Wait for the scheduler; the result is released there at once.
@@ -139,6 +133,8 @@ class Dask:
             If the scheduler is lost, or has had no worker for `NO_WORKERS` seconds.
         """
         while True:
+            if self._ready.empty():  # what is there is taken first, so that more can be sent together
+                self._send()
             key, found = self._next()
             if key not in self._flying:
                 continue
@@ -157,14 +153,16 @@ class Dask:
 
         Without a scheduler nobody can be asked; what workers then still commit is what a task of that key gives.
         """
+        unsent = {ticket for ticket, _, _ in self._unsent}
+        self._unsent.clear()
         try:
-            return self._cancel()
+            return unsent | self._cancel()
         except (OSError, RuntimeError, CancelledError):
             if not self._is_lost():
                 raise
         dropped = {ticket for _, ticket, _, _ in self._flying.values()}
         self._flying.clear()
-        return dropped
+        return unsent | dropped
 
     async def _follow(self, future: Any) -> None:
         """Fetch a result as soon as it is there: no other waits for a worker that is out of reach."""
@@ -174,6 +172,24 @@ class Dask:
         except Exception as error:
             found = error
         self._ready.put((future.key, found))
+
+    def _send(self) -> None:
+        """Send what was taken, the tasks of a function at once: most of what a graph costs, it costs for all."""
+        guard: Callable[..., Any] = run_guarded
+        given: dict[str, Any] = {"seconds": self._limits.seconds}
+        if self._terms is not None:
+            guard, given = run_on_terms, given | {"terms": self._terms}
+        while self._unsent:
+            function = self._unsent[0][1]
+            together = [one for one in self._unsent if one[1] is function]
+            tickets, functions, tasks = zip(*together, strict=True)
+            # Never met again, not even by a second try.
+            keys = [f"{task.stage}-{uuid.uuid4().hex}" for task in tasks]
+            futures = self._client.map(guard, functions, tasks, key=keys, pure=False, retries=0, **given)
+            self._unsent = [one for one in self._unsent if one[1] is not function]
+            for future, ticket, task in zip(futures, tickets, tasks, strict=True):
+                self._flying[future.key] = (future, ticket, function, task)
+                self._client.loop.add_callback(self._follow, future)
 
     def _forget_names(self) -> None:
         from dask.utils import key_split
