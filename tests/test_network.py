@@ -64,14 +64,18 @@ def test_a_scheduler_with_tls_takes_its_own_certificates(secured: str, files: tu
         assert executor.workers == 1
 
 
-def test_certificates_may_come_from_dasks_configuration(secured: str, files: tuple[str, str, str]) -> None:
+def test_certificates_may_come_from_dasks_configuration(
+    secured: str, files: tuple[str, str, str], stranger: tuple[str, str, str], tmp_path: Path
+) -> None:
     from dask import config
 
     with config.set(dict(zip(transport.DASKS.values(), files, strict=True))):
         check_answer(secured, make_security(secured, TlsFiles()))
-        # A certificate that is given goes with its own key, not with that of the configuration.
-        with pytest.raises(ConfigError, match="cannot be used"):
-            make_security(secured, TlsFiles(tls_cert=files[0]))
+    # A certificate that is given goes with its own key, here in its file, not with that of the configuration.
+    both = tmp_path / "both.pem"
+    both.write_text(Path(files[1]).read_text() + Path(files[2]).read_text())
+    with config.set(dict(zip(transport.DASKS.values(), stranger, strict=True))):
+        check_answer(secured, make_security(secured, TlsFiles(files[0], str(both))))
 
 
 def test_another_authority_is_refused(
