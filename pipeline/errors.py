@@ -10,6 +10,11 @@ class CityError(Exception):
 
     exit_code = 1
 
+    @property
+    def lines(self) -> list[str]:
+        """The message as it is shown: one line."""
+        return [str(self)]
+
 
 class InputError(CityError):
     """A file or a value in it cannot be used: mend or leave out the input."""

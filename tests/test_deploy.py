@@ -16,13 +16,14 @@ from typing import Any
 
 import pytest
 import yaml
-from dask.utils import parse_bytes
+from dask.utils import parse_bytes, parse_timedelta
 from packaging.requirements import Requirement
 
 from tests.sparse_city import ROOT, make_city
 from tests.test_run import hashes
 from tiler import fork_server
-from tiler.config import check_reach, load_config
+from tiler.cluster import PATIENCE
+from tiler.config import Config, check_reach, load_config
 from tiler.executors import KILL_AT
 from tiler.places import is_url
 
@@ -100,7 +101,11 @@ def test_dasks_settings_are_those_of_local_workers() -> None:
     assert settings["nanny"]["pre-spawn-environ"] == dict(fork_server.ENVIRONMENT)
     memory = {"target": False, "spill": False, "pause": False, "terminate": KILL_AT}
     assert settings["worker"] == {"memory": memory}
-    assert settings["scheduler"] == {"allowed-failures": 0, "worker-saturation": 1.0}
+    scheduler = {"allowed-failures": 0, "worker-saturation": 1.0, "worker-ttl": "65 minutes"}
+    assert settings["scheduler"] == scheduler
+    # A silent worker is let live as long as a task may hold its interpreter.
+    assert parse_timedelta(scheduler["worker-ttl"]) > Config().time_limit
+    assert parse_timedelta(settings["comm"]["timeouts"]["tcp"]) == PATIENCE
 
 
 def test_the_lock_has_each_dependency_in_a_version_that_will_do_and_checksums() -> None:

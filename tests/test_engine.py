@@ -17,8 +17,9 @@ import pytest
 
 from pipeline.errors import CityError, GeometryError, InputError
 from pipeline.notes import Note
+from tiler.cluster import connect
 from tiler.engine import Engine
-from tiler.executors import Executor, Serial, connect, local
+from tiler.executors import Executor, Serial, local
 from tiler.keys import item_key, stage_digest
 from tiler.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
 from tiler.store import Store

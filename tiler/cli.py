@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except CityError as error:
         if options.traceback:
             raise
-        print(f"citystitch: {printable(str(error))}", file=sys.stderr)
+        print("citystitch:", "\n".join(map(printable, error.lines)), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("citystitch: interrupted", file=sys.stderr)

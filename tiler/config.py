@@ -243,6 +243,12 @@ class Config:
     scheduler: str = _parameter(
         UNSET, "run", "address of a running Dask scheduler, whose workers see the same files; instead of workers"
     )
+    tls_ca: str = _parameter(
+        UNSET, "run", "with a scheduler at tls://: certificate file of the cluster's authority; empty: that of "
+        "Dask's configuration",
+    )  # fmt: skip
+    tls_cert: str = _parameter(UNSET, "run", "likewise: certificate file of this client")
+    tls_key: str = _parameter(UNSET, "run", "likewise: file of its key; empty: in that of the certificate")
     out: str = _parameter("out", "run", "folder for the results, or s3://BUCKET/NAME")
     overwrite: bool = _parameter(
         False, "run", "remove the results of an earlier run in that folder, and start anew"
@@ -300,6 +306,7 @@ CONDITIONS = {
     "smoothing_tolerance": ("mesher", "layered"),
     "fem_tolerance": ("mesher", "layered"),
 }
+TLS = ("tls_ca", "tls_cert", "tls_key")
 SOIL = ("least_spacing", "most_spacing", "stagger")  # of these, those that count for soil with either mesher
 
 
@@ -323,6 +330,8 @@ def idle_parameters(config: Config) -> list[str]:
         idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
     if config.layer_growth != default.layer_growth and not config.first_layer:
         idle.append(f"layer_growth = {config.layer_growth:g} has no effect: it counts with first_layer above 0")
+    if not config.scheduler:
+        idle += [f"{name} has no effect: it counts with scheduler" for name in TLS if getattr(config, name)]
     return idle
 
 
@@ -451,7 +460,7 @@ def _relative_to(folder: Path, name: str, value: Any) -> Any:
     if name == "pointcloud" and isinstance(value, (str, list)):
         value = [value] if isinstance(value, str) else value
         return [_below(folder, item) if isinstance(item, str) else item for item in value]
-    if name in ("footprints", "out") and isinstance(value, str) and value:
+    if name in ("footprints", "out", *TLS) and isinstance(value, str) and value:
         return _below(folder, value)
     return value
 

@@ -1,6 +1,5 @@
 """Where tasks run: in this process, in worker processes of this machine, or in a Dask cluster anywhere."""
 
-import logging
 import os
 import signal
 import time
@@ -9,14 +8,17 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
+from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 
 from pipeline.errors import CityError
 from tiler import fork_server
 from tiler.addresses import ANYWHERE
+from tiler.cluster_check import ClusterMismatchError, UnansweredError, check_cluster, tell_refusal
 from tiler.limits import Limits, WorkerError, machine_memory, run_guarded, tell_death, tell_memory
 from tiler.stage import Facts
 from tiler.task import Failure, Record, Task, run_task
+from tiler.terms import Refusal, Terms, run_on_terms
 
 Function = Callable[[Task], Facts]
 
@@ -87,6 +89,9 @@ class Dask:
         What a task may take.
     scheduler : distributed.Scheduler, optional
         The scheduler, where it is in this process: its HTTP server shows the page of the run.
+    terms : Terms, optional
+        What a worker must meet that did not come from here. A task that comes back from one that does not fails
+        with a `ClusterMismatchError`, which ends a run.
 
     Notes
     -----
@@ -95,15 +100,20 @@ class Dask:
     """
 
     def __init__(
-        self, client: Any, workers: int, limits: Limits | None = None, scheduler: Any | None = None
+        self,
+        client: Any,
+        workers: int,
+        limits: Limits | None = None,
+        scheduler: Any | None = None,
+        *,
+        terms: Terms | None = None,
     ) -> None:
-        from distributed import as_completed
-
         self.workers, self.scheduler = workers, scheduler
         self._limits = limits or Limits()
-        self._client = client
-        self._completed = as_completed()
-        self._flying: dict[str, tuple[int, Function, Task]] = {}
+        self._client, self._terms = client, terms
+        self._unsent: list[tuple[int, Function, Task]] = []
+        self._flying: dict[str, tuple[Any, int, Function, Task]] = {}
+        self._ready: SimpleQueue[tuple[str, Any]] = SimpleQueue()  # key, and the result or the error
         self._sent: Counter[int] = Counter()
         self._submitted = 0
         self._lost = False
@@ -112,12 +122,7 @@ class Dask:
         """Take a task; ClusterError if the scheduler is lost."""
         self._check_scheduler()
         self._forget_names()
-        key = f"{task.stage}-{uuid.uuid4().hex}"  # never met again, not even by a second try
-        future = self._client.submit(
-            run_guarded, function, task, self._limits.seconds, key=key, pure=False, retries=0
-        )
-        self._flying[future.key] = (ticket, function, task)
-        self._completed.add(future)
+        self._unsent.append((ticket, function, task))
 
     def wait(self) -> tuple[int, Record | Failure]:
         """Wait for the scheduler; the result is released there at once.
@@ -128,13 +133,15 @@ class Dask:
             If the scheduler is lost, or has had no worker for `NO_WORKERS` seconds.
         """
         while True:
-            self._wait_for_one()
-            future = next(self._completed)
-            if future.key not in self._flying:
+            if self._ready.empty():  # what is there is taken first, so that more can be sent together
+                self._send()
+            key, found = self._next()
+            if key not in self._flying:
                 continue
-            ticket, function, task = self._flying[future.key]
-            outcome = self._outcome(future, ticket, task)
-            del self._flying[future.key]
+            future, ticket, function, task = self._flying[key]
+            outcome = self._outcome(found, ticket, task)
+            future.release()
+            del self._flying[key]
             if outcome is not None:
                 self._sent.pop(ticket, None)
                 return ticket, outcome
@@ -146,15 +153,43 @@ class Dask:
 
         Without a scheduler nobody can be asked; what workers then still commit is what a task of that key gives.
         """
+        unsent = {ticket for ticket, _, _ in self._unsent}
+        self._unsent.clear()
         try:
-            return self._cancel()
+            return unsent | self._cancel()
         except (OSError, RuntimeError, CancelledError):
             if not self._is_lost():
                 raise
-        dropped = {ticket for ticket, _, _ in self._flying.values()}
+        dropped = {ticket for _, ticket, _, _ in self._flying.values()}
         self._flying.clear()
-        self._completed.clear()
-        return dropped
+        return unsent | dropped
+
+    async def _follow(self, future: Any) -> None:
+        """Fetch a result as soon as it is there: no other waits for a worker that is out of reach."""
+        found: Any
+        try:
+            found = await future
+        except Exception as error:
+            found = error
+        self._ready.put((future.key, found))
+
+    def _send(self) -> None:
+        """Send what was taken, the tasks of a function at once: most of what a graph costs, it costs for all."""
+        guard: Callable[..., Any] = run_guarded
+        given: dict[str, Any] = {"seconds": self._limits.seconds}
+        if self._terms is not None:
+            guard, given = run_on_terms, given | {"terms": self._terms}
+        while self._unsent:
+            function = self._unsent[0][1]
+            together = [one for one in self._unsent if one[1] is function]
+            tickets, functions, tasks = zip(*together, strict=True)
+            # Never met again, not even by a second try.
+            keys = [f"{task.stage}-{uuid.uuid4().hex}" for task in tasks]
+            futures = self._client.map(guard, functions, tasks, key=keys, pure=False, retries=0, **given)
+            self._unsent = [one for one in self._unsent if one[1] is not function]
+            for future, ticket, task in zip(futures, tickets, tasks, strict=True):
+                self._flying[future.key] = (future, ticket, function, task)
+                self._client.loop.add_callback(self._follow, future)
 
     def _forget_names(self) -> None:
         from dask.utils import key_split
@@ -163,11 +198,13 @@ class Dask:
         if self._submitted % FORGET == 0:
             key_split.cache_clear()
 
-    def _wait_for_one(self) -> None:
-        """Wait until a future is done. Dask waits for ever, or takes up a new scheduler without our tasks."""
+    def _next(self) -> tuple[str, Any]:
+        """Wait until a task is done. Dask waits for ever, or takes up a new scheduler without our tasks."""
         began = looked = time.monotonic()
-        while not self._completed.has_ready():
+        while True:
             self._check_scheduler()
+            with suppress(Empty):
+                return self._ready.get(timeout=0.1)
             if time.monotonic() - looked >= LOOK:
                 looked = time.monotonic()
                 if self._has_workers():
@@ -177,9 +214,6 @@ class Dask:
                         f"the Dask scheduler has no worker for {looked - began:.0f} s, bound {NO_WORKERS:g} s; "
                         "start some, the same command goes on where it ended"
                     )
-            with self._completed.thread_condition:
-                self._completed.thread_condition.wait(timeout=0.1)
-        self._check_scheduler()
 
     def _has_workers(self) -> bool:
         try:
@@ -200,12 +234,36 @@ class Dask:
         comm = self._client.scheduler_comm
         return self._client.status != "running" or comm is None or comm.comm.closed() or self._lost
 
+    @property
+    def _address(self) -> str:
+        return str(self._client.scheduler.address)
+
+    def _find_mismatch(self) -> ClusterMismatchError | None:
+        """Ask somebody's workers again: one may have joined that cannot even read a task, and dies of it."""
+        if self._terms is None:
+            return None
+        try:
+            check_cluster(self._client, self._address, self._terms, late=True)
+        except ClusterMismatchError as error:
+            return error
+        except UnansweredError:  # one is out of reach: what the others run is theirs
+            return None
+        except (OSError, RuntimeError, CancelledError):
+            self._check_scheduler()
+        return None
+
+    def _bystander(self, ticket: int) -> Failure | None:
+        """What came of a task that had not begun in a worker that died; None if it must be sent again."""
+        if mismatch := self._find_mismatch():
+            return Failure(mismatch)
+        if self._sent[ticket] < BYSTANDER:
+            return None
+        return Failure(WorkerError(f"{BYSTANDER} workers died before they began it; look at their logs"))
+
     def _cancel(self) -> set[int]:
         if self._is_lost():
             raise CancelledError
-        futures = [
-            future for future in self._completed.futures if future.key in self._flying and not future.done()
-        ]
+        futures = [future for future, *_ in self._flying.values() if not future.done()]
         keys = {future.key for future in futures}
         self._client.cancel(futures)
         clean = 0
@@ -215,30 +273,26 @@ class Dask:
                 raise CancelledError
             held = set().union(*self._client.run(_held, on_error="ignore").values())
             clean = 0 if held & keys else clean + 1
-        return {self._flying.pop(key)[0] for key in keys}
+        return {self._flying.pop(key)[1] for key in keys}
 
-    def _outcome(self, future: Any, ticket: int, task: Task) -> Record | Failure | None:
+    def _outcome(self, found: Any, ticket: int, task: Task) -> Record | Failure | None:
         """What came of a task; None if it must be sent again."""
         from distributed import KilledWorker
 
-        try:
-            outcome: Record | Failure = future.result()
-        except KilledWorker:
-            found = tell_death(task, self._limits)
-            if found is None and self._sent[ticket] >= BYSTANDER:
-                found = Failure(WorkerError(f"{BYSTANDER} workers died before they began it; look at their logs"))
-            return found
-        except CancelledError:  # nobody but a lost scheduler does that
-            self._lost = True
-            self._check_scheduler()
-            raise
-        except Exception as error:  # what Dask itself raises: a module that a worker lacks
-            return Failure(error)
-        finally:
-            future.release()
-        if isinstance(outcome, Failure) and outcome.kind == "memory":
-            return tell_memory(outcome, self._limits)
-        return outcome
+        match found:
+            case Record():
+                return found
+            case Failure():
+                return tell_memory(found, self._limits) if found.kind == "memory" else found
+            case Refusal():
+                return Failure(tell_refusal(found, self._address))
+            case KilledWorker():
+                return tell_death(task, self._limits) or self._bystander(ticket)
+            case CancelledError():  # nobody but a lost scheduler does that
+                self._lost = True
+                self._check_scheduler()
+        # What Dask itself raises: a module that a worker lacks.
+        return Failure(self._find_mismatch() or found)
 
 
 @contextmanager
@@ -315,45 +369,6 @@ def _kill_workers(cluster: Any) -> None:
         nanny.auto_restart = False
         with suppress(OSError, TypeError):
             os.kill(nanny.pid, signal.SIGKILL)
-
-
-@contextmanager
-def connect(address: str, limits: Limits | None = None) -> Iterator[Executor]:
-    """Run tasks on a Dask cluster whose workers see the same store and files; it is left running.
-
-    Parameters
-    ----------
-    address : str
-        Address of its scheduler, ``"tcp://10.0.0.1:8786"``.
-    limits : Limits, optional
-        The time limit holds if workers have one thread each; the memory limit is the cluster's own.
-
-    Raises
-    ------
-    CityError
-        If nothing answers there, or it has no workers.
-
-    Notes
-    -----
-    A worker that dies is not replaced: the others take its tasks. A lost scheduler ends the run with a
-    `ClusterError`, and so does a cluster that has had no worker for `NO_WORKERS` seconds.
-    """
-    from distributed import Client
-    from distributed.utils import silence_logging_cmgr
-
-    try:
-        client = Client(address)
-    except OSError as error:
-        raise CityError(
-            f"{address}: no Dask scheduler answers ({error}); start one, or check the address"
-        ) from error
-    # A lost scheduler is told once, by us.
-    with silence_logging_cmgr(logging.CRITICAL), client:
-        threads = list(client.nthreads().values())
-        if not threads:
-            raise CityError(f"{address}: the scheduler has no workers; start some and run again")
-        seconds = limits.seconds if limits is not None and max(threads) == 1 else 0.0
-        yield Dask(client, sum(threads), Limits(seconds))
 
 
 def share_memory(workers: int) -> int:

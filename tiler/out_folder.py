@@ -12,6 +12,7 @@ from tiler.limits import TASKS
 from tiler.places import in_bucket
 from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL
 from tiler.store import MANIFEST
+from tiler.terms import PROBE
 
 # What a run writes, and all that --overwrite removes; the record is replaced.
 INDEXES = ("mesh.pvtu", "boundary.pvtp")
@@ -152,7 +153,10 @@ def _remove_strangers(out: Path, tiles: Collection[str]) -> None:
         for path in (out / folder).glob(f"*{suffix}"):
             if path.stem not in tiles:
                 path.unlink()
-    for name in () if in_bucket(out) else map(Path, RESULTS):  # nothing unfinished is in a bucket
+    if in_bucket(out):
+        return  # nothing unfinished is in a bucket
+    (out / PROBE).unlink(missing_ok=True)
+    for name in map(Path, (*RESULTS, PROBE)):
         for path in out.glob(PART.format(stem=name.stem, suffix=name.suffix)):
             if path.is_file():
                 path.unlink()

@@ -125,6 +125,9 @@ def save_config(config: Config, out: Path) -> None:
         footprints=absolute(config.footprints) if config.footprints else "",
         out=str(out.absolute()),
         scheduler="",  # which no file may name
+        tls_ca="",
+        tls_cert="",
+        tls_key="",
         overwrite=False,
     )
     with replacing(out / CONFIG) as part:

@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,11 +18,12 @@ from stitch.grid import seams_of_tile
 from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.audit import Audit
+from tiler.cluster import reach_cluster, spell_out
 from tiler.config import Config
 from tiler.context import RunContext, pack_tiles, seam_name, tile_key
 from tiler.dashboard.server import read_address, watched
 from tiler.engine import Engine, Progress, StoppedError
-from tiler.executors import Executor, connect, local, serial, share_memory
+from tiler.executors import Executor, local, serial, share_memory
 from tiler.failures import Policy
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
@@ -75,6 +77,28 @@ from tiler.written import state_files
 
 SCHEMA = 1  # version of run.json's layout
 OwnExecutor = Callable[[Callable[[str], None]], AbstractContextManager[Executor]]
+
+
+@dataclass(frozen=True)
+class _Means:
+    """What a run is done with.
+
+    Attributes
+    ----------
+    dashboard : str or None
+        Where its page is shown, ``HOST:PORT``.
+    shown : Path
+        Folder of the events that the page is made of.
+    own_executor : callable or None
+        Makes the executor of one who brings it.
+    cluster : Executor or None
+        Of the scheduler that was asked for.
+    """
+
+    dashboard: str | None
+    shown: Path
+    own_executor: OwnExecutor | None
+    cluster: Executor | None
 
 
 def run(
@@ -131,6 +155,7 @@ def run(
     (``damaged-artefact``).
     """
     told = Watchers(watchers if say is None else [*watchers, Listener(say)])
+    config = spell_out(config)
     try:
         check_sources(config)
         if dashboard is not None:
@@ -141,7 +166,9 @@ def run(
         with only_run(out, told.say) as check, _beside(out, check, told) as shown:
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
-            return _run(config, out, earlier, damage, own, announce, told, dashboard, executor, shown)
+            with reach_cluster(config) as cluster:
+                means = _Means(dashboard, shown, executor, cluster)
+                return _run(config, out, earlier, damage, own, announce, told, means)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
             told.end("failed", tell_error(error))
@@ -156,9 +183,7 @@ def _run(
     own: OwnStages,
     announce: Announce | None,
     watchers: Watchers,
-    dashboard: str | None,
-    executor: OwnExecutor | None,
-    shown: Path,
+    means: _Means,
 ) -> dict[str, Any]:
     say = watchers.say
     start, untouched = time.perf_counter(), bool(earlier)
@@ -184,11 +209,11 @@ def _run(
         clear_folder(out, earlier, overwrite=config.overwrite)
         if not in_bucket(out):
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
-            if executor is None:
+            if means.own_executor is None:
                 shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
         save_config(config, out)
-        progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=shown)
-        record |= _mesh_region(config, out, plan, own, watchers, damage, dashboard, executor, shown)
+        progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=means.shown)
+        record |= _mesh_region(config, out, plan, own, watchers, damage, means)
         record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:
             say(message)
@@ -228,9 +253,7 @@ def _mesh_region(
     own: OwnStages,
     watchers: Watchers,
     damage: Mapping[str, str],
-    dashboard: str | None,
-    own_executor: OwnExecutor | None,
-    shown: Path,
+    means: _Means,
 ) -> dict[str, Any]:
     """Run all stages, and write the indexes of their pieces and the manifest.
 
@@ -239,8 +262,8 @@ def _mesh_region(
     """
     missing = Missing()
     with (
-        own_executor(watchers.say) if own_executor else _executor(config, dashboard or ANYWHERE) as executor,
-        watched(shown, dashboard, getattr(executor, "scheduler", None), watchers.say),
+        _executor(config, means, watchers.say) as executor,
+        watched(means.shown, means.dashboard, getattr(executor, "scheduler", None), watchers.say),
     ):
         while True:
             engine = make_engine(config, out, plan, executor, own, watchers)
@@ -419,13 +442,15 @@ def run_city_stages(engine: Engine, config: Config) -> int:
 
 
 @contextmanager
-def _executor(config: Config, dashboard: str) -> Iterator[Executor]:
-    if config.scheduler:
-        with connect(config.scheduler, Limits(config.time_limit)) as executor:
+def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iterator[Executor]:
+    if means.own_executor is not None:
+        with means.own_executor(say) as executor:
             yield executor
+    elif means.cluster is not None:
+        yield means.cluster
     elif config.workers:
-        memory = int(config.memory_limit * 2**30) or share_memory(config.workers)
-        with local(config.workers, Limits(config.time_limit, memory), dashboard=dashboard) as executor:
+        limits = Limits(config.time_limit, int(config.memory_limit * 2**30) or share_memory(config.workers))
+        with local(config.workers, limits, dashboard=means.dashboard or ANYWHERE) as executor:
             yield executor
     else:
         with serial() as executor:
