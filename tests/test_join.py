@@ -24,7 +24,7 @@ from tiler.config import make_config
 from tiler.crew import Crew, Given
 from tiler.engine import LEAST_WINDOW, PER_WORKER, Engine
 from tiler.executors import Serial
-from tiler.folder_lock import only_run
+from tiler.folder_lock import is_held, only_run
 from tiler.join import ARRAY_INDEX, join, name_member
 from tiler.lease import (
     Holder,
@@ -436,9 +436,20 @@ def test_a_folder_that_another_run_holds_is_waited_for(tmp_path: Path, monkeypat
     assert caught.value.exit_code == 1
     assert time.monotonic() - begin > 0.7
     assert list(tmp_path.iterdir()) == []
-    # Free: the run begins, and all of its members would end by its error.
+    # Once it is free the run begins, and all of its members would end by its error.
+    held, looks = only_run(tmp_path), list[Path]()
+
+    def look(out: Path) -> bool:
+        looks.append(out)
+        if len(looks) == 2:
+            held.__exit__(None, None, None)
+        return is_held(out)
+
+    monkeypatch.setattr("tiler.join.is_held", look)
+    held.__enter__()
     with pytest.raises(InputError, match=r"a\.laz"):
-        join(config, max_idle=0.7)
+        join(config, max_idle=60)
+    assert looks == [tmp_path] * 2
     assert not (tmp_path / SPOOL).exists()
 
 
