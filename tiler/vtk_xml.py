@@ -175,7 +175,8 @@ def _declare_all(pieces: Sequence[Path], kind: str) -> Iterator[dict[str, list[s
 
 
 def _declarations(path: Path, kind: str) -> dict[str, list[str]]:
-    with _opened_head(path) if in_bucket(path) else opened(path) as file:
+    remote = in_bucket(path)
+    with _opened_head(path) if remote else opened(path) as file:
         piece = _read_head(path, file, kind).piece
     return {
         section: [

@@ -50,7 +50,8 @@ def tell_change(path: Path, stated: Any) -> str:
         return "no size and checksum of it are stated"
     try:
         # An object is asked for once; of a file the size is known before it is read.
-        size, crc = sum_file(path) if in_bucket(path) else (path.stat().st_size, None)
+        remote = in_bucket(path)
+        size, crc = sum_file(path) if remote else (path.stat().st_size, None)
         if size != stated[0]:
             return f"has {size} bytes instead of {stated[0]}"
         return "" if (sum_file(path)[1] if crc is None else crc) == stated[1] else "its checksum differs"
