@@ -144,12 +144,14 @@ def _judge(error: Exception) -> str:
     status = _STATUS.search(text)
     if status is not None and status[1] == "405":  # which obstore takes for an object that is not there
         raise OSError(errno.EIO, "refused with status 405; the server must take HEAD and GET") from None
-    if isinstance(error, FileNotFoundError) or "NoSuchBucket" in text:  # listings give another error than reads
+    refused = status is not None and status[1] in ("401", "403")  # listings give another error than reads
+    if isinstance(error, FileNotFoundError) or "NoSuchBucket" in text:
         bucket = "NoSuchBucket" in text
         raise FileNotFoundError(errno.ENOENT, "no such bucket" if bucket else "no such object") from None
     if isinstance(error, (exceptions.PreconditionError, exceptions.AlreadyExistsError)):
         raise ChangedError from None
-    if isinstance(error, (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError, PermissionError)):
+    denied = (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError, PermissionError)
+    if refused or isinstance(error, denied):
         raise PermissionError(errno.EACCES, "access denied; check credentials and rights") from None
     if any(host in text for host in _METADATA):
         raise PermissionError(
