@@ -250,7 +250,10 @@ def test_what_another_try_does_not_mend_is_not_tried_again(memory: Memory, hasty
         assert raised.value.__cause__ is None
 
     expect(error(400), OSError, "refused with status 400")
+    expect(FileNotFoundError("status code: 405 Method Not Allowed"), OSError, "must take HEAD and GET")
+    expect(obstore.exceptions.GenericError("Content-Length Header missing"), OSError, "not tell the size")
     expect(obstore.exceptions.PermissionDeniedError("no"), PermissionError, "access denied")
+    expect(error(403), PermissionError, "access denied")
     expect(obstore.exceptions.GenericError("PUT http://169.254.169.254/latest"), PermissionError, "no credentials")
     expect(FileNotFoundError("<Code>NoSuchBucket</Code>"), FileNotFoundError, "no such bucket")
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
 from tiler.config import Config, check_reach, load_config, make_config
+from tiler.places import refuse_bucket
 
 if TYPE_CHECKING:
     from tiler.city_mesh import CityMesh
@@ -80,6 +81,7 @@ def mesh(
     from tiler.run import run
 
     config = _configure(pointcloud, footprints, parameters)
+    refuse_bucket(config.out, "a mesh in Python")
     _check_script(config.workers)
     run(config, stages=stages, parameters=stage_parameters, **_show(progress))
     return CityMesh(config.out)

@@ -16,7 +16,7 @@ from datetime import timedelta
 from functools import lru_cache
 from typing import Any, TypeVar
 
-from pipeline.errors import InputError
+from pipeline.errors import ConfigError
 from tiler.places import StoreUnreachableError
 
 T = TypeVar("T")
@@ -97,7 +97,7 @@ def ask(place: object, patience: float, request: Callable[[Any], T], root: str) 
         If the store refuses the request for another reason.
     StoreUnreachableError
         If it has not answered in time.
-    InputError
+    ConfigError
         If obstore is not installed.
     """
     began, delay, told = 0.0, FIRST_DELAY, False
@@ -141,12 +141,17 @@ def _judge(error: Exception) -> str:
     from obstore import exceptions
 
     text = str(error)
-    if isinstance(error, FileNotFoundError) or "NoSuchBucket" in text:  # listings give another error than reads
+    status = _STATUS.search(text)
+    if status is not None and status[1] == "405":  # which obstore takes for an object that is not there
+        raise OSError(errno.EIO, "refused with status 405; the server must take HEAD and GET") from None
+    refused = status is not None and status[1] in ("401", "403")  # listings give another error than reads
+    if isinstance(error, FileNotFoundError) or "NoSuchBucket" in text:
         bucket = "NoSuchBucket" in text
         raise FileNotFoundError(errno.ENOENT, "no such bucket" if bucket else "no such object") from None
     if isinstance(error, (exceptions.PreconditionError, exceptions.AlreadyExistsError)):
         raise ChangedError from None
-    if isinstance(error, (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError, PermissionError)):
+    denied = (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError, PermissionError)
+    if refused or isinstance(error, denied):
         raise PermissionError(errno.EACCES, "access denied; check credentials and rights") from None
     if any(host in text for host in _METADATA):
         raise PermissionError(
@@ -159,7 +164,8 @@ def _judge(error: Exception) -> str:
         raise error
     if "range" in text.lower() and "support" in text.lower():
         raise OSError(errno.EOPNOTSUPP, "the server gives no ranges of files; download the file") from None
-    status = _STATUS.search(text)
+    if "Header missing" in text:
+        raise OSError(errno.EIO, "the server does not tell the size of the file; download it") from None
     if status is None:
         return "no connection" if "error sending request" in text else "the answer broke off"
     if int(status[1]) < 500 and int(status[1]) not in _AGAIN:
@@ -179,7 +185,7 @@ def _make_client(root: str, endpoint: str, _process: int) -> Any:
     try:
         from obstore.store import HTTPStore, S3Store
     except ImportError:
-        raise InputError(f"{root}: needs obstore; pip install 'citystitch[objects]'") from None
+        raise ConfigError(f"{root}: needs obstore; pip install 'citystitch[objects]'") from None
     never: Any = {"max_retries": 0}
     options: Any = {"timeout": TIMEOUT, "connect_timeout": CONNECT_TIMEOUT}
     if not root.startswith("s3://"):
