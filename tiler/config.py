@@ -238,6 +238,11 @@ class Config:
     scheduler: str = _parameter(
         UNSET, "run", "address of a running Dask scheduler, whose workers see the same files; instead of workers"
     )
+    cluster: str = _parameter(
+        UNSET,
+        "run",
+        "TOML file that describes a cluster, whose batch system starts the workers; instead of workers",
+    )
     out: str = _parameter("out", "run", "folder for the results")
     overwrite: bool = _parameter(
         False, "run", "remove the results of an earlier run in that folder, and start anew"
@@ -362,7 +367,7 @@ def check_reach(path: Path, values: Mapping[str, Any]) -> None:
     ------
     ConfigError
         If the output folder lies outside the file's folder, by ``..``, an absolute path or a symbolic link; or if
-        it names a scheduler: who connects to one runs what it sends.
+        it names a scheduler, or a cluster: who connects to one runs what it sends.
     """
     out = values.get("out", UNSET)
     if isinstance(out, str) and "\0" not in out:
@@ -376,6 +381,11 @@ def check_reach(path: Path, values: Mapping[str, Any]) -> None:
         raise ConfigError(
             f"{path}: a file may not name a scheduler, as its address is trusted with this machine; give it on "
             "the command line, with --scheduler"
+        )
+    if values.get("cluster"):
+        raise ConfigError(
+            f"{path}: a file may not name a cluster, as the lines of its jobs are run; give it on the command "
+            "line, with --cluster"
         )
 
 
@@ -544,6 +554,11 @@ def _check_together(config: Config) -> None:
             f"{config.mesh_size:g} m; raise --first-layer or lower --mesh-size"
         )
     _check_pad(config)
+    if config.scheduler and config.cluster:
+        raise ConfigError(
+            f"scheduler = {_shown(config.scheduler)} and cluster = {_shown(config.cluster)}: workers are of one "
+            "or the other; leave one out"
+        )
     if not isinstance(config.domain_height, str):
         check_height(config, config.domain_height)
 

@@ -181,6 +181,10 @@ class Dask:
                 self._completed.thread_condition.wait(timeout=0.1)
         self._check_scheduler()
 
+    def _forgives(self, ticket: int, death: Failure) -> bool:
+        """Tell whether a task is sent again as if it had not begun, whose worker died with it."""
+        return False
+
     def _has_workers(self) -> bool:
         try:
             return bool(self._client.nthreads())
@@ -225,6 +229,8 @@ class Dask:
             outcome: Record | Failure = future.result()
         except KilledWorker:
             found = tell_death(task, self._limits)
+            if found is not None and self._forgives(ticket, found):
+                return None
             if found is None and self._sent[ticket] >= BYSTANDER:
                 found = Failure(WorkerError(f"{BYSTANDER} workers died before they began it; look at their logs"))
             return found

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import platform
 import shutil
 import time
@@ -16,6 +17,7 @@ from stitch.grid import seams_of_tile
 from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.audit import Audit
+from tiler.cluster_table import read_cluster
 from tiler.config import Config
 from tiler.context import RunContext, pack_tiles, seam_name, tile_key
 from tiler.dashboard.server import read_address, watched
@@ -124,6 +126,8 @@ def run(
     told = Watchers(watchers if say is None else [*watchers, Listener(say)])
     try:
         check_sources(config)
+        if config.cluster:
+            read_cluster(Path(config.cluster))
         if dashboard is not None:
             read_address(dashboard)
         out = Path(config.out)
@@ -213,7 +217,7 @@ def _mesh_region(
     """
     missing = Missing()
     with (
-        _executor(config, dashboard or ANYWHERE) as executor,
+        _executor(config, dashboard or ANYWHERE, watchers.say) as executor,
         watched(out, dashboard, getattr(executor, "scheduler", None), watchers.say),
     ):
         while True:
@@ -392,9 +396,15 @@ def run_city_stages(engine: Engine, config: Config) -> int:
 
 
 @contextmanager
-def _executor(config: Config, dashboard: str) -> Iterator[Executor]:
+def _executor(config: Config, dashboard: str, say: Callable[[str], None]) -> Iterator[Executor]:
     if config.scheduler:
         with connect(config.scheduler, Limits(config.time_limit)) as executor:
+            yield executor
+    elif config.cluster:
+        from tiler.jobqueue import JOB, job_queue
+
+        table, folder = read_cluster(Path(config.cluster)), Path(os.path.abspath(config.out)) / JOB
+        with job_queue(table, folder, Limits(config.time_limit), dashboard=dashboard, say=say) as executor:
             yield executor
     elif config.workers:
         memory = int(config.memory_limit * 2**30) or share_memory(config.workers)
@@ -415,7 +425,9 @@ def _find_damage(out: Path) -> dict[str, str]:
 
 def _foresee(plan: Plan, config: Config) -> list[str]:
     """Say which tiles may not fit into the memory of this machine."""
-    return [] if config.scheduler else warn_of_memory(plan.survey, config, memory=machine_memory())
+    return (
+        [] if config.scheduler or config.cluster else warn_of_memory(plan.survey, config, memory=machine_memory())
+    )
 
 
 def tell_error(error: BaseException) -> str:
