@@ -47,7 +47,7 @@ ReturnToService=2
 SlurmdTimeout=15
 KillWait=5
 MinJobAge=600
-PartitionName=city Nodes=node[1-4] Default=YES MaxTime=INFINITE State=UP
+PartitionName=city Nodes=node[1-4] Default=YES LLN=YES MaxTime=INFINITE State=UP
 """
 NODE = "NodeName=node{k} NodeHostname={host} NodeAddr=127.0.0.1 Port={port} CPUs={cpus} RealMemory={memory}\n"
 
@@ -85,10 +85,44 @@ class Slurm:
         """Numbers of the jobs that run on a node."""
         return self.ask("squeue", "--noheader", "--states=running", f"--nodelist={node}", "--format=%A").split()
 
+    def node_of(self, job: str) -> str:
+        """Node of a job that runs; empty of any other."""
+        return self.ask("squeue", "--noheader", "--states=running", f"--jobs={job}", "--format=%N").strip()
+
+    def start_node(self, node: str) -> None:
+        """Bring a node back."""
+        self.nodes[node] = self.start(["slurmd", "-D", "-N", node], node)
+        self.wait(
+            lambda: self.ask("sinfo", "--noheader", f"--nodes={node}", "--format=%t").strip() == "idle", 60, node
+        )
+
+    def start(self, command: list[str], name: str) -> "subprocess.Popen[bytes]":
+        """Start a process whose words go to a file."""
+        with (self.folder / f"{name}.txt").open("ab") as words:
+            return subprocess.Popen(
+                command, env=self.environment, stdout=words, stderr=words, start_new_session=True
+            )
+
+    def processes(self) -> list[psutil.Process]:
+        """List all processes that were started with its settings, but this one."""
+        ours = f"SLURM_CONF={self.environment['SLURM_CONF']}".encode()
+        found = (process for process in psutil.process_iter() if ours in _environment(process))
+        return [process for process in found if process.pid != os.getpid()]
+
+    def processes_of(self, job: str) -> list[psutil.Process]:
+        """List the processes of a job, by what SLURM puts into their environment, and their slurmstepd."""
+        found = []
+        for process in self.processes():
+            with suppress(psutil.Error):
+                title = " ".join(process.cmdline())
+                if f"SLURM_JOB_ID={job}".encode() in _environment(process) or f"slurmstepd: [{job}." in title:
+                    found.append(process)
+        return found
+
     def kill_node(self, node: str) -> None:
         """Lose a node: its slurmd and every process of its jobs, at once."""
         slurmd = psutil.Process(self.nodes[node].pid)
-        jobs = [one for job in self.jobs_on(node) for one in processes_of(job)]
+        jobs = [one for job in self.jobs_on(node) for one in self.processes_of(job)]
         slurmd.kill()
         for process in jobs:
             with suppress(psutil.NoSuchProcess):
@@ -101,17 +135,6 @@ class Slurm:
         while not look():
             assert time.monotonic() < end, f"{what}: not after {seconds:g} s; {self.states()}"
             time.sleep(0.3)
-
-
-def processes_of(job: str) -> list[psutil.Process]:
-    """List the processes of a job, by what SLURM puts into their environment, and their slurmstepd."""
-    found = []
-    for process in psutil.process_iter():
-        with suppress(psutil.Error):
-            title = " ".join(process.cmdline())
-            if process.environ().get("SLURM_JOB_ID") == job or f"slurmstepd: [{job}." in title:
-                found.append(process)
-    return found
 
 
 def skip_without_slurm() -> None:
@@ -144,8 +167,9 @@ def slurm_here(folder: Path) -> Iterator[Slurm]:
         stack.enter_context(_started(slurm, munge, "munged"))
         slurm.wait((folder / "munge.socket").exists, 30, "munged")
         stack.enter_context(_started(slurm, ["slurmctld", "-D"], "slurmctld"))
+        stack.callback(_end_nodes, slurm)
         for node in (f"node{k}" for k in range(1, NODES + 1)):
-            slurm.nodes[node] = stack.enter_context(_started(slurm, ["slurmd", "-D", "-N", node], node))
+            slurm.nodes[node] = slurm.start(["slurmd", "-D", "-N", node], node)
         slurm.wait(lambda: _count_idle(slurm) == NODES, 60, "idle nodes")
         yield slurm
 
@@ -160,29 +184,45 @@ def _count_idle(slurm: Slurm) -> int:
 
 @contextmanager
 def _started(slurm: Slurm, command: list[str], name: str) -> Iterator["subprocess.Popen[bytes]"]:
-    with (slurm.folder / f"{name}.txt").open("wb") as words:
-        process = subprocess.Popen(
-            command, env=slurm.environment, stdout=words, stderr=words, start_new_session=True
-        )
+    process = slurm.start(command, name)
     try:
         yield process
     finally:
-        if process.poll() is None:
-            process.terminate()
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.send_signal(signal.SIGKILL)
-                process.wait(20)
+        _end(process)
+
+
+def _end_nodes(slurm: Slurm) -> None:
+    for process in slurm.nodes.values():
+        _end(process)
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    process.terminate()
+    try:
+        process.wait(20)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGKILL)
+        process.wait(20)
 
 
 def _end_all(slurm: Slurm) -> None:
     """End what jobs have left, found by the settings that they were started with."""
-    for process in psutil.process_iter():
-        with suppress(psutil.Error):
-            ours = process.environ().get("SLURM_CONF") == slurm.environment["SLURM_CONF"]
-            if ours and process.pid != os.getpid():
+    for _ in range(20):  # what is killed may just have started another one
+        found = slurm.processes()
+        if not found:
+            return
+        for process in found:
+            with suppress(psutil.Error):
                 process.kill()
+        psutil.wait_procs(found, timeout=5)
+
+
+def _environment(process: psutil.Process) -> list[bytes]:
+    """Read the environment of a process; psutil stops where slurmstepd has written its title."""
+    try:
+        return Path(f"/proc/{process.pid}/environ").read_bytes().split(b"\0")
+    except OSError:
+        return []
 
 
 def _free_ports(n: int) -> list[int]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.slurm_here import Slurm, skip_without_slurm, slurm_here
-from tests.sparse_city import ROOT, SparseCity, make_city
+from tests.sparse_city import ROOT, SparseCity, count_results, make_city
 from tests.test_run import hashes
 from tiler.jobs import JobRecord, read_record
 
@@ -19,7 +19,7 @@ TABLE = """
 type = "slurm"
 partition = "city"
 python = "{python}"
-setup = ["export PYTHONPATH={root}"]
+setup = ["export PYTHONPATH={root}", "{slow}"]
 
 [controller]
 walltime = "{controller}"
@@ -34,7 +34,26 @@ margin = {rest}
 stagger = {stagger}
 memory = 1
 """
-LONG = {"controller": "00:30:00", "margin": 60, "worker": "00:30:00", "rest": 60, "stagger": 0, "workers": 3}
+LONG = {
+    "controller": "00:30:00",
+    "margin": 60,
+    "worker": "00:30:00",
+    "rest": 60,
+    "stagger": 0,
+    "workers": 3,
+    "slow": "",
+}
+# A worker imports this before its first task.
+SLOW = """
+import time
+from tiler import limits
+
+def slow(function, task, original=limits.run_task):
+    time.sleep({seconds})
+    return original(function, task)
+
+limits.run_task = slow
+"""
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +89,13 @@ def submit(slurm: Slurm, city: SparseCity, out: Path, *others: str, **table: obj
     return text.split()[1].rstrip(";")
 
 
+def slow(folder: Path, seconds: float) -> str:
+    """Line of shell that lets each task take so much longer (s)."""
+    path = folder / f"slow_{seconds:g}.py"
+    path.write_text(SLOW.format(seconds=seconds))
+    return f"export DASK_DISTRIBUTED__WORKER__PRELOAD={path}"
+
+
 def record(out: Path) -> JobRecord:
     found = read_record(out)
     assert found is not None
@@ -90,9 +116,13 @@ def results(out: Path) -> dict[str, str]:
     return {name: found for name, found in hashes(out).items() if not name.startswith("job/")}
 
 
-def worker_jobs(slurm: Slurm) -> list[str]:
-    rows = slurm.ask("squeue", "--noheader", "--states=running", "--format=%A %j").splitlines()
-    return [job for job, name in map(str.split, rows) if name == "citystitch-worker"]
+def worker_jobs(slurm: Slurm, out: Path) -> list[str]:
+    """Numbers of the workers of a run that are at work."""
+    logs = slurm.ask(
+        "squeue", "--noheader", "--states=running", "--Format=JobID:20,Name:30,STDOUT:400"
+    ).splitlines()
+    rows = (line.split() for line in logs)
+    return [job for job, name, log in rows if name == "citystitch-worker" and Path(log).is_relative_to(out)]
 
 
 def test_a_submitted_run_gives_the_bytes_of_a_serial_one(slurm: Slurm, city: SparseCity, tmp_path: Path) -> None:
@@ -102,7 +132,7 @@ def test_a_submitted_run_gives_the_bytes_of_a_serial_one(slurm: Slurm, city: Spa
     wait_for_end(slurm, out, 200)
     assert results(out) == city.hashes
     slurm.wait(lambda: slurm.states()[job] == "COMPLETED", 30, "end of the job")
-    slurm.wait(lambda: not worker_jobs(slurm), 30, "end of the workers")
+    slurm.wait(lambda: not worker_jobs(slurm, out), 30, "end of the workers")
     status = json.loads(call(slurm, "status", job, "--json"))
     assert status["state"] == "done"
     assert (status["job"]["state"], status["job"]["queue"]) == ("done", "COMPLETED")
@@ -113,7 +143,48 @@ def test_a_submitted_run_gives_the_bytes_of_a_serial_one(slurm: Slurm, city: Spa
 def test_a_cancelled_job_leaves_no_job(slurm: Slurm, city: SparseCity, tmp_path: Path) -> None:
     out = tmp_path / "out"
     job = submit(slurm, city, out)
-    slurm.wait(lambda: bool(worker_jobs(slurm)), 100, "workers")
+    slurm.wait(lambda: bool(worker_jobs(slurm, out)), 100, "workers")
     assert "is cancelled" in call(slurm, "cancel", job)
     slurm.wait(lambda: not {"RUNNING", "PENDING"} & set(slurm.states().values()), 60, "an empty queue")
     assert record(out).state == "cancelled"
+
+
+@pytest.mark.timeout(900)
+def test_lost_nodes_and_walltimes_cost_nothing(slurm: Slurm, city: SparseCity, tmp_path: Path) -> None:
+    """Two runs at a time, as they mostly sleep.
+
+    Of the first all workers end after a minute, one is cancelled from outside, and the node of another goes down.
+    The second has controllers of two minutes and needs more.
+    """
+    n, lossy, lasting = sum(city.stages().values()), tmp_path / "lossy", tmp_path / "lasting"
+    minute = {"worker": "00:01:00", "rest": 15, "stagger": 5}
+    submit(slurm, city, lossy, **minute, slow=slow(tmp_path, 0.6))
+    first = submit(slurm, city, lasting, controller="00:02:00", margin=20, workers=1, slow=slow(tmp_path, 0.35))
+
+    def wait_for_results(share: float) -> None:
+        slurm.wait(lambda: sum(count_results(lossy).values()) >= share * n, 400, f"{share:.0%} of the results")
+
+    wait_for_results(0.2)
+    slurm.ask("scancel", worker_jobs(slurm, lossy)[0])
+    wait_for_results(0.4)
+    homes = {slurm.node_of(record(out).job) for out in (lossy, lasting)}
+    slurm.wait(lambda: bool(nodes(slurm, lossy) - homes), 100, "a worker on a node of its own")
+    lost = min(nodes(slurm, lossy) - homes)
+    slurm.kill_node(lost)
+    wait_for_end(slurm, lossy, 600)
+    wait_for_end(slurm, lasting, 600)
+    assert results(lossy) == city.hashes
+    assert results(lasting) == city.hashes
+
+    assert record(lossy).earlier == ()
+    lives = len(list((lossy / "job" / "logs").glob("worker-*.log")))
+    assert lives >= 3 + 2 + 3, "workers did not retire"
+    assert "TIMEOUT" not in slurm.states().values()  # nobody waited for it
+    found = record(lasting)
+    assert found.earlier[0] == first
+    assert {slurm.states()[job] for job in found.earlier} == {"COMPLETED"}
+    slurm.start_node(lost)
+
+
+def nodes(slurm: Slurm, out: Path) -> set[str]:
+    return {slurm.node_of(job) for job in worker_jobs(slurm, out)} - {""}

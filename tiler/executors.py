@@ -181,7 +181,7 @@ class Dask:
                 self._completed.thread_condition.wait(timeout=0.1)
         self._check_scheduler()
 
-    def _forgives(self, ticket: int, death: Failure) -> bool:
+    def _forgives(self, task: Task, death: Failure) -> bool:
         """Tell whether a task is sent again as if it had not begun, whose worker died with it."""
         return False
 
@@ -229,7 +229,7 @@ class Dask:
             outcome: Record | Failure = future.result()
         except KilledWorker:
             found = tell_death(task, self._limits)
-            if found is not None and self._forgives(ticket, found):
+            if found is not None and self._forgives(task, found):
                 return None
             if found is None and self._sent[ticket] >= BYSTANDER:
                 found = Failure(WorkerError(f"{BYSTANDER} workers died before they began it; look at their logs"))

@@ -19,7 +19,7 @@ from tiler.cluster_table import Cluster
 from tiler.executors import KILL_AT, REFUSE_AT, ClusterError, Dask, Executor
 from tiler.limits import Limits
 from tiler.queues import QUEUES, JobSize, Queue, QueueError
-from tiler.task import Failure
+from tiler.task import Failure, Task
 
 JOB = "job"  # folder in that of a run, with all that its jobs need and print
 WORKER_JOBS = "workers.json"  # in it: the numbers of worker jobs that wait or run
@@ -35,7 +35,7 @@ SETTINGS: Mapping[str, Any] = {
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.system-monitor.log-length": 600,
     "distributed.diagnostics.computations.max-history": 1,
-    "distributed.deploy.lost-worker-timeout": "2 s",
+    "distributed.deploy.lost-worker-timeout": "15 s",  # a job's nanny may start its worker anew
 }
 # What a worker's own process is told; as variables, since its job has no other settings of Dask.
 VARIABLES: Mapping[str, Any] = {
@@ -59,13 +59,14 @@ class QueuedDask(Dask):
 
     def __init__(self, client: Any, table: Cluster, limits: Limits, scheduler: Any, jobs: "_Jobs") -> None:
         super().__init__(client, table.worker.max_workers, limits, scheduler)
-        self.losses: Counter[int] = Counter()
+        self.losses: Counter[tuple[str, str]] = Counter()  # by stage and name
         self._jobs = jobs
 
-    def _forgives(self, ticket: int, death: Failure) -> bool:
-        if death.kind != "killed" or self.losses[ticket] >= LOSSES:
+    def _forgives(self, task: Task, death: Failure) -> bool:
+        item = task.stage, task.name
+        if death.kind != "killed" or self.losses[item] >= LOSSES:
             return False
-        self.losses[ticket] += 1
+        self.losses[item] += 1
         return True
 
     def _has_workers(self) -> bool:

@@ -20,6 +20,7 @@ from tiler.queues import QUEUES, STOP_SIGNAL, JobSize, Queue, QueueError
 
 RECORD, TABLE, PARAMETERS, SCRIPT = "job.json", "cluster.toml", "run.toml", "job.sh"
 LOGS = "logs"
+CANCELLED = "cancelled"  # an empty file: whoever writes the record at that moment does not undo it
 NUMBER = re.compile(r"\d+(\[\])?(\.[\w.-]+)?")
 LIVING = ("submitted", "running", "handed over")  # how a job may stand that is not over
 
@@ -177,6 +178,8 @@ def read_record(out: Path) -> JobRecord | None:
         record = JobRecord(**values)
         if record.type not in QUEUES:
             raise ValueError(record.type)
+        if (path.parent / CANCELLED).exists():
+            record = record.change(state="cancelled")
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, KeyError) as error:
@@ -220,7 +223,7 @@ def cancel(out: Path) -> str:
     if not _is_alive(record):
         return f"job {record.job} is over already ({record.state})"
     queue = QUEUES[record.type]
-    write_record(out, record.change(state="cancelled"))  # first: nothing is submitted any more
+    (out / JOB / CANCELLED).touch()  # first: nothing is submitted any more
     before = record.earlier[-1:] if record.state == "handed over" else ()
     queue.cancel([record.job, *before])
     queue.cancel(_living(queue, read_worker_jobs(out / JOB)))
@@ -247,6 +250,7 @@ def _write_files(config: Config, out: Path, script: str) -> None:
     folder = out / JOB
     try:
         (folder / LOGS).mkdir(parents=True, exist_ok=True)
+        (folder / CANCELLED).unlink(missing_ok=True)
         shutil.copyfile(config.cluster, folder / TABLE)
         given = dataclasses.replace(
             config,

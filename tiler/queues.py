@@ -104,7 +104,7 @@ class Queue(ABC):
         """
         words = [*self.submit_words, *(self.after(after) if after else [])]
         text = self._submit(words, script)
-        found = re.search(r"\d+(?:\[\])?(?:\.[\w.-]+)?", text)
+        found = re.search(r"\d+(?:\[\])?(?:\.[A-Za-z][\w.-]*)?", text)
         if found is None:
             raise QueueError(f"{words[0]} printed no number of a job: {text.strip()!r}")
         return found[0]
