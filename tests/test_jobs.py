@@ -162,11 +162,13 @@ def test_scripts_pass_shellcheck(kind: str, tmp_path: Path) -> None:
     assert codes == [0, 0, 0, 1]
 
 
-def test_an_array_runs_members_that_know_their_numbers(tmp_path: Path) -> None:
+def test_an_array_runs_members_that_are_told_before_their_time(tmp_path: Path) -> None:
     lines = array_script(full(tmp_path, "slurm"), Path("/out"), 4).splitlines()
     assert "#SBATCH --array=0-3" in lines
     assert "#SBATCH --output=/out/job/logs/member-%A-%a.log" in lines
-    assert lines[-1].endswith('tiler.cli join /out/job/run.toml --out /out --member "${SLURM_ARRAY_TASK_ID}"')
+    assert "#SBATCH --signal=B:TERM@60" in lines
+    assert "#SBATCH --mem=3272M" in lines
+    assert lines[-1].endswith("tiler.cli join /out/job/run.toml --out /out --workers 2 --memory-limit 1.5")
     assert "#PBS -J 0-3" in array_script(full(tmp_path, "pbs"), Path("/out"), 4)
     assert "#$ -t 1-4" in array_script(full(tmp_path, "sge"), Path("/out"), 4)
     assert '#BSUB -J "citystitch[1-4]"' in array_script(full(tmp_path, "lsf"), Path("/out"), 4)

@@ -149,6 +149,17 @@ def test_a_cancelled_job_leaves_no_job(slurm: Slurm, city: SparseCity, tmp_path:
     assert record(out).state == "cancelled"
 
 
+def test_an_array_gives_the_bytes_of_a_serial_run(slurm: Slurm, city: SparseCity, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    job = submit(slurm, city, out, "--array", "3")
+    slurm.wait(lambda: slurm.states().get(f"{job}_0") == "RUNNING", 60, "elements at work")
+    assert "3 elements" in call(slurm, "status", job)
+    ends = [f"{job}_{k}" for k in range(3)]
+    slurm.wait(lambda: all(slurm.states()[one] == "COMPLETED" for one in ends), 200, "end of all elements")
+    assert results(out) == city.hashes
+    assert len(list((out / "job" / "logs").glob("member-*.log"))) == 3
+
+
 @pytest.mark.timeout(900)
 def test_lost_nodes_and_walltimes_cost_nothing(slurm: Slurm, city: SparseCity, tmp_path: Path) -> None:
     """Two runs at a time, as they mostly sleep.

@@ -123,6 +123,7 @@ def make_parser() -> argparse.ArgumentParser:
         default=False,
         help="write report.html at the end, as `citystitch report` does",
     )
+    _add_join(command("join", _join, "work at a run together with others, on any machines that share its folder"))
     plan = command("plan", _plan, "tell what a run would do and take, without doing it")
     plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
     plan.add_argument("--picture", type=Path, metavar="FILE.png", help="draw tiles, files and footprints")
@@ -173,6 +174,22 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
     )
     _add_parameters(parser)
+
+
+def _add_join(join: argparse.ArgumentParser) -> None:
+    """Add the options of one that joins a run: those of the run, and a few of its own."""
+    _add_inputs(join)
+    join.add_argument("--member", default="", metavar="NAME", help="its name (default: its element of an array)")
+    join.add_argument(
+        "--max-idle",
+        type=float,
+        default=600.0,
+        metavar="SECONDS",
+        help="how long to wait for a folder that a run holds which is not one to join (default: 600)",
+    )
+    words = join.add_mutually_exclusive_group()
+    words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
+    words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
 
 
 def _add_parameters(parser: argparse.ArgumentParser) -> None:
@@ -286,6 +303,29 @@ def _run_config(
         print_summary(record, out)
     code: int = record["exit_code"]
     return code
+
+
+def _join(options: argparse.Namespace) -> int:
+    config = make_config(with_file(vars(options)))
+    fork_server.begin()
+    from tiler.join import join
+    from tiler.terminal import make_views, print_last_line, print_summary
+
+    joined = join(
+        config,
+        member=options.member,
+        max_idle=options.max_idle,
+        views=lambda: make_views(quiet=options.quiet, verbose=options.verbose),
+        say=None if options.quiet else say,
+    )
+    if joined.error:
+        print(f"citystitch: {printable(joined.error)}", file=sys.stderr)
+    elif joined.record is not None:
+        show = print_last_line if options.quiet else print_summary
+        show(joined.record, Path(config.out))
+    elif not options.quiet:
+        say(f"{config.out}: the run is done")
+    return joined.exit_code
 
 
 def _plan(options: argparse.Namespace) -> int:

@@ -143,12 +143,19 @@ class Engine:
         watch: object = progress
         self._watch = watch if isinstance(watch, Watch) else None
         self._folder = store_path.parent if folder is None else folder
-        self._window = max(PER_WORKER * executor.workers, LEAST_WINDOW) if window is None else window
+        self._given_window = window
         if self._window < 1:
             raise ValueError(f"window {self._window}, expected 1 or more")
         self._items: dict[str, tuple[Scope, Items]] = {}
         self._laid_out: dict[str, tuple[Layout, Any]] = {}
         self._whole: dict[tuple[int, Scope], tuple[Layout, Items]] = {}
+
+    @property
+    def _window(self) -> int:
+        """Tasks in flight: more when workers come."""
+        if self._given_window is not None:
+            return self._given_window
+        return max(PER_WORKER * self._executor.workers, LEAST_WINDOW)
 
     def run(self, *stages: Stage, items: Mapping[str, Collection[str]] | None = None) -> None:
         """Run stages whose reads are among them or were run before.

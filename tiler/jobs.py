@@ -15,7 +15,7 @@ from pipeline.errors import ConfigError, InputError
 from tiler.atomic import replacing
 from tiler.cluster_table import Cluster, read_cluster
 from tiler.config import Config, write_config
-from tiler.jobqueue import JOB, begin_words, python_words, read_worker_jobs, worker_script
+from tiler.jobqueue import JOB, NANNY, begin_words, python_words, read_worker_jobs, worker_script
 from tiler.queues import QUEUES, STOP_SIGNAL, JobSize, Queue, QueueError
 
 RECORD, TABLE, PARAMETERS, SCRIPT = "job.json", "cluster.toml", "run.toml", "job.sh"
@@ -124,18 +124,21 @@ def controller_script(table: Cluster, out: Path) -> str:
 
 def array_script(table: Cluster, out: Path, n: int) -> str:
     """Script of an array of jobs that share the tiles of a run through its folder alone."""
+    worker = table.worker
     size = JobSize(
         "citystitch",
         out / JOB / LOGS / "member-{job}-{member}.log",
-        table.worker.walltime,
-        int(table.worker.memory * 2**30),
-        options=table.worker.options,
+        worker.walltime,
+        worker.processes * int(worker.memory * 2**30) + NANNY,
+        worker.processes,
+        worker.options,
+        warn=worker.margin,
         array=n,
     )
-    queue = QUEUES[table.type]
-    folder, place = out / JOB, shlex.quote(str(out))
-    command = f"exec {python_words(table)} -m tiler.cli join {shlex.quote(str(folder / PARAMETERS))} --out {place}"
-    lines = [*queue.header(table, size), "", *begin_words(table), f'{command} --member "${{{queue.member}}}"']
+    words = ["join", str(out / JOB / PARAMETERS), "--out", str(out)]
+    words += ["--workers", str(worker.processes), "--memory-limit", f"{worker.memory:g}"]
+    command = f"exec {python_words(table)} -m tiler.cli {shlex.join(words)}"
+    lines = [*QUEUES[table.type].header(table, size), "", *begin_words(table), command]
     return "\n".join(lines) + "\n"
 
 

@@ -17,7 +17,7 @@ from tiler.config import Config
 from tiler.out_folder import PROGRESS
 from tiler.stage import Scope
 from tiler.task import Record
-from tiler.watching import Item, Watcher
+from tiler.watching import LOST, Item, Watcher
 
 SCHEMA = 1  # of progress.json
 EVERY = 2.0  # s between two writes of it
@@ -129,8 +129,9 @@ class RunProgress(Watcher):
             self._announce(f"{stage} ({total})", state.seconds)
 
     def end(self, status: str, error: str = "") -> None:
-        """Write how the run ended."""
-        self.write(status, error)
+        """Write how the run ended; not if it is another process's by now."""
+        if status != LOST:
+            self.write(status, error)
 
     def write(self, status: str, error: str = "") -> None:
         """Write the file.

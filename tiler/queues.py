@@ -39,7 +39,7 @@ class JobSize:
     options : tuple of str
         Further directives.
     warn : float
-        A signal is wished so long before the time limit (s); 0 for none.
+        A signal is wished so long before the time limit (s), to elements of an array SIGTERM; 0 for none.
     array : int
         Number of elements of an array; 0 for a single job.
     """
@@ -63,7 +63,6 @@ class Queue(ABC):
     """One batch system."""
 
     prefix: ClassVar[str]  # of a directive in a script
-    member: ClassVar[str]  # variable that numbers the elements of an array
     scheduler: ClassVar[str]  # class of dask-jobqueue
     living: ClassVar[frozenset[str]]  # states of jobs that wait or run
     submit_words: ClassVar[tuple[str, ...]]
@@ -136,7 +135,7 @@ class Queue(ABC):
 class Slurm(Queue):
     """SLURM 20.11 or later."""
 
-    prefix, member, scheduler = "#SBATCH", "SLURM_ARRAY_TASK_ID", "SLURMCluster"
+    prefix, scheduler = "#SBATCH", "SLURMCluster"
     submit_words, cancel_words = ("sbatch", "--parsable"), ("scancel",)
     living = frozenset(
         ("PENDING", "CONFIGURING", "RUNNING", "COMPLETING", "SUSPENDED", "REQUEUED", "REQUEUE_HOLD", "RESIZING",
@@ -150,7 +149,8 @@ class Slurm(Queue):
         lines += [f"--cpus-per-task={size.cores}", f"--mem={size.mebibytes}M", f"--time={_clock(size.walltime)}"]
         lines += [f"--partition={cluster.partition}"] if cluster.partition else []
         lines += [f"--account={cluster.account}"] if cluster.account else []
-        lines += [f"--signal=B:{STOP_SIGNAL}@{size.warn:.0f}", "--requeue"] if size.warn else []
+        number = "TERM" if size.array else STOP_SIGNAL
+        lines += [f"--signal=B:{number}@{size.warn:.0f}", "--requeue"] if size.warn else []
         lines += [f"--array=0-{size.array - 1}"] if size.array else []
         return lines
 
@@ -188,7 +188,7 @@ class Slurm(Queue):
 class Pbs(Queue):
     """PBS Professional and OpenPBS."""
 
-    prefix, member, scheduler = "#PBS", "PBS_ARRAY_INDEX", "PBSCluster"
+    prefix, scheduler = "#PBS", "PBSCluster"
     submit_words, cancel_words = ("qsub",), ("qdel",)
     living = frozenset("BEHQRSTUWM")
 
@@ -227,7 +227,7 @@ class Pbs(Queue):
 class Sge(Queue):
     """Grid Engine."""
 
-    prefix, member, scheduler = "#$", "SGE_TASK_ID", "SGECluster"
+    prefix, scheduler = "#$", "SGECluster"
     submit_words, cancel_words = ("qsub", "-terse"), ("qdel",)
     living = frozenset(("qw", "hqw", "r", "t", "s", "S", "T", "Rr", "Rt", "hr", "Rq"))
 
@@ -265,7 +265,7 @@ class Sge(Queue):
 class Lsf(Queue):
     """LSF."""
 
-    prefix, member, scheduler = "#BSUB", "LSB_JOBINDEX", "LSFCluster"
+    prefix, scheduler = "#BSUB", "LSFCluster"
     submit_words, cancel_words = ("bsub",), ("bkill",)
     living = frozenset(("PEND", "PROV", "RUN", "WAIT", "PSUSP", "USUSP", "SSUSP", "UNKWN"))
 

@@ -7,7 +7,7 @@ import platform
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,6 +27,7 @@ from tiler.failures import Policy
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
 from tiler.keys import code_versions
+from tiler.lease import LostFolderError
 from tiler.limits import TASKS, Limits, machine_memory
 from tiler.manifest import find_remade, write_manifest
 from tiler.options import derived_parameters
@@ -58,6 +59,7 @@ from tiler.quarantine import (
 from tiler.run_watchers import begin_watching
 from tiler.seal import seal
 from tiler.settling import domain_of_run, settle_domain, take_domain
+from tiler.spool import SPOOL
 from tiler.stage import REGION_ITEM, Stage
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
@@ -68,10 +70,11 @@ from tiler.stopping import stops
 from tiler.summary import describe_tasks, summarise_run
 from tiler.task import peak_memory
 from tiler.vtk_files import write_pvtp, write_pvtu
-from tiler.watching import Listener, Watcher, Watchers
+from tiler.watching import LOST, Listener, Watcher, Watchers
 from tiler.written import state_files
 
 SCHEMA = 1  # version of run.json's layout
+OwnExecutor = Callable[[Callable[[str], None]], AbstractContextManager[Executor]]
 
 
 def run(
@@ -83,6 +86,7 @@ def run(
     parameters: Mapping[str, Any] | None = None,
     watchers: Sequence[Watcher] = (),
     dashboard: str | None = None,
+    executor: OwnExecutor | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -103,6 +107,9 @@ def run(
     dashboard : str, optional
         Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
         default. `say` is told its URL.
+    executor : callable, optional
+        Given what tells the run's watchers a sentence, makes the executor of all tasks, a context; by default
+        that which `config` asks for.
 
     Returns
     -------
@@ -136,7 +143,7 @@ def run(
         with only_run(out, told.say):
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
-            return _run(config, out, earlier, damage, own, announce, told, dashboard)
+            return _run(config, out, earlier, damage, own, announce, told, dashboard, executor)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
             told.end("failed", tell_error(error))
@@ -152,6 +159,7 @@ def _run(
     announce: Announce | None,
     watchers: Watchers,
     dashboard: str | None,
+    executor: OwnExecutor | None,
 ) -> dict[str, Any]:
     say = watchers.say
     start, untouched = time.perf_counter(), bool(earlier)
@@ -176,15 +184,21 @@ def _run(
         _write_record(out, record)
         clear_folder(out, earlier, overwrite=config.overwrite)
         shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
+        if executor is None:
+            shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
         save_config(config, out)
         progress = begin_watching(config, out, plan, own, watchers, announce=announce)
-        record |= _mesh_region(config, out, plan, own, watchers, damage, dashboard)
+        record |= _mesh_region(config, out, plan, own, watchers, damage, dashboard, executor)
         record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:
             say(message)
         record["status"] = "done"
         say(describe_tasks(record["tasks"]))
         failed = False
+    except LostFolderError as error:
+        untouched = True  # the folder is another process's now
+        watchers.end(LOST, str(error))
+        raise
     except StoppedError as error:
         record |= {"status": "stopped", "error": str(error)}
         raise
@@ -209,6 +223,7 @@ def _mesh_region(
     watchers: Watchers,
     damage: Mapping[str, str],
     dashboard: str | None,
+    own_executor: OwnExecutor | None,
 ) -> dict[str, Any]:
     """Run all stages, and write the indexes of their pieces and the manifest.
 
@@ -217,7 +232,9 @@ def _mesh_region(
     """
     missing = Missing()
     with (
-        _executor(config, dashboard or ANYWHERE, watchers.say) as executor,
+        own_executor(watchers.say)
+        if own_executor
+        else _executor(config, dashboard or ANYWHERE, watchers.say) as executor,
         watched(out, dashboard, getattr(executor, "scheduler", None), watchers.say),
     ):
         while True:

@@ -15,6 +15,7 @@ from tiler.stage import Box, Layout, Scope
 from tiler.task import Record
 
 Item = tuple[str, str]  # stage and name
+LOST = "lost"  # status of a run that another process drives by now: nothing of it is written any more
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,203 @@
+"""The worker processes of one member of a run: one task each at a time, with the limits of any worker."""
+
+import multiprocessing
+import os
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+from tiler import fork_server
+from tiler.executors import BYSTANDER, KILL_AT, REFUSE_AT
+from tiler.limits import Limits, WorkerError, limit_memory, run_guarded, tell_death, tell_memory
+from tiler.stage import Facts
+from tiler.task import Failure, Record, Task
+
+Function = Callable[[Task], Facts]
+Outcome = Record | Failure
+WEIGH = 0.5  # s between two looks at the memory of the processes
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """A task as it is given to a worker.
+
+    Attributes
+    ----------
+    ticket : int
+        Number of the engine's.
+    function : callable
+        Function of its stage.
+    task : Task
+        The task.
+    """
+
+    ticket: int
+    function: Function
+    task: Task
+
+
+@dataclass(eq=False)
+class _Hand:
+    """A worker process, and what it has in hand."""
+
+    process: Any
+    pipe: Any
+    given: Given | None = None
+    deaths: int = 0  # of processes that had this task, before it began
+
+
+class Crew:
+    """Worker processes of one thread each on this machine; what dies is replaced.
+
+    Parameters
+    ----------
+    workers : int
+        Number of processes.
+    limits : Limits
+        What a task may take.
+    """
+
+    def __init__(self, workers: int, limits: Limits) -> None:
+        self.workers, self.limits = workers, limits
+        self._methods: Any = multiprocessing.get_context(fork_server.METHOD)
+        fork_server.begin()
+        self._weighed = time.monotonic()
+        self._hands: list[_Hand] = []
+        self._hire()
+
+    @property
+    def n_free(self) -> int:
+        """Number of processes without a task."""
+        return sum(hand.given is None for hand in self._hands)
+
+    @property
+    def n_busy(self) -> int:
+        """Number of processes with a task."""
+        return len(self._hands) - self.n_free
+
+    def give(self, given: Given) -> None:
+        """Give a task to a process that has none; ValueError if all have one."""
+        for hand in self._hands:
+            if hand.given is None:
+                self._send(hand, given, 0)
+                return
+        raise ValueError(f"all {self.workers} workers have a task")
+
+    def collect(self, seconds: float) -> list[tuple[Given, Outcome]]:
+        """Take what is done, after so many seconds (s) at most; a process that died tells why by its file."""
+        pipes = {hand.pipe: hand for hand in self._hands}
+        found = []
+        for pipe in connection.wait(list(pipes), seconds):
+            hand = pipes[pipe]
+            outcome = self._receive(hand)
+            if outcome is not None and hand.given is not None:
+                found.append((hand.given, outcome))
+                hand.given = None
+        if time.monotonic() - self._weighed >= WEIGH:
+            self._weigh()
+        return found
+
+    def kill(self) -> list[Given]:
+        """End all processes at once and replace them; gives what they had in hand."""
+        had = [hand.given for hand in self._hands if hand.given is not None]
+        self.close()
+        self._hire()
+        return had
+
+    def close(self) -> None:
+        """End all processes at once."""
+        for hand in self._hands:
+            hand.process.kill()
+        for hand in self._hands:
+            hand.process.join()
+            hand.pipe.close()
+        self._hands = []
+
+    def _hire(self) -> None:
+        self._hands = [self._start() for _ in range(self.workers)]
+
+    def _start(self) -> _Hand:
+        ours, theirs = self._methods.Pipe()
+        memory = int(REFUSE_AT * self.limits.memory)
+        process = self._methods.Process(target=_work, args=(theirs, memory, self.limits.seconds), daemon=True)
+        process.start()
+        theirs.close()
+        return _Hand(process, ours)
+
+    def _send(self, hand: _Hand, given: Given, deaths: int) -> None:
+        hand.given, hand.deaths = given, deaths
+        try:
+            hand.pipe.send((given.function, given.task))
+        except OSError:  # it has died: seen when it is asked
+            return
+
+    def _receive(self, hand: _Hand) -> Outcome | None:
+        """Take the outcome of a process; replace it if it has died."""
+        try:
+            outcome: Outcome = hand.pipe.recv()
+        except (EOFError, OSError):
+            return self._replace(hand)
+        if isinstance(outcome, Failure) and outcome.kind == "memory":
+            return tell_memory(outcome, self.limits)
+        return outcome
+
+    def _replace(self, hand: _Hand) -> Outcome | None:
+        """Replace a dead process; gives how its task ended, or gives it to the new process if it had not begun."""
+        hand.process.join()
+        hand.pipe.close()
+        given, deaths = hand.given, hand.deaths + 1
+        fresh = self._start()
+        hand.process, hand.pipe = fresh.process, fresh.pipe
+        if given is None:
+            return None
+        outcome = tell_death(given.task, self.limits)
+        if outcome is None and deaths >= BYSTANDER:
+            outcome = Failure(WorkerError(f"{deaths} workers died before they began it; look at their logs"))
+        if outcome is None:
+            self._send(hand, given, deaths)
+        return outcome
+
+    def _weigh(self) -> None:
+        """End the processes whose memory went past the limit without being asked for, as that of mapped files."""
+        self._weighed = time.monotonic()
+        if not self.limits.memory:
+            return
+        for hand in self._hands:
+            if _resident(hand.process.pid) > KILL_AT * self.limits.memory:
+                hand.process.kill()
+
+
+def _resident(pid: int) -> int:
+    """Resident memory of a process (bytes); 0 where nobody tells."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError, ValueError):
+        return 0
+
+
+def _work(pipe: Any, memory: int, seconds: float) -> None:
+    """Run tasks until the other end is gone; signals are the member's affair."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    if memory:
+        limit_memory(memory)
+    tasks: queue.SimpleQueue[tuple[Function, Task]] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(pipe, tasks), daemon=True).start()
+    while True:
+        function, task = tasks.get()
+        pipe.send(run_guarded(function, task, seconds))
+
+
+def _listen(pipe: Any, tasks: "queue.SimpleQueue[tuple[Function, Task]]") -> None:
+    """Take tasks; whose member has died ends at once."""
+    while True:
+        try:
+            tasks.put(pipe.recv())
+        except Exception:
+            os._exit(1)
