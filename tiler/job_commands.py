@@ -37,7 +37,7 @@ def add_job_commands(command: Command, add_parameters: Callable[[argparse.Argume
 
 def find_run(job: str) -> Path:
     """Folder of a run, by itself or by the number of its job; InputError for an unknown number."""
-    if Path(job).is_dir() or not job.isdigit():
+    if Path(job).is_dir() or not job[:1].isdigit():
         return Path(job)
     from tiler.jobs import find_folder
 
