@@ -304,7 +304,7 @@ def test_all_of_each_family(originals: Path, tmp_path: Path, worker: Worker, fam
 
 # Configurations and command lines by hypothesis
 
-NAMES = [name for name in Config.__dataclass_fields__ if name not in {"out", "scheduler", "workers"}]
+NAMES = [name for name in Config.__dataclass_fields__ if name not in {"cluster", "out", "scheduler", "workers"}]
 SECTIONS = {name: entry.metadata["section"] for name, entry in Config.__dataclass_fields__.items()}
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=30)
 SCALARS = st.one_of(

@@ -445,6 +445,7 @@ CONFIGS: list[tuple[str, str, str]] = [
     ("out elsewhere", inputs('[run]\nout = "/tmp/elsewhere"'), "outside the folder of the file"),
     ("out through a link", inputs('[run]\nout = "link/out"'), "outside the folder of the file"),
     ("a scheduler", inputs('[run]\nscheduler = "tcp://127.0.0.1:9"'), "a file may not name a scheduler"),
+    ("a cluster", inputs('[run]\ncluster = "slurm.toml"'), "a file may not name a cluster"),
     ("bounds of 10^12 m", inputs("bounds = [0, 0, 1e12, 1e12]"), "more than 32766 tiles of 1000 m to a side"),
     ("terrain of micrometres", inputs("[terrain]\ndtm_spacing = 1e-6"), "nodes in a tile of 1000 m"),
     ("terrain of 10^-300 m", inputs("[terrain]\ndtm_spacing = 1e-300"), "inf nodes in a tile"),

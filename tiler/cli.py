@@ -18,6 +18,7 @@ from tiler.api import POSITIONAL, with_file
 from tiler.config import Config, annotated_defaults, make_config
 from tiler.domain import Height
 from tiler.export import FORMATS
+from tiler.job_commands import add_job_commands, describe_job, find_run, job_line
 from tiler.places import place, refuse_bucket
 from tiler.plain_text import printable
 
@@ -104,10 +105,7 @@ def make_parser() -> argparse.ArgumentParser:
         return sub
 
     run = command("run", _run, "mesh a region from point clouds and footprints")
-    run.add_argument(
-        POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
-    )
-    _add_parameters(run)
+    _add_inputs(run)
     run.add_argument(
         "--dashboard-address",
         default=ANYWHERE,
@@ -128,19 +126,16 @@ def make_parser() -> argparse.ArgumentParser:
     )
     _add_join(command("join", _join, "work at a run together with others, on any machines that share its folder"))
     plan = command("plan", _plan, "tell what a run would do and take, without doing it")
-    plan.add_argument(
-        POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
-    )
     plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
     plan.add_argument("--picture", type=Path, metavar="FILE.png", help="draw tiles, files and footprints")
-    _add_parameters(plan)
+    _add_inputs(plan)
     check = command("check", _check, "prove from the written files that a mesh is right")
     check.add_argument("directory", type=place, help="folder of a run")
     check.add_argument(
         "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
     )
     status = command("status", _status, "tell how far a run is, whether it is alive, and how to go on")
-    status.add_argument("directory", type=place, help="folder of a run")
+    status.add_argument("job", metavar="DIRECTORY|JOB", help="folder of a run, or number of its job")
     status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
     board = command("dashboard", _dashboard, "show the page of a run, at work, ended or dead, from its folder")
     board.add_argument("directory", type=_on_disk, help="folder of a run")
@@ -169,17 +164,23 @@ def make_parser() -> argparse.ArgumentParser:
         help="what to draw; sizes: triangles from above, by the length of their edges; quality: the boundary by "
         "the cells behind it; citymodel: blocks on the terrain",
     )
+    add_job_commands(command, _add_inputs)
     _add_export(command("export", _export, "write the mesh of a run for other programs, each vertex once"))
     command("config", _config, "print all parameters of a run, annotated, as a configuration file")
     return parser
 
 
-def _add_join(join: argparse.ArgumentParser) -> None:
-    """Add the options of one that joins a run: those of the run, and a few of its own."""
-    join.add_argument(
+def _add_inputs(parser: argparse.ArgumentParser) -> None:
+    """Add point clouds, and the parameters of a run."""
+    parser.add_argument(
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
     )
-    _add_parameters(join)
+    _add_parameters(parser)
+
+
+def _add_join(join: argparse.ArgumentParser) -> None:
+    """Add the options of one that joins a run: those of the run, and a few of its own."""
+    _add_inputs(join)
     join.add_argument("--member", default="", metavar="NAME", help="its name (default: its element of an array)")
     join.add_argument(
         "--max-idle",
@@ -288,7 +289,7 @@ def _run_config(
     dashboard: str | None = None,
     report: bool = False,
 ) -> int:
-    if config.workers and not config.scheduler:
+    if config.workers and not config.scheduler and not config.cluster:
         fork_server.begin()
     from tiler.events import EventLog, open_log
     from tiler.out_folder import refuse_result
@@ -365,13 +366,22 @@ def _check_folder(directory: Path) -> int:
 def _status(options: argparse.Namespace) -> int:
     from rich.console import Console
 
+    from tiler.out_folder import PROGRESS
     from tiler.status import print_status, read_status
 
-    status = read_status(options.directory)
+    directory = find_run(options.job)
+    job = describe_job(directory)
+    if job is not None and not options.as_json:
+        say(job_line(job))
+    if job is not None and not (directory / PROGRESS).is_file():
+        if options.as_json:
+            print(json.dumps({"state": "not begun", "job": job}, indent=1))
+        return 0
+    status = read_status(directory)
     if options.as_json:
-        print(json.dumps(status, indent=1))
+        print(json.dumps(status if job is None else status | {"job": job}, indent=1))
     else:
-        print_status(options.directory, status, Console(highlight=False))
+        print_status(directory, status, Console(highlight=False))
     return 0
 
 

@@ -249,6 +249,11 @@ class Config:
     )  # fmt: skip
     tls_cert: str = _parameter(UNSET, "run", "likewise: certificate file of this client")
     tls_key: str = _parameter(UNSET, "run", "likewise: file of its key; empty: in that of the certificate")
+    cluster: str = _parameter(
+        UNSET,
+        "run",
+        "TOML file that describes a cluster, whose batch system starts the workers; instead of workers",
+    )
     out: str = _parameter("out", "run", "folder for the results, or s3://BUCKET/NAME")
     overwrite: bool = _parameter(
         False, "run", "remove the results of an earlier run in that folder, and start anew"
@@ -376,7 +381,7 @@ def check_reach(path: Path, values: Mapping[str, Any]) -> None:
     ------
     ConfigError
         If the output folder lies outside the file's folder, by ``..``, an absolute path or a symbolic link; or if
-        it names a scheduler: who connects to one runs what it sends.
+        it names a scheduler, or a cluster: who connects to one runs what it sends.
     """
     out = values.get("out", UNSET)
     if isinstance(out, str) and "\0" not in out:
@@ -392,6 +397,11 @@ def check_reach(path: Path, values: Mapping[str, Any]) -> None:
         raise ConfigError(
             f"{path}: a file may not name a scheduler, as its address is trusted with this machine; give it on "
             "the command line, with --scheduler"
+        )
+    if values.get("cluster"):
+        raise ConfigError(
+            f"{path}: a file may not name a cluster, as the lines of its jobs are run; give it on the command "
+            "line, with --cluster"
         )
 
 
@@ -566,6 +576,16 @@ def _check_together(config: Config) -> None:
             f"{config.mesh_size:g} m; raise --first-layer or lower --mesh-size"
         )
     _check_pad(config)
+    if config.scheduler and config.cluster:
+        raise ConfigError(
+            f"scheduler = {_shown(config.scheduler)} and cluster = {_shown(config.cluster)}: workers are of one "
+            "or the other; leave one out"
+        )
+    if config.cluster and is_url(config.out):
+        raise ConfigError(
+            f"out = {_shown(config.out)} with a cluster: its jobs meet in the folder of the run; give one that all "
+            "nodes see, or a running scheduler instead of the cluster"
+        )
     if not isinstance(config.domain_height, str):
         check_height(config, config.domain_height)
 

@@ -215,6 +215,10 @@ class Dask:
                         "start some, the same command goes on where it ended"
                     )
 
+    def _forgives(self, task: Task, death: Failure) -> bool:
+        """Tell whether a task is sent again as if it had not begun, whose worker died with it."""
+        return False
+
     def _has_workers(self) -> bool:
         try:
             return bool(self._client.nthreads())
@@ -287,7 +291,10 @@ class Dask:
             case Refusal():
                 return Failure(tell_refusal(found, self._address))
             case KilledWorker():
-                return tell_death(task, self._limits) or self._bystander(ticket)
+                death = tell_death(task, self._limits)
+                if death is not None and self._forgives(task, death):
+                    return None
+                return death or self._bystander(ticket)
             case CancelledError():  # nobody but a lost scheduler does that
                 self._lost = True
                 self._check_scheduler()

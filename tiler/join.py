@@ -106,8 +106,8 @@ def join(
     CityError
         What `tiler.run.run` raises, in the process that drives; and if the folder is not free in time.
     """
-    if config.overwrite or config.scheduler:
-        what = "overwrite" if config.overwrite else "scheduler"
+    if config.overwrite or config.scheduler or config.cluster:
+        what = "overwrite" if config.overwrite else "scheduler" if config.scheduler else "cluster"
         raise ConfigError(
             f"{what}: members of a run work with what is in its folder, and without a scheduler; leave it out"
         )

@@ -19,6 +19,7 @@ from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.cluster import reach_cluster, spell_out
+from tiler.cluster_table import read_cluster
 from tiler.config import Config
 from tiler.context import RunContext, pack_tiles, seam_name, tile_key
 from tiler.dashboard.server import read_address, watched
@@ -158,6 +159,8 @@ def run(
     config = spell_out(config)
     try:
         check_sources(config)
+        if config.cluster:
+            read_cluster(Path(config.cluster))
         if dashboard is not None:
             read_address(dashboard)
         out = place(config.out, config.store_patience)
@@ -448,6 +451,14 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
             yield executor
     elif means.cluster is not None:
         yield means.cluster
+    elif config.cluster:
+        from tiler.jobqueue import JOB, job_queue
+
+        table, folder = read_cluster(Path(config.cluster)), Path(config.out).absolute() / JOB
+        with job_queue(
+            table, folder, Limits(config.time_limit), dashboard=means.dashboard or ANYWHERE, say=say
+        ) as executor:
+            yield executor
     elif config.workers:
         limits = Limits(config.time_limit, int(config.memory_limit * 2**30) or share_memory(config.workers))
         with local(config.workers, limits, dashboard=means.dashboard or ANYWHERE) as executor:
@@ -480,7 +491,9 @@ def _find_damage(out: Path) -> dict[str, str]:
 
 def _foresee(plan: Plan, config: Config) -> list[str]:
     """Say which tiles may not fit into the memory of this machine."""
-    return [] if config.scheduler else warn_of_memory(plan.survey, config, memory=machine_memory())
+    return (
+        [] if config.scheduler or config.cluster else warn_of_memory(plan.survey, config, memory=machine_memory())
+    )
 
 
 def tell_error(error: BaseException) -> str:

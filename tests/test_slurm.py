@@ -1,0 +1,209 @@
+"""Runs as jobs of a real SLURM: four nodes on this machine, started by the tests (`tests.slurm_here`)."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.slurm_here import Slurm, skip_without_slurm, slurm_here
+from tests.sparse_city import ROOT, SparseCity, count_results, make_city
+from tests.test_run import hashes
+from tiler.jobs import JobRecord, read_record
+
+pytestmark = pytest.mark.long
+
+TABLE = """
+type = "slurm"
+partition = "city"
+python = "{python}"
+setup = ["export PYTHONPATH={root}", "{slow}"]
+
+[controller]
+walltime = "{controller}"
+margin = {margin}
+memory = 1
+
+[worker]
+min_workers = {workers}
+max_workers = {workers}
+walltime = "{worker}"
+margin = {rest}
+stagger = {stagger}
+memory = 1
+"""
+LONG = {
+    "controller": "00:30:00",
+    "margin": 60,
+    "worker": "00:30:00",
+    "rest": 60,
+    "stagger": 0,
+    "workers": 3,
+    "slow": "",
+}
+# A worker imports this before its first task.
+SLOW = """
+import time
+from tiler import limits
+
+def slow(function, task, original=limits.run_task):
+    time.sleep({seconds})
+    return original(function, task)
+
+limits.run_task = slow
+"""
+
+
+@pytest.fixture(scope="module")
+def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
+    folder = tmp_path_factory.mktemp("slurm")
+    with slurm_here(folder) as slurm:
+        slurm.environment |= {"XDG_STATE_HOME": str(folder / "home"), "PYTHONPATH": str(ROOT)}
+        yield slurm
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory: pytest.TempPathFactory) -> SparseCity:
+    skip_without_slurm()
+    return make_city(tmp_path_factory.mktemp("city"), 4, buildings=40)
+
+
+@pytest.fixture(scope="module")
+def village(tmp_path_factory: pytest.TempPathFactory) -> SparseCity:
+    skip_without_slurm()
+    return make_city(tmp_path_factory.mktemp("village"), 2, buildings=12)
+
+
+def call(slurm: Slurm, *words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "tiler.cli", *words],
+        env=slurm.environment, cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def submit(slurm: Slurm, city: SparseCity, out: Path, *others: str, **table: object) -> str:
+    """Submit the city; returns the job's number."""
+    path = out.parent / f"{out.name}.toml"
+    path.write_text(TABLE.format(python=sys.executable, root=ROOT, **{**LONG, **table}))
+    run = city.command(out, "--cluster", str(path), *others)
+    text = call(slurm, "submit", *run[run.index("run") + 1 :])
+    assert text.startswith("job ")
+    return text.split()[1].rstrip(";")
+
+
+def slow(folder: Path, seconds: float) -> str:
+    """Line of shell that lets each task take so much longer (s)."""
+    path = folder / f"slow_{round(1000 * seconds)}.py"
+    path.write_text(SLOW.format(seconds=seconds))
+    return f"export DASK_DISTRIBUTED__WORKER__PRELOAD={path}"
+
+
+def record(out: Path) -> JobRecord:
+    found = read_record(out)
+    assert found is not None
+    return found
+
+
+def wait_for_end(slurm: Slurm, out: Path, seconds: float) -> None:
+    slurm.wait(lambda: record(out).state not in ("submitted", "running", "handed over"), seconds, "end of the run")
+    assert record(out).state == "done", log(out)
+
+
+def log(out: Path) -> str:
+    return "".join(path.read_text() for path in sorted((out / "job" / "logs").glob("controller-*")))
+
+
+def results(out: Path) -> dict[str, str]:
+    """Hashes of all but what the jobs need and print."""
+    return {name: found for name, found in hashes(out).items() if not name.startswith("job/")}
+
+
+def worker_jobs(slurm: Slurm, out: Path) -> list[str]:
+    """Numbers of the workers of a run that are at work."""
+    logs = slurm.ask(
+        "squeue", "--noheader", "--states=running", "--Format=JobID:20,Name:30,STDOUT:400"
+    ).splitlines()
+    rows = (line.split() for line in logs)
+    return [job for job, name, log in rows if name == "citystitch-worker" and Path(log).is_relative_to(out)]
+
+
+def test_a_submitted_run_gives_the_bytes_of_a_serial_one(slurm: Slurm, city: SparseCity, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    job = submit(slurm, city, out)
+    assert job in call(slurm, "status", job)
+    wait_for_end(slurm, out, 200)
+    assert results(out) == city.hashes
+    slurm.wait(lambda: slurm.states()[job] == "COMPLETED", 30, "end of the job")
+    slurm.wait(lambda: not worker_jobs(slurm, out), 30, "end of the workers")
+    status = json.loads(call(slurm, "status", job, "--json"))
+    assert status["state"] == "done"
+    assert (status["job"]["state"], status["job"]["queue"]) == ("done", "COMPLETED")
+    assert "no job follows" in call(slurm, "logs", str(out))
+    assert len(list((out / "job" / "logs").glob("worker-*.log"))) >= 3
+
+
+def test_a_cancelled_job_leaves_no_job(slurm: Slurm, city: SparseCity, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    job = submit(slurm, city, out)
+    slurm.wait(lambda: bool(worker_jobs(slurm, out)), 100, "workers")
+    assert "is cancelled" in call(slurm, "cancel", job)
+    slurm.wait(lambda: not {"RUNNING", "PENDING"} & set(slurm.states().values()), 60, "an empty queue")
+    assert record(out).state == "cancelled"
+
+
+def test_an_array_gives_the_bytes_of_a_serial_run(slurm: Slurm, city: SparseCity, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    job = submit(slurm, city, out, "--array", "3")
+    slurm.wait(lambda: slurm.states().get(f"{job}_0") == "RUNNING", 60, "elements at work")
+    assert "3 elements" in call(slurm, "status", job)
+    ends = [f"{job}_{k}" for k in range(3)]
+    slurm.wait(lambda: all(slurm.states()[one] == "COMPLETED" for one in ends), 200, "end of all elements")
+    assert results(out) == city.hashes
+    assert len(list((out / "job" / "logs").glob("member-*.log"))) == 3
+
+
+@pytest.mark.timeout(900)
+def test_lost_nodes_and_walltimes_cost_nothing(
+    slurm: Slurm, city: SparseCity, village: SparseCity, tmp_path: Path
+) -> None:
+    """Two runs at a time, as they mostly sleep.
+
+    Of the first all workers end after a minute, one is cancelled from outside, and the node of another goes down.
+    The second has controllers of two minutes and needs more.
+    """
+    n, lossy, lasting = sum(city.stages().values()), tmp_path / "lossy", tmp_path / "lasting"
+    minute = {"worker": "00:01:00", "rest": 15, "stagger": 5}
+    submit(slurm, city, lossy, **minute, slow=slow(tmp_path, 0.6))
+    first = submit(slurm, village, lasting, controller="00:02:00", margin=20, workers=1, slow=slow(tmp_path, 1.2))
+
+    def wait_for_results(share: float) -> None:
+        slurm.wait(lambda: sum(count_results(lossy).values()) >= share * n, 400, f"{share:.0%} of the results")
+
+    wait_for_results(0.2)
+    slurm.ask("scancel", worker_jobs(slurm, lossy)[0])
+    wait_for_results(0.4)
+    homes = {slurm.node_of(record(out).job) for out in (lossy, lasting)}
+    slurm.wait(lambda: bool(nodes(slurm, lossy) - homes), 100, "a worker on a node of its own")
+    lost = min(nodes(slurm, lossy) - homes)
+    slurm.kill_node(lost)
+    wait_for_end(slurm, lossy, 600)
+    wait_for_end(slurm, lasting, 600)
+    assert results(lossy) == city.hashes
+    assert results(lasting) == village.hashes
+
+    assert record(lossy).earlier == ()
+    lives = len(list((lossy / "job" / "logs").glob("worker-*.log")))
+    assert lives >= 3 + 2 + 3, "workers did not retire"
+    assert "TIMEOUT" not in slurm.states().values()  # nobody waited for it
+    found = record(lasting)
+    assert found.earlier[0] == first
+    assert {slurm.states()[job] for job in found.earlier} == {"COMPLETED"}
+    slurm.start_node(lost)
+
+
+def nodes(slurm: Slurm, out: Path) -> set[str]:
+    return {slurm.node_of(job) for job in worker_jobs(slurm, out)} - {""}
