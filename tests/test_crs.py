@@ -1,6 +1,7 @@
 """The region's CRS: who decides, what is refused, and the command that mends it."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 
 import pyproj
@@ -119,6 +120,24 @@ def test_contradictions_name_both_sides() -> None:
     ) as caught:
         resolve_crs(None, both, None)
     assert "reprojection --filters.reprojection.out_srs=EPSG:28992" in str(caught.value)
+
+
+def test_clouds_that_share_a_crs_are_compared_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def count(one: pyproj.CRS, other: pyproj.CRS) -> bool:
+        seen.append(1)
+        return same_crs(one, other)
+
+    monkeypatch.setattr("tiler.crs.same_crs", count)
+    first, other = cloud("EPSG:28992"), cloud("EPSG:28992+5709", "b.laz")
+    clouds = [replace(header, path=Path(f"{k}.laz")) for k in range(20) for header in (first, other)]
+    crs, said = resolve_crs(None, clouds, None)
+    assert (crs, said) == (pyproj.CRS("EPSG:28992"), [])
+    assert len(seen) <= 2
+    strange = cloud("EPSG:32631", "z.laz")
+    with pytest.raises(InputError, match=r"z.laz: states EPSG:32631, but .*0.laz states EPSG:28992"):
+        resolve_crs(None, [*clouds, strange], None)
 
 
 def test_a_geographic_cloud_is_refused_with_the_command() -> None:

@@ -22,7 +22,9 @@ from packaging.requirements import Requirement
 from tests.sparse_city import ROOT, make_city
 from tests.test_run import hashes
 from tiler import fork_server
+from tiler.config import check_reach, load_config
 from tiler.executors import KILL_AT
+from tiler.places import is_url
 
 DEPLOY = ROOT / "deploy"
 KUBERNETES = DEPLOY / "kubernetes"
@@ -156,6 +158,44 @@ def test_manifests_are_valid_and_the_overlay_joins_them(tmp_path: Path) -> None:
     broken.write_text(joined.replace("readOnlyRootFilesystem", "readOnlyRoot"))
     done = subprocess.run([validate, "--strict", str(broken)], capture_output=True, text=True, check=False)
     assert done.returncode != 0
+
+
+@pytest.mark.long
+def test_the_overlay_for_a_bucket_mounts_nothing_and_holds_no_secret(tmp_path: Path) -> None:
+    kubectl = shutil.which("kubectl")
+    if kubectl is None:
+        pytest.skip("kubectl is not installed: overlays are not joined here")
+    overlay = KUBERNETES / "overlays" / "s3"
+    joined = subprocess.run(
+        [kubectl, "kustomize", str(overlay)], capture_output=True, text=True, check=True
+    ).stdout
+    path = tmp_path / "all.yaml"
+    path.write_text(joined)
+    validate = program("kubernetes-validate", "pip install kubernetes-validate")
+    done = subprocess.run([validate, "--strict", str(path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    documents = list(yaml.safe_load_all(joined))
+    assert "Secret" not in {document["kind"] for document in documents}
+    assert "PersistentVolumeClaim" not in {document["kind"] for document in documents}
+    secret = [{"secretRef": {"name": "citystitch-s3"}}]
+    for name in ("citystitch-workers", "citystitch-run"):
+        (pod,) = (
+            d["spec"]["template"]["spec"]
+            for d in documents
+            if d["metadata"]["name"] == name and d["kind"] in ("Job", "Deployment")
+        )
+        (container,) = pod["containers"]
+        assert container["envFrom"] == secret
+        mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"]}
+        assert mounts.keys() == {volume["name"] for volume in pod["volumes"]}
+        assert mounts["tmp"] == "/tmp"
+    assert container["command"][-1] == "--out=s3://bucket/run"
+    # What the job is given is a configuration, and all of it is in buckets.
+    (given,) = (d["data"]["run.toml"] for d in documents if d["kind"] == "ConfigMap")
+    (tmp_path / "run.toml").write_text(given)
+    values = load_config(tmp_path / "run.toml")
+    check_reach(tmp_path / "run.toml", values)
+    assert all(is_url(text) for text in (*values["pointcloud"], values["footprints"]))
 
 
 @pytest.mark.long

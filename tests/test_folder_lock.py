@@ -73,7 +73,7 @@ def holder(folder: Path, *, locks: bool) -> Iterator["subprocess.Popen[str]"]:
 
 def elsewhere(folder: Path, **others: Any) -> Owner:
     """Put the lock file of an owner on another machine into a folder."""
-    owner = replace(folder_lock._this_process(), host="far", place="other boot", **others)
+    owner = replace(folder_lock.this_process(), host="far", place="other boot", **others)
     (folder / LOCK).write_text(json.dumps(asdict(owner)))
     return owner
 
@@ -106,7 +106,7 @@ def test_a_process_of_the_same_number_is_another_one(tmp_path: Path, monkeypatch
         raise OSError(errno.EOPNOTSUPP, "Operation not supported")
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    here = folder_lock._this_process()
+    here = folder_lock.this_process()
     (tmp_path / LOCK).write_text(json.dumps(asdict(here)))
     assert is_held(tmp_path)
     (tmp_path / LOCK).write_text(json.dumps(asdict(replace(here, began="1"))))

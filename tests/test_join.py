@@ -39,7 +39,7 @@ from tiler.lease import (
 )
 from tiler.limits import Limits, trace_file
 from tiler.mailbox import GoneError, MailReader, MailWriter
-from tiler.member import Ended, _Service
+from tiler.member import Ended, Left, _Service
 from tiler.spool import HOLDER, INBOX, OUTBOX, SPOOL, Spool
 from tiler.stage import Facts, Layout, Scope
 from tiler.store import Store
@@ -337,6 +337,21 @@ def test_all_is_given_up_when_another_process_drives(tmp_path: Path, spool: Spoo
     assert spool.drop_waiting() == {7}
 
 
+def test_a_member_that_is_given_up_does_not_take_the_driver_for_dead(tmp_path: Path) -> None:
+    lease = taken(tmp_path, 1)
+    place = tmp_path / "members.1"
+    place.mkdir()
+    MailWriter(place / INBOX)
+    write_holder(place / HOLDER, holder())
+    service = _Service(place, lease.path, holder(), IdleCrew())
+    service._heart.missed = True
+    assert service.work() is Left.GIVEN_UP
+    service._heart.missed = False
+    service.close()
+    assert service.work() is Left.GIVEN_UP
+    lease.close()
+
+
 def test_a_member_that_is_asked_to_stop_does_not_drive(tmp_path: Path) -> None:
     """As where all elements of an array are cancelled at once, the driver among them."""
     lease = taken(tmp_path, 1)
@@ -351,7 +366,7 @@ def test_a_member_that_is_asked_to_stop_does_not_drive(tmp_path: Path) -> None:
     service._looked = -1e9
     assert service.work() == Ended(130, "stopped as asked; the other members go on")
     service._stop, service._looked = False, -1e9
-    assert service.work() is None
+    assert service.work() is Left.DRIVER_GONE
     service.close()
     assert not tmp_path.exists()
 
@@ -564,18 +579,24 @@ def test_members_and_drivers_die_and_others_come(members: Members) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("members", [FAR], indirect=True)
-def test_a_driver_that_slept_on_another_machine_writes_nothing_more(members: Members) -> None:
+def test_who_slept_on_another_machine_is_replaced_and_joins_again(members: Members) -> None:
     for name in "ab":
         members.prepare(name)
     members.go("a", "b")
     driver = members.wait_for_driver()
     (other,) = set("ab") - {driver}
     members.wait_for_words(driver, f"{other} (process")
-    members.wait_for(0.3)
+    members.wait_for(0.1)
+    os.killpg(members.processes[other].pid, signal.SIGSTOP)
+    members.wait_for_words(driver, "is dead")
+    os.killpg(members.processes[other].pid, signal.SIGCONT)
+    members.wait_for_words(other, "the driver has given this member up")
+    members.wait_for(0.5)
+    assert members.driver() == driver
     os.killpg(members.processes[driver].pid, signal.SIGSTOP)
     assert members.wait_for_driver(driver) == other
-    members.wait_for(0.6)
+    members.wait_for(0.7)
     os.killpg(members.processes[driver].pid, signal.SIGCONT)
     members.wait_for_words(driver, "another process drives the run now")
-    members.end("a", "b")
+    members.end("a", "b")  # the old driver has written nothing more
     assert f"works as {driver} for {other}" in members.words(driver)

@@ -33,7 +33,7 @@ from tiler.region import find_pad
 from tiler.results import StoredTerrain
 from tiler.run import run, run_alone
 from tiler.stage import Facts, Read, Scope, Stage
-from tiler.stages.mesh import find_sizes
+from tiler.stages.surroundings import find_sizes
 from tiler.store import Store
 from tiler.task import Task
 from tiler.vtk_files import read_vtu

@@ -30,7 +30,7 @@ from tiler.check import CheckReport, check_run
 from tiler.config import make_config
 from tiler.mesh_pieces import open_pieces
 from tiler.results import StoredTerrain
-from tiler.stages.mesh import terrain_halo
+from tiler.stages.surroundings import terrain_halo
 from tiler.vtk_files import read_vtp
 
 X, Y = 318_000.0, 6_399_000.0

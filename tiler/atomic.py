@@ -2,12 +2,15 @@
 
 import os
 import shutil
+import tempfile
 import threading
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.errors import OutputError
+from tiler.places import in_bucket
 
 
 @contextmanager
@@ -17,7 +20,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     Parameters
     ----------
     path : Path
-        The file.
+        The file; an object is put whole, from a file in the temporary folder.
     durable : bool
         Wait until the disk has it: after a loss of power `path` is the old file or the new one, both whole.
 
@@ -26,10 +29,16 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     OutputError
         If the file cannot be written; then `path` is not there, or is the old file.
     """
-    part = path.with_name(f".{path.stem}.{os.getpid()}.{threading.get_ident()}.part{path.suffix}")
+    if in_bucket(path):
+        part = Path(tempfile.gettempdir()) / f"citystitch-{uuid.uuid4().hex}.part{path.suffix}"
+    else:
+        part = path.with_name(f".{path.stem}.{os.getpid()}.{threading.get_ident()}.part{path.suffix}")
     try:
         try:
             yield part
+            if in_bucket(path):
+                path.put_file(part)
+                return
             if durable:
                 _sync(part)
             os.replace(part, path)

@@ -19,6 +19,7 @@ from tiler.config import Config, annotated_defaults, make_config
 from tiler.domain import Height
 from tiler.export import FORMATS
 from tiler.job_commands import add_job_commands, describe_job, find_run, job_line
+from tiler.places import place, refuse_bucket
 from tiler.plain_text import printable
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ def make_parser() -> argparse.ArgumentParser:
     plan.add_argument("--picture", type=Path, metavar="FILE.png", help="draw tiles, files and footprints")
     _add_inputs(plan)
     check = command("check", _check, "prove from the written files that a mesh is right")
-    check.add_argument("directory", type=Path, help="folder of a run")
+    check.add_argument("directory", type=place, help="folder of a run")
     check.add_argument(
         "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
     )
@@ -137,7 +138,7 @@ def make_parser() -> argparse.ArgumentParser:
     status.add_argument("job", metavar="DIRECTORY|JOB", help="folder of a run, or number of its job")
     status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
     board = command("dashboard", _dashboard, "show the page of a run, at work, ended or dead, from its folder")
-    board.add_argument("directory", type=Path, help="folder of a run")
+    board.add_argument("directory", type=_on_disk, help="folder of a run")
     board.add_argument(
         "--port", type=int, default=0, metavar="N", help="port to listen at; 0: a free one (default)"
     )
@@ -145,7 +146,8 @@ def make_parser() -> argparse.ArgumentParser:
         "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
     )
     report = command("report", _report, "write report.html: what a run made, how good it is, what was left out")
-    report.add_argument("directory", type=Path, help="folder of a run")
+    report.add_argument("directory", type=_on_disk, help="folder of a run")
+    _add_fetch(command("fetch", _fetch, "fetch the folder of a run from a bucket, and verify its checksums"))
     synth = command("synth", _synth, "write a synthetic city: point cloud and footprints")
     synth.add_argument("directory", type=Path, help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
@@ -153,7 +155,7 @@ def make_parser() -> argparse.ArgumentParser:
     demo.add_argument("--out", type=Path, default=Path("demo"), help="folder to write to (default: demo)")
     _add_city(demo, size=600.0, buildings=220)
     render = command("render", _render, "draw a picture of a run")
-    render.add_argument("directory", type=Path, help="folder of a run")
+    render.add_argument("directory", type=_on_disk, help="folder of a run")
     render.add_argument("-o", "--output", type=Path, required=True, help="PNG file to write")
     render.add_argument(
         "--what",
@@ -234,9 +236,14 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int) -
     parser.add_argument("--seed", type=int, default=1, help="same seed, same bytes (default: 1)")
 
 
+def _add_fetch(fetch: argparse.ArgumentParser) -> None:
+    fetch.add_argument("source", metavar="s3://BUCKET/NAME", help="what --out of the run was")
+    fetch.add_argument("directory", type=Path, help="folder to write")
+
+
 def _add_export(export: argparse.ArgumentParser) -> None:
     """Add the options of all formats, and the table of these below them."""
-    export.add_argument("directory", type=Path, help="folder of a run")
+    export.add_argument("directory", type=_on_disk, help="folder of a run")
     export.add_argument("--format", choices=tuple(FORMATS), metavar="NAME", required=True, help="see below")
     export.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write")
     export.add_argument("--overwrite", action="store_true", help="replace it if it exists")
@@ -289,7 +296,9 @@ def _run_config(
     from tiler.run import run
     from tiler.terminal import make_views, print_last_line, print_summary
 
-    out = Path(config.out)
+    if report:
+        refuse_bucket(config.out, "--report")
+    out = place(config.out)
     watchers = make_views(quiet=quiet, verbose=verbose)
     if log is not None:
         refuse_result(out, log)
@@ -341,6 +350,7 @@ def _check(options: argparse.Namespace) -> int:
         from tiler.audit import audit_run
 
         return 0 if audit_run(options.directory, print) else EXIT_FAILED
+    refuse_bucket(options.directory, "check without --store")
     return _check_folder(options.directory)
 
 
@@ -403,6 +413,21 @@ def _report_run(out: Path, *, quiet: bool) -> None:
             f"citystitch: no report: {printable(reason)}; citystitch report {printable(str(out))} tries again",
             file=sys.stderr,
         )
+
+
+def _fetch(options: argparse.Namespace) -> int:
+    from tiler.fetch import fetch_run
+
+    return 0 if fetch_run(options.source, options.directory, say) else EXIT_FAILED
+
+
+def _on_disk(text: str) -> Path:
+    """Take the folder of a command that reads files of a disk."""
+    try:
+        refuse_bucket(text, "this command")
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return Path(text)
 
 
 def _synth(options: argparse.Namespace) -> int:

@@ -13,12 +13,13 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, OutputError
 from pipeline.las_points import KEPT, REASONS, judge_points
 from pipeline.pointcloud import PointCloud
 from tiler.copc import NODE_SLACK, CopcIndex, read_index, read_nodes
 from tiler.las_chunks import FIELDS, classes_of, coordinates_of
 from tiler.lasheader import AGAIN, RECORD_BYTES, LasPromise, read_promise
+from tiler.places import as_place, is_url, place, source_of
 
 CHUNK_POINTS = 1_000_000
 CHUNK_BYTES = 64_000_000  # wins over CHUNK_POINTS where a point has many extra bytes
@@ -65,7 +66,7 @@ def find_clouds(sources: Sequence[str | Path]) -> list[Path]:
     ----------
     sources : sequence of str or Path
         Files of any name, glob patterns (``**`` included), and folders, whose ``.las`` and ``.laz`` files
-        are taken in any case, without their subfolders.
+        are taken in any case, without their subfolders. URLs of files, and ``s3://`` ones of what lies below.
 
     Returns
     -------
@@ -79,8 +80,10 @@ def find_clouds(sources: Sequence[str | Path]) -> list[Path]:
     """
     if not sources:
         raise InputError("no point cloud was given; name a file, a folder or a glob such as 'tiles/*.laz'")
-    files = [path for source in sources for path in _expand(Path(source))]
-    return sorted({path.resolve(): path for path in sorted(files, reverse=True)}.values())
+    local = [source for source in sources if not is_url(str(source))]
+    files = [path for source in local for path in _expand(Path(source))]
+    remote = {path for source in sources if is_url(str(source)) for path in _expand_url(str(source))}
+    return sorted({path.resolve(): path for path in sorted(files, reverse=True)}.values()) + sorted(remote)
 
 
 def read_header(path: str | Path) -> CloudHeader:
@@ -105,10 +108,10 @@ def read_header(path: str | Path) -> CloudHeader:
     -----
     A CRS that cannot be parsed counts as none: the user must then state it, and is told so.
     """
-    path = Path(path)
+    path = as_place(path)
     promise = read_promise(path)
     evlrs = promise.extended <= RECORD_BYTES
-    with _laspy_as_input_error(path, promise, [0]), laspy.open(path, read_evlrs=evlrs) as reader:
+    with _laspy_as_input_error(path, promise, [0]), laspy.open(source_of(path), read_evlrs=evlrs) as reader:
         header = reader.header
     return CloudHeader(path, promise.n_points, promise.bounds, _parse_crs(header))
 
@@ -143,7 +146,7 @@ def read_points(path: str | Path, bounds: Box) -> tuple[PointCloud, dict[str, in
     -----
     Memory is that of the kept points (25 bytes each) and one chunk of the file.
     """
-    path = Path(path)
+    path = as_place(path)
     promise = read_promise(path)
     counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
     places, classes = [np.empty((0, 3))], [np.empty(0, np.uint8)]
@@ -190,7 +193,7 @@ def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePoint
         n_skipped, chunks = int(index.count[~near].sum()), _query(path, promise, index, near)
     first = next(chunks, None)
     if first is None:
-        with _laspy_as_input_error(path, promise, [0]), laspy.open(path, read_evlrs=False) as reader:
+        with _laspy_as_input_error(path, promise, [0]), laspy.open(source_of(path), read_evlrs=False) as reader:
             empty = laspy.ScaleAwarePointRecord.zeros(0, header=reader.header)
         yield empty, np.empty((0, 3)), n_skipped
         return
@@ -236,6 +239,20 @@ def _expand(source: Path) -> list[Path]:
         ) from error
 
 
+def _expand_url(source: str) -> list[Path]:
+    path = place(source)
+    try:
+        if path.suffix.lower() in _SUFFIXES:
+            path.stat()
+            return [path]
+        found = [one for one in path.iterdir() if one.suffix.lower() in _SUFFIXES and one.is_file()]
+    except OSError as error:
+        raise InputError(f"{source}: cannot be read ({error.strerror}); check the URL") from error
+    if not found:
+        raise InputError(f"{source}: no .las or .laz file lies below; name files, or what is before their names")
+    return found
+
+
 def _find(source: Path) -> list[Path]:
     if source.is_dir():
         found = [path for path in source.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file()]
@@ -270,7 +287,7 @@ def _chunks(path: Path, promise: LasPromise) -> Iterator[tuple[laspy.ScaleAwareP
     with (
         _laspy_as_input_error(path, promise, n_read),
         laspy.open(
-            path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False, decompression_selection=FIELDS
+            source_of(path), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False, decompression_selection=FIELDS
         ) as reader,
     ):
         while n_read[0] < promise.n_points:
@@ -353,7 +370,7 @@ def _laspy_as_input_error(path: Path, promise: LasPromise, n_read: list[int]) ->
     """
     try:
         yield
-    except InputError:
+    except (InputError, OutputError):
         raise
     except BaseException as error:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":

@@ -15,6 +15,7 @@ from pipeline.errors import ConfigError
 from stitch.least import LEAST_TILE
 from tiler.domain import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
 from tiler.pad_widths import check_widths
+from tiler.places import check_url, is_url
 from tiler.plain_text import shorten
 
 MAX_CONFIG_BYTES = 1_000_000
@@ -235,6 +236,10 @@ class Config:
     retries: int = _parameter(
         1, "run", "how often a task that fails is tried again before its tile is left out", least=0, most=100
     )
+    store_patience: float = _parameter(
+        600.0, "run", "how long a run waits for the bucket of its results where that does not answer", unit="s",
+        least=0,
+    )  # fmt: skip
     scheduler: str = _parameter(
         UNSET, "run", "address of a running Dask scheduler, whose workers see the same files; instead of workers"
     )
@@ -243,7 +248,7 @@ class Config:
         "run",
         "TOML file that describes a cluster, whose batch system starts the workers; instead of workers",
     )
-    out: str = _parameter("out", "run", "folder for the results")
+    out: str = _parameter("out", "run", "folder for the results, or s3://BUCKET/NAME")
     overwrite: bool = _parameter(
         False, "run", "remove the results of an earlier run in that folder, and start anew"
     )
@@ -371,6 +376,8 @@ def check_reach(path: Path, values: Mapping[str, Any]) -> None:
     """
     out = values.get("out", UNSET)
     if isinstance(out, str) and "\0" not in out:
+        if is_url(out):
+            raise ConfigError(f"{path}: out leads to {out}; give it on the command line, with --out")
         home, target = (Path(os.path.realpath(place)) for place in (path.parent, out or "."))
         if out and not target.is_relative_to(home):
             raise ConfigError(
@@ -453,10 +460,14 @@ def _read_toml(path: Path) -> dict[str, Any]:
 def _relative_to(folder: Path, name: str, value: Any) -> Any:
     if name == "pointcloud" and isinstance(value, (str, list)):
         value = [value] if isinstance(value, str) else value
-        return [str(folder / item) if isinstance(item, str) else item for item in value]
+        return [_below(folder, item) if isinstance(item, str) else item for item in value]
     if name in ("footprints", "out") and isinstance(value, str) and value:
-        return str(folder / value)
+        return _below(folder, value)
     return value
+
+
+def _below(folder: Path, text: str) -> str:
+    return text if is_url(text) else str(folder / text)
 
 
 def _convert(name: str, value: Any, wanted: Any) -> Any:
@@ -476,6 +487,8 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         raise ConfigError(f"{name} = {_shown(value)}: {wanted.__name__} expected, not {type(value).__name__}")
     if isinstance(value, str):
         _check_text(name, value)
+        if name in ("pointcloud", "footprints", "out"):
+            check_url(value)
     return value
 
 
@@ -554,6 +567,11 @@ def _check_together(config: Config) -> None:
             f"{config.mesh_size:g} m; raise --first-layer or lower --mesh-size"
         )
     _check_pad(config)
+    if config.cluster and is_url(config.out):
+        raise ConfigError(
+            f"out = {config.out} with a cluster: jobs keep their scripts and logs in the output folder; give one "
+            "of a file system that all nodes see"
+        )
     if config.scheduler and config.cluster:
         raise ConfigError(
             f"scheduler = {_shown(config.scheduler)} and cluster = {_shown(config.cluster)}: workers are of one "

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline.errors import ConfigError, InputError, OutputError
+from tiler.places import in_bucket
 
 LOCK = ".run.lock"  # in the folder of a run, as long as the run is at work
 ASKED = 5  # how often a lock is asked for that another process holds
@@ -50,7 +51,7 @@ class Owner:
 
 
 @contextmanager
-def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator[None]:
+def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator[Callable[[], None]]:
     """Hold a folder for one run at a time; the hold ends with the process, however it ends.
 
     Parameters
@@ -59,6 +60,11 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
         An existing folder that can be written.
     say : callable, optional
         Called with a sentence where the file system knows no locks, and where the folder of a dead owner is taken.
+
+    Yields
+    ------
+    callable
+        Raises OutputError if the hold was lost, which only one in a bucket can be.
 
     Raises
     ------
@@ -73,6 +79,12 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
     some know none: so the file also names its owner and is touched every `BEAT` seconds. An owner on this machine
     is asked for by its process, any other is listened to for `SILENCE` seconds.
     """
+    if in_bucket(folder):
+        from tiler.object_lease import only_run_in_bucket
+
+        with only_run_in_bucket(folder, say or _silent) as lease:
+            yield lease.check
+        return
     path = folder / LOCK
     file, locked = _take(path, say or _silent)
     try:
@@ -80,7 +92,7 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
         beat = threading.Thread(target=_beat, args=(file, stop), daemon=True)
         beat.start()
         try:
-            yield
+            yield _hold
         finally:
             stop.set()
             beat.join()
@@ -91,6 +103,10 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
 
 def is_held(folder: Path) -> bool:
     """Tell whether a run is at work in a folder; InputError if its lock file cannot be read."""
+    if in_bucket(folder):
+        from tiler.object_lease import is_held_in_bucket
+
+        return is_held_in_bucket(folder)
     path = folder / LOCK
     try:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
@@ -105,7 +121,7 @@ def is_held(folder: Path) -> bool:
         owner = _read_owner(path)
         if owner is None:
             return False
-        known = _is_alive(owner) if state == "none" or _is_elsewhere(owner) else False
+        known = is_alive(owner) if state == "none" or _is_elsewhere(owner) else False
         return time.time() - os.fstat(file).st_mtime < SILENCE if known is None else known
     finally:
         os.close(file)
@@ -178,7 +194,7 @@ def _wait_for_death(path: Path, owner: Owner, say: Callable[[str], None], *, loc
     """Return when the owner that a lock file names is dead; ConfigError if it lives."""
     if locked and not _is_elsewhere(owner):
         return  # the system would have refused the lock
-    alive = _is_alive(owner)
+    alive = is_alive(owner)
     if alive is None:
         say(f"{path.parent}: {_words(owner)} was at work there; listening for {SILENCE:g} s whether it is")
         alive = _hears(path, owner)
@@ -207,7 +223,7 @@ def _touched(path: Path) -> int:
 
 def _write_owner(path: Path, file: int, *, locked: bool) -> None:
     """Write who holds the folder; without locks, make sure that nobody else did so at the same moment."""
-    owner = _this_process()
+    owner = this_process()
     text = json.dumps(asdict(owner)).encode() + b"\n"
     os.ftruncate(file, 0)
     os.pwrite(file, text, 0)
@@ -258,11 +274,16 @@ def _words(owner: Owner) -> str:
     return f"process {owner.pid} on {owner.host}"
 
 
+def _hold() -> None:
+    """Do nothing: the system holds the lock."""
+
+
 def _silent(_: str) -> None:
     """Say nothing."""
 
 
-def _this_process() -> Owner:
+def this_process() -> Owner:
+    """Name this process as an owner."""
     pid = os.getpid()
     return Owner(socket.gethostname(), _place(), pid, _began(pid), uuid.uuid4().hex)
 
@@ -288,7 +309,7 @@ def _is_elsewhere(owner: Owner) -> bool:
     return (owner.host, owner.place) != (socket.gethostname(), _place())
 
 
-def _is_alive(owner: Owner) -> bool | None:
+def is_alive(owner: Owner) -> bool | None:
     """Tell whether an owner lives; None if it is elsewhere and cannot be asked for."""
     if _is_elsewhere(owner):
         return None

@@ -14,6 +14,7 @@ from pipeline.notes import Note
 from tiler.cells import order_by_cell, row_ranges
 from tiler.footprint_source import FootprintSource, make_footprints, open_source
 from tiler.layers import BATCH, Box, Features, scan_layer
+from tiler.places import as_place
 from tiler.repeated_ids import find_repeated_ids
 
 # Side of the cells that footprints are sorted by (m).
@@ -111,7 +112,7 @@ def scan_footprints(
     that, see `find_repeated_ids`: an id is the same whatever box is asked for.
     """
     source = open_source(
-        Path(path),
+        as_place(path),
         crs=crs,
         bounds=bounds,
         layer=layer,

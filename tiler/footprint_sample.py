@@ -1,7 +1,6 @@
 """A look at the footprints before a run: how many there are, where, and how finely they are drawn."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pyproj
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from tiler.config import Config
 from tiler.footprint_source import FootprintSource, make_footprints, open_source
 from tiler.layers import BATCH, scan_layer
+from tiler.places import place
 from tiler.region import Region
 
 SAMPLE_FEATURES = 500_000  # features that are read; of a larger file the first ones, and they stand for all
@@ -83,7 +83,7 @@ def sample_footprints(config: Config, region: Region, *, limit: int = SAMPLE_FEA
         return None
     crs = pyproj.CRS.from_user_input(region.crs)
     source = open_source(
-        Path(config.footprints),
+        place(config.footprints),
         crs=crs,
         bounds=region.bounds,
         layer=config.layer,

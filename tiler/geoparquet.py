@@ -12,6 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from tiler.places import source_of
 from tiler.wkb import parse_wkb
 
 Box = tuple[float, float, float, float]
@@ -201,12 +202,12 @@ def _open(path: Path, columns: Sequence[str] = ()) -> Any:
         raise InputError(
             f"{path}: Parquet needs pyarrow; pip install 'citystitch[parquet]', or convert the file to GPKG"
         ) from error
-    table = pyarrow.parquet.ParquetFile(path)
+    table = pyarrow.parquet.ParquetFile(source_of(path))
     size, n_rows = path.stat().st_size, table.metadata.num_rows
     if n_rows > size:
         raise InputError(f"{path}: claims {n_rows} features in {size} bytes; copy the file again")
     geometry = _geometry(path, table)[0]
-    return pyarrow.parquet.ParquetFile(path, read_dictionary=[geometry, *columns])
+    return pyarrow.parquet.ParquetFile(source_of(path), read_dictionary=[geometry, *columns])
 
 
 def _geometry(path: Path, table: Any) -> tuple[str, dict[str, Any]]:

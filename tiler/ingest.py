@@ -14,6 +14,7 @@ from pipeline.pointcloud import PointCloud
 from tiler.cells import Box, order_by_cell
 from tiler.clouds import read_chunks, select_usable
 from tiler.las_chunks import classes_of, scaling_of, units_of
+from tiler.places import as_place
 
 # Side of a cell (m). A box of 250 m reads 1.25, 1.54 and 2.14 times its points in cells of 32, 64 and 128 m, in
 # 21, 14 and 10 ranges of rows: 64 m is between many small reads and much that is read in vain.
@@ -91,14 +92,14 @@ def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator
     if not size > 0:
         raise ValueError(f"size of cells {size} m must be positive")
     total: Counter[tuple[int, int]] = Counter()
-    for chunk, xyz, n_skipped in read_chunks(Path(path), bounds):
+    for chunk, xyz, n_skipped in read_chunks(as_place(path), bounds):
         counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
         kept = select_usable(chunk, xyz, bounds, counts)
         counts["read"] += n_skipped
         counts["outside"] += n_skipped
         found = order_by_cell(xyz[kept, :2], size)
         total.update(dict(zip(map(tuple, found.cell.tolist()), np.diff(found.start).tolist(), strict=True)))
-        _check_density(Path(path), total, size)
+        _check_density(as_place(path), total, size)
         rows, all_classes = kept[found.order], classes_of(chunk)
         yield PointBlock(
             units_of(chunk)[rows],

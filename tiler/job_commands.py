@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError, InputError
+from tiler.places import in_bucket, place
 from tiler.plain_text import printable
 
 EVERY = 1.0  # s between two looks at a log that is followed
@@ -37,8 +38,8 @@ def add_job_commands(command: Command, add_parameters: Callable[[argparse.Argume
 
 def find_run(job: str) -> Path:
     """Folder of a run, by itself or by the number of its job; InputError for an unknown number."""
-    if Path(job).is_dir() or not job[:1].isdigit():
-        return Path(job)
+    if not job[:1].isdigit() or Path(job).is_dir():
+        return place(job)
     from tiler.jobs import find_folder
 
     return find_folder(job)
@@ -46,7 +47,7 @@ def find_run(job: str) -> Path:
 
 def describe_job(out: Path) -> dict[str, Any] | None:
     """Tell how the job of a run stands, as `tiler.jobs.tell_job`; None without a job."""
-    if not (out / "job").is_dir():  # nothing of clusters is imported for a run without
+    if in_bucket(out) or not (out / "job").is_dir():  # nothing of clusters is imported for a run without
         return None
     from tiler.jobs import tell_job
 

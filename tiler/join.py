@@ -13,12 +13,12 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import CityError, ConfigError
+from pipeline.errors import CityError, ConfigError, OutputError
 from tiler.config import Config
 from tiler.crew import Crew
 from tiler.engine import StoppedError
@@ -41,7 +41,7 @@ from tiler.lease import (
     this_holder,
 )
 from tiler.limits import Limits
-from tiler.member import serve
+from tiler.member import Ended, Left, serve
 from tiler.out_folder import RUN_RECORD, check_folder
 from tiler.plain_text import shorten
 from tiler.planning import check_sources
@@ -118,6 +118,9 @@ def join(
     name = name_member(member)
     check_sources(config)
     check_folder(Path(config.out), overwrite=False)
+    spool = Path(config.out) / SPOOL
+    if spool.is_symlink():
+        raise ConfigError(f"{spool}: is a symbolic link; remove it")
     workers = max(config.workers, 1)
     memory = int(config.memory_limit * 2**30) or share_memory(workers)
     crew = Crew(workers, Limits(config.time_limit, memory))
@@ -169,38 +172,38 @@ class _Joining:
             number = newest_lease(self._spool)
             self._gone = min(self._gone, number)  # smaller in a new spool
             if number > self._gone:
-                ended = self._serve(number)
-                if ended is not None:
-                    return ended
-                self._gone = number
+                joined = self._serve(number)
+                if isinstance(joined, Joined):
+                    return joined
+                if joined is Left.DRIVER_GONE:
+                    self._gone = number
             elif number and self._differs(number) and self._left(number):
                 time.sleep(LOOK / 2)  # one of them drives next, and tells what is wrong with this one
             elif lease := take_lease(self._spool, number + 1, self._me):
-                ended = self._drive(lease)
-                if ended is not None:
-                    return ended
-                self._gone = lease.number
+                driven = self._drive(lease)
+                if driven is not None:
+                    return driven
             else:
                 time.sleep(LOOK / 10)
 
-    def _serve(self, number: int) -> Joined | None:
-        """Work for a driver; None if it is gone."""
+    def _serve(self, number: int) -> Joined | Left:
+        """Work for a driver."""
         lease = self._lease(number)
         pulse = Pulse(lease, None)
         while (holder := read_holder(lease)) is None:
             if is_over(lease) or pulse.is_dead():
-                return None
+                return Left.DRIVER_GONE
             time.sleep(LOOK / 10)
         if not self._agrees(lease, holder):
-            return None
+            return Left.DRIVER_GONE
         self._say(f"{self._out}: works as {self._me.member} for {holder.tell()}, which drives the run")
         ended = serve(self._members(number), self._me, lease, holder, self._crew, self._say)
-        if ended is None and not lease.exists():
-            return self._missed_end()
-        if ended is None:
-            self._say(f"{self._out}: {holder.tell()} drives the run no longer")
-            return None
-        return Joined(ended.exit_code, ended.error)
+        if isinstance(ended, Ended):
+            return Joined(ended.exit_code, ended.error)
+        if not lease.exists():
+            return self._missed_end() or ended
+        self._say(f"{self._out}: {ended.value}: {holder.tell()}")
+        return ended
 
     def _agrees(self, lease: Path, holder: Holder) -> bool:
         """Hold our configuration against a driver's: False if it is gone, ConfigError if it lives and differs."""
@@ -246,7 +249,8 @@ class _Joining:
             raise
         except Exception as error:
             code = error.exit_code if isinstance(error, CityError) else 1
-            self._end(spool, lease, code, tell_error(error))
+            with suppress(OutputError):  # what the run failed by counts
+                self._end(spool, lease, code, tell_error(error))
             raise
         self._end(spool, lease, record["exit_code"], "")
         return Joined(record["exit_code"], "", record)

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError, InputError
 from tiler import geoparquet
+from tiler.local_copy import local_copy
+from tiler.places import in_bucket
 from tiler.vector_forms import check_form, read_head
 
 Box = tuple[float, float, float, float]
@@ -79,7 +81,8 @@ def describe_layer(path: Path, layer: str = "") -> Layer:
     Parameters
     ----------
     path : Path
-        SHP, GPKG, GeoJSON, FlatGeobuf or GeoParquet; see `check_form`.
+        SHP, GPKG, GeoJSON, FlatGeobuf or GeoParquet; see `check_form`. Of an object, Parquet is read by ranges;
+        all others are fetched first.
     layer : str
         Name of the layer; ``""`` for the only one that has geometries.
 
@@ -94,7 +97,9 @@ def describe_layer(path: Path, layer: str = "") -> Layer:
     ConfigError
         If the layer does not exist, or if there are several and none is named.
     """
-    if not os.path.exists(path):  # Path.exists raises where a name is too long
+    if not geoparquet.is_parquet(path):
+        path = local_copy(path)
+    if not in_bucket(path) and not os.path.exists(path):  # Path.exists raises where a name is too long
         raise InputError(f"{path}: no such file; check the path of the footprints")
     if geoparquet.is_parquet(path):
         if layer:

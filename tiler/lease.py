@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import CityError, OutputError
-from tiler.folder_lock import Owner, _is_alive, _this_process
+from tiler.folder_lock import Owner, is_alive, this_process
 
 BEAT = 3.0  # s between two heartbeats
 SILENCE = 30.0  # s without one, after which a process counts as dead
@@ -61,7 +61,7 @@ class Holder:
 
 def this_holder(member: str, workers: int, parameters: Mapping[str, Any]) -> Holder:
     """Describe this process."""
-    return Holder(_this_process(), member, workers, parameters)
+    return Holder(this_process(), member, workers, parameters)
 
 
 class Pulse:
@@ -87,7 +87,7 @@ class Pulse:
 
     def is_dead(self) -> bool:
         """Look: whether the process has ended, or been silent for `SILENCE` seconds."""
-        if self._owner is not None and _is_alive(self._owner) is False:
+        if self._owner is not None and is_alive(self._owner) is False:
             return True
         now, found = time.monotonic(), touched(self._path)
         self.heard |= found not in (self._touched, -1)

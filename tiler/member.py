@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,16 @@ class Ended:
     error: str = ""
 
 
+class Left(Enum):
+    """Why a member works for a driver no longer, though the run goes on."""
+
+    DRIVER_GONE = "the driver is dead, or has ended its lease"
+    GIVEN_UP = "the driver has given this member up, or must have, as it could not be heard"
+
+
 def serve(
     folder: Path, me: Holder, lease: Path, driver: Holder, crew: Crew, say: Callable[[str], None]
-) -> Ended | None:
+) -> Ended | Left:
     """Work for a driver until the run ends.
 
     Parameters
@@ -55,8 +63,8 @@ def serve(
 
     Returns
     -------
-    Ended or None
-        None if the driver is gone, or has given this member up: what was in hand is not done.
+    Ended or Left
+        How it ended; where it was left, what was in hand is not done.
 
     Raises
     ------
@@ -68,7 +76,7 @@ def serve(
         _make_place(place, me)
         service = _Service(place, lease, driver, crew)
     except FileNotFoundError:  # the spool was taken away
-        return None
+        return Left.GIVEN_UP
     try:
         with stops(service.stop, say):
             return service.work()
@@ -98,11 +106,13 @@ class _Service:
         self._heart.stop()
         remove_folder(self._place)
 
-    def work(self) -> Ended | None:
+    def work(self) -> Ended | Left:
         pause = Pause()
+        left: Left | None = None
         try:
             while self._ended is None:
-                if self._is_lost():
+                left = self._look()
+                if left is not None:
                     break
                 messages = self._inbox.read()
                 for message in messages:
@@ -117,12 +127,12 @@ class _Service:
                 self._outbox.write(pickle.dumps(("done", given.ticket, outcome)) for given, outcome in done)
                 pause.after(messages or done)
         except GoneError:
-            pass
+            left = Left.GIVEN_UP
         if self._crew.n_busy:
             self._crew.kill()
         if self._ended is None and self._stop:
             return Ended(STOPPED, "stopped as asked; the other members go on")
-        return self._ended
+        return self._ended or left or Left.GIVEN_UP
 
     def _take(self, kind: str, *content: Any) -> None:
         """Take a message of the driver."""
@@ -142,14 +152,16 @@ class _Service:
             self._outbox.write([pickle.dumps(("back", [given.ticket for given in self._waiting]))])
             self._waiting.clear()
 
-    def _is_lost(self) -> bool:
-        """Whether the driver is gone, or may have given this member up."""
+    def _look(self) -> Left | None:
+        """See whether the driver is gone, or may have given this member up."""
         if self._heart.missed:
-            return True
+            return Left.GIVEN_UP
         if time.monotonic() - self._looked < LOOK:
-            return False
+            return None
         self._looked = time.monotonic()
-        return is_over(self._lease) or self._pulse.is_dead() or self._inbox.waits() > SILENCE
+        if is_over(self._lease) or self._pulse.is_dead():
+            return Left.DRIVER_GONE
+        return Left.GIVEN_UP if self._inbox.waits() > SILENCE else None
 
 
 def _make_place(place: Path, me: Holder) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from pipeline.errors import ConfigError, OutputError
 from tiler.limits import TASKS
+from tiler.places import in_bucket
 from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL
 from tiler.store import MANIFEST
 
@@ -48,17 +49,14 @@ def check_folder(out: Path, *, overwrite: bool) -> list[str]:
         If it cannot be written, or holds results without the record of a run; or if it, or a folder of results in
         it, is a symbolic link: what is removed there would be somewhere else.
     """
+    remote = in_bucket(out)
+    if remote:
+        return _check_bucket(out, overwrite=overwrite)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; give another --out")
     refuse_links(out)
     earlier = [name for name in RESULTS if (out / name).exists()]
-    if earlier and not _is_ours(out):
-        raise ConfigError(f"{out}: holds {', '.join(earlier)}, but no run.json of a run; give another --out")
-    if earlier and not overwrite and not _has_record(out):
-        raise ConfigError(
-            f"{out / RUN_RECORD}: is not the record of a run; give another --out, or --overwrite to remove "
-            f"{', '.join(earlier)}"
-        )
+    _check_earlier(out, earlier, overwrite=overwrite)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -66,6 +64,27 @@ def check_folder(out: Path, *, overwrite: bool) -> list[str]:
     if not os.access(out, os.W_OK):
         raise ConfigError(f"{out}: cannot be written; give another --out")
     return earlier
+
+
+def _check_bucket(out: Path, *, overwrite: bool) -> list[str]:
+    """As `check_folder`; whether it can be written is known when the lease is."""
+    try:
+        there = {path.name for path in out.iterdir()}
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be read ({error.strerror}); give another --out") from error
+    earlier = [name for name in RESULTS if name in there]
+    _check_earlier(out, earlier, overwrite=overwrite)
+    return earlier
+
+
+def _check_earlier(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
+    if earlier and not _is_ours(out):
+        raise ConfigError(f"{out}: holds {', '.join(earlier)}, but no run.json of a run; give another --out")
+    if earlier and not overwrite and not _has_record(out):
+        raise ConfigError(
+            f"{out / RUN_RECORD}: is not the record of a run; give another --out, or --overwrite to remove "
+            f"{', '.join(earlier)}"
+        )
 
 
 def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
@@ -93,11 +112,22 @@ def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
             path = out / name
             if name == RUN_RECORD or name not in earlier:
                 continue
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+            _remove(path)
         for folder in PIECES:
             (out / folder).mkdir(exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written ({error.strerror}); give another --out") from error
+
+
+def _remove(path: Path) -> None:
+    if in_bucket(path):
+        from tiler.object_path import delete_below
+
+        delete_below(path)
+    elif path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
 
 
 def remove_strangers(out: Path, tiles: Collection[str]) -> None:
@@ -122,7 +152,7 @@ def _remove_strangers(out: Path, tiles: Collection[str]) -> None:
         for path in (out / folder).glob(f"*{suffix}"):
             if path.stem not in tiles:
                 path.unlink()
-    for name in map(Path, RESULTS):
+    for name in () if in_bucket(out) else map(Path, RESULTS):  # nothing unfinished is in a bucket
         for path in out.glob(PART.format(stem=name.stem, suffix=name.suffix)):
             if path.is_file():
                 path.unlink()
@@ -130,6 +160,8 @@ def _remove_strangers(out: Path, tiles: Collection[str]) -> None:
 
 def refuse_links(out: Path) -> None:
     """Raise ConfigError if the folder of a run, or a folder of results in it, is a symbolic link."""
+    if in_bucket(out):
+        return
     store = out / STORE
     stages = sorted(store.iterdir()) if store.is_dir() and not store.is_symlink() else []
     for path in (out, *(out / name for name in RESULTS), *stages):
@@ -160,6 +192,9 @@ def refuse_result(out: Path, log: Path) -> None:
 
 
 def _is_result(out: Path, path: Path) -> bool:
+    if in_bucket(out) or in_bucket(path):
+        both = in_bucket(out) and in_bucket(path)
+        return both and any(path.is_relative_to(out / name) for name in RESULTS)
     real = Path(os.path.realpath(path))
     return any(real.is_relative_to(os.path.realpath(out / name)) for name in RESULTS)
 

@@ -13,6 +13,7 @@ from tiler.clouds import CloudHeader, find_clouds, read_header
 from tiler.config import Config, idle_parameters
 from tiler.context import choose_tiles, make_layout, tile_key
 from tiler.crs import resolve_crs
+from tiler.places import in_bucket, place
 from tiler.region import (
     Region,
     check_region,
@@ -135,7 +136,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     """
     paths = find_clouds(config.pointcloud)
     headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
-    footprint_crs = read_footprint_crs(Path(config.footprints), config.layer) if config.footprints else None
+    footprint_crs = read_footprint_crs(place(config.footprints), config.layer) if config.footprints else None
     crs, messages = resolve_crs(config.crs or None, headers, footprint_crs)
     code = crs.to_epsg()
     region = Region(
@@ -178,7 +179,10 @@ def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:
 
 
 def identify(path: Path) -> str:
-    """Change when a file does: its size and the time of its last change."""
+    """Change when a file does: its size and the time of its last change; of an object its tag, if it has one."""
+    if in_bucket(path):
+        found = path.stat()
+        return f"{found.st_size} {found.e_tag or found.st_mtime_ns}"
     state = path.stat()
     return f"{state.st_size} {state.st_mtime_ns}"
 

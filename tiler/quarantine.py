@@ -15,6 +15,7 @@ from tiler.config import Config, write_config
 from tiler.context import SHARED, tile_key, tile_name
 from tiler.engine import Engine
 from tiler.failures import SetAside
+from tiler.places import absolute
 from tiler.planning import Plan, leave_out
 from tiler.stage import Box, Scope
 
@@ -120,8 +121,8 @@ def save_config(config: Config, out: Path) -> None:
     """Write the parameters of a run into its folder, paths absolute: any place will do to run it from."""
     saved = dataclasses.replace(
         config,
-        pointcloud=tuple(str(Path(source).absolute()) for source in config.pointcloud),
-        footprints=str(Path(config.footprints).absolute()) if config.footprints else "",
+        pointcloud=tuple(map(absolute, config.pointcloud)),
+        footprints=absolute(config.footprints) if config.footprints else "",
         out=str(out.absolute()),
         scheduler="",  # which no file may name
         overwrite=False,

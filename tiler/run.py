@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -45,6 +46,7 @@ from tiler.out_folder import (
 from tiler.own_stages import OwnStages, check_own, run_own_stages
 from tiler.pad import Pad
 from tiler.padding import CORE_STAGE, pad_plan, plan_alone
+from tiler.places import in_bucket, place, refuse_bucket
 from tiler.planning import Plan, check_sources, identify, make_plan
 from tiler.progress import Announce
 from tiler.quarantine import (
@@ -137,13 +139,13 @@ def run(
             read_cluster(Path(config.cluster))
         if dashboard is not None:
             read_address(dashboard)
-        out = Path(config.out)
+        out = place(config.out, config.store_patience)
         own = check_own(config, stages, parameters)
         check_folder(out, overwrite=config.overwrite)
-        with only_run(out, told.say):
+        with only_run(out, told.say) as check, _beside(out, check, told) as shown:
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
-            return _run(config, out, earlier, damage, own, announce, told, dashboard, executor)
+            return _run(config, out, earlier, damage, own, announce, told, dashboard, executor, shown)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
             told.end("failed", tell_error(error))
@@ -160,6 +162,7 @@ def _run(
     watchers: Watchers,
     dashboard: str | None,
     executor: OwnExecutor | None,
+    shown: Path,
 ) -> dict[str, Any]:
     say = watchers.say
     start, untouched = time.perf_counter(), bool(earlier)
@@ -175,7 +178,7 @@ def _run(
         # Nothing of an earlier run is touched before the inputs are known to be there; then, before anything else
         # changes, its record no longer says that it is done.
         plan = make_plan(config, say)
-        vectors = [Path(config.footprints)] if config.footprints else []
+        vectors = [place(config.footprints)] if config.footprints else []
         for warning in _foresee(plan, config):
             plan.messages.append(warning)
             say(warning)
@@ -183,17 +186,24 @@ def _run(
         untouched = False
         _write_record(out, record)
         clear_folder(out, earlier, overwrite=config.overwrite)
-        shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
-        if executor is None:
-            shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
+        if not in_bucket(out):
+            shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
+            if executor is None:
+                shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
         save_config(config, out)
-        progress = begin_watching(config, out, plan, own, watchers, announce=announce)
-        record |= _mesh_region(config, out, plan, own, watchers, damage, dashboard, executor)
+        progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=shown)
+        record |= _mesh_region(config, out, plan, own, watchers, damage, dashboard, executor, shown)
         record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:
             say(message)
         record["status"] = "done"
         say(describe_tasks(record["tasks"]))
+        if in_bucket(out):
+            from tiler.object_watch import describe_waits, tell_waits
+
+            record["store_waits"] = describe_waits()
+            if waits := tell_waits():
+                say(waits)
         failed = False
     except LostFolderError as error:
         untouched = True  # the folder is another process's now
@@ -224,6 +234,7 @@ def _mesh_region(
     damage: Mapping[str, str],
     dashboard: str | None,
     own_executor: OwnExecutor | None,
+    shown: Path,
 ) -> dict[str, Any]:
     """Run all stages, and write the indexes of their pieces and the manifest.
 
@@ -235,7 +246,7 @@ def _mesh_region(
         own_executor(watchers.say)
         if own_executor
         else _executor(config, dashboard or ANYWHERE, watchers.say) as executor,
-        watched(out, dashboard, getattr(executor, "scheduler", None), watchers.say),
+        watched(shown, dashboard, getattr(executor, "scheduler", None), watchers.say),
     ):
         while True:
             engine = make_engine(config, out, plan, executor, own, watchers)
@@ -287,7 +298,7 @@ def make_engine(
         str(out),
         config.open_size,
     )
-    footprints = Path(config.footprints) if config.footprints else None
+    footprints = place(config.footprints) if config.footprints else None
     parameters = SimpleNamespace(
         **dataclasses.asdict(config),
         **own.parameters,
@@ -328,6 +339,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
         What its stages raise; any other error likewise, its type kept.
     """
     check_sources(config)
+    refuse_bucket(config.out, "--only")
     whole = make_plan(config, _silent)
     domain, tallest = domain_of_run(config)
     pad, store = None, None
@@ -430,6 +442,19 @@ def _executor(config: Config, dashboard: str, say: Callable[[str], None]) -> Ite
     else:
         with serial() as executor:
             yield executor
+
+
+@contextmanager
+def _beside(out: Path, check: Callable[[], None], watchers: Watchers) -> Iterator[Path]:
+    """Give the folder of the events that the page of a run is made of; of one in a bucket, watch the store too."""
+    if not in_bucket(out):
+        yield out
+        return
+    from tiler.object_watch import WaitWatch, telling
+
+    watchers.add(WaitWatch(check))
+    with tempfile.TemporaryDirectory(prefix="citystitch-") as name, telling(watchers.say):
+        yield Path(name)
 
 
 def _find_damage(out: Path) -> dict[str, str]:

@@ -7,6 +7,7 @@ from tiler.context import make_layout
 from tiler.events import EventLog, begin_file
 from tiler.out_folder import EVENTS
 from tiler.own_stages import OwnStages, list_stages, stages_of_pad
+from tiler.places import in_bucket
 from tiler.planning import Plan
 from tiler.progress import Announce, RunProgress, command_line
 from tiler.region import foresee_pad
@@ -16,7 +17,14 @@ NOT_ALONE = ("proofs", "fit")  # stages of tiles and seams that `tiler.run.run_a
 
 
 def begin_watching(
-    config: Config, out: Path, plan: Plan, own: OwnStages, watchers: Watchers, *, announce: Announce | None = None
+    config: Config,
+    out: Path,
+    plan: Plan,
+    own: OwnStages,
+    watchers: Watchers,
+    *,
+    announce: Announce | None = None,
+    shown: Path | None = None,
 ) -> RunProgress:
     """Begin to tell how far a run is, with all stages that are known from the start.
 
@@ -34,6 +42,8 @@ def begin_watching(
         Those that the caller brings; the files' are added.
     announce : callable, optional
         As for `RunProgress`.
+    shown : Path, optional
+        Folder on a disk where the events are written first, of a run in a bucket.
 
     Raises
     ------
@@ -52,7 +62,12 @@ def begin_watching(
     totals = {name: total for name, (_, total) in expected.items()}
     progress = RunProgress(out, config, totals, announce=announce, command=command)
     watchers.add(progress)
-    watchers.add(EventLog(out / EVENTS, begin_file(out / EVENTS)))
+    if in_bucket(out) and shown is not None:
+        from tiler.object_watch import BucketEvents
+
+        watchers.add(BucketEvents(out / EVENTS, shown))
+    else:
+        watchers.add(EventLog(out / EVENTS, begin_file(out / EVENTS)))
     start = RunStart(
         out=out,
         command=command,

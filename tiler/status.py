@@ -13,6 +13,7 @@ from rich.table import Table
 from pipeline.errors import InputError
 from tiler.folder_lock import is_held
 from tiler.out_folder import PROGRESS, RUN_RECORD
+from tiler.places import in_bucket
 
 LISTED_ITEMS = 10  # items in hand that the table lists
 COUNTS = ("total", "done", "reused", "running", "failed")
@@ -127,7 +128,7 @@ def _next_move(directory: Path, status: dict[str, Any]) -> str:
     if status["state"] == "running":
         return f"next: wait, and ask again: citystitch status {directory}"
     if status["state"] == "done":
-        return f"next: citystitch check {directory}"
+        return f"next: citystitch {f'fetch {directory} DIR' if in_bucket(directory) else f'check {directory}'}"
     if not status["command"]:
         return "to go on where it ended: call tiler.run.run again as before, with the same stages of your own"
     return f"to go on where it ended, in {status['directory']}:\n{status['command']}"

@@ -4,7 +4,8 @@ A result is a zarr group ``<stage>/<name>``. Arrays above 32 kB are arrays of th
 array of bytes, ``_packed``, and if all of them are less than 16 kB, in the group's attributes. These hold what the
 writer gave, ``arrays`` (type and shape of each array and the CRC-32 of the raw bytes of each chunk), ``digest``, a
 hash of the content, ``files``, size and CRC-32 of every file of the arrays as it lies on disk, and ``checksum``,
-the CRC-32 of the file that the attributes are in.
+the CRC-32 of the file that the attributes are in. In a bucket each file is an object, and that of the attributes
+is put last (`tiler.object_results`).
 """
 
 import base64
@@ -14,13 +15,14 @@ import json
 import math
 import os
 import shutil
+import tempfile
 import uuid
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import zarr
@@ -47,8 +49,12 @@ from tiler.packing import (
     unpack,
     verified_chunks,
 )
+from tiler.places import in_bucket, read_at_most
 from tiler.seal import is_sealed, seal
 from tiler.written import GONE, find_changed_files, state_files
+
+if TYPE_CHECKING:
+    from tiler.object_path import ObjectPath
 
 PACKED = "_packed"
 # Bytes of numbers apart, then LZ4: written three times as fast as with zarr's default, a tenth more on disk. zarr
@@ -202,6 +208,9 @@ class Store:
     def remove(self, stage: str, name: str | None = None) -> None:
         """Remove a result, or all of a stage; it is gone at once and whole. Nothing happens if it is not there."""
         folder = self.path / stage if name is None else self.folder(stage, name)
+        if in_bucket(folder):
+            _withdraw(folder)
+            return
         gone = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}{PARTIAL}")
         try:
             os.replace(folder, gone)
@@ -212,7 +221,12 @@ class Store:
         _delete(gone)
 
     def sweep(self, stage: str) -> None:
-        """Remove what killed writers of the stage left behind; no writer may be at work."""
+        """Remove what killed writers of the stage left behind; no writer may be at work.
+
+        In a bucket that lies where the result will be, and goes when it is put or pruned.
+        """
+        if in_bucket(self.path):
+            return
         for folder in (self.path / stage).glob(f".*{PARTIAL}"):
             _delete(folder)
 
@@ -221,6 +235,8 @@ class Store:
         if not self.path.is_dir():
             return []
         beside = [entry for entry in self.path.iterdir() if not entry.is_dir() and entry.name != MANIFEST]
+        if in_bucket(self.path):  # nothing is hidden there
+            return sorted(beside)
         return sorted(beside + [entry for stage in self.stages() for entry in (self.path / stage).glob(".*")])
 
     def remove_strays(self) -> None:
@@ -299,7 +315,10 @@ class Writer:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}{PARTIAL}")
+        self._scratch = (
+            Path(tempfile.gettempdir()) / f"citystitch-{uuid.uuid4().hex}" if in_bucket(folder) else None
+        )
+        self._partial = (self._scratch or folder.parent) / f".{folder.name}.{uuid.uuid4().hex}{PARTIAL}"
         self._small: dict[str, NDArray[Any]] = {}
         self._buffers: dict[str, RowBuffer] = {}
         self._table: Table = {}
@@ -313,7 +332,7 @@ class Writer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        shutil.rmtree(self._partial, ignore_errors=True)
+        shutil.rmtree(self._scratch or self._partial, ignore_errors=True)
 
     def put(self, **arrays: ArrayLike) -> None:
         """Write whole arrays, each name once.
@@ -469,6 +488,11 @@ class Writer:
 
     def _replace(self) -> None:
         """Rename into place; another writer of the same result may do so at the same moment."""
+        if in_bucket(self._folder):
+            from tiler.object_results import publish
+
+            publish(self._partial, self._folder, GROUP)
+            return
         old = self._partial.with_name(f".{self._folder.name}.{uuid.uuid4().hex}{PARTIAL}")
         while True:
             try:
@@ -515,11 +539,19 @@ def _hash_content(arrays: list[list[Any]], attributes: Mapping[str, Any]) -> str
 
 def _delete(path: Path) -> None:
     """Delete a folder or a file, as far as that can be done."""
-    if path.is_dir() and not path.is_symlink():
+    if in_bucket(path):
+        _withdraw(path)
+    elif path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         with suppress(OSError):
             path.unlink()
+
+
+def _withdraw(path: "ObjectPath") -> None:
+    from tiler.object_path import delete_below
+
+    delete_below(path, GROUP)
 
 
 def _read_group(folder: Path) -> dict[str, Any]:
@@ -620,8 +652,7 @@ class _ChunkForm:
         """Decompress a chunk, after its size and form are known to be right."""
         n_bytes = math.prod(self.chunk) * self.dtype.itemsize
         further = (0,) * (len(self.chunk) - 1 + (self.dtype.kind == "U"))
-        with (folder / "c" / "/".join(map(str, (k, *further)))).open("rb") as file:
-            data = file.read(n_bytes + CHUNK_HEAD + 1)
+        data = read_at_most(folder / "c" / "/".join(map(str, (k, *further))), n_bytes + CHUNK_HEAD + 1)
         check_chunk(data, n_bytes)
         raw = np.frombuffer(DECODER.decode(data), np.uint8)
         return raw.view(self.dtype).reshape(self.chunk)[(slice(None), *map(slice, self.shape[1:]))]
@@ -654,7 +685,7 @@ def _damage(folder: Path, stage: str, name: str, array: str) -> Iterator[None]:
     """Whatever zarr and its codecs raise on broken files becomes one error that says where."""
     try:
         yield
-    except MemoryError:
+    except (MemoryError, OutputError):  # a bucket that does not answer has no damage
         raise
     except Exception as error:
         state = "is damaged" if (folder / GROUP).is_file() else "is not there"

@@ -3,7 +3,6 @@
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from pipeline.clusters import add_counts
@@ -13,6 +12,7 @@ from tiler.context import absent_tiles, tile_name
 from tiler.domain import settle
 from tiler.engine import Engine
 from tiler.padding import CORE_STAGE
+from tiler.places import place
 from tiler.planning import Plan
 from tiler.quarantine import Missing, describe_missing
 from tiler.stage import REGION_ITEM, Facts
@@ -84,7 +84,7 @@ def summarise_run(
             }
             for name in sorted(plan.layout.tiles.keys() - missing.tiles.keys())
         },
-        **describe_missing(missing, Path(config.out)),
+        **describe_missing(missing, place(config.out)),
         "counts": _join_counts(engine, plan, rounds) | {"tiles missing": len(missing.tiles)},
         "quality": report["quality"],
         "fidelity": report["fidelity"] | ({"outline": outline} if outline else {}),

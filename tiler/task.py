@@ -16,11 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import CityError
 from pipeline.notes import Note, count_notes
+from tiler.places import in_bucket
 from tiler.stage import Box, Facts, Scope
 from tiler.store import Store, Writer, plain_json
 from tiler.written import FILES, check_files, find_changed_files
 
 APART = ("key",)  # attributes of a result that are no content
+WAITED = "waiting for the store"  # step of a record: the time that requests to a bucket were repeated
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +235,17 @@ class Task:
         finally:
             self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - start
 
+    @contextmanager
+    def output(self) -> Iterator[Path]:
+        """Give the folder for files that the result states; in a bucket they are put when all are written."""
+        if not in_bucket(self.folder):
+            yield Path(self.context.out)
+            return
+        from tiler.object_results import files_for
+
+        with files_for(self.folder) as folder:
+            yield folder
+
     def _declared(self, stage: str) -> tuple[str, ...]:
         if stage not in self.refs:
             raise ValueError(f"stage {self.stage} reads stage {stage}, which it does not declare in reads")
@@ -255,7 +268,7 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
     it was written; a damaged one is computed again. An error leaves nothing behind. Errors come back as values; a
     RuntimeError with the text stands for one that cannot be pickled.
     """
-    start = time.perf_counter()
+    start, waited = time.perf_counter(), _waited(task)
     try:
         earlier = _take_earlier(task)
         if isinstance(earlier, Record):
@@ -273,6 +286,8 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
     finally:
         task._writer = None
     seconds = {step: round(value, 4) for step, value in task._seconds.items()}
+    if waiting := _waited(task) - waited:
+        seconds[WAITED] = round(waiting, 4)
     seconds["all"] = round(time.perf_counter() - start, 4)
     return Record(
         task.stage,
@@ -285,6 +300,15 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
         peak_memory=peak_memory(),
         damage=earlier,
     )
+
+
+def _waited(task: Task) -> float:
+    """Seconds that this process has waited for buckets so far."""
+    if not in_bucket(task.folder):
+        return 0.0
+    from tiler.object_requests import WAITS
+
+    return WAITS.seconds
 
 
 def _take_earlier(task: Task) -> Record | str:

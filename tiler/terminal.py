@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tiler.live_view import LiveView
+from tiler.places import in_bucket
 from tiler.plain_text import printable
 from tiler.plain_view import PlainView, QuietView
 from tiler.tally import Tally
@@ -78,6 +79,8 @@ def print_summary(record: dict[str, Any], out: Path, *, console: Console | None 
 def next_commands(out: Path) -> Sequence[Sequence[str]]:
     """List what to do with a finished run: prove it, look at it, take it along."""
     folder = str(out)
+    if in_bucket(out):
+        return (("citystitch", "fetch", folder, "DIR"),)
     return (
         ("citystitch", "check", folder),
         ("citystitch", "report", folder),

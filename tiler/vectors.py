@@ -9,6 +9,7 @@ from pipeline.notes import Note
 from tiler.crs import horizontal_crs
 from tiler.footprint_index import join_footprints, scan_footprints
 from tiler.layers import Box, describe_layer
+from tiler.places import as_place
 
 
 def read_footprint_crs(path: str | Path, layer: str = "") -> pyproj.CRS | None:
@@ -33,7 +34,7 @@ def read_footprint_crs(path: str | Path, layer: str = "") -> pyproj.CRS | None:
     ConfigError
         If the layer does not exist, or there are several and none is named.
     """
-    crs = describe_layer(Path(path), layer).crs
+    crs = describe_layer(as_place(path), layer).crs
     return None if horizontal_crs(crs) is None else crs
 
 

@@ -3,10 +3,12 @@
 Files are little-endian with UInt64 headers. Nothing here knows of meshes: see `tiler.vtk_files`.
 """
 
+import io
 import os
 import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -18,10 +20,13 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from tiler.atomic import replacing
+from tiler.places import in_bucket, read_at_most
 
 BLOCK_BYTES = 1 << 18  # uncompressed bytes of a zlib block
 ZLIB_LEVEL = 1
 HEAD_BYTES = 1 << 20  # bound on the XML in front of the data
+OBJECT_HEAD = 1 << 16  # bytes that are asked for to find it
+TOGETHER, BLOCK = 16, 1000  # heads of objects that are asked for at a time, and that wait
 INDEX_BYTES = 1 << 28  # bound on an index file
 MAX_RATIO = 1032  # zlib cannot compress better than this
 # VTK's names of the types that we write.
@@ -142,24 +147,36 @@ def write_index(path: Path, pieces: Sequence[Path], kind: str) -> None:
     """Write the index file over existing pieces; see `tiler.vtk_files.write_pvtp`."""
     if not pieces:
         raise ValueError("an index file needs at least one piece")
-    declared = _declarations(pieces[0], kind)
-    for piece in pieces[1:]:
-        if _declarations(piece, kind) != declared:
+    found = _declare_all(pieces, kind)
+    declared = next(found)
+    for piece, other in zip(pieces[1:], found, strict=True):
+        if other != declared:
             raise InputError(f"{piece}: declares other arrays than {pieces[0]}; run the tile again")
     lines = [*_opening(f"P{kind}", ' header_type="UInt64"'), f'  <P{kind} GhostLevel="0">']
     for section in ("Points", "PointData", "CellData"):
         arrays = [f"      <PDataArray {array}/>" for array in declared[section]]
         lines += [f"    <P{section}>", *arrays, f"    </P{section}>"]
     for piece in pieces:
-        source = PurePath(os.path.relpath(piece, path.parent)).as_posix()
+        source = PurePath(os.path.relpath(str(piece), str(path.parent))).as_posix()
         lines.append(f"    <Piece Source={quoteattr(source)}/>")
     lines += [f"  </P{kind}>", "</VTKFile>", ""]
     with replacing(path) as part, part.open("wb") as file:
         file.write("\n".join(lines).encode())
 
 
+def _declare_all(pieces: Sequence[Path], kind: str) -> Iterator[dict[str, list[str]]]:
+    """Read the declarations of pieces in their order; of objects, some at a time."""
+    if not in_bucket(pieces[0]):
+        yield from (_declarations(piece, kind) for piece in pieces)
+        return
+    with ThreadPoolExecutor(TOGETHER) as pool:
+        for start in range(0, len(pieces), BLOCK):
+            yield from pool.map(lambda piece: _declarations(piece, kind), pieces[start : start + BLOCK])
+
+
 def _declarations(path: Path, kind: str) -> dict[str, list[str]]:
-    with opened(path) as file:
+    remote = in_bucket(path)
+    with _opened_head(path) if remote else opened(path) as file:
         piece = _read_head(path, file, kind).piece
     return {
         section: [
@@ -191,6 +208,15 @@ def opened(path: Path) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
             yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); run the tile again") from error
+
+
+@contextmanager
+def _opened_head(path: Path) -> Iterator[BinaryIO]:
+    """Open what of an object holds the declarations of our own pieces: one request."""
+    try:
+        yield io.BytesIO(read_at_most(path, OBJECT_HEAD))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); run the tile again") from error
 

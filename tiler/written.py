@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from tiler.places import in_bucket
 from tiler.seal import sum_file
 
 FILES = "files"  # the fact that states them
@@ -48,10 +49,12 @@ def tell_change(path: Path, stated: Any) -> str:
     if not _is_statement(stated):
         return "no size and checksum of it are stated"
     try:
-        size = path.stat().st_size
+        # An object is asked for once; of a file the size is known before it is read.
+        remote = in_bucket(path)
+        size, crc = sum_file(path) if remote else (path.stat().st_size, None)
         if size != stated[0]:
             return f"has {size} bytes instead of {stated[0]}"
-        return "" if sum_file(path)[1] == stated[1] else "its checksum differs"
+        return "" if (sum_file(path)[1] if crc is None else crc) == stated[1] else "its checksum differs"
     except (FileNotFoundError, NotADirectoryError):
         return GONE
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What a simulated task comes to: time, size and facts of tasks of a real run, kept in ``recorded.json``."""
+"""What a simulated task comes to: time, size and facts of tasks of real runs, ``recorded.json`` by tile size."""
 
 import json
 import zlib
@@ -57,15 +57,22 @@ class Recorded:
 
 
 @cache
-def recorded_stages() -> dict[str, list[Recorded]]:
-    """Read the recorded tasks by stage; KeyError later on for a stage that was not recorded."""
-    found = json.loads(PATH.read_text())
+def recorded_stages(tile_size: float) -> dict[str, list[Recorded]]:
+    """Read the recorded tasks of a tile size (m) by stage.
+
+    Raises
+    ------
+    KeyError
+        For a tile size that was not recorded, and later on for such a stage.
+    """
+    found = json.loads(PATH.read_text())[f"{tile_size:g}"]
     return {stage: [Recorded(**task) for task in tasks] for stage, tasks in found["stages"].items()}
 
 
-def choose(stage: str, name: str) -> Recorded:
+def choose(tile_size: float, stage: str, name: str) -> Recorded:
     """Choose the recorded task that stands for an item, always the same one."""
-    tasks = recorded_stages()[stage if stage in recorded_stages() else f"{stage.rstrip('0123456789')}1"]
+    stages = recorded_stages(tile_size)
+    tasks = stages[stage if stage in stages else f"{stage.rstrip('0123456789')}1"]
     return tasks[draw(stage, name) % len(tasks)]
 
 

@@ -150,7 +150,7 @@ def _told(meter: Meter, engine: Engine, begin: float) -> dict[str, Any]:
 def run_virtual(country: str, n_tiles: int, workers: int, fail: float, folder: Path) -> dict[str, Any]:
     """Run a country in virtual time, with a stand-in for the store."""
     config, plan, told = survey(country, n_tiles, folder)
-    store = StandInStore(Path(config.out) / STORE, plan.layout)
+    store = StandInStore(Path(config.out) / STORE, plan.layout, config.tile_size)
     executor = VirtualWorkers(workers, store, fail)
     cpu, begin = time.process_time(), time.perf_counter()
     told |= drive(config, plan, executor, stand_in=store)
@@ -186,7 +186,7 @@ def run_dask(country: str, n_tiles: int, workers: int, folder: Path) -> dict[str
     """Run a country with a real scheduler in this process and worker processes, whose tasks are done at once."""
     config, plan, told = survey(country, n_tiles, folder)
     shutil.rmtree(config.out, ignore_errors=True)
-    store = StandInStore(Path(config.out) / STORE, plan.layout)
+    store = StandInStore(Path(config.out) / STORE, plan.layout, config.tile_size)
     with local(workers) as executor, patch("tiler.executors.run_guarded", instant):
         time.sleep(SETTLE)
         gc.collect()
@@ -198,12 +198,14 @@ def run_dask(country: str, n_tiles: int, workers: int, folder: Path) -> dict[str
 
 
 def record_city(city: Path, tile_size: int, folder: Path) -> None:
-    """Run a city of `citystitch synth`, and write what its tasks came to."""
+    """Run a city of `citystitch synth`, and write what its tasks came to, beside those of other tile sizes."""
     out = folder / "recorded"
     shutil.rmtree(out, ignore_errors=True)
     footprints, clouds = str(city / "footprints.shp"), str(city / "tiles")
     given = {"pointcloud": [clouds], "footprints": footprints, "out": str(out), "tile_size": float(tile_size)}
-    RECORDED.write_text(json.dumps(record(make_config(given)), indent=1) + "\n")
+    known = json.loads(RECORDED.read_text())
+    known[f"{tile_size:g}"] = record(make_config(given))
+    RECORDED.write_text(json.dumps(known, indent=1) + "\n")
 
 
 def main() -> None:

@@ -16,7 +16,9 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -85,6 +87,9 @@ def measure(city: Path, out: Path, *options: str, cores: int = 1) -> dict[str, A
         "driver": record["driver_memory_bytes"],
         "tiles": record["tiles"] if isinstance(record["tiles"], int) else len(record["tiles"]),
         "ran": sum(record["ran"].values()),
+        "points": record["counts"]["points read"],
+        "seams": record["seconds"]["seams"],
+        "columns": record["seconds"]["columns"],
     }
 
 
@@ -159,6 +164,21 @@ def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
     ]
 
 
+def study_rates(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """Both meshers at 10 and 5 m, serially, with tiles of the default size; the middle one of 3."""
+    city, rows = cities.make(3000, 4320), []
+    for _ in range(3):
+        for mesher in ("adaptive", "layered"):
+            for size in (10.0, 5.0):
+                found = measure(city, out, "--mesher", mesher, "--mesh-size", str(size), "--workers", "0")
+                rows.append(found | {"mesher": f"{mesher}, {size:g} m"})
+    kinds = dict.fromkeys(row["mesher"] for row in rows)
+    return [
+        sorted((row for row in rows if row["mesher"] == kind), key=lambda r: float(r["seams"] + r["columns"]))[1]
+        for kind in kinds
+    ]
+
+
 def study_profile(cities: Cities, out: Path) -> list[dict[str, Any]]:
     """(f) Samples of a serial run of the city of 2.5 km by our function that was at work, with py-spy.
 
@@ -199,7 +219,10 @@ def _frame(text: str) -> tuple[str, str]:
 
 
 def study_limits(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """What the machine does at best: LAZ decompression alone, a copy in memory, a file written and flushed."""
+    """What the machine does at best: LAZ decompression alone, a copy in memory, a file written and flushed.
+
+    And what its cores take from each other: serial runs of the city of 2.5 km alone, then two of them at once.
+    """
     import laspy
 
     files = sorted((cities.make(2500, 3000) / "tiles").glob("*.laz"))
@@ -223,11 +246,28 @@ def study_limits(cities: Cities, out: Path) -> list[dict[str, Any]]:
         os.fsync(file.fileno())
     disk = 4 * block.nbytes / (time.perf_counter() - start)
     path.unlink()
+    slower = _two_at_once(cities.make(2500, 3000), out)
     return [
+        {"limit": "two serial runs at once, over one alone", "value": f"{slower:.2f} times the time"},
+        {"limit": "hence two cores are at best", "value": f"{2 / slower:.2f} times one"},
         {"limit": "LAZ decompression by lazrs, one core", "value": f"{laz / 1e6:.2f} M points/s"},
         {"limit": "copy in memory, read and written, one core", "value": f"{copy / 1e9:.1f} GB/s"},
         {"limit": "file written and flushed", "value": f"{disk / 1e6:.0f} MB/s"},
     ]
+
+
+def _two_at_once(city: Path, out: Path) -> float:
+    """Time of a serial run beside another one over that of a run alone: the median of three."""
+    both = [out.with_name(f"{out.name}-{k}") for k in range(2)]
+    found = []
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(3):
+            alone = measure(city, both[0], "--tile-size", "625", "--workers", "0", cores=2)["total"]
+            runs = [pool.submit(measure, city, b, "--tile-size", "625", "--workers", "0", cores=2) for b in both]
+            found.append(sum(run.result()["total"] for run in runs) / 2 / alone)
+    for folder in both:
+        shutil.rmtree(folder)
+    return float(median(found))
 
 
 Study = Callable[[Cities, Path], list[dict[str, Any]]]
@@ -238,6 +278,7 @@ STUDIES: Mapping[str, Study] = {
     "workers": study_workers,
     "tiles": study_tiles,
     "fine": study_fine,
+    "rates": study_rates,
     "profile": study_profile,
     "limits": study_limits,
 }
@@ -295,6 +336,18 @@ def write_report(kept: Mapping[str, Any]) -> None:
             lines += ["", f"## {title}", "", words, "", *_runs(kept[name], key)]
     if "workers" in kept:
         lines += ["", "## (f) Shares", "", *_shares(kept["workers"])]
+    if "rates" in kept:
+        lines += [
+            "",
+            "## Rates",
+            "",
+            "A city of 3 km with 4,320 buildings, tiles of the default size, serial; the middle one of",
+        ]
+        lines += [
+            "3. *Step 3* is all that stages `seams` and `columns` do, with reading and writing their results.",
+            "",
+        ]
+        lines += _rates(kept["rates"])
     if "profile" in kept:
         lines += [
             "",
@@ -335,6 +388,18 @@ def _runs(rows: list[dict[str, Any]], key: str) -> list[str]:
         f"| {row['peak'] / 2**20:.0f} MiB | {row['driver'] / 2**20:.1f} MiB | {row['ran']:,} |"
         for row in rows
     )
+    return lines
+
+
+def _rates(rows: list[dict[str, Any]]) -> list[str]:
+    lines = ["| mesher | cells | step 3, cells/s | seams of it | steps 1-2, points/s |", "|---|---|---|---|---|"]
+    for row in rows:
+        both = row["seams"] + row["columns"]
+        early = sum(seconds for step, seconds in row["steps"].items() if step[0] in "12")
+        lines.append(
+            f"| {row['mesher']} | {row['cells'] / 1e6:.2f} M | {row['cells'] / both / 1e6:.2f} M "
+            f"| {100 * row['seams'] / both:.0f} % | {row['points'] / early / 1e6:.2f} M |"
+        )
     return lines
 
 

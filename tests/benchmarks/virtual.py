@@ -25,7 +25,7 @@ STORED = 64  # numbers that a simulated task puts into a real store
 def simulate(task: Task) -> Facts:
     """Stand for any stage's function: a few numbers into the store, and the facts that were recorded."""
     task.put(numbers=np.full(STORED, draw(task.stage, task.name)))
-    return make_facts(choose(task.stage, task.name), task.scope, task.name, task.box)
+    return make_facts(choose(task.context.tile_size, task.stage, task.name), task.scope, task.name, task.box)
 
 
 class StandInStore(Store):
@@ -35,15 +35,18 @@ class StandInStore(Store):
     ----------
     layout : Layout
         The items.
+    tile_size : float
+        Side of a tile (m).
     slots : int
         Room for hashes, a power of 2; some half of it may be used.
     """
 
-    def __init__(self, path: Path, layout: Layout, slots: int = 2**25) -> None:
+    def __init__(self, path: Path, layout: Layout, tile_size: float, slots: int = 2**25) -> None:
         super().__init__(path)
-        self.layout = layout
+        self.layout, self.tile_size = layout, tile_size
         self._mask = slots - 1
-        self._keys = np.memmap(tempfile.TemporaryFile(), np.uint64, shape=(slots,))  # noqa: SIM115
+        with tempfile.TemporaryFile() as file:
+            self._keys = np.memmap(file, np.uint64, shape=(slots,))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Go to a worker as a plain store, which nobody there looks into."""
@@ -62,11 +65,11 @@ class StandInStore(Store):
     def facts(self, stage: str, name: str) -> Facts:
         """Facts of a result."""
         scope, box = self._place(name)
-        return make_facts(choose(stage, name), scope, name, box)
+        return make_facts(choose(self.tile_size, stage, name), scope, name, box)
 
     def attributes(self, stage: str, name: str) -> dict[str, Any]:
         """Attributes of a result, always as if it were there."""
-        notes = [["simulated", name, 0.0, 0.0, ""] for _ in range(choose(stage, name).notes)]
+        notes = [["simulated", name, 0.0, 0.0, ""] for _ in range(choose(self.tile_size, stage, name).notes)]
         return {"facts": self.facts(stage, name), "notes": notes}
 
     def sweep(self, stage: str) -> None:
@@ -162,7 +165,7 @@ class VirtualWorkers:
             heapq.heappush(self._running, (self.clock + seconds, self._serial, ticket, outcome))
 
     def _run(self, task: Task) -> tuple[float, Record | Failure]:
-        chosen = choose(task.stage, task.name)
+        chosen = choose(task.context.tile_size, task.stage, task.name)
         if task.scope is not Scope.REGION and draw("fails", task.stage, task.name) < self._fail * 2**32:
             return chosen.seconds, Failure(CityError("simulated failure"), "Traceback: simulated\n" * 10)
         if self._store is None:
@@ -186,7 +189,7 @@ class VirtualWorkers:
 
 def instant(function: Function, task: Task, seconds: float) -> Record:
     """Stand for `tiler.limits.run_guarded`: the record of a task at once, and nothing in the store."""
-    chosen = choose(task.stage, task.name)
+    chosen = choose(task.context.tile_size, task.stage, task.name)
     facts = make_facts(chosen, task.scope, task.name, task.box)
     notes = {"simulated": chosen.notes} if chosen.notes else {}
     digest = hashlib.blake2b(f"{task.stage} {task.name}".encode(), digest_size=16).hexdigest()

@@ -1,8 +1,10 @@
-"""What watching costs: processor time of runs with and without it, in pairs, and of each item.
+"""What watching costs: processor time of runs with and without it, in pairs, of each item, and within a run.
 
     python -m tests.benchmarks.watching [PAIRS]
 
-The run is serial, in a pseudo-terminal, so that one process has all of it; seconds are the processor's.
+The run is serial, in a pseudo-terminal, so that one process has all of it; seconds are the processor's. Pairs have
+the noise of the machine, some per cent of each run, so what watchers and their threads take is measured within
+the runs too.
 """
 
 import os
@@ -12,9 +14,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from statistics import median
+from statistics import mean, median, stdev
 from typing import Any
 from unittest.mock import patch
 
@@ -22,6 +24,7 @@ from rich.console import Console
 
 from tiler.config import Config, make_config
 from tiler.events import EventLog, begin_file
+from tiler.live_view import LiveView
 from tiler.run import run
 from tiler.stage import Scope
 from tiler.synth import write_city
@@ -30,7 +33,8 @@ from tiler.terminal import make_views
 from tiler.watching import RunStart, Watcher, Watchers
 
 SIZE, BUILDINGS, TILE = 600.0, 220, 150.0  # m, number, m: 16 tiles
-PAIRS = 4
+PAIRS = 12
+CALLS = ("begin", "laid_out", "planned", "submitted", "__call__", "failed", "say", "end")
 TILES = 100_000
 FACTS = {
     "counts": {"cells": 8938, "facets": 1212, "seam faces": 542},
@@ -49,6 +53,38 @@ def seconds_of(config: Config, watchers: Sequence[Watcher], *, files: bool) -> f
     return time.process_time() - began
 
 
+class Clock:
+    """Adds up the processor time of what is called through it, by thread."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def of(self, owner: type, name: str) -> Any:
+        """Replace a method by one that is timed, for as long as the context lasts."""
+        function = getattr(owner, name)
+
+        def timed(*values: Any, **options: Any) -> Any:
+            began = time.thread_time()
+            try:
+                return function(*values, **options)
+            finally:
+                self.seconds += time.thread_time() - began
+
+        return patch.object(owner, name, timed)
+
+
+def measure_share(config: Config, watchers: Sequence[Watcher]) -> float:
+    """Share of a run's processor time in calls of all watchers and in their threads."""
+    clock = Clock()
+    with ExitStack() as stack:
+        for name in CALLS:
+            stack.enter_context(clock.of(Watchers, name))
+        stack.enter_context(clock.of(EventLog, "_write_now_and_then"))
+        stack.enter_context(clock.of(LiveView, "_draw_now_and_then"))
+        seconds = seconds_of(config, watchers, files=True)
+    return clock.seconds / seconds
+
+
 def drain(file: int) -> None:
     """Read what a terminal is shown, until it is closed."""
     with suppress(OSError):
@@ -56,8 +92,8 @@ def drain(file: int) -> None:
             pass
 
 
-def measure_pairs(pairs: int, folder: Path) -> list[tuple[float, float]]:
-    """Run in pairs, without and with all that watches."""
+def measure_pairs(pairs: int, folder: Path) -> tuple[list[tuple[float, float]], list[float]]:
+    """Run in pairs, without and with all that watches; then watched ones whose watchers are timed."""
     ours, theirs = pty.openpty()
     threading.Thread(target=drain, args=(ours,), daemon=True).start()
     terminal = os.fdopen(theirs, "w")
@@ -69,17 +105,20 @@ def measure_pairs(pairs: int, folder: Path) -> list[tuple[float, float]]:
     values |= {"out": str(folder / "out"), "tile_size": TILE, "overwrite": True}
     config = make_config(values)
     run(config)  # compiled code is in its place
+
+    def views() -> list[Watcher]:
+        environment = {"TERM": "xterm-256color", "COLUMNS": "120", "LINES": "40"}
+        return make_views(console=Console(file=terminal, _environ=environment))
+
     found = []
     for k in range(pairs):
-        console = Console(file=terminal, _environ={"TERM": "xterm-256color", "COLUMNS": "120", "LINES": "40"})
-        with_it: list[Watcher] = make_views(console=console)
         one = {"bare": 0.0, "watched": 0.0}
         for kind in sorted(one, reverse=bool(k % 2)):
             watched = kind == "watched"
-            one[kind] = seconds_of(config, with_it if watched else [], files=watched)
+            one[kind] = seconds_of(config, views() if watched else [], files=watched)
         found.append((one["bare"], one["watched"]))
         print(f"bare {one['bare']:.2f} s, watched {one['watched']:.2f} s", flush=True)
-    return found
+    return found, [measure_share(config, views()) for _ in range(max(pairs // 3, 1))]
 
 
 def measure_items(folder: Path) -> tuple[float, float]:
@@ -105,8 +144,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         seconds, size = measure_items(Path(folder))
         print(f"an item of {TILES:,}: {1e6 * seconds:.0f} microseconds, {size:.0f} bytes")
-        found = measure_pairs(pairs, Path(folder))
-    print(f"median {median(watched / bare for bare, watched in found) - 1:+.1%}")
+        found, shares = measure_pairs(pairs, Path(folder))
+    more = [watched / bare - 1 for bare, watched in found]
+    error = stdev(more) / len(more) ** 0.5 if len(more) > 1 else float("nan")
+    print(f"pairs: median {median(more):+.1%}, mean {mean(more):+.1%}, its standard error {error:.1%}")
+    print(f"within watched runs, watchers and their threads: {median(shares):.2%}")
 
 
 if __name__ == "__main__":

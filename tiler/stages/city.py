@@ -23,6 +23,7 @@ from pipeline.simplify import raise_buildings
 from pipeline.terrain import cut_terrain
 from pipeline.tile import measure_city, prepare_footprints
 from stitch.grid import Key
+from tiler.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.config import Config
 from tiler.context import find_owned, region_around, tile_key
 from tiler.options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
@@ -63,8 +64,8 @@ def first_round(config: Config) -> list[Stage]:
             (Read("houses", config.clearance, by_extent=True),),
             ("clearance",),
         ),
-        Stage("join-0", Scope.REGION, join_houses_in_clusters, (Read("houses"), Read("near-0"))),
-        Stage("members-0", Scope.TILE, list_members, (Read("join-0"),)),
+        Stage("join-0", Scope.REGION, join_houses_in_clusters, (Read("houses"), Read("near-0")), version=2),
+        Stage("members-0", Scope.TILE, list_members, (Read("join-0"),), version=2),
     ]
 
 
@@ -86,8 +87,14 @@ def later_round(config: Config, number: int) -> list[Stage]:
             (Read(f"shapes-{before}", config.clearance, by_extent=True),),
             ("clearance",),
         ),
-        Stage(f"join-{after}", Scope.REGION, join_close_clusters, (Read(f"join-{before}"), Read(f"near-{after}"))),
-        Stage(f"members-{after}", Scope.TILE, list_members, (Read(f"join-{after}"),)),
+        Stage(
+            f"join-{after}",
+            Scope.REGION,
+            join_close_clusters,
+            (Read(f"join-{before}"), Read(f"near-{after}")),
+            version=2,
+        ),
+        Stage(f"members-{after}", Scope.TILE, list_members, (Read(f"join-{after}"),), version=2),
     ]
 
 
@@ -170,7 +177,7 @@ def join_houses_in_clusters(task: Task) -> Facts:
     begin = np.array([[first[Key(i, j)] for i, j in pairs[:, [a, a + 1]].tolist()] for a in (0, 3)], np.int64)
     index = np.column_stack((begin[0] + pairs[:, 2], begin[1] + pairs[:, 5])) if len(pairs) else pairs[:, :2]
     cluster = join_pairs(len(house), index)
-    _put_clusters(task, house, cluster, np.ones(len(house), np.bool_))
+    task.put(**pack_clusters(house, cluster, np.ones(len(house), np.bool_)))
     return {"joined": 0, "clusters": len(np.unique(cluster))}
 
 
@@ -192,12 +199,12 @@ def find_near_shapes(task: Task) -> Facts:
 def join_close_clusters(task: Task) -> Facts:
     """Join the clusters whose results came close, over the whole region (step 2.1)."""
     before, near = sorted(task.refs)
-    (clusters,) = task.read(before, ("house", "cluster"))
-    house, cluster = clusters.arrays["house"], clusters.arrays["cluster"]
+    (clusters,) = task.read(before)
+    house, cluster = unpack_clusters(clusters.arrays)
     pairs = np.concatenate([np.empty((0, 6), np.int64)] + [result.arrays["pairs"] for result in task.read(near)])
     joined = join_pairs(len(cluster), _find_rows(house, pairs.reshape(-1, 3)).reshape(-1, 2))[cluster]
     touched = np.isin(joined, joined[joined != cluster])
-    _put_clusters(task, house, joined, touched)
+    task.put(**pack_clusters(house, joined, touched))
     fewer = len(np.unique(cluster)) - len(np.unique(joined))
     return {"joined": fewer, "clusters": len(np.unique(joined))}
 
@@ -205,15 +212,17 @@ def join_close_clusters(task: Task) -> Facts:
 def list_members(task: Task) -> Facts:
     """List the houses of the clusters that a tile owns: those whose first house is the tile's.
 
-    A cluster is called by the row of that house in its tile: other houses elsewhere change nothing here.
+    A cluster is called by the row of that house in its tile: other houses elsewhere change nothing here. Of the
+    region's rows a tile reads its own alone.
     """
     (stage,) = task.refs
-    (clusters,) = task.read(stage, ("house", "cluster", "changed"))
-    house, cluster = clusters.arrays["house"], clusters.arrays["cluster"]
-    mine = (house[cluster, :2] == tile_key(task.name)).all(axis=1)
-    task.put(house=house[mine], cluster=house[cluster[mine], 2], changed=clusters.arrays["changed"][mine])
-    tiles = np.unique(house[mine, :2], axis=0).tolist()
-    return {"n": int(mine.sum()), "names": sorted(f"{i}_{j}" for i, j in tiles)}
+    (found,) = task.read(stage, ("grid",))
+    place = place_in_grid(found.arrays["grid"], tile_key(task.name))
+    start, stop = (0, 0) if place < 0 else task.read_rows(stage, found.name, "start", place, place + 2).tolist()
+    mine = task.read_rows(stage, found.name, "owned", start, stop)
+    task.put(house=mine[:, :3].copy(), cluster=mine[:, 3].copy(), changed=mine[:, 4].astype(np.bool_))
+    tiles = np.unique(mine[:, :2], axis=0).tolist()
+    return {"n": len(mine), "names": sorted(f"{i}_{j}" for i, j in tiles)}
 
 
 def shape_members(task: Task) -> Facts:
@@ -330,13 +339,6 @@ def _near_rows(task: Task, polygons: NDArray[np.object_]) -> NDArray[np.int64]:
 def _in_tile(name: str, rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows of a tile as column and row of the tile and the row, (n, 3)."""
     return np.column_stack((np.tile(tile_key(name), (len(rows), 1)), rows))
-
-
-def _put_clusters(
-    task: Task, house: NDArray[np.int64], cluster: NDArray[np.int64], changed: NDArray[np.bool_]
-) -> None:
-    """Write houses as column and row of their tile and their place in it, and the first house of their cluster."""
-    task.put(house=house, cluster=cluster, changed=changed)
 
 
 def _members(task: Task) -> Result:

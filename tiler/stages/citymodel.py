@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -104,10 +103,10 @@ def _write(task: Task, stage: str, prefix: str, file: str) -> Facts:
     xmin, ymin, xmax, ymax = task.context.bounds
     blocks = ((part.model, _tell(part)) for part in _by_cell(task, stage, prefix, survey))
     bounds = (xmin, ymin, survey.low, xmax, ymax, survey.high)
-    out = Path(task.context.out)
-    with task.step("write"):
+    with task.step("write"), task.output() as out:
         task.notes(write_city_blocks(out / file, blocks, crs=task.context.crs, bounds=bounds))
-    return {"n": len(survey.number), FILES: state_files(out, [out / file])}
+        written = state_files(out, [out / file])
+    return {"n": len(survey.number), FILES: written}
 
 
 def _survey(task: Task, stage: str, prefix: str) -> _Survey:

@@ -1,7 +1,6 @@
 """Stages 1.1 to 1.3: points of each file, footprints, and the terrain of each tile."""
 
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +30,7 @@ from tiler.config import Config
 from tiler.context import tile_key
 from tiler.footprint_index import scan_footprints
 from tiler.ingest import read_cells
+from tiler.places import place
 from tiler.readers import clip, grow, read_cloud, read_outlines
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.tables import pack_polygons
@@ -125,7 +125,7 @@ def read_footprint_file(task: Task) -> Facts:
     n, first = 0, 0
     blocks, part_like = [0], set[str]()
     for block in scan_footprints(
-        Path(given.footprints),
+        place(given.footprints),
         crs=pyproj.CRS.from_user_input(task.context.crs),
         bounds=task.context.bounds,
         layer=given.layer,

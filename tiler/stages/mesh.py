@@ -10,25 +10,24 @@ from numpy.typing import NDArray
 from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
 from pipeline.columns import count_cells, lowest_gap
 from pipeline.errors import GeometryError
-from pipeline.layered import mesh_layers, terrain_reach
+from pipeline.layered import mesh_layers
 from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.nodes import Levels
 from pipeline.notes import Note
 from pipeline.raster import Dtm, sample_dtm, window_of
-from pipeline.sizes import SizeField, size_field, size_field_around
-from pipeline.spacing import top_reach
+from pipeline.sizes import SizeField
 from pipeline.terrain import cut_terrain
 from pipeline.underground import SoilOptions
 from stitch.corners import Corner, place_corner
 from stitch.facets import Side, find_seam_edges
-from stitch.grid import Bounds, Key, SeamKey, ends_of_seam, is_pinched, nominal_corner, seams_of_tile
+from stitch.grid import Bounds, Key, SeamKey, ends_of_seam, is_pinched, seams_of_tile
 from stitch.layered_seams import fill_corner_layers, fill_seam_layers
 from stitch.numbering import corner_part, count_inner_points, count_points, first_id, seam_ids
 from stitch.patches import mesh_patch
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
 from stitch.seams import Seam, find_vertices, trace_seam
 from stitch.soil_columns import fill_corner_soil, fill_seam_soil, join_seam
-from stitch.tiles import Sides, mesh_tile, sizes_halo, tile_halo
+from stitch.tiles import Sides, mesh_tile
 from stitch.walls import cut_walls
 from tiler.config import Config
 from tiler.context import seam_key, seam_name, tile_key
@@ -41,23 +40,21 @@ from tiler.options import (
     layer_parameters,
     mesh_options,
     plane_options,
-    size_rule,
     soil_options,
 )
-from tiler.readers import grow, read_buildings, read_known_terrain, region_window
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.approach import terrain_stage
 from tiler.stages.city import chooses_layers_later
+from tiler.stages.seam_tables import pack_columns, pack_seam, unpack_levels, unpack_pinched, unpack_seam
 from tiler.stages.soil import lay_soil, unpack_pinched_soil, unpack_soil
+from tiler.stages.surroundings import find_sizes, halos, read_surroundings, terrain_around, terrain_halo
 from tiler.tables import Buildings
-from tiler.task import Result, Task
-
-NO_PLANE = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))
+from tiler.task import Task
 
 
 def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     """Stages of seams and columns, with the halos of a domain as it is settled; as it is expected without one."""
-    halo, see = _halos(config, config.graded_size, around_walls=config.open_size > 0)
+    halo, see = halos(config, config.graded_size, around_walls=config.open_size > 0)
     domain = domain or Domain(config.expected_height, None)
     reads = [
         Read("model", see, by_extent=True),
@@ -75,14 +72,6 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
         Stage("seams", Scope.SEAM, seams, tuple(reads), parameters, version=2),
         Stage("columns", Scope.TILE, columns, (*reads, Read("seams", beside=True)), parameters, version=2),
     ]
-
-
-def terrain_halo(given: Any, domain: Domain | None = None) -> float:
-    """How far beyond the buildings that count terrain does (m)."""
-    options = mesh_options(given, domain)
-    if isinstance(options, AdaptiveOptions):
-        return top_reach(options.domain_height) + 2 * float(given.dtm_spacing)
-    return terrain_reach(options) + 2 * float(given.dtm_spacing)
 
 
 def make_seam(task: Task) -> Facts:
@@ -108,7 +97,7 @@ def make_columns_with_soil(task: Task) -> Facts:
 def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
     given, grid = task.parameters, task.context.grid
     key = seam_key(task.name)
-    buildings, dtm = _surroundings(task)
+    buildings, dtm = read_surroundings(task)
     polygons = buildings.model.polygons
     walls = cut_walls(polygons, mesh_size=given.mesh_size)
     sizes = find_sizes(walls, task)
@@ -145,7 +134,7 @@ def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
     if soil is not None:
         with task.step("soil of seams"):
             low, high = (
-                fill_corner_soil(place, air, _terrain_around(corner, dtm, task), soil, sizes=sizes)
+                fill_corner_soil(place, air, terrain_around(corner, dtm, task), soil, sizes=sizes)
                 for place, air, corner in zip((start, end), (first, last), ends_of_seam(key), strict=True)
             )
             below = fill_seam_soil(seam, (low, high), levels, terrain, soil, sizes=sizes)
@@ -157,7 +146,7 @@ def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
 def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
     given = task.parameters
     options = mesh_options(given)
-    buildings, dtm = _surroundings(task)
+    buildings, dtm = read_surroundings(task)
     model = buildings.model
     walls = cut_walls(model.polygons, mesh_size=given.mesh_size)
     sizes = find_sizes(walls, task)
@@ -230,107 +219,6 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
     }
 
 
-def pack_seam(seam: Seam, numbers: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-    """Write a seam as arrays; buildings go by their numbers."""
-    return {
-        "xy": seam.xy,
-        "wall_nodes": seam.wall_nodes,
-        "border": np.array([seam.border]),
-        "ring_xy": seam.ring.xy,
-        "ring_triangles": seam.ring.triangles,
-        "ring_building": np.append(numbers, -1)[seam.ring.building],
-        "vertex": seam.vertex,
-    }
-
-
-def unpack_seam(arrays: dict[str, NDArray[Any]], numbers: NDArray[np.int64]) -> Seam:
-    """Read what `pack_seam` wrote, for a city model with these numbers; its surroundings are not kept."""
-    order = np.argsort(numbers)
-    building = arrays["ring_building"]
-    row = np.full(len(building), -1, np.int32)
-    inside = building >= 0
-    row[inside] = order[np.searchsorted(numbers, building[inside], sorter=order)]
-    ring = PlaneMesh(arrays["ring_xy"], arrays["ring_triangles"], row)
-    return Seam(arrays["xy"], arrays["wall_nodes"], bool(arrays["border"][0]), ring, arrays["vertex"], NO_PLANE)
-
-
-def unpack_levels(arrays: dict[str, NDArray[Any]]) -> Levels:
-    """Read the columns of a seam within the region."""
-    return Levels(arrays["level_start"], arrays["level_z"], arrays["level_surface"])
-
-
-def unpack_pinched(seam: Seam, result: Result) -> list[tuple[Seam, Levels]]:
-    """Read the columns of the ends of a border in which two tiles meet alone, each as a seam of one vertex."""
-    arrays = result.arrays
-    return [
-        (
-            dataclasses.replace(seam, xy=seam.xy[[-k]]),
-            Levels(arrays[f"end{k}_start"], arrays[f"end{k}_z"], arrays[f"end{k}_surface"]),
-        )
-        for k, _ in result.facts.get("pinched", [])
-    ]
-
-
-def pack_columns(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-    """Write columns as arrays; buildings go by their numbers."""
-    plane = mesh.plane
-    return {
-        "xy": plane.xy,
-        "triangles": plane.triangles,
-        "building": np.append(numbers, -1)[plane.building],
-        "z_start": mesh.z_start,
-        "z": mesh.z,
-        "bottom": mesh.bottom,
-    }
-
-
-def _halos(given: Any, largest: float, *, around_walls: bool) -> tuple[float, float]:
-    """How far beyond a box terrain is sampled, and buildings count (m); the largest size is 0 without grading."""
-    if not largest:
-        halo = tile_halo(given.tile_size, given.mesh_size)
-        return halo, halo
-    rule = size_rule(given, largest)
-    halo = tile_halo(given.tile_size, given.mesh_size, rule)
-    return halo, sizes_halo(given.tile_size, rule) if around_walls else halo
-
-
-def _halos_of(task: Task) -> tuple[float, float]:
-    """How far beyond the box of a task terrain is sampled, and buildings count (m)."""
-    largest = task.context.open_size
-    return _halos(task.parameters, largest, around_walls=largest > 0 and task.parameters.open_size > 0)
-
-
-def find_sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
-    """Sizes around walls, or with a pad alone around the region; None where they are the same everywhere."""
-    given, largest = task.parameters, task.context.open_size
-    if not largest:
-        return None
-    rule = size_rule(given, largest)
-    return size_field(walls, rule) if given.open_size else size_field_around(given.core_bounds, rule)
-
-
-def _surroundings(task: Task) -> tuple[Buildings, Dtm]:
-    """Read what counts for a tile or a seam; the terrain is NaN at nodes of tiles that are absent."""
-    given = task.parameters
-    halo, see = _halos_of(task)
-    buildings = read_buildings(task, grow(task.box, see))
-    reach = grow(task.box, halo + terrain_halo(given))
-    return buildings, read_known_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
-
-
-def _terrain_around(key: Key, dtm: Dtm, task: Task) -> Dtm:
-    """Terrain that counts for a corner: the same nodes in all tasks that compute its column.
-
-    All of them read `terrain_halo` and more around it. The window ends two nodes short of that: the closest nodes
-    beyond a tile towards an absent one are the tile's, and a task may see them without reading that tile.
-    """
-    given = task.parameters
-    x, y = nominal_corner(task.context.grid, key)
-    halo, _ = _halos_of(task)
-    reach = halo + terrain_halo(given) - 2 * given.dtm_spacing
-    return cut_terrain(dtm, region_window(grow((x, y, x, y), reach), given.dtm_spacing, task.context.bounds))
-
-
 def _fill_corner(
     corner: Corner,
     key: Key,
@@ -343,7 +231,7 @@ def _fill_corner(
     """Column of a corner, of the mesher that is chosen: all seams that end there find the same one."""
     given, bounds = task.parameters, task.context.bounds
     options, model = mesh_options(given), buildings.model
-    dtm = _terrain_around(key, dtm, task)
+    dtm = terrain_around(key, dtm, task)
     if isinstance(options, AdaptiveOptions):
         return fill_corner(corner, dtm, model.roof, model.ids, options, sizes=sizes)
     angle = plane_options(given)["min_angle"]
@@ -386,7 +274,7 @@ def _fill_pinched(
             levels = _fill_corner(place, corner, dtm, buildings, walls, sizes, task)
             task.put(**{f"end{k}_start": levels.start, f"end{k}_z": levels.z, f"end{k}_surface": levels.surface})
             if soil is not None:
-                below = fill_corner_soil(place, levels, _terrain_around(corner, dtm, task), soil, sizes=sizes)
+                below = fill_corner_soil(place, levels, terrain_around(corner, dtm, task), soil, sizes=sizes)
                 task.put(**{f"end{k}_soil_start": below.start, f"end{k}_soil_z": below.z})
                 levels = join_seam(below, levels)
             pinched.append([k, len(levels.z)])

@@ -1,7 +1,6 @@
 """Stage 3.6: a piece of the mesh and of its boundary a tile, numbers for the whole region, proof of the seams."""
 
 import hashlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -117,13 +116,13 @@ def write_piece(task: Task) -> Facts:
     seams = _digest_seams(mesh, cells.points, shared, arrays["edge"], arrays["edge_seam"], key)
     # A column of a seam has levels that only the tile beyond uses, below a roof whose wall is the seam.
     cells, boundary = drop_points(cells, boundary, used)
-    out = Path(task.context.out)
-    with task.step("3.6 write pieces"):
+    with task.step("3.6 write pieces"), task.output() as out:
         ids = number_points(mesh, arrays["shared"], arrays["shared_id"], first_id(tile_part(key)))
         number = {VERTEX_ID: ids[used]}
         files = out / "mesh" / f"{task.name}.vtu", out / "boundary" / f"{task.name}.vtp"
         write_vtu(files[0], cells, point_data=number, cell_data=region)
         write_vtp(files[1], cells.points, boundary, point_data=number)
+        written = state_files(out, files)
     with task.step("3.6 measure cells"):
         histograms = quality_histograms(measure_cells(cells))
     for name, histogram in histograms.items():
@@ -131,7 +130,7 @@ def write_piece(task: Task) -> Facts:
     return {
         "counts": {"cells": len(cells.cells), "facets": len(boundary.facets), "seam faces": len(shared)},
         "seams": seams,
-        FILES: state_files(out, files),
+        FILES: written,
     }
 
 

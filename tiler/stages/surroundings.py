@@ -1,0 +1,75 @@
+"""What counts for a seam or a tile that is meshed: how far around, and the buildings and terrain there."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.adaptive import AdaptiveOptions
+from pipeline.layered import terrain_reach
+from pipeline.raster import Dtm
+from pipeline.sizes import SizeField, size_field, size_field_around
+from pipeline.spacing import top_reach
+from pipeline.terrain import cut_terrain
+from stitch.grid import Key, nominal_corner
+from stitch.tiles import sizes_halo, tile_halo
+from tiler.domain import Domain
+from tiler.options import mesh_options, size_rule
+from tiler.readers import grow, read_buildings, read_known_terrain, region_window
+from tiler.tables import Buildings
+from tiler.task import Task
+
+
+def terrain_halo(given: Any, domain: Domain | None = None) -> float:
+    """How far beyond the buildings that count terrain does (m)."""
+    options = mesh_options(given, domain)
+    if isinstance(options, AdaptiveOptions):
+        return top_reach(options.domain_height) + 2 * float(given.dtm_spacing)
+    return terrain_reach(options) + 2 * float(given.dtm_spacing)
+
+
+def halos(given: Any, largest: float, *, around_walls: bool) -> tuple[float, float]:
+    """How far beyond a box terrain is sampled, and buildings count (m); the largest size is 0 without grading."""
+    if not largest:
+        halo = tile_halo(given.tile_size, given.mesh_size)
+        return halo, halo
+    rule = size_rule(given, largest)
+    halo = tile_halo(given.tile_size, given.mesh_size, rule)
+    return halo, sizes_halo(given.tile_size, rule) if around_walls else halo
+
+
+def _halos_of(task: Task) -> tuple[float, float]:
+    """How far beyond the box of a task terrain is sampled, and buildings count (m)."""
+    largest = task.context.open_size
+    return halos(task.parameters, largest, around_walls=largest > 0 and task.parameters.open_size > 0)
+
+
+def find_sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
+    """Sizes around walls, or with a pad alone around the region; None where they are the same everywhere."""
+    given, largest = task.parameters, task.context.open_size
+    if not largest:
+        return None
+    rule = size_rule(given, largest)
+    return size_field(walls, rule) if given.open_size else size_field_around(given.core_bounds, rule)
+
+
+def read_surroundings(task: Task) -> tuple[Buildings, Dtm]:
+    """Read what counts for a tile or a seam; the terrain is NaN at nodes of tiles that are absent."""
+    given = task.parameters
+    halo, see = _halos_of(task)
+    buildings = read_buildings(task, grow(task.box, see))
+    reach = grow(task.box, halo + terrain_halo(given))
+    return buildings, read_known_terrain(task, reach, spacing=given.dtm_spacing, bounds=task.context.bounds)
+
+
+def terrain_around(key: Key, dtm: Dtm, task: Task) -> Dtm:
+    """Terrain that counts for a corner: the same nodes in all tasks that compute its column.
+
+    All of them read `terrain_halo` and more around it. The window ends two nodes short of that: the closest nodes
+    beyond a tile towards an absent one are the tile's, and a task may see them without reading that tile.
+    """
+    given = task.parameters
+    x, y = nominal_corner(task.context.grid, key)
+    halo, _ = _halos_of(task)
+    reach = halo + terrain_halo(given) - 2 * given.dtm_spacing
+    return cut_terrain(dtm, region_window(grow((x, y, x, y), reach), given.dtm_spacing, task.context.bounds))
