@@ -439,6 +439,7 @@ def test_a_dry_run_writes_nothing(run_file: Path, tmp_path: Path, capsys: pytest
         (["--cluster", "cluster.toml", "--overwrite"], "each job would begin anew"),
         (["--cluster", "cluster.toml", "--array", "-1"], "1 to 100000 elements"),
         (["--cluster", "cluster.toml", "--scheduler", "tcp://127.0.0.1:9"], "leave one out"),
+        (["--cluster", "cluster.toml", "--out", "s3://bucket/run"], "jobs keep their scripts and logs"),
     ],
 )
 def test_submit_refuses(

@@ -576,15 +576,15 @@ def _check_together(config: Config) -> None:
             f"{config.mesh_size:g} m; raise --first-layer or lower --mesh-size"
         )
     _check_pad(config)
+    if config.cluster and is_url(config.out):
+        raise ConfigError(
+            f"out = {config.out} with a cluster: jobs keep their scripts and logs in the output folder; give one "
+            "of a file system that all nodes see"
+        )
     if config.scheduler and config.cluster:
         raise ConfigError(
             f"scheduler = {_shown(config.scheduler)} and cluster = {_shown(config.cluster)}: workers are of one "
             "or the other; leave one out"
-        )
-    if config.cluster and is_url(config.out):
-        raise ConfigError(
-            f"out = {_shown(config.out)} with a cluster: its jobs meet in the folder of the run; give one that all "
-            "nodes see, or a running scheduler instead of the cluster"
         )
     if not isinstance(config.domain_height, str):
         check_height(config, config.domain_height)

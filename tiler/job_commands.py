@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError, InputError
-from tiler.places import in_bucket, is_url, place
+from tiler.places import in_bucket, place
 from tiler.plain_text import printable
 
 EVERY = 1.0  # s between two looks at a log that is followed
@@ -38,10 +38,8 @@ def add_job_commands(command: Command, add_parameters: Callable[[argparse.Argume
 
 def find_run(job: str) -> Path:
     """Folder of a run, by itself or by the number of its job; InputError for an unknown number."""
-    if is_url(job):
+    if not job[:1].isdigit() or Path(job).is_dir():
         return place(job)
-    if Path(job).is_dir() or not job[:1].isdigit():
-        return Path(job)
     from tiler.jobs import find_folder
 
     return find_folder(job)

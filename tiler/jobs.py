@@ -16,6 +16,7 @@ from tiler.atomic import replacing
 from tiler.cluster_table import Cluster, read_cluster
 from tiler.config import Config, write_config
 from tiler.jobqueue import JOB, NANNY, begin_words, python_words, read_worker_jobs, worker_script
+from tiler.places import absolute
 from tiler.queues import QUEUES, STOP_SIGNAL, JobSize, Queue, QueueError
 
 RECORD, TABLE, PARAMETERS, SCRIPT = "job.json", "cluster.toml", "run.toml", "job.sh"
@@ -257,8 +258,8 @@ def _write_files(config: Config, out: Path, script: str) -> None:
         shutil.copyfile(config.cluster, folder / TABLE)
         given = dataclasses.replace(
             config,
-            pointcloud=tuple(_absolute(source) for source in config.pointcloud),
-            footprints=_absolute(config.footprints),
+            pointcloud=tuple(map(absolute, config.pointcloud)),
+            footprints=absolute(config.footprints) if config.footprints else "",
             cluster="",
             scheduler="",
             out="out",
@@ -268,10 +269,6 @@ def _write_files(config: Config, out: Path, script: str) -> None:
         (folder / SCRIPT).chmod(0o755)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written ({error.strerror}); give another --out") from error
-
-
-def _absolute(source: str) -> str:
-    return source if not source or "://" in source else os.path.abspath(source)
 
 
 def _is_alive(record: JobRecord) -> bool:
