@@ -89,13 +89,6 @@ class Slurm:
         """Node of a job that runs; empty of any other."""
         return self.ask("squeue", "--noheader", "--states=running", f"--jobs={job}", "--format=%N").strip()
 
-    def start_node(self, node: str) -> None:
-        """Bring a node back."""
-        self.nodes[node] = self.start(["slurmd", "-D", "-N", node], node)
-        self.wait(
-            lambda: self.ask("sinfo", "--noheader", f"--nodes={node}", "--format=%t").strip() == "idle", 60, node
-        )
-
     def start(self, command: list[str], name: str) -> "subprocess.Popen[bytes]":
         """Start a process whose words go to a file."""
         with (self.folder / f"{name}.txt").open("ab") as words:

@@ -206,7 +206,6 @@ def test_lost_nodes_and_walltimes_cost_nothing(
     found = record(lasting)
     assert found.earlier[0] == first
     assert {slurm.states()[job] for job in found.earlier} == {"COMPLETED"}
-    slurm.start_node(lost)
 
 
 def nodes(slurm: Slurm, out: Path) -> set[str]:
