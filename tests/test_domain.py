@@ -16,11 +16,12 @@ from stitch.grid import Bounds
 from tests.cities import crowded_blocks
 from tests.test_tiles import SIZE, TILE, around, prove, prove_local
 from tests.tiles import Town, hash_files, make_town, write_town
+from tiler.alone import run_alone
 from tiler.cli import main
 from tiler.config import Config, idle_parameters, load_config, make_config
 from tiler.domain import Domain, read_height, settle
 from tiler.options import expected_levels
-from tiler.run import run, run_alone
+from tiler.run import run
 from tiler.stages.domain import LOW_DOMAIN, layer_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.store import Store

@@ -20,6 +20,7 @@ from tests.cities import crowded_blocks
 from tests.faults import injected, raises
 from tests.programs import mesh_is_ok, read_check, run_foam
 from tests.tiles import hash_files, make_town, run_of, write_footprints, write_town
+from tiler.alone import run_alone
 from tiler.check import check_run
 from tiler.cli import main
 from tiler.config import Config, check_height, load_config, make_config
@@ -31,7 +32,7 @@ from tiler.pad_widths import widths_in_metres
 from tiler.plan_report import plan_run
 from tiler.region import find_pad
 from tiler.results import StoredTerrain
-from tiler.run import run, run_alone
+from tiler.run import run
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.surroundings import find_sizes
 from tiler.store import Store

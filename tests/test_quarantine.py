@@ -15,11 +15,12 @@ from pipeline.mesh import Marker
 from tests.faults import Faults, injected, raises, segfaults
 from tests.test_resume import Town
 from tests.test_run import hashes
+from tiler.alone import run_alone
 from tiler.check import check_run
 from tiler.cli import main
 from tiler.config import make_config
 from tiler.results import StoredTerrain
-from tiler.run import run, run_alone
+from tiler.run import run
 from tiler.synth import write_city
 from tiler.task import Task
 from tiler.vtk_files import read_vtp, read_vtu

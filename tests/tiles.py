@@ -25,7 +25,8 @@ from tiler.engine import Engine
 from tiler.executors import serial
 from tiler.options import derived_parameters
 from tiler.planning import Plan, identify, make_plan
-from tiler.run import run, run_city_stages
+from tiler.run import run
+from tiler.sequence import run_city_stages
 from tiler.settling import settle_domain
 from tiler.stage import REGION_ITEM
 from tiler.stages.citymodel import city_model_stages

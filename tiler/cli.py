@@ -274,7 +274,7 @@ def _run(options: argparse.Namespace) -> int:
         return _run_config(config, dashboard=dashboard, report=options.report, **words)
     if options.log_json is not None:
         raise ConfigError("--log-json tells of a whole run; leave out it or --only")
-    from tiler.run import run_alone
+    from tiler.alone import run_alone
 
     print(run_alone(config, options.only, say=None if options.quiet else say))
     return 0

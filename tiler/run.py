@@ -10,33 +10,27 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 from pipeline.errors import CityError, OutputError
-from stitch.grid import seams_of_tile
 from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.cluster import reach_cluster, spell_out
 from tiler.cluster_table import read_cluster
 from tiler.config import Config
-from tiler.context import RunContext, pack_tiles, seam_name, tile_key
 from tiler.dashboard.server import read_address, watched
-from tiler.engine import Engine, Progress, StoppedError
+from tiler.engine import StoppedError
 from tiler.executors import Executor, local, serial, share_memory
-from tiler.failures import Policy
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
 from tiler.keys import code_versions
 from tiler.lease import LostFolderError
 from tiler.limits import TASKS, Limits, machine_memory
 from tiler.manifest import find_remade, write_manifest
-from tiler.options import derived_parameters
 from tiler.out_folder import (
     INDEXES,
     MANIFEST_PATH,
-    PIECES,
     RUN_RECORD,
     STORE,
     check_folder,
@@ -46,29 +40,22 @@ from tiler.out_folder import (
 )
 from tiler.own_stages import OwnStages, check_own, run_own_stages
 from tiler.pad import Pad
-from tiler.padding import CORE_STAGE, pad_plan, plan_alone
-from tiler.places import in_bucket, place, refuse_bucket
-from tiler.planning import Plan, check_sources, identify, make_plan
+from tiler.padding import pad_plan
+from tiler.places import in_bucket, place
+from tiler.planning import Plan, check_sources, make_plan
 from tiler.progress import Announce
 from tiler.quarantine import (
     HolesError,
     Missing,
-    config_alone,
     find_missing,
     leave_holes,
     save_config,
-    stop_at_holes,
 )
 from tiler.run_watchers import begin_watching
 from tiler.seal import seal
-from tiler.settling import domain_of_run, settle_domain, take_domain
+from tiler.sequence import make_engine, run_stages
 from tiler.spool import SPOOL
-from tiler.stage import REGION_ITEM, Stage
-from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
-from tiler.stages.citymodel import city_model_stages
-from tiler.stages.inputs import input_stages
-from tiler.stages.mesh import mesh_stages
-from tiler.stages.pieces import fit_stage, piece_stages
+from tiler.stage import Stage
 from tiler.stopping import stops
 from tiler.summary import describe_tasks, summarise_run
 from tiler.task import peak_memory
@@ -298,152 +285,6 @@ def _mesh_region(
     return summary | {"driver_memory_bytes": peak_memory()}
 
 
-def make_engine(
-    config: Config,
-    out: Path,
-    plan: Plan,
-    executor: Executor,
-    own: OwnStages,
-    progress: Progress | None = None,
-    *,
-    set_aside: bool = True,
-) -> Engine:
-    """Make the engine of a run over the items of its plan; failures are set aside, or end it."""
-    context = RunContext(
-        plan.region.bounds,
-        plan.region.crs,
-        config.tile_size,
-        config.mesh_size,
-        pack_tiles(plan.grid),
-        str(out),
-        config.open_size,
-    )
-    footprints = place(config.footprints) if config.footprints else None
-    parameters = SimpleNamespace(
-        **dataclasses.asdict(config),
-        **own.parameters,
-        **derived_parameters(config),
-        footprints_identity=identify(footprints) if footprints else "",
-    )
-    return Engine(
-        out / STORE,
-        plan.layout,
-        parameters=parameters,
-        context=context,
-        executor=executor,
-        progress=progress,
-        policy=Policy(retries=config.retries, set_aside=set_aside),
-    )
-
-
-def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = None) -> Path:
-    """Mesh one tile alone, with those around it that its halo needs, in this process: to look into a failure.
-
-    Parameters
-    ----------
-    config : Config
-        Parameters of the whole run.
-    tile : str
-        Name of the tile.
-    say : callable, optional
-        Called with sentences that the user should read.
-
-    Returns
-    -------
-    Path
-        Its VTU piece, in a folder below that of the run. The cells are those of the whole run, bit for bit.
-
-    Raises
-    ------
-    CityError
-        What its stages raise; any other error likewise, its type kept.
-    """
-    check_sources(config)
-    refuse_bucket(config.out, "--only")
-    whole = make_plan(config, _silent)
-    domain, tallest = domain_of_run(config)
-    pad, store = None, None
-    if config.padded:
-        alone, pad, store = plan_alone(config, whole, tile, tallest)
-    else:
-        alone = config_alone(config, whole, tile)
-    out = Path(alone.out)
-    out.mkdir(parents=True, exist_ok=True)
-    with only_run(out, say):
-        plan = make_plan(alone, say or _silent)
-        for folder in PIECES:
-            (out / folder).mkdir(exist_ok=True)
-        with serial() as executor:
-            engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
-            run_city_stages(engine, alone)
-            seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
-            take_domain(engine, alone, domain, pad, store)
-            engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
-            (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
-            engine.run(pieces, items={"pieces": [tile]})
-    return out / "mesh" / f"{tile}.vtu"
-
-
-def run_stages(engine: Engine, config: Config) -> int:
-    """Run all stages in their order; returns how often clusters of houses were simplified.
-
-    Parameters
-    ----------
-    engine : Engine
-        Engine over the region's items.
-    config : Config
-        Parameters of the run.
-    """
-    rounds = run_city_stages(engine, config)
-    domain = settle_domain(engine, config)
-    if config.padded:
-        engine.tell_layout()
-        both = engine.layout, engine.context
-        engine.lay_out(*engine.laid_out(CORE_STAGE))
-        engine.run(*city_model_stages(), fit_stage(config))
-        engine.lay_out(*both)
-        engine.run(*mesh_stages(config, domain))
-    else:
-        engine.run(*city_model_stages(), *mesh_stages(config, domain))
-    engine.run(*piece_stages(config))
-    # Beside a tile without a piece, others were written as if they had a neighbour.
-    while lost := [name for stage, name in engine.set_aside if stage == "pieces"]:
-        for tile in lost:
-            engine.give_up(("pieces", tile), ("columns", tile))
-        engine.run(*piece_stages(config))
-    return rounds
-
-
-def run_city_stages(engine: Engine, config: Config) -> int:
-    """Run the stages up to the simplified city model; parameters and result as for `run_stages`.
-
-    Raises
-    ------
-    HolesError
-        If an item was set aside.
-    """
-    engine.run(*input_stages(config))
-    stop_at_holes(engine)
-    engine.run(house_stage(config))
-    stop_at_holes(engine)
-    engine.run(*first_round(config))
-    stop_at_holes(engine)
-    engine.run(shape_stage(0))
-    stop_at_holes(engine)
-    last = 0
-    while True:
-        engine.run(*later_round(config, last + 1))
-        stop_at_holes(engine)
-        if not engine.records[f"join-{last + 1}", REGION_ITEM].facts["joined"]:
-            break
-        last += 1
-        engine.run(shape_stage(last))
-        stop_at_holes(engine)
-    engine.run(model_stage(config, last))
-    stop_at_holes(engine)
-    return last + 1
-
-
 @contextmanager
 def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iterator[Executor]:
     if means.own_executor is not None:
@@ -504,7 +345,3 @@ def tell_error(error: BaseException) -> str:
 def _write_record(out: Path, record: dict[str, Any]) -> None:
     with replacing(out / RUN_RECORD, durable=True) as part:
         part.write_bytes(seal(json.dumps(record, indent=1, default=str).encode() + b"\n"))
-
-
-def _silent(_: str) -> None:
-    """Say nothing."""

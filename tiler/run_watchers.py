@@ -13,7 +13,7 @@ from tiler.progress import Announce, RunProgress, command_line
 from tiler.region import foresee_pad
 from tiler.watching import RunStart, Watchers
 
-NOT_ALONE = ("proofs", "fit")  # stages of tiles and seams that `tiler.run.run_alone` does without
+NOT_ALONE = ("proofs", "fit")  # stages of tiles and seams that `tiler.alone.run_alone` does without
 
 
 def begin_watching(

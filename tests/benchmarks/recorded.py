@@ -15,7 +15,7 @@ from tiler.engine import Engine
 from tiler.executors import serial
 from tiler.own_stages import OwnStages
 from tiler.planning import make_plan
-from tiler.run import make_engine, run_stages
+from tiler.sequence import make_engine, run_stages
 from tiler.stage import Box, Facts, Scope
 from tiler.store import Store
 from tiler.task import Record

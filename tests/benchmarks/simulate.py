@@ -28,7 +28,7 @@ from tiler.planning import Plan, make_plan
 from tiler.progress import RunProgress
 from tiler.quarantine import HolesError, Missing, find_missing, leave_holes
 from tiler.records import Records
-from tiler.run import make_engine, run_stages
+from tiler.sequence import make_engine, run_stages
 from tiler.summary import summarise_run
 from tiler.task import Record
 

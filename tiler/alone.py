@@ -1,0 +1,76 @@
+"""One tile of a run meshed alone, to look into a failure."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from stitch.grid import seams_of_tile
+from tiler.config import Config
+from tiler.context import seam_name, tile_key
+from tiler.executors import serial
+from tiler.folder_lock import only_run
+from tiler.out_folder import (
+    PIECES,
+)
+from tiler.own_stages import OwnStages
+from tiler.padding import plan_alone
+from tiler.places import refuse_bucket
+from tiler.planning import check_sources, make_plan
+from tiler.quarantine import (
+    config_alone,
+)
+from tiler.sequence import make_engine, run_city_stages
+from tiler.settling import domain_of_run, take_domain
+from tiler.stages.mesh import mesh_stages
+from tiler.stages.pieces import piece_stages
+
+
+def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = None) -> Path:
+    """Mesh one tile alone, with those around it that its halo needs, in this process: to look into a failure.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the whole run.
+    tile : str
+        Name of the tile.
+    say : callable, optional
+        Called with sentences that the user should read.
+
+    Returns
+    -------
+    Path
+        Its VTU piece, in a folder below that of the run. The cells are those of the whole run, bit for bit.
+
+    Raises
+    ------
+    CityError
+        What its stages raise; any other error likewise, its type kept.
+    """
+    check_sources(config)
+    refuse_bucket(config.out, "--only")
+    whole = make_plan(config, _silent)
+    domain, tallest = domain_of_run(config)
+    pad, store = None, None
+    if config.padded:
+        alone, pad, store = plan_alone(config, whole, tile, tallest)
+    else:
+        alone = config_alone(config, whole, tile)
+    out = Path(alone.out)
+    out.mkdir(parents=True, exist_ok=True)
+    with only_run(out, say):
+        plan = make_plan(alone, say or _silent)
+        for folder in PIECES:
+            (out / folder).mkdir(exist_ok=True)
+        with serial() as executor:
+            engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
+            run_city_stages(engine, alone)
+            seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
+            take_domain(engine, alone, domain, pad, store)
+            engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
+            (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
+            engine.run(pieces, items={"pieces": [tile]})
+    return out / "mesh" / f"{tile}.vtu"
+
+
+def _silent(_: str) -> None:
+    """Say nothing."""

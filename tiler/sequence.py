@@ -1,0 +1,127 @@
+"""The stages of a run in their order, over an engine."""
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
+from tiler.config import Config
+from tiler.context import RunContext, pack_tiles
+from tiler.engine import Engine, Progress
+from tiler.executors import Executor
+from tiler.failures import Policy
+from tiler.options import derived_parameters
+from tiler.out_folder import (
+    STORE,
+)
+from tiler.own_stages import OwnStages
+from tiler.padding import CORE_STAGE
+from tiler.places import place
+from tiler.planning import Plan, identify
+from tiler.quarantine import (
+    stop_at_holes,
+)
+from tiler.settling import settle_domain
+from tiler.stage import REGION_ITEM
+from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
+from tiler.stages.citymodel import city_model_stages
+from tiler.stages.inputs import input_stages
+from tiler.stages.mesh import mesh_stages
+from tiler.stages.pieces import fit_stage, piece_stages
+
+
+def run_stages(engine: Engine, config: Config) -> int:
+    """Run all stages in their order; returns how often clusters of houses were simplified.
+
+    Parameters
+    ----------
+    engine : Engine
+        Engine over the region's items.
+    config : Config
+        Parameters of the run.
+    """
+    rounds = run_city_stages(engine, config)
+    domain = settle_domain(engine, config)
+    if config.padded:
+        engine.tell_layout()
+        both = engine.layout, engine.context
+        engine.lay_out(*engine.laid_out(CORE_STAGE))
+        engine.run(*city_model_stages(), fit_stage(config))
+        engine.lay_out(*both)
+        engine.run(*mesh_stages(config, domain))
+    else:
+        engine.run(*city_model_stages(), *mesh_stages(config, domain))
+    engine.run(*piece_stages(config))
+    # Beside a tile without a piece, others were written as if they had a neighbour.
+    while lost := [name for stage, name in engine.set_aside if stage == "pieces"]:
+        for tile in lost:
+            engine.give_up(("pieces", tile), ("columns", tile))
+        engine.run(*piece_stages(config))
+    return rounds
+
+
+def run_city_stages(engine: Engine, config: Config) -> int:
+    """Run the stages up to the simplified city model; parameters and result as for `run_stages`.
+
+    Raises
+    ------
+    HolesError
+        If an item was set aside.
+    """
+    engine.run(*input_stages(config))
+    stop_at_holes(engine)
+    engine.run(house_stage(config))
+    stop_at_holes(engine)
+    engine.run(*first_round(config))
+    stop_at_holes(engine)
+    engine.run(shape_stage(0))
+    stop_at_holes(engine)
+    last = 0
+    while True:
+        engine.run(*later_round(config, last + 1))
+        stop_at_holes(engine)
+        if not engine.records[f"join-{last + 1}", REGION_ITEM].facts["joined"]:
+            break
+        last += 1
+        engine.run(shape_stage(last))
+        stop_at_holes(engine)
+    engine.run(model_stage(config, last))
+    stop_at_holes(engine)
+    return last + 1
+
+
+def make_engine(
+    config: Config,
+    out: Path,
+    plan: Plan,
+    executor: Executor,
+    own: OwnStages,
+    progress: Progress | None = None,
+    *,
+    set_aside: bool = True,
+) -> Engine:
+    """Make the engine of a run over the items of its plan; failures are set aside, or end it."""
+    context = RunContext(
+        plan.region.bounds,
+        plan.region.crs,
+        config.tile_size,
+        config.mesh_size,
+        pack_tiles(plan.grid),
+        str(out),
+        config.open_size,
+    )
+    footprints = place(config.footprints) if config.footprints else None
+    parameters = SimpleNamespace(
+        **dataclasses.asdict(config),
+        **own.parameters,
+        **derived_parameters(config),
+        footprints_identity=identify(footprints) if footprints else "",
+    )
+    return Engine(
+        out / STORE,
+        plan.layout,
+        parameters=parameters,
+        context=context,
+        executor=executor,
+        progress=progress,
+        policy=Policy(retries=config.retries, set_aside=set_aside),
+    )
