@@ -73,6 +73,13 @@ def error(status: int) -> Exception:
     return cast(Exception, obstore.exceptions.GenericError(f"Server returned non-2xx status code: {status} x"))
 
 
+def wait_until(state: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20
+    while not state():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def test_a_place_has_the_names_of_a_path_and_survives_pickling() -> None:
     path = bucket() / "store.zarr" / "points" / "a.b.laz"
     assert (path.name, path.stem, path.suffix) == ("a.b.laz", "a.b", ".laz")
@@ -266,8 +273,7 @@ def test_one_run_at_a_time_by_a_lease(memory: Memory, monkeypatch: pytest.Monkey
         assert folder_lock.is_held(out)
         with pytest.raises(ConfigError, match="another run is at work there"), folder_lock.only_run(out):
             pass
-        time.sleep(0.1)
-        assert json.loads((bucket() / folder_lock.LOCK).read_bytes())["beats"] > 0
+        wait_until(lambda: json.loads((bucket() / folder_lock.LOCK).read_bytes())["beats"] > 0)
         check()
     assert memory.list_keys() == []
     # An owner elsewhere that is silent is dead; one that beats is not.
@@ -276,9 +282,8 @@ def test_one_run_at_a_time_by_a_lease(memory: Memory, monkeypatch: pytest.Monkey
     with folder_lock.only_run(out, said.append) as check:
         assert "taken over from (process 1 on far), which is dead" in said[-1]
         (bucket() / folder_lock.LOCK).write_bytes(json.dumps(far).encode())
-        time.sleep(0.1)
         with pytest.raises(OutputError, match="another run has taken it over"):
-            check()
+            wait_until(lambda: bool(check()))
     assert memory.list_keys() == [f"run/{folder_lock.LOCK}"]  # that of the other one stays
 
 
