@@ -22,6 +22,7 @@ from packaging.requirements import Requirement
 from tests.sparse_city import ROOT, make_city
 from tests.test_run import hashes
 from tiler import fork_server
+from tiler.cli import make_parser
 from tiler.cluster import PATIENCE
 from tiler.config import Config, check_reach, load_config
 from tiler.executors import KILL_AT
@@ -94,6 +95,21 @@ def test_memory_that_is_asked_for_is_the_limit_and_holds_the_worker(pod: dict[st
             break
     else:
         assert "worker" not in words(pod)
+
+
+def test_what_jobs_are_given_is_a_configuration() -> None:
+    path = KUBERNETES / "base" / "run.toml"
+    values = load_config(path)
+    check_reach(path, values)
+    assert values["tile_size"] == 1000.0
+    jobs = [words(pod) for name, pod in PODS if "run" in " ".join(words(pod))]
+    assert len(jobs) == 2
+    for job in jobs:
+        line = job[-1].removeprefix("exec ").split() if job[0] == "sh" else job
+        given = make_parser().parse_args(line[1:])
+        assert line[:3] == ["citystitch", "run", "/config/run.toml"]
+        assert given.scheduler
+        assert given.out == "/data/out"
 
 
 def test_dasks_settings_are_those_of_local_workers() -> None:
@@ -223,11 +239,14 @@ def free_ports(n: int) -> list[int]:
         return [one.getsockname()[1] for one in sockets]
 
 
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT), "DASK_CONFIG": str(DEPLOY)}
+
+
 @contextmanager
 def started(command: list[str], log: Path) -> Iterator[None]:
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "DASK_CONFIG": str(DEPLOY)}
     with log.open("wb") as file:
-        process = subprocess.Popen(command, stdout=file, stderr=file, env=environment, start_new_session=True)
+        process = subprocess.Popen(command, stdout=file, stderr=file, env=environment(), start_new_session=True)
         try:
             yield
         finally:
@@ -270,8 +289,16 @@ def test_the_pods_commands_run_and_give_the_bytes_of_a_serial_run(tmp_path: Path
             stack.enter_context(started(worker, tmp_path / f"worker-{health}.log"))
         for health in others:
             assert wait_for(f"http://127.0.0.1:{health}/health") == "ok"
-        run = city.command(tmp_path / "out", "--scheduler", address)
-        done = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, check=False)
+        # The job with its own parameters, but for places, and for sizes, which the small city has.
+        inputs = city.command(tmp_path)[4:7]
+        places = {"/data/tiles": inputs[0], "/data/footprints.gpkg": inputs[2], "/data": str(tmp_path)}
+        text = (KUBERNETES / "base" / "run.toml").read_text()
+        run = " ".join(commands["run"][2:]).replace("/config", str(tmp_path))
+        for old, new in {**places, "tcp://citystitch-scheduler:8786": address}.items():
+            text, run = text.replace(f'"{old}"', f'"{new}"'), run.replace(old, new)
+        (tmp_path / "run.toml").write_text(text)
+        sizes = city.command(tmp_path)[7:-2]
+        job = [sys.executable, "-m", "tiler.cli", "run", *run.split(), *sizes]
+        done = subprocess.run(job, capture_output=True, text=True, cwd=tmp_path, env=environment(), check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert commands["run"][-1] == "--scheduler=tcp://citystitch-scheduler:8786"
     assert hashes(tmp_path / "out") == city.hashes
