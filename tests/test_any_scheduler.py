@@ -19,20 +19,21 @@ from tests.namespaces import dask_command
 from tests.sparse_city import ROOT, SparseCity, children, count_results, make_city, start
 from tests.test_engine import grid_layout, make, nothing
 from tests.test_run import hashes
-from tiler import cluster_check, terms
-from tiler.cluster import connect, spell_out
-from tiler.cluster_check import (
+from tiler.config import Config
+from tiler.scheduler import check as cluster_check
+from tiler.scheduler import terms
+from tiler.scheduler.check import (
     ClusterMismatchError,
     UnansweredError,
     check_cluster,
     compare_files,
     compare_versions,
 )
-from tiler.config import Config
+from tiler.scheduler.reach import connect, spell_out
+from tiler.scheduler.terms import PROBE, Terms, check_files, offer_terms, own_terms
+from tiler.scheduler.versions import LIBRARIES, MISSING, NATIVE, tell_versions
 from tiler.stage import Facts, Scope, Stage
 from tiler.task import Task
-from tiler.terms import PROBE, Terms, check_files, offer_terms, own_terms
-from tiler.versions import LIBRARIES, MISSING, NATIVE, tell_versions
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def test_every_library_of_the_keys_is_compared() -> None:
 def test_citystitch_counts_by_its_sources(tmp_path: Path) -> None:
     for package in ("pipeline", "stitch", "tiler"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    words = "from tiler.versions import tell_versions; print(tell_versions(())['citystitch'])"
+    words = "from tiler.scheduler.versions import tell_versions; print(tell_versions(())['citystitch'])"
 
     def ask() -> str:
         command = [sys.executable, "-c", words]

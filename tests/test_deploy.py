@@ -23,10 +23,10 @@ from tests.sparse_city import ROOT, make_city
 from tests.test_run import hashes
 from tiler import fork_server
 from tiler.cli import make_parser
-from tiler.cluster import PATIENCE
 from tiler.config import Config, check_reach, load_config
 from tiler.executors import KILL_AT
 from tiler.places import is_url
+from tiler.scheduler.reach import PATIENCE
 
 DEPLOY = ROOT / "deploy"
 KUBERNETES = DEPLOY / "kubernetes"

@@ -17,10 +17,10 @@ import pytest
 
 from pipeline.errors import CityError, GeometryError, InputError
 from pipeline.notes import Note
-from tiler.cluster import connect
 from tiler.engine import Engine
 from tiler.executors import Executor, Serial, local
 from tiler.keys import item_key, stage_digest
+from tiler.scheduler.reach import connect
 from tiler.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
 from tiler.store import Store
 from tiler.task import Failure, Record, Task

@@ -14,11 +14,11 @@ import pytest
 from pipeline.errors import CityError
 from tests.test_engine import make
 from tiler import fork_server
-from tiler.cluster_table import Cluster
 from tiler.executors import ClusterError
-from tiler.jobqueue import LOSSES, SETTINGS, UNBORN, QueuedDask, _Jobs, read_worker_jobs
+from tiler.jobs.jobqueue import LOSSES, SETTINGS, UNBORN, QueuedDask, _Jobs, read_worker_jobs
+from tiler.jobs.queues import QueueError
+from tiler.jobs.table import Cluster
 from tiler.limits import Limits
-from tiler.queues import QueueError
 from tiler.stage import Facts, Scope, Stage
 from tiler.task import Task
 

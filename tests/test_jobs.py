@@ -17,13 +17,14 @@ import pytest
 from pipeline.errors import ConfigError, InputError
 from tests.sparse_city import ROOT
 from tests.test_deploy import program
-from tiler import controller, jobs
 from tiler.cli import main
-from tiler.cluster_table import TYPES, Cluster, read_cluster
 from tiler.config import make_config
-from tiler.jobqueue import worker_script
-from tiler.jobs import JobRecord, array_script, controller_script, read_record, write_record
-from tiler.queues import QUEUES
+from tiler.jobs import controller
+from tiler.jobs import submission as jobs
+from tiler.jobs.jobqueue import worker_script
+from tiler.jobs.queues import QUEUES
+from tiler.jobs.submission import JobRecord, array_script, controller_script, read_record, write_record
+from tiler.jobs.table import TYPES, Cluster, read_cluster
 from tiler.synth import write_city
 
 TEMPLATES = ROOT / "deploy" / "slurm"
@@ -124,7 +125,7 @@ def test_the_script_of_a_controller(kind: str, tmp_path: Path) -> None:
         "trap '' USR1",
         "source /etc/profile.d/modules.sh",
         "module load GCC/13.2.0",
-        "exec apptainer exec /shared/city.sif python -m tiler.controller /out",
+        "exec apptainer exec /shared/city.sif python -m tiler.jobs.controller /out",
     ]
 
 
@@ -203,7 +204,7 @@ STATES = {
 @pytest.mark.parametrize("kind", TYPES)
 def test_states_are_read(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     text, alive = STATES[kind]
-    monkeypatch.setattr("tiler.queues._call", lambda words, **_: text)
+    monkeypatch.setattr("tiler.jobs.queues._call", lambda words, **_: text)
     states = QUEUES[kind].states(list(alive))
     assert {job: QUEUES[kind].is_alive(states.get(job)) for job in alive} == alive
 
@@ -226,7 +227,7 @@ def test_the_number_of_a_submitted_job_is_read(
         calls.append(words)
         return said
 
-    monkeypatch.setattr("tiler.queues._call", call)
+    monkeypatch.setattr("tiler.jobs.queues._call", call)
     path = table(tmp_path, "")
     assert QUEUES[kind].submit(path, after="7") == job
     assert any("7" in word for word in calls[0])
@@ -272,7 +273,7 @@ def drive(out: Path, monkeypatch: pytest.MonkeyPatch, driver: str) -> int:
     """Run a controller whose driver is a line of Python."""
     real = subprocess.Popen
     monkeypatch.setattr(controller, "POLL", 0.05)
-    monkeypatch.setattr("tiler.controller.subprocess.Popen", lambda _: real([sys.executable, "-c", driver]))
+    monkeypatch.setattr("tiler.jobs.controller.subprocess.Popen", lambda _: real([sys.executable, "-c", driver]))
     numbers = (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT)
     before = [signal.getsignal(number) for number in numbers]
     try:
@@ -394,7 +395,7 @@ def test_submit_keeps_what_jobs_run_and_refuses_a_second_one(
     monkey, out = tmp_path / "cluster.toml", tmp_path / "out"
     submit = ["submit", str(run_file), "--cluster", str(monkey)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tiler.jobs.controller_script", lambda *_: "script\n")
+        patch.setattr("tiler.jobs.submission.controller_script", lambda *_: "script\n")
         assert main(submit) == 0
         assert "job 101" in capsys.readouterr().out
         assert main(submit) == 2

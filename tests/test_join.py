@@ -18,15 +18,15 @@ import pytest
 from pipeline.errors import CityError, ConfigError, InputError
 from tests.sparse_city import SparseCity, children, make_city, start, wait_for_results, wait_until_gone
 from tests.test_run import hashes
-from tiler import lease as leases
-from tiler import mailbox
 from tiler.config import make_config
-from tiler.crew import Crew, Given
 from tiler.engine import LEAST_WINDOW, PER_WORKER, Engine
 from tiler.executors import Serial
 from tiler.folder_lock import is_held, only_run
-from tiler.join import ARRAY_INDEX, join, name_member
-from tiler.lease import (
+from tiler.joining import lease as leases
+from tiler.joining import mailbox
+from tiler.joining.crew import Crew, Given
+from tiler.joining.join import ARRAY_INDEX, join, name_member
+from tiler.joining.lease import (
     Holder,
     Lease,
     LostFolderError,
@@ -37,10 +37,10 @@ from tiler.lease import (
     this_holder,
     write_holder,
 )
+from tiler.joining.mailbox import GoneError, MailReader, MailWriter
+from tiler.joining.member import Ended, Left, _Service
+from tiler.joining.spool import HOLDER, INBOX, OUTBOX, SPOOL, Spool
 from tiler.limits import Limits, trace_file
-from tiler.mailbox import GoneError, MailReader, MailWriter
-from tiler.member import Ended, Left, _Service
-from tiler.spool import HOLDER, INBOX, OUTBOX, SPOOL, Spool
 from tiler.stage import Facts, Layout, Scope
 from tiler.store import Store
 from tiler.task import Declared, Failure, Record, Task
@@ -50,7 +50,7 @@ END = 240.0  # s that members may take
 MEMBER = """
 import sys, time
 from pathlib import Path
-from tiler import crew, join
+from tiler.joining import crew, join
 from tiler.cli import main
 give = crew.Crew.give
 def give_slowly(self, given):
@@ -66,7 +66,8 @@ import errno, fcntl, os
 def refuse(*_):
     raise OSError(errno.ENOLCK, "No locks available")
 fcntl.flock = refuse
-from tiler import folder_lock, lease
+from tiler import folder_lock
+from tiler.joining import lease
 folder_lock._place = lambda: f"machine {os.getpid()}"
 folder_lock.BEAT, folder_lock.SILENCE, lease.BEAT, lease.SILENCE = 0.3, 4.0, 0.3, 4.0
 """
@@ -428,7 +429,7 @@ def test_wrong_options_are_refused(tmp_path: Path, name: str, idle: float, words
 
 
 def test_a_folder_that_another_run_holds_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tiler.join.Crew", IdleCrew)
+    monkeypatch.setattr("tiler.joining.join.Crew", IdleCrew)
     config = make_config({"pointcloud": ["a.laz"], "out": str(tmp_path)})
     begin = time.monotonic()
     with only_run(tmp_path), pytest.raises(CityError, match=r"has been at work there for 0\.7 s") as caught:
@@ -445,7 +446,7 @@ def test_a_folder_that_another_run_holds_is_waited_for(tmp_path: Path, monkeypat
             held.__exit__(None, None, None)
         return is_held(out)
 
-    monkeypatch.setattr("tiler.join.is_held", look)
+    monkeypatch.setattr("tiler.joining.join.is_held", look)
     held.__enter__()
     with pytest.raises(InputError, match=r"a\.laz"):
         join(config, max_idle=60)

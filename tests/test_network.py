@@ -16,11 +16,11 @@ from pipeline.errors import CityError, ConfigError
 from tests.namespaces import Host, certificates, dask_command, hosts
 from tests.sparse_city import ROOT, SparseCity, children, count_results, make_city, start
 from tests.test_run import hashes
-from tiler import transport
-from tiler.cluster import connect
 from tiler.config import idle_parameters, make_config
 from tiler.quarantine import save_config
-from tiler.transport import TlsFiles, check_answer, make_security
+from tiler.scheduler import transport
+from tiler.scheduler.reach import connect
+from tiler.scheduler.transport import TlsFiles, check_answer, make_security
 
 CUT = 30.0  # s
 LOST = "the connection to the Dask scheduler is lost; all that was done is kept"
@@ -248,7 +248,8 @@ def test_a_driver_that_is_cut_off_for_good_ends_and_goes_on_later(
         cluster((scheduler, worker), files, tmp_path / "cluster") as (address, _),
         ExitStack() as stack,
     ):
-        shorter = "import sys; from tiler import cluster, cli; cluster.PATIENCE = 11; sys.exit(cli.main())"
+        shorter = "import sys; from tiler import cli; from tiler.scheduler import reach; "
+        shorter += "reach.PATIENCE = 11; sys.exit(cli.main())"
         command = command_from(driver, city, out, address, files)
         at = command.index("-m")
         environment = ["env", "DASK_DISTRIBUTED__COMM__TIMEOUTS__TCP=11s"]

@@ -13,13 +13,15 @@ import pytest
 from pipeline.errors import ConfigError, InputError, OutputError
 from tests.test_run import hashes
 from tests.towns import Town, make_town
-from tiler import folder_lock, object_requests, range_file
+from tiler import folder_lock
 from tiler.cli import main
 from tiler.config import load_config, make_config
-from tiler.fetch import fetch_run
-from tiler.object_path import ObjectPath
+from tiler.objects import range_file
+from tiler.objects import requests as object_requests
+from tiler.objects.fetch import fetch_run
+from tiler.objects.path import ObjectPath
+from tiler.objects.range_file import RangeFile
 from tiler.places import StoreUnreachableError, absolute, place
-from tiler.range_file import RangeFile
 from tiler.run import run
 from tiler.store import Store
 

@@ -11,7 +11,7 @@ import pytest
 from tests.slurm_here import Slurm, skip_without_slurm, slurm_here
 from tests.sparse_city import ROOT, SparseCity, count_results, make_city
 from tests.test_run import hashes
-from tiler.jobs import JobRecord, read_record
+from tiler.jobs.submission import JobRecord, read_record
 
 pytestmark = pytest.mark.long
 

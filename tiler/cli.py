@@ -18,7 +18,7 @@ from tiler.api import POSITIONAL, with_file
 from tiler.config import Config, annotated_defaults, make_config
 from tiler.domain import Height
 from tiler.export import FORMATS
-from tiler.job_commands import add_job_commands, describe_job, find_run, job_line
+from tiler.jobs.commands import add_job_commands, describe_job, find_run, job_line
 from tiler.places import place, refuse_bucket
 from tiler.plain_text import printable
 
@@ -317,7 +317,7 @@ def _run_config(
 def _join(options: argparse.Namespace) -> int:
     config = make_config(with_file(vars(options)))
     fork_server.begin()
-    from tiler.join import join
+    from tiler.joining.join import join
     from tiler.terminal import make_views, print_last_line, print_summary
 
     joined = join(
@@ -416,7 +416,7 @@ def _report_run(out: Path, *, quiet: bool) -> None:
 
 
 def _fetch(options: argparse.Namespace) -> int:
-    from tiler.fetch import fetch_run
+    from tiler.objects.fetch import fetch_run
 
     return 0 if fetch_run(options.source, options.directory, say) else EXIT_FAILED
 

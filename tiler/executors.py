@@ -14,11 +14,11 @@ from typing import Any, Protocol
 from pipeline.errors import CityError
 from tiler import fork_server
 from tiler.addresses import ANYWHERE
-from tiler.cluster_check import ClusterMismatchError, UnansweredError, check_cluster, tell_refusal
 from tiler.limits import Limits, WorkerError, machine_memory, run_guarded, tell_death, tell_memory
+from tiler.scheduler.check import ClusterMismatchError, UnansweredError, check_cluster, tell_refusal
+from tiler.scheduler.terms import Refusal, Terms, run_on_terms
 from tiler.stage import Facts
 from tiler.task import Failure, Record, Task, run_task
-from tiler.terms import Refusal, Terms, run_on_terms
 
 Function = Callable[[Task], Facts]
 

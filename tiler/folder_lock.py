@@ -80,7 +80,7 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
     is asked for by its process, any other is listened to for `SILENCE` seconds.
     """
     if in_bucket(folder):
-        from tiler.object_lease import only_run_in_bucket
+        from tiler.objects.lease import only_run_in_bucket
 
         with only_run_in_bucket(folder, say or _silent) as lease:
             yield lease.check
@@ -104,7 +104,7 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
 def is_held(folder: Path) -> bool:
     """Tell whether a run is at work in a folder; InputError if its lock file cannot be read."""
     if in_bucket(folder):
-        from tiler.object_lease import is_held_in_bucket
+        from tiler.objects.lease import is_held_in_bucket
 
         return is_held_in_bucket(folder)
     path = folder / LOCK

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError, InputError
 from tiler import geoparquet
-from tiler.local_copy import local_copy
+from tiler.objects.local_copy import local_copy
 from tiler.places import in_bucket
 from tiler.vector_forms import check_form, read_head
 

@@ -10,9 +10,9 @@ from typing import Any
 from pipeline.errors import ConfigError, OutputError
 from tiler.limits import TASKS
 from tiler.places import in_bucket
+from tiler.scheduler.terms import PROBE
 from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL
 from tiler.store import MANIFEST
-from tiler.terms import PROBE
 
 # What a run writes, and all that --overwrite removes; the record is replaced.
 INDEXES = ("mesh.pvtu", "boundary.pvtp")
@@ -122,7 +122,7 @@ def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
 
 def _remove(path: Path) -> None:
     if in_bucket(path):
-        from tiler.object_path import delete_below
+        from tiler.objects.path import delete_below
 
         delete_below(path)
     elif path.is_dir():

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, BinaryIO, TypeGuard, cast
 from pipeline.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
-    from tiler.object_path import ObjectPath
+    from tiler.objects.path import ObjectPath
 
 PATIENCE = 600.0  # s that a request is repeated for where nothing sound answers
 _URL = re.compile(r"(s3|https?)://", re.IGNORECASE)
@@ -56,7 +56,7 @@ def place(text: str, patience: float = PATIENCE) -> Path:
     """
     if not is_url(text):
         return Path(text)
-    from tiler.object_path import ObjectPath
+    from tiler.objects.path import ObjectPath
 
     check_url(text)
     scheme, rest = text.split("://", 1)

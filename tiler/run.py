@@ -16,16 +16,16 @@ from pipeline.errors import CityError, OutputError
 from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.audit import Audit
-from tiler.cluster import reach_cluster, spell_out
-from tiler.cluster_table import read_cluster
 from tiler.config import Config
 from tiler.dashboard.server import read_address, watched
 from tiler.engine import StoppedError
 from tiler.executors import Executor, local, serial, share_memory
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
+from tiler.jobs.table import read_cluster
+from tiler.joining.lease import LostFolderError
+from tiler.joining.spool import SPOOL
 from tiler.keys import code_versions
-from tiler.lease import LostFolderError
 from tiler.limits import TASKS, Limits, machine_memory
 from tiler.manifest import find_remade, write_manifest
 from tiler.out_folder import (
@@ -52,9 +52,9 @@ from tiler.quarantine import (
     save_config,
 )
 from tiler.run_watchers import begin_watching
+from tiler.scheduler.reach import reach_cluster, spell_out
 from tiler.seal import seal
 from tiler.sequence import make_engine, run_stages
-from tiler.spool import SPOOL
 from tiler.stage import Stage
 from tiler.stopping import stops
 from tiler.summary import describe_tasks, summarise_run
@@ -210,7 +210,7 @@ def _run(
         record["status"] = "done"
         say(describe_tasks(record["tasks"]))
         if in_bucket(out):
-            from tiler.object_watch import describe_waits, tell_waits
+            from tiler.objects.watch import describe_waits, tell_waits
 
             record["store_waits"] = describe_waits()
             if waits := tell_waits():
@@ -293,7 +293,7 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
     elif means.cluster is not None:
         yield means.cluster
     elif config.cluster:
-        from tiler.jobqueue import JOB, job_queue
+        from tiler.jobs.jobqueue import JOB, job_queue
 
         table, folder = read_cluster(Path(config.cluster)), Path(config.out).absolute() / JOB
         with job_queue(
@@ -315,7 +315,7 @@ def _beside(out: Path, check: Callable[[], None], watchers: Watchers) -> Iterato
     if not in_bucket(out):
         yield out
         return
-    from tiler.object_watch import WaitWatch, telling
+    from tiler.objects.watch import WaitWatch, telling
 
     watchers.add(WaitWatch(check))
     with tempfile.TemporaryDirectory(prefix="citystitch-") as name, telling(watchers.say):

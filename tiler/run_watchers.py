@@ -63,7 +63,7 @@ def begin_watching(
     progress = RunProgress(out, config, totals, announce=announce, command=command)
     watchers.add(progress)
     if in_bucket(out) and shown is not None:
-        from tiler.object_watch import BucketEvents
+        from tiler.objects.watch import BucketEvents
 
         watchers.add(BucketEvents(out / EVENTS, shown))
     else:

@@ -5,7 +5,7 @@ array of bytes, ``_packed``, and if all of them are less than 16 kB, in the grou
 writer gave, ``arrays`` (type and shape of each array and the CRC-32 of the raw bytes of each chunk), ``digest``, a
 hash of the content, ``files``, size and CRC-32 of every file of the arrays as it lies on disk, and ``checksum``,
 the CRC-32 of the file that the attributes are in. In a bucket each file is an object, and that of the attributes
-is put last (`tiler.object_results`).
+is put last (`tiler.objects.results`).
 """
 
 import base64
@@ -54,7 +54,7 @@ from tiler.seal import is_sealed, seal
 from tiler.written import GONE, find_changed_files, state_files
 
 if TYPE_CHECKING:
-    from tiler.object_path import ObjectPath
+    from tiler.objects.path import ObjectPath
 
 PACKED = "_packed"
 # Bytes of numbers apart, then LZ4: written three times as fast as with zarr's default, a tenth more on disk. zarr
@@ -489,7 +489,7 @@ class Writer:
     def _replace(self) -> None:
         """Rename into place; another writer of the same result may do so at the same moment."""
         if in_bucket(self._folder):
-            from tiler.object_results import publish
+            from tiler.objects.results import publish
 
             publish(self._partial, self._folder, GROUP)
             return
@@ -549,7 +549,7 @@ def _delete(path: Path) -> None:
 
 
 def _withdraw(path: "ObjectPath") -> None:
-    from tiler.object_path import delete_below
+    from tiler.objects.path import delete_below
 
     delete_below(path, GROUP)
 

@@ -241,7 +241,7 @@ class Task:
         if not in_bucket(self.folder):
             yield Path(self.context.out)
             return
-        from tiler.object_results import files_for
+        from tiler.objects.results import files_for
 
         with files_for(self.folder) as folder:
             yield folder
@@ -306,7 +306,7 @@ def _waited(task: Task) -> float:
     """Seconds that this process has waited for buckets so far."""
     if not in_bucket(task.folder):
         return 0.0
-    from tiler.object_requests import WAITS
+    from tiler.objects.requests import WAITS
 
     return WAITS.seconds
 

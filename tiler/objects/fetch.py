@@ -7,7 +7,7 @@ from pipeline.errors import ConfigError, InputError
 from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.folder_lock import LOCK, is_held, only_run
-from tiler.object_path import ObjectPath
+from tiler.objects.path import ObjectPath
 from tiler.out_folder import check_folder
 from tiler.places import in_bucket, place
 

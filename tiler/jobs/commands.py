@@ -40,16 +40,16 @@ def find_run(job: str) -> Path:
     """Folder of a run, by itself or by the number of its job; InputError for an unknown number."""
     if not job[:1].isdigit() or Path(job).is_dir():
         return place(job)
-    from tiler.jobs import find_folder
+    from tiler.jobs.submission import find_folder
 
     return find_folder(job)
 
 
 def describe_job(out: Path) -> dict[str, Any] | None:
-    """Tell how the job of a run stands, as `tiler.jobs.tell_job`; None without a job."""
+    """Tell how the job of a run stands, as `tiler.jobs.submission.tell_job`; None without a job."""
     if in_bucket(out) or not (out / "job").is_dir():  # nothing of clusters is imported for a run without
         return None
-    from tiler.jobs import tell_job
+    from tiler.jobs.submission import tell_job
 
     return tell_job(out)
 
@@ -70,7 +70,7 @@ def job_line(job: dict[str, Any]) -> str:
 def _submit(options: argparse.Namespace) -> int:
     from tiler.api import with_file
     from tiler.config import make_config
-    from tiler.jobs import submit
+    from tiler.jobs.submission import submit
 
     if options.array < 0 or options.array > 100_000:
         raise ConfigError(f"--array {options.array}: 1 to 100000 elements expected")
@@ -84,14 +84,14 @@ def _submit(options: argparse.Namespace) -> int:
 
 
 def _cancel(options: argparse.Namespace) -> int:
-    from tiler.jobs import cancel, find_folder
+    from tiler.jobs.submission import cancel, find_folder
 
     print(printable(cancel(find_folder(options.job))))
     return 0
 
 
 def _logs(options: argparse.Namespace) -> int:
-    from tiler.jobs import find_folder, list_logs
+    from tiler.jobs.submission import find_folder, list_logs
 
     out = find_folder(options.job)
     read: dict[Path, int] = {}

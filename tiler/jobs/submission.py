@@ -13,11 +13,11 @@ from typing import Any
 
 from pipeline.errors import ConfigError, InputError
 from tiler.atomic import replacing
-from tiler.cluster_table import Cluster, read_cluster
 from tiler.config import Config, write_config
-from tiler.jobqueue import JOB, NANNY, begin_words, python_words, read_worker_jobs, worker_script
+from tiler.jobs.jobqueue import JOB, NANNY, begin_words, python_words, read_worker_jobs, worker_script
+from tiler.jobs.queues import QUEUES, STOP_SIGNAL, JobSize, Queue, QueueError
+from tiler.jobs.table import Cluster, read_cluster
 from tiler.places import absolute
-from tiler.queues import QUEUES, STOP_SIGNAL, JobSize, Queue, QueueError
 
 RECORD, TABLE, PARAMETERS, SCRIPT = "job.json", "cluster.toml", "run.toml", "job.sh"
 LOGS = "logs"
@@ -118,7 +118,7 @@ def controller_script(table: Cluster, out: Path) -> str:
         table.controller.options,
         warn=table.controller.margin,
     )
-    command = f"exec {python_words(table)} -m tiler.controller {shlex.quote(str(out))}"
+    command = f"exec {python_words(table)} -m tiler.jobs.controller {shlex.quote(str(out))}"
     lines = [*QUEUES[table.type].header(table, size), "", f"trap '' {STOP_SIGNAL}", *begin_words(table), command]
     return "\n".join(lines) + "\n"
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tiler.object_path import ObjectPath
+from tiler.objects.path import ObjectPath
 
 PREFIX = "citystitch-"  # of temporary folders
 

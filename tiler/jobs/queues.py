@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from pipeline.errors import CityError
-from tiler.cluster_table import Cluster
+from tiler.jobs.table import Cluster
 
 PATIENCE = 60.0  # s that a command of a batch system may take
 STOP_SIGNAL = "USR1"  # sent to a controller before its time limit, where the batch system can

@@ -10,8 +10,8 @@ from contextlib import contextmanager, suppress
 from pipeline.errors import ConfigError, OutputError
 from tiler import folder_lock
 from tiler.folder_lock import BUSY, LOCK, NEXT, Owner
-from tiler.object_path import ObjectPath
-from tiler.object_requests import ChangedError
+from tiler.objects.path import ObjectPath
+from tiler.objects.requests import ChangedError
 
 
 class Lease:

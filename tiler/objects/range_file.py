@@ -5,10 +5,10 @@ import io
 import os
 from typing import TYPE_CHECKING, Any
 
-from tiler.object_requests import ChangedError
+from tiler.objects.requests import ChangedError
 
 if TYPE_CHECKING:
-    from tiler.object_path import ObjectPath
+    from tiler.objects.path import ObjectPath
 
 LEAST = 1 << 14  # bytes of one request: headers and indexes are read in small pieces
 MOST = 1 << 23  # of one that goes on where the last one ended; each is twice the one before

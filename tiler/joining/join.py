@@ -1,8 +1,8 @@
 """`citystitch join`: one of several processes, on any machines, that work at one run through its folder alone.
 
-All are started with the same command. One of them has the lease of the driver (`tiler.lease`) and runs what
-`citystitch run` does; the others are members and do tasks for it (`tiler.spool`). Where the driver dies, or is
-asked to stop, another one takes its place.
+All are started with the same command. One of them has the lease of the driver (`tiler.joining.lease`) and runs
+what `citystitch run` does; the others are members and do tasks for it (`tiler.joining.spool`). Where the driver
+dies, or is asked to stop, another one takes its place.
 """
 
 import dataclasses
@@ -20,12 +20,11 @@ from typing import Any
 
 from pipeline.errors import CityError, ConfigError, OutputError
 from tiler.config import Config
-from tiler.crew import Crew
 from tiler.engine import StoppedError
 from tiler.executors import Executor, share_memory
 from tiler.folder_lock import is_held
-from tiler.keys import code_versions
-from tiler.lease import (
+from tiler.joining.crew import Crew
+from tiler.joining.lease import (
     LOOK,
     PREFIX,
     Holder,
@@ -40,13 +39,14 @@ from tiler.lease import (
     take_lease,
     this_holder,
 )
+from tiler.joining.member import Ended, Left, serve
+from tiler.joining.spool import HOLDER, SPOOL, Spool
+from tiler.keys import code_versions
 from tiler.limits import Limits
-from tiler.member import Ended, Left, serve
 from tiler.out_folder import RUN_RECORD, check_folder
 from tiler.plain_text import shorten
 from tiler.planning import check_sources
 from tiler.run import run, tell_error
-from tiler.spool import HOLDER, SPOOL, Spool
 from tiler.watching import Watcher
 
 MAX_IDLE = 600.0  # s that a member waits for a folder that another run holds

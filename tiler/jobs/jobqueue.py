@@ -15,10 +15,10 @@ from pipeline.errors import ConfigError
 from tiler import fork_server
 from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
-from tiler.cluster_table import Cluster
 from tiler.executors import KILL_AT, REFUSE_AT, ClusterError, Dask, Executor
+from tiler.jobs.queues import QUEUES, JobSize, Queue, QueueError
+from tiler.jobs.table import Cluster
 from tiler.limits import Limits
-from tiler.queues import QUEUES, JobSize, Queue, QueueError
 from tiler.task import Failure, Task
 
 JOB = "job"  # folder in that of a run, with all that its jobs need and print

@@ -9,10 +9,19 @@ from pathlib import Path
 from types import FrameType
 
 from pipeline.errors import CityError
-from tiler.cluster_table import Cluster, read_cluster
-from tiler.jobqueue import JOB
-from tiler.jobs import SCRIPT, TABLE, JobRecord, count_results, now, read_record, run_words, write_record
-from tiler.queues import QUEUES, STOP_SIGNAL, QueueError
+from tiler.jobs.jobqueue import JOB
+from tiler.jobs.queues import QUEUES, STOP_SIGNAL, QueueError
+from tiler.jobs.submission import (
+    SCRIPT,
+    TABLE,
+    JobRecord,
+    count_results,
+    now,
+    read_record,
+    run_words,
+    write_record,
+)
+from tiler.jobs.table import Cluster, read_cluster
 
 FINAL = {0: "done", 2: "wrong configuration", 3: "done but for parts"}  # exit codes after which none follows
 POLL = 1.0  # s

@@ -1,4 +1,4 @@
-"""A member of a run: does the tasks that its driver sends to its mailbox, see `tiler.spool`."""
+"""A member of a run: does the tasks that its driver sends to its mailbox, see `tiler.joining.spool`."""
 
 import pickle
 import time
@@ -9,10 +9,10 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from tiler.crew import Crew, Given
-from tiler.lease import LOOK, SILENCE, Heart, Holder, Pulse, is_over, remove_folder, write_holder
-from tiler.mailbox import GoneError, MailReader, MailWriter
-from tiler.spool import HOLDER, INBOX, OUTBOX, Pause
+from tiler.joining.crew import Crew, Given
+from tiler.joining.lease import LOOK, SILENCE, Heart, Holder, Pulse, is_over, remove_folder, write_holder
+from tiler.joining.mailbox import GoneError, MailReader, MailWriter
+from tiler.joining.spool import HOLDER, INBOX, OUTBOX, Pause
 from tiler.stopping import stops
 
 STOPPED = 130  # exit code

@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from pipeline.errors import ConfigError
-from tiler import versions
-from tiler.terms import GRACE, Files, Refusal, Terms, check_files, own_versions
-from tiler.versions import TRANSPORT
+from tiler.scheduler import versions
+from tiler.scheduler.terms import GRACE, Files, Refusal, Terms, check_files, own_versions
+from tiler.scheduler.versions import TRANSPORT
 
 ANSWER, LATE_ANSWER = 60.0, 5.0  # s that workers may take to answer, before a run and in it
 NAMED = 3  # workers that are named in a line; the others are counted
 
-# Runs the text of `tiler.versions` where there may be no citystitch.
+# Runs the text of `tiler.scheduler.versions` where there may be no citystitch.
 PROBE = "exec(source, scope := {}) or scope['tell_versions'](only)"
 
 EARLY = "this cluster cannot take the tasks of this run, and nothing was written"

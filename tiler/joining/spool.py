@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tiler.crew import Crew, Function, Given, Outcome
-from tiler.lease import (
+from tiler.joining.crew import Crew, Function, Given, Outcome
+from tiler.joining.lease import (
     LOOK,
     SILENCE,
     Holder,
@@ -29,8 +29,8 @@ from tiler.lease import (
     read_holder,
     remove_folder,
 )
+from tiler.joining.mailbox import GoneError, MailReader, MailWriter
 from tiler.limits import tell_death
-from tiler.mailbox import GoneError, MailReader, MailWriter
 from tiler.task import Failure, Record, Task
 
 SPOOL = ".spool"  # in the folder of a run, as long as members are at work

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from pipeline.errors import CityError
 from tiler.clouds import find_clouds
-from tiler.cluster_check import check_cluster
 from tiler.config import Config
 from tiler.executors import Dask, Executor
 from tiler.limits import Limits
 from tiler.places import is_url
-from tiler.terms import Terms, offer_terms, own_terms
-from tiler.transport import NO_FILES, TlsFiles, check_answer, make_security
+from tiler.scheduler.check import check_cluster
+from tiler.scheduler.terms import Terms, offer_terms, own_terms
+from tiler.scheduler.transport import NO_FILES, TlsFiles, check_answer, make_security
 
 TCP_TIMEOUT = "distributed.comm.timeouts.tcp"
 PATIENCE = 120.0  # s that a link may be cut; Dask by itself gives it up after 30 s
@@ -32,7 +32,7 @@ def reach_cluster(config: Config) -> Iterator[Executor | None]:
     Raises
     ------
     CityError
-        As `connect` and `tiler.terms.offer_terms`; nothing is left in the folder.
+        As `connect` and `tiler.scheduler.terms.offer_terms`; nothing is left in the folder.
     """
     if not config.scheduler:
         yield None
@@ -96,8 +96,8 @@ def connect(
     CityError
         If nothing answers there, or it has no workers.
     ConfigError
-        If it cannot be reached that way, or a worker does not meet the terms: see `tiler.transport` and
-        `tiler.cluster_check`.
+        If it cannot be reached that way, or a worker does not meet the terms: see `tiler.scheduler.transport` and
+        `tiler.scheduler.check`.
 
     Notes
     -----

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pipeline.errors import OutputError
 from tiler.events import EventLog, begin_file
-from tiler.object_path import ObjectPath
-from tiler.object_requests import WAITS
+from tiler.objects.path import ObjectPath
+from tiler.objects.requests import WAITS
 from tiler.task import WAITED, Record
 from tiler.watching import Watcher
 

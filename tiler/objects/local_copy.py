@@ -11,7 +11,7 @@ from pipeline.errors import InputError
 from tiler.places import in_bucket
 
 if TYPE_CHECKING:
-    from tiler.object_path import ObjectPath
+    from tiler.objects.path import ObjectPath
 
 READ_BYTES = 1 << 23  # of one request
 

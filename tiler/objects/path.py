@@ -11,8 +11,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TypeVar, cast
 
-from tiler.object_requests import ask
-from tiler.range_file import RangeFile
+from tiler.objects.range_file import RangeFile
+from tiler.objects.requests import ask
 
 T = TypeVar("T")
 FILE, FOLDER = "file", "folder"
@@ -55,7 +55,7 @@ class ObjectPath:
     Raises
     ------
     OSError, StoreUnreachableError
-        From all methods that ask the store, as `tiler.object_requests.ask`.
+        From all methods that ask the store, as `tiler.objects.requests.ask`.
     """
 
     __slots__ = ("_kind", "key", "patience", "root")

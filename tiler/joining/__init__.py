@@ -1,0 +1,1 @@
+"""`citystitch join`: processes that work at one run through its folder alone."""
