@@ -23,6 +23,7 @@ from tiler.objects.path import ObjectPath
 from tiler.objects.range_file import RangeFile
 from tiler.places import StoreUnreachableError, absolute, place
 from tiler.run import run
+from tiler.stage import Scope
 from tiler.store import Store
 
 obstore = pytest.importorskip("obstore")
@@ -369,3 +370,39 @@ def test_an_object_that_would_lead_out_of_the_folder_is_not_fetched(memory: Memo
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="nothing lies below"):
         fetch_run("s3://bucket/none", tmp_path / "out", lambda _: None)
+
+
+def test_an_address_that_never_answered_is_given_up_soon(
+    memory: Memory, hasty: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(object_requests, "FIRST_PATIENCE", 0.05)
+    monkeypatch.setattr(object_requests, "_answered", set())
+    monkeypatch.setattr(object_requests.WAITS, "working", False)
+    begin = time.monotonic()
+
+    def rule() -> None:
+        if time.monotonic() < begin + 0.3:
+            raise obstore.exceptions.GenericError("HTTP error: error sending request")
+
+    memory.rule = rule
+    with pytest.raises(StoreUnreachableError, match="nothing has answered at s3://bucket .*check the address"):
+        bucket().read_bytes()
+    monkeypatch.setattr(object_requests.WAITS, "working", True)  # a worker that starts in a pause waits
+    bucket().write_bytes(b"x")
+    monkeypatch.setattr(object_requests.WAITS, "working", False)
+    begin = time.monotonic()  # as does who was answered before
+    assert bucket().read_bytes() == b"x"
+
+
+def test_who_does_tasks_waits(
+    memory: Memory, hasty: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from tiler import task as tasks
+
+    monkeypatch.setattr(tasks, "WAITS", object_requests.WAITS)
+    assert not object_requests.WAITS.working
+    given = tasks.Task(
+        "s", "n", Scope.TILE, (0.0, 0.0, 1.0, 1.0), None, None, "", Store(tmp_path), {}, "k", tmp_path
+    )
+    tasks.run_task(lambda _: {}, given)
+    assert object_requests.WAITS.working

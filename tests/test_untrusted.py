@@ -351,7 +351,7 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
     ("a pipe", pipe("house.gpkg"), "house.gpkg", 1, "is no regular file"),
     ("empty Parquet", written("", "house.parquet"), "house.parquet", 1, "is empty"),
     ("text Parquet", written("hello", "house.parquet"), "house.parquet", 1, "cannot be read as GeoParquet"),
-    ("a server", lambda _: None, "https://127.0.0.1:9/a.gpkg", 1, "no such file"),
+    ("a server", lambda _: None, "https://127.0.0.1:9/a.gpkg", 1, "nothing has answered at https://127.0.0.1:9"),
     ("a virtual file", lambda _: None, "/vsicurl/http:/127.0.0.1:9/a.gpkg", 1, "no such file"),
     ("half a GPKG", cut("house.gpkg", 0.5), "house.gpkg", 1, "cannot be read"),
     ("deep GeoJSON", written(DEEP, "a.geojson"), "a.geojson", 1, "cannot be read"),
@@ -388,7 +388,17 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
 @pytest.mark.parametrize(
     ("damage", "name", "code", "text"), [case[1:] for case in FOOTPRINTS], ids=[case[0] for case in FOOTPRINTS]
 )
-def test_footprints(city: Path, capsys: Capture, damage: Damage, name: str, code: int, text: str) -> None:
+def test_footprints(
+    city: Path,
+    capsys: Capture,
+    monkeypatch: pytest.MonkeyPatch,
+    damage: Damage,
+    name: str,
+    code: int,
+    text: str,
+) -> None:
+    monkeypatch.setattr("tiler.objects.requests.FIRST_PATIENCE", 0.1)
+    monkeypatch.setattr("tiler.objects.requests.WAITS.working", False)
     damage(city)
     houses = name if name.startswith(("http", "/")) else str(city / name)
     found = call(capsys, "run", city / "cloud.laz", "--footprints", houses, "--out", city / "out", *QUICK)

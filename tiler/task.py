@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import CityError
 from pipeline.notes import Note, count_notes
+from tiler.objects.requests import WAITS
 from tiler.places import in_bucket
 from tiler.stage import Box, Facts, Scope
 from tiler.store import Store, Writer, plain_json
@@ -269,6 +270,7 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
     RuntimeError with the text stands for one that cannot be pickled.
     """
     start, waited = time.perf_counter(), _waited(task)
+    WAITS.working = True
     try:
         earlier = _take_earlier(task)
         if isinstance(earlier, Record):
@@ -306,7 +308,6 @@ def _waited(task: Task) -> float:
     """Seconds that this process has waited for buckets so far."""
     if not in_bucket(task.folder):
         return 0.0
-    from tiler.objects.requests import WAITS
 
     return WAITS.seconds
 

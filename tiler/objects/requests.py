@@ -24,6 +24,7 @@ FIRST_DELAY, LONGEST_DELAY = (
     0.1,
     10.0,
 )  # s between two tries, doubled each time, a random half of it taken off
+FIRST_PATIENCE = 20.0  # s for one that has never answered: its address may be wrong
 TOLD_AFTER = 5.0  # s of waiting before somebody is told
 TIMEOUT = timedelta(seconds=120)  # of one request
 CONNECT_TIMEOUT = timedelta(seconds=10)
@@ -52,6 +53,8 @@ class Waits:
         Of a driver: items whose workers waited, and how long in all.
     tell : callable or None
         Called with a sentence when such a pause begins and ends.
+    working : bool
+        Whether this process does tasks: their run has begun, and they wait for a store that never answered here.
     """
 
     retries: int = 0
@@ -60,6 +63,7 @@ class Waits:
     tasks: int = 0
     task_seconds: float = 0.0
     tell: Callable[[str], None] | None = None
+    working: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def say(self, text: str) -> None:
@@ -69,6 +73,7 @@ class Waits:
 
 
 WAITS = Waits()
+_answered: set[str] = set()  # roots that have given any sound answer to this process
 
 
 def ask(place: object, patience: float, request: Callable[[Any], T], root: str) -> T:
@@ -96,7 +101,7 @@ def ask(place: object, patience: float, request: Callable[[Any], T], root: str) 
     OSError
         If the store refuses the request for another reason.
     StoreUnreachableError
-        If it has not answered in time.
+        If it has not answered in time; `FIRST_PATIENCE` where it never has, but in tasks.
     ConfigError
         If obstore is not installed.
     """
@@ -106,10 +111,14 @@ def ask(place: object, patience: float, request: Callable[[Any], T], root: str) 
             found = request(_client(root))
             break
         except Exception as error:
-            reason = _judge(error)
+            reason = _judge_answer(error, root)
         now = time.monotonic()
         began = began or now
         waited = now - began
+        if waited >= FIRST_PATIENCE and not WAITS.working and root not in _answered:
+            raise StoreUnreachableError(
+                f"{place}: nothing has answered at {root} for {waited:.0f} s ({reason}); check the address"
+            )
         if waited >= patience:
             _count(waited, told)
             raise StoreUnreachableError(
@@ -123,6 +132,7 @@ def ask(place: object, patience: float, request: Callable[[Any], T], root: str) 
             WAITS.retries += 1
         time.sleep(min(delay * random.uniform(0.5, 1.0), max(patience - waited, 0.0)))
         delay = min(2 * delay, LONGEST_DELAY)
+    _answered.add(root)
     if began:
         _count(time.monotonic() - began, told)
         if told:
@@ -134,6 +144,18 @@ def _count(seconds: float, told: bool) -> None:
     with WAITS.lock:
         WAITS.seconds += seconds
         WAITS.pauses += told
+
+
+def _judge_answer(error: Exception, root: str) -> str:
+    """Judge as `_judge`, and take note where that is an answer."""
+    try:
+        reason = _judge(error)
+    except (OSError, ChangedError):
+        _answered.add(root)
+        raise
+    if reason.startswith("status"):
+        _answered.add(root)
+    return reason
 
 
 def _judge(error: Exception) -> str:
