@@ -385,7 +385,7 @@ def test_an_address_that_never_answered_is_given_up_soon(
             raise obstore.exceptions.GenericError("HTTP error: error sending request")
 
     memory.rule = rule
-    with pytest.raises(StoreUnreachableError, match="nothing has answered at s3://bucket .*check the address"):
+    with pytest.raises(StoreUnreachableError, match=r"nothing has answered at s3://bucket .*check the address"):
         bucket().read_bytes()
     monkeypatch.setattr(object_requests.WAITS, "working", True)  # a worker that starts in a pause waits
     bucket().write_bytes(b"x")
