@@ -32,7 +32,7 @@ from tiler.sequence import make_engine, run_stages
 from tiler.summary import summarise_run
 from tiler.task import Record
 
-SAMPLED = 50_000  # tasks between two looks at memory
+SAMPLED = 10_000  # tasks between two looks at memory
 SETTLE = 3.0  # s after which a cluster is quiet
 
 
@@ -47,6 +47,7 @@ class Meter(RunProgress):
     def __init__(self, out: Path, config: Config, plan: Plan, *, stop_after: int = 0) -> None:
         super().__init__(out, config, {s.name: len(plan.layout.boxes(s.scope)) for s in list_stages(config)})
         self.peak, self.done, self.stop_after = memory(), 0, stop_after
+        self.samples: list[tuple[int, float]] = []  # tasks done, and memory (MB)
         self.stop: Callable[[], None] = lambda: None
 
     def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
@@ -54,8 +55,9 @@ class Meter(RunProgress):
         super().__call__(stage, done, total, record)
         self.done += 1
         if self.done % SAMPLED == 0:
-            self.peak = max(self.peak, memory())
-            print(f"{stage}: {self.done} tasks, {memory():.0f} MB", file=sys.stderr, flush=True)
+            self.samples.append((self.done, memory()))
+            self.peak = max(self.peak, self.samples[-1][1])
+            print(f"{stage}: {self.done} tasks, {self.samples[-1][1]:.1f} MB", file=sys.stderr, flush=True)
         if self.done == self.stop_after:
             self.stop()
 
@@ -144,6 +146,7 @@ def _told(meter: Meter, engine: Engine, begin: float) -> dict[str, Any]:
         "records": len(engine.records),
         "memory_run": now,
         "peak": max(meter.peak, now),
+        "samples": meter.samples[:: max(len(meter.samples) // 10, 1)],
     }
 
 
