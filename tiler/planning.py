@@ -13,6 +13,7 @@ from tiler.clouds import CloudHeader, find_clouds, read_header
 from tiler.config import Config, idle_parameters
 from tiler.context import choose_tiles, make_layout, tile_key
 from tiler.crs import resolve_crs
+from tiler.objects.requests import WAITS
 from tiler.places import in_bucket, place
 from tiler.region import (
     Region,
@@ -111,6 +112,7 @@ def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
     CityError
         If an input is missing or unreadable, or does not fit the others.
     """
+    WAITS.working = False  # whatever this process did before
     found = survey_inputs(config, say)
     layout = make_layout(found.grid, file_items(found.clouds), identity=found.region.crs)
     return Plan(found.region, found.headers, found.messages, found.unreadable, found.grid, layout, found)
