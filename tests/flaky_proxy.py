@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+from tests.loopback import serving
+
 OWN = {"connection", "transfer-encoding", "keep-alive", "content-length", "date", "server"}
 ERRORS = {
     "403": b"<Error><Code>AccessDenied</Code><Message>Access Denied</Message></Error>",
@@ -112,12 +114,5 @@ def flaky_proxy(port: int) -> Iterator[FlakyProxy]:
     """Run a proxy in a thread."""
     proxy = FlakyProxy(port)
     handler = type("Handler", (_Handler,), {"proxy": proxy})
-    with _Server(("127.0.0.1", 0), handler) as server:
-        proxy.url = f"http://127.0.0.1:{server.server_port}"
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
-        thread.start()
-        try:
-            yield proxy
-        finally:
-            server.shutdown()
-            thread.join()
+    with serving(_Server(("127.0.0.1", 0), handler)) as proxy.url:
+        yield proxy

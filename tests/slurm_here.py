@@ -14,6 +14,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.loopback import free_ports
+
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
 PATH = f"{os.environ['PATH']}{os.pathsep}/usr/sbin{os.pathsep}/sbin"
 NODES = 4
@@ -143,7 +145,7 @@ def skip_without_slurm() -> None:
 def slurm_here(folder: Path) -> Iterator[Slurm]:
     """Start a SLURM of four nodes in a folder; all its processes end with the context."""
     skip_without_slurm()
-    host, ports = socket.gethostname().split(".")[0], _free_ports(NODES + 1)
+    host, ports = socket.gethostname().split(".")[0], free_ports(NODES + 1)
     text = SETTINGS.format(folder=folder, host=host, ports=ports)
     for k, port in enumerate(ports[1:], 1):
         text += NODE.format(k=k, host=host, port=port, cpus=CPUS, memory=MEMORY)
@@ -216,11 +218,3 @@ def _environment(process: psutil.Process) -> list[bytes]:
         return Path(f"/proc/{process.pid}/environ").read_bytes().split(b"\0")
     except OSError:
         return []
-
-
-def _free_ports(n: int) -> list[int]:
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(n)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [one.getsockname()[1] for one in sockets]

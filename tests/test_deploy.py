@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ import yaml
 from dask.utils import parse_bytes, parse_timedelta
 from packaging.requirements import Requirement
 
+from tests.loopback import free_ports
 from tests.sparse_city import ROOT, make_city
 from tests.test_run import hashes
 from tiler import fork_server
@@ -229,14 +229,6 @@ def test_the_dockerfile_passes_hadolint(tmp_path: Path) -> None:
     done = subprocess.run([hadolint, str(bad)], capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "DL3000" in done.stdout
-
-
-def free_ports(n: int) -> list[int]:
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(n)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [one.getsockname()[1] for one in sockets]
 
 
 def environment() -> dict[str, str]:

@@ -8,16 +8,12 @@ from tiler.config import Config
 from tiler.context import seam_name, tile_key
 from tiler.executors import serial
 from tiler.folder_lock import only_run
-from tiler.out_folder import (
-    PIECES,
-)
+from tiler.out_folder import PIECES
 from tiler.own_stages import OwnStages
 from tiler.padding import plan_alone
 from tiler.places import refuse_bucket
 from tiler.planning import check_sources, make_plan
-from tiler.quarantine import (
-    config_alone,
-)
+from tiler.quarantine import config_alone
 from tiler.sequence import make_engine, run_city_stages
 from tiler.settling import domain_of_run, take_domain
 from tiler.stages.mesh import mesh_stages

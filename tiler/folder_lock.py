@@ -196,11 +196,11 @@ def _wait_for_death(path: Path, owner: Owner, say: Callable[[str], None], *, loc
         return  # the system would have refused the lock
     alive = is_alive(owner)
     if alive is None:
-        say(f"{path.parent}: {_words(owner)} was at work there; listening for {SILENCE:g} s whether it is")
+        say(f"{path.parent}: {tell_owner(owner)} was at work there; listening for {SILENCE:g} s whether it is")
         alive = _hears(path, owner)
     if alive:
         raise ConfigError(f"{path.parent}: {BUSY}{_name(owner)}; {NEXT}")
-    say(f"{path.parent}: taken over from {_words(owner)}, which is dead")
+    say(f"{path.parent}: taken over from {tell_owner(owner)}, which is dead")
 
 
 def _hears(path: Path, owner: Owner) -> bool:
@@ -267,10 +267,11 @@ def _read_owner(path: Path) -> Owner | None:
 
 
 def _name(owner: Owner | None) -> str:
-    return f" ({_words(owner)})" if owner is not None else ""
+    return f" ({tell_owner(owner)})" if owner is not None else ""
 
 
-def _words(owner: Owner) -> str:
+def tell_owner(owner: Owner) -> str:
+    """Say who has a folder."""
     return f"process {owner.pid} on {owner.host}"
 
 

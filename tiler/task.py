@@ -306,10 +306,7 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
 
 def _waited(task: Task) -> float:
     """Seconds that this process has waited for buckets so far."""
-    if not in_bucket(task.folder):
-        return 0.0
-
-    return WAITS.seconds
+    return WAITS.seconds if in_bucket(task.folder) else 0.0
 
 
 def _take_earlier(task: Task) -> Record | str:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import CityError, OutputError
-from tiler.folder_lock import Owner, is_alive, this_process
+from tiler.folder_lock import Owner, is_alive, tell_owner, this_process
 
 BEAT = 3.0  # s between two heartbeats
 SILENCE = 30.0  # s without one, after which a process counts as dead
@@ -56,7 +56,7 @@ class Holder:
 
     def tell(self) -> str:
         """Name it for people."""
-        return f"{self.member} (process {self.owner.pid} on {self.owner.host})"
+        return f"{self.member} ({tell_owner(self.owner)})"
 
 
 def this_holder(member: str, workers: int, parameters: Mapping[str, Any]) -> Holder:

@@ -7,11 +7,10 @@ from pipeline.errors import ConfigError, InputError
 from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.folder_lock import LOCK, is_held, only_run
+from tiler.objects.local_copy import copy_object
 from tiler.objects.path import ObjectPath
 from tiler.out_folder import check_folder
 from tiler.places import in_bucket, place
-
-READ_BYTES = 1 << 23  # of one request
 
 
 def fetch_run(source: str, folder: Path, tell: Callable[[str], None]) -> bool:
@@ -75,9 +74,8 @@ def _fetch(source: ObjectPath, path: Path, size: int) -> bool:
         return False
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with replacing(path) as part, part.open("wb") as file, source.open() as data:
-            while block := data.read(READ_BYTES):
-                file.write(block)
+        with replacing(path) as part:
+            copy_object(source, part)
     except FileNotFoundError as error:
         raise InputError(f"{source}: was taken away meanwhile; fetch again") from error
     return True

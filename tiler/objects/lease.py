@@ -163,4 +163,4 @@ def _text(owner: Owner, beats: int) -> bytes:
 
 
 def _words(owner: Owner | None) -> str:
-    return f" (process {owner.pid} on {owner.host})" if owner is not None else ""
+    return f" ({folder_lock.tell_owner(owner)})" if owner is not None else ""

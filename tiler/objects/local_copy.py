@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shutil
 import tempfile
 import uuid
 from pathlib import Path
@@ -48,13 +49,19 @@ def local_copy(path: Path) -> Path:
         folder.mkdir(mode=0o700, exist_ok=True)
         part = folder / f".{uuid.uuid4().hex}.part"
         try:
-            _fetch(path, part)
+            copy_object(path, part)
             os.replace(part, copy)
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be fetched ({error.strerror}); check the URL and free space") from error
     return copy
+
+
+def copy_object(source: "ObjectPath", path: Path) -> None:
+    """Copy an object to a new file, by ranges; OSError if either refuses."""
+    with source.open() as data, path.open("xb") as file:
+        shutil.copyfileobj(data, file, READ_BYTES)
 
 
 def _own_folder() -> Path:
@@ -65,9 +72,3 @@ def _own_folder() -> Path:
     if folder.is_symlink() or state.st_uid != os.getuid() or state.st_mode & 0o022:
         raise InputError(f"{folder}: is not this user's alone; remove it, or set TMPDIR to another folder")
     return folder
-
-
-def _fetch(path: "ObjectPath", part: Path) -> None:
-    with path.open("rb") as source, part.open("xb") as file:
-        while block := source.read(READ_BYTES):
-            file.write(block)

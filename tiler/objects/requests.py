@@ -20,10 +20,8 @@ from pipeline.errors import ConfigError
 from tiler.places import StoreUnreachableError
 
 T = TypeVar("T")
-FIRST_DELAY, LONGEST_DELAY = (
-    0.1,
-    10.0,
-)  # s between two tries, doubled each time, a random half of it taken off
+# s between two tries, doubled each time, up to a half of it taken off at random
+FIRST_DELAY, LONGEST_DELAY = 0.1, 10.0
 FIRST_PATIENCE = 20.0  # s for one that has never answered: its address may be wrong
 TOLD_AFTER = 5.0  # s of waiting before somebody is told
 TIMEOUT = timedelta(seconds=120)  # of one request

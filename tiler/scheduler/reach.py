@@ -11,7 +11,7 @@ from tiler.clouds import find_clouds
 from tiler.config import Config
 from tiler.executors import Dask, Executor
 from tiler.limits import Limits
-from tiler.places import is_url
+from tiler.places import absolute, is_url
 from tiler.scheduler.check import check_cluster
 from tiler.scheduler.terms import Terms, offer_terms, own_terms
 from tiler.scheduler.transport import NO_FILES, TlsFiles, check_answer, make_security
@@ -60,14 +60,10 @@ def spell_out(config: Config) -> Config:
         return config
     return dataclasses.replace(
         config,
-        pointcloud=tuple(_absolute(source) for source in config.pointcloud),
-        footprints=_absolute(config.footprints) if config.footprints else "",
-        out=_absolute(config.out),
+        pointcloud=tuple(map(absolute, config.pointcloud)),
+        footprints=absolute(config.footprints) if config.footprints else "",
+        out=absolute(config.out),
     )
-
-
-def _absolute(place: str) -> str:
-    return place if is_url(place) else str(Path(place).absolute())
 
 
 @contextmanager
