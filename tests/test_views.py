@@ -360,6 +360,15 @@ def test_libraries_are_silent(tmp_path: Path) -> None:
         assert "child" in process.stderr if seen else process.stderr == ""
 
 
+def test_logs_of_libraries_are_silent() -> None:
+    """Dask tells of closed connections after its cluster has let go of its logs; others are as open."""
+    code = "import logging, sys; from tiler.cli import main; sys.argv = ['citystitch', 'config']; main();"
+    code += "import distributed; names = ['distributed.batched', 'distributed.client', 'tornado', 'asyncio'];"
+    code += "[logging.getLogger(name).critical('said by %s', name) for name in names]"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stderr == ""
+
+
 def in_tmux(words: list[str], width: int, folder: Path) -> Iterator[str]:
     """Run a command in a terminal of tmux; gives what its screen shows, again and again, and at the end all."""
     server, done = f"citystitch-{os.getpid()}-{width}", folder / "done"

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+import logging
 import os
 import sys
 import tempfile
@@ -82,7 +83,13 @@ def _find_cache() -> None:
 
 
 def _silence_libraries() -> None:
-    """Keep the warnings of libraries from the user, who can do nothing about them, here and in workers."""
+    """
+    Keep the warnings of libraries from the user, who can do nothing about them, here and in workers.
+
+    Their logs are kept from the terminal in this process alone: Dask adds no handler of its own where there is one
+    already, and says a lot, with tracebacks, about connections that end when a run is interrupted.
+    """
+    logging.getLogger().addHandler(logging.NullHandler())
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
         os.environ["PYTHONWARNINGS"] = "ignore"
