@@ -1,5 +1,6 @@
 """Somebody's scheduler: workers of other versions or on another disk are refused, before a run and in it."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -200,10 +201,11 @@ def test_tasks_that_cannot_be_sent_end_a_run_and_nothing_waits_for_them(client: 
     assert len(engine.store.names("b")) == len(engine.layout.tiles)
 
 
-def test_paths_of_a_run_on_a_cluster_are_absolute() -> None:
+@pytest.mark.parametrize("workers", [{"scheduler": "tcp://a:1"}, {"cluster": "slurm.toml"}])
+def test_paths_of_a_run_on_a_cluster_are_absolute(workers: dict[str, str]) -> None:
     given = Config(pointcloud=("a/*.laz",), footprints="f.gpkg", out="out")
     assert spell_out(given) == given
-    found = spell_out(Config(pointcloud=("a/*.laz",), footprints="f.gpkg", out="out", scheduler="tcp://a:1"))
+    found = spell_out(dataclasses.replace(given, **workers))  # type: ignore[arg-type]
     here = str(Path.cwd())
     assert found.pointcloud == (f"{here}/a/*.laz",)
     assert (found.footprints, found.out) == (f"{here}/f.gpkg", f"{here}/out")

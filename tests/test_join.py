@@ -25,7 +25,7 @@ from tiler.folder_lock import is_held, only_run
 from tiler.joining import lease as leases
 from tiler.joining import mailbox
 from tiler.joining.crew import Crew, Given
-from tiler.joining.join import ARRAY_INDEX, join, name_member
+from tiler.joining.join import ARRAY_INDEX, describe_member, join, name_member
 from tiler.joining.lease import (
     Holder,
     Lease,
@@ -545,6 +545,21 @@ def members(city: SparseCity, tmp_path: Path, request: pytest.FixtureRequest) ->
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+
+
+def test_members_of_other_folders_have_the_same_parameters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A path is the file that it means; a URL is itself wherever a member was started."""
+    url = "https://host/a.laz"
+    (tmp_path / "a").mkdir()
+    monkeypatch.chdir(tmp_path)
+    first = describe_member(make_config({"pointcloud": [url, "b.laz"], "out": "s3://bucket/run"}))
+    monkeypatch.chdir(tmp_path / "a")
+    second = describe_member(make_config({"pointcloud": [url, "../b.laz"], "out": "s3://bucket/run"}))
+    assert first == second
+    assert (first["pointcloud"], first["footprints"]) == ([url, str(tmp_path / "b.laz")], "")
+    assert first != describe_member(make_config({"pointcloud": [url, "b.laz"], "out": "s3://bucket/run"}))
 
 
 @pytest.mark.long

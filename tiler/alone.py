@@ -12,6 +12,7 @@ from tiler.out_folder import PIECES
 from tiler.own_stages import OwnStages
 from tiler.padding import plan_alone
 from tiler.places import refuse_bucket
+from tiler.plain_text import say_nothing
 from tiler.planning import check_sources, make_plan
 from tiler.quarantine import config_alone
 from tiler.sequence import make_engine, run_city_stages
@@ -44,7 +45,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
     """
     check_sources(config)
     refuse_bucket(config.out, "--only")
-    whole = make_plan(config, _silent)
+    whole = make_plan(config, say_nothing)
     domain, tallest = domain_of_run(config)
     pad, store = None, None
     if config.padded:
@@ -54,7 +55,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
     out = Path(alone.out)
     out.mkdir(parents=True, exist_ok=True)
     with only_run(out, say):
-        plan = make_plan(alone, say or _silent)
+        plan = make_plan(alone, say or say_nothing)
         for folder in PIECES:
             (out / folder).mkdir(exist_ok=True)
         with serial() as executor:
@@ -66,7 +67,3 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
             (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
             engine.run(pieces, items={"pieces": [tile]})
     return out / "mesh" / f"{tile}.vtu"
-
-
-def _silent(_: str) -> None:
-    """Say nothing."""

@@ -3,7 +3,6 @@
 import os
 import shutil
 import tempfile
-import threading
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,7 +31,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     if in_bucket(path):
         part = Path(tempfile.gettempdir()) / f"citystitch-{uuid.uuid4().hex}.part{path.suffix}"
     else:
-        part = path.with_name(f".{path.stem}.{os.getpid()}.{threading.get_ident()}.part{path.suffix}")
+        part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part{path.suffix}")
     try:
         try:
             yield part
@@ -70,7 +69,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     OutputError
         If the folder cannot be written; then `path` is not there, or is the old folder.
     """
-    stem = f".{path.name}.{os.getpid()}.{threading.get_ident()}"
+    stem = f".{path.name}.{uuid.uuid4().hex}"
     part, old = path.with_name(f"{stem}.part"), path.with_name(f"{stem}.old")
     try:
         try:

@@ -296,7 +296,7 @@ def _run_config(
     dashboard: str | None = None,
     report: bool = False,
 ) -> int:
-    if config.workers and not config.scheduler and not config.cluster:
+    if config.workers and not config.on_cluster:
         fork_server.begin()
     from tiler.events import EventLog, open_log
     from tiler.out_folder import refuse_result

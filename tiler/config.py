@@ -260,6 +260,11 @@ class Config:
     )
 
     @property
+    def on_cluster(self) -> bool:
+        """Whether workers are of a cluster, not of this machine."""
+        return bool(self.scheduler or self.cluster)
+
+    @property
     def padded(self) -> bool:
         """Whether there is a pad around the region."""
         return any(width != 0 for width in self.pad)

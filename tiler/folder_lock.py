@@ -15,6 +15,7 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError, InputError, OutputError
 from tiler.places import in_bucket
+from tiler.plain_text import say_nothing
 
 LOCK = ".run.lock"  # in the folder of a run, as long as the run is at work
 ASKED = 5  # how often a lock is asked for that another process holds
@@ -82,11 +83,11 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
     if in_bucket(folder):
         from tiler.objects.lease import only_run_in_bucket
 
-        with only_run_in_bucket(folder, say or _silent) as lease:
+        with only_run_in_bucket(folder, say or say_nothing) as lease:
             yield lease.check
         return
     path = folder / LOCK
-    file, locked = _take(path, say or _silent)
+    file, locked = _take(path, say or say_nothing)
     try:
         stop = threading.Event()
         beat = threading.Thread(target=_beat, args=(file, stop), daemon=True)
@@ -277,10 +278,6 @@ def tell_owner(owner: Owner) -> str:
 
 def _hold() -> None:
     """Do nothing: the system holds the lock."""
-
-
-def _silent(_: str) -> None:
-    """Say nothing."""
 
 
 def this_process() -> Owner:

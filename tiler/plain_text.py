@@ -54,5 +54,9 @@ def shorten(text: str, length: int) -> str:
     return text[: length - len(mark)] + mark
 
 
+def say_nothing(_: str) -> None:
+    """Take a line for a user who wants none."""
+
+
 def _escape(sign: str) -> str:
     return sign.encode("unicode_escape", errors="surrogatepass").decode("ascii")

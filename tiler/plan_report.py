@@ -18,6 +18,7 @@ from tiler.config import Config
 from tiler.footprint_sample import FootprintSample, sample_footprints
 from tiler.forecast import CELLS_A_POINT, Forecast, forecast_run
 from tiler.limits import machine_memory
+from tiler.plain_text import say_nothing
 from tiler.planning import Survey, check_sources, survey_inputs
 from tiler.terminal import plain
 
@@ -59,9 +60,9 @@ def plan_run(
     for path in (json_file, picture):
         if path is not None and not path.parent.is_dir():
             raise ConfigError(f"{path}: there is no folder {path.parent}; make it, or choose another")
-    survey = survey_inputs(config, _silent)
+    survey = survey_inputs(config, say_nothing)
     sample = sample_footprints(config, survey.region)
-    memory = None if config.scheduler else machine_memory()
+    memory = None if config.on_cluster else machine_memory()
     forecast = forecast_run(survey, sample, config, memory=memory)
     plan = describe_plan(survey, sample, forecast, config, memory)
     _print_plan(plan, console or _console())
@@ -257,7 +258,3 @@ def _km(metres: float) -> str:
 def _console() -> Console:
     console = Console(highlight=False)
     return console if console.width <= WIDTH else Console(highlight=False, width=WIDTH)
-
-
-def _silent(_: str) -> None:
-    """Say nothing: the plan lists the messages."""

@@ -332,9 +332,7 @@ def _find_damage(out: Path) -> dict[str, str]:
 
 def _foresee(plan: Plan, config: Config) -> list[str]:
     """Say which tiles may not fit into the memory of this machine."""
-    return (
-        [] if config.scheduler or config.cluster else warn_of_memory(plan.survey, config, memory=machine_memory())
-    )
+    return [] if config.on_cluster else warn_of_memory(plan.survey, config, memory=machine_memory())
 
 
 def tell_error(error: BaseException) -> str:

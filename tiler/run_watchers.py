@@ -74,7 +74,7 @@ def begin_watching(
         bounds=plan.region.bounds,
         crs=plan.region.crs,
         tile_size=config.tile_size,
-        workers=0 if config.scheduler or config.cluster else max(config.workers, 1),
+        workers=0 if config.on_cluster else max(config.workers, 1),
         tiles=layout.tiles,
         seams=layout.seams,
         expected=expected,

@@ -19,6 +19,7 @@ from tiler.executors import KILL_AT, REFUSE_AT, ClusterError, Dask, Executor
 from tiler.jobs.queues import QUEUES, JobSize, Queue, QueueError
 from tiler.jobs.table import Cluster
 from tiler.limits import Limits
+from tiler.plain_text import say_nothing
 from tiler.task import Failure, Task
 
 JOB = "job"  # folder in that of a run, with all that its jobs need and print
@@ -82,7 +83,7 @@ def job_queue(
     limits: Limits,
     *,
     dashboard: str = ANYWHERE,
-    say: Callable[[str], None] = lambda _: None,
+    say: Callable[[str], None] = say_nothing,
 ) -> Iterator[Executor]:
     """Run tasks on workers that are jobs; all of them are cancelled with the context.
 

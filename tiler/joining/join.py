@@ -44,7 +44,8 @@ from tiler.joining.spool import HOLDER, SPOOL, Spool
 from tiler.keys import code_versions
 from tiler.limits import Limits
 from tiler.out_folder import RUN_RECORD, check_folder
-from tiler.plain_text import shorten
+from tiler.places import is_url
+from tiler.plain_text import say_nothing, shorten
 from tiler.planning import check_sources
 from tiler.run import run, tell_error
 from tiler.watching import Watcher
@@ -106,7 +107,7 @@ def join(
     CityError
         What `tiler.run.run` raises, in the process that drives; and if the folder is not free in time.
     """
-    if config.overwrite or config.scheduler or config.cluster:
+    if config.overwrite or config.on_cluster:
         what = "overwrite" if config.overwrite else "scheduler" if config.scheduler else "cluster"
         raise ConfigError(
             f"{what}: members of a run work with what is in its folder, and without a scheduler; leave it out"
@@ -125,8 +126,8 @@ def join(
     memory = int(config.memory_limit * 2**30) or share_memory(workers)
     crew = Crew(workers, Limits(config.time_limit, memory))
     try:
-        me = this_holder(name, workers, _describe(config))
-        return _Joining(config, me, crew, max_idle, views, say or _silent).go()
+        me = this_holder(name, workers, describe_member(config))
+        return _Joining(config, me, crew, max_idle, views, say or say_nothing).go()
     finally:
         crew.close()
 
@@ -309,17 +310,22 @@ def _driving(spool: Spool, lease: Lease, say: Say) -> Iterator[Executor]:
     lease.check_now()
 
 
-def _describe(config: Config) -> dict[str, Any]:
+def describe_member(config: Config) -> dict[str, Any]:
     """What all members must have in common: parameters, with the paths that they mean, and versions."""
     paths = {
-        "pointcloud": [os.path.abspath(path) for path in config.pointcloud],
-        "footprints": os.path.abspath(config.footprints) if config.footprints else "",
-        "out": os.path.abspath(config.out),
+        "pointcloud": list(map(_spell_path, config.pointcloud)),
+        "footprints": _spell_path(config.footprints),
+        "out": _spell_path(config.out),
     }
     versions = {"python": platform.python_version()} | dict(code_versions())
     plain = dataclasses.asdict(config) | paths | {f"version of {name}": text for name, text in versions.items()}
     described: dict[str, Any] = json.loads(json.dumps(plain))
     return described
+
+
+def _spell_path(text: str) -> str:
+    """Give one text for one place, whatever the current folder; the same for none and for URLs."""
+    return text if not text or is_url(text) else os.path.abspath(text)
 
 
 def _find_difference(me: Holder, driver: Holder) -> str:
@@ -329,7 +335,3 @@ def _find_difference(me: Holder, driver: Holder) -> str:
         if ours != theirs:
             return f"{name} = {shorten(str(ours), 200)} here, {shorten(str(theirs), 200)} in the run at work there"
     return ""
-
-
-def _silent(_: str) -> None:
-    """Say nothing."""

@@ -12,6 +12,7 @@ from tiler import folder_lock
 from tiler.folder_lock import BUSY, LOCK, NEXT, Owner
 from tiler.objects.path import ObjectPath
 from tiler.objects.requests import ChangedError
+from tiler.plain_text import say_nothing
 
 
 class Lease:
@@ -142,7 +143,7 @@ def _read(path: ObjectPath) -> tuple[Owner | None, str] | None:
         return None, state.e_tag
 
 
-def _lives(path: ObjectPath, owner: Owner | None, e_tag: str, say: Callable[[str], None] = lambda _: None) -> bool:
+def _lives(path: ObjectPath, owner: Owner | None, e_tag: str, say: Callable[[str], None] = say_nothing) -> bool:
     known = None if owner is None else folder_lock.is_alive(owner)
     if known is not None:
         return known

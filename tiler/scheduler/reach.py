@@ -56,7 +56,7 @@ def reach_cluster(config: Config) -> Iterator[Executor | None]:
 
 def spell_out(config: Config) -> Config:
     """Make the paths of a run absolute where it is on a cluster: a worker has another current folder."""
-    if not config.scheduler:
+    if not config.on_cluster:
         return config
     return dataclasses.replace(
         config,
