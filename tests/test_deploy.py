@@ -116,7 +116,7 @@ def test_dasks_settings_are_those_of_local_workers() -> None:
     settings = yaml.safe_load((DEPLOY / "dask.yaml").read_text())["distributed"]
     assert settings["nanny"]["pre-spawn-environ"] == dict(fork_server.ENVIRONMENT)
     memory = {"target": False, "spill": False, "pause": False, "terminate": KILL_AT}
-    assert settings["worker"] == {"memory": memory}
+    assert settings["worker"] == {"memory": memory, "profile": {"enabled": False}}
     scheduler = {"allowed-failures": 0, "worker-saturation": 1.0, "worker-ttl": "65 minutes"}
     assert settings["scheduler"] == scheduler
     # A silent worker is let live as long as a task may hold its interpreter.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from distributed import get_worker
 
 from tests.test_engine import grid_layout, make
 from tiler import fork_server
@@ -25,6 +26,7 @@ def look(task: Task) -> Facts:
         "environment": sorted(kept),
         "server": psutil.Process(os.getppid()).cmdline()[-1].startswith("from multiprocessing.forkserver"),
         "imported": "tiler.stages.mesh" in sys.modules,
+        "sampled": get_worker().periodic_callbacks.keys() & {"profile", "profile-cycle"} != set(),
     }
 
 
@@ -37,4 +39,4 @@ def test_workers_are_forked_with_their_settings_and_the_driver_keeps_its_own(tmp
         engine.run(Stage("looks", Scope.REGION, look))
     facts = engine.records["looks", "region"].facts
     expected = sorted(f"{name}={value}" for name, value in fork_server.ENVIRONMENT.items())
-    assert facts == {"environment": expected, "server": True, "imported": True}
+    assert facts == {"environment": expected, "server": True, "imported": True, "sampled": False}

@@ -332,8 +332,9 @@ def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHE
     # Everything is bound to this machine, on free ports: two runs do not meet. A dead process shows by its closed
     # connection, so a worker that is silent because its task holds the interpreter is let live. No array is in
     # Dask's hands, so there is nothing to spill and nothing to pause for. Dask's logs of transitions, of its own
-    # load and of what was submitted hold on to memory: they are kept short. A process that dies is started again
-    # by its nanny: the cluster would give up one whose process is just starting 15 s after an earlier one died.
+    # load and of what was submitted hold on to memory: they are kept short, and its samples of what a worker's
+    # thread is at, 0.2 MB a second that stay for an hour, are not taken. A process that dies is started again by
+    # its nanny: the cluster would give up one whose process is just starting 15 s after an earlier one died.
     settings = {
         "distributed.nanny.pre-spawn-environ": dict(fork_server.ENVIRONMENT),
         "distributed.worker.multiprocessing-method": fork_server.METHOD,
@@ -345,6 +346,7 @@ def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHE
         "distributed.admin.system-monitor.log-length": 600,
         "distributed.diagnostics.computations.max-history": 1,
         "distributed.deploy.lost-worker-timeout": "3650 days",
+        "distributed.worker.profile.enabled": False,
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.pause": False,

@@ -41,6 +41,7 @@ SETTINGS: Mapping[str, Any] = {
 # What a worker's own process is told; as variables, since its job has no other settings of Dask.
 VARIABLES: Mapping[str, Any] = {
     **fork_server.ENVIRONMENT,
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": False,
     "DASK_DISTRIBUTED__WORKER__MEMORY__TARGET": False,
     "DASK_DISTRIBUTED__WORKER__MEMORY__SPILL": False,
     "DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE": False,
