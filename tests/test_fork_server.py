@@ -1,5 +1,6 @@
 """Worker processes are forked from one that has imported what they need, and keep the memory that they had."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -26,6 +27,7 @@ def look(task: Task) -> Facts:
         "environment": sorted(kept),
         "server": psutil.Process(os.getppid()).cmdline()[-1].startswith("from multiprocessing.forkserver"),
         "imported": "tiler.stages.mesh" in sys.modules,
+        "frozen": gc.get_freeze_count() > 50_000,
         "sampled": get_worker().periodic_callbacks.keys() & {"profile", "profile-cycle"} != set(),
     }
 
@@ -39,4 +41,4 @@ def test_workers_are_forked_with_their_settings_and_the_driver_keeps_its_own(tmp
         engine.run(Stage("looks", Scope.REGION, look))
     facts = engine.records["looks", "region"].facts
     expected = sorted(f"{name}={value}" for name, value in fork_server.ENVIRONMENT.items())
-    assert facts == {"environment": expected, "server": True, "imported": True, "sampled": False}
+    assert facts == {"environment": expected, "server": True, "imported": True, "frozen": True, "sampled": False}

@@ -20,7 +20,7 @@ ENVIRONMENT: Mapping[str, int] = {
     "MALLOC_TRIM_THRESHOLD_": 2**28,
     "MALLOC_MMAP_THRESHOLD_": 2**25,
 }
-MODULES = ["distributed.nanny", "tiler.run"]
+MODULES = ["distributed.nanny", "tiler.run", "tiler.frozen"]
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 
 
