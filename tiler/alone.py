@@ -64,6 +64,6 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
             seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
             take_domain(engine, alone, domain, pad, store)
             engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
-            (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
+            (pieces,) = (stage for stage in piece_stages() if stage.name == "pieces")
             engine.run(pieces, items={"pieces": [tile]})
     return out / "mesh" / f"{tile}.vtu"

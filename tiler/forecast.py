@@ -195,9 +195,9 @@ def list_stages(config: Config) -> list[Stage]:
         *approach_stages(config),
         *layer_stages(config, Domain(config.expected_height, None)),
         *city_model_stages(),
-        *([fit_stage(config)] if config.padded else []),
+        fit_stage(config),
         *mesh_stages(config),
-        *piece_stages(config),
+        *piece_stages(),
     ]
 
 

@@ -41,15 +41,15 @@ def list_stages(config: Config) -> list[Stage]:
     stages = [*input_stages(config), house_stage(config), *first_round(config), shape_stage(0)]
     stages += [*later_round(config, 1), model_stage(config, 0), *domain_stages(config)]
     stages += [*approach_stages(config), *layer_stages(config, Domain(config.expected_height, None))]
-    stages += [*city_model_stages(), *([fit_stage(config)] if config.padded else [])]
-    return [*stages, *mesh_stages(config), *piece_stages(config)]
+    stages += [*city_model_stages(), fit_stage(config)]
+    return [*stages, *mesh_stages(config), *piece_stages()]
 
 
 def stages_of_pad(config: Config) -> set[str]:
     """Names of the stages that are run over region and pad; none without a pad."""
     if not config.padded:
         return set()
-    return {stage.name for stage in [*approach_stages(config), *mesh_stages(config), *piece_stages(config)]}
+    return {stage.name for stage in [*approach_stages(config), *mesh_stages(config), *piece_stages()]}
 
 
 def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, Any] | None) -> OwnStages:

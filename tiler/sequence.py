@@ -41,21 +41,23 @@ def run_stages(engine: Engine, config: Config) -> int:
     """
     rounds = run_city_stages(engine, config)
     domain = settle_domain(engine, config)
+    # Nothing waits for these: first in a call, so last of what may run, they fill the time in which others wait.
+    of_model = [fit_stage(config), *city_model_stages()]
+    meshed = [*mesh_stages(config, domain), *piece_stages()]
     if config.padded:
         engine.tell_layout()
         both = engine.layout, engine.context
         engine.lay_out(*engine.laid_out(CORE_STAGE))
-        engine.run(*city_model_stages(), fit_stage(config))
+        engine.run(*of_model)
         engine.lay_out(*both)
-        engine.run(*mesh_stages(config, domain))
+        engine.run(*meshed)
     else:
-        engine.run(*city_model_stages(), *mesh_stages(config, domain))
-    engine.run(*piece_stages(config))
+        engine.run(*of_model, *meshed)
     # Beside a tile without a piece, others were written as if they had a neighbour.
     while lost := [name for stage, name in engine.set_aside if stage == "pieces"]:
         for tile in lost:
             engine.give_up(("pieces", tile), ("columns", tile))
-        engine.run(*piece_stages(config))
+        engine.run(*piece_stages())
     return rounds
 
 

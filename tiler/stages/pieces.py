@@ -53,8 +53,8 @@ def fit_stage(config: Config) -> Stage:
     return Stage("fit", Scope.TILE, measure_fit, reads, ("dtm_spacing", "ground_filter"))
 
 
-def piece_stages(config: Config) -> list[Stage]:
-    """Stages from columns to files; where there is a pad, without that of the fit."""
+def piece_stages() -> list[Stage]:
+    """Stages from columns to files; the last reads the fit, too."""
     meshed = (Read("seams", optional=True), Read("columns", optional=True))
     beside = (Read("columns", beside=True, others_by_name=True, optional=True),)
     return [
@@ -62,7 +62,6 @@ def piece_stages(config: Config) -> list[Stage]:
         # Of the tiles around it a piece asks only which of them there are.
         Stage("pieces", Scope.TILE, write_piece, beside, version=2),
         Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces", beside=True, optional=True),)),
-        *([] if config.padded else [fit_stage(config)]),
         Stage("report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True))),
     ]
 
