@@ -105,13 +105,13 @@ def test_a_run_that_is_killed_among_faults_and_resumed_has_the_bytes_of_one_on_a
 
 
 @pytest.mark.long
-def test_a_store_that_vanishes_for_a_while_pauses_the_run(town: Town, proxy: FlakyProxy, tmp_path: Path) -> None:
+def test_a_store_that_vanishes_for_a_minute_pauses_the_run(town: Town, proxy: FlakyProxy, tmp_path: Path) -> None:
     url, gone = f"s3://{BUCKET}/paused", [0.0, 0.0]
 
     def fault(number: int, method: str, path: str) -> str:
         now = time.monotonic()
         if method == "PUT" and "/store.zarr/houses/" in path and not gone[1]:
-            gone[:] = [now, now + 20.0]
+            gone[:] = [now, now + 60.0]
         return "cut" if gone[0] <= now < gone[1] else ""
 
     proxy.fault = fault

@@ -145,7 +145,7 @@ def test_ranges_are_read_at_once_and_chunks_once(
         checked.extend(expected)
         return verified_chunks(rows, chunk, expected)
 
-    monkeypatch.setattr("tiler.store.verified_chunks", watch)
+    monkeypatch.setattr("tiler.result_reader.verified_chunks", watch)
     found = store.read_ranges("s", "n", ["numbers", "big"], ranges)
     assert list(found) == ["big", "numbers"]
     assert found["big"].tobytes() == BIG[rows].tobytes()

@@ -18,8 +18,9 @@ from pipeline.errors import CityError
 from pipeline.notes import Note, count_notes
 from tiler.objects.requests import WAITS
 from tiler.places import in_bucket
+from tiler.result_writer import Writer, plain_json
 from tiler.stage import Box, Facts, Scope
-from tiler.store import Store, Writer, plain_json
+from tiler.store import Store
 from tiler.written import FILES, check_files, find_changed_files
 
 APART = ("key",)  # attributes of a result that are no content

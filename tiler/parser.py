@@ -1,0 +1,219 @@
+"""The options of every command."""
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+from pipeline.errors import ConfigError
+from tiler.addresses import ANYWHERE
+from tiler.api import POSITIONAL
+from tiler.config import Config
+from tiler.domain import Height
+from tiler.export import FORMATS
+from tiler.jobs.commands import add_job_commands
+from tiler.places import place, refuse_bucket
+
+Handler = Callable[[argparse.Namespace], int]
+EXIT_CODES = (
+    "Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 3 done but for parts listed in run.json, "
+    "130 stopped."
+)
+METAVARS = {str: "NAME", float: "NUMBER", int: "NUMBER"}
+
+
+def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
+    """Make the parser of all commands; the parameters of a run come from `Config`.
+
+    Parameters
+    ----------
+    handlers : mapping
+        What does each command, by its name.
+    """
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--traceback", action="store_true", help="show where in the code an error arose")
+    parser = argparse.ArgumentParser(
+        prog="citystitch",
+        description="LiDAR point clouds and building footprints in, one conforming tetrahedral city mesh out.",
+        epilog=EXIT_CODES,
+    )
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    def add(name: str, handler: Handler, text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text, epilog=EXIT_CODES, parents=[common])
+        sub.set_defaults(handler=handler)
+        return sub
+
+    def command(name: str, text: str) -> argparse.ArgumentParser:
+        return add(name, handlers[name], text)
+
+    run = command("run", "mesh a region from point clouds and footprints")
+    _add_inputs(run)
+    run.add_argument(
+        "--dashboard-address",
+        default=ANYWHERE,
+        metavar="HOST:PORT",
+        help="where the page of the run is shown while it is at work (default: a free port of 127.0.0.1)",
+    )
+    run.add_argument("--no-dashboard", action="store_true", help="show no page of the run")
+    run.add_argument("--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure")
+    words = run.add_mutually_exclusive_group()
+    words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
+    words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
+    run.add_argument("--log-json", type=Path, metavar="FILE", help="write what happens, a JSON object a line")
+    run.add_argument(
+        "--report",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="write report.html at the end, as `citystitch report` does",
+    )
+    _add_join(command("join", "work at a run together with others, on any machines that share its folder"))
+    plan = command("plan", "tell what a run would do and take, without doing it")
+    plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
+    plan.add_argument("--picture", type=Path, metavar="FILE.png", help="draw tiles, files and footprints")
+    _add_inputs(plan)
+    check = command("check", "prove from the written files that a mesh is right")
+    check.add_argument("directory", type=place, help="folder of a run")
+    check.add_argument(
+        "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
+    )
+    status = command("status", "tell how far a run is, whether it is alive, and how to go on")
+    status.add_argument("job", metavar="DIRECTORY|JOB", help="folder of a run, or number of its job")
+    status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
+    board = command("dashboard", "show the page of a run, at work, ended or dead, from its folder")
+    board.add_argument("directory", type=_on_disk, help="folder of a run")
+    board.add_argument(
+        "--port", type=int, default=0, metavar="N", help="port to listen at; 0: a free one (default)"
+    )
+    board.add_argument(
+        "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
+    )
+    report = command("report", "write report.html: what a run made, how good it is, what was left out")
+    report.add_argument("directory", type=_on_disk, help="folder of a run")
+    _add_fetch(command("fetch", "fetch the folder of a run from a bucket, and verify its checksums"))
+    synth = command("synth", "write a synthetic city: point cloud and footprints")
+    synth.add_argument("directory", type=Path, help="folder to write to")
+    _add_city(synth, size=1000.0, buildings=500)
+    demo = command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one")
+    demo.add_argument("--out", type=Path, default=Path("demo"), help="folder to write to (default: demo)")
+    _add_city(demo, size=600.0, buildings=220)
+    render = command("render", "draw a picture of a run")
+    render.add_argument("directory", type=_on_disk, help="folder of a run")
+    render.add_argument("-o", "--output", type=Path, required=True, help="PNG file to write")
+    render.add_argument(
+        "--what",
+        choices=("boundary", "mesh", "overview", "tiles", "sizes", "quality", "citymodel"),
+        default="boundary",
+        help="what to draw; sizes: triangles from above, by the length of their edges; quality: the boundary by "
+        "the cells behind it; citymodel: blocks on the terrain",
+    )
+    add_job_commands(add, _add_inputs)
+    _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
+    command("config", "print all parameters of a run, annotated, as a configuration file")
+    return parser
+
+
+def _add_inputs(parser: argparse.ArgumentParser) -> None:
+    """Add point clouds, and the parameters of a run."""
+    parser.add_argument(
+        POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
+    )
+    _add_parameters(parser)
+
+
+def _add_join(join: argparse.ArgumentParser) -> None:
+    """Add the options of one that joins a run: those of the run, and a few of its own."""
+    _add_inputs(join)
+    join.add_argument("--member", default="", metavar="NAME", help="its name (default: its element of an array)")
+    join.add_argument(
+        "--max-idle",
+        type=float,
+        default=600.0,
+        metavar="SECONDS",
+        help="how long to wait for a folder that a run holds which is not one to join (default: 600)",
+    )
+    words = join.add_mutually_exclusive_group()
+    words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
+    words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
+
+
+def _add_parameters(parser: argparse.ArgumentParser) -> None:
+    """Add an option for every parameter of a run; what is not given is left to the file or default."""
+    hints = get_type_hints(Config)
+    groups: dict[str, Any] = {}
+    for entry in dataclasses.fields(Config):
+        if entry.name == POSITIONAL:
+            continue
+        data, wanted = entry.metadata, hints[entry.name]
+        group = groups.setdefault(data["section"], parser.add_argument_group(data["section"]))
+        words: dict[str, Any] = {"dest": entry.name, "default": argparse.SUPPRESS, "help": _help(entry)}
+        if wanted is bool:
+            words["action"] = argparse.BooleanOptionalAction
+        elif get_origin(wanted) is tuple and get_args(wanted)[0] == Height:
+            words |= {"type": str, "nargs": "+", "metavar": "M|nH"}
+        elif get_origin(wanted) is tuple:
+            words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
+        elif wanted == Height:
+            words |= {"type": str, "metavar": "M|nH"}
+        else:
+            unit = "" if wanted is str else data["unit"].upper()
+            words |= {"type": wanted, "metavar": unit or METAVARS[wanted]}
+            if data["choices"]:
+                words |= {"choices": data["choices"], "metavar": None}
+        group.add_argument(f"--{entry.name.replace('_', '-')}", **words)
+
+
+def _help(entry: "dataclasses.Field[Any]") -> str:
+    data = entry.metadata
+    shown = isinstance(entry.default, (int, float)) and not isinstance(entry.default, bool)
+    default = f"default: {entry.default:g}" if shown else f"default: {entry.default}" if entry.default else ""
+    facts = ", ".join(fact for fact in (default, data["unit"], data["source"]) if fact)
+    return f"{data['text']} ({facts})".replace("%", "%%") if facts else data["text"]
+
+
+def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int) -> None:
+    parser.add_argument("--size", type=float, default=size, help=f"side of the city in m (default: {size:g})")
+    parser.add_argument("--buildings", type=int, default=buildings, help=f"their number (default: {buildings})")
+    parser.add_argument("--density", type=float, default=1.5, help="points per m2 (default: 1.5)")
+    parser.add_argument("--relief", type=float, default=20.0, help="height of the hills in m (default: 20)")
+    parser.add_argument("--seed", type=int, default=1, help="same seed, same bytes (default: 1)")
+
+
+def _add_fetch(fetch: argparse.ArgumentParser) -> None:
+    fetch.add_argument("source", metavar="s3://BUCKET/NAME", help="what --out of the run was")
+    fetch.add_argument("directory", type=Path, help="folder to write")
+
+
+def _add_export(export: argparse.ArgumentParser) -> None:
+    """Add the options of all formats, and the table of these below them."""
+    export.add_argument("directory", type=_on_disk, help="folder of a run")
+    export.add_argument("--format", choices=tuple(FORMATS), metavar="NAME", required=True, help="see below")
+    export.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write")
+    export.add_argument("--overwrite", action="store_true", help="replace it if it exists")
+    given: dict[str, dict[str, Any]] = {
+        "parts": {"type": int, "metavar": "N", "help": "decomposed for N processes instead of whole"},
+        "case": {"choices": ("wind",), "help": "add the files of a simulation"},
+        "buildings": {
+            "choices": ("patches", "zones"),
+            "help": "one patch a building instead of walls and roofs; zones: one face zone beside them (openfoam)",
+        },
+        "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
+    }
+    for option, words in given.items():
+        takers = ", ".join(name for name, kind in FORMATS.items() if option in kind.options)
+        words |= {"default": argparse.SUPPRESS, "help": f"{takers}: {words['help']}"}
+        export.add_argument(f"--{option}", **words)
+    width = max(map(len, FORMATS))
+    rows = [f"  {name:<{width}}  {kind.description}" for name, kind in FORMATS.items()]
+    export.formatter_class = argparse.RawDescriptionHelpFormatter
+    export.epilog = "\n".join(["formats:", *rows, "", EXIT_CODES])
+
+
+def _on_disk(text: str) -> Path:
+    """Take the folder of a command that reads files of a disk."""
+    try:
+        refuse_bucket(text, "this command")
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return Path(text)

@@ -1,0 +1,167 @@
+"""One result of the store read back and verified: see `tiler.store` for what it is made of."""
+
+import base64
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numcodecs import Blosc
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError, OutputError
+from tiler.packing import CHUNK_HEAD, Table, check_chunk, check_entry, verified_chunks
+from tiler.places import read_at_most
+from tiler.seal import is_sealed
+
+PACKED = "_packed"
+CODECS = ["bytes", "blosc"]  # what chunks are written with
+DECODER = Blosc()  # takes how a chunk was compressed from its head
+RESERVED = ("arrays", "checksum", "digest", "files")
+GROUP = "zarr.json"  # the file of a result's attributes
+
+
+def read_group(folder: Path) -> dict[str, Any]:
+    """Read all attributes of a result; ValueError if its file is not as it was written."""
+    text = (folder / GROUP).read_bytes()
+    if not is_sealed(text):
+        raise ValueError("checksum of the attributes differs")
+    attributes: dict[str, Any] = json.loads(text)["attributes"]
+    return attributes
+
+
+def open_result(folder: Path, stage: str, name: str) -> tuple[Table, dict[str, Any], str]:
+    """Read the table of arrays, the attributes and the digest of a result."""
+    with damage(folder, stage, name, "attributes"):
+        attributes = read_group(folder)
+        table, digest = attributes["arrays"], attributes["digest"]
+        return table, {key: value for key, value in attributes.items() if key not in RESERVED}, digest
+
+
+def find_entry(folder: Path, table: Table, array: str, stage: str, name: str) -> dict[str, Any]:
+    """Look an array up: ValueError if there is none of the name, InputError if what is said of it is damaged."""
+    if array not in table or array == PACKED:
+        names = ", ".join(sorted(set(table) - {PACKED})) or "none"
+        raise ValueError(f"stage {stage}, {name}: no array {array}, it has: {names}")
+    with damage(folder, stage, name, array):
+        check_entry(table[array])
+    return table[array]
+
+
+def read_packed(folder: Path, stage: str, name: str, table: Table) -> NDArray[Any]:
+    """Read the bytes that the small arrays of a result lie in; InputError if they are damaged."""
+    with damage(folder, stage, name, PACKED):
+        entry = table[PACKED]
+        if "base64" not in entry:
+            check_entry(entry)
+    if "base64" in entry:  # under the checksum of the attributes
+        return np.frombuffer(base64.b64decode(entry["base64"]), dtype=np.uint8)
+    return read_chunks(folder, stage, name, PACKED, entry)
+
+
+def read_chunks(
+    folder: Path,
+    stage: str,
+    name: str,
+    array: str,
+    entry: Mapping[str, Any],
+    ranges: Sequence[tuple[int, int]] | None = None,
+) -> NDArray[Any]:
+    """Read rows of one zarr array, all by default, and verify every chunk that was read."""
+    n_rows, chunk = entry["shape"][0], entry["chunk"]
+    wanted = [(0, n_rows)] if ranges is None else ranges
+    parts = []
+    with damage(folder, stage, name, array):
+        form = _ChunkForm.of(entry)
+        form.check((folder / array / GROUP).read_bytes())
+        for first, last, inside in _chunks_of_ranges(wanted, chunk):
+            low, high = first * chunk, min(last * chunk, n_rows)
+            rows = np.empty((max(high - low, 0), *form.shape[1:]), form.dtype)
+            for k in range(first, last):
+                start = k * chunk
+                rows[start - low : start - low + chunk] = form.read(folder / array, k)[: high - start]
+            wrong = [first + k for k in verified_chunks(rows, chunk, entry["crc"][first:last])]
+            if wrong:
+                raise ValueError(f"checksum differs in {len(wrong)} chunks, first in chunk {wrong[0]}")
+            parts += [rows[start - low : stop - low] for start, stop in inside]
+    return join_rows(parts, rows)
+
+
+@dataclass(frozen=True)
+class _ChunkForm:
+    """How zarr keeps an array of some type and shape: in chunks of so many rows, compressed by Blosc.
+
+    zarr itself needs 2 ms to open and read a small array, a fifth of a run: its files are read here, by its codec.
+    """
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    chunk: tuple[int, ...]
+
+    @classmethod
+    def of(cls, entry: Mapping[str, Any]) -> Self:
+        """Take the form from what the store says of an array."""
+        shape = tuple(entry["shape"])
+        return cls(np.dtype(entry["dtype"]), shape, (entry["chunk"], *(max(n, 1) for n in shape[1:])))
+
+    def check(self, text: bytes) -> None:
+        """Hold zarr's own description of the array against the form; ValueError if they differ."""
+        found = json.loads(text)
+        tail = (self.dtype.itemsize,) if self.dtype.kind == "U" else ()
+        name = "uint8" if tail else self.dtype.name
+        shape, expected = tuple(found["shape"]), (*self.shape, *tail)
+        if shape != expected:
+            raise ValueError(f"shape {shape} instead of {expected}")
+        chunks = tuple(found["chunk_grid"]["configuration"]["chunk_shape"])
+        codecs = [codec["name"] for codec in found["codecs"]]
+        if found["data_type"] != name or chunks != (*self.chunk, *tail) or codecs != CODECS:
+            raise ValueError(f"chunks {chunks} of {found['data_type']} by {', '.join(codecs)}")
+
+    def read(self, folder: Path, k: int) -> NDArray[Any]:
+        """Decompress a chunk, after its size and form are known to be right."""
+        n_bytes = math.prod(self.chunk) * self.dtype.itemsize
+        further = (0,) * (len(self.chunk) - 1 + (self.dtype.kind == "U"))
+        data = read_at_most(folder / "c" / "/".join(map(str, (k, *further))), n_bytes + CHUNK_HEAD + 1)
+        check_chunk(data, n_bytes)
+        raw = np.frombuffer(DECODER.decode(data), np.uint8)
+        return raw.view(self.dtype).reshape(self.chunk)[(slice(None), *map(slice, self.shape[1:]))]
+
+
+def _chunks_of_ranges(
+    ranges: Sequence[tuple[int, int]], chunk: int
+) -> Iterator[tuple[int, int, list[tuple[int, int]]]]:
+    """Group ascending ranges of rows that share chunks: first chunk, last and one more, and the ranges."""
+    first, last, inside = 0, 0, list[tuple[int, int]]()
+    for start, stop in ranges:
+        begin, end = start // chunk, -(-stop // chunk)
+        if inside and begin >= last:
+            yield first, last, inside
+            inside = []
+        first, last = (first, max(last, end)) if inside else (begin, max(begin, end))
+        inside.append((start, stop))
+    yield first, last, inside
+
+
+def join_rows(parts: Sequence[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
+    """Put rows one after the other in memory of their own, so that no chunk stays with a few of them."""
+    if len(parts) == 1 and len(parts[0]) == len(like):
+        return parts[0]
+    return np.concatenate([like[:0], *parts])
+
+
+@contextmanager
+def damage(folder: Path, stage: str, name: str, array: str) -> Iterator[None]:
+    """Whatever zarr and its codecs raise on broken files becomes one error that says where."""
+    try:
+        yield
+    except (MemoryError, OutputError):  # a bucket that does not answer has no damage
+        raise
+    except Exception as error:
+        state = "is damaged" if (folder / GROUP).is_file() else "is not there"
+        raise InputError(
+            f"stage {stage}, {name}: {array} in {folder} {state} ({error}); run again: it is made anew"
+        ) from error

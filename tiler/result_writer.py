@@ -1,0 +1,300 @@
+"""One result of the store on its way there: see `tiler.store` for what it is made of."""
+
+import base64
+import errno
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import uuid
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import zarr
+from numpy.typing import ArrayLike, NDArray
+from zarr.codecs import BloscCodec
+
+from pipeline.errors import OutputError
+from tiler.packing import (
+    INLINE_BYTES,
+    PACKED_BYTES,
+    RowBuffer,
+    Table,
+    as_rows,
+    check_name,
+    checksums,
+    pack,
+    plain_array,
+    raw_bytes,
+    rows_per_chunk,
+)
+from tiler.places import in_bucket
+from tiler.result_reader import GROUP, PACKED, RESERVED
+from tiler.seal import seal
+from tiler.written import state_files
+
+if TYPE_CHECKING:
+    from tiler.objects.path import ObjectPath
+
+# Bytes of numbers apart, then LZ4: written three times as fast as with zarr's default, a tenth more on disk. zarr
+# calls it from threads of its own, where Blosc uses one thread: the bytes are always the same.
+COMPRESSION = BloscCodec(cname="lz4", clevel=5, shuffle="shuffle")
+PARTIAL = ".partial"
+
+
+class Writer:
+    """One result on its way into the store; nothing of it is visible before `commit`.
+
+    Leaving the context without a commit, or by an error, leaves nothing behind. The bytes on disk depend on the
+    arrays and attributes alone: not on their order, nor on how appended rows were cut into pieces.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the result will be.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._scratch = (
+            Path(tempfile.gettempdir()) / f"citystitch-{uuid.uuid4().hex}" if in_bucket(folder) else None
+        )
+        self._partial = (self._scratch or folder.parent) / f".{folder.name}.{uuid.uuid4().hex}{PARTIAL}"
+        self._small: dict[str, NDArray[Any]] = {}
+        self._buffers: dict[str, RowBuffer] = {}
+        self._table: Table = {}
+        self._hashes: dict[str, hashlib.blake2b] = {}
+
+    def __enter__(self) -> Self:
+        with self._disk():
+            self._partial.mkdir(parents=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        shutil.rmtree(self._scratch or self._partial, ignore_errors=True)
+
+    def put(self, **arrays: ArrayLike) -> None:
+        """Write whole arrays, each name once.
+
+        Raises
+        ------
+        ValueError
+            If a name came before, or an array is of a type that cannot be stored (objects, complex numbers).
+        OutputError
+            If the disk refuses.
+        """
+        for name, values in arrays.items():
+            check_name(name)
+            if name in self._small or name in self._table or name in self._buffers:
+                raise ValueError(f"array {name} is written twice")
+            array = plain_array(name, values)
+            self._hash(name, array)
+            self._put(name, array)
+
+    def append(self, **arrays: ArrayLike) -> None:
+        """Append rows to arrays, which grow chunk by chunk on disk: about 4 MB of each are held in memory.
+
+        Raises
+        ------
+        ValueError
+            If the rows differ in type or shape from those before, or the array was put.
+        OutputError
+            If the disk refuses.
+        """
+        for name, values in arrays.items():
+            check_name(name)
+            rows = plain_array(name, values)
+            if rows.ndim == 0:
+                raise ValueError(f"array {name}: a single value has no rows to append")
+            if name not in self._buffers:
+                if name in self._small or name in self._table:
+                    raise ValueError(f"array {name} is written twice")
+                self._buffers[name] = RowBuffer(name, rows)
+            self._buffers[name].add(rows)
+            self._hash(name, rows)
+            whole = self._buffers[name].whole_chunks()
+            if whole is not None:
+                self._extend(name, whole)
+
+    def discard(self) -> None:
+        """Forget all arrays that were written so far."""
+        for name in self._table:
+            shutil.rmtree(self._partial / name, ignore_errors=True)
+        self._small, self._buffers, self._table, self._hashes = {}, {}, {}, {}
+
+    def commit(self, attributes: Mapping[str, Any] | None = None, *, apart: Collection[str] = ()) -> str:
+        """Make the result visible, in place of an earlier one.
+
+        Parameters
+        ----------
+        attributes : mapping, optional
+            Plain JSON values by name, without NaN.
+        apart : collection of str
+            Attributes that are no content: they do not count for the digest.
+
+        Returns
+        -------
+        str
+            Digest of the content, 32 hexadecimal digits: BLAKE2b of name, type, shape and raw bytes of every array
+            and of the attributes. Equal content has equal digests, however it was put.
+
+        Raises
+        ------
+        ValueError
+            If the attributes are no plain JSON, or use a name of `RESERVED`.
+        OutputError
+            If the disk refuses.
+        """
+        kept = plain_json(dict(attributes or {}))
+        if set(kept) & set(RESERVED):
+            raise ValueError(f"attributes may not be named {' or '.join(RESERVED)}")
+        for name, buffer in sorted(self._buffers.items()):
+            rest = buffer.rest()
+            if name not in self._table:
+                self._put(name, rest)
+            elif len(rest):
+                self._extend(name, rest)
+        if self._small:
+            packed, table = pack(self._small)
+            if len(packed) <= INLINE_BYTES:
+                self._table[PACKED] = {"base64": base64.b64encode(packed.data).decode()}
+            else:
+                self._create(PACKED, packed)
+            self._table |= table
+        digest = self._digest({name: value for name, value in kept.items() if name not in apart})
+        kept["digest"] = digest
+        kept["arrays"] = plain_json(self._table)
+        with self._disk():
+            files = sorted(path for path in self._partial.rglob("*") if path.is_file())
+            kept |= {"files": state_files(self._partial, files), "checksum": "0" * 8}
+            zarr.create_group(str(self._partial), zarr_format=3, attributes=dict(sorted(kept.items())))
+            group = self._partial / GROUP
+            group.write_bytes(seal(group.read_bytes()))
+            self._replace()
+        return digest
+
+    def _hash(self, name: str, rows: NDArray[Any]) -> None:
+        """Hash the bytes of an array as they come: how rows were cut does not show in them."""
+        if name not in self._hashes:
+            self._hashes[name] = hashlib.blake2b(digest_size=16)
+        self._hashes[name].update(raw_bytes(rows).data)
+
+    def _digest(self, attributes: Mapping[str, Any]) -> str:
+        arrays = [
+            [name, self._table[name]["dtype"], self._table[name]["shape"], found.hexdigest()]
+            for name, found in sorted(self._hashes.items())
+        ]
+        return hash_content(arrays, attributes)
+
+    def _put(self, name: str, array: NDArray[Any]) -> None:
+        if array.nbytes <= PACKED_BYTES or array.ndim == 0:
+            self._small[name] = array.copy()
+        else:
+            self._create(name, array)
+
+    def _create(self, name: str, array: NDArray[Any]) -> None:
+        rows, chunk = as_rows(array), min(rows_per_chunk(array), max(len(array), 1))
+        self._table[name] = {
+            "dtype": array.dtype.str,
+            "shape": list(array.shape),
+            "chunk": chunk,
+            "crc": checksums(array, chunk),
+        }
+        with self._disk():
+            # Chunks of zeros are written too: how zarr tells -0.0 from 0.0 is its versions' own affair.
+            zarr.create_array(
+                str(self._partial / name),
+                data=rows,
+                chunks=(chunk, *(max(n, 1) for n in rows.shape[1:])),
+                zarr_format=3,
+                compressors=COMPRESSION,
+                config={"write_empty_chunks": True},
+            )
+
+    def _extend(self, name: str, rows: NDArray[Any]) -> None:
+        """Add rows to an array on disk that ends with a whole chunk."""
+        if name not in self._table:
+            self._create(name, rows)
+            return
+        entry = self._table[name]
+        n_old, n_new = entry["shape"][0], entry["shape"][0] + len(rows)
+        with self._disk():
+            array = zarr.open_array(str(self._partial / name), mode="r+", config={"write_empty_chunks": True})
+            array.resize((n_new, *array.shape[1:]))
+            array[n_old:n_new] = as_rows(rows)
+        entry["shape"][0] = n_new
+        entry["crc"] += checksums(rows, entry["chunk"])
+
+    def _replace(self) -> None:
+        """Rename into place; another writer of the same result may do so at the same moment."""
+        if in_bucket(self._folder):
+            from tiler.objects.results import publish
+
+            publish(self._partial, self._folder, GROUP)
+            return
+        old = self._partial.with_name(f".{self._folder.name}.{uuid.uuid4().hex}{PARTIAL}")
+        while True:
+            try:
+                os.replace(self._partial, self._folder)
+                return
+            except OSError as error:
+                if error.errno not in {errno.ENOTEMPTY, errno.EEXIST}:
+                    raise
+            try:
+                os.replace(self._folder, old)
+            except FileNotFoundError:
+                continue
+            delete(old)
+
+    @contextmanager
+    def _disk(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OutputError(
+                f"{self._folder}: cannot be written ({error}); free space there or choose another folder"
+            ) from error
+
+
+def plain_json(value: Any) -> Any:
+    """Bring a value into plain JSON (tuples become lists) with sorted keys.
+
+    Raises
+    ------
+    ValueError
+        If it holds NaN, infinity, or anything but dicts, lists, strings, numbers, booleans and None.
+    """
+    try:
+        return json.loads(json.dumps(value, sort_keys=True, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{error}; give plain JSON values, None for what is not there") from error
+
+
+def hash_content(arrays: list[list[Any]], attributes: Mapping[str, Any]) -> str:
+    """Make the digest of a result: name, type, shape and hash of each array, and the attributes that count."""
+    text = json.dumps([arrays, attributes], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def delete(path: Path) -> None:
+    """Delete a folder or a file, as far as that can be done."""
+    if in_bucket(path):
+        withdraw(path)
+    elif path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
+
+
+def withdraw(path: "ObjectPath") -> None:
+    """Delete the objects of a result or a stage, those that make it visible first."""
+    from tiler.objects.path import delete_below
+
+    delete_below(path, GROUP)
