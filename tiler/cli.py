@@ -2,6 +2,7 @@
 
 import argparse
 import gc
+import importlib
 import json
 import logging
 import os
@@ -127,7 +128,7 @@ def _run_config(
     from tiler.run import run
     from tiler.terminal import make_views, print_last_line, print_summary
 
-    gc.freeze()  # what was imported stays
+    importlib.import_module("tiler.frozen")  # after all others, once a process
     if report:
         refuse_bucket(config.out, "--report")
     out = place(config.out)
