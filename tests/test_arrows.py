@@ -19,7 +19,7 @@ COMPOSING = {"pipeline.tile", "pipeline.simplify"}
 HOMES = {
     "dask": ("tiler/",),
     "distributed": ("tiler/",),
-    "zarr": ("tiler/store.py",),
+    "zarr": ("tiler/result_writer.py",),
     "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py"),
     "laspy": ("tiler/",),
     "pyogrio": ("tiler/",),
