@@ -459,6 +459,7 @@ CONFIGS: list[tuple[str, str, str]] = [
     ("bounds of 10^12 m", inputs("bounds = [0, 0, 1e12, 1e12]"), "more than 32766 tiles of 1000 m to a side"),
     ("terrain of micrometres", inputs("[terrain]\ndtm_spacing = 1e-6"), "nodes in a tile of 1000 m"),
     ("terrain of 10^-300 m", inputs("[terrain]\ndtm_spacing = 1e-300"), "inf nodes in a tile"),
+    ("terrain of 10^300 m", inputs("[terrain]\ndtm_spacing = 1e300"), "the extent of a tile, whose terrain"),
     (
         "cells without number",
         inputs("[mesh]\nmesh_size = 0.1\ndomain_height = 1e9"),

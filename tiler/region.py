@@ -117,6 +117,12 @@ def check_sizes(region: Region, config: Config) -> None:
             f"region {_words(region.bounds)}: {n_tiles:.3g} tiles of {region.tile_size:g} m > {MOST_IN_ALL:.3g}; "
             "raise --tile-size or give smaller --bounds"
         )
+    extent = min(region.tile_size, max(width, height))
+    if config.dtm_spacing > extent:
+        raise ConfigError(
+            f"dtm_spacing = {config.dtm_spacing:g} m > {extent:g} m, the extent of a tile, whose terrain may "
+            "have no node; lower --dtm-spacing"
+        )
     area = min(width, 1.5 * region.tile_size) * min(height, 1.5 * region.tile_size)
     nodes = area / config.dtm_spacing**2 if config.dtm_spacing > 1e-9 else math.inf
     if nodes > MOST_NODES:
