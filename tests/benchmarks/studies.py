@@ -370,7 +370,12 @@ def _growth(rows: list[dict[str, Any]], name: str, key: str) -> list[str]:
     series = {step: [row["steps"][step] for row in rows] for step in steps}
     whole = [sum(row["steps"].values()) for row in rows]
     draw_log_plot(DOCS / f"study-{name}.png", sizes, {**series, "all": whole}, x=key, y="seconds")
-    lines = [*_runs(rows, key), "", "| step | exponent, all sizes | upper half |", "|---|---|---|"]
+    lines = [
+        *_runs(rows, "mesh size" if key == "cells" else key),
+        "",
+        "| step | exponent, all sizes | upper half |",
+        "|---|---|---|",
+    ]
     half = len(rows) // 2
     for step, seconds in {**series, "all steps": whole}.items():
         told = [fit_exponent(sizes, seconds), fit_exponent(sizes[half:], seconds[half:])]
