@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.building_points import BuildingPoints
 from pipeline.city import City
-from pipeline.citymodel import CityModel, number_ids
+from pipeline.citymodel import CityModel
 from pipeline.house_levels import HouseParts
 from pipeline.houses import Houses
 from pipeline.point_fidelity import HouseFidelity
@@ -121,6 +121,7 @@ def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
     arrays: Arrays = {
         **pack_polygons(model.polygons, "polygon"),
         "id": model.ids,
+        "number": model.numbers,
         "house": model.house,
         "ground": model.ground,
         "roof": model.roof,
@@ -140,7 +141,18 @@ def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
 
 
 BUILDING_ARRAYS = (
-    *("polygon", "polygon_start", "id", "house", "ground", "roof", "member", "member_start", "roof_source"),
+    *(
+        "polygon",
+        "polygon_start",
+        "id",
+        "number",
+        "house",
+        "ground",
+        "roof",
+        "member",
+        "member_start",
+        "roof_source",
+    ),
     *("measured_roof", "wall_ground", "group", "layers"),
     *("fidelity_points", "fidelity_rmse", "fidelity_bias", "fidelity_coverage"),
 )
@@ -153,7 +165,7 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
     model = CityModel(
         unpack_polygons(arrays, "polygon"),
         arrays["id"],
-        number_ids(arrays["id"]),
+        arrays["number"],
         arrays["ground"],
         arrays["roof"],
         tuple(tuple(names[a:b]) for a, b in pairwise(start)),

@@ -114,7 +114,7 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *GROUND, *mesh), version=2)
+    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *GROUND, *mesh), version=3)
 
 
 def chooses_layers_later(config: Config) -> bool:

@@ -111,7 +111,7 @@ def _write(task: Task, stage: str, prefix: str, file: str) -> Facts:
 
 def _survey(task: Task, stage: str, prefix: str) -> _Survey:
     """Look at all tiles, one after the other."""
-    wanted = [prefix + name for name in ("polygon", "polygon_start", "id", "house", "ground", "roof")]
+    wanted = [prefix + name for name in ("polygon", "polygon_start", "id", "number", "house", "ground", "roof")]
     names = task.refs[stage]
     cells, tiles = [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
     numbers, of = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
@@ -145,7 +145,7 @@ def _outlines(arrays: dict[str, NDArray[Any]], prefix: str) -> CityModel:
     own = {name.removeprefix(prefix): values for name, values in arrays.items()}
     polygons, ids = unpack_polygons(own, "polygon"), own["id"]
     members: tuple[tuple[str, ...], ...] = ((),) * len(ids)
-    return CityModel(polygons, ids, number_ids(ids), own["ground"], own["roof"], members, own["house"])
+    return CityModel(polygons, ids, own["number"], own["ground"], own["roof"], members, own["house"])
 
 
 def _check_numbers(task: Task, stage: str, prefix: str, survey: _Survey) -> None:
