@@ -57,7 +57,7 @@ def terrain(task: Task) -> Facts:
     for result in task.read("ingest", names=["points"]):
         x, y = result.arrays["points"].T
         count += int(((x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)).sum())
-    task.put(z=np.full(5000, count * task.parameters.scale))
+    task.put(z=np.full(20_000, count * task.parameters.scale))
     return {"count": count}
 
 
@@ -546,6 +546,7 @@ def test_wrong_arguments(tmp_path: Path) -> None:
         ("facts", "facts of stage bad"),
         ("files", "facts of stage bad: 'files' states files that were written"),
         ("reach", "2.2 of source is beyond its reach"),
+        ("window", "2.2 of source is beyond its reach"),
     ],
 )
 def test_a_function_is_held_to_what_its_stage_declares(tmp_path: Path, function: str, message: str) -> None:
@@ -633,7 +634,7 @@ def seen(task: Task) -> Facts:
 
 
 def many(task: Task) -> Facts:
-    task.put(z=np.arange(10_000.0))
+    task.put(z=np.arange(20_000.0))
     return {}
 
 
@@ -706,10 +707,15 @@ def beyond_reach(task: Task) -> Facts:
     return {"n": len(task.read_rows("source", "2.2", "z", 0, 1))}
 
 
+def window_beyond_reach(task: Task) -> Facts:
+    return {"n": len(task.read_window("source", "2.2", "z", (0, 1), (0, 1)))}
+
+
 MISBEHAVED = {
     "reads": undeclared_read,
     "parameter": undeclared_parameter,
     "facts": odd_facts,
     "files": odd_files,
     "reach": beyond_reach,
+    "window": window_beyond_reach,
 }

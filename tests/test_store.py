@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError, OutputError
-from tiler.packing import CHUNK_BYTES, INLINE_BYTES, PACKED_BYTES, verified_chunks
+from tiler.packing import CHUNK_BYTES, INLINE_BYTES, PACKED_BYTES, SQUARE, verified_chunks
 from tiler.store import Store
 
 RNG = np.random.default_rng(7)
@@ -154,6 +154,78 @@ def test_ranges_are_read_at_once_and_chunks_once(
     assert store.read_ranges("s", "n", ["few"], [(0, 2), (5, 8)])["few"].tolist() == BIG[[0, 1, 5, 6, 7]].tolist()
     with pytest.raises(ValueError, match="rows"):
         store.read_ranges("s", "n", ["few"], [(0, 10)])
+
+
+def write_raster(store: Store, raster: NDArray[Any]) -> None:
+    with store.writer("s", "n") as writer:
+        writer.put_rasters(z=raster)
+        writer.commit()
+
+
+@pytest.mark.parametrize(
+    "shape", [(2 * SQUARE, 3 * SQUARE), (2 * SQUARE + 1, 700), (5, 90_000), (90_000, 3), (4, 5), (0, 9)]
+)
+@pytest.mark.parametrize("dtype", ["f8", "i4"])
+def test_windows_of_a_raster(store: Store, dtype: str, shape: tuple[int, int]) -> None:
+    raster = sample(dtype, shape)
+    write_raster(store, raster)
+    assert np.array_equal(store.read("s", "n")[0]["z"], raster)
+    assert np.array_equal(store.read_rows("s", "n", "z", shape[0] // 3, shape[0]), raster[shape[0] // 3 :])
+    for _ in range(20):
+        top, bottom = sorted(RNG.integers(0, shape[0] + 1, 2).tolist())
+        left, right = sorted(RNG.integers(0, shape[1] + 1, 2).tolist())
+        found = store.read_window("s", "n", "z", (top, bottom), (left, right))
+        assert found.dtype == raster.dtype
+        assert np.array_equal(found, raster[top:bottom, left:right])
+    store.write("t", "n", {"z": raster})
+    assert store.describe("s", "n") == store.describe("t", "n")
+    assert store.compute_digest("s", "n") == store.describe("s", "n")[1]
+    window = (0, shape[0]), (1, 4 if shape[1] > 3 else 3)
+    assert np.array_equal(store.read_window("t", "n", "z", *window), raster[:, slice(*window[1])])
+
+
+def test_a_window_reads_its_own_chunks_alone(store: Store) -> None:
+    raster = RNG.normal(size=(3 * SQUARE, 3 * SQUARE - 7))
+    write_raster(store, raster)
+    files = chunk_files(store, "z")
+    assert [path.relative_to(path.parents[1]).as_posix() for path in files] == [
+        f"{j}/{i}" for j in range(3) for i in range(3)
+    ]
+    for path in files:
+        if path.parts[-2:] != ("1", "2"):
+            path.write_bytes(b"not read")
+    window = (SQUARE, 2 * SQUARE), (2 * SQUARE, 3 * SQUARE - 7)
+    assert np.array_equal(store.read_window("s", "n", "z", *window), raster[slice(*window[0]), slice(*window[1])])
+    for (top, bottom), (left, right) in [((SQUARE - 1, SQUARE + 1), window[1]), (window[0], (5, 2 * SQUARE + 1))]:
+        with pytest.raises(InputError, match=r"stage s, n: z in .* is damaged"):
+            store.read_window("s", "n", "z", (top, bottom), (left, right))
+
+
+def test_chunks_of_a_raster_in_each_others_place_are_found(store: Store) -> None:
+    write_raster(store, RNG.normal(size=(2 * SQUARE, 2 * SQUARE)))
+    one, other = chunk_files(store, "z")[1:3]
+    data = one.read_bytes(), other.read_bytes()
+    one.write_bytes(data[1])
+    other.write_bytes(data[0])
+    with pytest.raises(InputError, match="checksum differs in chunk 0/1"):
+        store.read("s", "n")
+
+
+def test_what_is_no_raster_or_beyond_it(store: Store) -> None:
+    with store.writer("s", "n") as writer:
+        for wrong in (np.zeros(3), np.zeros((3, 3, 3)), np.array([["a"]])):
+            with pytest.raises(ValueError, match="no raster"):
+                writer.put_rasters(z=wrong)
+        writer.put(flat=BIG[0])
+        writer.put_rasters(z=np.zeros((SQUARE, 2 * SQUARE)))
+        with pytest.raises(ValueError, match="twice"):
+            writer.put_rasters(z=np.zeros((2, 2)))
+        writer.commit()
+    with pytest.raises(ValueError, match="no raster"):
+        store.read_window("s", "n", "flat", (0, 1), (0, 1))
+    for rows, columns in [((-1, 2), (0, 1)), ((0, 1), (0, 2 * SQUARE + 1)), ((2, 1), (0, 1)), ((0, 1), (3, 2))]:
+        with pytest.raises(ValueError, match="which has"):
+            store.read_window("s", "n", "z", rows, columns)
 
 
 def test_a_damaged_chunk_is_found_where_it_is_read_and_only_there(store: Store) -> None:

@@ -570,6 +570,29 @@ STORES: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
+RASTERS: list[tuple[dict[str, Any], str]] = [
+    ({"columns": 0}, "chunks of 0 columns"),
+    ({"columns": 10**12}, "chunks of 1000000000000 columns"),
+    ({"columns": "1"}, "chunks of 1 columns"),
+    ({"columns": 700}, "9 checksums"),
+    ({"chunk": 10**9}, "chunks of 1000000000 rows"),
+    ({"shape": [10**9, 700]}, "9 checksums for 1000000000 rows"),
+    ({"shape": [600]}, "columns"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), RASTERS)
+def test_a_raster_is_not_believed(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    store = Store(tmp_path / "store.zarr")
+    with store.writer("s", "n") as writer:
+        writer.put_rasters(a=np.zeros((600, 700)))
+        writer.commit()
+    hostile_attributes(store.folder("s", "n"), lambda table: table["a"].update(change))
+    with pytest.raises(Exception, match="is damaged") as caught:
+        store.read_window("s", "n", "a", (0, 2), (0, 2))
+    assert message in str(caught.value)
+
+
 @pytest.mark.parametrize(("change", "message"), [case[1:] for case in STORES], ids=[case[0] for case in STORES])
 def test_a_store_is_not_believed(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     store = Store(tmp_path / "store.zarr")

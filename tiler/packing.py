@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 CHUNK_BYTES = 4 * 2**20  # about what one read or write moves at a time
-PACKED_BYTES = 32 * 2**10  # smaller arrays share one array of bytes: an array of its own costs 3 ms to write
+SQUARE = 256  # rows and columns of a raster's chunks: what a neighbour reads of it is seldom more than a strip
+PACKED_BYTES = 128 * 2**10  # smaller arrays share one array of bytes: an array of its own costs 3 ms to write
 INLINE_BYTES = 16 * 2**10  # and if all of them are smaller than this, that one is spared too
 BLOSC_VERSIONS = (1, 2)  # of its format, in the first byte
 CHUNK_HEAD = 16  # bytes of the header of a Blosc chunk
@@ -69,6 +70,21 @@ def rows_per_chunk(array: NDArray[Any]) -> int:
     return max(CHUNK_BYTES // max(row_bytes, 1), 1)
 
 
+def count_columns(entry: Mapping[str, Any]) -> int:
+    """Count the chunks beside each other in an array: more than one in rasters alone."""
+    return -(-entry["shape"][1] // entry["columns"]) if "columns" in entry else 1
+
+
+def square_checksums(raster: NDArray[Any]) -> list[int]:
+    """Compute the CRC-32 of every square chunk of a raster, row by row of them."""
+    ny, nx = raster.shape
+    return [
+        zlib.crc32(raw_bytes(np.ascontiguousarray(raster[j : j + SQUARE, i : i + SQUARE])).data)
+        for j in range(0, ny, SQUARE)
+        for i in range(0, nx, SQUARE)
+    ]
+
+
 def checksums(array: NDArray[Any], rows: int) -> list[int]:
     """Compute the CRC-32 of every chunk of so many rows."""
     return [zlib.crc32(raw_bytes(array[start : start + rows]).data) for start in range(0, len(array), rows)]
@@ -110,10 +126,14 @@ def check_entry(entry: Mapping[str, Any]) -> None:
         if type(entry["offset"]) is not int or entry["offset"] < 0:
             raise ValueError("place in the packed bytes")
         return
+    if "columns" in entry:
+        if len(shape) != 2 or type(entry["columns"]) is not int or not 1 <= entry["columns"] <= max(shape[1], 1):
+            raise ValueError(f"chunks of {str(entry['columns'])[:20]} columns")
+        shape = [shape[0], entry["columns"]]
     chunk, row_bytes = entry["chunk"], np.dtype(dtype).itemsize * math.prod(max(n, 1) for n in shape[1:])
     if type(chunk) is not int or not 1 <= chunk * row_bytes <= max(CHUNK_BYTES, min(row_bytes, MOST_ROW)):
         raise ValueError(f"chunks of {chunk} rows of {row_bytes} bytes")
-    if len(entry["crc"]) != -(-shape[0] // chunk):
+    if len(entry["crc"]) != -(-shape[0] // chunk) * count_columns(entry):
         raise ValueError(f"{len(entry['crc'])} checksums for {shape[0]} rows in chunks of {chunk}")
 
 

@@ -1,6 +1,5 @@
 """What stages read of each other's results: points, terrain, houses and buildings in a box."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -20,8 +19,6 @@ from pipeline.raster import (
     grow_window,
     join_dtm,
     node_window,
-    window_of,
-    windows_meet,
 )
 from pipeline.terrain import cut_terrain, join_terrain
 from stitch.grid import Bounds
@@ -94,15 +91,29 @@ def read_known_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) 
     Where the task reads the stage ``approach``, it is that of region and pad.
     """
     stage = "approach" if "approach" in task.refs else "terrain"
-    return join_terrain(list(_read_rasters(task, stage)), region_window(box, spacing, bounds))
+    window = region_window(box, spacing, bounds)
+    return join_terrain(read_rasters(task, stage, window), window)
 
 
 def join_rasters(task: Task, stage: str, window: NodeWindow, spacing: float) -> Dtm:
     """Read the nodes of a window from the rasters of a stage; NaN where none has them, there may be no raster."""
-    parts = [part for part in _read_rasters(task, stage) if windows_meet(window_of(part), window)]
+    parts = read_rasters(task, stage, window)
     if not parts:
         return Dtm(np.full((window.ny, window.nx), np.nan), window.i0, window.j0, spacing)
     return join_dtm(parts, window)
+
+
+def read_rasters(task: Task, stage: str, window: NodeWindow) -> list[Dtm]:
+    """Read what the rasters of a stage have of a window, each that has any."""
+    parts = []
+    for result in task.read(stage, ()):
+        i0, j0, nx, ny, spacing = (result.facts[name] for name in ("i0", "j0", "nx", "ny", "spacing"))
+        common = grow_window(NodeWindow(i0, j0, nx, ny), 0, within=window)
+        if common.nx and common.ny:
+            rows, columns = common.j0 - j0, common.i0 - i0
+            z = task.read_window(stage, result.name, "z", (rows, rows + common.ny), (columns, columns + common.nx))
+            parts.append(Dtm(z, common.i0, common.j0, spacing))
+    return parts
 
 
 def region_window(box: Box, spacing: float, bounds: Bounds) -> NodeWindow:
@@ -137,13 +148,14 @@ def read_buildings(task: Task, box: Box) -> Buildings:
 
     Their layers are those of the stage ``layers``, where the task reads it.
     """
-    near = []
+    near, here = [], shapely.box(*box)
+    shapely.prepare(here)
     later = task.read("layers") if "layers" in task.refs else iter(())
     layers = {result.name: result.arrays["layers"] for result in later}
     for result in task.read("model"):
         buildings = unpack_buildings(result.arrays)
         buildings = replace(buildings, layers=layers.get(result.name, buildings.layers))
-        rows = np.flatnonzero(shapely.intersects(shapely.box(*box), buildings.model.polygons))
+        rows = np.flatnonzero(shapely.intersects(here, buildings.model.polygons))
         near.append(take_buildings(buildings, rows))
     return join_buildings(near)
 
@@ -171,9 +183,3 @@ def _ranges_of_blocks(
         for first, last in blocks
         for found in select_cells(cell[first:last], row[first : last + 1], box, size=CELL)
     ]
-
-
-def _read_rasters(task: Task, stage: str) -> Iterator[Dtm]:
-    for result in task.read(stage, ("z",)):
-        facts = result.facts
-        yield Dtm(result.arrays["z"], facts["i0"], facts["j0"], facts["spacing"])

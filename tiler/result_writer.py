@@ -22,6 +22,7 @@ from pipeline.errors import OutputError
 from tiler.packing import (
     INLINE_BYTES,
     PACKED_BYTES,
+    SQUARE,
     RowBuffer,
     Table,
     as_rows,
@@ -31,6 +32,7 @@ from tiler.packing import (
     plain_array,
     raw_bytes,
     rows_per_chunk,
+    square_checksums,
 )
 from tiler.places import in_bucket
 from tiler.result_reader import GROUP, PACKED, RESERVED
@@ -90,12 +92,23 @@ class Writer:
             If the disk refuses.
         """
         for name, values in arrays.items():
-            check_name(name)
-            if name in self._small or name in self._table or name in self._buffers:
-                raise ValueError(f"array {name} is written twice")
-            array = plain_array(name, values)
-            self._hash(name, array)
-            self._put(name, array)
+            self._put(name, self._take(name, values))
+
+    def put_rasters(self, **rasters: ArrayLike) -> None:
+        """Write whole arrays of rows and columns, each name once, in square chunks, to read windows of them.
+
+        Raises
+        ------
+        ValueError
+            As from `put`, or if an array has not two axes.
+        OutputError
+            If the disk refuses.
+        """
+        for name, values in rasters.items():
+            raster = self._take(name, values)
+            if raster.ndim != 2 or raster.dtype.kind == "U":
+                raise ValueError(f"array {name}: {raster.dtype} {raster.shape} is no raster")
+            self._put(name, raster, square=True)
 
     def append(self, **arrays: ArrayLike) -> None:
         """Append rows to arrays, which grow chunk by chunk on disk: about 4 MB of each are held in memory.
@@ -179,6 +192,15 @@ class Writer:
             self._replace()
         return digest
 
+    def _take(self, name: str, values: ArrayLike) -> NDArray[Any]:
+        """Check a whole array and hash it."""
+        check_name(name)
+        if name in self._small or name in self._table or name in self._buffers:
+            raise ValueError(f"array {name} is written twice")
+        array = plain_array(name, values)
+        self._hash(name, array)
+        return array
+
     def _hash(self, name: str, rows: NDArray[Any]) -> None:
         """Hash the bytes of an array as they come: how rows were cut does not show in them."""
         if name not in self._hashes:
@@ -192,26 +214,29 @@ class Writer:
         ]
         return hash_content(arrays, attributes)
 
-    def _put(self, name: str, array: NDArray[Any]) -> None:
+    def _put(self, name: str, array: NDArray[Any], *, square: bool = False) -> None:
         if array.nbytes <= PACKED_BYTES or array.ndim == 0:
             self._small[name] = array.copy()
         else:
-            self._create(name, array)
+            self._create(name, array, square=square)
 
-    def _create(self, name: str, array: NDArray[Any]) -> None:
-        rows, chunk = as_rows(array), min(rows_per_chunk(array), max(len(array), 1))
-        self._table[name] = {
-            "dtype": array.dtype.str,
-            "shape": list(array.shape),
-            "chunk": chunk,
-            "crc": checksums(array, chunk),
-        }
+    def _create(self, name: str, array: NDArray[Any], *, square: bool = False) -> None:
+        rows = as_rows(array)
+        chunk, *further = (max(n, 1) for n in rows.shape)
+        entry: dict[str, Any] = {"dtype": array.dtype.str, "shape": list(array.shape)}
+        if square:
+            chunk, further = min(chunk, SQUARE), [min(further[0], SQUARE)]
+            entry |= {"chunk": chunk, "columns": further[0], "crc": square_checksums(array)}
+        else:
+            chunk = min(chunk, rows_per_chunk(array))
+            entry |= {"chunk": chunk, "crc": checksums(array, chunk)}
+        self._table[name] = entry
         with self._disk():
             # Chunks of zeros are written too: how zarr tells -0.0 from 0.0 is its versions' own affair.
             zarr.create_array(
                 str(self._partial / name),
                 data=rows,
-                chunks=(chunk, *(max(n, 1) for n in rows.shape[1:])),
+                chunks=(chunk, *further),
                 zarr_format=3,
                 compressors=COMPRESSION,
                 config={"write_empty_chunks": True},

@@ -1,6 +1,6 @@
 """The store: results by stage and name in zarr (v3), written whole or not at all, verified on every read.
 
-A result is a zarr group ``<stage>/<name>``. Arrays above 32 kB are arrays of their own; smaller ones lie in one
+A result is a zarr group ``<stage>/<name>``. Arrays above 128 kB are arrays of their own; smaller ones lie in one
 array of bytes, ``_packed``, and if all of them are less than 16 kB, in the group's attributes. These hold what the
 writer gave, ``arrays`` (type and shape of each array and the CRC-32 of the raw bytes of each chunk), ``digest``, a
 hash of the content, ``files``, size and CRC-32 of every file of the arrays as it lies on disk, and ``checksum``,
@@ -31,6 +31,7 @@ from tiler.result_reader import (
     read_chunks,
     read_group,
     read_packed,
+    read_window,
 )
 from tiler.result_writer import PARTIAL, Writer, delete, hash_content, withdraw
 from tiler.written import GONE, find_changed_files
@@ -147,6 +148,34 @@ class Store:
             else:
                 found[array] = read_chunks(folder, stage, name, array, entry, ranges)
         return found
+
+    def read_window(
+        self, stage: str, name: str, array: str, rows: tuple[int, int], columns: tuple[int, int]
+    ) -> NDArray[Any]:
+        """Read a window of an array of rows and columns; only chunks that hold some of it are read and verified.
+
+        These are small if it was written by `Writer.put_rasters`.
+
+        Raises
+        ------
+        InputError
+            If the result is not there, or a chunk that is needed is damaged.
+        ValueError
+            If there is no such array, or it does not hold the window.
+        """
+        folder = self.folder(stage, name)
+        table, _, _ = open_result(folder, stage, name)
+        entry = find_entry(folder, table, array, stage, name)
+        shape = entry["shape"]
+        if len(shape) != 2:
+            raise ValueError(f"stage {stage}, {name}: {array} is no raster but {shape}")
+        if not (0 <= rows[0] <= rows[1] <= shape[0] and 0 <= columns[0] <= columns[1] <= shape[1]):
+            raise ValueError(
+                f"stage {stage}, {name}: rows {rows}, columns {columns} of {array}, which has {shape}"
+            )
+        if "columns" in entry:
+            return read_window(folder, stage, name, array, entry, rows, columns)
+        return self.read_ranges(stage, name, [array], [rows])[array][:, slice(*columns)]
 
     def attributes(self, stage: str, name: str) -> dict[str, Any]:
         """Read the attributes of a result and no array; InputError as for `read`."""

@@ -208,9 +208,21 @@ class Task:
             raise ValueError(f"stage {self.stage}, {self.name}: {name} of {stage} is beyond its reach")
         return self.store.read_ranges(stage, name, names, ranges)
 
+    def read_window(
+        self, stage: str, name: str, array: str, rows: tuple[int, int], columns: tuple[int, int]
+    ) -> NDArray[Any]:
+        """Read a window of an array that was put by `put_rasters`; errors as for `read`."""
+        if name not in self._declared(stage):
+            raise ValueError(f"stage {self.stage}, {self.name}: {name} of {stage} is beyond its reach")
+        return self.store.read_window(stage, name, array, rows, columns)
+
     def put(self, **arrays: ArrayLike) -> None:
         """Write whole arrays of the result, each name once."""
         self._open_writer().put(**arrays)
+
+    def put_rasters(self, **rasters: ArrayLike) -> None:
+        """Write whole arrays of rows and columns, each name once, in chunks that suit `read_window`."""
+        self._open_writer().put_rasters(**rasters)
 
     def append(self, **arrays: ArrayLike) -> None:
         """Append rows to arrays of the result, which may become larger than memory."""

@@ -79,7 +79,7 @@ def lay_approach(task: Task) -> Facts:
     if known.z.size:
         part = cut_nodes(z, own, window_of(known))
         np.copyto(part, known.z, where=~np.isnan(known.z))
-    task.put(z=z)
+    task.put_rasters(z=z)
     return {"i0": own.i0, "j0": own.j0, "nx": own.nx, "ny": own.ny, "spacing": spacing}
 
 

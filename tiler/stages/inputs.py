@@ -31,7 +31,7 @@ from tiler.context import tile_key
 from tiler.footprint_index import scan_footprints
 from tiler.ingest import read_cells
 from tiler.places import place
-from tiler.readers import clip, grow, read_cloud, read_outlines
+from tiler.readers import clip, grow, read_cloud, read_outlines, read_rasters
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.tables import pack_polygons
 from tiler.task import Task
@@ -201,7 +201,7 @@ def bin_tile(task: Task) -> Facts:
     )
     cloud = read_cloud(task, grow(box, spacing / 2), ground_filter=task.parameters.ground_filter)
     raster, _ = bin_nodes(cloud, window, spacing=spacing)
-    task.put(z=raster.z)
+    task.put_rasters(z=raster.z)
     return _raster_facts(raster)
 
 
@@ -210,8 +210,8 @@ def flood_tile(task: Task) -> Facts:
     spacing = task.parameters.dtm_spacing
     own = own_window(task)
     within = node_window(task.context.bounds, spacing)
-    parts = [_raster(result.arrays["z"], result.facts) for result in task.read("ground")]
-    flooded = flood_terrain(join_dtm(parts, grow_window(own, FILL_RINGS, within=within)), own)
+    window = grow_window(own, FILL_RINGS, within=within)
+    flooded = flood_terrain(join_dtm(read_rasters(task, "ground", window), window), own)
     sums = coarsen(flooded)
     task.put(z=flooded.dtm.z, ring=flooded.ring, node=sums.node.reshape(-1, 2), total=sums.total, count=sums.count)
     return _raster_facts(flooded.dtm) | {"known": sums.n_known, "deep": count_deep(flooded)}
@@ -250,7 +250,7 @@ def fill_tile(task: Task) -> Facts:
     (lakes,) = task.read("lakes")
     coarse = _raster(lakes.arrays.get("z", np.empty((0, 0))), lakes.facts)
     filled, counts = fill_terrain(flooded, coarse)
-    task.put(z=filled.z)
+    task.put_rasters(z=filled.z)
     return _raster_facts(filled) | {
         "counts": {
             "terrain nodes": filled.z.size,
