@@ -90,7 +90,14 @@ def measure(city: Path, out: Path, *options: str, cores: int = 1) -> dict[str, A
         "points": record["counts"]["points read"],
         "seams": record["seconds"]["seams"],
         "columns": record["seconds"]["columns"],
+        "seams computed": computed_seconds(record, "seams"),
+        "columns computed": computed_seconds(record, "columns"),
     }
+
+
+def computed_seconds(record: Mapping[str, Any], stage: str) -> float:
+    """Seconds that a stage computes, without those in which it reads and writes results."""
+    return float(sum(value for name, value in record["seconds"].items() if name.startswith(f"{stage}: ")))
 
 
 class Cities:
@@ -99,11 +106,12 @@ class Cities:
     def __init__(self, home: Path) -> None:
         self.home = home
 
-    def make(self, size: int, buildings: int) -> Path:
-        """Folder of a city of `size` metres with so many buildings."""
-        folder = self.home / f"city-{size}-{buildings}"
+    def make(self, size: int, buildings: int, density: float = 1.5) -> Path:
+        """Folder of a city of `size` metres with so many buildings, and points a square metre."""
+        folder = self.home / f"city-{size}-{buildings}-{density:g}"
         if not folder.exists():
-            citystitch("synth", str(folder), "--size", str(size), "--buildings", str(buildings))
+            words = ("--size", str(size), "--buildings", str(buildings), "--density", f"{density:g}")
+            citystitch("synth", str(folder), *words)
         return folder
 
 
@@ -135,14 +143,18 @@ def study_area(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(d) The city of 2.5 km serially, with one and with two workers; runs take turns."""
-    city = cities.make(2500, 3000)
-    rows = [
-        measure(city, out, "--tile-size", "625", "--workers", workers, cores=2) | {"workers": int(workers)}
-        for _ in range(3)
-        for workers in ("0", "1", "2")
+    """(d) The cities of 2.5 and 5 km serially, with one and with two workers; runs take turns."""
+    rows = []
+    for side in (2500, 5000):
+        city = cities.make(side, 480 * side**2 // 10**6)
+        for workers in ("0", "1", "2") * 3:
+            found = measure(city, out, "--tile-size", "625", "--workers", workers, cores=2)
+            rows.append(found | {"workers": int(workers), "side": side})
+    kinds = dict.fromkeys((row["side"], row["workers"]) for row in rows)
+    return [
+        sorted((row for row in rows if (row["side"], row["workers"]) == kind), key=lambda r: float(r["total"]))[1]
+        for kind in kinds
     ]
-    return [sorted((r for r in rows if r["workers"] == n), key=lambda r: float(r["total"]))[1] for n in (0, 1, 2)]
 
 
 def study_tiles(cities: Cities, out: Path) -> list[dict[str, Any]]:
@@ -165,16 +177,17 @@ def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_rates(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """Both meshers at 10 and 5 m, serially, with tiles of the default size; the middle one of 3."""
-    city, rows = cities.make(3000, 4320), []
+    """Both meshers at 10 and 5 m, and a dense cloud; serially, tiles of the default size; the middle one of 3."""
+    city, dense, rows = cities.make(3000, 4320), cities.make(1000, 480, 16.0), []
     for _ in range(3):
         for mesher in ("adaptive", "layered"):
             for size in (10.0, 5.0):
                 found = measure(city, out, "--mesher", mesher, "--mesh-size", str(size), "--workers", "0")
                 rows.append(found | {"mesher": f"{mesher}, {size:g} m"})
+        rows.append(measure(dense, out, "--workers", "0") | {"mesher": "adaptive, 10 m, 1 km, 16 points a m2"})
     kinds = dict.fromkeys(row["mesher"] for row in rows)
     return [
-        sorted((row for row in rows if row["mesher"] == kind), key=lambda r: float(r["seams"] + r["columns"]))[1]
+        sorted((row for row in rows if row["mesher"] == kind), key=lambda r: float(r["total"]))[1]
         for kind in kinds
     ]
 
@@ -225,10 +238,12 @@ def study_limits(cities: Cities, out: Path) -> list[dict[str, Any]]:
     """
     import laspy
 
+    from tiler.las_chunks import FIELDS
+
     files = sorted((cities.make(2500, 3000) / "tiles").glob("*.laz"))
     start, n_points = time.perf_counter(), 0
     for path in files:
-        with laspy.open(path) as reader:
+        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, decompression_selection=FIELDS) as reader:
             n_points += len(reader.read().points)
     laz = n_points / (time.perf_counter() - start)
     block = np.ones(2**25)
@@ -326,7 +341,7 @@ def write_report(kept: Mapping[str, Any]) -> None:
             "workers",
             "(d) Workers",
             "workers",
-            "The city of 2.5 km with 3,000 buildings; the middle one of 3.",
+            "Cities of 2.5 and 5 km with 480 buildings a km2; the middle one of 3.",
         ),
         ("tiles", "(e) Tile size", "tile size", "The city of 2.5 km, two workers."),
         ("fine", "Fine meshes", "mesh size", "The city of 2.5 km, two workers, smaller tiles for smaller cells."),
@@ -335,16 +350,16 @@ def write_report(kept: Mapping[str, Any]) -> None:
         if name in kept:
             lines += ["", f"## {title}", "", words, "", *_runs(kept[name], key)]
     if "workers" in kept:
-        lines += ["", "## (f) Shares", "", *_shares(kept["workers"])]
+        lines += ["", *_speedups(kept["workers"])]
+        lines += ["", "## (f) Shares", "", *_shares(kept["workers"][:3])]
     if "rates" in kept:
         lines += [
             "",
             "## Rates",
             "",
-            "A city of 3 km with 4,320 buildings, tiles of the default size, serial; the middle one of",
-        ]
-        lines += [
-            "3. *Step 3* is all that stages `seams` and `columns` do, with reading and writing their results.",
+            "A city of 3 km with 4,320 buildings and 1.5 points a m2, tiles of the default size, serial; the",
+            "middle one of 3. *Step 3* is what stages `seams` and `columns` compute (3.1 to 3.5), then all that",
+            "they do, with what they read and write of the store.",
             "",
         ]
         lines += _rates(kept["rates"])
@@ -397,15 +412,28 @@ def _runs(rows: list[dict[str, Any]], key: str) -> list[str]:
 
 
 def _rates(rows: list[dict[str, Any]]) -> list[str]:
-    lines = ["| mesher | cells | step 3, cells/s | seams of it | steps 1-2, points/s |", "|---|---|---|---|---|"]
+    lines = [
+        "| mesher | cells | step 3, cells/s | seams of it | with the store | seams of it | steps 1-2, points/s |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for row in rows:
-        both = row["seams"] + row["columns"]
+        told = []
+        for kind in (" computed", ""):
+            both = row[f"seams{kind}"] + row[f"columns{kind}"]
+            told += [f"{row['cells'] / both / 1e6:.2f} M", f"{100 * row[f'seams{kind}'] / both:.0f} %"]
         early = sum(seconds for step, seconds in row["steps"].items() if step[0] in "12")
-        lines.append(
-            f"| {row['mesher']} | {row['cells'] / 1e6:.2f} M | {row['cells'] / both / 1e6:.2f} M "
-            f"| {100 * row['seams'] / both:.0f} % | {row['points'] / early / 1e6:.2f} M |"
-        )
+        told.append(f"{row['points'] / early / 1e6:.2f} M")
+        lines.append(f"| {row['mesher']} | {row['cells'] / 1e6:.2f} M | {' | '.join(told)} |")
     return lines
+
+
+def _speedups(rows: list[dict[str, Any]]) -> list[str]:
+    totals = {(row["side"], row["workers"]): row["total"] for row in rows}
+    return [
+        f"{side / 1000:g} km: two workers are {totals[side, 0] / totals[side, 2]:.2f} times serial, "
+        f"{totals[side, 1] / totals[side, 2]:.2f} times one."
+        for side in dict.fromkeys(row["side"] for row in rows)
+    ]
 
 
 def _shares(rows: list[dict[str, Any]]) -> list[str]:
