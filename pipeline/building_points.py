@@ -79,9 +79,9 @@ def extract_building_points(
     """
     roof = cloud.classification == BUILDING if building_class else ~np.isin(cloud.classification, NEVER_ROOF)
     ground = (cloud.classification == GROUND) | (cloud.classification == WATER)
-    roof_start, roof_z = _points_inside(np.compress(roof, cloud.xyz, axis=0), polygons, None)
+    roof_start, roof_z = _points_inside(cloud.xyz, roof, polygons, None)
     rings = shapely.buffer(_coarsened(polygons, margin), margin)
-    ground_start, ground_z = _points_inside(np.compress(ground, cloud.xyz, axis=0), rings, polygons)
+    ground_start, ground_z = _points_inside(cloud.xyz, ground, rings, polygons)
     return BuildingPoints(*remove_outliers(roof_start, roof_z), *remove_outliers(ground_start, ground_z))
 
 
@@ -176,10 +176,13 @@ def _take(
 
 
 def _points_inside(
-    xyz: NDArray[np.float64], polygons: NDArray[np.object_], outside: NDArray[np.object_] | None
+    xyz: NDArray[np.float64],
+    among: NDArray[np.bool_],
+    polygons: NDArray[np.object_],
+    outside: NDArray[np.object_] | None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Heights of the points in each polygon, and not in its counterpart in `outside` where given."""
-    polygon, point = find_inside(xyz, polygons)
+    polygon, point = find_inside(xyz, polygons, among=among)
     if outside is not None:
         apart = ~are_inside(outside, polygon, xyz[point], closed=True)
         polygon, point = polygon[apart], point[apart]

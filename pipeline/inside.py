@@ -1,13 +1,14 @@
 """Points inside polygons, by counting crossings (steps 1.5, 2.0 and 2.4)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-INDEX_CELL = 4.0  # m, side of a cell of the point index; a power of two, so that borders of cells are exact
+INDEX_CELL = 2.0  # m, side of a cell of the point index; a power of two, so that borders of cells are exact
 DOUBT = 1e-15  # share of its two products within which rounding may have chosen the sign of a turn
 OUTSIDE, INSIDE, UNSURE = range(3)
 POLYGON = 3  # GEOS's number of that type
@@ -49,7 +50,9 @@ def list_edges(polygons: NDArray[np.object_]) -> Edges:
     return Edges(start, xy[first], xy[first + 1])
 
 
-def find_inside(xy: Array, polygons: NDArray[np.object_]) -> tuple[Index, Index]:
+def find_inside(
+    xy: Array, polygons: NDArray[np.object_], *, among: NDArray[np.bool_] | None = None
+) -> tuple[Index, Index]:
     """Find the points inside each polygon, those on its outline left out.
 
     Parameters
@@ -58,6 +61,8 @@ def find_inside(xy: Array, polygons: NDArray[np.object_]) -> tuple[Index, Index]
         Points (m).
     polygons : object, (n,)
         Valid shapely Polygons; a point in several of them is found in each.
+    among : bool, (k,), optional
+        Points to look for; all by default.
 
     Returns
     -------
@@ -66,15 +71,17 @@ def find_inside(xy: Array, polygons: NDArray[np.object_]) -> tuple[Index, Index]
 
     Notes
     -----
-    Points are sorted into square cells. A polygon goes through the rows of cells under its box, and holds the
-    points there against the edges that meet the row. Where rounding might decide, GEOS is asked: the result is
-    that of `shapely.contains_xy` for every pair.
+    Polygons are listed in the square cells that they have a part of. A point is held against those of its cell:
+    it is in a polygon that has the whole cell, else the polygon's edges that meet the cell's row tell. Where
+    rounding might decide, GEOS is asked: the result is that of `shapely.contains_xy` for every pair.
     """
     if len(xy) == 0 or len(polygons) == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
     edges = list_edges(polygons)
-    sorted_xy, order, first, cell_start = _sort_into_cells(xy)
-    start, found = _find(sorted_xy, order, first, cell_start, edges.start, edges.a, edges.b)
+    if len(edges.a) == 0:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    among = np.ones(len(xy), np.bool_) if among is None else among
+    start, found = _find(xy, among, edges.start, edges.a, edges.b)
     polygon = np.repeat(np.arange(len(polygons)), np.diff(start))
     point, side = found >> 2, found & 3
     if not (side == UNSURE).any():
@@ -147,41 +154,6 @@ def _settle(
     return inside
 
 
-@numba.njit(cache=True, nogil=True)
-def _sort_into_cells(
-    xy: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.int32], tuple[int, int], NDArray[np.int64]]:
-    """Sort points by cell, row by row, in their old order within a cell.
-
-    Gives their coordinates and rows in that order, column and row of the first cell, and where each cell starts; a
-    row of starts ends with that of the next row.
-    """
-    low_x = high_x = xy[0, 0]
-    low_y = high_y = xy[0, 1]
-    for k in range(len(xy)):
-        low_x, high_x = min(low_x, xy[k, 0]), max(high_x, xy[k, 0])
-        low_y, high_y = min(low_y, xy[k, 1]), max(high_y, xy[k, 1])
-    i0, j0 = int(np.floor(low_x / INDEX_CELL)), int(np.floor(low_y / INDEX_CELL))
-    width = int(np.floor(high_x / INDEX_CELL)) - i0 + 1
-    height = int(np.floor(high_y / INDEX_CELL)) - j0 + 1
-    start = np.zeros(height * (width + 1) + 1, np.int64)
-    cell = np.empty(len(xy), np.int32)
-    for k in range(len(xy)):
-        i, j = int(np.floor(xy[k, 0] / INDEX_CELL)) - i0, int(np.floor(xy[k, 1] / INDEX_CELL)) - j0
-        cell[k] = j * (width + 1) + i
-        start[cell[k] + 1] += 1
-    for c in range(1, len(start)):
-        start[c] += start[c - 1]
-    place = start[:-1].copy()
-    order = np.empty(len(xy), np.int32)
-    sorted_xy = np.empty((len(xy), 2))
-    for k in range(len(xy)):
-        to = place[cell[k]]
-        place[cell[k]] += 1
-        order[to], sorted_xy[to, 0], sorted_xy[to, 1] = k, xy[k, 0], xy[k, 1]
-    return sorted_xy, order, (i0, j0), start[:-1].reshape(height, width + 1)
-
-
 @numba.njit(cache=True, nogil=True, inline="always")
 def _cross(x: float, y: float, xa: float, ya: float, xb: float, yb: float) -> int:
     """Whether the ray from a point towards greater x crosses an edge; `UNSURE` where the point may be on it."""
@@ -210,61 +182,156 @@ def _side(x: float, y: float, first: int, last: int, a: NDArray[np.float64], b: 
     return side
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _may_meet(
+    xa: float, ya: float, xb: float, yb: float, left: float, under: float, right: float, over: float
+) -> bool:
+    """Whether an edge may meet a box, its sides included; False where it surely does not."""
+    if max(xa, xb) < left or min(xa, xb) > right or max(ya, yb) < under or min(ya, yb) > over:
+        return False
+    n_ahead = n_behind = 0
+    for x in (left, right):
+        for y in (under, over):
+            ahead, across = (xb - xa) * (y - ya), (yb - ya) * (x - xa)
+            doubt = DOUBT * (abs(ahead) + abs(across))
+            n_ahead += ahead - across > doubt
+            n_behind += across - ahead > doubt
+    return n_ahead < 4 and n_behind < 4
+
+
+@numba.njit(cache=True, nogil=True)
+def _side_of_cell(left: float, under: float, near: Index, a: Array, b: Array) -> int:
+    """Side of a cell from the rings of the edges that meet its row; `UNSURE` where it may have both."""
+    right, over = left + INDEX_CELL, under + INDEX_CELL
+    side = OUTSIDE
+    for e in near:
+        if _may_meet(a[e, 0], a[e, 1], b[e, 0], b[e, 1], left, under, right, over):
+            return UNSURE
+        crossed = _cross((left + right) / 2, (under + over) / 2, a[e, 0], a[e, 1], b[e, 0], b[e, 1])
+        if crossed == UNSURE:
+            return UNSURE
+        side ^= crossed
+    return side
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_cells(xy: Array, among: NDArray[np.bool_], a: Array, b: Array) -> tuple[int, int, int, int]:
+    """Column and row of the first cell that has both points and edges around it, number of columns and rows."""
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for k in range(len(xy)):
+        if among[k]:
+            low_x, high_x = min(low_x, xy[k, 0]), max(high_x, xy[k, 0])
+            low_y, high_y = min(low_y, xy[k, 1]), max(high_y, xy[k, 1])
+    low_x, high_x = max(low_x, min(a[:, 0].min(), b[:, 0].min())), min(high_x, max(a[:, 0].max(), b[:, 0].max()))
+    low_y, high_y = max(low_y, min(a[:, 1].min(), b[:, 1].min())), min(high_y, max(a[:, 1].max(), b[:, 1].max()))
+    if not (low_x <= high_x and low_y <= high_y):
+        return 0, 0, 0, 0
+    i0, j0 = int(np.floor(low_x / INDEX_CELL)), int(np.floor(low_y / INDEX_CELL))
+    return i0, j0, int(np.floor(high_x / INDEX_CELL)) - i0 + 1, int(np.floor(high_y / INDEX_CELL)) - j0 + 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _put_into_cells(
+    cells: tuple[int, int, int, int], edge_start: Index, a: Array, b: Array
+) -> tuple[Index, NDArray[np.int32], Index, Array, Array]:
+    """List for each cell the polygons that have a part of it.
+
+    Gives where each cell's list starts; the polygons in it; first and last of their edges that meet the row of
+    cells, none where the cell is inside; and from and to of these edges.
+    """
+    i0, j0, width, height = cells
+    size = INDEX_CELL
+    n, n_near = 0, 0
+    cell, polygon, edges = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty((1024, 2), np.int64)
+    near = np.empty(1024, np.int64)
+    for p in range(len(edge_start) - 1):
+        e0, e1 = edge_start[p], edge_start[p + 1]
+        if e0 == e1:
+            continue
+        low_y, high_y = min(a[e0:e1, 1].min(), b[e0:e1, 1].min()), max(a[e0:e1, 1].max(), b[e0:e1, 1].max())
+        bottom = max(int(np.floor(low_y / size)) - j0, 0)
+        top = min(int(np.floor(high_y / size)) - j0, height - 1)
+        for row in range(bottom, top + 1):
+            under, over = (row + j0) * size, (row + j0 + 1) * size
+            first = n_near
+            low_x, high_x = np.inf, -np.inf
+            while n_near + e1 - e0 > len(near):
+                near = _lengthen(near)
+            for e in range(e0, e1):
+                if not ((a[e, 1] < under and b[e, 1] < under) or (a[e, 1] > over and b[e, 1] > over)):
+                    near[n_near] = e
+                    n_near += 1
+                    low_x, high_x = min(low_x, a[e, 0], b[e, 0]), max(high_x, a[e, 0], b[e, 0])
+            if first == n_near:
+                continue
+            left = max(int(np.floor(low_x / size)) - i0, 0)
+            right = min(int(np.floor(high_x / size)) - i0, width - 1)
+            while n + right + 1 - left > len(cell):
+                cell, polygon, edges = _lengthen(cell), _lengthen(polygon), _lengthen(edges)
+            for column in range(left, right + 1):
+                side = _side_of_cell((column + i0) * size, under, near[first:n_near], a, b)
+                if side != OUTSIDE:
+                    cell[n], polygon[n] = row * width + column, p
+                    edges[n, 0], edges[n, 1] = first, n_near if side == UNSURE else first
+                    n += 1
+    start, order = _group(cell[:n], width * height)
+    return start, polygon[:n][order], edges[:n][order], a[near[:n_near]], b[near[:n_near]]
+
+
+@numba.njit(cache=True, nogil=True)
+def _lengthen(values: NDArray[Any]) -> NDArray[Any]:
+    """Twice the room, with the values in its first half."""
+    room = np.empty((2 * len(values), *values.shape[1:]), values.dtype)
+    room[: len(values)] = values
+    return room
+
+
+@numba.njit(cache=True, nogil=True)
+def _group(group: NDArray[np.integer], n: int) -> tuple[Index, Index]:
+    """Where each of n groups starts, and the rows by group, in their old order within each."""
+    start = np.zeros(n + 1, np.int64)
+    for k in range(len(group)):
+        start[group[k] + 1] += 1
+    for g in range(n):
+        start[g + 1] += start[g]
+    place = start[:-1].copy()
+    order = np.empty(len(group), np.int64)
+    for k in range(len(group)):
+        order[place[group[k]]] = k
+        place[group[k]] += 1
+    return start, order
+
+
 @numba.njit(cache=True, nogil=True)
 def _find(
-    xy: NDArray[np.float64],
-    order: NDArray[np.int32],
-    first: tuple[int, int],
-    cell_start: NDArray[np.int64],
-    edge_start: NDArray[np.int64],
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    xy: Array, among: NDArray[np.bool_], edge_start: Index, edge_a: Array, edge_b: Array
+) -> tuple[Index, Index]:
     """For each polygon, four times the point plus its side, of all points that are not surely outside."""
-    height, width = cell_start.shape[0], cell_start.shape[1] - 1
-    n = len(edge_start) - 1
-    start = np.zeros(n + 1, np.int64)
-    found = np.empty(1024, np.int64)
-    near = np.empty(np.max(np.diff(edge_start)), np.int64)
-    n_found = 0
-    for p in range(n):
-        e0, e1 = edge_start[p], edge_start[p + 1]
-        if e0 < e1:
-            low_x = min(a[e0:e1, 0].min(), b[e0:e1, 0].min())
-            high_x = max(a[e0:e1, 0].max(), b[e0:e1, 0].max())
-            low_y = min(a[e0:e1, 1].min(), b[e0:e1, 1].min())
-            high_y = max(a[e0:e1, 1].max(), b[e0:e1, 1].max())
-            left = max(int(np.floor(low_x / INDEX_CELL)) - first[0], 0)
-            right = min(int(np.floor(high_x / INDEX_CELL)) - first[0], width - 1)
-            bottom = max(int(np.floor(low_y / INDEX_CELL)) - first[1], 0)
-            top = min(int(np.floor(high_y / INDEX_CELL)) - first[1], height - 1)
-            for row in range(bottom, top + 1 if left <= right else bottom):
-                begin, end = cell_start[row, left], cell_start[row, right + 1]
-                if begin == end:
-                    continue
-                n_near = 0
-                under, over = (row + first[1]) * INDEX_CELL, (row + first[1] + 1) * INDEX_CELL
-                for e in range(e0, e1):
-                    if not ((a[e, 1] < under and b[e, 1] < under) or (a[e, 1] > over and b[e, 1] > over)):
-                        near[n_near] = e
-                        n_near += 1
-                while n_found + end - begin > len(found):
-                    found = np.concatenate((found, np.empty_like(found)))
-                for k in range(begin, end):
-                    side = OUTSIDE
-                    for m in range(n_near):
-                        e = near[m]
-                        crossed = _cross(xy[k, 0], xy[k, 1], a[e, 0], a[e, 1], b[e, 0], b[e, 1])
-                        if crossed == UNSURE:
-                            side = UNSURE
-                            break
-                        side ^= crossed
-                    if side != OUTSIDE:
-                        found[n_found] = 4 * np.int64(order[k]) + side
-                        n_found += 1
-            found[start[p] : n_found].sort()
-        start[p + 1] = n_found
-    return start, found[:n_found].copy()
+    n_polygons = len(edge_start) - 1
+    cells = _find_cells(xy, among, edge_a, edge_b)
+    i0, j0, width, height = cells
+    cell_start, polygon, edges, a, b = _put_into_cells(cells, edge_start, edge_a, edge_b)
+    owner, found = np.empty(1024, np.int32), np.empty(1024, np.int64)
+    n = 0
+    for k in range(len(xy) if width else 0):
+        if not among[k]:
+            continue
+        x, y = xy[k, 0], xy[k, 1]
+        i, j = int(np.floor(x / INDEX_CELL)) - i0, int(np.floor(y / INDEX_CELL)) - j0
+        if i < 0 or i >= width or j < 0 or j >= height:
+            continue
+        first, last = cell_start[j * width + i], cell_start[j * width + i + 1]
+        if n + last - first > len(found):
+            owner, found = _lengthen(owner), _lengthen(found)
+        for m in range(first, last):
+            begin, end = edges[m, 0], edges[m, 1]
+            side = INSIDE if begin == end else _side(x, y, begin, end, a, b)
+            if side != OUTSIDE:
+                owner[n], found[n] = polygon[m], 4 * np.int64(k) + side
+                n += 1
+    start, order = _group(owner[:n], n_polygons)
+    return start, found[order]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from pipeline.inside import are_inside, find_inside
 from pipeline.pointcloud import GROUND, WATER, PointCloud
+from pipeline.raster import Dtm, measure_over
 from pipeline.residuals import Residuals, ResidualSums, conclude, merge_residuals, sum_residuals, summarise
 from pipeline.roof_points import RoofPoints, select_roof
-from pipeline.terrain import Dtm, sample_dtm
 
 __all__ = [
     "KINDS",
@@ -203,27 +203,30 @@ def _find_residuals(
     """Find the residuals (m) of the points of each kind."""
     built = np.isfinite(roof)
     polygons, roof = polygons[built], roof[built]
-    roof_xyz = np.compress(select_roof(cloud, building_class=building_class), cloud.xyz, axis=0)
-    building, point, original = _find_in_both(roof_xyz, polygons, footprints)
-    missed = np.compress(original & ~_mark(len(roof_xyz), point), roof_xyz, axis=0)
+    xyz = cloud.xyz
+    is_roof = select_roof(cloud, building_class=building_class)
+    building, point, original = _find_in_both(xyz, is_roof, polygons, footprints)
+    missed = original & ~_mark(len(xyz), point)
 
     is_ground = (cloud.classification == GROUND) | (cloud.classification == WATER)
-    ground_xyz = np.compress(is_ground, cloud.xyz, axis=0)
-    over, below, original = _find_in_both(ground_xyz, polygons, footprints)
-    open_ground = np.compress(~_mark(len(ground_xyz), below), ground_xyz, axis=0)
+    over, below, original = _find_in_both(xyz, is_ground, polygons, footprints)
+    open_ground = is_ground & ~_mark(len(xyz), below)
     return {
-        "roof": roof[building] - roof_xyz[point, 2],
-        "missed": sample_dtm(dtm, missed[:, :2]) - missed[:, 2],
-        "ground": sample_dtm(dtm, open_ground[:, :2]) - open_ground[:, 2],
-        "swallowed": (roof[over] - ground_xyz[below, 2])[~original[below]],
+        "roof": roof[building] - xyz[point, 2],
+        "missed": measure_over(dtm, xyz, missed),
+        "ground": measure_over(dtm, xyz, open_ground),
+        "swallowed": (roof[over] - xyz[below, 2])[~original[below]],
     }
 
 
 def _find_in_both(
-    xyz: NDArray[np.float64], polygons: NDArray[np.object_], footprints: NDArray[np.object_]
+    xyz: NDArray[np.float64],
+    among: NDArray[np.bool_],
+    polygons: NDArray[np.object_],
+    footprints: NDArray[np.object_],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Find the points in each polygon, as `find_inside`, and tell which points are in a footprint."""
-    polygon, point = find_inside(xyz, np.concatenate((polygons, footprints)))
+    polygon, point = find_inside(xyz, np.concatenate((polygons, footprints)), among=among)
     n = int(np.searchsorted(polygon, len(polygons)))
     return polygon[:n], point[:n], _mark(len(xyz), point[n:])
 

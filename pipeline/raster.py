@@ -203,6 +203,26 @@ def sample_dtm(dtm: Dtm, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     return height
 
 
+def measure_over(dtm: Dtm, xyz: NDArray[np.float64], among: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Measure how high terrain is over points: `sample_dtm` minus their own heights.
+
+    Parameters
+    ----------
+    dtm : Dtm
+        Terrain without empty nodes.
+    xyz : float64, (n, 3)
+        Points (m).
+    among : bool, (n,)
+        Which ``k`` of them.
+
+    Returns
+    -------
+    float64, (k,)
+        Differences (m), in their order.
+    """
+    return np.asarray(_measure_over(dtm.z, dtm.i0, dtm.j0, dtm.spacing, xyz, among))
+
+
 @numba.njit(cache=True, nogil=True)
 def _sample(
     z: NDArray[np.float64],
@@ -212,15 +232,39 @@ def _sample(
     xy: NDArray[np.float64],
     height: NDArray[np.float64],
 ) -> None:
-    ny, nx = z.shape
     for k in range(len(xy)):
-        u = min(max(xy[k, 0] / spacing, float(i0)), float(i0 + nx - 1))
-        v = min(max(xy[k, 1] / spacing, float(j0)), float(j0 + ny - 1))
-        i = min(int(np.floor(u)), i0 + max(nx - 2, 0))
-        j = min(int(np.floor(v)), j0 + max(ny - 2, 0))
-        s, t = u - i, v - j
-        left, low = i - i0, j - j0
-        right, high = min(left + 1, nx - 1), min(low + 1, ny - 1)
-        below = (1 - s) * z[low, left] + s * z[low, right]
-        above = (1 - s) * z[high, left] + s * z[high, right]
-        height[k] = (1 - t) * below + t * above
+        height[k] = _height_at(z, i0, j0, spacing, xy[k, 0], xy[k, 1])
+
+
+@numba.njit(cache=True, nogil=True)
+def _measure_over(
+    z: NDArray[np.float64],
+    i0: int,
+    j0: int,
+    spacing: float,
+    xyz: NDArray[np.float64],
+    among: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    over = np.empty(np.count_nonzero(among))
+    n = 0
+    for k in range(len(xyz)):
+        if among[k]:
+            over[n] = _height_at(z, i0, j0, spacing, xyz[k, 0], xyz[k, 1]) - xyz[k, 2]
+            n += 1
+    return over
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _height_at(z: NDArray[np.float64], i0: int, j0: int, spacing: float, x: float, y: float) -> float:
+    ny, nx = z.shape
+    u = min(max(x / spacing, float(i0)), float(i0 + nx - 1))
+    v = min(max(y / spacing, float(j0)), float(j0 + ny - 1))
+    i = min(int(np.floor(u)), i0 + max(nx - 2, 0))
+    j = min(int(np.floor(v)), j0 + max(ny - 2, 0))
+    s, t = u - i, v - j
+    left, low = i - i0, j - j0
+    right, high = min(left + 1, nx - 1), min(low + 1, ny - 1)
+    below = (1 - s) * z[low, left] + s * z[low, right]
+    above = (1 - s) * z[high, left] + s * z[high, right]
+    height: float = (1 - t) * below + t * above
+    return height

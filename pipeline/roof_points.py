@@ -57,7 +57,6 @@ def locate_roof_points(cloud: PointCloud, polygons: NDArray[np.object_], *, buil
     Two standard deviations (the outliers of step 1.5) would cut off a low annex with less than a fifth of
     the points: its distance from the mean, ``(1 - p) D``, exceeds ``2 sqrt(p (1 - p)) D`` when ``p < 0.2``.
     """
-    xyz = np.compress(select_roof(cloud, building_class=building_class), cloud.xyz, axis=0)
-    polygon, point = find_inside(xyz, polygons)
+    polygon, point = find_inside(cloud.xyz, polygons, among=select_roof(cloud, building_class=building_class))
     start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))
-    return RoofPoints(start, sort_points(start, xyz[point]))
+    return RoofPoints(start, sort_points(start, cloud.xyz[point]))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import shapely
+import shapely.affinity
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -23,6 +24,11 @@ def by_geos(xy: Array, polygons: NDArray[np.object_], *, closed: bool) -> NDArra
 def check(xy: Array, polygons: NDArray[np.object_]) -> None:
     pairs = [index.tolist() for index in np.nonzero(by_geos(xy, polygons, closed=False))]
     assert [index.tolist() for index in find_inside(xy, polygons)] == pairs
+    some = np.arange(len(xy)) % 3 > 0
+    some_pairs = [(a, b) for a, b in zip(*pairs, strict=True) if some[b]]
+    assert (
+        list(zip(*(index.tolist() for index in find_inside(xy, polygons, among=some)), strict=True)) == some_pairs
+    )
     polygon, point = np.divmod(np.arange(len(polygons) * len(xy)), max(len(xy), 1))
     for closed in (False, True):
         found = are_inside(polygons, polygon, xy[point], closed=closed)
@@ -60,6 +66,17 @@ def test_outlines_holes_and_empty_polygons() -> None:
     check(np.array([[x, y] for x in axis for y in axis]), polygons)
     check(np.empty((0, 2)), polygons)
     check(np.zeros((3, 2)), polygons[:0])
+
+
+def test_many_points_in_wide_polygons() -> None:
+    """Cells that lie inside as a whole, outlines along their borders, a grid that outgrows its first room."""
+    ring = shapely.box(0, 0, 64, 48).difference(shapely.box(8, 8, 30, 31))
+    turned = shapely.affinity.rotate(shapely.box(-5, -5, 50, 20), 30)
+    polygons = np.array([ring, turned, shapely.box(1000, 1000, 1001, 1001)])
+    axis = np.arange(-10.0, 70, 0.5)
+    check(np.array([[x, y] for x in axis for y in axis]), polygons)
+    check(np.array([[500.0, 500.0], [501.0, 700.0]]), polygons)
+    check(np.array([[2000.0, 500.0]]), polygons)
 
 
 @settings(max_examples=60, deadline=None)

@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 
 from pipeline.errors import InputError
 from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
-from pipeline.raster import HEIGHT_UNIT, NodeWindow, cut_nodes, grow_window, join_dtm, node_window, window_of
+from pipeline.raster import (
+    HEIGHT_UNIT,
+    NodeWindow,
+    cut_nodes,
+    grow_window,
+    join_dtm,
+    measure_over,
+    node_window,
+    window_of,
+)
 from pipeline.terrain import Dtm, bin_ground, bin_nodes, compute_dtm, fill_dtm, sample_dtm
 from pipeline.terrain_fill import (
     COARSE,
@@ -89,6 +98,8 @@ def test_sampling_has_the_same_bits_from_any_cut_of_the_raster() -> None:
     cut = Dtm(whole.z[10:30, 5:45].copy(), 318005, 6399010, 1.0)
     xy = np.column_stack((rng.uniform(318006, 318043, 500), rng.uniform(6399011, 6399028, 500)))
     assert sample_dtm(whole, xy).tobytes() == sample_dtm(cut, xy).tobytes()
+    xyz, among = np.column_stack((xy, xy[:, 0])), np.arange(len(xy)) % 3 > 0
+    assert measure_over(cut, xyz, among).tobytes() == (sample_dtm(cut, xy) - xyz[:, 2])[among].tobytes()
 
 
 def test_sampling_beyond_the_raster_takes_its_border() -> None:
