@@ -8,6 +8,7 @@ from pipeline.pointcloud import HIGH_NOISE, LOW_NOISE
 
 KEPT, OUTSIDE, WITHHELD, NOISE, ABSURD = range(5)
 REASONS = ("kept", "outside", "withheld", "noise", "absurd")
+LEFT_OUT = -1  # what a class becomes whose points are not wanted
 HEIGHT_LIMIT = 10_000.0  # m; no ground, building or return lies beyond
 
 Box = tuple[float, float, float, float]
@@ -61,9 +62,16 @@ def judge_points(
 
 @numba.njit(cache=True, nogil=True)
 def cut_units(
-    units: NDArray[np.int32], classification: NDArray[np.uint8], scale: Triple, offset: Triple, box: Box
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Give the coordinates and classes of the points within a box, in their old order.
+    units: NDArray[np.int32],
+    classification: NDArray[np.uint8],
+    scale: Triple,
+    offset: Triple,
+    box: Box,
+    become: NDArray[np.int16],
+    xyz: NDArray[np.float64],
+    classes: NDArray[np.uint8],
+) -> int:
+    """Write the coordinates and classes of the wanted points within a box, in their old order.
 
     Parameters
     ----------
@@ -71,28 +79,40 @@ def cut_units(
         Coordinates in units of the file, as in `find_coordinates`.
     classification : uint8, (n,)
         ASPRS classes.
+    scale, offset : tuple of 3 floats
+        Size of a unit along each axis, and place of unit 0 (m).
     box : tuple of 4 floats
         xmin, ymin, xmax, ymax (m); the borders belong to the box.
+    become : int16, (256,)
+        Class that each class becomes; `LEFT_OUT` for those that are not wanted.
+    xyz : float64, (m, 3)
+        Room for ``m >= n`` coordinates (m); the first rows are written.
+    classes : uint8, (m,)
+        Room for their classes, likewise.
 
     Returns
     -------
-    xyz : float64, (k, 3)
-        Coordinates (m).
-    classification : uint8, (k,)
-        Their classes.
+    int
+        Number of points that were written.
+
+    Raises
+    ------
+    ValueError
+        If there is no room for all points.
     """
+    if min(len(xyz), len(classes)) < len(units):
+        raise ValueError("no room for all points")
     n = 0
     for k in range(len(units)):
-        n += _is_within(units[k, 0] * scale[0] + offset[0], units[k, 1] * scale[1] + offset[1], box)
-    xyz, classes = np.empty((n, 3)), np.empty(n, np.uint8)
-    n = 0
-    for k in range(len(units)):
+        new = become[classification[k]]
+        if new == LEFT_OUT:
+            continue
         x, y = units[k, 0] * scale[0] + offset[0], units[k, 1] * scale[1] + offset[1]
         if _is_within(x, y, box):
             xyz[n, 0], xyz[n, 1], xyz[n, 2] = x, y, units[k, 2] * scale[2] + offset[2]
-            classes[n] = classification[k]
+            classes[n] = new
             n += 1
-    return xyz, classes
+    return n
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

@@ -54,13 +54,13 @@ def whole(blocks: list[PointBlock]) -> PointCloud:
 
 def found(blocks: list[PointBlock], box: Box, size: float = CELL) -> PointCloud:
     """Read a box back as a reader of the store does: the ranges of rows, then the crop."""
-    parts = [
-        cut_units(block.units[first:stop], block.classification[first:stop], block.scale, block.offset, box)
-        for block in blocks
-        for first, stop in select_cells(block.cell, block.start, box, size=size)
-    ]
-    xyz = np.concatenate([np.empty((0, 3)), *(part[0] for part in parts)])
-    return PointCloud(xyz, np.concatenate([np.empty(0, np.uint8), *(part[1] for part in parts)]))
+    n, room = 0, sum(len(block.units) for block in blocks)
+    xyz, classes = np.empty((room, 3)), np.empty(room, np.uint8)
+    for block in blocks:
+        for first, stop in select_cells(block.cell, block.start, box, size=size):
+            rows = block.units[first:stop], block.classification[first:stop], block.scale, block.offset
+            n += cut_units(*rows, box, np.arange(256, dtype=np.int16), xyz[n:], classes[n:])
+    return PointCloud(xyz[:n], classes[:n])
 
 
 def total(blocks: list[PointBlock]) -> dict[str, int]:

@@ -1,6 +1,7 @@
 """What stages read of each other's results: points, terrain, houses and buildings in a box."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.building_points import NEVER_ROOF
 from pipeline.citymodel import Footprints
 from pipeline.ground_filter import FILTER_REACH, classify_ground
-from pipeline.las_points import cut_units
+from pipeline.las_points import LEFT_OUT, Triple, cut_units
 from pipeline.pointcloud import BUILDING, PointCloud
 from pipeline.raster import (
     Dtm,
@@ -29,6 +30,8 @@ from tiler.stage import Box
 from tiler.tables import Buildings, join_buildings, take_buildings, unpack_buildings
 from tiler.task import Task
 
+CLASSES = 256  # that a point may have
+
 
 def grow(box: Box, by: float) -> Box:
     """Grow a box on all sides (m)."""
@@ -40,8 +43,8 @@ def clip(box: Box, bounds: Box) -> Box:
     return max(box[0], bounds[0]), max(box[1], bounds[1]), min(box[2], bounds[2]), min(box[3], bounds[3])
 
 
-def read_cloud(task: Task, box: Box, *, ground_filter: bool = False) -> PointCloud:
-    """Read the points within a box, from the stage ``points``.
+def read_cloud(task: Task, box: Box, *, classes: Sequence[int], ground_filter: bool = False) -> PointCloud:
+    """Read the points of some classes within a box, from the stage ``points``.
 
     Parameters
     ----------
@@ -49,6 +52,8 @@ def read_cloud(task: Task, box: Box, *, ground_filter: bool = False) -> PointClo
         A task that reads that stage.
     box : (xmin, ymin, xmax, ymax)
         Box (m); its borders belong to it.
+    classes : sequence of int
+        ASPRS classes that are wanted.
     ground_filter : bool
         Find ground by our own filter.
 
@@ -59,21 +64,17 @@ def read_cloud(task: Task, box: Box, *, ground_filter: bool = False) -> PointClo
         are not ground, water, vegetation or noise.
     """
     wide = clip(grow(box, FILTER_REACH), task.context.bounds) if ground_filter else box
-    places, classes = [np.empty((0, 3))], [np.empty(0, np.uint8)]
-    marks = [True]
-    for name in task.refs["points"]:
-        found, marked_file = _read_file(task, name, wide)
-        places.append(found.xyz)
-        classes.append(found.classification)
-        marks.append(marked_file)
-    cloud = PointCloud(np.concatenate(places), np.concatenate(classes))
-    if ground_filter:
-        cloud = classify_ground(cloud, bounds=wide)
-    if not all(marks):
-        marked = np.repeat(marks, [len(xyz) for xyz in places])
-        roof = ~marked & ~np.isin(cloud.classification, NEVER_ROOF)
-        cloud = PointCloud(cloud.xyz, np.where(roof, BUILDING, cloud.classification).astype(np.uint8))
-    return crop_cloud(cloud, box) if ground_filter else cloud
+    files = [file for name in task.refs["points"] if (file := _find_rows(task, name, wide)) is not None]
+    wanted = [_reclassify(classes, marked=file.marks_buildings) for file in files]
+    if not ground_filter:
+        return _read_files(task, files, box, wanted)[0]
+    cloud, count = _read_files(task, files, wide, [np.arange(CLASSES, dtype=np.int16)] * len(files))
+    found = classify_ground(cloud, bounds=wide).classification
+    ends = np.cumsum([0, *count])
+    parts = [table[found[first:end]] for table, (first, end) in zip(wanted, pairwise(ends), strict=True)]
+    become = np.concatenate([np.empty(0, np.int16), *parts])
+    kept = become != LEFT_OUT
+    return crop_cloud(PointCloud(cloud.xyz[kept], become[kept].astype(np.uint8)), box)
 
 
 def read_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm:
@@ -160,17 +161,49 @@ def read_buildings(task: Task, box: Box) -> Buildings:
     return join_buildings(near)
 
 
-def _read_file(task: Task, name: str, box: Box) -> tuple[PointCloud, bool]:
-    """Read the points of a file in cells that meet a box, cropped to it; also whether it marks buildings."""
+@dataclass(frozen=True, eq=False)
+class _FileRows:
+    """Rows of a file to read, as ranges, and what it says of their units and classes."""
+
+    name: str
+    ranges: list[tuple[int, int]]
+    scale: Triple
+    offset: Triple
+    marks_buildings: bool
+
+
+def _find_rows(task: Task, name: str, box: Box) -> _FileRows | None:
+    """Find the rows of a file in cells that meet a box; None for a file that could not be read."""
     facts = task.store.attributes("points", name)["facts"]
     if facts["unreadable"]:
-        return PointCloud(np.empty((0, 3)), np.empty(0, np.uint8)), True
+        return None
     arrays, _ = task.store.read("points", name, names=("cell", "cell_row", "block", "end"))
     ranges = _ranges_of_blocks(arrays["cell"], np.append(arrays["cell_row"], arrays["end"]), arrays["block"], box)
-    rows = task.read_ranges("points", name, ("units", "classification"), ranges)
-    scale, offset = tuple(facts["scale"]), tuple(facts["offset"])
-    cut = cut_units(rows["units"], rows["classification"], scale, offset, box)
-    return PointCloud(*cut), facts["marks_buildings"]
+    return _FileRows(name, ranges, tuple(facts["scale"]), tuple(facts["offset"]), facts["marks_buildings"])
+
+
+def _reclassify(classes: Sequence[int], *, marked: bool) -> NDArray[np.int16]:
+    """Class that each class becomes in a file that marks buildings, or not; `LEFT_OUT` for unwanted ones."""
+    become = np.arange(CLASSES, dtype=np.int16)
+    if not marked:
+        become[~np.isin(become, NEVER_ROOF)] = BUILDING
+    become[~np.isin(become, classes)] = LEFT_OUT
+    return become
+
+
+def _read_files(
+    task: Task, files: Sequence[_FileRows], box: Box, become: Sequence[NDArray[np.int16]]
+) -> tuple[PointCloud, list[int]]:
+    """Read points of files, cropped to a box, one file after the other; also their number in each."""
+    room = sum(stop - first for file in files for first, stop in file.ranges)
+    xyz, classes = np.empty((room, 3)), np.empty(room, np.uint8)
+    count: list[int] = []
+    for file, table in zip(files, become, strict=True):
+        rows = task.read_ranges("points", file.name, ("units", "classification"), file.ranges)
+        n = sum(count)
+        found = rows["units"], rows["classification"], file.scale, file.offset
+        count.append(cut_units(*found, box, table, xyz[n:], classes[n:]))
+    return PointCloud(xyz[: sum(count)], classes[: sum(count)]), count
 
 
 def _ranges_of_blocks(

@@ -136,10 +136,9 @@ def _measure_points(
         for name, (west, south, east, north) in sorted(files.items())
         if west <= box[2] and east >= box[0] and south <= box[3] and north >= box[1]
     )
-    cloud = read_cloud(task, box, ground_filter=ground_filter)
-    kept = np.flatnonzero(np.isin(cloud.classification, list(CLASSES)))
-    kept = kept[:: max(1, -(-len(kept) // MOST_POINTS))]
-    xyz, kind = cloud.xyz[kept], cloud.classification[kept]
+    cloud = read_cloud(task, box, classes=list(CLASSES), ground_filter=ground_filter)
+    step = max(1, -(-len(cloud.xyz) // MOST_POINTS))
+    xyz, kind = cloud.xyz[::step], cloud.classification[::step]
     triangle, residual = measure_surface(mesh, xyz)
     there = triangle != NOWHERE
     built = mesh.plane.building[triangle] >= 0

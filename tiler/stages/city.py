@@ -1,5 +1,6 @@
 """Stages 1.4 to 2.3: houses of each tile, clusters of close ones across tiles, and the simplified city model."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
 from pipeline.planar import join_pairs
 from pipeline.point_fidelity import HouseFidelity, measure_houses
-from pipeline.pointcloud import PointCloud
+from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
 from pipeline.raster import Dtm, window_of
 from pipeline.roof_points import locate_roof_points
 from pipeline.simplify import raise_buildings
@@ -41,7 +42,7 @@ from tiler.tables import (
 )
 from tiler.task import Result, Task
 
-GROUND = ("dtm_spacing", "ground_filter")
+TERRAIN = ("dtm_spacing", "ground_filter")
 
 
 def house_stage(config: Config) -> Stage:
@@ -51,7 +52,7 @@ def house_stage(config: Config) -> Stage:
         Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
-    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *GROUND))
+    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN))
 
 
 def first_round(config: Config) -> list[Stage]:
@@ -114,7 +115,7 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *GROUND, *mesh), version=3)
+    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=3)
 
 
 def chooses_layers_later(config: Config) -> bool:
@@ -134,7 +135,7 @@ def make_houses(task: Task) -> Facts:
     places = np.array([(note.x, note.y) for note in notes]).reshape(-1, 2)
     task.notes(note for note, mine in zip(notes, find_owned(task.box, bounds, places), strict=True) if mine)
     extent = _extent(own.polygons)
-    cloud, dtm = _surroundings(task, extent, options.ground_margin, 2 * spacing)
+    cloud, dtm = _surroundings(task, extent, options.ground_margin, 2 * spacing, (BUILDING, GROUND, WATER))
     terrain = cut_terrain(dtm, window_of(dtm))
     city = measure_city(cloud, own, terrain, options, building_class=True, trace=task.step)
     task.notes(city.notes)
@@ -262,7 +263,7 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0
     shapes = _keep_within(task, shapes, gathered.houses)
     extent = _extent(shapes.polygons)
-    cloud, dtm = _surroundings(task, extent, options.ground_margin, reach + 2 * given.dtm_spacing)
+    cloud, dtm = _surroundings(task, extent, options.ground_margin, reach + 2 * given.dtm_spacing, (BUILDING,))
     reserved = {name for result in task.read("reserved", ()) for name in result.facts["names"]}
     terrain = cut_terrain(dtm, window_of(dtm))
     city = raise_buildings(gathered.houses, shapes, terrain, options, reserved=reserved, trace=task.step)
@@ -311,8 +312,10 @@ def _owned(task: Task, footprints: Footprints) -> Footprints:
     return Footprints(footprints.polygons[mine], footprints.ids[mine], footprints.given_height[mine])
 
 
-def _surroundings(task: Task, extent: Box | None, margin: float, reach: float) -> tuple[PointCloud, Dtm]:
-    """Points and terrain of a box; none and any where there is no house to ask for them.
+def _surroundings(
+    task: Task, extent: Box | None, margin: float, reach: float, classes: Sequence[int]
+) -> tuple[PointCloud, Dtm]:
+    """Points of some classes and terrain of a box; none and any where there is no house to ask for them.
 
     The terrain is NaN at nodes of tiles that are absent.
     """
@@ -321,7 +324,7 @@ def _surroundings(task: Task, extent: Box | None, margin: float, reach: float) -
         nothing = PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
         return nothing, Dtm(np.zeros((1, 1)), 0, 0, given.dtm_spacing)
     with task.step("1.1 points of houses"):
-        cloud = read_cloud(task, grow(extent, margin), ground_filter=given.ground_filter)
+        cloud = read_cloud(task, grow(extent, margin), classes=classes, ground_filter=given.ground_filter)
     return cloud, read_known_terrain(task, grow(extent, reach), spacing=given.dtm_spacing, bounds=bounds)
 
 

@@ -9,7 +9,7 @@ import shapely
 
 from pipeline.errors import InputError
 from pipeline.notes import Note
-from pipeline.pointcloud import BUILDING
+from pipeline.pointcloud import BUILDING, GROUND, WATER
 from pipeline.raster import Dtm, NodeWindow, grow_window, join_dtm, node_window
 from pipeline.terrain import bin_nodes
 from pipeline.terrain_fill import (
@@ -199,7 +199,8 @@ def bin_tile(task: Task) -> Facts:
         (window.i0 + window.nx - 1) * spacing,
         (window.j0 + window.ny - 1) * spacing,
     )
-    cloud = read_cloud(task, grow(box, spacing / 2), ground_filter=task.parameters.ground_filter)
+    box = grow(box, spacing / 2)
+    cloud = read_cloud(task, box, classes=(GROUND, WATER), ground_filter=task.parameters.ground_filter)
     raster, _ = bin_nodes(cloud, window, spacing=spacing)
     task.put_rasters(z=raster.z)
     return _raster_facts(raster)

@@ -19,7 +19,7 @@ from pipeline.histograms import (
 )
 from pipeline.mesh import ColumnMesh, SeamEdges
 from pipeline.point_fidelity import KINDS, FidelitySums, conclude_fidelity, merge_fidelity, sum_fidelity
-from pipeline.pointcloud import PointCloud
+from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
 from pipeline.quality import measure_cells
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
 from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
@@ -157,9 +157,10 @@ def prove_seam(task: Task) -> Facts:
 def measure_fit(task: Task) -> Facts:
     """Measure how far the points of a tile are from the city model (step 2.4)."""
     given, bounds = task.parameters, task.context.bounds
-    cloud = read_cloud(task, task.box, ground_filter=given.ground_filter)
+    cloud = read_cloud(task, task.box, classes=(BUILDING, GROUND, WATER), ground_filter=given.ground_filter)
     own = find_owned(task.box, bounds, cloud.xyz[:, :2])
-    cloud = PointCloud(np.compress(own, cloud.xyz, axis=0), cloud.classification[own])
+    if not own.all():
+        cloud = PointCloud(cloud.xyz[own], cloud.classification[own])
     dtm = read_terrain(task, task.box, spacing=given.dtm_spacing, bounds=bounds)
     buildings = read_buildings(task, task.box)
     outlines = [np.empty(0, object)]
