@@ -16,13 +16,27 @@ Triple = tuple[float, float, float]
 
 
 @numba.njit(cache=True, nogil=True)
-def find_coordinates(units: NDArray[np.int32], scale: Triple, offset: Triple) -> NDArray[np.float64]:
+def find_coordinates(
+    x: NDArray[np.int32], y: NDArray[np.int32], z: NDArray[np.int32], scale: Triple, offset: Triple
+) -> NDArray[np.float64]:
     """Give the coordinates (m), float64 (n, 3), of points in units of a file: ``units * scale + offset``."""
-    xyz = np.empty((len(units), 3))
-    for k in range(len(units)):
-        for axis in range(3):
-            xyz[k, axis] = units[k, axis] * scale[axis] + offset[axis]
+    xyz = np.empty((len(x), 3))
+    for k in range(len(x)):
+        xyz[k, 0] = x[k] * scale[0] + offset[0]
+        xyz[k, 1] = y[k] * scale[1] + offset[1]
+        xyz[k, 2] = z[k] * scale[2] + offset[2]
     return xyz
+
+
+@numba.njit(cache=True, nogil=True)
+def take_units(
+    x: NDArray[np.int32], y: NDArray[np.int32], z: NDArray[np.int32], rows: NDArray[np.int64]
+) -> NDArray[np.int32]:
+    """Take rows, (k,), of coordinates in units of a file, each (n,), side by side: int32 (k, 3)."""
+    units = np.empty((len(rows), 3), np.int32)
+    for k in range(len(rows)):
+        units[k, 0], units[k, 1], units[k, 2] = x[rows[k]], y[rows[k]], z[rows[k]]
+    return units
 
 
 @numba.njit(cache=True, nogil=True)

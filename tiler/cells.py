@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 Box = tuple[float, float, float, float]
 
-_FEW = 1 << 16  # keys below this sort by radix
+MOST_CELLS = 1 << 20  # that rows are counted in; 65 km square of those of points
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +17,7 @@ class CellOrder:
 
     Attributes
     ----------
-    order : int64, (n,)
+    order : int64, (k,)
         Rows by ascending cell, row-major (j, then i); the rows of a cell in their old order.
     cell : int64, (c, 2)
         Cells (i, j) that have rows, in that order.
@@ -29,15 +30,17 @@ class CellOrder:
     start: NDArray[np.int64]
 
 
-def order_by_cell(xy: NDArray[np.float64], size: float) -> CellOrder:
+def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.bool_] | None = None) -> CellOrder:
     """Order places by the cells of the grid with the corners at multiples of a size.
 
     Parameters
     ----------
-    xy : float64, (n, 2)
+    xy : float64, (n, 2) or (n, 3)
         Finite coordinates (m).
     size : float
         Side of a cell (m).
+    among : bool, (n,), optional
+        Rows to order; all by default.
 
     Returns
     -------
@@ -51,7 +54,7 @@ def order_by_cell(xy: NDArray[np.float64], size: float) -> CellOrder:
     Notes
     -----
     Cell (i, j) holds i = floor(x / size), j = floor(y / size): it depends on the place alone. O(n) where
-    fewer than 65536 cells are spanned, else O(n log n).
+    no more than `MOST_CELLS` are spanned, else O(n log n).
 
     Examples
     --------
@@ -61,19 +64,9 @@ def order_by_cell(xy: NDArray[np.float64], size: float) -> CellOrder:
     """
     if not size > 0:
         raise ValueError(f"size of cells {size} m must be positive")
-    if len(xy) == 0:
-        return CellOrder(np.empty(0, np.int64), np.empty((0, 2), np.int64), np.zeros(1, np.int64))
-    i, j = (np.floor(column / size).astype(np.int64) for column in xy.T)
-    first, width = i.min(), int(i.max() - i.min()) + 1
-    low = j.min()
-    key = (j - low) * width + (i - first)
-    if key.max() < _FEW:
-        key = key.astype(np.uint16)
-    order = np.argsort(key, kind="stable")
-    key = key[order].astype(np.int64)
-    begin = np.flatnonzero(np.diff(key, prepend=-1))
-    cell = np.column_stack((key[begin] % width + first, key[begin] // width + low))
-    return CellOrder(order, cell, np.append(begin, len(xy)))
+    among = np.ones(len(xy), np.bool_) if among is None else among
+    order, cell, start = _order(xy, among, float(size))
+    return CellOrder(order, cell, start)
 
 
 def select_cells(
@@ -125,3 +118,50 @@ def row_ranges(wanted: NDArray[np.bool_], start: NDArray[np.int64]) -> list[tupl
     change = np.flatnonzero(np.diff(wanted.astype(np.int8), prepend=0, append=0))
     rows = start[change].reshape(-1, 2)
     return [(int(first), int(stop)) for first, stop in rows if stop > first]
+
+
+@numba.njit(cache=True, nogil=True)
+def _order(
+    xy: NDArray[np.float64], among: NDArray[np.bool_], size: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Order, cells and starts of `CellOrder`."""
+    room = np.count_nonzero(among)
+    i, j, rows = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64)
+    n = 0
+    for k in range(len(xy)):
+        if among[k]:
+            i[n], j[n], rows[n] = int(np.floor(xy[k, 0] / size)), int(np.floor(xy[k, 1] / size)), k
+            n += 1
+    if n == 0:
+        return rows, np.empty((0, 2), np.int64), np.zeros(1, np.int64)
+    first, low = i.min(), j.min()
+    width = i.max() - first + 1
+    key = (j - low) * width + (i - first)
+    n_cells = key.max() + 1
+    place = _count_below(key, n_cells) if n_cells <= MOST_CELLS else np.argsort(np.argsort(key, kind="mergesort"))
+    order = np.empty(n, np.int64)
+    sorted_key = np.empty(n, np.int64)
+    for k in range(n):
+        order[place[k]], sorted_key[place[k]] = rows[k], key[k]
+    begin = np.flatnonzero(np.diff(sorted_key)) + 1
+    start = np.empty(len(begin) + 2, np.int64)
+    start[0], start[1:-1], start[-1] = 0, begin, n
+    cell = np.empty((len(start) - 1, 2), np.int64)
+    for c in range(len(cell)):
+        cell[c, 0], cell[c, 1] = sorted_key[start[c]] % width + first, sorted_key[start[c]] // width + low
+    return order, cell, start
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_below(key: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Place of each key among all in ascending order, equal ones in their old order; keys are below n."""
+    start = np.zeros(n + 1, np.int64)
+    for k in range(len(key)):
+        start[key[k] + 1] += 1
+    for c in range(n):
+        start[c + 1] += start[c]
+    place = np.empty(len(key), np.int64)
+    for k in range(len(key)):
+        place[k] = start[key[k]]
+        start[key[k]] += 1
+    return place

@@ -204,7 +204,7 @@ def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePoint
 
 def select_usable(
     chunk: laspy.ScaleAwarePointRecord, xyz: NDArray[np.float64], bounds: Box, counts: dict[str, int]
-) -> NDArray[np.int64]:
+) -> NDArray[np.bool_]:
     """Select the usable points of a chunk, and count what became of each.
 
     Parameters
@@ -220,14 +220,14 @@ def select_usable(
 
     Returns
     -------
-    int64, (k,)
-        Rows of the points to keep, ascending.
+    bool, (n,)
+        Which points to keep.
     """
     verdict = judge_points(xyz, classes_of(chunk), np.asarray(chunk.withheld) != 0, bounds)
     for reason, number in zip(REASONS, np.bincount(verdict, minlength=len(REASONS)).tolist(), strict=True):
         counts[reason] += number
     counts["read"] += len(xyz)
-    return np.flatnonzero(verdict == KEPT)
+    return np.asarray(verdict == KEPT)
 
 
 def _expand(source: Path) -> list[Path]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.las_points import Triple
+from pipeline.las_points import Triple, take_units
 from pipeline.pointcloud import PointCloud
 from tiler.cells import Box, order_by_cell
 from tiler.clouds import read_chunks, select_usable
@@ -97,14 +97,14 @@ def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator
         kept = select_usable(chunk, xyz, bounds, counts)
         counts["read"] += n_skipped
         counts["outside"] += n_skipped
-        found = order_by_cell(xyz[kept, :2], size)
+        found = order_by_cell(xyz, size, among=kept)
         total.update(dict(zip(map(tuple, found.cell.tolist()), np.diff(found.start).tolist(), strict=True)))
         _check_density(as_place(path), total, size)
-        rows, all_classes = kept[found.order], classes_of(chunk)
+        all_classes = classes_of(chunk)
         yield PointBlock(
-            units_of(chunk)[rows],
+            take_units(*units_of(chunk), found.order),
             *scaling_of(chunk),
-            all_classes[rows],
+            all_classes[found.order],
             found.cell,
             found.start,
             np.flatnonzero(np.bincount(all_classes, minlength=1)).astype(np.uint8),

@@ -11,12 +11,9 @@ _FIELDS = laspy.DecompressionSelection
 FIELDS = _FIELDS.XY_RETURNS_CHANNEL | _FIELDS.Z | _FIELDS.CLASSIFICATION | _FIELDS.FLAGS
 
 
-def units_of(chunk: laspy.ScaleAwarePointRecord) -> NDArray[np.int32]:
-    """Give the coordinates in units of the file, int32 (n, 3)."""
-    units = np.empty((len(chunk), 3), np.int32)
-    for k, axis in enumerate("XYZ"):
-        units[:, k] = chunk.array[axis]
-    return units
+def units_of(chunk: laspy.ScaleAwarePointRecord) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """Give x, y and z in units of the file, int32 (n,) each, where the chunk has them."""
+    return chunk.array["X"], chunk.array["Y"], chunk.array["Z"]
 
 
 def scaling_of(chunk: laspy.ScaleAwarePointRecord) -> tuple[Triple, Triple]:
@@ -27,7 +24,7 @@ def scaling_of(chunk: laspy.ScaleAwarePointRecord) -> tuple[Triple, Triple]:
 
 def coordinates_of(chunk: laspy.ScaleAwarePointRecord) -> NDArray[np.float64]:
     """Give the coordinates (m), float64 (n, 3)."""
-    return np.asarray(find_coordinates(units_of(chunk), *scaling_of(chunk)))
+    return np.asarray(find_coordinates(*units_of(chunk), *scaling_of(chunk)))
 
 
 def classes_of(chunk: laspy.ScaleAwarePointRecord) -> NDArray[np.uint8]:
