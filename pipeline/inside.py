@@ -9,6 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 INDEX_CELL = 2.0  # m, side of a cell of the point index; a power of two, so that borders of cells are exact
+BLOCK = 1 << 13  # points that room is made for at a time
 DOUBT = 1e-15  # share of its two products within which rounding may have chosen the sign of a turn
 OUTSIDE, INSIDE, UNSURE = range(3)
 POLYGON = 3  # GEOS's number of that type
@@ -310,28 +311,52 @@ def _find(
     """For each polygon, four times the point plus its side, of all points that are not surely outside."""
     n_polygons = len(edge_start) - 1
     cells = _find_cells(xy, among, edge_a, edge_b)
-    i0, j0, width, height = cells
     cell_start, polygon, edges, a, b = _put_into_cells(cells, edge_start, edge_a, edge_b)
-    owner, found = np.empty(1024, np.int32), np.empty(1024, np.int64)
+    most = np.max(np.diff(cell_start)) if len(polygon) else 0
+    owner, found = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int64)
     n = 0
-    for k in range(len(xy) if width else 0):
+    for first in range(0, len(xy) if most else 0, BLOCK):
+        last = min(first + BLOCK, len(xy))
+        while n + (last - first) * most > len(found):
+            owner, found = _lengthen(owner), _lengthen(found)
+        n = _find_some(xy, among, first, last, cells, cell_start, polygon, edges, a, b, owner, found, n)
+    start, order = _group(owner[:n], n_polygons)
+    return start, found[order]
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_some(
+    xy: Array,
+    among: NDArray[np.bool_],
+    first: int,
+    last: int,
+    cells: tuple[int, int, int, int],
+    cell_start: Index,
+    polygon: NDArray[np.int32],
+    edges: Index,
+    a: Array,
+    b: Array,
+    owner: NDArray[np.int32],
+    found: Index,
+    n: int,
+) -> int:
+    """Write what `_find` finds of the points from first to last after the n that there are; give their number."""
+    i0, j0, width, height = cells
+    for k in range(first, last):
         if not among[k]:
             continue
         x, y = xy[k, 0], xy[k, 1]
         i, j = int(np.floor(x / INDEX_CELL)) - i0, int(np.floor(y / INDEX_CELL)) - j0
         if i < 0 or i >= width or j < 0 or j >= height:
             continue
-        first, last = cell_start[j * width + i], cell_start[j * width + i + 1]
-        if n + last - first > len(found):
-            owner, found = _lengthen(owner), _lengthen(found)
-        for m in range(first, last):
+        cell = j * width + i
+        for m in range(cell_start[cell], cell_start[cell + 1]):
             begin, end = edges[m, 0], edges[m, 1]
             side = INSIDE if begin == end else _side(x, y, begin, end, a, b)
             if side != OUTSIDE:
                 owner[n], found[n] = polygon[m], 4 * np.int64(k) + side
                 n += 1
-    start, order = _group(owner[:n], n_polygons)
-    return start, found[order]
+    return n
 
 
 @numba.njit(cache=True, nogil=True)
