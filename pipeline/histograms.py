@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,12 +64,28 @@ def count_values(values: NDArray[np.floating], limits: tuple[float, float], bins
     low, high = limits
     if not (low < high and bins > 0):
         raise ValueError(f"no histogram of {bins} bins from {low} to {high}")
-    values = values.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise ValueError(f"{np.count_nonzero(~np.isfinite(values))} of {len(values)} values are not finite")
-    place = np.floor((np.clip(values, low, high) - low) * (bins / (high - low))).astype(np.int64)
-    counts = np.bincount(np.minimum(place, bins - 1), minlength=bins).astype(np.int64)
-    return Histogram(low, high, counts, float(values.min(initial=np.inf)), float(values.max(initial=-np.inf)))
+    counts = np.zeros(bins, np.int64)
+    least, greatest, n_finite = _count(values, float(low), float(high), counts)
+    if n_finite < len(values):
+        raise ValueError(f"{len(values) - n_finite} of {len(values)} values are not finite")
+    return Histogram(low, high, counts, least, greatest)
+
+
+@numba.njit(cache=True, nogil=True)
+def _count(
+    values: NDArray[np.floating], low: float, high: float, counts: NDArray[np.int64]
+) -> tuple[float, float, int]:
+    """Add values to their bins; give the least and the greatest, and the number of finite ones."""
+    least, greatest, n_finite = np.inf, -np.inf, 0
+    scale = len(counts) / (high - low)
+    for given in values:
+        value = np.float64(given)
+        if np.isfinite(value):
+            place = int(np.floor((min(max(value, low), high) - low) * scale))
+            counts[min(place, len(counts) - 1)] += 1
+            least, greatest = min(least, value), max(greatest, value)
+            n_finite += 1
+    return least, greatest, n_finite
 
 
 def merge_histograms(parts: Sequence[Histogram]) -> Histogram:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,11 +69,21 @@ def sum_residuals(residual: NDArray[np.float64]) -> ResidualSums:
     (4, 0, 2000000000)
     """
     absolute = count_values(np.abs(residual), HISTOGRAM_LIMITS, HISTOGRAM_BINS)
-    units = np.rint(residual / UNIT).astype(np.int64)
-    squares = units**2
-    # In two halves, neither of which can overflow 64 bits.
-    upper, lower = int((squares >> 32).sum()), int((squares & 0xFFFFFFFF).sum())
-    return ResidualSums(len(residual), int(units.sum()), (upper << 32) + lower, absolute)
+    total, upper, lower = _sum_units(residual)
+    return ResidualSums(len(residual), int(total), (int(upper) << 32) + int(lower), absolute)
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_units(residual: NDArray[np.float64]) -> tuple[int, int, int]:
+    """Sum of residuals in `UNIT`, and of their squares in two halves, neither of which can overflow 64 bits."""
+    total = upper = lower = 0
+    for value in residual:
+        units = int(np.rint(value / UNIT))
+        square = units * units
+        total += units
+        upper += square >> 32
+        lower += square & 0xFFFFFFFF
+    return total, upper, lower
 
 
 def merge_residuals(parts: Sequence[ResidualSums]) -> ResidualSums:
