@@ -52,7 +52,12 @@ def has_building_class(cloud: PointCloud) -> bool:
 
 
 def extract_building_points(
-    cloud: PointCloud, polygons: NDArray[np.object_], *, margin: float, building_class: bool
+    cloud: PointCloud,
+    polygons: NDArray[np.object_],
+    *,
+    margin: float,
+    building_class: bool,
+    roof: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None,
 ) -> BuildingPoints:
     """Extract each building's roof and ground points, outliers removed (paper, step 1.5).
 
@@ -67,6 +72,8 @@ def extract_building_points(
     building_class : bool
         True: roof points are those of class 6 inside. False, for a cloud without that class: those inside
         that are neither ground, water, vegetation nor noise.
+    roof : (start, z), optional
+        The roof points of each polygon, where they are known: int64 (n + 1,), and heights (m), ascending in each.
 
     Returns
     -------
@@ -77,12 +84,15 @@ def extract_building_points(
     -----
     The result does not depend on the order of the points.
     """
-    roof = cloud.classification == BUILDING if building_class else ~np.isin(cloud.classification, NEVER_ROOF)
+    if roof is None:
+        on_roof = (
+            cloud.classification == BUILDING if building_class else ~np.isin(cloud.classification, NEVER_ROOF)
+        )
+        roof = _points_inside(cloud.xyz, on_roof, polygons, None)
     ground = (cloud.classification == GROUND) | (cloud.classification == WATER)
-    roof_start, roof_z = _points_inside(cloud.xyz, roof, polygons, None)
     rings = shapely.buffer(_coarsened(polygons, margin), margin)
     ground_start, ground_z = _points_inside(cloud.xyz, ground, rings, polygons)
-    return BuildingPoints(*remove_outliers(roof_start, roof_z), *remove_outliers(ground_start, ground_z))
+    return BuildingPoints(*remove_outliers(*roof), *remove_outliers(ground_start, ground_z))
 
 
 def _coarsened(polygons: NDArray[np.object_], margin: float) -> NDArray[np.object_]:

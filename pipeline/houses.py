@@ -16,7 +16,7 @@ from pipeline.building_points import (
 from pipeline.city import City, CityOptions
 from pipeline.house_levels import HouseParts, LevelOptions, split_levels
 from pipeline.pointcloud import PointCloud
-from pipeline.roof_points import locate_roof_points
+from pipeline.roof_points import RoofPoints, locate_roof_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,12 @@ class Houses:
 
 
 def divide_houses(
-    city: City, cloud: PointCloud, options: CityOptions, *, building_class: bool | None = None
+    city: City,
+    cloud: PointCloud,
+    options: CityOptions,
+    *,
+    building_class: bool | None = None,
+    roofs: RoofPoints | None = None,
 ) -> Houses:
     """Divide houses where their roofs step (step 2.0, ours); with other options, take each as one part.
 
@@ -62,12 +67,15 @@ def divide_houses(
         Parameters.
     building_class : bool, optional
         Whether the cloud marks buildings; by default, whether it has a point of that class.
+    roofs : RoofPoints, optional
+        Roof points of the houses, where they are known.
     """
     model = city.model
     marks = has_building_class(cloud) if building_class is None else building_class
     parts, points = HouseParts(model.polygons, np.arange(len(model))), city.points
     if options.split_levels and options.simplify == "clearance" and len(model):
-        roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
+        if roofs is None:
+            roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
         parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
         points = extract_building_points(cloud, parts.polygons, margin=options.ground_margin, building_class=marks)
     return Houses(model.ids, model.polygons, city.given_height, parts, points)

@@ -60,3 +60,19 @@ def locate_roof_points(cloud: PointCloud, polygons: NDArray[np.object_], *, buil
     polygon, point = find_inside(cloud.xyz, polygons, among=select_roof(cloud, building_class=building_class))
     start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))
     return RoofPoints(start, sort_points(start, cloud.xyz[point]))
+
+
+def keep_roof_points(points: RoofPoints, kept: NDArray[np.bool_]) -> RoofPoints:
+    """Keep the points of some buildings, bool (n,).
+
+    Examples
+    --------
+    >>> points = RoofPoints(np.array([0, 1, 3, 3]), np.array([[0.0, 0, 9], [1, 0, 5], [2, 0, 5]]))
+    >>> found = keep_roof_points(points, np.array([False, True, True]))
+    >>> found.start.tolist(), found.xyz[:, 0].tolist()
+    ([0, 2, 2], [1.0, 2.0])
+    """
+    if kept.all():
+        return points
+    count = np.diff(points.start)
+    return RoofPoints(np.concatenate(([0], np.cumsum(count[kept]))), points.xyz[np.repeat(kept, count)])

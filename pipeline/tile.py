@@ -25,6 +25,7 @@ from pipeline.mesh import ColumnMesh
 from pipeline.notes import Note
 from pipeline.plane import mesh_plane
 from pipeline.pointcloud import PointCloud
+from pipeline.roof_points import RoofPoints
 from pipeline.terrain import Dtm
 
 # Plane meshes: the paper's, and ours, which Triangle refines again and vertices are moved in.
@@ -110,6 +111,7 @@ def measure_city(
     options: CityOptions,
     *,
     building_class: bool,
+    roofs: RoofPoints | None = None,
     trace: Trace = no_trace,
 ) -> City:
     """Give footprints their points and heights (steps 1.5 and 1.6).
@@ -126,12 +128,18 @@ def measure_city(
         Parameters.
     building_class : bool
         Whether the cloud marks buildings.
+    roofs : RoofPoints, optional
+        Roof points of the footprints, where they are known.
     trace : callable, optional
         Context manager around each step.
     """
     with trace("1.5 extract building points"):
         points = extract_building_points(
-            cloud, footprints.polygons, margin=options.ground_margin, building_class=building_class
+            cloud,
+            footprints.polygons,
+            margin=options.ground_margin,
+            building_class=building_class,
+            roof=None if roofs is None else (roofs.start, roofs.xyz[:, 2]),
         )
     with trace("1.6 building heights"):
         heights = measure_heights(points, footprints.polygons, dtm, footprints.given_height, options)

@@ -8,7 +8,6 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions
-from pipeline.city import City
 from pipeline.citymodel import Footprints
 from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leave_out, shape_clusters
 from pipeline.groups import adjacent_houses
@@ -16,10 +15,10 @@ from pipeline.houses import Houses, divide_houses, join_houses, take_houses
 from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
 from pipeline.planar import join_pairs
-from pipeline.point_fidelity import HouseFidelity, measure_houses
+from pipeline.point_fidelity import measure_houses
 from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
 from pipeline.raster import Dtm, window_of
-from pipeline.roof_points import locate_roof_points
+from pipeline.roof_points import keep_roof_points, locate_roof_points
 from pipeline.simplify import raise_buildings
 from pipeline.terrain import cut_terrain
 from pipeline.tile import measure_city, prepare_footprints
@@ -137,12 +136,16 @@ def make_houses(task: Task) -> Facts:
     extent = _extent(own.polygons)
     cloud, dtm = _surroundings(task, extent, options.ground_margin, 2 * spacing, (BUILDING, GROUND, WATER))
     terrain = cut_terrain(dtm, window_of(dtm))
-    city = measure_city(cloud, own, terrain, options, building_class=True, trace=task.step)
+    with task.step("1.5 extract building points"):
+        roofs = locate_roof_points(cloud, own.polygons, building_class=True)
+    city = measure_city(cloud, own, terrain, options, building_class=True, roofs=roofs, trace=task.step)
     task.notes(city.notes)
+    roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
     with task.step("2.0 split levels"):
-        houses = divide_houses(city, cloud, options, building_class=True)
+        houses = divide_houses(city, cloud, options, building_class=True, roofs=roofs)
     with task.step("1.7 fit of roofs"):
-        full = make_buildings(city, _fit(cloud, city), np.zeros(len(city.model), np.int32))
+        fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
+        full = make_buildings(city, fidelity, np.zeros(len(city.model), np.int32))
     task.put(**pack_houses(houses), **pack_buildings(full, "full_"))
     return {
         "n": len(houses),
@@ -276,7 +279,8 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
             model.polygons, model.roof, city.wall_ground, city.group, pairs, dtm, bounds, mesh
         )
     with task.step("2.4 fit of roofs"):
-        fidelity = _fit(cloud, city)
+        roofs = locate_roof_points(cloud, city.model.polygons, building_class=True)
+        fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
     task.put(**pack_buildings(make_buildings(city, fidelity, layers)))
     counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
     counts |= {"roofs on another layer": parted} if parted else {}
@@ -326,11 +330,6 @@ def _surroundings(
     with task.step("1.1 points of houses"):
         cloud = read_cloud(task, grow(extent, margin), classes=classes, ground_filter=given.ground_filter)
     return cloud, read_known_terrain(task, grow(extent, reach), spacing=given.dtm_spacing, bounds=bounds)
-
-
-def _fit(cloud: PointCloud, city: City) -> HouseFidelity:
-    points = locate_roof_points(cloud, city.model.polygons, building_class=True)
-    return measure_houses(points, city.model.polygons, city.model.roof)
 
 
 def _near_rows(task: Task, polygons: NDArray[np.object_]) -> NDArray[np.int64]:
