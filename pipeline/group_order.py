@@ -4,6 +4,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+FEW = 24  # points that are sorted one by one
+
 
 @numba.njit(cache=True, nogil=True)
 def sort_values(start: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -42,17 +44,84 @@ def sort_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> NDArray[n
     """
     ordered = np.empty_like(xyz)
     for g in range(len(start) - 1):
-        group = xyz[start[g] : start[g + 1]]
-        rows = np.argsort(group[:, 2])
-        i = 0
-        while i < len(rows):
-            j = _end_of_run(group[:, 2], rows, i)
-            if j > i + 1:
-                rows[i:j] = _sort_by_place(group, rows[i:j])
-            i = j
-        for k in range(len(rows)):
-            ordered[start[g] + k] = group[rows[k]]
+        group = ordered[start[g] : start[g + 1]]
+        group[:] = xyz[start[g] : start[g + 1]]
+        bins = _deal_out(group, 2)
+        for k in range(len(bins) - 1):
+            _sort_run(group[bins[k] : bins[k + 1]])
     return ordered
+
+
+@numba.njit(cache=True, nogil=True)
+def _deal_out(xyz: NDArray[np.float64], axis: int) -> NDArray[np.int64]:
+    """Put points in order of as many bins of equal width along an axis; give where each bin starts."""
+    n = len(xyz)
+    start = np.zeros(n + 1, np.int64)
+    if n == 0:
+        return start
+    values = xyz[:, axis]
+    low, high = values.min(), values.max()
+    scale = (n - 1) / (high - low) if high > low else 0.0
+    place = np.empty(n, np.int64)
+    for k in range(n):
+        place[k] = max(min(int((values[k] - low) * scale), n - 1), 0)
+        start[place[k] + 1] += 1
+    for k in range(n):
+        start[k + 1] += start[k]
+    old, free = xyz.copy(), start[:-1].copy()
+    for k in range(n):
+        to = free[place[k]]
+        free[place[k]] += 1
+        xyz[to, 0], xyz[to, 1], xyz[to, 2] = old[k, 0], old[k, 1], old[k, 2]
+    return start
+
+
+@numba.njit(cache=True, nogil=True)
+def _sort_run(xyz: NDArray[np.float64]) -> None:
+    """Sort points of about the same height in place; many of the very same height by bins again."""
+    if len(xyz) <= FEW:
+        _insert(xyz)
+    elif xyz[:, 2].min() == xyz[:, 2].max():
+        bins = _deal_out(xyz, 1)
+        for k in range(len(bins) - 1):
+            _sort_some(xyz[bins[k] : bins[k + 1]])
+    else:
+        _sort_some(xyz)
+
+
+@numba.njit(cache=True, nogil=True)
+def _sort_some(xyz: NDArray[np.float64]) -> None:
+    """Sort points in place, whatever they are."""
+    if len(xyz) <= FEW:
+        _insert(xyz)
+        return
+    rows = np.argsort(xyz[:, 2])
+    i = 0
+    while i < len(rows):
+        j = _end_of_run(xyz[:, 2], rows, i)
+        if j > i + 1:
+            rows[i:j] = _sort_by_place(xyz, rows[i:j])
+        i = j
+    xyz[:] = xyz[rows]
+
+
+@numba.njit(cache=True, nogil=True)
+def _insert(xyz: NDArray[np.float64]) -> None:
+    """Sort a few points in place."""
+    for k in range(1, len(xyz)):
+        x, y, z = xyz[k]
+        m = k
+        while m > 0 and _is_before(x, y, z, xyz[m - 1, 0], xyz[m - 1, 1], xyz[m - 1, 2]):
+            xyz[m, 0], xyz[m, 1], xyz[m, 2] = xyz[m - 1, 0], xyz[m - 1, 1], xyz[m - 1, 2]
+            m -= 1
+        xyz[m, 0], xyz[m, 1], xyz[m, 2] = x, y, z
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _is_before(x: float, y: float, z: float, x2: float, y2: float, z2: float) -> bool:
+    if z != z2:
+        return z < z2
+    return y < y2 or (y == y2 and x < x2)
 
 
 @numba.njit(cache=True, nogil=True)

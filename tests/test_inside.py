@@ -93,12 +93,13 @@ def test_owners_are_those_of_geos(seed: int) -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 10**6), levels=st.sampled_from([1, 3, 1000]))
-def test_groups_are_sorted_as_by_numpy(seed: int, levels: int) -> None:
+@given(seed=st.integers(0, 10**6), levels=st.sampled_from([1, 3, 1000]), most=st.sampled_from([40, 400]))
+def test_groups_are_sorted_as_by_numpy(seed: int, levels: int, most: int) -> None:
     rng = np.random.default_rng(seed)
-    start = np.concatenate(([0], np.cumsum(rng.integers(0, 40, 6))))
+    start = np.concatenate(([0], np.cumsum(rng.integers(0, most, 6))))
     group = np.repeat(np.arange(6), np.diff(start))
     xyz = rng.integers(0, levels, (start[-1], 3)) / 7.0
+    xyz[:: rng.integers(1, 5), 2] += rng.choice([0.0, 1e6])
     order = np.lexsort((xyz[:, 0], xyz[:, 1], xyz[:, 2], group))
     assert sort_points(start, xyz).tolist() == xyz[order].tolist()
     assert sort_values(start, xyz[:, 2]).tolist() == xyz[np.lexsort((xyz[:, 2], group)), 2].tolist()
