@@ -122,8 +122,11 @@ def _offsets(grid: TileGrid, key: Key, reach: float) -> NDArray[np.float64]:
 
 
 def _clearance(walls: NDArray[np.float64], xy: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    """Distance from places close to each other to the next wall (m), `reach` at most; float64, (n,)."""
     clear = np.full(len(xy), reach)
-    tree = shapely.STRtree(shapely.linestrings(walls))
+    low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
+    close = ((walls.max(axis=1) >= low) & (walls.min(axis=1) <= high)).all(axis=1)
+    tree = shapely.STRtree(shapely.linestrings(walls[close]))
     (row, _), distance = tree.query_nearest(
         shapely.points(xy), max_distance=reach, return_distance=True, all_matches=False
     )

@@ -129,7 +129,12 @@ def _is_near(
 ) -> NDArray[np.bool_]:
     """Whether triangles have their centres close to a line, and where it is known what holds them."""
     known = ((centre >= core[:2]) & (centre <= core[2:])).all(axis=1)
-    near: NDArray[np.bool_] = known & shapely.dwithin(shapely.LineString(line), shapely.points(centre), reach)
+    beyond = np.maximum(line.min(axis=0) - centre, centre - line.max(axis=0)).max(axis=1)
+    row = np.flatnonzero(known & (beyond <= reach))
+    near = np.zeros(len(centre), np.bool_)
+    whole = shapely.LineString(line)
+    shapely.prepare(whole)
+    near[row] = shapely.dwithin(whole, shapely.points(centre[row]), reach[row])
     return near
 
 

@@ -18,6 +18,7 @@ from stitch import paths
 from stitch.corners import place_corner
 from stitch.grid import Key, SeamKey, is_border, make_grid, seam_keys, tile_keys
 from stitch.seams import find_vertices, trace_seam
+from stitch.tiles import areas_within
 from stitch.walls import cut_walls, split_walls
 from tests.cities import Bounds, tilted_dtm
 from tests.stitching import (
@@ -185,6 +186,12 @@ def test_the_clearest_place_is_the_middle_of_the_street() -> None:
     border = place_corner(NINE, Key(1, 0), street, cut_walls(street, mesh_size=10.0), mesh_size=10.0)
     assert border.xy.tolist() == [140, 0]
     assert np.isnan(border.tips[3]).all()
+
+
+def test_buildings_count_with_their_part_in_a_tile() -> None:
+    tile = shapely.box(0, 0, 100, 100)
+    houses = [shapely.box(10, 10, 20, 20), shapely.box(95, 0, 110, 10), shapely.box(100, 0, 120, 9)]
+    assert areas_within(np.array(houses), tile).tolist() == [100, 50, 0]
 
 
 def test_pieces_of_a_wall_are_the_same_in_both_directions_and_split_where_told() -> None:
