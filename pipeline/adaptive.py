@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns import plane_edges
+from pipeline.edges import plane_edges
 from pipeline.errors import GeometryError
 from pipeline.growth import Growth, movable_height
 from pipeline.improve_columns import improve_columns

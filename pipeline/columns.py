@@ -10,6 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.edges import plane_edges
 from pipeline.mesh import Boundary, ColumnMesh, Marker, SeamEdges, TetMesh
 from pipeline.plane import signed_areas
 
@@ -136,28 +137,6 @@ def split_boundary(
     same columns there, so what one leaves out the other does not have.
     """
     return _extract_boundary(mesh, numbers, bounds, seams, strict=True)
-
-
-def plane_edges(triangles: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Edges of a plane mesh and the triangles beside them.
-
-    Parameters
-    ----------
-    triangles : int32, (m, 3)
-        Ascending vertex indices.
-
-    Returns
-    -------
-    edges : int32, (e, 2)
-        Ascending vertex indices, each edge once, sorted.
-    of_triangle : int32, (m, 3)
-        Edges of each triangle: those between its corners 0-1, 0-2, 1-2.
-    """
-    pairs = triangles[:, [[0, 1], [0, 2], [1, 2]]].reshape(-1, 2)
-    n = int(triangles.max()) + 1
-    key, index = np.unique(pairs[:, 0].astype(np.int64) * n + pairs[:, 1], return_inverse=True)
-    edges = np.column_stack((key // n, key % n)).astype(np.int32)
-    return edges, index.reshape(-1, 3).astype(np.int32)
 
 
 def _oriented(facets: NDArray[np.int32], swap: NDArray[np.bool_]) -> NDArray[np.int32]:

@@ -9,6 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.edges import triangle_neighbours
+
 SEARCH_SWEEPS = 6  # rounds of the search in each pass
 FIRST_STEP = 0.15  # of the mesh size: the search's first step
 LAST_STEP = 0.01  # of the first step: the search's last
@@ -66,29 +68,6 @@ def improve_plane(
         _move_vertices(xy, triangles, neighbour, frozen, DIRECTIONS, first_step)
         _flip_edges(xy, triangles, neighbour, label)
     return xy, triangles
-
-
-def triangle_neighbours(triangles: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Find the triangle across the edge opposite to each corner, -1 at the border.
-
-    Parameters
-    ----------
-    triangles : int32, (m, 3)
-        Vertex indices.
-
-    Examples
-    --------
-    >>> triangle_neighbours(np.array([[0, 1, 2], [2, 1, 3]], np.int32)).tolist()
-    [[1, -1, -1], [-1, -1, 0]]
-    """
-    ends = np.sort(triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1).astype(np.int64)
-    key = ends[:, 0] * (int(triangles.max()) + 1) + ends[:, 1]
-    order = np.argsort(key, kind="stable")
-    twin = np.flatnonzero(key[order[1:]] == key[order[:-1]])
-    neighbour = np.full(len(key), -1, np.int32)
-    neighbour[order[twin]] = order[twin + 1] // 3
-    neighbour[order[twin + 1]] = order[twin] // 3
-    return neighbour.reshape(-1, 3)
 
 
 def _frozen_vertices(

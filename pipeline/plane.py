@@ -9,6 +9,7 @@ import shapely
 import triangle
 from numpy.typing import NDArray
 
+from pipeline.edges import sort_triangles
 from pipeline.errors import GeometryError
 from pipeline.improve_plane import improve_plane
 from pipeline.mesh import PlaneMesh
@@ -78,9 +79,12 @@ def collect_graph(edges: NDArray[np.float64], seeds: NDArray[np.float64]) -> Pla
     PlaneGraph
         Vertices sorted by (x, y) and segments by their vertices: the same for edges in any order.
     """
-    unique, index = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+    # Complex numbers compare as (x, y) do.
+    unique, index = np.unique(np.ascontiguousarray(edges).view(np.complex128), return_inverse=True)
     segments = np.sort(index.reshape(-1, 2), axis=1)
-    return PlaneGraph(unique, np.unique(segments, axis=0).astype(np.int32), seeds)
+    key = np.unique(segments[:, 0] * len(unique) + segments[:, 1])
+    ends = np.column_stack((key // len(unique), key % len(unique)))
+    return PlaneGraph(unique.view(np.float64).reshape(-1, 2), ends.astype(np.int32), seeds)
 
 
 def triangulate_plane(
@@ -266,12 +270,12 @@ def mesh_plane(
 
 def order_plane(xy: NDArray[np.float64], triangles: NDArray[np.int32], label: NDArray[np.int32]) -> PlaneMesh:
     """Sort vertices by (x, y) and triangles by their vertices; vertices that no triangle has are gone."""
-    used = np.unique(triangles)
+    used = np.flatnonzero(np.bincount(triangles.ravel(), minlength=len(xy)))
     order = used[np.lexsort((xy[used, 1], xy[used, 0]))]
     rank = np.empty(len(xy), np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
     sorted_triangles = np.sort(rank[triangles], axis=1)
-    rows = np.lexsort(sorted_triangles.T[::-1])
+    rows = sort_triangles(sorted_triangles)
     return PlaneMesh(xy[order], sorted_triangles[rows], label[rows])
 
 

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns import plane_edges
+from pipeline.edges import plane_edges
 from pipeline.errors import SolverError
 from pipeline.mesh import PlaneMesh
 

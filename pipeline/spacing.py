@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns import plane_edges
+from pipeline.edges import plane_edges
 from pipeline.mesh import PlaneMesh
 from pipeline.terrain import HEIGHT_UNIT, Dtm, sample_dtm
 

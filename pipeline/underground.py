@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns import Bounds, expand_cells, find_used_points, plane_edges, split_boundary
+from pipeline.columns import Bounds, expand_cells, find_used_points, split_boundary
+from pipeline.edges import plane_edges
 from pipeline.levels import stagger_columns
 from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
 from pipeline.nodes import GROUND_SURFACE, Levels, SeamColumns, join_levels, take_columns

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns import plane_edges
+from pipeline.edges import plane_edges
 from pipeline.mesh import PlaneMesh, SeamEdges
 from pipeline.nodes import GROUND_SURFACE, SeamColumns
 from stitch.seams import Seam, find_vertices

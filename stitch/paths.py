@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
+from pipeline.edges import triangle_neighbours
 from pipeline.errors import GeometryError
-from pipeline.improve_plane import triangle_neighbours
 from stitch.corners import Corner
 from stitch.grid import SeamKey, TileGrid, band_width
 from stitch.strips import Strip

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions, AdaptiveReport, fill_columns, mesh_adaptive
 from pipeline.citymodel import CityModel
-from pipeline.columns import expand_cells, extract_boundary, lowest_gap, plane_edges
+from pipeline.columns import expand_cells, extract_boundary, lowest_gap
+from pipeline.edges import plane_edges, sort_triangles, triangle_neighbours
 from pipeline.errors import GeometryError
 from pipeline.heights import highest_wall_ground, raise_low_roofs
 from pipeline.improve_columns import improve_columns, radius_ratios
-from pipeline.improve_plane import improve_plane, triangle_neighbours
+from pipeline.improve_plane import improve_plane
 from pipeline.levels import fill_levels, stagger_columns
 from pipeline.mesh import ColumnMesh, Marker, MergeOrder, PlaneMesh
 from pipeline.nodes import (
@@ -442,6 +443,20 @@ def opposite_angles(xy: NDArray[np.float64], triangles: NDArray[np.int32]) -> ND
         cosine = (u * v).sum(axis=1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
         angles.append(np.arccos(cosine))
     return np.column_stack(angles)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_edges_and_triangles_are_sorted(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    fan = np.array([[0, k, k + 1] for k in range(1, 40)])  # one vertex has many edges, of triangles in any order
+    triangles = rng.permuted(np.concatenate((fan, fan[:, [1, 2, 0]] + [40, 40, 1]))[rng.permutation(78)], axis=1)
+    triangles = rng.permutation(triangles.max() + 1)[triangles].astype(np.int32)
+    edges, of_triangle = plane_edges(triangles)
+    pairs = np.sort(triangles[:, [[0, 1], [0, 2], [1, 2]]], axis=2)
+    assert edges.tolist() == np.unique(pairs.reshape(-1, 2), axis=0).tolist()
+    assert (edges[of_triangle] == pairs).all()
+    rows = sort_triangles(np.sort(triangles, axis=1))
+    assert rows.tolist() == np.lexsort(np.sort(triangles, axis=1).T[::-1]).tolist()
 
 
 def test_neighbours_lie_across_the_opposite_edge() -> None:

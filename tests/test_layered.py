@@ -7,7 +7,8 @@ import pytest
 import shapely
 
 from pipeline.citymodel import CityModel
-from pipeline.columns import count_cells, expand_cells, extract_boundary, lowest_gap, plane_edges
+from pipeline.columns import count_cells, expand_cells, extract_boundary, lowest_gap
+from pipeline.edges import plane_edges
 from pipeline.errors import GeometryError, SolverError
 from pipeline.fem import solve_laplace, stiffness_matrix
 from pipeline.groups import adjacent_houses
