@@ -108,30 +108,45 @@ def domain_top(dtm: Dtm, xy: NDArray[np.float64], *, domain_height: float) -> ND
     and a region that hold the same nodes get the same bits. Cost is linear in the nodes.
     """
     half = max(round(top_reach(domain_height) / TOP_PASSES / dtm.spacing), 1)
-    units = np.rint(dtm.z / HEIGHT_UNIT).astype(np.int64)
+    units = np.rint(dtm.z / HEIGHT_UNIT)
     for _ in range(TOP_PASSES):
-        across = np.ascontiguousarray(_average(units, half).T)
-        units = np.ascontiguousarray(_average(across, half).T)
-    smooth = Dtm(np.multiply(units, HEIGHT_UNIT, dtype=np.float64), dtm.i0, dtm.j0, dtm.spacing)
+        units = _average(units, half)
+    smooth = Dtm(units * HEIGHT_UNIT, dtm.i0, dtm.j0, dtm.spacing)
     return domain_height + sample_dtm(smooth, xy)
 
 
 @numba.njit(cache=True, nogil=True)
-def _average(units: NDArray[np.int64], half: int) -> NDArray[np.int64]:
-    """Moving average down the columns over ``2 half + 1`` rows, fewer at the border, rounded down."""
+def _average(units: NDArray[np.float64], half: int) -> NDArray[np.float64]:
+    """Moving average of whole numbers over a square of side ``2 half + 1``, less at the border.
+
+    It is rounded down after the columns and after the rows. Sums are exact, and so is what is rounded down: a
+    quotient of numbers below 2^52 is no whole number unless it is one exactly.
+    """
     rows, columns = units.shape
-    average = np.empty((rows, columns), np.int64)
-    total = np.zeros(columns, np.int64)
+    average = np.empty((rows, columns))
+    total, down = np.zeros(columns), np.empty(columns)
     for row in range(min(half, rows)):
         for column in range(columns):
             total[column] += units[row, column]
     for row in range(rows):
         enters, leaves = row + half, row - half - 1
-        n = min(enters + 1, rows) - max(leaves + 1, 0)
-        for column in range(columns):
-            if enters < rows:
+        if enters < rows:
+            for column in range(columns):
                 total[column] += units[enters, column]
-            if leaves >= 0:
+        if leaves >= 0:
+            for column in range(columns):
                 total[column] -= units[leaves, column]
-            average[row, column] = total[column] // n
+        n = float(min(enters + 1, rows) - max(leaves + 1, 0))
+        for column in range(columns):
+            down[column] = np.floor(total[column] / n)
+        across = 0.0
+        for column in range(min(half, columns)):
+            across += down[column]
+        for column in range(columns):
+            enters, leaves = column + half, column - half - 1
+            if enters < columns:
+                across += down[enters]
+            if leaves >= 0:
+                across -= down[leaves]
+            average[row, column] = np.floor(across / (min(enters + 1, columns) - max(leaves + 1, 0)))
     return average

@@ -31,7 +31,7 @@ from pipeline.nodes import (
 from pipeline.plane import mesh_plane, signed_areas
 from pipeline.quality import measure_cells, quality_percentiles
 from pipeline.spacing import SpacingLimits, domain_top, mean_edges, top_reach, vertical_spacing
-from pipeline.terrain import Dtm, sample_dtm
+from pipeline.terrain import HEIGHT_UNIT, Dtm, sample_dtm
 from stitch.conformity import pair_cell_faces, pair_edges
 from tests.cities import Bounds, city_of, crowded_blocks, hilly_dtm, tilted_dtm
 from tests.terraces import prove_conforming, prove_volume, prove_walls, terrace_town
@@ -364,6 +364,20 @@ def test_the_top_is_the_smoothed_terrain_and_does_not_follow_a_mast() -> None:
     np.testing.assert_allclose(domain_top(tilted, xy[:1], domain_height=100.0), 110.0, atol=1e-3)
     flat.z[100, 100] += 40
     assert 104 < domain_top(flat, xy, domain_height=100.0)[0] < 104.1
+
+
+@pytest.mark.parametrize("shape", [(41, 30), (3, 7), (1, 1)])
+def test_the_top_is_averaged_in_whole_numbers_that_are_rounded_down(shape: tuple[int, int]) -> None:
+    z = np.random.default_rng(1).normal(0, 30, shape)
+    units, half = np.rint(z / HEIGHT_UNIT).astype(int), 5
+    for _ in range(2):
+        for axis in range(2):
+            lines = np.moveaxis(units, axis, 0)
+            means = [lines[max(k - half, 0) : k + half + 1] for k in range(len(lines))]
+            units = np.moveaxis(np.array([part.sum(axis=0) // len(part) for part in means]), 0, axis)
+    nodes = np.argwhere(np.ones(shape, bool))[:, ::-1].astype(np.float64)
+    top = domain_top(Dtm(z, 0, 0, 1.0), nodes, domain_height=20.0)
+    assert (top == 20 + units.ravel() * HEIGHT_UNIT).all()
 
 
 def test_spacing_follows_the_edges_within_limits() -> None:
