@@ -6,6 +6,8 @@ order compares two columns by what these two are, so the faces over an edge are 
 triangles: the mesh conforms.
 """
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +35,35 @@ def expand_cells(mesh: ColumnMesh) -> TetMesh:
         Points in the order of `ColumnMesh.z`: column by column from below. Cells triangle by triangle.
     """
     column = np.repeat(np.arange(len(mesh.plane.xy)), np.diff(mesh.z_start))
-    points = np.column_stack((mesh.plane.xy[column], mesh.z))
-    cells = np.empty((count_cells(mesh), 4), np.int32)
-    clockwise = signed_areas(mesh.plane) < 0
-    by_height = mesh.order == "heights"
-    _merge_columns(mesh.plane.triangles, mesh.bottom, mesh.z_start, mesh.z, by_height, clockwise, cells)
-    return TetMesh(points, cells)
+    return TetMesh(np.column_stack((mesh.plane.xy[column], mesh.z)), _merge(mesh))
+
+
+def expand_again(mesh: ColumnMesh, cells: NDArray[np.int32], moved: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Write the cells anew over the triangles of some levels, in place.
+
+    Parameters
+    ----------
+    mesh : ColumnMesh
+        Columns that ascend.
+    cells : int32, (n_cells, 4)
+        Its cells as `expand_cells` gave them at other heights, which are brought up to date.
+    moved : bool, (z_start[-1],)
+        Levels whose heights are others than they were then.
+
+    Returns
+    -------
+    int64, (k,)
+        The cells that were written.
+    """
+    plane = mesh.plane
+    touched = np.zeros(len(plane.xy), np.bool_)
+    touched[np.searchsorted(mesh.z_start, np.flatnonzero(moved), side="right") - 1] = True
+    again = touched[plane.triangles].any(axis=1)
+    count = (np.diff(mesh.z_start)[plane.triangles] - 1 - mesh.bottom).sum(axis=1)
+    rows = np.flatnonzero(np.repeat(again, count))
+    part = replace(plane, triangles=plane.triangles[again], building=plane.building[again])
+    cells[rows] = _merge(replace(mesh, plane=part, bottom=mesh.bottom[again]))
+    return rows
 
 
 def find_used_points(mesh: ColumnMesh) -> NDArray[np.bool_]:
@@ -137,6 +162,14 @@ def split_boundary(
     same columns there, so what one leaves out the other does not have.
     """
     return _extract_boundary(mesh, numbers, bounds, seams, strict=True)
+
+
+def _merge(mesh: ColumnMesh) -> NDArray[np.int32]:
+    cells = np.empty((count_cells(mesh), 4), np.int32)
+    clockwise = signed_areas(mesh.plane) < 0
+    by_height = mesh.order == "heights"
+    _merge_columns(mesh.plane.triangles, mesh.bottom, mesh.z_start, mesh.z, by_height, clockwise, cells)
+    return cells
 
 
 def _oriented(facets: NDArray[np.int32], swap: NDArray[np.bool_]) -> NDArray[np.int32]:

@@ -11,13 +11,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns import expand_cells
-from pipeline.mesh import ColumnMesh, TetMesh
+from pipeline.columns import expand_again, expand_cells
+from pipeline.mesh import ColumnMesh
 
 WORST = 0.5  # levels of cells with a radius ratio below this may move
 SEARCH_SWEEPS = 10
 FIRST_STEP = 0.15  # of the column's spacing
 LAST_STEP = 0.02  # of the first step
+BLOCK = 64  # cells that are measured side by side
 
 
 def improve_columns(
@@ -59,22 +60,24 @@ def improve_columns(
     all its cells is kept.
     """
     step = np.repeat(FIRST_STEP * spacing, np.diff(mesh.z_start))
-    cells = expand_cells(mesh)
-    ratio, cost = _measure_mesh(cells, free, flat_cells)
-    best, least_cost = mesh, cost
+    expanded = expand_cells(mesh)
+    points, cells = expanded.points, expanded.cells
+    ratio = radius_ratios(points, cells)
+    best, least_cost = mesh, _total_cost(ratio, cells, free, flat_cells)
     before = after = float(ratio.min())
-    moved = 0
+    n_moved = 0
     for _ in range(passes):
-        active = _levels_of(cells.cells, ratio < WORST, len(mesh.z)) & free
-        points = cells.points.copy()
-        start, of_level = _cells_of_levels(cells.cells, active)
-        moved += _search(points, cells.cells, np.flatnonzero(active), start, of_level, step)
+        active = _levels_of(cells, ratio < WORST, len(mesh.z)) & free
+        start, of_level = _cells_of_levels(cells, active)
+        n_moved += _search(points, cells, np.flatnonzero(active), start, of_level, step)
+        moved = mesh.z != points[:, 2]
         mesh = replace(mesh, z=points[:, 2].copy())
-        cells = expand_cells(mesh)
-        ratio, cost = _measure_mesh(cells, free, flat_cells)
+        again = expand_again(mesh, cells, moved)
+        ratio[again] = radius_ratios(points, cells[again])
+        cost = _total_cost(ratio, cells, free, flat_cells)
         if cost < least_cost:
             best, least_cost, after = mesh, cost, float(ratio.min())
-    return best, (before, after), moved
+    return best, (before, after), n_moved
 
 
 def radius_ratios(points: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -86,16 +89,15 @@ def radius_ratios(points: NDArray[np.float64], cells: NDArray[np.int32]) -> NDAr
     >>> float(radius_ratios(corners, np.array([[0, 1, 3, 2]], np.int32))[0].round(12))
     1.0
     """
-    ratio: NDArray[np.float64] = _measure(points, cells)[0]
+    ratio: NDArray[np.float64] = _measure(points, cells)
     return ratio
 
 
-def _measure_mesh(mesh: TetMesh, free: NDArray[np.bool_], flat_cells: bool) -> tuple[NDArray[np.float64], float]:
-    """Radius ratio of every cell, and what the search minimises, over those that count."""
-    ratio, cost = _measure(mesh.points, mesh.cells)
-    if flat_cells:
-        cost = _measure(mesh.points, mesh.cells[free[mesh.cells].any(axis=1)])[1]
-    return ratio, cost
+def _total_cost(
+    ratio: NDArray[np.float64], cells: NDArray[np.int32], free: NDArray[np.bool_], flat_cells: bool
+) -> float:
+    """What the search minimises, over all cells that count."""
+    return float(_add_costs(ratio[free[cells].any(axis=1)] if flat_cells else ratio))
 
 
 def _levels_of(cells: NDArray[np.int32], chosen: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:
@@ -104,12 +106,14 @@ def _levels_of(cells: NDArray[np.int32], chosen: NDArray[np.bool_], n: int) -> N
     return levels
 
 
-@numba.njit(cache=True, nogil=True)
-def _ratio(points: NDArray[np.float64], a: int, b: int, c: int, d: int) -> float:
-    x, y, z = points[a, 0], points[a, 1], points[a, 2]
-    ux, uy, uz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
-    vx, vy, vz = points[c, 0] - x, points[c, 1] - y, points[c, 2] - z
-    wx, wy, wz = points[d, 0] - x, points[d, 1] - y, points[d, 2] - z
+@numba.njit(cache=True, nogil=True, inline="always")
+def _radius_ratio(
+    ax: float, ay: float, az: float, bx: float, by: float, bz: float,
+    cx: float, cy: float, cz: float, dx: float, dy: float, dz: float,
+) -> float:  # fmt: skip
+    ux, uy, uz = bx - ax, by - ay, bz - az
+    vx, vy, vz = cx - ax, cy - ay, cz - az
+    wx, wy, wz = dx - ax, dy - ay, dz - az
     # Normals of the faces at the first corner, each twice the face's area long; the fourth closes them.
     px, py, pz = vy * wz - vz * wy, vz * wx - vx * wz, vx * wy - vy * wx
     qx, qy, qz = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
@@ -123,8 +127,18 @@ def _ratio(points: NDArray[np.float64], a: int, b: int, c: int, d: int) -> float
         + np.sqrt(sx * sx + sy * sy + sz * sz)
     )
     uu, vv, ww = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, wx * wx + wy * wy + wz * wz
-    cx, cy, cz = uu * px + vv * qx + ww * rx, uu * py + vv * qy + ww * ry, uu * pz + vv * qz + ww * rz
-    return float(6 * volume6 * abs(volume6) / (surface2 * np.sqrt(cx * cx + cy * cy + cz * cz)))
+    ex, ey, ez = uu * px + vv * qx + ww * rx, uu * py + vv * qy + ww * ry, uu * pz + vv * qz + ww * rz
+    return float(6 * volume6 * abs(volume6) / (surface2 * np.sqrt(ex * ex + ey * ey + ez * ez)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _ratio(points: NDArray[np.float64], a: int, b: int, c: int, d: int) -> float:
+    return float(
+        _radius_ratio(
+            points[a, 0], points[a, 1], points[a, 2], points[b, 0], points[b, 1], points[b, 2],
+            points[c, 0], points[c, 1], points[c, 2], points[d, 0], points[d, 1], points[d, 2],
+        )
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
@@ -135,15 +149,33 @@ def _inverse_power(ratio: float) -> float:
     return square * square * square * square
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _measure(points: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Radius ratio of every cell: corners of a block side by side let the machine take several cells at once."""
+    ratio, block = np.empty(len(cells)), np.empty(BLOCK)
+    at = np.empty((12, BLOCK))
+    for first in range(0, len(cells), BLOCK):
+        n = min(BLOCK, len(cells) - first)
+        for i in range(n):
+            for c in range(4):
+                p = cells[first + i, c]
+                for k in range(3):
+                    at[3 * c + k, i] = points[p, k]
+        for i in range(n):
+            block[i] = _radius_ratio(
+                at[0, i], at[1, i], at[2, i], at[3, i], at[4, i], at[5, i],
+                at[6, i], at[7, i], at[8, i], at[9, i], at[10, i], at[11, i],
+            )  # fmt: skip
+        ratio[first : first + n] = block[:n]
+    return ratio
+
+
 @numba.njit(cache=True, nogil=True)
-def _measure(points: NDArray[np.float64], cells: NDArray[np.int32]) -> tuple[NDArray[np.float64], float]:
-    """Radius ratio of every cell, and what the search minimises, over all of them."""
-    ratio = np.empty(len(cells))
+def _add_costs(ratio: NDArray[np.float64]) -> float:
     total = 0.0
-    for i in range(len(cells)):
-        ratio[i] = _ratio(points, cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3])
+    for i in range(len(ratio)):
         total += _inverse_power(ratio[i])
-    return ratio, total
+    return total
 
 
 @numba.njit(cache=True, nogil=True)

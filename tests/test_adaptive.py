@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions, AdaptiveReport, fill_columns, mesh_adaptive
 from pipeline.citymodel import CityModel
-from pipeline.columns import expand_cells, extract_boundary, lowest_gap
+from pipeline.columns import expand_again, expand_cells, extract_boundary, lowest_gap
 from pipeline.edges import plane_edges, sort_triangles, triangle_neighbours
 from pipeline.errors import GeometryError
 from pipeline.heights import highest_wall_ground, raise_low_roofs
@@ -516,3 +516,21 @@ def test_a_moved_level_ends_where_a_step_either_way_is_worse() -> None:
         return float((radius_ratios(points, cells.cells) ** -8).sum())
 
     assert cost(0.0) < min(cost(-0.05), cost(0.05))
+
+
+def test_cells_written_again_are_those_of_the_new_heights() -> None:
+    bounds = (0.0, 0.0, 120.0, 120.0)
+    dtm = tilted_dtm(bounds, slope_x=0.1)
+    mesh, _ = mesh_of(city_on(dtm, bounds, 4, seed=3), dtm, bounds)
+    cells, step = expand_cells(mesh).cells, np.diff(mesh.z)
+    moved = np.zeros(len(mesh.z), bool)
+    moved[1:-1] = (np.arange(len(moved) - 2) % 50 == 7) & (step[1:] > 0) & (step[:-1] > 0)
+    z = np.where(moved, np.pad(0.2 * mesh.z[1:-1] + 0.8 * mesh.z[2:], 1), mesh.z)
+    higher = dataclasses.replace(mesh, z=z)
+    wanted = expand_cells(higher)
+    different = (cells != wanted.cells).any(axis=1)
+    rows = expand_again(higher, cells, moved)
+    assert 0 < different.sum() < len(rows) < len(cells)
+    assert (cells == wanted.cells).all()
+    alone = np.concatenate([radius_ratios(wanted.points, cells[k : k + 1]) for k in range(130)])
+    assert (radius_ratios(wanted.points, cells[:130]) == alone).all()
