@@ -255,25 +255,36 @@ def _multiply(
     slant: NDArray[np.float64],
     x: NDArray[np.float64],
     y: NDArray[np.float64],
-) -> None:
-    n, levels = x.shape
+) -> float:
+    """Write the product of the matrix and x into y, and return the product of the two.
+
+    Every coupling is read once, for both of its ends; edges are sorted by their first column.
+    """
+    n, last = len(x), x.shape[1] - 1
     for i in range(n):
-        for k in range(levels):
-            y[i, k] = diagonal[i, k] * x[i, k]
-        for k in range(levels - 1):
-            y[i, k] += up[i, k] * x[i, k + 1]
-        for k in range(levels - 1):
-            y[i, k + 1] += up[i, k] * x[i, k]
-    for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
-        for k in range(levels):
-            y[i, k] += level[e, k] * x[j, k]
-        for k in range(levels):
-            y[j, k] += level[e, k] * x[i, k]
-        for k in range(levels - 1):
-            y[i, k] += slant[e, k] * x[j, k + 1]
-        for k in range(levels - 1):
-            y[j, k + 1] += slant[e, k] * x[i, k]
+        below, coupling_below, here = 0.0, 0.0, x[i, 0]
+        for k in range(last):
+            above, coupling = x[i, k + 1], up[i, k]
+            y[i, k] = diagonal[i, k] * here + coupling * above + coupling_below * below
+            below, coupling_below, here = here, coupling, above
+        y[i, last] = diagonal[i, last] * here + coupling_below * below
+    total = 0.0
+    e = 0
+    for i in range(n):
+        while e < len(edges) and edges[e, 0] == i:
+            j = edges[e, 1]
+            below, slant_below, beside = 0.0, 0.0, x[j, 0]
+            for k in range(last):
+                even, rising, here, above = level[e, k], slant[e, k], x[i, k], x[j, k + 1]
+                y[i, k] = y[i, k] + even * beside + rising * above
+                y[j, k] = y[j, k] + even * here + slant_below * below
+                below, slant_below, beside = here, rising, above
+            y[i, last] += level[e, last] * beside
+            y[j, last] = y[j, last] + level[e, last] * x[i, last] + slant_below * below
+            e += 1
+        for k in range(last + 1):
+            total += x[i, k] * y[i, k]
+    return total
 
 
 @numba.njit(cache=True, nogil=True)
@@ -304,12 +315,7 @@ def _conjugate_gradients(
             largest = max(largest, abs(s))
     iteration = 0
     while largest > tolerance and iteration < max_iterations:
-        _multiply(edges, diagonal, up, level, slant, p, q)
-        curvature = 0.0
-        for i in range(n):
-            for k in range(levels):
-                curvature += p[i, k] * q[i, k]
-        alpha = rho / curvature
+        alpha = rho / _multiply(edges, diagonal, up, level, slant, p, q)
         new_rho, largest = 0.0, 0.0
         for i in range(n):
             for k in range(levels):
