@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ LONGEST_SPOKE = 0.8  # mesh sizes
 SPOKE_OF_DEPTH = 0.25  # of the distance to the next corner
 INSIDE_WORTH = 0.5  # clearance in a building counts for half
 SAME = 0.001  # m; distances that differ by less count as equal, so that rounding settles no tie
+BEST = 3  # times that; places that are worse than the best by more cannot become it by rounding
 DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])  # east, north, west, south
 
 
@@ -89,9 +91,13 @@ def place_corner(
     depth = closest_line(grid, key)
     offset = _offsets(grid, key, min(reach, CORNER_SHARE * depth))
     xy = nominal + offset
-    clear = _clearance(walls, xy, reach)
+    walls = _walls_around(walls, xy, reach)
     building = _building_at(polygons, xy)
-    worth = np.rint(np.where(building >= 0, INSIDE_WORTH, 1.0) * clear / SAME)
+    share = np.where(building >= 0, INSIDE_WORTH, 1.0)
+    close = _find_best(walls, xy, share, reach, BEST * SAME)
+    xy, offset, building, share = xy[close], offset[close], building[close], share[close]
+    clear = _clearance(walls, xy, reach)
+    worth = np.rint(share * clear / SAME)
     best = np.lexsort((offset[:, 1], offset[:, 0], (offset**2).sum(axis=1), -worth))[0]
     free, size = clear[best], mesh_size
     if sizes is not None:
@@ -121,12 +127,47 @@ def _offsets(grid: TileGrid, key: Key, reach: float) -> NDArray[np.float64]:
     return disc
 
 
-def _clearance(walls: NDArray[np.float64], xy: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-    """Distance from places close to each other to the next wall (m), `reach` at most; float64, (n,)."""
-    clear = np.full(len(xy), reach)
+def _walls_around(walls: NDArray[np.float64], xy: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
     low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
-    close = ((walls.max(axis=1) >= low) & (walls.min(axis=1) <= high)).all(axis=1)
-    tree = shapely.STRtree(shapely.linestrings(walls[close]))
+    around: NDArray[np.float64] = walls[((walls.max(axis=1) >= low) & (walls.min(axis=1) <= high)).all(axis=1)]
+    return around
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _find_best(
+    walls: NDArray[np.float64], xy: NDArray[np.float64], share: NDArray[np.float64], reach: float, margin: float
+) -> NDArray[np.int64]:
+    """Places whose share of the distance to the next wall is the largest, but for less than a margin.
+
+    A place is given up at the first wall that is too close, and the wall that the one before was given up for is
+    tried first.
+    """
+    value = np.empty(len(xy))
+    best, culprit = 0.0, 0
+    for i in range(len(xy)):
+        bound = (best - margin) / share[i]
+        least = reach * reach
+        for m in range(-1, len(walls)):
+            w = m if m >= 0 else culprit
+            if w >= len(walls):
+                continue
+            dx, dy = walls[w, 1, 0] - walls[w, 0, 0], walls[w, 1, 1] - walls[w, 0, 1]
+            px, py = xy[i, 0] - walls[w, 0, 0], xy[i, 1] - walls[w, 0, 1]
+            square = dx * dx + dy * dy
+            along = min(max((px * dx + py * dy) / square, 0.0), 1.0) if square > 0 else 0.0
+            ox, oy = px - along * dx, py - along * dy
+            least = min(least, ox * ox + oy * oy)
+            if bound > 0 and least < bound * bound:
+                culprit = w
+                break
+        value[i] = share[i] * np.sqrt(least)
+        best = max(best, value[i])
+    return np.flatnonzero(value >= best - margin)
+
+
+def _clearance(walls: NDArray[np.float64], xy: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    clear = np.full(len(xy), reach)
+    tree = shapely.STRtree(shapely.linestrings(walls))
     (row, _), distance = tree.query_nearest(
         shapely.points(xy), max_distance=reach, return_distance=True, all_matches=False
     )

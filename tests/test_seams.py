@@ -20,7 +20,7 @@ from stitch.grid import Key, SeamKey, is_border, make_grid, seam_keys, tile_keys
 from stitch.seams import find_vertices, trace_seam
 from stitch.tiles import areas_within
 from stitch.walls import cut_walls, split_walls
-from tests.cities import Bounds, tilted_dtm
+from tests.cities import Bounds, crowded_blocks, tilted_dtm
 from tests.stitching import (
     OPTIONS,
     Scene,
@@ -186,6 +186,21 @@ def test_the_clearest_place_is_the_middle_of_the_street() -> None:
     border = place_corner(NINE, Key(1, 0), street, cut_walls(street, mesh_size=10.0), mesh_size=10.0)
     assert border.xy.tolist() == [140, 0]
     assert np.isnan(border.tips[3]).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_place_is_given_up_that_could_be_the_clearest(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    houses = crowded_blocks(SQUARE, 12, seed=seed)
+    polygons = np.array([*houses, shapely.box(100, 100, 136, 180)] if seed == 3 else houses)
+    walls = cut_walls(polygons, mesh_size=10.0)
+    keys = [Key(i, j) for i in range(4) for j in range(4)]
+    quick = [place_corner(NINE, key, polygons, walls, mesh_size=10.0) for key in keys]
+    monkeypatch.setattr("stitch.corners._find_best", lambda walls, xy, *_: np.arange(len(xy)))
+    for key, corner in zip(keys, quick, strict=True):
+        thorough = place_corner(NINE, key, polygons, walls, mesh_size=10.0)
+        assert corner.xy.tobytes() == thorough.xy.tobytes()
+        assert corner.tips.tobytes() == thorough.tips.tobytes()
+        assert corner.building == thorough.building
 
 
 def test_buildings_count_with_their_part_in_a_tile() -> None:
