@@ -51,6 +51,10 @@ def test_only_points_of_the_classes_in_the_box_are_read() -> None:
     assert cloud.xyz.tolist() == [pytest.approx(place) for place in expected]
     assert cloud.classification.tolist() == [BUILDING, WATER, BUILDING, BUILDING]
     assert read_cloud(task, BOX, classes=(GROUND,)).xyz[:, 2] == pytest.approx([0.1])
+    assert read_cloud(task, BOX).classification.tolist() == [
+        *(BUILDING, UNCLASSIFIED, WATER),
+        *(BUILDING, HIGH_VEGETATION, GROUND, BUILDING),
+    ]
     assert len(read_cloud(a_task(b=([], True)), BOX, classes=(GROUND,)).xyz) == 0
 
 

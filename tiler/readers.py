@@ -43,7 +43,9 @@ def clip(box: Box, bounds: Box) -> Box:
     return max(box[0], bounds[0]), max(box[1], bounds[1]), min(box[2], bounds[2]), min(box[3], bounds[3])
 
 
-def read_cloud(task: Task, box: Box, *, classes: Sequence[int], ground_filter: bool = False) -> PointCloud:
+def read_cloud(
+    task: Task, box: Box, *, classes: Sequence[int] | None = None, ground_filter: bool = False
+) -> PointCloud:
     """Read the points of some classes within a box, from the stage ``points``.
 
     Parameters
@@ -52,8 +54,8 @@ def read_cloud(task: Task, box: Box, *, classes: Sequence[int], ground_filter: b
         A task that reads that stage.
     box : (xmin, ymin, xmax, ymax)
         Box (m); its borders belong to it.
-    classes : sequence of int
-        ASPRS classes that are wanted.
+    classes : sequence of int, optional
+        ASPRS classes that are wanted; all by default.
     ground_filter : bool
         Find ground by our own filter.
 
@@ -182,12 +184,13 @@ def _find_rows(task: Task, name: str, box: Box) -> _FileRows | None:
     return _FileRows(name, ranges, tuple(facts["scale"]), tuple(facts["offset"]), facts["marks_buildings"])
 
 
-def _reclassify(classes: Sequence[int], *, marked: bool) -> NDArray[np.int16]:
+def _reclassify(classes: Sequence[int] | None, *, marked: bool) -> NDArray[np.int16]:
     """Class that each class becomes in a file that marks buildings, or not; `LEFT_OUT` for unwanted ones."""
     become = np.arange(CLASSES, dtype=np.int16)
     if not marked:
         become[~np.isin(become, NEVER_ROOF)] = BUILDING
-    become[~np.isin(become, classes)] = LEFT_OUT
+    if classes is not None:
+        become[~np.isin(become, classes)] = LEFT_OUT
     return become
 
 
