@@ -65,8 +65,9 @@ class Worker:
         process = self._process or self._start()
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdin.write(json.dumps(arguments) + "\n")
-        process.stdin.flush()
+        with contextlib.suppress(BrokenPipeError):  # it has ended already, which its silence tells
+            process.stdin.write(json.dumps(arguments) + "\n")
+            process.stdin.flush()
         begin = time.monotonic()
         ready, _, _ = select.select([process.stdout], [], [], self.limit)
         seconds = time.monotonic() - begin
