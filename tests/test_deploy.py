@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import dask.config
 import pytest
 import yaml
 from dask.utils import parse_bytes, parse_timedelta
@@ -24,7 +25,7 @@ from tests.test_run import hashes
 from tiler import fork_server
 from tiler.cli import make_parser
 from tiler.config import Config, check_reach, load_config
-from tiler.executors import KILL_AT
+from tiler.dask_settings import BOTH, SCHEDULER, WORKER, as_variables
 from tiler.places import is_url
 from tiler.scheduler.reach import PATIENCE
 
@@ -113,15 +114,24 @@ def test_what_jobs_are_given_is_a_configuration() -> None:
 
 
 def test_dasks_settings_are_those_of_local_workers() -> None:
-    settings = yaml.safe_load((DEPLOY / "dask.yaml").read_text())["distributed"]
-    assert settings["nanny"]["pre-spawn-environ"] == dict(fork_server.ENVIRONMENT)
-    memory = {"target": False, "spill": False, "pause": False, "terminate": KILL_AT}
-    assert settings["worker"] == {"memory": memory, "profile": {"enabled": False}}
-    scheduler = {"allowed-failures": 0, "worker-saturation": 1.0, "worker-ttl": "65 minutes"}
-    assert settings["scheduler"] == scheduler
+    settings = yaml.safe_load((DEPLOY / "dask.yaml").read_text())
+    given = settings["distributed"]
+    assert given["nanny"].pop("pre-spawn-environ") == dict(fork_server.ENVIRONMENT)
     # A silent worker is let live as long as a task may hold its interpreter.
-    assert parse_timedelta(scheduler["worker-ttl"]) > Config().time_limit
-    assert parse_timedelta(settings["comm"]["timeouts"]["tcp"]) == PATIENCE
+    assert parse_timedelta(given["scheduler"].pop("worker-ttl")) > Config().time_limit
+    assert parse_timedelta(given.pop("comm")["timeouts"]["tcp"]) == PATIENCE
+    assert dict(leaves(settings)) == {**SCHEDULER, **WORKER, **BOTH}
+    variables = {name: str(value) for name, value in as_variables(WORKER).items()}
+    found = dask.config.collect_env(variables)
+    assert {name: dask.config.get(name, config=found) for name in WORKER} == dict(WORKER)
+
+
+def leaves(tree: dict[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{above}{name}.")
+        else:
+            yield above + name, value
 
 
 def test_the_lock_has_each_dependency_in_a_version_that_will_do_and_checksums() -> None:

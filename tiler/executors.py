@@ -14,7 +14,8 @@ from typing import Any, Protocol
 from pipeline.errors import CityError
 from tiler import fork_server
 from tiler.addresses import ANYWHERE
-from tiler.limits import Limits, WorkerError, machine_memory, run_guarded, tell_death, tell_memory
+from tiler.dask_settings import BOTH, SCHEDULER, WORKER
+from tiler.limits import REFUSE_AT, Limits, WorkerError, machine_memory, run_guarded, tell_death, tell_memory
 from tiler.scheduler.check import ClusterMismatchError, UnansweredError, check_cluster, tell_refusal
 from tiler.scheduler.terms import Refusal, Terms, run_on_terms
 from tiler.stage import Facts
@@ -27,7 +28,6 @@ BYSTANDER = 20  # how often a task may wait in a process that dies of another on
 LOOK = 5.0  # s without a word of the scheduler, after which it is asked whether it has workers
 NO_WORKERS = 300.0  # s without any worker, after which a run ends; a busy machine starts them slowly
 MEMORY_SHARE = 0.9  # of the machine, for all workers together
-REFUSE_AT, KILL_AT = 0.9, 0.95  # of the limit: no more is given; a process is ended whose memory was not counted
 
 
 class ClusterError(CityError):
@@ -330,30 +330,17 @@ def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHE
 
     limits = limits or Limits(memory=share_memory(workers))
     # Everything is bound to this machine, on free ports: two runs do not meet. A dead process shows by its closed
-    # connection, so a worker that is silent because its task holds the interpreter is let live. No array is in
-    # Dask's hands, so there is nothing to spill and nothing to pause for. Dask's logs of transitions, of its own
-    # load and of what was submitted hold on to memory: they are kept short, and its samples of what a worker's
-    # thread is at, 0.2 MB a second that stay for an hour, are not taken. A process that dies is started again by
-    # its nanny: the cluster would give up one whose process is just starting 15 s after an earlier one died.
+    # connection, so a worker that is silent because its task holds the interpreter is let live. One that dies is
+    # started again by its nanny: the cluster would give up one that just starts 15 s after an earlier one died.
     settings = {
+        **SCHEDULER,
+        **WORKER,
+        **BOTH,
         "distributed.nanny.pre-spawn-environ": dict(fork_server.ENVIRONMENT),
         "distributed.worker.multiprocessing-method": fork_server.METHOD,
         "distributed.worker.daemon": False,
         "distributed.scheduler.worker-ttl": None,
-        "distributed.scheduler.allowed-failures": 0,
-        "distributed.scheduler.worker-saturation": 1.0,
-        "distributed.admin.low-level-log-length": 100,
-        "distributed.admin.system-monitor.log-length": 600,
-        "distributed.admin.system-monitor.interval": "2 s",
-        "distributed.admin.tick.interval": "500 ms",
-        "distributed.worker.memory.monitor-interval": "200 ms",
-        "distributed.diagnostics.computations.max-history": 1,
         "distributed.deploy.lost-worker-timeout": "3650 days",
-        "distributed.worker.profile.enabled": False,
-        "distributed.worker.memory.target": False,
-        "distributed.worker.memory.spill": False,
-        "distributed.worker.memory.pause": False,
-        "distributed.worker.memory.terminate": KILL_AT,
     }
     with (
         config.set(settings),

@@ -23,6 +23,7 @@ from tiler.task import Failure, Record, Task, run_task
 
 TASKS = ".tasks"  # folder beside the store, with a file for every task that runs
 TIMEOUT = "Timeout ("  # how the fault handler begins at the time limit
+REFUSE_AT, KILL_AT = 0.9, 0.95  # of the limit: no more is given; a process is ended whose memory was not counted
 ADVICE = "use fewer workers, give each more memory (--memory-limit), or make tiles smaller"
 
 

@@ -15,10 +15,11 @@ from pipeline.errors import ConfigError
 from tiler import fork_server
 from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
-from tiler.executors import KILL_AT, REFUSE_AT, ClusterError, Dask, Executor
+from tiler.dask_settings import BOTH, SCHEDULER, WORKER, as_variables
+from tiler.executors import ClusterError, Dask, Executor
 from tiler.jobs.queues import QUEUES, JobSize, Queue, QueueError
 from tiler.jobs.table import Cluster
-from tiler.limits import Limits
+from tiler.limits import REFUSE_AT, Limits
 from tiler.plain_text import say_nothing
 from tiler.task import Failure, Task
 
@@ -30,22 +31,16 @@ ASK = 10.0  # s between two questions to the batch system
 UNBORN = 5  # worker jobs in a row that end without a worker, before it is an error
 NANNY = 200 * 2**20  # bytes of a job that are not its workers'
 SETTINGS: Mapping[str, Any] = {
+    **SCHEDULER,
+    **BOTH,
     "distributed.scheduler.worker-ttl": "10 minutes",
-    "distributed.scheduler.allowed-failures": 0,
-    "distributed.scheduler.worker-saturation": 1.0,
-    "distributed.admin.low-level-log-length": 100,
-    "distributed.admin.system-monitor.log-length": 600,
-    "distributed.diagnostics.computations.max-history": 1,
     "distributed.deploy.lost-worker-timeout": "15 s",  # a job's nanny may start its worker anew
 }
 # What a worker's own process is told; as variables, since its job has no other settings of Dask.
 VARIABLES: Mapping[str, Any] = {
     **fork_server.ENVIRONMENT,
-    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": False,
-    "DASK_DISTRIBUTED__WORKER__MEMORY__TARGET": False,
-    "DASK_DISTRIBUTED__WORKER__MEMORY__SPILL": False,
-    "DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE": False,
-    "DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": KILL_AT,
+    **as_variables(WORKER),
+    **as_variables(BOTH),
     "PYTHONWARNINGS": "ignore",
 }
 

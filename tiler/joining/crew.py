@@ -13,8 +13,17 @@ from pathlib import Path
 from typing import Any
 
 from tiler import fork_server
-from tiler.executors import BYSTANDER, KILL_AT, REFUSE_AT
-from tiler.limits import Limits, WorkerError, limit_memory, run_guarded, tell_death, tell_memory
+from tiler.executors import BYSTANDER
+from tiler.limits import (
+    KILL_AT,
+    REFUSE_AT,
+    Limits,
+    WorkerError,
+    limit_memory,
+    run_guarded,
+    tell_death,
+    tell_memory,
+)
 from tiler.stage import Facts
 from tiler.task import Failure, Record, Task
 
