@@ -231,6 +231,24 @@ def _frame(text: str) -> tuple[str, str]:
     return "/".join(path.parts[-2:]) if "stages" not in path.parts else "/".join(path.parts[-3:]), name
 
 
+def study_startup(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """From the command to the end of its help, and to the begin of the first task of a run: medians of 7."""
+    city = cities.make(1000, 480)
+    found: dict[str, list[float]] = {}
+    for _ in range(7):
+        start = time.perf_counter()
+        citystitch("--help")
+        found.setdefault("the end of `citystitch --help`", []).append(time.perf_counter() - start)
+        for workers in ("0", "2"):
+            shutil.rmtree(out, ignore_errors=True)
+            began = time.time()
+            record_of(city, out, "--workers", workers)
+            done = (json.loads(line) for line in (out / "events.jsonl").read_text().splitlines())
+            first = min(event["t"] - event["seconds"] for event in done if event["event"] == "done")
+            found.setdefault(f"the first task of a run with {workers} workers", []).append(first - began)
+    return [{"until": until, "seconds": round(median(seconds), 3)} for until, seconds in found.items()]
+
+
 def study_limits(cities: Cities, out: Path) -> list[dict[str, Any]]:
     """What the machine does at best: LAZ decompression alone, a copy in memory, a file written and flushed.
 
@@ -295,6 +313,7 @@ STUDIES: Mapping[str, Study] = {
     "fine": study_fine,
     "rates": study_rates,
     "profile": study_profile,
+    "startup": study_startup,
     "limits": study_limits,
 }
 
@@ -351,8 +370,9 @@ def write_report(kept: Mapping[str, Any]) -> None:
             lines += ["", f"## {title}", "", words]
             for side in dict.fromkeys(row.get("side") for row in kept[name]):
                 lines += ["", *_runs([row for row in kept[name] if row.get("side") == side], key)]
+            if name == "workers":
+                lines += ["", *_speedups(kept[name])]
     if "workers" in kept:
-        lines += ["", *_speedups(kept["workers"])]
         lines += ["", "## (f) Shares", "", *_shares(kept["workers"][:3])]
     if "rates" in kept:
         lines += [
@@ -374,6 +394,9 @@ def write_report(kept: Mapping[str, Any]) -> None:
         ]
         lines += ["innermost function, with what it calls of others.", "", "| function | share |", "|---|---|"]
         lines += [f"| `{row['place']}` | {100 * row['share']:.1f} % |" for row in kept["profile"]]
+    if "startup" in kept:
+        lines += ["", "## Start-up", "", "Medians of 7.", "", "| from the command to | seconds |", "|---|---|"]
+        lines += [f"| {row['until']} | {row['seconds']:.2f} |" for row in kept["startup"]]
     if "limits" in kept:
         lines += ["", "## What the machine can", "", "| | |", "|---|---|"]
         lines += [f"| {row['limit']} | {row['value']} |" for row in kept["limits"]]
