@@ -19,7 +19,7 @@ from vtkmodules.vtkIOXML import (
 from pipeline.errors import InputError, OutputError
 from pipeline.mesh import Boundary, TetMesh
 from tests.meshes import TinyCity, make_city, split_city
-from tiler import vtk_xml
+from tiler import vtk_files, vtk_xml
 from tiler.vtk_files import (
     read_piece_paths,
     read_vtp,
@@ -230,6 +230,19 @@ def test_a_block_that_is_exactly_full(tmp_path: Path, small_blocks: None) -> Non
     assert_same(arrays_of(grid.GetPointData())["h"], points[:, 2].copy())
     assert_same(read_vtu(tmp_path / "m.vtu").point_data["h"], points[:, 2].copy())
     assert_same(meshio.read(tmp_path / "m.vtu").point_data["h"], points[:, 2].copy())
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_offsets_that_are_kept_are_those_of_the_file(tmp_path: Path, city: TinyCity) -> None:
+    meshes = [TetMesh(city.mesh.points, city.mesh.cells[:n]) for n in (len(city.mesh.cells), 100, 37, 1000)]
+    for k, mesh in enumerate(meshes):
+        write_vtu(tmp_path / f"{k}.vtu", mesh)
+        data = read_with_vtk(vtkXMLUnstructuredGridReader(), tmp_path / f"{k}.vtu")
+        assert_same(rows_of(data.GetCells(), 4).astype(np.int32), mesh.cells.astype(np.int32))
+    for k, mesh in enumerate(meshes):
+        vtk_files._packed_ends.cache_clear()
+        write_vtu(tmp_path / "alone.vtu", mesh)
+        assert (tmp_path / "alone.vtu").read_bytes() == (tmp_path / f"{k}.vtu").read_bytes()
 
 
 def test_same_input_same_bytes_and_the_input_is_left_alone(tmp_path: Path, city: TinyCity) -> None:
