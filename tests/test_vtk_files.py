@@ -240,7 +240,7 @@ def test_offsets_that_are_kept_are_those_of_the_file(tmp_path: Path, city: TinyC
         data = read_with_vtk(vtkXMLUnstructuredGridReader(), tmp_path / f"{k}.vtu")
         assert_same(rows_of(data.GetCells(), 4).astype(np.int32), mesh.cells.astype(np.int32))
     for k, mesh in enumerate(meshes):
-        vtk_files._packed_ends.cache_clear()
+        vtk_files._compress_ends.cache_clear()
         write_vtu(tmp_path / "alone.vtu", mesh)
         assert (tmp_path / "alone.vtu").read_bytes() == (tmp_path / f"{k}.vtu").read_bytes()
 

@@ -18,8 +18,8 @@ from pipeline.errors import InputError, OutputError
 from pipeline.mesh import TetMesh
 from pipeline.quality import measure_cells
 from stitch.numbering import Numbering, collect_ids, number_without_gaps
-from tiler.vtk_files import TETRA
-from tiler.vtk_xml import Sections, Stream, read_data_file, read_point_array, write_data_file
+from tiler.vtk_files import stream_offsets, stream_types
+from tiler.vtk_xml import Sections, Stream, read_data_file, read_point_array, stream_items, write_data_file
 
 VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide ids, see `stitch.numbering`
 TILE = "tile"  # cell array on request: which tile a cell is of, counted from 0 by name
@@ -158,7 +158,7 @@ def _write_file(
     *,
     scalars: bool,
 ) -> None:
-    rows = [_connectivity(source, kind, numbers), _offsets(source)]
+    rows = [_connectivity(source, kind, numbers), stream_offsets(int(source.n_rows.sum()), source.width)]
     arrays = source.read(0)["CellData"]
     of_cells = {name: _cell_array(source, name, array) for name, array in arrays.items()}
     if scalars:
@@ -171,7 +171,7 @@ def _write_file(
         "CellData": list(of_cells.values()),
     }
     if kind == "UnstructuredGrid":
-        rows.append(Stream("types", np.dtype(np.uint8), 1, n_rows, lambda i, j: np.full(j - i, TETRA, np.uint8)))
+        rows.append(stream_types(n_rows))
         counts = {"NumberOfPoints": len(xyz), "NumberOfCells": n_rows}
     else:
         sections["PointData"].append(_flat("vertex", numbers, 1))
@@ -224,7 +224,7 @@ def _checked_ids(path: Path, ids: NDArray[Any] | None) -> NDArray[np.int64]:
 
 
 def _flat(name: str, values: NDArray[Any], components: int) -> Stream:
-    return Stream(name, values.dtype, components, len(values), lambda i, j: np.asarray(values[i:j]))
+    return stream_items(name, values.dtype, components, len(values), lambda i, j: np.asarray(values[i:j]))
 
 
 def _connectivity(source: _Source, kind: str, numbers: NDArray[np.int64]) -> Stream:
@@ -239,12 +239,6 @@ def _connectivity(source: _Source, kind: str, numbers: NDArray[np.int64]) -> Str
 
     dtype = np.dtype(np.int32 if source.n_points < 2**31 else np.int64)
     return _joined("connectivity", dtype, source.n_rows * source.width, of_piece, components=1)
-
-
-def _offsets(source: _Source) -> Stream:
-    n_rows, width = int(source.n_rows.sum()), source.width
-    dtype = np.dtype(np.int32 if n_rows * width < 2**31 else np.int64)
-    return Stream("offsets", dtype, 1, n_rows, lambda i, j: np.arange(i + 1, j + 1) * width)
 
 
 def _cell_array(source: _Source, name: str, first: NDArray[Any]) -> Stream:
@@ -292,4 +286,4 @@ def _joined(
         parts = [cached(k)[max(i - start[k], 0) : j - start[k]] for k in range(int(low), int(high))]
         return np.concatenate(parts) if parts else np.empty(0, dtype)
 
-    return Stream(name, dtype, components, int(start[-1]), items)
+    return stream_items(name, dtype, components, int(start[-1]), items)

@@ -95,18 +95,18 @@ def read_known_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) 
     """
     stage = "approach" if "approach" in task.refs else "terrain"
     window = region_window(box, spacing, bounds)
-    return join_terrain(read_rasters(task, stage, window), window)
+    return join_terrain(_read_rasters(task, stage, window), window)
 
 
 def join_rasters(task: Task, stage: str, window: NodeWindow, spacing: float) -> Dtm:
     """Read the nodes of a window from the rasters of a stage; NaN where none has them, there may be no raster."""
-    parts = read_rasters(task, stage, window)
+    parts = _read_rasters(task, stage, window)
     if not parts:
         return Dtm(np.full((window.ny, window.nx), np.nan), window.i0, window.j0, spacing)
     return join_dtm(parts, window)
 
 
-def read_rasters(task: Task, stage: str, window: NodeWindow) -> list[Dtm]:
+def _read_rasters(task: Task, stage: str, window: NodeWindow) -> list[Dtm]:
     """Read what the rasters of a stage have of a window, each that has any."""
     parts = []
     for result in task.read(stage, ()):

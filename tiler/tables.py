@@ -141,19 +141,8 @@ def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
 
 
 BUILDING_ARRAYS = (
-    *(
-        "polygon",
-        "polygon_start",
-        "id",
-        "number",
-        "house",
-        "ground",
-        "roof",
-        "member",
-        "member_start",
-        "roof_source",
-    ),
-    *("measured_roof", "wall_ground", "group", "layers"),
+    *("polygon", "polygon_start", "id", "number", "house", "ground", "roof", "member", "member_start"),
+    *("roof_source", "measured_roof", "wall_ground", "group", "layers"),
     *("fidelity_points", "fidelity_rmse", "fidelity_bias", "fidelity_coverage"),
 )
 

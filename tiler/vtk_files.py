@@ -25,6 +25,7 @@ from tiler.vtk_xml import (
     opened,
     parse_xml,
     read_data_file,
+    stream_items,
     write_data_file,
     write_index,
 )
@@ -99,7 +100,7 @@ def write_vtu(path: Path, mesh: TetMesh, *, point_data: Arrays = NO_ARRAYS, cell
     n_points, n_cells = len(mesh.points), len(mesh.cells)
     sections = {
         "Points": [make_stream("Points", mesh.points, np.float64)],
-        "Cells": [*_connectivity(mesh.cells, n_points), _types(n_cells)],
+        "Cells": [*_connectivity(mesh.cells, n_points), stream_types(n_cells)],
         "PointData": _data_streams(point_data, n_points),
         "CellData": _data_streams(cell_data, n_cells),
     }
@@ -248,28 +249,23 @@ def read_piece_paths(path: Path) -> list[Path]:
 def _connectivity(rows: NDArray[Any], n_points: int) -> list[Stream]:
     n_rows, width = rows.shape
     index = np.int32 if n_points < 2**31 else np.int64
-    offset = np.int32 if rows.size < 2**31 else np.int64
-    flat: NDArray[Any] = np.ascontiguousarray(rows).reshape(-1)
-
-    kind = np.dtype(offset)
-    return [
-        Stream("connectivity", np.dtype(index), 1, rows.size, lambda i, j: flat[i:j]),
-        Stream("offsets", kind, 1, n_rows, partial(_ends, width), partial(_packed_ends, width, kind)),
-    ]
+    return [make_stream("connectivity", rows.reshape(-1), index), stream_offsets(n_rows, width)]
 
 
-def _ends(width: int, i: int, j: int) -> NDArray[Any]:
-    ends: NDArray[Any] = np.arange(i + 1, j + 1, dtype=np.int64) * width
-    return ends
+def stream_offsets(n_rows: int, width: int) -> Stream:
+    """Make the stream that tells where rows of so many numbers end in the connectivity."""
+    dtype = np.dtype(np.int32 if n_rows * width < 2**31 else np.int64)
+    return Stream("offsets", dtype, 1, n_rows, partial(_compress_ends, width, dtype))
 
 
 @lru_cache(maxsize=256)  # of 77 kB at most; a fifth of the time to compress a piece, and the same in all of them
-def _packed_ends(width: int, dtype: np.dtype[Any], i: int, j: int) -> bytes:
-    return compress_block(_ends(width, i, j), dtype)
+def _compress_ends(width: int, dtype: np.dtype[Any], i: int, j: int) -> bytes:
+    return compress_block(np.arange(i + 1, j + 1, dtype=np.int64) * width, dtype)
 
 
-def _types(n_cells: int) -> Stream:
-    return Stream("types", np.dtype(np.uint8), 1, n_cells, lambda i, j: np.full(j - i, TETRA, np.uint8))
+def stream_types(n_cells: int) -> Stream:
+    """Make the stream of the types of tetrahedra."""
+    return stream_items("types", np.dtype(np.uint8), 1, n_cells, lambda i, j: np.full(j - i, TETRA, np.uint8))
 
 
 def _data_streams(arrays: Arrays, n_rows: int) -> list[Stream]:

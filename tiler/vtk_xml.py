@@ -43,17 +43,13 @@ DTYPES = {name: np.dtype(dtype).newbyteorder("<") for dtype, name in VTK_TYPES.i
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """One array on its way to the disk: ``items(i, j)`` makes its numbers ``i`` to ``j``.
-
-    Numbers that are the same in many files may be kept in compressed blocks: then ``blocks(i, j)`` gives these.
-    """
+    """One array on its way to the disk: ``block(i, j)`` makes its numbers ``i`` to ``j``, compressed."""
 
     name: str
     dtype: np.dtype[Any]
     components: int
     n_items: int
-    items: Callable[[int, int], NDArray[Any]]
-    blocks: Callable[[int, int], bytes] | None = None
+    block: Callable[[int, int], bytes]
 
 
 Sections = dict[str, list[Stream]]
@@ -71,7 +67,14 @@ def make_stream(name: str, array: NDArray[Any], dtype: Any) -> Stream:
     """Make a stream of an array (n,) or (n, components), to be written as `dtype`."""
     flat = np.ascontiguousarray(array).reshape(-1)
     components = array.shape[1] if array.ndim == 2 else 1
-    return Stream(name, np.dtype(dtype), components, flat.size, lambda i, j: flat[i:j])
+    return stream_items(name, np.dtype(dtype), components, flat.size, lambda i, j: flat[i:j])
+
+
+def stream_items(
+    name: str, dtype: np.dtype[Any], components: int, n_items: int, items: Callable[[int, int], NDArray[Any]]
+) -> Stream:
+    """Make a stream of numbers that ``items(i, j)`` makes, to be written as `dtype`."""
+    return Stream(name, dtype, components, n_items, lambda i, j: compress_block(items(i, j), dtype))
 
 
 def compress_block(items: NDArray[Any], dtype: np.dtype[Any]) -> bytes:
@@ -142,8 +145,7 @@ def _write_blocks(file: BinaryIO, stream: Stream) -> None:
     start = file.tell()
     file.write(table.tobytes())
     for k in range(n_blocks):
-        first, last = k * step, min((k + 1) * step, stream.n_items)
-        block = stream.blocks(first, last) if stream.blocks else compress_block(stream.items(first, last), dtype)
+        block = stream.block(k * step, min((k + 1) * step, stream.n_items))
         table[3 + k] = len(block)
         file.write(block)
     end = file.tell()

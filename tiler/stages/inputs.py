@@ -10,7 +10,7 @@ import shapely
 from pipeline.errors import InputError
 from pipeline.notes import Note
 from pipeline.pointcloud import BUILDING, GROUND, WATER
-from pipeline.raster import Dtm, NodeWindow, grow_window, join_dtm, node_window
+from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
 from pipeline.terrain import bin_nodes
 from pipeline.terrain_fill import (
     COARSE,
@@ -31,7 +31,7 @@ from tiler.context import tile_key
 from tiler.footprint_index import scan_footprints
 from tiler.ingest import read_cells
 from tiler.places import place
-from tiler.readers import clip, grow, read_cloud, read_outlines, read_rasters
+from tiler.readers import clip, grow, join_rasters, read_cloud, read_outlines
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.tables import pack_polygons
 from tiler.task import Task
@@ -212,7 +212,7 @@ def flood_tile(task: Task) -> Facts:
     own = own_window(task)
     within = node_window(task.context.bounds, spacing)
     window = grow_window(own, FILL_RINGS, within=within)
-    flooded = flood_terrain(join_dtm(read_rasters(task, "ground", window), window), own)
+    flooded = flood_terrain(join_rasters(task, "ground", window, spacing), own)
     sums = coarsen(flooded)
     task.put(z=flooded.dtm.z, ring=flooded.ring, node=sums.node.reshape(-1, 2), total=sums.total, count=sums.count)
     return _raster_facts(flooded.dtm) | {"known": sums.n_known, "deep": count_deep(flooded)}
