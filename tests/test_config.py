@@ -4,12 +4,16 @@ import dataclasses
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.errors import ConfigError
+from stitch.least import LEAST_TILE
 from tiler.api import with_file
 from tiler.cli import make_parser
 from tiler.config import Config, annotated_defaults, load_config, make_config
+from tiler.planning import survey_inputs
+from tiler.synth import write_city
 
 
 def test_the_annotated_defaults_are_the_defaults() -> None:
@@ -57,6 +61,7 @@ def test_every_parameter_is_an_option(capsys: pytest.CaptureFixture[str]) -> Non
     [
         ({"mesh_size": 0.0}, r"mesh_size = 0 m: must be at least 0\.1 m"),
         ({"domain_height": float("nan")}, "domain_height = nan: must be a finite number"),
+        ({"tile_size": 9.0}, "tile_size = 9 m: at least 10 m; .*or give 0 for one that follows the mesh size"),
         ({"roof_percentile": 101.0}, "roof_percentile = 101 %: must be at most 100 %"),
         ({"dtm_spacing": -1.0}, "dtm_spacing = -1 m: must be above 0 m"),
         ({"smoother": "magic"}, "smoother = 'magic': must be one of columns, fem"),
@@ -99,3 +104,23 @@ def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         load_config(tmp_path / "none.toml")
+
+
+def test_tiles_follow_the_mesh_size_alone_where_no_side_is_given(tmp_path: Path) -> None:
+    sizes = np.array([100.0, 80.0, 20.0, 10.0, 7.0, 5.0, 2.5, 1.0])
+    high = {"domain_height": 1000.0}
+    sides = np.array([make_config({"mesh_size": size} | high).tile_size_or_default for size in sizes.tolist()])
+    assert sides[2:4].tolist() == [1250.0, 1250.0]
+    assert (np.diff(sides) <= 0).all()
+    assert (sides >= LEAST_TILE * sizes).all()
+    cells = sides**2 / sizes**3  # but for a factor
+    fine = sizes <= 10
+    assert (cells[fine] <= 3.2 * cells[3]).all()
+    assert (cells[fine] >= 0.9 * cells[3]).all()
+    assert make_config({"mesh_size": 2.5, "open_size": 40.0}).tile_size_or_default == LEAST_TILE * 40.0
+
+    files = write_city(tmp_path, size=100, buildings=1)
+    given = {"pointcloud": [str(path) for path in files.clouds], "mesh_size": 2.5}
+    said: list[str] = []
+    assert survey_inputs(make_config(given), said.append).region.tile_size == 220.0
+    assert survey_inputs(make_config(given | {"tile_size": 90.0}), said.append).region.tile_size == 90.0

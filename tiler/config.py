@@ -17,6 +17,7 @@ from tiler.domain import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, r
 from tiler.pad_widths import check_widths
 from tiler.places import check_url, is_url
 from tiler.plain_text import shorten
+from tiler.tile_size import LEAST_SIDE, choose_tile_size
 
 MAX_CONFIG_BYTES = 1_000_000
 MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
@@ -219,9 +220,13 @@ class Config:
         1e-8, "mesh", "relative residual of the linear systems with smoother = fem", above=0, most=1e-2
     )
     tile_size: float = _parameter(
-        1000.0, "run", "side of a tile, at least 14 mesh sizes; tiles are aligned to multiples of it in the CRS",
-        unit="m", least=10,
-    )  # fmt: skip
+        0.0,
+        "run",
+        "side of a tile, at least 14 mesh sizes; tiles are aligned to multiples of it in the CRS; 0 takes 1250 m, "
+        "and less for meshes finer than 10 m (520 m for 5 m, 220 m for 2.5 m), which have more cells",
+        unit="m",
+        least=0,
+    )
     workers: int = _parameter(
         0, "run", "worker processes on this machine; 0 runs in this process", least=0, most=1024
     )
@@ -283,7 +288,7 @@ class Config:
         """
         if self.open_size or not self.padded:
             return self.open_size
-        most = self.tile_size / LEAST_TILE
+        most = self.tile_size_or_default / LEAST_TILE
         if self.mesher == "adaptive" and not isinstance(self.domain_height, str):
             most = min(most, self.domain_height / (2 * self.most_spacing))
         size = min(PAD_COARSENING * self.mesh_size, most * (1 - ROUNDING))
@@ -293,6 +298,11 @@ class Config:
     def layer_height_or_default(self) -> float:
         """Height of a layer (m): the mesh size where none is given."""
         return self.layer_height or self.mesh_size
+
+    @property
+    def tile_size_or_default(self) -> float:
+        """Side of a tile (m), which follows the mesh size where none is given."""
+        return self.tile_size or choose_tile_size(self.mesh_size, self.largest_size)
 
     @property
     def expected_height(self) -> float:
@@ -581,6 +591,18 @@ def _check_together(config: Config) -> None:
             f"{config.mesh_size:g} m; raise --first-layer or lower --mesh-size"
         )
     _check_pad(config)
+    _check_way(config)
+    if not isinstance(config.domain_height, str):
+        check_height(config, config.domain_height)
+
+
+def _check_way(config: Config) -> None:
+    """Check how and where the run takes place."""
+    if 0 < config.tile_size < LEAST_SIDE:
+        raise ConfigError(
+            f"tile_size = {config.tile_size:g} m: at least {LEAST_SIDE:g} m; raise it, or give 0 for one that "
+            "follows the mesh size"
+        )
     if config.cluster and is_url(config.out):
         raise ConfigError(
             f"out = {config.out} with a cluster: jobs keep their scripts and logs in the output folder; give one "
@@ -591,8 +613,6 @@ def _check_together(config: Config) -> None:
             f"scheduler = {_shown(config.scheduler)} and cluster = {_shown(config.cluster)}: workers are of one "
             "or the other; leave one out"
         )
-    if not isinstance(config.domain_height, str):
-        check_height(config, config.domain_height)
 
 
 def _check_pad(config: Config) -> None:

@@ -38,7 +38,8 @@ SOIL_PARAMETERS = ("underground", "mesh_size", "least_spacing", "most_spacing", 
 def derived_parameters(config: Config) -> dict[str, float]:
     """Parameters that follow from others, by name: a stage that declares one does not depend on the others.
 
-    ``graded_size`` is the largest target edge length of region and pad (m).
+    ``graded_size`` is the largest target edge length of region and pad, ``tile_size_or_default`` the side of a
+    tile (m).
     ``roof_clearance_or_spacing`` and ``roof_group_or_spacing`` (m) are at least the least vertical spacing of the
     adaptive mesher: heights closer than that cannot both be exact in a column.
     """
@@ -46,6 +47,7 @@ def derived_parameters(config: Config) -> dict[str, float]:
     return {
         "layer_height_or_default": config.layer_height_or_default,
         "graded_size": config.graded_size,
+        "tile_size_or_default": config.tile_size_or_default,
         "roof_clearance_or_spacing": max(config.roof_clearance, spacing),
         "roof_group_or_spacing": max(config.roof_group, spacing),
     }

@@ -102,7 +102,7 @@ def plan_alone(config: Config, whole: Plan, tile: str, tallest: float) -> tuple[
     alone = config_alone(config, wide, tile)
     box = bounds_around(wide, tile)
     grid = pad_grid(whole.grid, box, mesh_size=config.mesh_size, open_size=config.graded_size)
-    alone = replace(alone, bounds=core_part(box, pad.core, config.tile_size))
+    alone = replace(alone, bounds=core_part(box, pad.core, config.tile_size_or_default))
     return alone, Pad(pad.core, grid), Path(config.out) / STORE
 
 

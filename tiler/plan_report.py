@@ -93,7 +93,7 @@ def describe_plan(
         }
         | ({"core": list(survey.region.bounds)} if config.padded else {}),
         "tiles": {
-            "size": config.tile_size,
+            "size": config.tile_size_or_default,
             "present": len(loads),
             "absent": int((~there).sum()),
             "seams": sum(int(seams.sum()) for seams in seams_present(grid)),

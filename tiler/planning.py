@@ -142,13 +142,18 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     crs, messages = resolve_crs(config.crs or None, headers, footprint_crs)
     code = crs.to_epsg()
     region = Region(
-        choose_bounds(config.bounds, headers), f"EPSG:{code}" if code else crs.to_wkt(), config.tile_size
+        choose_bounds(config.bounds, headers),
+        f"EPSG:{code}" if code else crs.to_wkt(),
+        config.tile_size_or_default,
     )
     check_region(region, config.largest_size, headers, kind="open" if config.open_size else "mesh")
     check_sizes(region, config)
     clouds = [header for header in headers if header.n_points and _meets(header, region)]
     whole = make_grid(
-        region.bounds, tile_size=config.tile_size, mesh_size=config.mesh_size, open_size=config.open_size
+        region.bounds,
+        tile_size=config.tile_size_or_default,
+        mesh_size=config.mesh_size,
+        open_size=config.open_size,
     )
     grid = choose_tiles(whole, [header.bounds[:4] for header in clouds])
     present = tiles_present(grid)

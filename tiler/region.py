@@ -191,7 +191,7 @@ def find_pad(core: TileGrid, config: Config, tallest: float) -> Pad:
     widths = widths_in_metres(config.pad, tallest)
     check_widths(widths, mesh_size=config.mesh_size, dtm_spacing=config.dtm_spacing)
     bounds = pad_bounds(core.bounds, widths)
-    region = Region(bounds, "", config.tile_size)
+    region = Region(bounds, "", config.tile_size_or_default)
     check_region(region, config.mesh_size, [])
     check_sizes(region, config)
     return Pad(core.bounds, pad_grid(core, bounds, mesh_size=config.mesh_size, open_size=config.graded_size))

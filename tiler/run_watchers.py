@@ -73,7 +73,7 @@ def begin_watching(
         command=command,
         bounds=plan.region.bounds,
         crs=plan.region.crs,
-        tile_size=config.tile_size,
+        tile_size=config.tile_size_or_default,
         workers=0 if config.on_cluster else max(config.workers, 1),
         tiles=layout.tiles,
         seams=layout.seams,

@@ -105,7 +105,7 @@ def make_engine(
     context = RunContext(
         plan.region.bounds,
         plan.region.crs,
-        config.tile_size,
+        config.tile_size_or_default,
         config.mesh_size,
         pack_tiles(plan.grid),
         str(out),

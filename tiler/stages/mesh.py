@@ -61,7 +61,7 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
         Read(terrain_stage(config), halo + terrain_halo(config, domain)),
     ]
     reads += [Read("layers", see, by_extent=True)] if chooses_layers_later(config) else []
-    parameters = (*PLANE_PARAMETERS, *layer_parameters(config), "dtm_spacing", "tile_size")
+    parameters = (*PLANE_PARAMETERS, *layer_parameters(config), "dtm_spacing", "tile_size_or_default")
     parameters += SIZE_PARAMETERS if config.graded_size else ()
     parameters += PAD_PARAMETERS if config.padded else ()
     parameters += SOIL_PARAMETERS if config.underground else ()

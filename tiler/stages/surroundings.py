@@ -31,11 +31,11 @@ def terrain_halo(given: Any, domain: Domain | None = None) -> float:
 def halos(given: Any, largest: float, *, around_walls: bool) -> tuple[float, float]:
     """How far beyond a box terrain is sampled, and buildings count (m); the largest size is 0 without grading."""
     if not largest:
-        halo = tile_halo(given.tile_size, given.mesh_size)
+        halo = tile_halo(given.tile_size_or_default, given.mesh_size)
         return halo, halo
     rule = size_rule(given, largest)
-    halo = tile_halo(given.tile_size, given.mesh_size, rule)
-    return halo, sizes_halo(given.tile_size, rule) if around_walls else halo
+    halo = tile_halo(given.tile_size_or_default, given.mesh_size, rule)
+    return halo, sizes_halo(given.tile_size_or_default, rule) if around_walls else halo
 
 
 def _halos_of(task: Task) -> tuple[float, float]:
