@@ -7,14 +7,11 @@ are written from that: `python -m tests.benchmarks.studies cells` measures one s
 
 import json
 import os
-import platform
-import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,56 +21,14 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.bench import COMMAND, citystitch, record_of
-from tests.benchmarks.log_plot import draw_log_plot
+from tests.benchmarks.studies_report import DOCS, step_seconds, write_report
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-KEPT, REPORT = DOCS / "studies.json", DOCS / "studies.md"
+KEPT = DOCS / "studies.json"
 MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
 BUILDINGS = (100, 300, 1000, 3000, 10_000, 20_000, 50_000)
-SIDES = (1000, 2000, 3000, 5000)  # m; 10000 with --large
+SIDES = (1000, 2000, 3000, 5000, 10_000)  # m
+TILES_A_SIDE = (8, 16, 32)
 TILES = (250, 500, 850, 1250, 2500)  # m, on 2.5 km
-LEAST_SECONDS = 0.1  # less is not fitted
-
-# Steps of the paper by the stages and parts of stages that do them, as run.json names them.
-STEPS: Mapping[str, tuple[str, ...]] = {
-    "1.1 points": ("points",),
-    "1.2 footprints": ("footprints", "outlines"),
-    "1.3 terrain": ("ground", "flooded", "coarse", "lakes", "terrain"),
-    "1.4-2.0 houses": ("houses",),
-    "2.1 simplify": ("near", "join", "members", "shapes"),
-    "2.3 heights": ("model",),
-    "1.7, 2.4 city model": ("citymodel", "citymodel-full"),
-    "3.1 plane mesh": ("columns: 3.1 plane mesh", "seams: 3.1 seams"),
-    "3.2-3.5 columns": ("columns: 3.2-3.5 columns", "seams: 3.2-3.5 columns of seams"),
-    "3.6 pieces": ("pieces",),
-    "fit, proofs, report": ("fit", "proofs", "report", "numbers"),
-}
-
-
-def step_seconds(record: Mapping[str, Any]) -> dict[str, float]:
-    """Seconds of each step of a run, all tiles together; what no step names is ``rest``."""
-    given: Counter[str] = Counter()
-    for name, seconds in record["seconds"].items():
-        given[re.sub(r"-\d+(?=:|$)", "", name)] += seconds
-    found = {step: sum(given[part] for part in parts) for step, parts in STEPS.items()}
-    stages = sum(seconds for name, seconds in record["seconds"].items() if ": " not in name)
-    found["rest"] = max(stages - sum(found.values()), 0.0)
-    return {step: round(seconds, 3) for step, seconds in found.items()}
-
-
-def fit_exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float | None:
-    """Slope of log(seconds) over log(sizes) by least squares; None with fewer than two values that count.
-
-    Examples
-    --------
-    >>> round(fit_exponent([1, 10, 100], [2, 20, 200]), 3)
-    1.0
-    """
-    n, t = np.asarray(sizes, np.float64), np.asarray(seconds, np.float64)
-    use = t >= LEAST_SECONDS
-    if use.sum() < 2:
-        return None
-    return float(np.polyfit(np.log(n[use]), np.log(t[use]), 1)[0])
 
 
 def measure(city: Path, out: Path, *options: str, cores: int = 1) -> dict[str, Any]:
@@ -119,8 +74,9 @@ class Cities:
 def study_cells(cities: Cities, out: Path) -> list[dict[str, Any]]:
     """(a) One kilometre with 480 buildings, in one process on one core, by mesh size."""
     city = cities.make(1000, 480)
-    sizes = ("--tile-size", "500", "--workers", "0")
-    return [measure(city, out, "--mesh-size", str(size), *sizes) | {"mesh size": size} for size in MESH_SIZES]
+    return [
+        measure(city, out, "--mesh-size", str(size), "--workers", "0") | {"mesh size": size} for size in MESH_SIZES
+    ]
 
 
 def study_buildings(cities: Cities, out: Path) -> list[dict[str, Any]]:
@@ -132,15 +88,23 @@ def study_buildings(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_area(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(c) 480 buildings a km2 on more and more of them, one worker."""
-    sides = (*SIDES, 10_000) if "--large" in sys.argv else SIDES
-    return [
-        measure(
-            cities.make(side, round(480 * side**2 / 1e6)), out, "--tile-size", "500", "--workers", "1", cores=2
-        )
-        | {"area": side**2 / 1e6}
-        for side in sides
-    ]
+    """(c) 480 buildings a km2 on more and more of them, one worker; the middle one of 3, the largest once."""
+    rows = []
+    for side in SIDES:
+        city = cities.make(side, round(480 * side**2 / 1e6))
+        for _ in range(1 if side == SIDES[-1] else 3):
+            found = measure(city, out, "--tile-size", "500", "--workers", "1", cores=2)
+            rows.append(found | {"area": side**2 / 1e6})
+    return middle_ones(rows, "area")
+
+
+def study_driver(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """Memory of the driver by the number of tiles, small ones of 150 m with hardly a house, two workers."""
+    rows = []
+    for n in TILES_A_SIDE:
+        city = cities.make(150 * n, n * n // 2, 0.5)
+        rows.append(measure(city, out, "--tile-size", "150", "--workers", "2", cores=2) | {"tiles a side": n})
+    return rows
 
 
 def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
@@ -149,13 +113,17 @@ def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
     for side, several in ((2500, ("0", "1", "2")), (5000, ("0", "2"))):
         city = cities.make(side, 480 * side**2 // 10**6)
         for workers in several * 3:
-            found = measure(city, out, "--tile-size", "625", "--workers", workers, cores=2)
+            found = measure(city, out, "--workers", workers, cores=2)
             rows.append(found | {"workers": int(workers), "side": side})
-    kinds = dict.fromkeys((row["side"], row["workers"]) for row in rows)
-    return [
-        sorted((row for row in rows if (row["side"], row["workers"]) == kind), key=lambda r: float(r["total"]))[1]
-        for kind in kinds
-    ]
+    return middle_ones(rows, "side", "workers")
+
+
+def middle_ones(rows: Sequence[dict[str, Any]], *keys: str) -> list[dict[str, Any]]:
+    """Of the rows with the same values of some keys the one whose run took neither longest nor shortest."""
+    kinds: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        kinds.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return [sorted(some, key=lambda row: float(row["total"]))[len(some) // 2] for some in kinds.values()]
 
 
 def study_tiles(cities: Cities, out: Path) -> list[dict[str, Any]]:
@@ -168,12 +136,11 @@ def study_tiles(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """The city of 2.5 km at 10, 5 and 2.5 m with two workers: tiles as large as the cells allow."""
+    """The city of 2.5 km at 10, 5 and 2.5 m with two workers."""
     city = cities.make(2500, 3000)
     return [
-        measure(city, out, "--mesh-size", str(size), "--tile-size", str(tile), "--workers", "2", cores=2)
-        | {"mesh size": size, "tile size": tile}
-        for size, tile in ((10.0, 625), (5.0, 320), (2.5, 160))
+        measure(city, out, "--mesh-size", str(size), "--workers", "2", cores=2) | {"mesh size": size}
+        for size in (10.0, 5.0, 2.5)
     ]
 
 
@@ -186,11 +153,7 @@ def study_rates(cities: Cities, out: Path) -> list[dict[str, Any]]:
                 found = measure(city, out, "--mesher", mesher, "--mesh-size", str(size), "--workers", "0")
                 rows.append(found | {"mesher": f"{mesher}, {size:g} m"})
         rows.append(measure(dense, out, "--workers", "0") | {"mesher": "adaptive, 10 m, 1 km, 16 points a m2"})
-    kinds = dict.fromkeys(row["mesher"] for row in rows)
-    return [
-        sorted((row for row in rows if row["mesher"] == kind), key=lambda r: float(r["total"]))[1]
-        for kind in kinds
-    ]
+    return middle_ones(rows, "mesher")
 
 
 def study_profile(cities: Cities, out: Path) -> list[dict[str, Any]]:
@@ -202,7 +165,7 @@ def study_profile(cities: Cities, out: Path) -> list[dict[str, Any]]:
         raise SystemExit("no py-spy; python -m pip install py-spy")
     city, raw = cities.make(2500, 3000), out.parent / "samples"
     words = [*COMMAND, "run", str(city / "tiles"), "--footprints", str(city / "footprints.shp")]
-    words += ["--tile-size", "625", "--workers", "0", "--overwrite", "--out", str(out)]
+    words += ["--workers", "0", "--overwrite", "--out", str(out)]
     subprocess.run(
         ["py-spy", "record", "-r", "100", "-t", "-i", "-f", "raw", "-o", str(raw), "--", *words],
         check=True,
@@ -296,8 +259,8 @@ def _two_at_once(city: Path, out: Path) -> float:
     found = []
     with ThreadPoolExecutor(2) as pool:
         for _ in range(3):
-            alone = measure(city, both[0], "--tile-size", "625", "--workers", "0", cores=2)["total"]
-            runs = [pool.submit(measure, city, b, "--tile-size", "625", "--workers", "0", cores=2) for b in both]
+            alone = measure(city, both[0], "--workers", "0", cores=2)["total"]
+            runs = [pool.submit(measure, city, b, "--workers", "0", cores=2) for b in both]
             found.append(sum(run.result()["total"] for run in runs) / 2 / alone)
     for folder in both:
         shutil.rmtree(folder)
@@ -309,6 +272,7 @@ STUDIES: Mapping[str, Study] = {
     "cells": study_cells,
     "buildings": study_buildings,
     "area": study_area,
+    "driver": study_driver,
     "workers": study_workers,
     "tiles": study_tiles,
     "fine": study_fine,
@@ -335,137 +299,6 @@ def main() -> None:
             KEPT.write_text(json.dumps(kept, indent=1) + "\n")
             print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
     write_report(kept)
-
-
-def write_report(kept: Mapping[str, Any]) -> None:
-    """Write docs/studies.md and its pictures of what was measured."""
-    lines = [
-        "# Studies of cost",
-        "",
-        "Written by `make studies` (one study: `python -m tests.benchmarks.studies cells`); do not edit.",
-        "Synthetic cities (`citystitch synth`), LAZ and SHP to written pieces, numba's cache warm, one run each",
-        "where nothing else is said. The machine is shared: compare within a table.",
-        "",
-        f"Machine: {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}.",
-    ]
-    growth = (
-        ("cells", "(a) Cells", "cells", "One kilometre with 480 buildings, mesh size 20 to 2.5 m, serial."),
-        ("buildings", "(b) Buildings", "buildings", "6.25 km², mesh size 10 m, serial."),
-        ("area", "(c) Area", "area", "480 buildings a km², mesh size 10 m, tiles of 500 m, one worker."),
-    )
-    for name, title, key, words in growth:
-        if name in kept:
-            lines += ["", f"## {title}", "", words, "", *_growth(kept[name], name, key)]
-    tables = (
-        (
-            "workers",
-            "(d) Workers",
-            "workers",
-            "Cities of 2.5 and 5 km with 480 buildings a km2; the middle one of 3.",
-        ),
-        ("tiles", "(e) Tile size", "tile size", "The city of 2.5 km, two workers."),
-        ("fine", "Fine meshes", "mesh size", "The city of 2.5 km, two workers, smaller tiles for smaller cells."),
-    )
-    for name, title, key, words in tables:
-        if name in kept:
-            lines += ["", f"## {title}", "", words]
-            for side in dict.fromkeys(row.get("side") for row in kept[name]):
-                lines += ["", *_runs([row for row in kept[name] if row.get("side") == side], key)]
-            if name == "workers":
-                lines += ["", *_speedups(kept[name])]
-    if "workers" in kept:
-        lines += ["", "## (f) Shares", "", *_shares(kept["workers"][:3])]
-    if "rates" in kept:
-        lines += [
-            "",
-            "## Rates",
-            "",
-            "A city of 3 km with 4,320 buildings and 1.5 points a m2, tiles of the default size, serial; the",
-            "middle one of 3. *Step 3* is what stages `seams` and `columns` compute (3.1 to 3.5), then all that",
-            "they do, with what they read and write of the store; *written* are cells a second into VTU pieces.",
-            "",
-        ]
-        lines += _rates(kept["rates"])
-    if "profile" in kept:
-        lines += [
-            "",
-            "## Where the time goes",
-            "",
-            "Serial run of the city of 2.5 km, 100 samples a second (py-spy): our",
-        ]
-        lines += ["innermost function, with what it calls of others.", "", "| function | share |", "|---|---|"]
-        lines += [f"| `{row['place']}` | {100 * row['share']:.1f} % |" for row in kept["profile"]]
-    if "startup" in kept:
-        lines += ["", "## Start-up", "", "Medians of 7.", "", "| from the command to | seconds |", "|---|---|"]
-        lines += [f"| {row['until']} | {row['seconds']:.2f} |" for row in kept["startup"]]
-    if "limits" in kept:
-        lines += ["", "## What the machine can", "", "| | |", "|---|---|"]
-        lines += [f"| {row['limit']} | {row['value']} |" for row in kept["limits"]]
-    REPORT.write_text("\n".join(lines) + "\n")
-
-
-def _growth(rows: list[dict[str, Any]], name: str, key: str) -> list[str]:
-    """A table of runs, one of exponents, and the plot."""
-    sizes = [float(row[key]) for row in rows]
-    steps = [*STEPS, "rest"]
-    series = {step: [row["steps"][step] for row in rows] for step in steps}
-    whole = [sum(row["steps"].values()) for row in rows]
-    draw_log_plot(DOCS / f"study-{name}.png", sizes, {**series, "all": whole}, x=key, y="seconds")
-    lines = [
-        *_runs(rows, "mesh size" if key == "cells" else key),
-        "",
-        "| step | exponent, all sizes | upper half |",
-        "|---|---|---|",
-    ]
-    half = len(rows) // 2
-    for step, seconds in {**series, "all steps": whole}.items():
-        told = [fit_exponent(sizes, seconds), fit_exponent(sizes[half:], seconds[half:])]
-        lines.append(f"| {step} | " + " | ".join("-" if e is None else f"{e:.2f}" for e in told) + " |")
-    return [*lines, "", f"![Seconds of each step against {key}](study-{name}.png)"]
-
-
-def _runs(rows: list[dict[str, Any]], key: str) -> list[str]:
-    lines = [
-        f"| {key} | tiles | cells | whole run | worker's peak | driver | tasks |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines.extend(
-        f"| {row[key]:,g} | {row['tiles']} | {row['cells'] / 1e6:.2f} M | {row['total']:.1f} s "
-        f"| {row['peak'] / 2**20:.0f} MiB | {row['driver'] / 2**20:.1f} MiB | {row['ran']:,} |"
-        for row in rows
-    )
-    return lines
-
-
-def _rates(rows: list[dict[str, Any]]) -> list[str]:
-    lines = [
-        "| mesher | cells | step 3, cells/s | seams | with the store | seams | written | steps 1-2, points/s |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        told = []
-        for kind in (" computed", ""):
-            both = row[f"seams{kind}"] + row[f"columns{kind}"]
-            told += [f"{row['cells'] / both / 1e6:.2f} M", f"{100 * row[f'seams{kind}'] / both:.0f} %"]
-        told.append(f"{row['cells'] / row['written'] / 1e6:.2f} M")
-        early = sum(seconds for step, seconds in row["steps"].items() if step[0] in "12")
-        told.append(f"{row['points'] / early / 1e6:.2f} M")
-        lines.append(f"| {row['mesher']} | {row['cells'] / 1e6:.2f} M | {' | '.join(told)} |")
-    return lines
-
-
-def _speedups(rows: list[dict[str, Any]]) -> list[str]:
-    totals = {(row["side"], row["workers"]): row["total"] for row in rows}
-    told = [f"{totals[side, 0] / totals[side, 2]:.2f} at {side / 1000:g} km" for side, n in totals if n == 2]
-    return [f"Two workers over one process: {', '.join(told)}."]
-
-
-def _shares(rows: list[dict[str, Any]]) -> list[str]:
-    lines = ["| step | " + " | ".join(f"{row['workers']} workers" for row in rows) + " |", "|---|---|---|---|"]
-    for step in (*STEPS, "rest"):
-        parts = (f"{100 * row['steps'][step] / sum(row['steps'].values()):.1f} %" for row in rows)
-        lines.append(f"| {step} | " + " | ".join(parts) + " |")
-    return lines
 
 
 if __name__ == "__main__":

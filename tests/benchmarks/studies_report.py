@@ -1,0 +1,217 @@
+"""docs/studies.md and its pictures, written of what `tests.benchmarks.studies` measured."""
+
+import os
+import platform
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.benchmarks.log_plot import draw_log_plot
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+REPORT = DOCS / "studies.md"
+LEAST_SECONDS = 0.1  # less is not fitted
+
+# Steps of the paper by the stages and parts of stages that do them, as run.json names them.
+STEPS: Mapping[str, tuple[str, ...]] = {
+    "1.1 points": ("points",),
+    "1.2 footprints": ("footprints", "outlines"),
+    "1.3 terrain": ("ground", "flooded", "coarse", "lakes", "terrain"),
+    "1.4-2.0 houses": ("houses",),
+    "2.1 simplify": ("near", "join", "members", "shapes"),
+    "2.3 heights": ("model",),
+    "1.7, 2.4 city model": ("citymodel", "citymodel-full"),
+    "3.1 plane mesh": ("columns: 3.1 plane mesh", "seams: 3.1 seams"),
+    "3.2-3.5 columns": ("columns: 3.2-3.5 columns", "seams: 3.2-3.5 columns of seams"),
+    "3.6 pieces": ("pieces",),
+    "fit, proofs, report": ("fit", "proofs", "report", "numbers"),
+}
+
+
+def step_seconds(record: Mapping[str, Any]) -> dict[str, float]:
+    """Seconds of each step of a run, all tiles together; what no step names is ``rest``."""
+    given: Counter[str] = Counter()
+    for name, seconds in record["seconds"].items():
+        given[re.sub(r"-\d+(?=:|$)", "", name)] += seconds
+    found = {step: sum(given[part] for part in parts) for step, parts in STEPS.items()}
+    stages = sum(seconds for name, seconds in record["seconds"].items() if ": " not in name)
+    found["rest"] = max(stages - sum(found.values()), 0.0)
+    return {step: round(seconds, 3) for step, seconds in found.items()}
+
+
+def fit_exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float | None:
+    """Slope of log(seconds) over log(sizes) by least squares; None with fewer than two values that count.
+
+    Examples
+    --------
+    >>> round(fit_exponent([1, 10, 100], [2, 20, 200]), 3)
+    1.0
+    """
+    n, t = np.asarray(sizes, np.float64), np.asarray(seconds, np.float64)
+    use = t >= LEAST_SECONDS
+    if use.sum() < 2:
+        return None
+    return float(np.polyfit(np.log(n[use]), np.log(t[use]), 1)[0])
+
+
+def write_report(kept: Mapping[str, Any]) -> None:
+    """Write docs/studies.md and its pictures of what was measured."""
+    lines = [
+        "# Studies of cost",
+        "",
+        "Written by `make studies` (one study: `python -m tests.benchmarks.studies cells`); do not edit.",
+        "Synthetic cities (`citystitch synth`), LAZ and SHP to written pieces, numba's cache warm, one run each",
+        "where nothing else is said. The machine is shared: compare within a table.",
+        "",
+        f"Machine: {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}.",
+    ]
+    growth = (
+        (
+            "cells",
+            "(a) Cells",
+            "cells",
+            "One kilometre with 480 buildings, mesh size 20 to 2.5 m, serial, tiles of the default size.",
+        ),
+        ("buildings", "(b) Buildings", "buildings", "6.25 km², mesh size 10 m, tiles of 625 m, serial."),
+        (
+            "area",
+            "(c) Area",
+            "area",
+            "480 buildings a km², mesh size 10 m, tiles of 500 m, one worker; middle one of 3, largest once.",
+        ),
+    )
+    for name, title, key, words in growth:
+        if name in kept:
+            lines += ["", f"## {title}", "", words, "", *_growth(kept[name], name, key)]
+    if "driver" in kept:
+        lines += ["", "## Memory of the driver", "", *_driver(kept["driver"])]
+    tables = (
+        (
+            "workers",
+            "(d) Workers",
+            "workers",
+            "Cities of 2.5 and 5 km with 480 buildings a km², tiles of the default size; the middle one of 3.",
+        ),
+        ("tiles", "(e) Tile size", "tile size", "The city of 2.5 km, two workers."),
+        ("fine", "Fine meshes", "mesh size", "The city of 2.5 km, two workers, tiles of the default size."),
+    )
+    for name, title, key, words in tables:
+        if name in kept:
+            lines += ["", f"## {title}", "", words]
+            for side in dict.fromkeys(row.get("side") for row in kept[name]):
+                lines += ["", *_runs([row for row in kept[name] if row.get("side") == side], key)]
+            if name == "workers":
+                lines += ["", *_speedups(kept[name])]
+    if "workers" in kept:
+        lines += ["", "## (f) Shares", "", *_shares(kept["workers"][:3])]
+    if "rates" in kept:
+        lines += [
+            "",
+            "## Rates",
+            "",
+            "A city of 3 km with 4,320 buildings and 1.5 points a m2, tiles of the default size, serial; the",
+            "middle one of 3. *Step 3* is what stages `seams` and `columns` compute (3.1 to 3.5), then all that",
+            "they do, with what they read and write of the store; *written* are cells a second into VTU pieces.",
+            "",
+        ]
+        lines += _rates(kept["rates"])
+    if "profile" in kept:
+        lines += [
+            "",
+            "## Where the time goes",
+            "",
+            "Serial run of the city of 2.5 km, 100 samples a second (py-spy): our",
+        ]
+        lines += ["innermost function, with what it calls of others.", "", "| function | share |", "|---|---|"]
+        lines += [f"| `{row['place']}` | {100 * row['share']:.1f} % |" for row in kept["profile"]]
+    if "startup" in kept:
+        lines += ["", "## Start-up", "", "Medians of 7.", "", "| from the command to | seconds |", "|---|---|"]
+        lines += [f"| {row['until']} | {row['seconds']:.2f} |" for row in kept["startup"]]
+    if "limits" in kept:
+        lines += ["", "## What the machine can", "", "| | |", "|---|---|"]
+        lines += [f"| {row['limit']} | {row['value']} |" for row in kept["limits"]]
+    REPORT.write_text("\n".join(lines) + "\n")
+
+
+def _growth(rows: list[dict[str, Any]], name: str, key: str) -> list[str]:
+    """A table of runs, one of exponents, and the plot."""
+    sizes = [float(row[key]) for row in rows]
+    steps = [*STEPS, "rest"]
+    series = {step: [row["steps"][step] for row in rows] for step in steps}
+    whole = [sum(row["steps"].values()) for row in rows]
+    draw_log_plot(DOCS / f"study-{name}.png", sizes, {**series, "all": whole}, x=key, y="seconds")
+    lines = [
+        *_runs(rows, "mesh size" if key == "cells" else key),
+        "",
+        "| step | exponent, all sizes | upper half |",
+        "|---|---|---|",
+    ]
+    half = len(rows) // 2
+    for step, seconds in {**series, "all steps": whole}.items():
+        told = [fit_exponent(sizes, seconds), fit_exponent(sizes[half:], seconds[half:])]
+        lines.append(f"| {step} | " + " | ".join("-" if e is None else f"{e:.2f}" for e in told) + " |")
+    return [*lines, "", f"![Seconds of each step against {key}](study-{name}.png)"]
+
+
+def _runs(rows: list[dict[str, Any]], key: str) -> list[str]:
+    lines = [
+        f"| {key} | tiles | cells | whole run | worker's peak | driver | tasks |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines.extend(
+        f"| {row[key]:,g} | {row['tiles']} | {row['cells'] / 1e6:.2f} M | {row['total']:.1f} s "
+        f"| {row['peak'] / 2**20:.0f} MiB | {row['driver'] / 2**20:.1f} MiB | {row['ran']:,} |"
+        for row in rows
+    )
+    return lines
+
+
+def _rates(rows: list[dict[str, Any]]) -> list[str]:
+    lines = [
+        "| mesher | cells | step 3, cells/s | seams | with the store | seams | written | steps 1-2, points/s |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        told = []
+        for kind in (" computed", ""):
+            both = row[f"seams{kind}"] + row[f"columns{kind}"]
+            told += [f"{row['cells'] / both / 1e6:.2f} M", f"{100 * row[f'seams{kind}'] / both:.0f} %"]
+        told.append(f"{row['cells'] / row['written'] / 1e6:.2f} M")
+        early = sum(seconds for step, seconds in row["steps"].items() if step[0] in "12")
+        told.append(f"{row['points'] / early / 1e6:.2f} M")
+        lines.append(f"| {row['mesher']} | {row['cells'] / 1e6:.2f} M | {' | '.join(told)} |")
+    return lines
+
+
+def _speedups(rows: list[dict[str, Any]]) -> list[str]:
+    totals = {(row["side"], row["workers"]): row["total"] for row in rows}
+    told = [f"{totals[side, 0] / totals[side, 2]:.2f} at {side / 1000:g} km" for side, n in totals if n == 2]
+    return [f"Two workers over one process: {', '.join(told)}."]
+
+
+def _driver(rows: list[dict[str, Any]]) -> list[str]:
+    lines = [
+        "Tiles of 150 m with hardly a house, client and Dask's scheduler in one process, two workers.",
+        "",
+        *_runs(rows, "tiles a side"),
+        "",
+    ]
+    told = [
+        f"{(after['driver'] - before['driver']) / (after['tiles'] - before['tiles']) / 1e3:.1f} kB a tile between "
+        f"{before['tiles']:,} and {after['tiles']:,}"
+        for before, after in pairwise(rows)
+    ]
+    return [*lines, f"The driver takes {', '.join(told)}."]
+
+
+def _shares(rows: list[dict[str, Any]]) -> list[str]:
+    lines = ["| step | " + " | ".join(f"{row['workers']} workers" for row in rows) + " |", "|---|---|---|---|"]
+    for step in (*STEPS, "rest"):
+        parts = (f"{100 * row['steps'][step] / sum(row['steps'].values()):.1f} %" for row in rows)
+        lines.append(f"| {step} | " + " | ".join(parts) + " |")
+    return lines
