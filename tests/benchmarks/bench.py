@@ -18,7 +18,6 @@ RUNS = 3
 REPORT = Path(__file__).resolve().parents[2] / "docs" / "benchmarks.md"
 INGEST = ("points", "footprints")
 COMMAND = [sys.executable, "-m", "tiler.cli"]
-TILE = "625"  # m: the city of 2.5 km in 16 tiles
 
 
 def citystitch(*arguments: str, cores: int = 2) -> None:
@@ -81,7 +80,7 @@ def main() -> None:
         by_workers: dict[str, list[dict[str, Any]]] = {"0": [], "1": [], "2": []}
         for _ in range(RUNS):
             for workers, records in by_workers.items():
-                records.append(record_of(cities[2500], out, "--tile-size", TILE, "--workers", workers))
+                records.append(record_of(cities[2500], out, "--workers", workers))
         by_area = {
             size: summarise([record_of(cities[size], out, "--tile-size", "500", "--workers", "1")])
             for size in (1000, 2000, 4000)
@@ -114,7 +113,7 @@ def report(
         "",
         f"Machine: {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}.",
         "",
-        f"## A city of 2.5 km with 3,000 buildings at 10 m, tiles of {TILE} m",
+        "## A city of 2.5 km with 3,000 buildings at 10 m",
         "",
         f"Medians of {RUNS} runs that take turns. *After ingest* is the wall time of all stages but those that",
         "read LAZ and SHP; the ratio is that of 1 worker to this row. Peak memory is of the largest process that",

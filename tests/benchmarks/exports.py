@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.bench import REPORT, TILE, citystitch, record_of
+from tests.benchmarks.bench import REPORT, citystitch, record_of
 from tests.benchmarks.reliability import replace_between
 from tiler.export import FORMATS, export_run
 
@@ -111,7 +111,7 @@ def main(words: Sequence[str]) -> int:
     with tempfile.TemporaryDirectory() as folder:
         city, out = Path(folder) / "city", Path(folder) / "out"
         citystitch("synth", str(city), "--size", "2500", "--buildings", "3000")
-        record_of(city, out, "--tile-size", TILE, "--workers", "2")
+        record_of(city, out, "--workers", "2")
         return measure_all(out)
 
 
