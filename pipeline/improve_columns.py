@@ -132,16 +132,6 @@ def _radius_ratio(
 
 
 @numba.njit(cache=True, nogil=True)
-def _ratio(points: NDArray[np.float64], a: int, b: int, c: int, d: int) -> float:
-    return float(
-        _radius_ratio(
-            points[a, 0], points[a, 1], points[a, 2], points[b, 0], points[b, 1], points[b, 2],
-            points[c, 0], points[c, 1], points[c, 2], points[d, 0], points[d, 1], points[d, 2],
-        )
-    )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True)
 def _inverse_power(ratio: float) -> float:
     if ratio <= 0:
         return np.inf
@@ -149,23 +139,35 @@ def _inverse_power(ratio: float) -> float:
     return square * square * square * square
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _lay_out(points: NDArray[np.float64], cell: NDArray[np.int32], at: NDArray[np.float64], i: int) -> None:
+    """Write the corners of a cell into column i, a row for each coordinate."""
+    for c in range(4):
+        p = cell[c]
+        for k in range(3):
+            at[3 * c + k, i] = points[p, k]
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _measure_block(at: NDArray[np.float64], n: int, ratio: NDArray[np.float64]) -> None:
+    """Radius ratio of the first n columns: corners side by side let the machine take several cells at once."""
+    for i in range(n):
+        ratio[i] = _radius_ratio(
+            at[0, i], at[1, i], at[2, i], at[3, i], at[4, i], at[5, i],
+            at[6, i], at[7, i], at[8, i], at[9, i], at[10, i], at[11, i],
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
 def _measure(points: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Radius ratio of every cell: corners of a block side by side let the machine take several cells at once."""
+    """Radius ratio of every cell."""
     ratio, block = np.empty(len(cells)), np.empty(BLOCK)
     at = np.empty((12, BLOCK))
     for first in range(0, len(cells), BLOCK):
         n = min(BLOCK, len(cells) - first)
         for i in range(n):
-            for c in range(4):
-                p = cells[first + i, c]
-                for k in range(3):
-                    at[3 * c + k, i] = points[p, k]
-        for i in range(n):
-            block[i] = _radius_ratio(
-                at[0, i], at[1, i], at[2, i], at[3, i], at[4, i], at[5, i],
-                at[6, i], at[7, i], at[8, i], at[9, i], at[10, i], at[11, i],
-            )  # fmt: skip
+            _lay_out(points, cells[first + i], at, i)
+        _measure_block(at, n, block)
         ratio[first : first + n] = block[:n]
     return ratio
 
@@ -203,16 +205,12 @@ def _cells_of_levels(
 
 
 @numba.njit(cache=True, nogil=True)
-def _cost(
-    points: NDArray[np.float64], cells: NDArray[np.int32], of_level: NDArray[np.int32], bound: float
-) -> float:
-    total = 0.0
-    for i in of_level:
-        ratio = _ratio(points, cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3])
-        total += _inverse_power(ratio)
-        if total >= bound:
-            return np.inf
-    return total
+def _cost(at: NDArray[np.float64], row: NDArray[np.int64], z: float, n: int, ratio: NDArray[np.float64]) -> float:
+    """Cost of the first n cells with one corner of each, whose height is in that row, at z."""
+    for i in range(n):
+        at[row[i], i] = z
+    _measure_block(at, n, ratio)
+    return float(_add_costs(ratio[:n]))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -227,24 +225,32 @@ def _search(
     """Try a step up or down at each level in turn, the last good direction first."""
     step = first_step[level]
     moved = np.zeros(len(level), np.bool_)
+    most = np.diff(start).max() if len(level) else 0
+    at, ratio, row = np.empty((12, most)), np.empty(most), np.empty(most, np.int64)
     for _ in range(SEARCH_SWEEPS):
         for k in range(len(level)):
             p = level[k]
             if abs(step[k]) < LAST_STEP * first_step[p]:
                 continue
             around = of_level[start[k] : start[k + 1]]
+            n = len(around)
+            for i in range(n):
+                cell = cells[around[i]]
+                _lay_out(points, cell, at, i)
+                for c in range(4):
+                    if cell[c] == p:
+                        row[i] = 3 * c + 2
             z = points[p, 2]
-            here = _cost(points, cells, around, np.inf)
-            points[p, 2] = z + step[k]
-            if _cost(points, cells, around, here) < here:
+            here = _cost(at, row, z, n, ratio)
+            if _cost(at, row, z + step[k], n, ratio) < here:
+                points[p, 2] = z + step[k]
                 step[k] *= 1.25
                 moved[k] = True
                 continue
-            points[p, 2] = z - step[k]
-            if _cost(points, cells, around, here) < here:
+            if _cost(at, row, z - step[k], n, ratio) < here:
+                points[p, 2] = z - step[k]
                 step[k] *= -1.25
                 moved[k] = True
                 continue
-            points[p, 2] = z
             step[k] *= 0.5
     return int(moved.sum())
