@@ -18,9 +18,11 @@ MAX_FLIP_SWEEPS = 100  # a bound that rounding could otherwise break; some 5 wer
 FLIP_TOLERANCE = 1e-10  # sine of the angle by which two opposite angles must exceed a half turn
 MAX_RING = 64  # triangles around a vertex; a vertex with more stays
 
-# Sines and cosines of multiples of 45 degrees, written out: the same bits on every machine.
+# To stay, and the cosines and sines of multiples of 45 degrees, written out: the same bits on every machine.
 _D = 0.7071067811865476
-DIRECTIONS = np.array([[1.0, 0], [_D, _D], [0, 1.0], [-_D, _D], [-1.0, 0], [-_D, -_D], [0, -1.0], [_D, -_D]])
+DIRECTIONS = np.array(
+    [[0.0, 0], [1.0, 0], [_D, _D], [0, 1.0], [-_D, _D], [-1.0, 0], [-_D, -_D], [0, -1.0], [_D, -_D]]
+)
 
 
 def improve_plane(
@@ -80,22 +82,21 @@ def _frozen_vertices(
     return frozen
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _ring_cost(ring: NDArray[np.float64], n: int, x: float, y: float, bound: float) -> float:
-    """Sum of (squared edges / area)^4 of the triangles around a place; infinite from `bound` on."""
-    total = 0.0
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _ring_costs(
+    ring: NDArray[np.float64], n: int, x: NDArray[np.float64], y: NDArray[np.float64], cost: NDArray[np.float64]
+) -> None:
+    """Sum of (squared edges / area)^4 of the triangles around each of some places; infinite outside of them."""
+    cost[:] = 0.0
     for k in range(n):
-        px, py = ring[k, 0] - x, ring[k, 1] - y
-        qx, qy = ring[k, 2] - x, ring[k, 3] - y
-        area2 = px * qy - py * qx
-        if area2 <= 0:
-            return np.inf
-        ratio = (px * px + py * py + qx * qx + qy * qy + ring[k, 4]) / area2
-        square = ratio * ratio
-        total += square * square
-        if total >= bound:
-            return np.inf
-    return total
+        ax, ay, bx, by, opposite = ring[k, 0], ring[k, 1], ring[k, 2], ring[k, 3], ring[k, 4]
+        for d in range(len(cost)):
+            px, py = ax - x[d], ay - y[d]
+            qx, qy = bx - x[d], by - y[d]
+            area2 = px * qy - py * qx
+            ratio = (px * px + py * py + qx * qx + qy * qy + opposite) / area2
+            square = ratio * ratio
+            cost[d] += square * square if area2 > 0 else np.inf
 
 
 @numba.njit(cache=True, nogil=True)
@@ -139,21 +140,22 @@ def _move_vertices(
             of_vertex[triangles[t, k]] = t
     step = first_step.copy()
     ring = np.empty((MAX_RING, 5))
+    x, y, cost = np.empty(len(directions)), np.empty(len(directions)), np.empty(len(directions))
     for _ in range(SEARCH_SWEEPS):
         for v in range(len(xy)):
             if frozen[v] or of_vertex[v] < 0 or step[v] < LAST_STEP * first_step[v]:
                 continue
             n = _collect_ring(xy, triangles, neighbour, v, of_vertex[v], ring)
-            x, y = xy[v, 0], xy[v, 1]
-            here = _ring_cost(ring, n, x, y, np.inf)
-            best = here
             for d in range(len(directions)):
-                nx, ny = x + step[v] * directions[d, 0], y + step[v] * directions[d, 1]
-                cost = _ring_cost(ring, n, nx, ny, best)
-                if cost < best:
-                    best = cost
-                    xy[v, 0], xy[v, 1] = nx, ny
-            step[v] *= 1.25 if best < here else 0.5
+                x[d] = xy[v, 0] + step[v] * directions[d, 0]
+                y[d] = xy[v, 1] + step[v] * directions[d, 1]
+            _ring_costs(ring, n, x, y, cost)
+            best = 0
+            for d in range(1, len(directions)):
+                if cost[d] < cost[best]:
+                    best = d
+            xy[v, 0], xy[v, 1] = x[best], y[best]
+            step[v] *= 1.25 if best else 0.5
 
 
 @numba.njit(cache=True, nogil=True)
