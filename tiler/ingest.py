@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.las_points import Triple, take_units
-from pipeline.pointcloud import PointCloud
 from tiler.cells import Box, order_by_cell
 from tiler.clouds import read_chunks, select_usable
 from tiler.las_chunks import classes_of, scaling_of, units_of
@@ -120,23 +119,3 @@ def _check_density(path: Path, total: Counter[tuple[int, int]], size: float) -> 
             f"{path}: more than {worst} points in the square of {size:g} m at ({i * size:g}, {j * size:g}), "
             f"at most {MOST_POINTS} are taken; thin the file: pdal translate {path.name} thin.laz sample"
         )
-
-
-def crop_cloud(cloud: PointCloud, box: Box) -> PointCloud:
-    """Keep the points within a box.
-
-    Parameters
-    ----------
-    cloud : PointCloud
-        Any points.
-    box : tuple of 4 floats
-        xmin, ymin, xmax, ymax (m); the borders belong to the box.
-
-    Returns
-    -------
-    PointCloud
-        In their old order.
-    """
-    x, y = cloud.xyz[:, 0], cloud.xyz[:, 1]
-    inside = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
-    return PointCloud(cloud.xyz[inside], cloud.classification[inside])
