@@ -95,6 +95,26 @@ def extract_building_points(
     return BuildingPoints(*remove_outliers(*roof), *remove_outliers(ground_start, ground_z))
 
 
+def reach_of_points(polygons: NDArray[np.object_], margin: float) -> NDArray[np.object_]:
+    """Lay an area around each polygon that has all points which `extract_building_points` may take of it.
+
+    Parameters
+    ----------
+    polygons : object, (n,)
+        Valid shapely Polygons.
+    margin : float
+        As there (m).
+
+    Returns
+    -------
+    object, (n,)
+        Wide enough for parts of the polygons too, whose walls may be some millimetres off theirs: twice a quarter
+        of the margin by coarsening, and what rounded corners lack.
+    """
+    areas: NDArray[np.object_] = shapely.buffer(_coarsened(polygons, margin), 1.6 * margin + 0.1)
+    return areas
+
+
 def _coarsened(polygons: NDArray[np.object_], margin: float) -> NDArray[np.object_]:
     """Simplify what has very many vertices within a quarter of the margin that is laid around it.
 

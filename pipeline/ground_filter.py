@@ -6,6 +6,7 @@ cut off whatever rises more steeply than terrain does.
 """
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +20,14 @@ SLOPE = 0.15  # terrain rises no more than this over a window
 STEP = 0.5  # m, allowed above the opened surface whatever the window
 GAP = 16  # cells as far as this from a point get a height; farther ones are as good as outside the cloud
 
+Bounds = tuple[float, float, float, float]
+
 # An opening looks twice as far as its half-width, and each looks at the result of the one before. One cell
 # more, because the cloud may end within a cell.
 FILTER_REACH = CELL * (2 * sum(math.ceil(width / CELL) for width in WINDOWS) + GAP + 1)  # m
 
 
-def classify_ground(cloud: PointCloud, *, bounds: tuple[float, float, float, float] | None = None) -> PointCloud:
+def classify_ground(cloud: PointCloud, *, bounds: Bounds | None = None) -> PointCloud:
     """Classify as ground (2) what lies within half a metre of the opened lowest surface.
 
     Parameters
@@ -53,27 +56,66 @@ def classify_ground(cloud: PointCloud, *, bounds: tuple[float, float, float, flo
     part, like the outside of the cloud. The order of the points does not matter. Cost is linear in points and
     cells.
     """
-    usable = ~np.isin(cloud.classification, (LOW_NOISE, HIGH_NOISE))
-    if not usable.any():
-        return cloud
-    xyz = cloud.xyz[usable]
-    cell = np.floor(xyz[:, :2] / CELL).astype(np.int64)
     if bounds is None:
-        low, high = cell.min(axis=0), cell.max(axis=0)
-    else:
-        box = np.floor(np.array(bounds) / CELL).astype(np.int64)
-        low, high = box[:2], box[2:]
-        if (cell < low).any() or (cell > high).any():
-            raise ValueError(f"points outside {bounds}")
-    nx, ny = (high - low + 1).tolist()
-    column, row = (cell - low).T
+        xy = cloud.xyz[_are_usable(cloud), :2]
+        if not len(xy):
+            return cloud
+        bounds = (*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist())
+    return classify_above(cloud, find_terrain([cloud], bounds), bounds)
+
+
+def find_terrain(clouds: Iterable[PointCloud], bounds: Bounds) -> NDArray[np.float64]:
+    """Open the lowest surface of points that come in parts; each part is looked at once.
+
+    Parameters
+    ----------
+    clouds : iterable of PointCloud
+        All points within the bounds, in parts of any size.
+    bounds : (xmin, ymin, xmax, ymax)
+        As for `classify_ground`.
+
+    Returns
+    -------
+    float64, (ny, nx)
+        Height of the opened surface (m) in each cell; infinite where no point is near.
+
+    Raises
+    ------
+    ValueError
+        If a point that is not noise lies outside the bounds.
+    """
+    nx, ny = _find_cells(np.array(bounds)[None, 2:], bounds)[0] + 1
     lowest = np.full((ny, nx), np.inf)
-    np.minimum.at(lowest, (row, column), xyz[:, 2])
-    terrain = _open_progressively(_fill_gaps(lowest))
+    for cloud in clouds:
+        xyz = cloud.xyz[_are_usable(cloud)]
+        column, row = _find_cells(xyz, bounds).T
+        np.minimum.at(lowest, (row, column), xyz[:, 2])
+    return _open_progressively(_fill_gaps(lowest))
+
+
+def classify_above(cloud: PointCloud, terrain: NDArray[np.float64], bounds: Bounds) -> PointCloud:
+    """Classify points of a part of the bounds by the surface that `find_terrain` found there."""
+    usable = _are_usable(cloud)
+    xyz = cloud.xyz[usable]
+    column, row = _find_cells(xyz, bounds).T
     is_ground = np.zeros(len(usable), np.bool_)
     is_ground[usable] = xyz[:, 2] <= terrain[row, column] + STEP
     classes = np.where(cloud.classification == GROUND, UNCLASSIFIED, cloud.classification)
     return PointCloud(cloud.xyz, np.where(is_ground, GROUND, classes).astype(np.uint8))
+
+
+def _are_usable(cloud: PointCloud) -> NDArray[np.bool_]:
+    return ~np.isin(cloud.classification, (LOW_NOISE, HIGH_NOISE))
+
+
+def _find_cells(xy: NDArray[np.float64], bounds: Bounds) -> NDArray[np.int64]:
+    """Column and row of the cell of each point, counted from the bounds' lower corner."""
+    low, high = np.floor(np.array(bounds).reshape(2, 2) / CELL).astype(np.int64)
+    cell: NDArray[np.int64] = np.floor(xy[:, :2] / CELL).astype(np.int64)
+    if (cell < low).any() or (cell > high).any():
+        raise ValueError(f"points outside {bounds}")
+    cell -= low
+    return cell
 
 
 def _fill_gaps(surface: NDArray[np.float64]) -> NDArray[np.float64]:

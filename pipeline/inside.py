@@ -91,6 +91,56 @@ def find_inside(
     return polygon[inside], point[inside]
 
 
+@dataclass(frozen=True, eq=False)
+class Cover:
+    """Cells of the index that some polygons have a part of.
+
+    Attributes
+    ----------
+    i0, j0 : int
+        Column and row of the first cell; cell (i, j) begins at ``i * INDEX_CELL``, ``j * INDEX_CELL``.
+    marked : bool, (rows, columns)
+        Whether a polygon has a part of the cell; it may be marked where one only comes within rounding of it.
+    """
+
+    i0: int
+    j0: int
+    marked: NDArray[np.bool_]
+
+
+def cover_polygons(polygons: NDArray[np.object_]) -> Cover:
+    """Mark the cells that polygons, valid shapely Polygons or MultiPolygons (n,), have a part of."""
+    edges = list_edges(polygons)
+    if len(edges.a) == 0:
+        return Cover(0, 0, np.zeros((0, 0), np.bool_))
+    cells = _find_cells(edges.a, np.ones(len(edges.a), np.bool_), edges.a, edges.b)
+    i0, j0, width, height = cells
+    cell_start = _put_into_cells(cells, edges.start, edges.a, edges.b)[0]
+    return Cover(i0, j0, (np.diff(cell_start) > 0).reshape(height, width))
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_up(xy: Array, i0: int, j0: int, marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    height, width = marked.shape
+    found = np.zeros(len(xy), np.bool_)
+    for k in range(len(xy)):
+        i, j = int(np.floor(xy[k, 0] / INDEX_CELL)) - i0, int(np.floor(xy[k, 1] / INDEX_CELL)) - j0
+        found[k] = 0 <= i < width and 0 <= j < height and marked[j, i]
+    return found
+
+
+def are_covered(cover: Cover, xy: Array) -> NDArray[np.bool_]:
+    """Tell which points, (k, 2) or (k, 3), lie in cells of a cover: all inside its polygons, and some near them.
+
+    Examples
+    --------
+    >>> cover = cover_polygons(np.array([shapely.box(0.5, 0.5, 3.0, 1.5)]))
+    >>> are_covered(cover, np.array([[0.1, 0.1], [3.5, 1.0], [4.5, 1.0], [1.0, 2.5]]))
+    array([ True,  True, False, False])
+    """
+    return np.asarray(_look_up(xy, cover.i0, cover.j0, cover.marked))
+
+
 def are_inside(
     polygons: NDArray[np.object_], polygon: Index, xy: Array, *, closed: bool = False, edges: Edges | None = None
 ) -> NDArray[np.bool_]:

@@ -29,26 +29,62 @@ def find_coordinates(
 
 
 @numba.njit(cache=True, nogil=True)
-def take_units(
-    x: NDArray[np.int32], y: NDArray[np.int32], z: NDArray[np.int32], rows: NDArray[np.int64]
-) -> NDArray[np.int32]:
-    """Take rows, (k,), of coordinates in units of a file, each (n,), side by side: int32 (k, 3)."""
-    units = np.empty((len(rows), 3), np.int32)
-    for k in range(len(rows)):
-        units[k, 0], units[k, 1], units[k, 2] = x[rows[k]], y[rows[k]], z[rows[k]]
-    return units
+def find_range(units: NDArray[np.int32]) -> tuple[int, int]:
+    """Give the least and the greatest of units, at least one; numpy takes three times as long in records.
+
+    Examples
+    --------
+    >>> find_range(np.array([3, -1, 7, 2], np.int32))
+    (-1, 7)
+    """
+    low = high = units[0]
+    for value in units:
+        low, high = min(low, value), max(high, value)
+    return low, high
+
+
+@numba.njit(cache=True, nogil=True)
+def put_units(
+    x: NDArray[np.int32],
+    y: NDArray[np.int32],
+    z: NDArray[np.int32],
+    classification: NDArray[np.uint8],
+    place: NDArray[np.int64],
+    n: int,
+) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+    """Put n points in places of their own, (m,), -1 for those to leave out: int32 (n, 3) in units, and classes.
+
+    Points are read in the order of the file, and written to as many strands as there are cells: either is close to
+    the one before, while taking them cell by cell would look all over the file.
+    """
+    units, classes = np.empty((n, 3), np.int32), np.empty(n, np.uint8)
+    for k in range(len(place)):
+        to = place[k]
+        if to >= 0:
+            units[to, 0], units[to, 1], units[to, 2] = x[k], y[k], z[k]
+            classes[to] = classification[k]
+    return units, classes
 
 
 @numba.njit(cache=True, nogil=True)
 def judge_points(
-    xyz: NDArray[np.float64], classification: NDArray[np.uint8], withheld: NDArray[np.bool_], box: Box
+    x: NDArray[np.int32],
+    y: NDArray[np.int32],
+    z: NDArray[np.int32],
+    scale: Triple,
+    offset: Triple,
+    classification: NDArray[np.uint8],
+    withheld: NDArray[np.bool_],
+    box: Box,
 ) -> NDArray[np.uint8]:
     """Say what becomes of each point: the first reason to drop it of `REASONS`, or `KEPT`.
 
     Parameters
     ----------
-    xyz : float64, (n, 3)
-        Coordinates (m).
+    x, y, z : int32, (n,)
+        Coordinates in units of the file, as in `find_coordinates`.
+    scale, offset : tuple of 3 floats
+        Size of a unit along each axis, and place of unit 0 (m).
     classification : uint8, (n,)
         ASPRS classes.
     withheld : bool, (n,)
@@ -61,16 +97,16 @@ def judge_points(
     uint8, (n,)
         Positions in `REASONS`.
     """
-    verdict = np.empty(len(xyz), np.uint8)
-    for k in range(len(xyz)):
-        if not _is_within(xyz[k, 0], xyz[k, 1], box):
+    verdict = np.empty(len(x), np.uint8)
+    for k in range(len(x)):
+        if not _is_within(x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1], box):
             verdict[k] = OUTSIDE
         elif withheld[k]:
             verdict[k] = WITHHELD
         elif classification[k] == LOW_NOISE or classification[k] == HIGH_NOISE:
             verdict[k] = NOISE
         else:
-            verdict[k] = KEPT if abs(xyz[k, 2]) <= HEIGHT_LIMIT else ABSURD
+            verdict[k] = KEPT if abs(z[k] * scale[2] + offset[2]) <= HEIGHT_LIMIT else ABSURD
     return verdict
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -188,7 +189,7 @@ def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roof: NDAr
         n_points,
         np.sqrt(np.bincount(house, residual**2, len(n_points)) / some),
         np.bincount(house, residual, len(n_points)) / some,
-        _measure_coverage(points, house, polygons),
+        _measure_coverage(points, polygons),
     )
 
 
@@ -237,9 +238,7 @@ def _mark(n: int, index: NDArray[np.int64]) -> NDArray[np.bool_]:
     return marked
 
 
-def _measure_coverage(
-    points: RoofPoints, house: NDArray[np.int64], polygons: NDArray[np.object_]
-) -> NDArray[np.float64]:
+def _measure_coverage(points: RoofPoints, polygons: NDArray[np.object_]) -> NDArray[np.float64]:
     """Share of the cells of each house that have a point; points lie within the box of their house."""
     low, size = _cells_under(shapely.bounds(polygons).reshape(-1, 4))
     count = size[:, 0] * size[:, 1]
@@ -247,11 +246,26 @@ def _measure_coverage(
     box = np.repeat(np.arange(len(polygons)), count)
     row, column = np.divmod(np.arange(len(box)) - begin[box], size[box, 0])
     belongs = are_inside(polygons, box, (low[box] + np.column_stack((column, row)) + 0.5) * COVERAGE_CELL)
-    cell = np.floor(points.xyz[:, :2] / COVERAGE_CELL).astype(np.int64) - low[house]
-    filled = np.zeros(len(box), np.bool_)
-    filled[begin[house] + cell[:, 1] * size[house, 0] + cell[:, 0]] = True
+    filled = _find_filled(points.start, points.xyz, low, size[:, 0], begin, np.zeros(len(box), np.bool_))
     n_filled = np.bincount(box[filled], minlength=len(polygons))
     return n_filled / np.maximum(np.bincount(box[belongs | filled], minlength=len(polygons)), 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_filled(
+    start: NDArray[np.int64],
+    xyz: NDArray[np.float64],
+    low: NDArray[np.int64],
+    width: NDArray[np.int64],
+    begin: NDArray[np.int64],
+    filled: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Mark the cells that have a point of their house: those of house h begin at ``begin[h]``, row by row."""
+    for h in range(len(begin)):
+        for x, y, _ in xyz[start[h] : start[h + 1]]:
+            i, j = int(np.floor(x / COVERAGE_CELL)) - low[h, 0], int(np.floor(y / COVERAGE_CELL)) - low[h, 1]
+            filled[begin[h] + j * width[h] + i] = True
+    return filled
 
 
 def _cells_under(boxes: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

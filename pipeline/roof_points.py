@@ -59,7 +59,9 @@ def locate_roof_points(cloud: PointCloud, polygons: NDArray[np.object_], *, buil
     """
     polygon, point = find_inside(cloud.xyz, polygons, among=select_roof(cloud, building_class=building_class))
     start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))
-    return RoofPoints(start, sort_points(start, cloud.xyz[point]))
+    xyz = cloud.xyz[point]
+    del polygon, point  # they are as large as what is sorted
+    return RoofPoints(start, sort_points(start, xyz))
 
 
 def keep_roof_points(points: RoofPoints, kept: NDArray[np.bool_]) -> RoofPoints:

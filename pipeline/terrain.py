@@ -5,7 +5,7 @@ A region in one piece takes `compute_dtm`. Tiles take the same steps one by one:
 `merge_coarse` and `coarse_terrain` for the region; then `fill_terrain`. The bytes are the same.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numba
 import numpy as np
@@ -39,13 +39,16 @@ __all__ = [
 ]
 
 
-def bin_nodes(cloud: PointCloud, window: NodeWindow, *, spacing: float) -> tuple[Dtm, NDArray[np.int64]]:
+def bin_nodes(
+    clouds: Iterable[PointCloud], window: NodeWindow, *, spacing: float
+) -> tuple[Dtm, NDArray[np.int64]]:
     """Average the ground points (classes 2 and 9) around each node.
 
     Parameters
     ----------
-    cloud : PointCloud
-        Points as far as half a spacing beyond the nodes; those of other classes or farther are passed over.
+    clouds : iterable of PointCloud
+        Points as far as half a spacing beyond the nodes, in parts of any size, each looked at once; those of
+        other classes or farther are passed over.
     window : NodeWindow
         Nodes.
     spacing : float
@@ -57,10 +60,14 @@ def bin_nodes(cloud: PointCloud, window: NodeWindow, *, spacing: float) -> tuple
         Bin means, NaN where a bin is empty.
     int64, (ny, nx)
         Points in each bin.
+
+    Notes
+    -----
+    Heights are summed as whole numbers: neither the order of the points matters nor how they are parted.
     """
-    total, count = _sum_bins(
-        cloud.xyz, cloud.classification, spacing, window.i0, window.j0, np.zeros((window.ny, window.nx))
-    )
+    total, count = np.zeros((window.ny, window.nx)), np.zeros((window.ny, window.nx), np.int64)
+    for cloud in clouds:
+        _sum_bins(cloud.xyz, cloud.classification, spacing, window.i0, window.j0, total, count)
     mean = np.full(count.shape, np.nan)
     np.divide(total * HEIGHT_UNIT, count, out=mean, where=count > 0)
     return Dtm(mean, window.i0, window.j0, spacing), count
@@ -74,10 +81,10 @@ def _sum_bins(
     i0: int,
     j0: int,
     total: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Add up the heights of ground points around each node, in whole `HEIGHT_UNIT`, and count them."""
+    count: NDArray[np.int64],
+) -> None:
+    """Add the heights of ground points to the total around each node, in whole `HEIGHT_UNIT`, and count them."""
     ny, nx = total.shape
-    count = np.zeros((ny, nx), np.int64)
     for k in range(len(xyz)):
         if classification[k] != GROUND and classification[k] != WATER:
             continue
@@ -85,7 +92,6 @@ def _sum_bins(
         if 0 <= i < nx and 0 <= j < ny:
             total[j, i] += np.rint(xyz[k, 2] / HEIGHT_UNIT)
             count[j, i] += 1
-    return total, count
 
 
 def bin_ground(
@@ -102,7 +108,7 @@ def bin_ground(
     spacing : float
         Distance between nodes (m).
     """
-    return bin_nodes(cloud, node_window(bounds, spacing), spacing=spacing)
+    return bin_nodes([cloud], node_window(bounds, spacing), spacing=spacing)
 
 
 def fill_dtm(dtm: Dtm) -> Dtm:

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tiler.cells import MOST_CELLS, order_by_cell
+from tiler.cells import MOST_CELLS, find_places, order_by_cell
 
 
 @settings(max_examples=60, deadline=None)
@@ -25,3 +25,20 @@ def test_rows_are_ordered_as_by_numpy(seed: int, n: int, size: float, wide: bool
     everything = order_by_cell(xy, size)
     assert everything.order[among[everything.order]].tolist() == expected
     assert len(everything.order) == n
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(0, 60), wide=st.booleans())
+def test_places_of_units_are_those_in_the_order_of_coordinates(seed: int, n: int, wide: bool) -> None:
+    rng = np.random.default_rng(seed)
+    units = rng.integers(-20_000, 20_000, (n, 2)).astype(np.int32)
+    if wide and n:
+        units[0] = 2**31 - 1
+    among = rng.random(n) < 0.7
+    scale, offset = (0.01, 0.02), (318_000.0, -64.0)
+    place, cell, start = find_places(units[:, 0], units[:, 1], scale, offset, among, 64.0 if n % 2 else 3.0)
+    found = order_by_cell(np.asarray(units * scale + offset, np.float64), 64.0 if n % 2 else 3.0, among=among)
+    assert place[found.order].tolist() == list(range(len(found.order)))
+    assert (place[~among] == -1).all()
+    assert cell.tolist() == found.cell.tolist()
+    assert start.tolist() == found.start.tolist()

@@ -9,6 +9,7 @@ from pipeline.building_points import (
     extract_building_points,
     has_building_class,
     merge_building_points,
+    reach_of_points,
     remove_outliers,
 )
 from pipeline.heights import (
@@ -55,6 +56,27 @@ def test_ground_points_lie_outside_within_the_margin() -> None:
     cloud = PointCloud(xyz, np.array([GROUND, GROUND, GROUND, WATER, WATER], np.uint8))
     points = extract_building_points(cloud, polygons(HOUSE), margin=1.0, building_class=True)
     assert points.ground_z.tolist() == [1.0, 4.0]
+
+
+@pytest.mark.parametrize("margin", [0.01, 1.0, 5.0])
+def test_all_ground_points_of_parts_lie_in_reach(margin: float) -> None:
+    """The outline has so many vertices that it is coarsened, its parts have not."""
+    angle = np.linspace(0, 2 * np.pi, 3001)[:-1]
+    radius = 20 + 0.24 * margin * (np.arange(3000) % 2)
+    round_house = shapely.Polygon(np.column_stack((radius * np.cos(angle), radius * np.sin(angle))))
+    half = shapely.clip_by_rect(round_house, -30, -30, 0, 30)
+    xy = np.random.default_rng(5).uniform(-32, 32, (20_000, 2))
+    cloud = PointCloud(np.column_stack((xy, xy[:, 0])), np.full(len(xy), GROUND, np.uint8))
+    (area,) = reach_of_points(polygons(round_house), margin)
+    near = shapely.contains_xy(area, xy[:, 0], xy[:, 1])
+    part = PointCloud(cloud.xyz[near], cloud.classification[near])
+    assert near.sum() < len(xy)
+    for shape in (round_house, half):
+        found, expected = (
+            extract_building_points(one, polygons(shape), margin=margin, building_class=True)
+            for one in (part, cloud)
+        )
+        assert found.ground_z.tolist() == expected.ground_z.tolist()
 
 
 def test_without_building_class_roofs_are_what_is_neither_ground_nor_plants() -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.group_order import sort_points, sort_values
-from pipeline.inside import are_inside, find_inside, find_owner
+from pipeline.inside import INDEX_CELL, are_covered, are_inside, cover_polygons, find_inside, find_owner
 
 Array = NDArray[np.float64]
 
@@ -103,3 +103,16 @@ def test_groups_are_sorted_as_by_numpy(seed: int, levels: int, most: int) -> Non
     order = np.lexsort((xyz[:, 0], xyz[:, 1], xyz[:, 2], group))
     assert sort_points(start, xyz).tolist() == xyz[order].tolist()
     assert sort_values(start, xyz[:, 2]).tolist() == xyz[np.lexsort((xyz[:, 2], group)), 2].tolist()
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), whole=st.booleans())
+def test_a_cover_has_all_that_is_inside_and_nothing_far(seed: int, whole: bool) -> None:
+    rng = np.random.default_rng(seed)
+    polygons = np.array([star(rng, whole=whole) for _ in range(3)], dtype=object)
+    xy = rng.uniform(-30, 30, (500, 2))
+    covered = are_covered(cover_polygons(polygons), xy)
+    assert covered[find_inside(xy, polygons)[1]].all()
+    near = shapely.buffer(shapely.union_all(polygons), 1.5 * INDEX_CELL)
+    assert not covered[~shapely.contains_xy(near, xy[:, 0], xy[:, 1])].any()
+    assert not are_covered(cover_polygons(polygons[:0]), xy).any()

@@ -1,12 +1,14 @@
 """Rows in order of the cells of a fixed grid, so that what lies in a box is a few ranges of rows."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 Box = tuple[float, float, float, float]
+Pair = tuple[float, float]
 
 MOST_CELLS = 1 << 20  # that rows are counted in; 65 km square of those of points
 
@@ -65,8 +67,43 @@ def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.boo
     if not size > 0:
         raise ValueError(f"size of cells {size} m must be positive")
     among = np.ones(len(xy), np.bool_) if among is None else among
-    order, cell, start = _order(xy, among, float(size))
+    place, cell, start = _find_places(xy[:, 0], xy[:, 1], (1.0, 1.0), (0.0, 0.0), among, float(size))
+    rows = np.flatnonzero(place >= 0)
+    order = np.empty(len(rows), np.int64)
+    order[place[rows]] = rows
     return CellOrder(order, cell, start)
+
+
+def find_places(
+    x: NDArray[np.int32],
+    y: NDArray[np.int32],
+    scale: Pair,
+    offset: Pair,
+    among: NDArray[np.bool_],
+    size: float,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Find the places of coordinates in whole units, ``units * scale + offset`` (m), in order of their cells.
+
+    Parameters
+    ----------
+    x, y : int32, (n,)
+        Coordinates in units.
+    scale, offset : pair of float
+        Size of a unit along both axes, and place of unit 0 (m).
+    among : bool, (n,)
+        Rows to order.
+    size : float
+        Side of a cell (m), positive.
+
+    Returns
+    -------
+    place : int64, (n,)
+        Place of each row in the order that `order_by_cell` gives of the same coordinates; -1 for other rows.
+    cell, start : int64
+        As in `CellOrder`.
+    """
+    place, cell, start = _find_places(x, y, scale, offset, among, float(size))
+    return place, cell, start
 
 
 def select_cells(
@@ -121,47 +158,63 @@ def row_ranges(wanted: NDArray[np.bool_], start: NDArray[np.int64]) -> list[tupl
 
 
 @numba.njit(cache=True, nogil=True)
-def _order(
-    xy: NDArray[np.float64], among: NDArray[np.bool_], size: float
+def _find_places(
+    x: NDArray[Any], y: NDArray[Any], scale: Pair, offset: Pair, among: NDArray[np.bool_], size: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Order, cells and starts of `CellOrder`."""
-    room = np.count_nonzero(among)
-    i, j, rows = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64)
-    n = 0
-    for k in range(len(xy)):
+    """Place of each row in the order of cells, and cells and starts of `CellOrder`."""
+    place = np.full(len(x), -1, np.int64)
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for k in range(len(x)):
         if among[k]:
-            i[n], j[n], rows[n] = int(np.floor(xy[k, 0] / size)), int(np.floor(xy[k, 1] / size)), k
-            n += 1
-    if n == 0:
-        return rows, np.empty((0, 2), np.int64), np.zeros(1, np.int64)
-    first, low = i.min(), j.min()
-    width = i.max() - first + 1
-    key = (j - low) * width + (i - first)
-    n_cells = key.max() + 1
-    place = _count_below(key, n_cells) if n_cells <= MOST_CELLS else np.argsort(np.argsort(key, kind="mergesort"))
-    order = np.empty(n, np.int64)
-    sorted_key = np.empty(n, np.int64)
-    for k in range(n):
-        order[place[k]], sorted_key[place[k]] = rows[k], key[k]
-    begin = np.flatnonzero(np.diff(sorted_key)) + 1
-    start = np.empty(len(begin) + 2, np.int64)
-    start[0], start[1:-1], start[-1] = 0, begin, n
-    cell = np.empty((len(start) - 1, 2), np.int64)
-    for c in range(len(cell)):
-        cell[c, 0], cell[c, 1] = sorted_key[start[c]] % width + first, sorted_key[start[c]] // width + low
-    return order, cell, start
+            at_x, at_y = x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1]
+            low_x, high_x = min(low_x, at_x), max(high_x, at_x)
+            low_y, high_y = min(low_y, at_y), max(high_y, at_y)
+    if low_x > high_x:
+        return place, np.empty((0, 2), np.int64), np.zeros(1, np.int64)
+    first, low = int(np.floor(low_x / size)), int(np.floor(low_y / size))
+    width = int(np.floor(high_x / size)) - first + 1
+    n_cells = (int(np.floor(high_y / size)) - low + 1) * width
+    for k in range(len(x)):
+        if among[k]:
+            at_x, at_y = x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1]
+            place[k] = (int(np.floor(at_y / size)) - low) * width + int(np.floor(at_x / size)) - first
+    key, count = _put_in_order(place, n_cells) if n_cells <= MOST_CELLS else _sort_keys(place)
+    start = np.zeros(len(key) + 1, np.int64)
+    cell = np.empty((len(key), 2), np.int64)
+    for c in range(len(key)):
+        start[c + 1] = start[c] + count[c]
+        cell[c, 0], cell[c, 1] = key[c] % width + first, key[c] // width + low
+    return place, cell, start
 
 
 @numba.njit(cache=True, nogil=True)
-def _count_below(key: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Place of each key among all in ascending order, equal ones in their old order; keys are below n."""
-    start = np.zeros(n + 1, np.int64)
-    for k in range(len(key)):
-        start[key[k] + 1] += 1
-    for c in range(n):
-        start[c + 1] += start[c]
-    place = np.empty(len(key), np.int64)
-    for k in range(len(key)):
-        place[k] = start[key[k]]
-        start[key[k]] += 1
-    return place
+def _put_in_order(place: NDArray[np.int64], n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Turn keys below n into their places in ascending order, equal ones in their old order; -1 stays.
+
+    Gives the keys that there are, and how many rows have each.
+    """
+    count = np.zeros(n, np.int64)
+    for key in place:
+        if key >= 0:
+            count[key] += 1
+    free = np.cumsum(count) - count
+    for k in range(len(place)):
+        key = place[k]
+        if key >= 0:
+            place[k] = free[key]
+            free[key] += 1
+    there = np.flatnonzero(count)
+    return there, count[there]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sort_keys(place: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Do what `_put_in_order` does, for keys of any size."""
+    rows = np.flatnonzero(place >= 0)
+    rows = rows[np.argsort(place[rows], kind="mergesort")]
+    key = place[rows]
+    begin = np.concatenate((np.zeros(1, np.int64), np.flatnonzero(np.diff(key)) + 1))
+    for k in range(len(rows)):
+        place[rows[k]] = k
+    return key[begin], np.diff(np.append(begin, len(rows)))

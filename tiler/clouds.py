@@ -17,7 +17,7 @@ from pipeline.errors import InputError, OutputError
 from pipeline.las_points import KEPT, REASONS, judge_points
 from pipeline.pointcloud import PointCloud
 from tiler.copc import NODE_SLACK, CopcIndex, read_index, read_nodes
-from tiler.las_chunks import FIELDS, classes_of, coordinates_of
+from tiler.las_chunks import FIELDS, classes_of, coordinates_of, ends_of, scaling_of, units_of
 from tiler.lasheader import AGAIN, RECORD_BYTES, LasPromise, read_promise
 from tiler.places import as_place, is_url, place, source_of
 
@@ -150,14 +150,14 @@ def read_points(path: str | Path, bounds: Box) -> tuple[PointCloud, dict[str, in
     promise = read_promise(path)
     counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
     places, classes = [np.empty((0, 3))], [np.empty(0, np.uint8)]
-    for chunk, xyz in _chunks(path, promise):
-        kept = select_usable(chunk, xyz, bounds, counts)
-        places.append(xyz[kept])
+    for chunk in _chunks(path, promise):
+        kept = select_usable(chunk, bounds, counts)
+        places.append(coordinates_of(chunk)[kept])
         classes.append(classes_of(chunk)[kept])
     return PointCloud(np.concatenate(places), np.concatenate(classes)), counts
 
 
-def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64], int]]:
+def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePointRecord, int]]:
     """Read a file by chunks, without those parts of a COPC file that are away from a box.
 
     Parameters
@@ -171,8 +171,6 @@ def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePoint
     ------
     laspy.ScaleAwarePointRecord
         Some million points, in the order of the file; the first chunk may be empty, others are not.
-    float64, (n, 3)
-        Their coordinates (m).
     int
         Points that are not read, all of them outside the box; not 0 in the first chunk only.
 
@@ -195,24 +193,20 @@ def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePoint
     if first is None:
         with _laspy_as_input_error(path, promise, [0]), laspy.open(source_of(path), read_evlrs=False) as reader:
             empty = laspy.ScaleAwarePointRecord.zeros(0, header=reader.header)
-        yield empty, np.empty((0, 3)), n_skipped
+        yield empty, n_skipped
         return
-    yield *first, n_skipped
-    for chunk, xyz in chunks:
-        yield chunk, xyz, 0
+    yield first, n_skipped
+    for chunk in chunks:
+        yield chunk, 0
 
 
-def select_usable(
-    chunk: laspy.ScaleAwarePointRecord, xyz: NDArray[np.float64], bounds: Box, counts: dict[str, int]
-) -> NDArray[np.bool_]:
+def select_usable(chunk: laspy.ScaleAwarePointRecord, bounds: Box, counts: dict[str, int]) -> NDArray[np.bool_]:
     """Select the usable points of a chunk, and count what became of each.
 
     Parameters
     ----------
     chunk : laspy.ScaleAwarePointRecord
         Points of a file, n of them.
-    xyz : float64, (n, 3)
-        Their coordinates (m).
     bounds : tuple of 4 floats
         xmin, ymin, xmax, ymax; the borders belong to the box.
     counts : dict of str to int
@@ -223,10 +217,12 @@ def select_usable(
     bool, (n,)
         Which points to keep.
     """
-    verdict = judge_points(xyz, classes_of(chunk), np.asarray(chunk.withheld) != 0, bounds)
+    verdict = judge_points(
+        *units_of(chunk), *scaling_of(chunk), classes_of(chunk), np.asarray(chunk.withheld) != 0, bounds
+    )
     for reason, number in zip(REASONS, np.bincount(verdict, minlength=len(REASONS)).tolist(), strict=True):
         counts[reason] += number
-    counts["read"] += len(xyz)
+    counts["read"] += len(chunk)
     return np.asarray(verdict == KEPT)
 
 
@@ -280,8 +276,8 @@ def _glob(pattern: Path) -> list[Path]:
     return [path for path in found if not any(part.startswith(".") for part in path.relative_to(base).parts)]
 
 
-def _chunks(path: Path, promise: LasPromise) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64]]]:
-    """Yield the points and their coordinates by chunks; fail if there are fewer than the header claims."""
+def _chunks(path: Path, promise: LasPromise) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """Yield the points by chunks; fail if there are fewer than the header claims."""
     step = _step(promise)
     n_read = [0]
     with (
@@ -295,9 +291,8 @@ def _chunks(path: Path, promise: LasPromise) -> Iterator[tuple[laspy.ScaleAwareP
             if len(chunk) == 0:
                 break
             n_read[0] += len(chunk)
-            xyz = coordinates_of(chunk)
-            _check_within_header(path, promise, xyz[:, :2])
-            yield chunk, xyz
+            _check_within_header(path, promise, chunk)
+            yield chunk
     if n_read[0] != promise.n_points:
         raise InputError(f"{path}: {n_read[0]} of {promise.n_points} points could be read; {AGAIN}")
 
@@ -320,24 +315,26 @@ def _near(box: NDArray[np.float64], bounds: Box) -> NDArray[np.bool_]:
 
 def _query(
     path: Path, promise: LasPromise, index: CopcIndex, near: NDArray[np.bool_]
-) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64]]]:
+) -> Iterator[laspy.ScaleAwarePointRecord]:
     n_read = [0]
     with _laspy_as_input_error(path, promise, n_read):
-        for chunk, xyz in read_nodes(path, index, near, step=_step(promise)):
+        for chunk in read_nodes(path, index, near, step=_step(promise)):
             n_read[0] += len(chunk)
-            _check_within_header(path, promise, xyz[:, :2])
-            yield chunk, xyz
+            _check_within_header(path, promise, chunk)
+            yield chunk
 
 
 def _step(promise: LasPromise) -> int:
     return max(1, min(CHUNK_POINTS, CHUNK_BYTES // promise.point_size))
 
 
-def _check_within_header(path: Path, promise: LasPromise, xy: NDArray[np.float64]) -> None:
+def _check_within_header(path: Path, promise: LasPromise, chunk: laspy.ScaleAwarePointRecord) -> None:
     low = np.array(promise.bounds[:2]) - HEADER_SLACK
     high = np.array(promise.bounds[2:4]) + HEADER_SLACK
-    if not len(xy) or all(xy[:, k].min() >= low[k] and xy[:, k].max() <= high[k] for k in range(2)):
+    ends = ends_of(chunk)[:, :2]
+    if ((ends >= low) & (ends <= high)).all():
         return
+    xy = coordinates_of(chunk)[:, :2]
     stray = ((xy < low) | (xy > high)).any(axis=1)
     x, y = xy[stray][0]
     raise InputError(

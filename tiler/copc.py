@@ -101,7 +101,7 @@ def read_index(path: Path, promise: LasPromise) -> CopcIndex | None:
 
 def read_nodes(
     path: Path, index: CopcIndex, wanted: NDArray[np.bool_], *, step: int
-) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64]]]:
+) -> Iterator[laspy.ScaleAwarePointRecord]:
     """Read the points of some nodes.
 
     Parameters
@@ -119,8 +119,6 @@ def read_nodes(
     ------
     laspy.ScaleAwarePointRecord
         Points in the order of the file.
-    float64, (m, 3)
-        Their coordinates.
 
     Raises
     ------
@@ -139,9 +137,8 @@ def read_nodes(
             lazrs.decompress_points_with_chunk_table(b"".join(blobs), zipped, raw, table)
             record = laspy.PackedPointRecord.from_buffer(raw, header.point_format)
             chunk = laspy.ScaleAwarePointRecord(record.array, header.point_format, header.scales, header.offsets)
-            xyz = coordinates_of(chunk)
-            _check_within_nodes(path, xyz, np.repeat(index.box[part], index.count[part], axis=0))
-            yield chunk, xyz
+            _check_within_nodes(path, coordinates_of(chunk), np.repeat(index.box[part], index.count[part], axis=0))
+            yield chunk
 
 
 def _index(nodes: NDArray[np.void], corner: NDArray[np.float64], side: float) -> CopcIndex:

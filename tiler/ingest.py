@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.las_points import Triple, take_units
-from pipeline.pointcloud import PointCloud
-from tiler.cells import Box, order_by_cell
+from pipeline.las_points import Triple, put_units
+from tiler.cells import Box, find_places
 from tiler.clouds import read_chunks, select_usable
 from tiler.las_chunks import classes_of, scaling_of, units_of
 from tiler.places import as_place
@@ -92,24 +91,19 @@ def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator
     if not size > 0:
         raise ValueError(f"size of cells {size} m must be positive")
     total: Counter[tuple[int, int]] = Counter()
-    for chunk, xyz, n_skipped in read_chunks(as_place(path), bounds):
+    for chunk, n_skipped in read_chunks(as_place(path), bounds):
         counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
-        kept = select_usable(chunk, xyz, bounds, counts)
+        kept = select_usable(chunk, bounds, counts)
         counts["read"] += n_skipped
         counts["outside"] += n_skipped
-        found = order_by_cell(xyz, size, among=kept)
-        total.update(dict(zip(map(tuple, found.cell.tolist()), np.diff(found.start).tolist(), strict=True)))
+        (x, y, z), (scale, offset) = units_of(chunk), scaling_of(chunk)
+        place, cell, start = find_places(x, y, scale[:2], offset[:2], kept, size)
+        total.update(dict(zip(map(tuple, cell.tolist()), np.diff(start).tolist(), strict=True)))
         _check_density(as_place(path), total, size)
         all_classes = classes_of(chunk)
-        yield PointBlock(
-            take_units(*units_of(chunk), found.order),
-            *scaling_of(chunk),
-            all_classes[found.order],
-            found.cell,
-            found.start,
-            np.flatnonzero(np.bincount(all_classes, minlength=1)).astype(np.uint8),
-            counts,
-        )
+        units, classes = put_units(x, y, z, all_classes, place, int(start[-1]))
+        there = np.flatnonzero(np.bincount(all_classes, minlength=1)).astype(np.uint8)
+        yield PointBlock(units, scale, offset, classes, cell, start, there, counts)
 
 
 def _check_density(path: Path, total: Counter[tuple[int, int]], size: float) -> None:
@@ -120,23 +114,3 @@ def _check_density(path: Path, total: Counter[tuple[int, int]], size: float) -> 
             f"{path}: more than {worst} points in the square of {size:g} m at ({i * size:g}, {j * size:g}), "
             f"at most {MOST_POINTS} are taken; thin the file: pdal translate {path.name} thin.laz sample"
         )
-
-
-def crop_cloud(cloud: PointCloud, box: Box) -> PointCloud:
-    """Keep the points within a box.
-
-    Parameters
-    ----------
-    cloud : PointCloud
-        Any points.
-    box : tuple of 4 floats
-        xmin, ymin, xmax, ymax (m); the borders belong to the box.
-
-    Returns
-    -------
-    PointCloud
-        In their old order.
-    """
-    x, y = cloud.xyz[:, 0], cloud.xyz[:, 1]
-    inside = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
-    return PointCloud(cloud.xyz[inside], cloud.classification[inside])

@@ -4,7 +4,7 @@ import laspy
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.las_points import Triple, find_coordinates
+from pipeline.las_points import Triple, find_coordinates, find_range
 
 _FIELDS = laspy.DecompressionSelection
 # Fields to decompress where points are stored by fields (formats 6 to 10): coordinates, class and withheld.
@@ -14,6 +14,14 @@ FIELDS = _FIELDS.XY_RETURNS_CHANNEL | _FIELDS.Z | _FIELDS.CLASSIFICATION | _FIEL
 def units_of(chunk: laspy.ScaleAwarePointRecord) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Give x, y and z in units of the file, int32 (n,) each, where the chunk has them."""
     return chunk.array["X"], chunk.array["Y"], chunk.array["Z"]
+
+
+def ends_of(chunk: laspy.ScaleAwarePointRecord) -> NDArray[np.float64]:
+    """Give the coordinates (m) of the least and the greatest units along each axis, (2, 3); (0, 3) of none."""
+    if len(chunk) == 0:
+        return np.empty((0, 3))
+    x, y, z = (np.array(find_range(units), np.int32) for units in units_of(chunk))
+    return np.asarray(find_coordinates(x, y, z, *scaling_of(chunk)))
 
 
 def scaling_of(chunk: laspy.ScaleAwarePointRecord) -> tuple[Triple, Triple]:

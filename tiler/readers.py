@@ -1,6 +1,6 @@
 """What stages read of each other's results: points, terrain, houses and buildings in a box."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from pipeline.building_points import NEVER_ROOF
 from pipeline.citymodel import Footprints
-from pipeline.ground_filter import FILTER_REACH, classify_ground
+from pipeline.ground_filter import FILTER_REACH, classify_above, find_terrain
+from pipeline.inside import Cover, are_covered
 from pipeline.las_points import LEFT_OUT, Triple, cut_units
 from pipeline.pointcloud import BUILDING, PointCloud
 from pipeline.raster import (
@@ -25,11 +26,14 @@ from pipeline.terrain import cut_terrain, join_terrain
 from stitch.grid import Bounds
 from tiler.cells import select_cells
 from tiler.footprint_index import FootprintRows, join_footprints, select_footprints
-from tiler.ingest import CELL, crop_cloud
+from tiler.ingest import CELL
+from tiler.packing import CHUNK_BYTES
 from tiler.stage import Box
 from tiler.tables import Buildings, join_buildings, take_buildings, unpack_buildings
 from tiler.task import Task
 
+CHUNK_ROWS = CHUNK_BYTES // 12  # of coordinates in the store, three units of 4 bytes each
+BAND = 3 * CHUNK_ROWS  # rows of points that are read at a time, 1.05 million
 CLASSES = 256  # that a point may have
 
 
@@ -44,9 +48,46 @@ def clip(box: Box, bounds: Box) -> Box:
 
 
 def read_cloud(
-    task: Task, box: Box, *, classes: Sequence[int] | None = None, ground_filter: bool = False
+    task: Task,
+    box: Box,
+    *,
+    classes: Sequence[int] | None = None,
+    ground_filter: bool = False,
+    cover: Cover | None = None,
 ) -> PointCloud:
     """Read the points of some classes within a box, from the stage ``points``.
+
+    Parameters
+    ----------
+    task, box, classes, ground_filter
+        As for `read_bands`.
+    cover : Cover, optional
+        Cells to which points are cut; by default none, all of the box are read.
+
+    Returns
+    -------
+    PointCloud
+        As from `read_bands`, in one; memory is 25 bytes for each point that is kept, and a band.
+    """
+    xyz, found = np.empty((0, 3)), np.empty(0, np.uint8)
+    for band in read_bands(task, box, classes=classes, ground_filter=ground_filter):
+        kept = slice(None) if cover is None else are_covered(cover, band.xyz)
+        _extend(xyz, band.xyz[kept])
+        _extend(found, band.classification[kept])
+    return PointCloud(xyz, found)
+
+
+def _extend(array: NDArray[Any], rows: NDArray[Any]) -> None:
+    """Add rows to an array in its place: the system moves pages where it can, and nothing is there twice."""
+    n = len(array)
+    array.resize((n + len(rows), *array.shape[1:]), refcheck=False)
+    array[n:] = rows
+
+
+def read_bands(
+    task: Task, box: Box, *, classes: Sequence[int] | None = None, ground_filter: bool = False
+) -> Iterator[PointCloud]:
+    """Read the points of some classes within a box in bands, one after the other, from the stage ``points``.
 
     Parameters
     ----------
@@ -59,24 +100,37 @@ def read_cloud(
     ground_filter : bool
         Find ground by our own filter.
 
-    Returns
-    -------
+    Yields
+    ------
     PointCloud
-        Points that may lie on a roof have class 6: in a file that marks no building at all, these are all that
-        are not ground, water, vegetation or noise.
+        At least one. Points that may lie on a roof have class 6: in a file that marks no building at all, these
+        are all that are not ground, water, vegetation or noise.
+
+    Notes
+    -----
+    A band is `BAND` rows of the files at most, in the order of files and rows: it depends on the files and the box
+    alone. Memory is 45 bytes for each of them and a chunk of the store, some 50 MB, however many points the box
+    has. The ground filter reads all points within its reach a first time, and keeps the surface: 40 bytes a square
+    metre.
     """
-    wide = clip(grow(box, FILTER_REACH), task.context.bounds) if ground_filter else box
-    files = [file for name in task.refs["points"] if (file := _find_rows(task, name, wide)) is not None]
-    wanted = [_reclassify(classes, marked=file.marks_buildings) for file in files]
     if not ground_filter:
-        return _read_files(task, files, box, wanted)[0]
-    cloud, count = _read_files(task, files, wide, [np.arange(CLASSES, dtype=np.int16)] * len(files))
-    found = classify_ground(cloud, bounds=wide).classification
-    ends = np.cumsum([0, *count])
-    parts = [table[found[first:end]] for table, (first, end) in zip(wanted, pairwise(ends), strict=True)]
-    become = np.concatenate([np.empty(0, np.int16), *parts])
-    kept = become != LEFT_OUT
-    return crop_cloud(PointCloud(cloud.xyz[kept], become[kept].astype(np.uint8)), box)
+        for files in _cut_bands(_find_files(task, box)):
+            yield _read_files(task, files, box, [_reclassify(classes, file.marks_buildings) for file in files])[0]
+        return
+    wide = clip(grow(box, FILTER_REACH), task.context.bounds)
+    terrain = find_terrain((cloud for cloud, _ in _read_all(task, wide)), wide)
+    for cloud, marked in _read_all(task, clip(box, wide)):
+        found = classify_above(cloud, terrain, wide).classification
+        become = np.where(marked, _reclassify(classes, True)[found], _reclassify(classes, False)[found])
+        kept = become != LEFT_OUT
+        yield PointCloud(cloud.xyz[kept], become[kept].astype(np.uint8))
+
+
+def _read_all(task: Task, box: Box) -> Iterator[tuple[PointCloud, NDArray[np.bool_]]]:
+    """Read the points of all classes within a box, as files have them; and whether their file marks buildings."""
+    for files in _cut_bands(_find_files(task, box)):
+        cloud, count = _read_files(task, files, box, [np.arange(CLASSES, dtype=np.int16)] * len(files))
+        yield cloud, np.repeat(np.array([file.marks_buildings for file in files], np.bool_), count)
 
 
 def read_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm:
@@ -174,6 +228,33 @@ class _FileRows:
     marks_buildings: bool
 
 
+def _find_files(task: Task, box: Box) -> list[_FileRows]:
+    """Find the rows to read of all files."""
+    return [file for name in task.refs["points"] if (file := _find_rows(task, name, box)) is not None]
+
+
+def _cut_bands(files: Sequence[_FileRows]) -> Iterator[list[_FileRows]]:
+    """Part rows of files into bands of at most `BAND` rows; at least one, which may be empty.
+
+    A range is cut between chunks of the store, so that no chunk is read for two bands.
+    """
+    band: list[_FileRows] = []
+    room = BAND
+    for file in files:
+        ranges: list[tuple[int, int]] = []
+        for begin, stop in file.ranges:
+            first = begin
+            while stop - first > room:
+                cut = max((first + room) // CHUNK_ROWS * CHUNK_ROWS, first)
+                ranges += [(first, cut)] if cut > first else []
+                yield [*band, replace(file, ranges=ranges)] if ranges else band
+                first, band, ranges, room = cut, [], [], BAND
+            ranges.append((first, stop))
+            room -= stop - first
+        band += [replace(file, ranges=ranges)] if ranges else []
+    yield band
+
+
 def _find_rows(task: Task, name: str, box: Box) -> _FileRows | None:
     """Find the rows of a file in cells that meet a box; None for a file that could not be read."""
     facts = task.store.attributes("points", name)["facts"]
@@ -184,7 +265,7 @@ def _find_rows(task: Task, name: str, box: Box) -> _FileRows | None:
     return _FileRows(name, ranges, tuple(facts["scale"]), tuple(facts["offset"]), facts["marks_buildings"])
 
 
-def _reclassify(classes: Sequence[int] | None, *, marked: bool) -> NDArray[np.int16]:
+def _reclassify(classes: Sequence[int] | None, marked: bool) -> NDArray[np.int16]:
     """Class that each class becomes in a file that marks buildings, or not; `LEFT_OUT` for unwanted ones."""
     become = np.arange(CLASSES, dtype=np.int16)
     if not marked:

@@ -71,28 +71,31 @@ def read_chunks(
     entry: Mapping[str, Any],
     ranges: Sequence[tuple[int, int]] | None = None,
 ) -> NDArray[Any]:
-    """Read rows of one zarr array, all by default, and verify every chunk that was read."""
+    """Read rows of one zarr array, all by default, and verify every chunk that was read.
+
+    Ranges ascend. Memory is that of the rows that are wanted, and of one chunk.
+    """
     n_rows, chunk = entry["shape"][0], entry["chunk"]
     wanted = [(0, n_rows)] if ranges is None else ranges
     if "columns" in entry:
         columns = (0, entry["shape"][1])
         strips = [read_window(folder, stage, name, array, entry, rows, columns) for rows in wanted]
         return strips[0] if len(strips) == 1 else np.concatenate(strips)
-    parts = []
+    n_read, held = 0, -1
     with damage(folder, stage, name, array):
         form = _ChunkForm.of(entry)
         form.check((folder / array / GROUP).read_bytes())
-        for first, last, inside in _chunks_of_ranges(wanted, chunk):
-            low, high = first * chunk, min(last * chunk, n_rows)
-            rows = np.empty((max(high - low, 0), *form.shape[1:]), form.dtype)
-            for k in range(first, last):
-                start = k * chunk
-                rows[start - low : start - low + chunk] = form.read(folder / array, k)
-            wrong = [first + k for k in verified_chunks(rows, chunk, entry["crc"][first:last])]
-            if wrong:
-                raise ValueError(f"checksum differs in {len(wrong)} chunks, first in chunk {wrong[0]}")
-            parts += [rows[start - low : stop - low] for start, stop in inside]
-    return join_rows(parts, rows)
+        rows = np.empty((sum(stop - start for start, stop in wanted), *form.shape[1:]), form.dtype)
+        for start, stop in wanted:
+            for k in range(start // chunk, -(-stop // chunk)):
+                if k != held:
+                    block, held = form.read(folder / array, k), k
+                    if list(verified_chunks(block, chunk, entry["crc"][k : k + 1])):
+                        raise ValueError(f"checksum differs in chunk {k}")
+                part = block[max(start - k * chunk, 0) : stop - k * chunk]
+                rows[n_read : n_read + len(part)] = part
+                n_read += len(part)
+    return rows
 
 
 def read_window(
@@ -164,21 +167,6 @@ class _ChunkForm:
         raw = np.frombuffer(DECODER.decode(data), np.uint8)
         left = [size - k * step for size, k, step in zip(self.shape, at, self.chunk, strict=True)]
         return raw.view(self.dtype).reshape(self.chunk)[tuple(map(slice, left))]
-
-
-def _chunks_of_ranges(
-    ranges: Sequence[tuple[int, int]], chunk: int
-) -> Iterator[tuple[int, int, list[tuple[int, int]]]]:
-    """Group ascending ranges of rows that share chunks: first chunk, last and one more, and the ranges."""
-    first, last, inside = 0, 0, list[tuple[int, int]]()
-    for start, stop in ranges:
-        begin, end = start // chunk, -(-stop // chunk)
-        if inside and begin >= last:
-            yield first, last, inside
-            inside = []
-        first, last = (first, max(last, end)) if inside else (begin, max(begin, end))
-        inside.append((start, stop))
-    yield first, last, inside
 
 
 def join_rows(parts: Sequence[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:

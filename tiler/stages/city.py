@@ -8,10 +8,12 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions
+from pipeline.building_points import reach_of_points
 from pipeline.citymodel import Footprints
 from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leave_out, shape_clusters
 from pipeline.groups import adjacent_houses
 from pipeline.houses import Houses, divide_houses, join_houses, take_houses
+from pipeline.inside import cover_polygons
 from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
 from pipeline.planar import join_pairs
@@ -123,7 +125,10 @@ def chooses_layers_later(config: Config) -> bool:
 
 
 def make_houses(task: Task) -> Facts:
-    """Clean the footprints of a tile, and give its houses their points, heights and parts (steps 1.4 to 2.0)."""
+    """Clean the footprints of a tile, and give its houses their points, heights and parts (steps 1.4 to 2.0).
+
+    Memory grows with the points on and around its houses, not with all points of the tile.
+    """
     options, spacing = city_options(task.parameters), task.parameters.dtm_spacing
     grid, bounds = task.context.grid, task.context.bounds
     with task.step("1.4 clean footprints"):
@@ -134,7 +139,9 @@ def make_houses(task: Task) -> Facts:
     places = np.array([(note.x, note.y) for note in notes]).reshape(-1, 2)
     task.notes(note for note, mine in zip(notes, find_owned(task.box, bounds, places), strict=True) if mine)
     extent = _extent(own.polygons)
-    cloud, dtm = _surroundings(task, extent, options.ground_margin, 2 * spacing, (BUILDING, GROUND, WATER))
+    near = reach_of_points(own.polygons, options.ground_margin)
+    dtm = _terrain_around(task, extent, 2 * spacing)
+    cloud = _points_near(task, extent, options.ground_margin, near, (BUILDING, GROUND, WATER))
     terrain = cut_terrain(dtm, window_of(dtm))
     with task.step("1.5 extract building points"):
         roofs = locate_roof_points(cloud, own.polygons, building_class=True)
@@ -143,6 +150,7 @@ def make_houses(task: Task) -> Facts:
     roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
     with task.step("2.0 split levels"):
         houses = divide_houses(city, cloud, options, building_class=True, roofs=roofs)
+    del cloud  # large, and no longer needed
     with task.step("1.7 fit of roofs"):
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
         full = make_buildings(city, fidelity, np.zeros(len(city.model), np.int32))
@@ -266,7 +274,7 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0
     shapes = _keep_within(task, shapes, gathered.houses)
     extent = _extent(shapes.polygons)
-    cloud, dtm = _surroundings(task, extent, options.ground_margin, reach + 2 * given.dtm_spacing, (BUILDING,))
+    dtm = _terrain_around(task, extent, reach + 2 * given.dtm_spacing)
     reserved = {name for result in task.read("reserved", ()) for name in result.facts["names"]}
     terrain = cut_terrain(dtm, window_of(dtm))
     city = raise_buildings(gathered.houses, shapes, terrain, options, reserved=reserved, trace=task.step)
@@ -278,8 +286,10 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
         layers, parted = choose_layers(
             model.polygons, model.roof, city.wall_ground, city.group, pairs, dtm, bounds, mesh
         )
+    cloud = _points_near(task, extent, options.ground_margin, shapes.polygons, (BUILDING,))
     with task.step("2.4 fit of roofs"):
         roofs = locate_roof_points(cloud, city.model.polygons, building_class=True)
+        del cloud
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
     task.put(**pack_buildings(make_buildings(city, fidelity, layers)))
     counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
@@ -316,20 +326,28 @@ def _owned(task: Task, footprints: Footprints) -> Footprints:
     return Footprints(footprints.polygons[mine], footprints.ids[mine], footprints.given_height[mine])
 
 
-def _surroundings(
-    task: Task, extent: Box | None, margin: float, reach: float, classes: Sequence[int]
-) -> tuple[PointCloud, Dtm]:
-    """Points of some classes and terrain of a box; none and any where there is no house to ask for them.
-
-    The terrain is NaN at nodes of tiles that are absent.
-    """
-    given, bounds = task.parameters, task.context.bounds
+def _points_near(
+    task: Task, extent: Box | None, margin: float, areas: NDArray[np.object_], classes: Sequence[int]
+) -> PointCloud:
+    """Points of some classes in areas, and some near them, as far as a margin around an extent, if any."""
     if extent is None:
-        nothing = PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
-        return nothing, Dtm(np.zeros((1, 1)), 0, 0, given.dtm_spacing)
+        return PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
     with task.step("1.1 points of houses"):
-        cloud = read_cloud(task, grow(extent, margin), classes=classes, ground_filter=given.ground_filter)
-    return cloud, read_known_terrain(task, grow(extent, reach), spacing=given.dtm_spacing, bounds=bounds)
+        return read_cloud(
+            task,
+            grow(extent, margin),
+            classes=classes,
+            ground_filter=task.parameters.ground_filter,
+            cover=cover_polygons(areas),
+        )
+
+
+def _terrain_around(task: Task, extent: Box | None, reach: float) -> Dtm:
+    """Terrain around an extent, NaN at nodes of tiles that are absent; any where there is no extent."""
+    spacing = task.parameters.dtm_spacing
+    if extent is None:
+        return Dtm(np.zeros((1, 1)), 0, 0, spacing)
+    return read_known_terrain(task, grow(extent, reach), spacing=spacing, bounds=task.context.bounds)
 
 
 def _near_rows(task: Task, polygons: NDArray[np.object_]) -> NDArray[np.int64]:

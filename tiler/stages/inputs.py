@@ -31,7 +31,7 @@ from tiler.context import tile_key
 from tiler.footprint_index import scan_footprints
 from tiler.ingest import read_cells
 from tiler.places import place
-from tiler.readers import clip, grow, join_rasters, read_cloud, read_outlines
+from tiler.readers import clip, grow, join_rasters, read_bands, read_outlines
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.tables import pack_polygons
 from tiler.task import Task
@@ -190,7 +190,7 @@ def own_window(task: Task) -> NodeWindow:
 
 
 def bin_tile(task: Task) -> Facts:
-    """Average the ground points around the nodes of a tile (step 1.3)."""
+    """Average the ground points around the nodes of a tile (step 1.3), a band of points at a time."""
     spacing = task.parameters.dtm_spacing
     window = own_window(task)
     box = (
@@ -200,8 +200,8 @@ def bin_tile(task: Task) -> Facts:
         (window.j0 + window.ny - 1) * spacing,
     )
     box = grow(box, spacing / 2)
-    cloud = read_cloud(task, box, classes=(GROUND, WATER), ground_filter=task.parameters.ground_filter)
-    raster, _ = bin_nodes(cloud, window, spacing=spacing)
+    bands = read_bands(task, box, classes=(GROUND, WATER), ground_filter=task.parameters.ground_filter)
+    raster, _ = bin_nodes(bands, window, spacing=spacing)
     task.put_rasters(z=raster.z)
     return _raster_facts(raster)
 

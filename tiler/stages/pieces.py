@@ -28,7 +28,7 @@ from stitch.numbering import corner_part, first_id, make_offsets, number_points,
 from tiler.config import Config
 from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
 from tiler.merged import VERTEX_ID
-from tiler.readers import read_buildings, read_cloud, read_terrain
+from tiler.readers import read_bands, read_buildings, read_terrain
 from tiler.results import COLUMN_ARRAYS, unpack_columns
 from tiler.run_folder import REGION
 from tiler.stage import Facts, Read, Scope, Stage
@@ -40,6 +40,7 @@ from tiler.written import FILES, state_files
 
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
 ID_ARRAYS = ("shared", "shared_id")
+FIT_CLASSES = (BUILDING, GROUND, WATER)
 
 
 def fit_stage(config: Config) -> Stage:
@@ -155,26 +156,23 @@ def prove_seam(task: Task) -> Facts:
 
 
 def measure_fit(task: Task) -> Facts:
-    """Measure how far the points of a tile are from the city model (step 2.4)."""
+    """Measure how far the points of a tile are from the city model (step 2.4), a band of points at a time."""
     given, bounds = task.parameters, task.context.bounds
-    cloud = read_cloud(task, task.box, classes=(BUILDING, GROUND, WATER), ground_filter=given.ground_filter)
-    own = find_owned(task.box, bounds, cloud.xyz[:, :2])
-    if not own.all():
-        cloud = PointCloud(cloud.xyz[own], cloud.classification[own])
     dtm = read_terrain(task, task.box, spacing=given.dtm_spacing, bounds=bounds)
     buildings = read_buildings(task, task.box)
     outlines = [np.empty(0, object)]
     for result in task.read("houses", ("outline", "outline_start")):
         polygons = unpack_polygons(result.arrays, "outline")
         outlines.append(polygons[shapely.intersects(shapely.box(*task.box), polygons)])
-    sums = sum_fidelity(
-        cloud,
-        dtm,
-        buildings.model.polygons,
-        buildings.model.roof,
-        footprints=np.concatenate(outlines),
-        building_class=True,
-    )
+    model, footprints = buildings.model, np.concatenate(outlines)
+    parts = []
+    for cloud in read_bands(task, task.box, classes=FIT_CLASSES, ground_filter=given.ground_filter):
+        own = find_owned(task.box, bounds, cloud.xyz[:, :2])
+        mine = cloud if own.all() else PointCloud(cloud.xyz[own], cloud.classification[own])
+        parts.append(
+            sum_fidelity(mine, dtm, model.polygons, model.roof, footprints=footprints, building_class=True)
+        )
+    sums = merge_fidelity(parts)
     facts = {}
     for kind in KINDS:
         residual: ResidualSums = getattr(sums, kind)
