@@ -17,9 +17,10 @@ from pipeline.layered import LayeredOptions, Smoother, layer_mesh, mesh_layers
 from pipeline.mesh import ColumnMesh, Marker, PlaneMesh, TetMesh
 from pipeline.neighbours import join_equal_roofs, part_neighbours
 from pipeline.plane import mesh_plane, signed_areas
-from pipeline.relax import assemble_stencil, relax_columns
+from pipeline.relax import relax_columns
 from pipeline.repair import repair_columns
 from pipeline.slab import smooth_slab
+from pipeline.stencil import assemble_stencil
 from pipeline.terrain import Dtm, sample_dtm
 from pipeline.trim import count_removed_layers, first_kept, first_levels
 from tests.cities import Bounds, city_of, hilly_dtm, random_blocks, random_city, tilted_dtm
@@ -212,6 +213,44 @@ def test_the_stencil_is_the_stiffness_matrix_of_the_cells() -> None:
         np.add.at(dense, (columns[used], rows[used]), values[used])
     np.add.at(dense, (number[number >= 0], number[number >= 0]), stencil.diagonal[number >= 0])
     np.testing.assert_allclose(dense, matrix, atol=1e-9 * np.abs(matrix).max())
+
+
+def test_sweeps_solve_for_the_unknowns_and_leave_what_is_given() -> None:
+    """Against a dense solve; single precision alone does not reach the last tolerance, rounds of it do."""
+    city, dtm, _ = random_city((0.0, 0.0, 120.0, 120.0), 4, seed=5)
+    plane, _ = mesh_plane((0.0, 0.0, 120.0, 120.0), city.polygons, mesh_size=15.0)
+    z = sample_dtm(dtm, plane.xy)[:, None] + np.array([0.0, 2.0, 7.0, 30.0, 60.0])
+    first = first_levels(plane, np.array([1, 2, 3, 1], np.int32))
+    kept = first_kept(plane, first)
+    used = np.arange(5) >= kept[:, None]
+    fixed = np.arange(5) <= kept[:, None]
+    given = np.where(fixed & used, 3.0 * np.sin(plane.xy[:, :1] / 20), 0.0)
+    number = np.full(z.shape, -1)
+    number[used] = np.arange(used.sum())
+    matrix = stiffness_matrix(expand_cells(layer_mesh(plane, z, first))).toarray()
+    free, known = number[~fixed], number[fixed & used]
+    exact = given.copy()
+    exact[~fixed] = np.linalg.solve(matrix[np.ix_(free, free)], -matrix[np.ix_(free, known)] @ given[fixed & used])
+    diagonal = matrix.diagonal()[free]
+    for tolerance, reach in ((3e-3, 3e-2), (1e-10, 1e-8)):
+        u, _, residual = relax_columns(plane, first, z, fixed, given, tolerance=tolerance)
+        np.testing.assert_array_equal(u[fixed], given[fixed])
+        np.testing.assert_allclose(u, exact, atol=reach)
+        assert residual <= tolerance
+        true = np.abs(matrix @ u[used])[free] / diagonal
+        assert residual == pytest.approx(true.max(), rel=1e-3)
+
+
+def test_a_tolerance_below_rounding_ends_where_rounds_gain_nothing() -> None:
+    plane, _ = mesh_plane((0.0, 0.0, 60.0, 60.0), city_of([], []).polygons, mesh_size=10.0)
+    z = np.tile(np.linspace(0, 50, 6), (len(plane.xy), 1))
+    fixed = np.zeros(z.shape, bool)
+    fixed[:, [0, -1]] = True
+    first = np.zeros(len(plane.triangles), np.int32)
+    given = np.where(fixed, np.cos(plane.xy[:, :1]), 0.0)
+    _, iterations, residual = relax_columns(plane, first, z, fixed, given, tolerance=0.0)
+    assert iterations < 200
+    assert 0 < residual < 1e-14
 
 
 def test_a_solver_that_does_not_converge_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
