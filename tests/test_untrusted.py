@@ -456,14 +456,14 @@ CONFIGS: list[tuple[str, str, str]] = [
     ("out through a link", inputs('[run]\nout = "link/out"'), "outside the folder of the file"),
     ("a scheduler", inputs('[run]\nscheduler = "tcp://127.0.0.1:9"'), "a file may not name a scheduler"),
     ("a cluster", inputs('[run]\ncluster = "slurm.toml"'), "a file may not name a cluster"),
-    ("bounds of 10^12 m", inputs("bounds = [0, 0, 1e12, 1e12]"), "more than 32766 tiles of 1000 m to a side"),
-    ("terrain of micrometres", inputs("[terrain]\ndtm_spacing = 1e-6"), "nodes in a tile of 1000 m"),
+    ("bounds of 10^12 m", inputs("bounds = [0, 0, 1e12, 1e12]"), "more than 32766 tiles of 1250 m to a side"),
+    ("terrain of micrometres", inputs("[terrain]\ndtm_spacing = 1e-6"), "nodes in a tile of 1250 m"),
     ("terrain of 10^-300 m", inputs("[terrain]\ndtm_spacing = 1e-300"), "inf nodes in a tile"),
     ("terrain of 10^300 m", inputs("[terrain]\ndtm_spacing = 1e300"), "the extent of a tile, whose terrain"),
     (
         "cells without number",
         inputs("[mesh]\nmesh_size = 0.1\ndomain_height = 1e9"),
-        "cells in a tile of 1000 m > 2.15e+09",
+        "cells in a tile of 10 m > 2.15e+09",
     ),
     ("unknown section with an escape", '["\\u001b[31m"]\na = 1', r"unknown section [\x1b[31m]"),
 ]

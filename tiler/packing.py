@@ -2,11 +2,11 @@
 
 import math
 import re
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from deflate import crc32
 from numpy.typing import ArrayLike, NDArray
 
 CHUNK_BYTES = 4 * 2**20  # about what one read or write moves at a time
@@ -79,7 +79,7 @@ def square_checksums(raster: NDArray[Any]) -> list[int]:
     """Compute the CRC-32 of every square chunk of a raster, row by row of them."""
     ny, nx = raster.shape
     return [
-        zlib.crc32(raw_bytes(np.ascontiguousarray(raster[j : j + SQUARE, i : i + SQUARE])).data)
+        crc32(raw_bytes(np.ascontiguousarray(raster[j : j + SQUARE, i : i + SQUARE])).data)
         for j in range(0, ny, SQUARE)
         for i in range(0, nx, SQUARE)
     ]
@@ -87,7 +87,7 @@ def square_checksums(raster: NDArray[Any]) -> list[int]:
 
 def checksums(array: NDArray[Any], rows: int) -> list[int]:
     """Compute the CRC-32 of every chunk of so many rows."""
-    return [zlib.crc32(raw_bytes(array[start : start + rows]).data) for start in range(0, len(array), rows)]
+    return [crc32(raw_bytes(array[start : start + rows]).data) for start in range(0, len(array), rows)]
 
 
 def pack(arrays: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], Table]:

@@ -1,8 +1,9 @@
 """Checksums of files: of any file, and of a JSON text that carries its own."""
 
 import re
-import zlib
 from pathlib import Path
+
+from deflate import crc32
 
 from tiler.places import in_bucket
 
@@ -16,11 +17,11 @@ def sum_file(path: Path) -> tuple[int, int]:
     if in_bucket(path):  # in one request where it is small
         data = path.read_bytes(READ_BYTES)
         if len(data) < READ_BYTES:
-            return len(data), zlib.crc32(data)
+            return len(data), crc32(data)
     size = crc = 0
     with path.open("rb") as file:
         while block := file.read(READ_BYTES):
-            size, crc = size + len(block), zlib.crc32(block, crc)
+            size, crc = size + len(block), crc32(block, crc)
     return size, crc
 
 
@@ -41,7 +42,7 @@ def seal(text: bytes, before: int = 0) -> bytes:
     """
     if BLANK.encode() not in text:
         raise ValueError(f"the text has no {BLANK}")
-    found = f'"checksum": "{zlib.crc32(text, before):08x}"'
+    found = f'"checksum": "{crc32(text, before):08x}"'
     return text.replace(BLANK.encode(), found.encode(), 1)
 
 
@@ -57,4 +58,4 @@ def is_sealed(text: bytes, before: int = 0) -> bool:
     if found is None:
         return False
     blank = text[: found.start()] + BLANK.encode() + text[found.end() :]
-    return zlib.crc32(blank, before) == int(found[1], 16)
+    return crc32(blank, before) == int(found[1], 16)

@@ -17,6 +17,7 @@ from pipeline.errors import InputError
 from pipeline.mesh import Boundary, TetMesh
 from tiler.vtk_xml import (
     INDEX_BYTES,
+    THOROUGH,
     VTK_TYPES,
     Stream,
     compress_block,
@@ -260,7 +261,7 @@ def stream_offsets(n_rows: int, width: int) -> Stream:
 
 @lru_cache(maxsize=256)  # of 77 kB at most; a fifth of the time to compress a piece, and the same in all of them
 def _compress_ends(width: int, dtype: np.dtype[Any], i: int, j: int) -> bytes:
-    return compress_block(np.arange(i + 1, j + 1, dtype=np.int64) * width, dtype)
+    return compress_block(np.arange(i + 1, j + 1, dtype=np.int64) * width, dtype, level=THOROUGH)
 
 
 def stream_types(n_cells: int) -> Stream:

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from deflate import zlib_compress
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
@@ -23,7 +24,8 @@ from tiler.atomic import replacing
 from tiler.places import in_bucket, read_at_most
 
 BLOCK_BYTES = 1 << 18  # uncompressed bytes of a zlib block
-ZLIB_LEVEL = 1
+LEVEL = 1  # of libdeflate
+THOROUGH = 10  # a level that finds what steady sequences repeat: less than half the bytes of the others
 HEAD_BYTES = 1 << 20  # bound on the XML in front of the data
 OBJECT_HEAD = 1 << 16  # bytes that are asked for to find it
 TOGETHER, BLOCK = 16, 1000  # heads of objects that are asked for at a time, and that wait
@@ -77,9 +79,9 @@ def stream_items(
     return Stream(name, dtype, components, n_items, lambda i, j: compress_block(items(i, j), dtype))
 
 
-def compress_block(items: NDArray[Any], dtype: np.dtype[Any]) -> bytes:
-    """Compress a block of numbers, written as `dtype`."""
-    return zlib.compress(items.astype(dtype.newbyteorder("<"), copy=False).tobytes(), ZLIB_LEVEL)
+def compress_block(items: NDArray[Any], dtype: np.dtype[Any], *, level: int = LEVEL) -> bytes:
+    """Compress a block of numbers, written as `dtype`, to a zlib stream."""
+    return bytes(zlib_compress(items.astype(dtype.newbyteorder("<"), copy=False).tobytes(), level))
 
 
 def write_data_file(path: Path, kind: str, counts: Mapping[str, int], sections: Sections) -> None:
