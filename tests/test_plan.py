@@ -209,10 +209,10 @@ def test_the_first_footprints_stand_for_those_of_a_large_file(city: Config) -> N
 def test_tiles_that_do_not_fit_into_memory_are_told_with_a_size_that_does(city: Config) -> None:
     large = replace(city, tile_size=300.0, mesh_size=4.0, workers=2)
     assert not forecast_of(large, memory=4e9).warnings
-    (warning,) = forecast_of(large, memory=1.05e9).warnings
+    (warning,) = forecast_of(large, memory=9.2e8).warnings
     assert "--tile-size" in warning
     size = float(warning.split("--tile-size ")[1].split(",")[0])
-    assert not forecast_of(replace(large, tile_size=size), memory=1.05e9).warnings
+    assert not forecast_of(replace(large, tile_size=size), memory=9.2e8).warnings
     (warning,) = forecast_of(large, memory=5e8).warnings
     assert "--tile-size" not in warning
     assert "fewer --workers" in warning
@@ -324,7 +324,7 @@ def test_a_run_says_before_it_starts_which_tiles_may_not_fit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_city(tmp_path / "city", size=200.0, buildings=4, density=0.5, relief=2, seed=1)
-    for memory in (4.0, 0.4):
+    for memory in (4.0, 0.3):
         monkeypatch.setattr("tiler.run.machine_memory", lambda memory=memory: memory * 2**30)
         said: list[str] = []
         values = {"pointcloud": [str(tmp_path / "city" / "tiles")], "out": str(tmp_path / str(memory))}
@@ -333,12 +333,12 @@ def test_a_run_says_before_it_starts_which_tiles_may_not_fit(
         assert bool(warned) is (memory < 1)
         assert set(warned) <= set(said)
     assert "4 of 4 tiles may not fit into memory: up to 0." in warned[0]
-    assert "a worker > 0.3 GiB, 80 % of the 0.4 GiB that it has" in warned[0]
+    assert "a worker > 0.2 GiB, 80 % of the 0.3 GiB that it has" in warned[0]
 
 
 def test_the_memory_limit_counts(tmp_path: Path) -> None:
     write_city(tmp_path / "city", size=200.0, buildings=4, density=0.5, relief=2, seed=1)
     values = {"pointcloud": [str(tmp_path / "city" / "tiles")], "tile_size": 100.0, "mesh_size": 5.0}
-    for limit, warns in ((0.0, False), (4.0, False), (0.4, True)):
+    for limit, warns in ((0.0, False), (4.0, False), (0.3, True)):
         config = make_config(values | {"workers": 1, "memory_limit": limit})
         assert bool(warn_of_memory(survey_inputs(config, print), config, memory=2.0**33)) is warns
