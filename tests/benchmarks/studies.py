@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.bench import COMMAND, citystitch, record_of
-from tests.benchmarks.studies_report import DOCS, step_seconds, write_report
+from tests.benchmarks.studies_report import DOCS, MEASURED, step_seconds, write_report
 
 KEPT = DOCS / "studies.json"
 MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
@@ -296,6 +297,7 @@ def main() -> None:
         for name in names:
             start = time.perf_counter()
             kept[name] = STUDIES[name](cities, out)
+            kept.setdefault(MEASURED, {})[name] = datetime.now(UTC).date().isoformat()
             KEPT.write_text(json.dumps(kept, indent=1) + "\n")
             print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
     write_report(kept)

@@ -4,7 +4,7 @@ import os
 import platform
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from tests.benchmarks.log_plot import draw_log_plot
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 REPORT = DOCS / "studies.md"
 LEAST_SECONDS = 0.1  # less is not fitted
+MEASURED = "measured"  # day of each study, beside the studies
 
 # Steps of the paper by the stages and parts of stages that do them, as run.json names them.
 STEPS: Mapping[str, tuple[str, ...]] = {
@@ -65,76 +66,22 @@ def write_report(kept: Mapping[str, Any]) -> None:
         "# Studies of cost",
         "",
         "Written by `make studies` (one study: `python -m tests.benchmarks.studies cells`); do not edit.",
-        "Synthetic cities (`citystitch synth`), LAZ and SHP to written pieces, numba's cache warm, one run each",
-        "where nothing else is said. The machine is shared: compare within a table.",
+        "Synthetic cities (`citystitch synth`), LAZ and SHP to written pieces, mesh size 10 m, tiles of the",
+        "default size, numba's cache warm, one run each, where nothing else is said. The machine is shared: compare",
+        "within a table.",
         "",
         f"Machine: {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}.",
     ]
-    growth = (
-        (
-            "cells",
-            "(a) Cells",
-            "cells",
-            "One kilometre with 480 buildings, mesh size 20 to 2.5 m, serial, tiles of the default size.",
-        ),
-        ("buildings", "(b) Buildings", "buildings", "6.25 km², mesh size 10 m, tiles of 625 m, serial."),
-        (
-            "area",
-            "(c) Area",
-            "area",
-            "480 buildings a km², mesh size 10 m, tiles of 500 m, one worker; middle one of 3, largest once.",
-        ),
-    )
-    for name, title, key, words in growth:
-        if name in kept:
-            lines += ["", f"## {title}", "", words, "", *_growth(kept[name], name, key)]
-    if "driver" in kept:
-        lines += ["", "## Memory of the driver", "", *_driver(kept["driver"])]
-    tables = (
-        (
-            "workers",
-            "(d) Workers",
-            "workers",
-            "Cities of 2.5 and 5 km with 480 buildings a km², tiles of the default size; the middle one of 3.",
-        ),
-        ("tiles", "(e) Tile size", "tile size", "The city of 2.5 km, two workers."),
-        ("fine", "Fine meshes", "mesh size", "The city of 2.5 km, two workers, tiles of the default size."),
-    )
-    for name, title, key, words in tables:
-        if name in kept:
-            lines += ["", f"## {title}", "", words]
-            for side in dict.fromkeys(row.get("side") for row in kept[name]):
-                lines += ["", *_runs([row for row in kept[name] if row.get("side") == side], key)]
-            if name == "workers":
-                lines += ["", *_speedups(kept[name])]
-    if "workers" in kept:
-        lines += ["", "## (f) Shares", "", *_shares(kept["workers"][:3])]
-    if "rates" in kept:
-        lines += [
-            "",
-            "## Rates",
-            "",
-            "A city of 3 km with 4,320 buildings and 1.5 points a m2, tiles of the default size, serial; the",
-            "middle one of 3. *Step 3* is what stages `seams` and `columns` compute (3.1 to 3.5), then all that",
-            "they do, with what they read and write of the store; *written* are cells a second into VTU pieces.",
-            "",
-        ]
-        lines += _rates(kept["rates"])
-    if "profile" in kept:
-        lines += [
-            "",
-            "## Where the time goes",
-            "",
-            "Serial run of the city of 2.5 km, 100 samples a second (py-spy): our",
-        ]
-        lines += ["innermost function, with what it calls of others.", "", "| function | share |", "|---|---|"]
-        lines += [f"| `{row['place']}` | {100 * row['share']:.1f} % |" for row in kept["profile"]]
-    if "startup" in kept:
-        lines += ["", "## Start-up", "", "Medians of 7.", "", "| from the command to | seconds |", "|---|---|"]
-        lines += [f"| {row['until']} | {row['seconds']:.2f} |" for row in kept["startup"]]
-    if "limits" in kept:
-        lines += ["", "## What the machine can", "", "| | |", "|---|---|"]
-        lines += [f"| {row['limit']} | {row['value']} |" for row in kept["limits"]]
+    for study, title, words, body in SECTIONS:
+        if study in kept:
+            lines += [
+                "",
+                f"## {title}",
+                "",
+                f"{words} Measured on {kept[MEASURED][study]}.",
+                "",
+                *body(kept[study]),
+            ]
     REPORT.write_text("\n".join(lines) + "\n")
 
 
@@ -195,18 +142,35 @@ def _speedups(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _driver(rows: list[dict[str, Any]]) -> list[str]:
-    lines = [
-        "Tiles of 150 m with hardly a house, client and Dask's scheduler in one process, two workers.",
-        "",
-        *_runs(rows, "tiles a side"),
-        "",
-    ]
     told = [
         f"{(after['driver'] - before['driver']) / (after['tiles'] - before['tiles']) / 1e3:.1f} kB a tile between "
         f"{before['tiles']:,} and {after['tiles']:,}"
         for before, after in pairwise(rows)
     ]
-    return [*lines, f"The driver takes {', '.join(told)}."]
+    return [*_runs(rows, "tiles a side"), "", f"The driver takes {', '.join(told)}."]
+
+
+def _workers(rows: list[dict[str, Any]]) -> list[str]:
+    lines = []
+    for side in dict.fromkeys(row["side"] for row in rows):
+        lines += [*_runs([row for row in rows if row["side"] == side], "workers"), ""]
+    return [*lines, *_speedups(rows)]
+
+
+def _profile(rows: list[dict[str, Any]]) -> list[str]:
+    return _table("function", "share", ((f"`{row['place']}`", f"{100 * row['share']:.1f} %") for row in rows))
+
+
+def _startup(rows: list[dict[str, Any]]) -> list[str]:
+    return _table("from the command to", "seconds", ((row["until"], f"{row['seconds']:.2f}") for row in rows))
+
+
+def _limits(rows: list[dict[str, Any]]) -> list[str]:
+    return _table("", "", ((row["limit"], row["value"]) for row in rows))
+
+
+def _table(left: str, right: str, rows: Iterable[tuple[str, str]]) -> list[str]:
+    return [f"| {left} | {right} |", "|---|---|", *(f"| {one} | {other} |" for one, other in rows)]
 
 
 def _shares(rows: list[dict[str, Any]]) -> list[str]:
@@ -215,3 +179,74 @@ def _shares(rows: list[dict[str, Any]]) -> list[str]:
         parts = (f"{100 * row['steps'][step] / sum(row['steps'].values()):.1f} %" for row in rows)
         lines.append(f"| {step} | " + " | ".join(parts) + " |")
     return lines
+
+
+Rows = list[dict[str, Any]]
+# Of each study: its title, what was run, and what is made of its rows.
+SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
+    (
+        "cells",
+        "(a) Cells",
+        "One kilometre with 480 buildings, mesh size 20 to 2.5 m, serial.",
+        lambda rows: _growth(rows, "cells", "cells"),
+    ),
+    (
+        "buildings",
+        "(b) Buildings",
+        "6.25 km², tiles of 625 m, serial.",
+        lambda rows: _growth(rows, "buildings", "buildings"),
+    ),
+    (
+        "area",
+        "(c) Area",
+        "480 buildings a km², tiles of 500 m, one worker; the middle one of 3 runs, of the largest one.",
+        lambda rows: _growth(rows, "area", "area"),
+    ),
+    (
+        "driver",
+        "Memory of the driver",
+        "Tiles of 150 m with hardly a house; client and Dask's scheduler in one process, two workers.",
+        _driver,
+    ),
+    (
+        "workers",
+        "(d) Workers",
+        "Cities of 2.5 and 5 km with 480 buildings a km²; the middle one of 3 runs.",
+        _workers,
+    ),
+    (
+        "tiles",
+        "(e) Tile size",
+        "The city of 2.5 km, two workers.",
+        lambda rows: _runs(rows, "tile size"),
+    ),
+    (
+        "fine",
+        "Fine meshes",
+        "The city of 2.5 km, two workers.",
+        lambda rows: _runs(rows, "mesh size"),
+    ),
+    (
+        "workers",
+        "(f) Shares",
+        "Of the city of 2.5 km.",
+        lambda rows: _shares(rows[:3]),
+    ),
+    (
+        "rates",
+        "Rates",
+        "A city of 3 km with 4,320 buildings and 1.5 points a m², serial; the middle one of 3 runs. *Step 3* is "
+        "what stages\n`seams` and `columns` compute (3.1 to 3.5), then all that they do, with what they read and "
+        "write of the store; *written*\nare cells a second into VTU pieces.",
+        _rates,
+    ),
+    (
+        "profile",
+        "Where the time goes",
+        "Serial run of the city of 2.5 km, 100 samples a second (py-spy): our innermost function, with what it "
+        "calls of others.",
+        _profile,
+    ),
+    ("startup", "Start-up", "Medians of 7.", _startup),
+    ("limits", "What the machine can", "The last three on one core.", _limits),
+)
