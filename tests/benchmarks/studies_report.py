@@ -67,8 +67,8 @@ def write_report(kept: Mapping[str, Any]) -> None:
         "",
         "Written by `make studies` (one study: `python -m tests.benchmarks.studies cells`); do not edit.",
         "Synthetic cities (`citystitch synth`), LAZ and SHP to written pieces, mesh size 10 m, tiles of the",
-        "default size, numba's cache warm, one run each, where nothing else is said. The machine is shared: compare",
-        "within a table.",
+        "default size, numba's cache warm, one run each, where nothing else is said. The machine is shared:",
+        "compare within a table.",
         "",
         f"Machine: {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}.",
     ]
@@ -142,10 +142,11 @@ def _speedups(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _driver(rows: list[dict[str, Any]]) -> list[str]:
+    pairs = [*pairwise(rows), (rows[0], rows[-1])]
     told = [
         f"{(after['driver'] - before['driver']) / (after['tiles'] - before['tiles']) / 1e3:.1f} kB a tile between "
         f"{before['tiles']:,} and {after['tiles']:,}"
-        for before, after in pairwise(rows)
+        for before, after in pairs
     ]
     return [*_runs(rows, "tiles a side"), "", f"The driver takes {', '.join(told)}."]
 
