@@ -27,6 +27,7 @@ CODE = (
     "lazrs",
     "pyogrio",
     "pyproj",
+    "deflate",
 )
 
 
