@@ -1,5 +1,6 @@
 """VTU, VTP and their index files (step 3.6): written by us, read back by vtk, meshio and ourselves."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import meshio
 import numpy as np
 import pytest
+from deflate import zlib_compress
 from numpy.typing import NDArray
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOXML import (
@@ -419,3 +421,31 @@ def test_missing_files_are_input_errors(tmp_path: Path, city: TinyCity) -> None:
         (tmp_path / "m.pvtu").write_text(text)
         with pytest.raises(InputError, match=r"m\.pvtu: not a file of ours"):
             read_piece_paths(tmp_path / "m.pvtu")
+
+
+def test_meshio_takes_no_array_for_another_whose_offset_is_the_same(tmp_path: Path) -> None:
+    """The third array would begin where meshio puts the second one, once it has unpacked the first."""
+    rng = np.random.default_rng(5)
+    points, cells = rng.random((400, 3)), np.array([[0, 1, 2, 3]])
+    unpacked = 4 * -(-(8 + points.nbytes) // 3)
+    path, moved = tmp_path / "m.vtu", 0
+    for n in range(3600, 3720):
+        values = np.concatenate((rng.integers(0, 256, n), np.zeros(4800 - n))).astype(np.uint8)
+        sections = {
+            "Points": [make_stream("Points", points, np.float64)],
+            "PointData": [make_stream("v", values.reshape(400, 12), np.uint8)],
+            "Cells": [
+                make_stream("connectivity", cells, np.int32),
+                make_stream("offsets", np.array([4]), np.int32),
+                make_stream("types", np.array([10]), np.uint8),
+            ],
+        }
+        write_data_file(path, "UnstructuredGrid", {"NumberOfPoints": 400, "NumberOfCells": 1}, sections)
+        offsets = [int(text) for text in re.findall(rb'offset="(\d+)"', path.read_bytes())]
+        assert unpacked not in offsets[2:]
+        plain = 32 + len(zlib_compress(values.tobytes(), vtk_xml.LEVEL))
+        moved += offsets[1] + plain == unpacked
+        mesh = meshio.read(path)
+        assert mesh.cells[0].data.tolist() == cells.tolist()
+        assert_same(mesh.point_data["v"], values.reshape(400, 12))
+    assert moved

@@ -7,7 +7,7 @@ import io
 import os
 import xml.etree.ElementTree as ET
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +25,7 @@ from tiler.places import in_bucket, read_at_most
 
 BLOCK_BYTES = 1 << 18  # uncompressed bytes of a zlib block
 LEVEL = 1  # of libdeflate
+OTHER_LEVELS = (2, 6, 12, 0)
 THOROUGH = 10  # a level that finds what steady sequences repeat: less than half the bytes of the others
 HEAD_BYTES = 1 << 20  # bound on the XML in front of the data
 OBJECT_HEAD = 1 << 16  # bytes that are asked for to find it
@@ -91,14 +92,22 @@ def write_data_file(path: Path, kind: str, counts: Mapping[str, int], sections: 
     ------
     OutputError
         If the file cannot be written; then it is not there, or is the old one.
+
+    Notes
+    -----
+    meshio (5.3) unpacks arrays to base64 and puts their new offsets into the XML one by one, where it then looks
+    up the old ones of the others: no array begins at an offset that an earlier one has there.
     """
     streams = [stream for streams in sections.values() for stream in streams]
     with replacing(path) as part, part.open("wb") as file:
         file.write(_render(kind, counts, sections, [0] * len(streams)))
         start, offsets = file.tell(), []
+        unpacked, taken = 0, set[int]()
         for stream in streams:
             offsets.append(file.tell() - start)
-            _write_blocks(file, stream)
+            taken.add(start + unpacked)
+            unpacked += 4 * -(-(8 + stream.n_items * stream.dtype.itemsize) // 3)
+            _write_blocks(file, stream, taken)
         file.write(b"\n  </AppendedData>\n</VTKFile>\n")
         file.seek(0)
         file.write(_render(kind, counts, sections, offsets))
@@ -137,8 +146,11 @@ def _declaration(vtk_type: str, name: str, components: str) -> str:
     return f"type={quoteattr(vtk_type)} Name={quoteattr(name)}{width}"
 
 
-def _write_blocks(file: BinaryIO, stream: Stream) -> None:
-    """Write one array: its table of block sizes, then its blocks; the table is filled in afterwards."""
+def _write_blocks(file: BinaryIO, stream: Stream, taken: Collection[int]) -> None:
+    """Write one array: its table of block sizes, then its blocks; the table is filled in afterwards.
+
+    It ends at none of the places that are taken.
+    """
     dtype = stream.dtype
     step = BLOCK_BYTES // dtype.itemsize
     n_blocks = -(-stream.n_items // step)
@@ -148,12 +160,23 @@ def _write_blocks(file: BinaryIO, stream: Stream) -> None:
     file.write(table.tobytes())
     for k in range(n_blocks):
         block = stream.block(k * step, min((k + 1) * step, stream.n_items))
+        if k == n_blocks - 1:
+            block = _end_elsewhere(block, {end - file.tell() for end in taken})
         table[3 + k] = len(block)
         file.write(block)
     end = file.tell()
     file.seek(start)
     file.write(table.tobytes())
     file.seek(end)
+
+
+def _end_elsewhere(block: bytes, lengths: Collection[int]) -> bytes:
+    """Pack a block anew if its length is one of some; that of one that cannot be packed remains."""
+    for level in OTHER_LEVELS:
+        if len(block) not in lengths:
+            break
+        block = bytes(zlib_compress(zlib.decompress(block), level))
+    return block
 
 
 def write_index(path: Path, pieces: Sequence[Path], kind: str) -> None:
