@@ -200,7 +200,7 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
         "area",
         "(c) Area",
-        "480 buildings a km², tiles of 500 m, one worker; the middle one of 3 runs, of the largest one.",
+        "480 buildings a km², tiles of 500 m, one worker.",
         lambda rows: _growth(rows, "area", "area"),
     ),
     (
