@@ -8,8 +8,10 @@ What the terrain at some place adds fades with the distance d like exp(-pi d / (
 tile is as good as the region: `slab_window` for a mesh, `lift_places` for places that belong to none.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
@@ -20,7 +22,10 @@ from pipeline.terrain import Dtm, cut_terrain, sample_dtm
 REACH = 3.0  # domain heights; terrain farther from a mesh counts for nothing
 BLOCK = 1.0  # domain heights; side of the squares that `lift_places` works in
 
+SUMS = 0.25  # of the grid's shorter side; for fewer rows or columns, sums are faster than a transform
+
 Bounds = tuple[float, float, float, float]
+Nodes = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,12 +172,18 @@ def smooth_slab(
     n_x, n_y = (max(int(n), 1) for n in np.rint(size / grid_spacing))
     spectrum = dctn(_terrain_on_grid(dtm, bounds, n_x, n_y), type=1)
     wave = np.hypot(np.pi / size[0] * np.arange(n_x + 1), np.pi / size[1] * np.arange(n_y + 1)[:, None])
-    node, weight = _bilinear((xy - low) / size * [n_x, n_y], n_x, n_y)
+    position = (xy - low) / size * [n_x, n_y]
+    nodes = _nodes_around(position, n_x, n_y)
+    node, weight = _bilinear(position, n_x, n_y, nodes)
+    back = _choose_way_back(spectrum.shape, nodes)
+    bottom = 1 / (1 + np.exp(-2 * wave * domain_height))
     z = np.empty((len(xy), n_layers + 1))
     z[:, 0] = sample_dtm(dtm, xy)
     for level in range(1, n_layers + 1):
         height = domain_height * level / n_layers if shape is None else float(shape.levels[level])
-        lifted = idctn(spectrum * _damping(wave, height, domain_height), type=1).ravel()
+        # cosh(k (H - z)) / cosh(k H), written so that nothing overflows.
+        damping = np.exp(-wave * height) * (1 + np.exp(-2 * wave * (domain_height - height))) * bottom
+        lifted = back(spectrum * damping).ravel()
         z[:, level] = height + (lifted[node] * weight).sum(axis=1)
     return z if shape is None else shape_levels(z, shape)
 
@@ -207,17 +218,62 @@ def _terrain_on_grid(dtm: Dtm, bounds: Bounds, n_x: int, n_y: int) -> NDArray[np
     return sample_dtm(dtm, nodes).reshape(n_y + 1, n_x + 1)
 
 
-def _damping(wave: NDArray[np.float64], height: float, domain_height: float) -> NDArray[np.float64]:
-    """cosh(k (H - z)) / cosh(k H), written so that nothing overflows."""
-    above = np.exp(-2 * wave * (domain_height - height))
-    damping: NDArray[np.float64] = np.exp(-wave * height) * (1 + above) / (1 + np.exp(-2 * wave * domain_height))
-    return damping
+def _nodes_around(position: NDArray[np.float64], n_x: int, n_y: int) -> Nodes:
+    """Nodes between which positions are, given in units of the grid: first and last row, first and last column."""
+    first = np.clip(np.floor(position.min(axis=0)).astype(np.int64), 0, [n_x - 1, n_y - 1])
+    last = np.clip(np.floor(position.max(axis=0)).astype(np.int64), 0, [n_x - 1, n_y - 1]) + 1
+    return int(first[1]), int(last[1]), int(first[0]), int(last[0])
 
 
-def _bilinear(position: NDArray[np.float64], n_x: int, n_y: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Flat indices and weights of the four nodes around each position, given in units of the grid."""
+def _choose_way_back(shape: tuple[int, ...], nodes: Nodes) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Choose how the values at nodes are found of a spectrum: sums for a few rows or columns, else a transform."""
+    row, last_row, column, last_column = nodes
+    rows, columns = np.arange(row, last_row + 1), np.arange(column, last_column + 1)
+    if min(len(rows), len(columns)) > SUMS * min(shape):
+        return lambda spectrum: idctn(spectrum, type=1)[row : last_row + 1, column : last_column + 1]
+    along_y, along_x = _cosines(rows, shape[0]), _cosines(columns, shape[1])
+    if len(rows) <= len(columns):
+        along_x = np.ascontiguousarray(along_x.T)
+        return lambda spectrum: _sum_modes(spectrum, along_y, along_x)
+    along_y = np.ascontiguousarray(along_y.T)
+    return lambda spectrum: _sum_modes(np.ascontiguousarray(spectrum.T), along_x, along_y).T
+
+
+def _cosines(place: NDArray[np.int64], n: int) -> NDArray[np.float64]:
+    """What each mode of a transform of n nodes adds at some of them; float64, (len(place), n)."""
+    share = np.full(n, 2.0)
+    share[[0, -1]] = 1.0
+    # Whole turns are taken off while numbers are whole.
+    turn = np.outer(place, np.arange(n)) % (2 * (n - 1))
+    cosines: NDArray[np.float64] = np.cos(np.pi / (n - 1) * turn) * (share / (2 * (n - 1)))
+    return cosines
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_modes(
+    spectrum: NDArray[np.float64], rows: NDArray[np.float64], columns: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sum the modes of a spectrum at nodes: cosines of a few rows (r, ny), of columns (nx, c); float64, (r, c)."""
+    found, line = np.zeros((len(rows), columns.shape[1])), np.empty(spectrum.shape[1])
+    for r in range(len(rows)):
+        line[:] = 0.0
+        for j in range(spectrum.shape[0]):
+            for i in range(spectrum.shape[1]):
+                line[i] += rows[r, j] * spectrum[j, i]
+        for i in range(spectrum.shape[1]):
+            for c in range(columns.shape[1]):
+                found[r, c] += line[i] * columns[i, c]
+    return found
+
+
+def _bilinear(
+    position: NDArray[np.float64], n_x: int, n_y: int, nodes: Nodes
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Flat indices among some nodes and weights of the four around each position, given in units of the grid."""
+    row, _, column, last_column = nodes
     cell = np.clip(np.floor(position).astype(np.int64), 0, [n_x - 1, n_y - 1])
     s, t = (position - cell).T
-    first = cell[:, 1] * (n_x + 1) + cell[:, 0]
-    node = first[:, None] + np.array([0, 1, n_x + 1, n_x + 2])
+    wide = last_column - column + 1
+    first = (cell[:, 1] - row) * wide + cell[:, 0] - column
+    node = first[:, None] + np.array([0, 1, wide, wide + 1])
     return node, np.column_stack(((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t))

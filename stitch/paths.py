@@ -1,5 +1,6 @@
 """A seam's way: the shortest path along the edges of a strip (before step 3.1, ours)."""
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -84,36 +85,72 @@ def _costs(
     strip: Strip, offset: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
     """Edges of a strip, what each costs, and the vertices on walls or in buildings."""
-    triangles = strip.triangles.astype(np.int64)
     neighbour = triangle_neighbours(strip.triangles)
-    label = np.append(strip.building, -2)
-    other = label[neighbour]
-    mine = np.repeat(strip.building[:, None], 3, axis=1)
-    ends = np.stack((np.roll(triangles, -1, axis=1), np.roll(triangles, -2, axis=1)), axis=2)
-    wall = (other != mine) & (neighbour >= 0)
-    on_wall = np.zeros(len(strip.xy), np.bool_)
-    on_wall[ends[wall]] = True
-    built = np.zeros(len(strip.xy), np.bool_)
-    built[triangles[strip.building >= 0]] = True
-    once = (neighbour < 0) | (np.arange(len(triangles))[:, None] < neighbour)
-    edges = ends[once]
-    inside = (mine == other)[once] & (mine[once] >= 0)
-    length = np.sqrt(((strip.xy[edges[:, 0]] - strip.xy[edges[:, 1]]) ** 2).sum(axis=1))
-    mean_offset = offset[edges].mean(axis=1)
-    poor = 1 - _worst_shape(strip)[edges].min(axis=1)
-    extra = POOR_COST * poor + WALL_COST * on_wall[edges].sum(axis=1) + INSIDE_COST * inside
-    return edges, length * (1 + OFFSET_COST * mean_offset**2) * (1 + extra), on_wall | built
-
-
-def _worst_shape(strip: Strip) -> NDArray[np.float64]:
-    """Worst shape of the triangles at each vertex: area over squared edges, 1 if all are equilateral."""
-    corners = strip.xy[strip.triangles]
-    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    squares = (u**2).sum(axis=1) + (v**2).sum(axis=1) + ((u - v) ** 2).sum(axis=1)
-    shape = 2 * np.sqrt(3) * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / squares
     worst = np.ones(len(strip.xy))
-    np.minimum.at(worst, strip.triangles.ravel(), np.repeat(shape, 3))
-    return worst
+    on_wall, built = np.zeros(len(strip.xy), np.bool_), np.zeros(len(strip.xy), np.bool_)
+    _look_at_vertices(strip.xy, strip.triangles, neighbour, strip.building, worst, on_wall, built)
+    edges, cost = _cost_edges(strip.xy, strip.triangles, neighbour, strip.building, worst, on_wall, offset)
+    return edges, cost, on_wall | built
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_at_vertices(
+    xy: NDArray[np.float64],
+    triangles: NDArray[np.int32],
+    neighbour: NDArray[np.int32],
+    building: NDArray[np.int32],
+    worst: NDArray[np.float64],
+    on_wall: NDArray[np.bool_],
+    built: NDArray[np.bool_],
+) -> None:
+    """Find vertices on walls and in buildings, and the worst shape of the triangles at each vertex.
+
+    A shape is the area over the squared edges, 1 if the triangle is equilateral.
+    """
+    for t in range(len(triangles)):
+        a, b, c = triangles[t]
+        ux, uy = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
+        vx, vy = xy[c, 0] - xy[a, 0], xy[c, 1] - xy[a, 1]
+        squares = (ux * ux + uy * uy) + (vx * vx + vy * vy) + ((ux - vx) * (ux - vx) + (uy - vy) * (uy - vy))
+        shape = 2 * np.sqrt(3.0) * (ux * vy - uy * vx) / squares
+        for k in range(3):
+            v = triangles[t, k]
+            worst[v] = min(worst[v], shape)
+            if building[t] >= 0:
+                built[v] = True
+            u = neighbour[t, k]
+            if u >= 0 and building[u] != building[t]:
+                on_wall[triangles[t, (k + 1) % 3]] = True
+                on_wall[triangles[t, (k + 2) % 3]] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def _cost_edges(
+    xy: NDArray[np.float64],
+    triangles: NDArray[np.int32],
+    neighbour: NDArray[np.int32],
+    building: NDArray[np.int32],
+    worst: NDArray[np.float64],
+    on_wall: NDArray[np.bool_],
+    offset: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    edges, cost = np.empty((3 * len(triangles), 2), np.int64), np.empty(3 * len(triangles))
+    n = 0
+    for t in range(len(triangles)):
+        for k in range(3):
+            u = neighbour[t, k]
+            if 0 <= u < t:
+                continue
+            p, q = triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]
+            dx, dy = xy[p, 0] - xy[q, 0], xy[p, 1] - xy[q, 1]
+            mean_offset = (offset[p] + offset[q]) / 2
+            extra = POOR_COST * (1 - min(worst[p], worst[q])) + WALL_COST * (int(on_wall[p]) + int(on_wall[q]))
+            if u >= 0 and building[t] >= 0 and building[u] == building[t]:
+                extra += INSIDE_COST
+            edges[n, 0], edges[n, 1] = p, q
+            cost[n] = np.sqrt(dx * dx + dy * dy) * (1 + OFFSET_COST * mean_offset * mean_offset) * (1 + extra)
+            n += 1
+    return edges[:n].copy(), cost[:n].copy()
 
 
 def _shortest(

@@ -2,17 +2,17 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from pipeline.mesh import PlaneMesh
 from pipeline.plane import order_plane
 from pipeline.sizes import SizeField, largest_size, local_sizes
 from stitch.corners import Corner
-from stitch.grid import Bounds, SeamKey, TileGrid, is_border
+from stitch.grid import SeamKey, TileGrid, is_border
 from stitch.paths import find_path
-from stitch.strips import Strip, mesh_strip, strip_core
+from stitch.strips import Strip, centres, improve_around, mesh_strip, strip_core
 from stitch.walls import find_on_walls
 
 SURROUNDINGS = 2.0  # mesh sizes; how far around a seam triangles count for the layers of its columns
@@ -36,7 +36,7 @@ class Seam:
     vertex : int32, (k,)
         The seam's vertices in `ring`; empty on the region's border.
     surroundings : PlaneMesh
-        The strip's triangles within `SURROUNDINGS` of it, with those of `ring`; empty on the region's border.
+        The strip's triangles as far around it as was asked, with those of `ring`; empty on the region's border.
     """
 
     xy: NDArray[np.float64]
@@ -58,14 +58,25 @@ def trace_seam(
     min_angle: float,
     passes: int,
     sizes: SizeField | None = None,
+    surroundings: float = SURROUNDINGS,
 ) -> Seam:
     """Find a seam in the triangles of its strip.
 
-    Parameters and errors as in `mesh_strip` and `find_path`.
+    Parameters
+    ----------
+    grid, key, ends, polygons, walls, mesh_size, min_angle, sizes
+        As in `mesh_strip`, with its errors and those of `find_path`.
+    passes : int
+        Rounds of `improve_plane` around the seam.
+    surroundings : float
+        How far around the seam triangles are kept for the layers of its columns (mesh sizes); with 0 none are but
+        those at its vertices.
 
     Notes
     -----
-    Along the region's border, the seam is all vertices of the strip there. Cost is that of the strip.
+    The best path is found twice: in the strip as it was triangulated, and again when the triangles around that
+    path are improved. Along the region's border, the seam is all vertices of the strip there. Cost is that of the
+    strip.
     """
     border = is_border(grid, key)
     strip = mesh_strip(
@@ -76,7 +87,6 @@ def trace_seam(
         walls,
         mesh_size=mesh_size,
         min_angle=min_angle,
-        passes=0 if border else passes,
         sizes=sizes,
     )
     if border:
@@ -84,15 +94,21 @@ def trace_seam(
         xy = _border_vertices(strip, key.axis, ends)
         return Seam(xy, np.empty((0, 2)), True, nothing, np.empty(0, np.int32), nothing)
     path = find_path(grid, key, ends, strip)
+    if passes:
+        strip = improve_around(strip, path, ends, mesh_size=mesh_size, passes=passes, sizes=sizes)
+        path = find_path(grid, key, ends, strip)
     xy = strip.xy[path]
     on, _ = find_on_walls(strip.walls, xy, reach=ON_WALL)
     around = np.isin(strip.triangles, path).any(axis=1)
     ring = order_plane(strip.xy, strip.triangles[around], strip.building[around])
-    core = strip_core(grid, key, mesh_size=largest_size(sizes, mesh_size=mesh_size))
-    centre = strip.xy[strip.triangles].mean(axis=1)
-    near = around | _is_near(centre, xy, core, SURROUNDINGS * local_sizes(sizes, centre, mesh_size=mesh_size))
-    surroundings = order_plane(strip.xy, strip.triangles[near], strip.building[near])
-    return Seam(xy, xy[np.unique(on)], False, ring, find_vertices(ring.xy, xy), surroundings)
+    near = ring
+    if surroundings:
+        size = local_sizes(sizes, centres(strip.xy, strip.triangles), mesh_size=mesh_size)
+        core = strip_core(grid, key, mesh_size=largest_size(sizes, mesh_size=mesh_size))
+        reach = surroundings * np.broadcast_to(size, len(strip.triangles))
+        rows = around | _are_near(strip, np.array(core), xy, reach)
+        near = order_plane(strip.xy, strip.triangles[rows], strip.building[rows])
+    return Seam(xy, xy[np.unique(on)], False, ring, find_vertices(ring.xy, xy), near)
 
 
 def find_vertices(among: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArray[np.int32]:
@@ -127,18 +143,40 @@ def find_vertices(among: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArra
     return row.astype(np.int32)
 
 
-def _is_near(
-    centre: NDArray[np.float64], line: NDArray[np.float64], core: Bounds, reach: NDArray[np.float64]
+def _are_near(
+    strip: Strip, core: NDArray[np.float64], line: NDArray[np.float64], reach: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Whether triangles have their centres close to a line, and where it is known what holds them."""
-    known = ((centre >= core[:2]) & (centre <= core[2:])).all(axis=1)
-    beyond = np.maximum(line.min(axis=0) - centre, centre - line.max(axis=0)).max(axis=1)
-    row = np.flatnonzero(known & (beyond <= reach))
-    near = np.zeros(len(centre), np.bool_)
-    whole = shapely.LineString(line)
-    shapely.prepare(whole)
-    near[row] = shapely.dwithin(whole, shapely.points(centre[row]), reach[row])
+    centre = centres(strip.xy, strip.triangles)
+    near: NDArray[np.bool_] = np.all((centre >= core[:2]) & (centre <= core[2:]), axis=1)
+    longest = float(np.sqrt((np.diff(line, axis=0) ** 2).sum(axis=1).max()))
+    _leave_near(centre, line, longest, reach, near)
     return near
+
+
+@numba.njit(cache=True, nogil=True)
+def _leave_near(
+    centre: NDArray[np.float64],
+    line: NDArray[np.float64],
+    longest: float,
+    reach: NDArray[np.float64],
+    near: NDArray[np.bool_],
+) -> None:
+    """Clear the marks of places that are farther than their reach from all pieces of a line, `longest` at most."""
+    for i in range(len(centre)):
+        if not near[i]:
+            continue
+        near[i] = False
+        for k in range(len(line) - 1):
+            ax, ay = centre[i, 0] - line[k, 0], centre[i, 1] - line[k, 1]
+            if max(abs(ax), abs(ay)) > longest + reach[i]:
+                continue
+            dx, dy = line[k + 1, 0] - line[k, 0], line[k + 1, 1] - line[k, 1]
+            share = min(max((ax * dx + ay * dy) / (dx * dx + dy * dy), 0.0), 1.0)
+            ax, ay = ax - share * dx, ay - share * dy
+            if ax * ax + ay * ay <= reach[i] * reach[i]:
+                near[i] = True
+                break
 
 
 def _border_vertices(strip: Strip, axis: int, ends: tuple[Corner, Corner]) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from stitch.walls import LONGEST_PIECE, walls_within
 
 RING = 1.5  # mesh sizes; the triangles around a vertex have their centres within that
 SECTORS = 5  # four quadrants around a corner, and elsewhere
+CORRIDOR = 4  # triangles on either side of a path that are improved
 MARGIN = 0.5  # mesh sizes between the last piece of wall and the strip's sides
 
 
@@ -50,7 +51,6 @@ def mesh_strip(
     *,
     mesh_size: float,
     min_angle: float,
-    passes: int,
     sizes: SizeField | None = None,
 ) -> Strip:
     """Triangulate a strip.
@@ -71,8 +71,6 @@ def mesh_strip(
         Target edge length h (m).
     min_angle : float
         Bound on the angles (degrees).
-    passes : int
-        Rounds of `improve_plane`, of no use on the region's border, whose vertices stay.
     sizes : SizeField, optional
         Target edge lengths that are not the same everywhere.
 
@@ -98,11 +96,60 @@ def mesh_strip(
     building = label_triangles(xy, triangles, polygons)
     # Beyond the core, what holds a triangle is a matter of which houses were given.
     building[~_within(xy, triangles, core)] = -1
+    return Strip(xy, triangles, building, inside)
+
+
+def improve_around(
+    strip: Strip,
+    path: NDArray[np.int64],
+    ends: tuple[Corner, Corner],
+    *,
+    mesh_size: float,
+    passes: int,
+    sizes: SizeField | None = None,
+) -> Strip:
+    """Move vertices and flip edges of a strip for better angles, where a seam can be.
+
+    Parameters
+    ----------
+    strip : Strip
+        A strip as it was triangulated.
+    path : int64, (k,)
+        Vertices of the best path through it.
+    ends, mesh_size, sizes
+        As in `mesh_strip`.
+    passes : int
+        Rounds of `improve_plane`.
+
+    Notes
+    -----
+    A path on open ground is hardly left any more: what is within `CORRIDOR` triangles of it is improved, and its
+    edges cost less then, all others what they did. A path that touches a house is left where better triangles
+    let another through a gap, so all are improved. Cost is that of the triangles that are.
+    """
+    rows = _rows_around(strip, path)
+    vertex, local = np.unique(strip.triangles[rows], return_inverse=True)
+    xy, triangles = strip.xy[vertex], local.reshape(-1, 3).astype(np.int32)
     # Different labels on the two sides of a first edge keep it where it is.
-    label = building * SECTORS + _sectors(xy, triangles, ends)
+    label = strip.building[rows] * SECTORS + _sectors(xy, triangles, ends)
     size = local_sizes(sizes, xy, mesh_size=mesh_size)
     xy, triangles = improve_plane(xy, triangles, label.astype(np.int32), mesh_size=size, passes=passes)
-    return Strip(xy, triangles, building, inside)
+    all_xy, all_triangles = strip.xy.copy(), strip.triangles.copy()
+    all_xy[vertex], all_triangles[rows] = xy, vertex[triangles]
+    return Strip(all_xy, all_triangles, strip.building, strip.walls)
+
+
+def _rows_around(strip: Strip, path: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles that are at most `CORRIDOR` away from a path; all, if one at the path is in a house."""
+    reached = np.zeros(len(strip.xy), np.bool_)
+    reached[path] = True
+    near = reached[strip.triangles].any(axis=1)
+    if (strip.building[near] >= 0).any():
+        return np.arange(len(strip.triangles))
+    for _ in range(1, CORRIDOR):
+        reached[strip.triangles[near]] = True
+        near = reached[strip.triangles].any(axis=1)
+    return np.flatnonzero(near)
 
 
 def strip_core(grid: TileGrid, seam: SeamKey, *, mesh_size: float) -> Bounds:
@@ -124,18 +171,19 @@ def label_triangles(
 ) -> NDArray[np.int32]:
     """Row of the building around the centre of each triangle, -1 where none; int32, (m,)."""
     label = np.full(len(triangles), -1, np.int32)
-    building, row = find_inside(_centres(xy, triangles), polygons)
+    building, row = find_inside(centres(xy, triangles), polygons)
     label[row] = building
     return label
 
 
-def _centres(xy: NDArray[np.float64], triangles: NDArray[np.int32]) -> NDArray[np.float64]:
+def centres(xy: NDArray[np.float64], triangles: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Centres of triangles (m); float64, (m, 2)."""
     centre: NDArray[np.float64] = (xy[triangles[:, 0]] + xy[triangles[:, 1]] + xy[triangles[:, 2]]) / 3
     return centre
 
 
 def _within(xy: NDArray[np.float64], triangles: NDArray[np.int32], box: Bounds) -> NDArray[np.bool_]:
-    centre = _centres(xy, triangles)
+    centre = centres(xy, triangles)
     inside: NDArray[np.bool_] = np.all((centre >= box[:2]) & (centre <= box[2:]), axis=1)
     return inside
 
@@ -172,7 +220,7 @@ def _sectors(
     xy: NDArray[np.float64], triangles: NDArray[np.int32], ends: tuple[Corner, Corner]
 ) -> NDArray[np.int32]:
     """Number the quadrants around the corners for triangles beside the first edges there; 0 elsewhere."""
-    centre = _centres(xy, triangles)
+    centre = centres(xy, triangles)
     sector = np.zeros(len(triangles), np.int32)
     for end in ends:
         length = np.nanmax(np.abs(end.tips - end.xy))

@@ -198,6 +198,27 @@ def test_windows_differ_by_little_from_the_region() -> None:
     assert near.tobytes() == alone.tobytes()
 
 
+@pytest.mark.parametrize("box", [(0.0, 0.0, 9.0, 9.0), (700.0, 40.0, 725.0, 690.0), (0.0, 380.0, 700.0, 410.0)])
+def test_sums_for_a_few_nodes_give_what_the_transform_gives(box: Bounds, monkeypatch: pytest.MonkeyPatch) -> None:
+    bounds = (0.0, 0.0, 730.0, 690.0)
+    dtm = hilly_dtm(bounds, relief=40.0, length=80.0, noise=1.0)
+    xy = np.random.default_rng(0).uniform(box[:2], box[2:], (50, 2))
+    xy[:2] = box[:2], box[2:]
+
+    def smooth() -> NDArray[np.float64]:
+        return smooth_slab(dtm, xy, bounds, domain_height=60.0, n_layers=12, grid_spacing=10.0)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.slab._sum_modes", None)
+        patch.setattr("pipeline.slab.SUMS", 0.0)
+        transformed = smooth()
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.slab.idctn", None)
+        summed = smooth()
+    np.testing.assert_allclose(summed, transformed, rtol=0, atol=1e-12)
+    assert np.ptp(summed[:, 3]) > 0.3
+
+
 STREET = [shapely.box(100, 90, 130, 180), shapely.box(152, 90, 180, 180), shapely.box(300, 300, 310, 310)]
 
 

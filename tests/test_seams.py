@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import shapely
+from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.adaptive import mesh_adaptive
@@ -18,6 +19,7 @@ from stitch import paths
 from stitch.corners import place_corner
 from stitch.grid import Key, SeamKey, is_border, make_grid, seam_keys, tile_keys
 from stitch.seams import find_vertices, trace_seam
+from stitch.strips import CORRIDOR, Strip, improve_around, mesh_strip
 from stitch.tiles import areas_within
 from stitch.walls import cut_walls, split_walls
 from tests.cities import Bounds, crowded_blocks, tilted_dtm
@@ -283,3 +285,58 @@ def test_a_seam_takes_a_detour_before_it_cuts_a_house() -> None:
         NINE, SeamKey(0, 1, 1), (ends[0], ends[1]), house, walls, mesh_size=10.0, min_angle=28.0, passes=4
     )
     assert not shapely.intersects(shapely.LineString(seam.xy), house[0])
+
+
+def test_a_strip_is_improved_around_its_path_or_whole_where_that_touches_a_house() -> None:
+    key, corners = SeamKey(0, 1, 1), (Key(1, 1), Key(2, 1))
+
+    def improve(houses: list[shapely.Polygon]) -> tuple[Strip, Strip, NDArray[np.float64], NDArray[np.float64]]:
+        polygons = np.array(houses, object)
+        walls = cut_walls(polygons, mesh_size=4.0)
+        start, end = (place_corner(NINE, corner, polygons, walls, mesh_size=4.0) for corner in corners)
+        strip = mesh_strip(NINE, key, (start, end), polygons, walls, mesh_size=4.0, min_angle=28.0)
+        path = paths.find_path(NINE, key, (start, end), strip)
+        better = improve_around(strip, path, (start, end), mesh_size=4.0, passes=4)
+        away = shapely.distance(shapely.LineString(strip.xy[path]), shapely.points(strip.xy))
+        again = better.xy[paths.find_path(NINE, key, (start, end), better)]
+        for tip in (start.xy, start.tips[0], end.tips[2], end.xy):
+            assert (again == tip).all(axis=1).any()
+        return strip, better, away, again
+
+    strip, better, away, again = improve([])
+    moved = (strip.xy != better.xy).any(axis=1)
+    assert moved[away < 4].mean() > 0.8
+    assert not moved[away > 4 * CORRIDOR].any()
+    assert shapely.LineString(again).length < 1.06 * 140
+    for some in (strip, better):
+        u, v = some.xy[some.triangles[:, 1]], some.xy[some.triangles[:, 2]]
+        u, v = u - some.xy[some.triangles[:, 0]], v - some.xy[some.triangles[:, 0]]
+        area = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
+        assert area.min() > 0
+        assert np.isclose(area.sum(), np.prod(np.ptp(some.xy, axis=0)))
+    strip, better, away, _ = improve([shapely.box(195, 100, 225, 176)])
+    moved = (strip.xy != better.xy).any(axis=1)
+    assert moved[away > 4 * CORRIDOR].mean() > 0.5
+
+
+def test_only_layers_need_more_of_a_strip_than_the_triangles_at_a_seam() -> None:
+    none = np.empty(0, object)
+    walls = cut_walls(none, mesh_size=10.0)
+    start, end = (place_corner(NINE, key, none, walls, mesh_size=10.0) for key in (Key(1, 1), Key(2, 1)))
+    seams = [
+        trace_seam(
+            NINE,
+            SeamKey(0, 1, 1),
+            (start, end),
+            none,
+            walls,
+            mesh_size=10.0,
+            min_angle=28.0,
+            passes=4,
+            surroundings=reach,
+        )
+        for reach in (0.0, 2.0)
+    ]
+    assert seams[0].xy.tobytes() == seams[1].xy.tobytes()
+    assert seams[0].surroundings is seams[0].ring
+    assert len(seams[1].surroundings.triangles) > 1.5 * len(seams[1].ring.triangles)

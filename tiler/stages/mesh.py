@@ -25,7 +25,7 @@ from stitch.layered_seams import fill_corner_layers, fill_seam_layers
 from stitch.numbering import corner_part, count_inner_points, count_points, first_id, seam_ids
 from stitch.patches import mesh_patch
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
-from stitch.seams import Seam, find_vertices, trace_seam
+from stitch.seams import SURROUNDINGS, Seam, find_vertices, trace_seam
 from stitch.soil_columns import fill_corner_soil, fill_seam_soil, join_seam
 from stitch.tiles import Sides, mesh_tile
 from stitch.walls import cut_walls
@@ -68,7 +68,7 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     seams, columns = (
         (make_seam_with_soil, make_columns_with_soil) if config.underground else (make_seam, make_columns)
     )
-    version = 3 if config.mesher == "layered" else 2
+    version = 4 if config.mesher == "layered" else 3
     return [
         Stage("seams", Scope.SEAM, seams, tuple(reads), parameters, version=version),
         Stage("columns", Scope.TILE, columns, (*reads, Read("seams", beside=True)), parameters, version=version),
@@ -118,6 +118,7 @@ def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
             min_angle=plane["min_angle"],
             passes=plane["passes"],
             sizes=sizes,
+            surroundings=SURROUNDINGS if given.mesher == "layered" else 0.0,
         )
     task.put(**pack_seam(seam, buildings.model.numbers))
     facts = {"border": seam.border, "vertices": len(seam.xy)}
