@@ -18,6 +18,8 @@ REPORT = DOCS / "studies.md"
 LEAST_SECONDS = 0.1  # less is not fitted
 MEASURED = "measured"  # day of each study, beside the studies
 
+Rows = list[dict[str, Any]]
+
 # Steps of the paper by the stages and parts of stages that do them, as run.json names them.
 STEPS: Mapping[str, tuple[str, ...]] = {
     "1.1 points": ("points",),
@@ -85,7 +87,7 @@ def write_report(kept: Mapping[str, Any]) -> None:
     REPORT.write_text("\n".join(lines) + "\n")
 
 
-def _growth(rows: list[dict[str, Any]], name: str, key: str) -> list[str]:
+def _growth(rows: Rows, name: str, key: str) -> list[str]:
     """A table of runs, one of exponents, and the plot."""
     sizes = [float(row[key]) for row in rows]
     steps = [*STEPS, "rest"]
@@ -105,7 +107,7 @@ def _growth(rows: list[dict[str, Any]], name: str, key: str) -> list[str]:
     return [*lines, "", f"![Seconds of each step against {key}](study-{name}.png)"]
 
 
-def _runs(rows: list[dict[str, Any]], key: str) -> list[str]:
+def _runs(rows: Rows, key: str) -> list[str]:
     lines = [
         f"| {key} | tiles | cells | whole run | worker's peak | driver | tasks |",
         "|---|---|---|---|---|---|---|",
@@ -118,7 +120,7 @@ def _runs(rows: list[dict[str, Any]], key: str) -> list[str]:
     return lines
 
 
-def _rates(rows: list[dict[str, Any]]) -> list[str]:
+def _rates(rows: Rows) -> list[str]:
     lines = [
         "| mesher | cells | step 3, cells/s | seams | with the store | seams | written | steps 1-2, points/s |",
         "|---|---|---|---|---|---|---|---|",
@@ -135,13 +137,13 @@ def _rates(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _speedups(rows: list[dict[str, Any]]) -> list[str]:
+def _speedups(rows: Rows) -> list[str]:
     totals = {(row["side"], row["workers"]): row["total"] for row in rows}
     told = [f"{totals[side, 0] / totals[side, 2]:.2f} at {side / 1000:g} km" for side, n in totals if n == 2]
     return [f"Two workers over one process: {', '.join(told)}."]
 
 
-def _driver(rows: list[dict[str, Any]]) -> list[str]:
+def _driver(rows: Rows) -> list[str]:
     pairs = [*pairwise(rows), (rows[0], rows[-1])]
     told = [
         f"{(after['driver'] - before['driver']) / (after['tiles'] - before['tiles']) / 1e3:.1f} kB a tile between "
@@ -151,22 +153,22 @@ def _driver(rows: list[dict[str, Any]]) -> list[str]:
     return [*_runs(rows, "tiles a side"), "", f"The driver takes {', '.join(told)}."]
 
 
-def _workers(rows: list[dict[str, Any]]) -> list[str]:
+def _workers(rows: Rows) -> list[str]:
     lines = []
     for side in dict.fromkeys(row["side"] for row in rows):
         lines += [*_runs([row for row in rows if row["side"] == side], "workers"), ""]
     return [*lines, *_speedups(rows)]
 
 
-def _profile(rows: list[dict[str, Any]]) -> list[str]:
+def _profile(rows: Rows) -> list[str]:
     return _table("function", "share", ((f"`{row['place']}`", f"{100 * row['share']:.1f} %") for row in rows))
 
 
-def _startup(rows: list[dict[str, Any]]) -> list[str]:
+def _startup(rows: Rows) -> list[str]:
     return _table("from the command to", "seconds", ((row["until"], f"{row['seconds']:.2f}") for row in rows))
 
 
-def _limits(rows: list[dict[str, Any]]) -> list[str]:
+def _limits(rows: Rows) -> list[str]:
     return _table("", "", ((row["limit"], row["value"]) for row in rows))
 
 
@@ -174,7 +176,7 @@ def _table(left: str, right: str, rows: Iterable[tuple[str, str]]) -> list[str]:
     return [f"| {left} | {right} |", "|---|---|", *(f"| {one} | {other} |" for one, other in rows)]
 
 
-def _shares(rows: list[dict[str, Any]]) -> list[str]:
+def _shares(rows: Rows) -> list[str]:
     lines = ["| step | " + " | ".join(f"{row['workers']} workers" for row in rows) + " |", "|---|---|---|---|"]
     for step in (*STEPS, "rest"):
         parts = (f"{100 * row['steps'][step] / sum(row['steps'].values()):.1f} %" for row in rows)
@@ -182,7 +184,6 @@ def _shares(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-Rows = list[dict[str, Any]]
 # Of each study: its title, what was run, and what is made of its rows.
 SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
