@@ -40,10 +40,10 @@ BYTES_A_HOUSE = 4000.0
 BASE_MEMORY = 300e6  # bytes; of a worker with its libraries
 MEMORY_A_CELL = 55.0
 MEMORY_A_LIDAR_POINT = 18.0
-SECONDS_A_CELL = 1.25e-6
-SECONDS_A_LIDAR_POINT = 1.4e-6
-SECONDS_A_HOUSE = 0.023
-SECONDS_A_TASK = 0.05
+SECONDS_A_CELL = 0.45e-6
+SECONDS_A_LIDAR_POINT = 0.8e-6
+SECONDS_A_HOUSE = 2.8e-3
+SECONDS_A_TASK = 0.015
 SECONDS_OF_DRIVER = 0.002  # for each task, whatever the number of workers
 SECONDS_TO_START = 3.0
 MEASURED_ON = "a shared core of a cloud server (x86-64, 2026)"
@@ -143,7 +143,7 @@ def forecast_run(
     Cells are those of open ground, in proportion to volume over the cubed mesh size, and those at walls that are
     shorter than the mesh size, in proportion to height over wall length. LiDAR points lie evenly in the box of
     their file, footprints of an incomplete sample evenly over the tiles. Constants are means over a few measured
-    runs; cells were within a factor of 1.5 on all of them.
+    runs; cells were within a factor of 1.5 on all of them, seconds within 2 (medians).
     """
     loads = _loads(survey, sample, config)
     tasks = count_tasks(survey, config)

@@ -193,7 +193,7 @@ def _print_plan(plan: dict[str, Any], console: Console) -> None:
     rows.append(
         (
             "",
-            f"estimates, the time good to a factor of 3: from {_count(rate['cells per second and core'])} cells, "
+            f"estimates, the time good to a factor of 2: from {_count(rate['cells per second and core'])} cells, "
             f"{_count(rate['LiDAR points per second and core'])} LiDAR points, "
             f"{rate['footprints per second and core']} footprints, {rate['tasks per second and core']} tasks "
             f"a second and core, measured on {rate['measured on']}",
