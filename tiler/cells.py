@@ -67,27 +67,23 @@ def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.boo
     if not size > 0:
         raise ValueError(f"size of cells {size} m must be positive")
     among = np.ones(len(xy), np.bool_) if among is None else among
-    place, cell, start = _find_places(xy[:, 0], xy[:, 1], (1.0, 1.0), (0.0, 0.0), among, float(size))
+    place, cell, start = find_places(xy[:, 0], xy[:, 1], (1.0, 1.0), (0.0, 0.0), among, float(size))
     rows = np.flatnonzero(place >= 0)
     order = np.empty(len(rows), np.int64)
     order[place[rows]] = rows
     return CellOrder(order, cell, start)
 
 
+@numba.njit(cache=True, nogil=True)
 def find_places(
-    x: NDArray[np.int32],
-    y: NDArray[np.int32],
-    scale: Pair,
-    offset: Pair,
-    among: NDArray[np.bool_],
-    size: float,
+    x: NDArray[Any], y: NDArray[Any], scale: Pair, offset: Pair, among: NDArray[np.bool_], size: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Find the places of coordinates in whole units, ``units * scale + offset`` (m), in order of their cells.
 
     Parameters
     ----------
     x, y : int32, (n,)
-        Coordinates in units.
+        Coordinates in units; numbers of another type are taken as they are.
     scale, offset : pair of float
         Size of a unit along both axes, and place of unit 0 (m).
     among : bool, (n,)
@@ -102,7 +98,29 @@ def find_places(
     cell, start : int64
         As in `CellOrder`.
     """
-    place, cell, start = _find_places(x, y, scale, offset, among, float(size))
+    place = np.full(len(x), -1, np.int64)
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for k in range(len(x)):
+        if among[k]:
+            at_x, at_y = x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1]
+            low_x, high_x = min(low_x, at_x), max(high_x, at_x)
+            low_y, high_y = min(low_y, at_y), max(high_y, at_y)
+    if low_x > high_x:
+        return place, np.empty((0, 2), np.int64), np.zeros(1, np.int64)
+    first, low = int(np.floor(low_x / size)), int(np.floor(low_y / size))
+    width = int(np.floor(high_x / size)) - first + 1
+    n_cells = (int(np.floor(high_y / size)) - low + 1) * width
+    for k in range(len(x)):
+        if among[k]:
+            at_x, at_y = x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1]
+            place[k] = (int(np.floor(at_y / size)) - low) * width + int(np.floor(at_x / size)) - first
+    key, count = _put_in_order(place, n_cells) if n_cells <= MOST_CELLS else _sort_keys(place)
+    start = np.zeros(len(key) + 1, np.int64)
+    cell = np.empty((len(key), 2), np.int64)
+    for c in range(len(key)):
+        start[c + 1] = start[c] + count[c]
+        cell[c, 0], cell[c, 1] = key[c] % width + first, key[c] // width + low
     return place, cell, start
 
 
@@ -155,37 +173,6 @@ def row_ranges(wanted: NDArray[np.bool_], start: NDArray[np.int64]) -> list[tupl
     change = np.flatnonzero(np.diff(wanted.astype(np.int8), prepend=0, append=0))
     rows = start[change].reshape(-1, 2)
     return [(int(first), int(stop)) for first, stop in rows if stop > first]
-
-
-@numba.njit(cache=True, nogil=True)
-def _find_places(
-    x: NDArray[Any], y: NDArray[Any], scale: Pair, offset: Pair, among: NDArray[np.bool_], size: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Place of each row in the order of cells, and cells and starts of `CellOrder`."""
-    place = np.full(len(x), -1, np.int64)
-    low_x = low_y = np.inf
-    high_x = high_y = -np.inf
-    for k in range(len(x)):
-        if among[k]:
-            at_x, at_y = x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1]
-            low_x, high_x = min(low_x, at_x), max(high_x, at_x)
-            low_y, high_y = min(low_y, at_y), max(high_y, at_y)
-    if low_x > high_x:
-        return place, np.empty((0, 2), np.int64), np.zeros(1, np.int64)
-    first, low = int(np.floor(low_x / size)), int(np.floor(low_y / size))
-    width = int(np.floor(high_x / size)) - first + 1
-    n_cells = (int(np.floor(high_y / size)) - low + 1) * width
-    for k in range(len(x)):
-        if among[k]:
-            at_x, at_y = x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1]
-            place[k] = (int(np.floor(at_y / size)) - low) * width + int(np.floor(at_x / size)) - first
-    key, count = _put_in_order(place, n_cells) if n_cells <= MOST_CELLS else _sort_keys(place)
-    start = np.zeros(len(key) + 1, np.int64)
-    cell = np.empty((len(key), 2), np.int64)
-    for c in range(len(key)):
-        start[c + 1] = start[c] + count[c]
-        cell[c, 0], cell[c, 1] = key[c] % width + first, key[c] // width + low
-    return place, cell, start
 
 
 @numba.njit(cache=True, nogil=True)

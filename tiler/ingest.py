@@ -97,7 +97,7 @@ def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator
         counts["read"] += n_skipped
         counts["outside"] += n_skipped
         (x, y, z), (scale, offset) = units_of(chunk), scaling_of(chunk)
-        place, cell, start = find_places(x, y, scale[:2], offset[:2], kept, size)
+        place, cell, start = find_places(x, y, scale[:2], offset[:2], kept, float(size))
         total.update(dict(zip(map(tuple, cell.tolist()), np.diff(start).tolist(), strict=True)))
         _check_density(as_place(path), total, size)
         all_classes = classes_of(chunk)
