@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_points import BuildingPoints, merge_building_points
+from pipeline.building_points import BuildingPoints, take_building_points
 from pipeline.citymodel import CityModel, Footprints, number_ids
 from pipeline.heights import ROOF_SOURCES, Heights, compute_building_heights
 from pipeline.notes import Note
@@ -134,7 +134,7 @@ def assemble_city(
     )
     return City(
         model,
-        merge_building_points(points, tuple(np.array([row]) for row in kept)),
+        take_building_points(points, kept),
         footprints.given_height[kept],
         heights.roof_source[kept],
         wall_ground[kept],

@@ -77,7 +77,13 @@ def divide_houses(
         if roofs is None:
             roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
         parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
-        points = extract_building_points(cloud, parts.polygons, margin=options.ground_margin, building_class=marks)
+        divided = np.flatnonzero(np.bincount(parts.house)[parts.house] > 1)
+        found = extract_building_points(
+            cloud, parts.polygons[divided], margin=options.ground_margin, building_class=marks
+        )
+        rows = parts.house.copy()  # a house that is not divided keeps its points
+        rows[divided] = len(model) + np.arange(len(divided))
+        points = take_building_points(join_building_points([points, found]), rows)
     return Houses(model.ids, model.polygons, city.given_height, parts, points)
 
 

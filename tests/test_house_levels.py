@@ -11,10 +11,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely import affinity
 
+from pipeline.building_points import extract_building_points
+from pipeline.city import CityOptions
+from pipeline.citymodel import Footprints
 from pipeline.house_levels import HouseParts, LevelOptions, split_levels
-from pipeline.pointcloud import BUILDING, PointCloud
+from pipeline.houses import divide_houses
+from pipeline.pointcloud import BUILDING, GROUND, PointCloud
+from pipeline.raster import Dtm
 from pipeline.rings import make_canonical
 from pipeline.roof_points import RoofPoints, locate_roof_points
+from pipeline.tile import build_city
 
 Array = NDArray[np.float64]
 Roof = Callable[[Array, Array], Array]
@@ -66,6 +72,44 @@ def test_a_low_annex_is_cut_off_where_it_begins() -> None:
     np.testing.assert_allclose(cut[:, 1], 12.0, atol=0.5)
     assert cut[0, 1] == pytest.approx(cut[1, 1], abs=1e-9)  # along the back wall
     assert sorted(shapely.area(parts).tolist()) == pytest.approx([80, 120], abs=5)
+
+
+def test_parts_have_the_points_that_are_found_in_and_around_each() -> None:
+    houses = np.array([shapely.box(30, 0, 40, 20), HOUSE, shapely.box(10, 0, 20, 20)], object)
+    roofs = [scan(houses[0], lambda x, y: 9 + 0 * x), scan(HOUSE, annex), scan(houses[2], lambda x, y: 4 + x / 10)]
+    soil = scan(shapely.box(-5, -5, 45, 25).difference(shapely.union_all(houses)), lambda x, y: y / 9)
+    xyz = np.concatenate([cloud.xyz for cloud in (*roofs, soil)])
+    count = len(xyz) - len(soil.xyz), len(soil.xyz)
+    cloud = PointCloud(xyz, np.repeat(np.array([BUILDING, GROUND], np.uint8), count))
+    footprints = Footprints(houses, np.array(["a", "b", "c"]), np.full(3, np.nan))
+    options = CityOptions(
+        min_building_area=5.0,
+        vertex_tolerance=0.01,
+        ground_margin=1.0,
+        ground_percentile=10.0,
+        roof_percentile=90.0,
+        default_height=6.0,
+        roof_clearance=2.0,
+        border="drop",
+        simplify="clearance",
+        clearance=0.5,
+        clearance_floor=0.1,
+        min_courtyard_area=10.0,
+        split_levels=True,
+        roof_group=2.0,
+        manifold=False,
+    )
+    dtm = Dtm(np.zeros((80, 80)), -10, -10, 1.0)
+    city = build_city(cloud, footprints, dtm, (-20.0, -20.0, 60.0, 60.0), options)
+    divided = divide_houses(city, cloud, options)
+    assert sorted(divided.parts.house.tolist()) == [0, 1, 1, 2]
+    expected = extract_building_points(
+        cloud, divided.parts.polygons, margin=options.ground_margin, building_class=True
+    )
+    for name, values in vars(expected).items():
+        np.testing.assert_array_equal(getattr(divided.points, name), values, err_msg=name)
+    assert (np.diff(expected.roof_start) > 0).all()
+    assert (np.diff(expected.ground_start) > 0).all()
 
 
 @pytest.mark.parametrize("angle", [17.0, 45.0, 120.0])
