@@ -119,13 +119,18 @@ def cover_polygons(polygons: NDArray[np.object_]) -> Cover:
     return Cover(i0, j0, (np.diff(cell_start) > 0).reshape(height, width))
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def is_covered(x: float, y: float, i0: int, j0: int, marked: NDArray[np.bool_]) -> bool:
+    """Tell for kernels whether a place lies in a cell of the cover with these attributes."""
+    i, j = int(np.floor(x / INDEX_CELL)) - i0, int(np.floor(y / INDEX_CELL)) - j0
+    return bool(0 <= i < marked.shape[1] and 0 <= j < marked.shape[0] and marked[j, i])
+
+
 @numba.njit(cache=True, nogil=True)
 def _look_up(xy: Array, i0: int, j0: int, marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    height, width = marked.shape
     found = np.zeros(len(xy), np.bool_)
     for k in range(len(xy)):
-        i, j = int(np.floor(xy[k, 0] / INDEX_CELL)) - i0, int(np.floor(xy[k, 1] / INDEX_CELL)) - j0
-        found[k] = 0 <= i < width and 0 <= j < height and marked[j, i]
+        found[k] = is_covered(xy[k, 0], xy[k, 1], i0, j0, marked)
     return found
 
 

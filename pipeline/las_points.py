@@ -4,6 +4,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.inside import is_covered
 from pipeline.pointcloud import HIGH_NOISE, LOW_NOISE
 
 KEPT, OUTSIDE, WITHHELD, NOISE, ABSURD = range(5)
@@ -118,10 +119,11 @@ def cut_units(
     offset: Triple,
     box: Box,
     become: NDArray[np.int16],
+    cover: tuple[int, int, NDArray[np.bool_]] | None,
     xyz: NDArray[np.float64],
     classes: NDArray[np.uint8],
 ) -> int:
-    """Write the coordinates and classes of the wanted points within a box, in their old order.
+    """Write the coordinates and classes of the wanted points within a box and a cover, in their old order.
 
     Parameters
     ----------
@@ -135,6 +137,8 @@ def cut_units(
         xmin, ymin, xmax, ymax (m); the borders belong to the box.
     become : int16, (256,)
         Class that each class becomes; `LEFT_OUT` for those that are not wanted.
+    cover : tuple, optional
+        ``i0``, ``j0`` and ``marked`` of a `Cover`; None where all of the box is wanted.
     xyz : float64, (m, 3)
         Room for ``m >= n`` coordinates (m); the first rows are written.
     classes : uint8, (m,)
@@ -158,7 +162,9 @@ def cut_units(
         if new == LEFT_OUT:
             continue
         x, y = units[k, 0] * scale[0] + offset[0], units[k, 1] * scale[1] + offset[1]
-        if _is_within(x, y, box):
+        if not _is_within(x, y, box):
+            continue
+        if cover is None or is_covered(x, y, cover[0], cover[1], cover[2]):
             xyz[n, 0], xyz[n, 1], xyz[n, 2] = x, y, units[k, 2] * scale[2] + offset[2]
             classes[n] = new
             n += 1

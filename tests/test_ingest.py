@@ -59,7 +59,7 @@ def found(blocks: list[PointBlock], box: Box, size: float = CELL) -> PointCloud:
     for block in blocks:
         for first, stop in select_cells(block.cell, block.start, box, size=size):
             rows = block.units[first:stop], block.classification[first:stop], block.scale, block.offset
-            n += cut_units(*rows, box, np.arange(256, dtype=np.int16), xyz[n:], classes[n:])
+            n += cut_units(*rows, box, np.arange(256, dtype=np.int16), None, xyz[n:], classes[n:])
     return PointCloud(xyz[:n], classes[:n])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.inside import cover_polygons
+from pipeline.inside import are_covered, cover_polygons
 from pipeline.pointcloud import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from tests.tiles import make_town, run_of, write_town
 from tiler.readers import read_bands, read_cloud
@@ -110,9 +110,16 @@ def test_bands_have_all_points_in_order_and_no_more_rows_than_they_may(
 
 def test_points_may_be_cut_to_a_cover() -> None:
     cover = cover_polygons(np.array([shapely.box(0.5, 1.5, 1.5, 2.5)]))
-    cloud = read_cloud(a_task(a=(MARKED, True), c=(UNMARKED, False)), BOX, cover=cover)
+    task = a_task(a=(MARKED, True), c=(UNMARKED, False))
+    cloud = read_cloud(task, BOX, cover=cover)
     assert cloud.xyz[:, 2].tolist() == pytest.approx([3.0, 0.07, 0.08, 0.11])
     assert cloud.classification.tolist() == [BUILDING, WATER, BUILDING, BUILDING]
+    filtered = read_cloud(task, BOX, ground_filter=True)
+    near = are_covered(cover, filtered.xyz)
+    assert 0 < np.count_nonzero(near) < len(near)
+    cut = read_cloud(task, BOX, ground_filter=True, cover=cover)
+    assert cut.xyz.tolist() == filtered.xyz[near].tolist()
+    assert cut.classification.tolist() == filtered.classification[near].tolist()
 
 
 def run_store(values: dict[str, Any], out: Path) -> Store:

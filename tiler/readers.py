@@ -59,10 +59,8 @@ def read_cloud(
 
     Parameters
     ----------
-    task, box, classes, ground_filter
+    task, box, classes, ground_filter, cover
         As for `read_bands`.
-    cover : Cover, optional
-        Cells to which points are cut; by default none, all of the box are read.
 
     Returns
     -------
@@ -70,10 +68,9 @@ def read_cloud(
         As from `read_bands`, in one; memory is 25 bytes for each point that is kept, and a band.
     """
     xyz, found = np.empty((0, 3)), np.empty(0, np.uint8)
-    for band in read_bands(task, box, classes=classes, ground_filter=ground_filter):
-        kept = slice(None) if cover is None else are_covered(cover, band.xyz)
-        _extend(xyz, band.xyz[kept])
-        _extend(found, band.classification[kept])
+    for band in read_bands(task, box, classes=classes, ground_filter=ground_filter, cover=cover):
+        _extend(xyz, band.xyz)
+        _extend(found, band.classification)
     return PointCloud(xyz, found)
 
 
@@ -85,7 +82,12 @@ def _extend(array: NDArray[Any], rows: NDArray[Any]) -> None:
 
 
 def read_bands(
-    task: Task, box: Box, *, classes: Sequence[int] | None = None, ground_filter: bool = False
+    task: Task,
+    box: Box,
+    *,
+    classes: Sequence[int] | None = None,
+    ground_filter: bool = False,
+    cover: Cover | None = None,
 ) -> Iterator[PointCloud]:
     """Read the points of some classes within a box in bands, one after the other, from the stage ``points``.
 
@@ -99,6 +101,8 @@ def read_bands(
         ASPRS classes that are wanted; all by default.
     ground_filter : bool
         Find ground by our own filter.
+    cover : Cover, optional
+        Cells to which points are cut; by default none, all of the box are read.
 
     Yields
     ------
@@ -115,15 +119,18 @@ def read_bands(
     """
     if not ground_filter:
         for files in _cut_bands(_find_files(task, box)):
-            yield _read_files(task, files, box, [_reclassify(classes, file.marks_buildings) for file in files])[0]
+            become = [_reclassify(classes, file.marks_buildings) for file in files]
+            yield _read_files(task, files, box, become, cover)[0]
         return
     wide = clip(grow(box, FILTER_REACH), task.context.bounds)
     terrain = find_terrain((cloud for cloud, _ in _read_all(task, wide)), wide)
     for cloud, marked in _read_all(task, clip(box, wide)):
         found = classify_above(cloud, terrain, wide).classification
-        become = np.where(marked, _reclassify(classes, True)[found], _reclassify(classes, False)[found])
-        kept = become != LEFT_OUT
-        yield PointCloud(cloud.xyz[kept], become[kept].astype(np.uint8))
+        new = np.where(marked, _reclassify(classes, True)[found], _reclassify(classes, False)[found])
+        kept = new != LEFT_OUT
+        if cover is not None:
+            kept &= are_covered(cover, cloud.xyz)
+        yield PointCloud(cloud.xyz[kept], new[kept].astype(np.uint8))
 
 
 def _read_all(task: Task, box: Box) -> Iterator[tuple[PointCloud, NDArray[np.bool_]]]:
@@ -276,17 +283,22 @@ def _reclassify(classes: Sequence[int] | None, marked: bool) -> NDArray[np.int16
 
 
 def _read_files(
-    task: Task, files: Sequence[_FileRows], box: Box, become: Sequence[NDArray[np.int16]]
+    task: Task,
+    files: Sequence[_FileRows],
+    box: Box,
+    become: Sequence[NDArray[np.int16]],
+    cover: Cover | None = None,
 ) -> tuple[PointCloud, list[int]]:
-    """Read points of files, cropped to a box, one file after the other; also their number in each."""
+    """Read points of files, cropped to a box and a cover, one file after the other; also their number in each."""
     room = sum(stop - first for file in files for first, stop in file.ranges)
     xyz, classes = np.empty((room, 3)), np.empty(room, np.uint8)
     count: list[int] = []
+    cells = None if cover is None else (cover.i0, cover.j0, cover.marked)
     for file, table in zip(files, become, strict=True):
         rows = task.read_ranges("points", file.name, ("units", "classification"), file.ranges)
         n = sum(count)
         found = rows["units"], rows["classification"], file.scale, file.offset
-        count.append(cut_units(*found, box, table, xyz[n:], classes[n:]))
+        count.append(cut_units(*found, box, table, cells, xyz[n:], classes[n:]))
     return PointCloud(xyz[: sum(count)], classes[: sum(count)]), count
 
 
