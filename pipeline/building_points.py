@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -149,16 +150,30 @@ def remove_outliers(
     >>> remove_outliers(np.array([0, 0, 7]), np.array([1.0, 1, 1, 1, 1, 1, 9]))
     (array([0, 0, 6]), array([1., 1., 1., 1., 1., 1.]))
     """
-    count = np.diff(start)
-    group = np.repeat(np.arange(len(count)), count)
-    some = np.maximum(count, 1)
-    mean = np.bincount(group, z, len(count)) / some
-    offset = z - mean[group]
-    deviation = np.sqrt(np.bincount(group, offset**2, len(count)) / some)
-    # A group of equal values has a deviation of rounding errors only: keep it whole.
-    keep = np.abs(offset) <= deviations * deviation[group] + 1e-9
-    kept = np.bincount(group[keep], minlength=len(count))
+    keep, kept = _select_close(start, z, deviations)
     return np.concatenate(([0], np.cumsum(kept))), z[keep]
+
+
+@numba.njit(cache=True, nogil=True)
+def _select_close(
+    start: NDArray[np.int64], z: NDArray[np.float64], deviations: float
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Select the values close to the mean of their group, bool (k,), and count them in each, int64 (n,)."""
+    keep, kept = np.zeros(len(z), np.bool_), np.zeros(len(start) - 1, np.int64)
+    for g in range(len(kept)):
+        group = z[start[g] : start[g + 1]]
+        total = squares = 0.0
+        for value in group:
+            total += value
+        mean = total / max(len(group), 1)
+        for value in group:
+            squares += (value - mean) * (value - mean)
+        # A group of equal values has a deviation of rounding errors only: keep it whole.
+        most = deviations * np.sqrt(squares / max(len(group), 1)) + 1e-9
+        for k in range(start[g], start[g + 1]):
+            keep[k] = abs(z[k] - mean) <= most
+            kept[g] += keep[k]
+    return keep, kept
 
 
 def merge_building_points(points: BuildingPoints, members: tuple[NDArray[np.int64], ...]) -> BuildingPoints:
@@ -223,8 +238,21 @@ def _points_inside(
 def _regroup(
     start: NDArray[np.int64], z: NDArray[np.float64], owner: NDArray[np.int64], n: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    group = np.repeat(owner, np.diff(start))
-    kept = group >= 0
-    group, z = group[kept], z[kept]
-    order = np.lexsort((z, group))
-    return np.concatenate(([0], np.cumsum(np.bincount(group, minlength=n)))), z[order]
+    taken = owner >= 0
+    count = np.bincount(owner[taken], np.diff(start)[taken], minlength=n).astype(np.int64)
+    new_start = np.concatenate(([0], np.cumsum(count)))
+    return new_start, sort_values(new_start, _deal_out(start, z, owner, new_start))
+
+
+@numba.njit(cache=True, nogil=True)
+def _deal_out(
+    start: NDArray[np.int64], z: NDArray[np.float64], owner: NDArray[np.int64], new_start: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Put the values of each group behind those of the others of its owner; those of -1 are left out."""
+    dealt, free = np.empty(new_start[-1]), new_start.copy()
+    for g in range(len(owner)):
+        if owner[g] >= 0:
+            first = free[owner[g]]
+            free[owner[g]] += start[g + 1] - start[g]
+            dealt[first : free[owner[g]]] = z[start[g] : start[g + 1]]
+    return dealt

@@ -1,5 +1,7 @@
 """Values and points put in order within groups that lie one after the other (steps 1.5 and 2.0)."""
 
+from itertools import pairwise
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +9,6 @@ from numpy.typing import NDArray
 FEW = 24  # points that are sorted one by one
 
 
-@numba.njit(cache=True, nogil=True)
 def sort_values(start: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sort the values of each group, ``values[start[i]:start[i + 1]]``; none may be NaN.
 
@@ -17,8 +18,8 @@ def sort_values(start: NDArray[np.int64], values: NDArray[np.float64]) -> NDArra
     array([1., 3., 0., 2.])
     """
     ordered = values.copy()
-    for g in range(len(start) - 1):
-        ordered[start[g] : start[g + 1]].sort()
+    for first, stop in pairwise(start.tolist()):
+        ordered[first:stop].sort()  # numpy's own takes half the time of a kernel's, or less
     return ordered
 
 
