@@ -98,7 +98,9 @@ def test_appended_rows_are_the_bytes_of_one_put(store: Store) -> None:
     for case, cuts in enumerate([[1], [N_CHUNK], [5, 5, N_CHUNK + 1, 2 * N_CHUNK], range(0, len(BIG), 40_000)]):
         with store.writer(f"append{case}", "n") as writer:
             for piece, names in zip(np.split(BIG, cuts), np.split(ids, cuts), strict=True):
-                writer.append(big=piece, ids=names)
+                given = piece.copy()
+                writer.append(big=given, ids=names)
+                given[:] = 0  # the caller's own again
             writer.append(few=BIG[:0])
             writer.append(few=BIG[:7])
             writer.commit({"a": 1})

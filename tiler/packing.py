@@ -194,24 +194,26 @@ class RowBuffer:
         self._pieces: list[NDArray[Any]] = []
         self._count = 0
 
-    def add(self, piece: NDArray[Any]) -> None:
-        """Take rows of the same type and shape; raises ValueError for others."""
+    def add(self, piece: NDArray[Any]) -> list[NDArray[Any]]:
+        """Take rows of the same type and shape; raises ValueError for others.
+
+        Gives what whole chunks there are now, in order, and keeps copies of the rows beyond. Chunks that the piece
+        has to itself are views of it.
+        """
         if piece.dtype != self.dtype or piece.shape[1:] != self.row_shape:
             raise ValueError(
                 f"array {self.name}: rows of {piece.dtype} {piece.shape[1:]} appended to rows of {self.dtype} "
                 f"{self.row_shape}; give all pieces one type and width"
             )
-        self._pieces.append(piece.copy())
-        self._count += len(piece)
-
-    def whole_chunks(self) -> NDArray[Any] | None:
-        """Take out as many whole chunks as there are, or None; rows beyond stay."""
-        if self._count < self.chunk:
-            return None
-        rows = self.rest()
-        whole = len(rows) // self.chunk * self.chunk
-        self._pieces, self._count = [rows[whole:].copy()], len(rows) - whole
-        return rows[:whole]
+        if self._count + len(piece) < self.chunk:
+            self._pieces.append(piece.copy())
+            self._count += len(piece)
+            return []
+        first = -self._count % self.chunk  # rows that a begun chunk lacks
+        stop = first + (len(piece) - first) // self.chunk * self.chunk
+        begun = np.concatenate([*self._pieces, piece[:first]]) if first else piece[:0]
+        self._pieces, self._count = [piece[stop:].copy()], len(piece) - stop
+        return [rows for rows in (begun, piece[first:stop]) if len(rows)]
 
     def rest(self) -> NDArray[Any]:
         """Give the rows that are left."""

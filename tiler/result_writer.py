@@ -129,10 +129,9 @@ class Writer:
                 if name in self._small or name in self._table:
                     raise ValueError(f"array {name} is written twice")
                 self._buffers[name] = RowBuffer(name, rows)
-            self._buffers[name].add(rows)
+            chunks = self._buffers[name].add(rows)
             self._hash(name, rows)
-            whole = self._buffers[name].whole_chunks()
-            if whole is not None:
+            for whole in chunks:
                 self._extend(name, whole)
 
     def discard(self) -> None:
