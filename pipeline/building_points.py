@@ -229,7 +229,7 @@ def _points_inside(
     """Heights of the points in each polygon, and not in its counterpart in `outside` where given."""
     polygon, point = find_inside(xyz, polygons, among=among)
     if outside is not None:
-        apart = ~are_inside(outside, polygon, xyz[point], closed=True)
+        apart = ~are_inside(outside, polygon, np.take(xyz, point, axis=0), closed=True)
         polygon, point = polygon[apart], point[apart]
     start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))
     return start, sort_values(start, xyz[point, 2])

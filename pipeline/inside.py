@@ -85,9 +85,11 @@ def find_inside(
     start, found = _find(xy, among, edges.start, edges.a, edges.b)
     polygon = np.repeat(np.arange(len(polygons)), np.diff(start))
     point, side = found >> 2, found & 3
-    if not (side == UNSURE).any():
+    unsure = np.flatnonzero(side == UNSURE)
+    if len(unsure) == 0:
         return polygon, point
-    inside = _settle(polygons, polygon, xy[point], side, closed=False)
+    inside = np.ones(len(point), np.bool_)
+    inside[unsure] = shapely.contains_xy(polygons[polygon[unsure]], *xy[point[unsure], :2].T)
     return polygon[inside], point[inside]
 
 

@@ -59,7 +59,7 @@ def locate_roof_points(cloud: PointCloud, polygons: NDArray[np.object_], *, buil
     """
     polygon, point = find_inside(cloud.xyz, polygons, among=select_roof(cloud, building_class=building_class))
     start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))
-    xyz = cloud.xyz[point]
+    xyz = np.take(cloud.xyz, point, axis=0)  # in half of the time of an index
     del polygon, point  # they are as large as what is sorted
     return RoofPoints(start, sort_points(start, xyz))
 
