@@ -179,23 +179,26 @@ def _settle_clusters(
     """Settle the roofs of each cluster by themselves; groups are numbered through."""
     pairs = adjacent_houses(shapes.polygons)
     area = shapely.area(shapes.polygons)
-    roof, group, n_groups = heights.roof.copy(), np.zeros(len(ids), np.int32), 0
+    roof = np.maximum(heights.roof, wall_ground + options.roof_clearance)  # of a building that is alone
+    group, n_groups = np.zeros(len(ids), np.int32), 0
     order = np.argsort(shapes.cluster, kind="stable")
     number = np.empty(len(order), np.int64)
     for rows in np.split(order, np.flatnonzero(np.diff(shapes.cluster[order])) + 1) if len(order) else []:
-        number[rows] = np.arange(len(rows))
-        mine = pairs[np.isin(pairs[:, 0], rows)]
-        roof[rows], found = settle_roofs(
-            heights.roof[rows],
-            area[rows],
-            wall_ground[rows],
-            number[mine],
-            key=ids[rows],
-            threshold=options.roof_group,
-            clearance=options.roof_clearance,
-        )
-        group[rows] = found + n_groups
-        n_groups += int(found.max(initial=-1)) + 1
+        group[rows] = n_groups
+        if len(rows) > 1:
+            number[rows] = np.arange(len(rows))
+            mine = pairs[np.isin(pairs[:, 0], rows)]
+            roof[rows], found = settle_roofs(
+                heights.roof[rows],
+                area[rows],
+                wall_ground[rows],
+                number[mine],
+                key=ids[rows],
+                threshold=options.roof_group,
+                clearance=options.roof_clearance,
+            )
+            group[rows] += found
+        n_groups = int(group[rows].max()) + 1
     return roof, group
 
 

@@ -11,12 +11,14 @@ from pipeline.building_facts import describe_buildings, measure_model
 from pipeline.building_points import BuildingPoints, take_building_points
 from pipeline.city import City
 from pipeline.citymodel import Footprints
+from pipeline.clusters import Shapes
 from pipeline.columns import expand_cells, extract_boundary
+from pipeline.heights import Heights
 from pipeline.layered import LayeredOptions
 from pipeline.mesh import Marker
 from pipeline.notes import count_notes
 from pipeline.pointcloud import PointCloud
-from pipeline.simplify import settle_roofs, simplify_city
+from pipeline.simplify import _settle_clusters, settle_roofs, simplify_city
 from pipeline.spacing import SpacingLimits
 from pipeline.tile import build_city, mesh_city
 from tests.cities import cloud_over, tilted_dtm
@@ -137,6 +139,19 @@ def test_a_roof_is_raised_before_it_is_compared_with_its_neighbours() -> None:
     city = planar_city(footprints_of(FRONT, BACK), cloud, slope=0.5)
     # The terrain reaches 16 m at the front house's walls (x = 1032) and 22.5 m at the other's (x = 1045).
     assert sorted(city.model.roof.tolist()) == pytest.approx([18.0, 24.5])
+
+
+def test_roofs_are_settled_cluster_by_cluster() -> None:
+    """One alone and too low, a pair that is grouped, one alone and high, and a pair that is not."""
+    x = np.array([0.0, 40.0, 50.0, 20.0, 70.0, 80.0])
+    polygons = shapely.box(x, 0, x + 10, 10)
+    nothing = np.empty((0, 2), np.int64)
+    shapes = Shapes(polygons, np.arange(7), np.arange(6), np.array([3, 5, 5, 0, 9, 9]), nothing, {})
+    heights = Heights(np.zeros(6), np.array([1.0, 9, 10, 30, 8, 20]), np.zeros(6, np.int8), np.zeros(6, np.bool_))
+    roof, group = _settle_clusters(shapes, heights, np.ones(6), np.array(list("fedcba")), OPTIONS)
+    assert roof.tolist() == [3.0, 9.5, 9.5, 30.0, 8.0, 20.0]
+    assert group.tolist() == [1, 2, 2, 0, 4, 3]
+    assert group.dtype == np.int32
 
 
 def test_settled_roofs_meet_both_rules() -> None:
