@@ -473,6 +473,23 @@ def test_later_stages_go_first_then_names(tmp_path: Path) -> None:
     assert order[:7] == ["a 0.0", "a 0.1", "a 0.2", "a 1.0", "a 1.1", "b 0.0", "a 1.2"]
 
 
+def test_of_a_stage_larger_tiles_go_first(tmp_path: Path) -> None:
+    order: list[str] = []
+    boxes = {
+        "a": (0.0, 0.0, 1.0, 1.0),
+        "b": (1.0, 0.0, 3.0, 1.0),
+        "c": (0.0, 1.0, 3.0, 4.0),
+        "d": (0.0, 4.0, 2.0, 5.0),
+    }
+    seams = {"small": (0.0, 0.0, 1.0, 0.0), "wide": (0.0, 0.0, 9.0, 9.0)}
+    layout = Layout({}, boxes, seams, (0.0, 0.0, 3.0, 5.0))
+    engine = make(tmp_path, layout=layout, window=1, progress=lambda *told: order.append(told[3].name))
+    engine.run(Stage("tiles", Scope.TILE, nothing))
+    assert order == ["c", "b", "d", "a"]
+    engine.run(Stage("seams", Scope.SEAM, nothing))
+    assert order[4:] == ["small", "wide"]
+
+
 def test_progress_counts_to_the_end(tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
     engine = make(tmp_path, progress=lambda stage, done, total, record: told.append((stage, done, total)))

@@ -161,7 +161,7 @@ class Engine:
         """Run stages whose reads are among them or were run before.
 
         A task is submitted when all that it reads is done; of those that may run, those of later stages go first,
-        then in the order of names.
+        then those of larger tiles, then in the order of names.
 
         Parameters
         ----------
@@ -366,7 +366,8 @@ class _Run:
         unfinished = self.waiting[np.repeat(~done, np.diff(self.start))]
         self.n_missing: NDArray[np.int64] = np.bincount(unfinished, minlength=n_tasks)
         ready = np.flatnonzero((self.n_missing == 0) & ~done)
-        self.ready = [(-int(self.rank[task]), task) for task in ready.tolist()]
+        self.order = self._order()
+        self.ready = [(int(self.order[task]), task) for task in ready.tolist()]
         heapq.heapify(self.ready)
         self.in_flight: set[int] = set()
         self.tried: Counter[int] = Counter()
@@ -374,6 +375,20 @@ class _Run:
         if engine._watch is not None:
             for planned in plan:
                 engine._watch.planned(planned.stage.name, planned.stage.scope, len(planned.items.names))
+
+    def _order(self) -> NDArray[np.int32]:
+        """Where each task stands among those that may run: later stages first, then larger tiles, then names.
+
+        What takes longest begins first, so that no worker is left with it alone at the end of a stage.
+        """
+        area = np.zeros(len(self.rank))
+        for planned in self.plan:
+            if planned.stage.scope is Scope.TILE:
+                xmin, ymin, xmax, ymax = planned.items.boxes.T
+                area[planned.first : planned.first + len(xmin)] = np.rint((xmax - xmin) * (ymax - ymin))
+        order = np.empty(len(area), np.int32)
+        order[np.lexsort((-area, -self.rank))] = np.arange(len(area), dtype=np.int32)
+        return order
 
     def drive(self) -> None:
         executor = self.engine._executor
@@ -490,7 +505,7 @@ class _Run:
         for task in self.waiting[self.start[ticket] : self.start[ticket + 1]].tolist():
             self.n_missing[task] -= 1
             if self.n_missing[task] == 0:
-                heapq.heappush(self.ready, (-int(self.rank[task]), task))
+                heapq.heappush(self.ready, (int(self.order[task]), task))
 
     def _settle(self) -> None:
         """After an error: give up what has not begun, wait for the rest, and keep no record of either."""
