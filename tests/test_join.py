@@ -54,7 +54,7 @@ from tiler.joining import crew, join
 from tiler.cli import main
 give = crew.Crew.give
 def give_slowly(self, given):
-    time.sleep(0.1)
+    time.sleep(0.25)
     give(self, given)
 crew.Crew.give = give_slowly
 while not Path(sys.argv[1]).exists():

@@ -237,9 +237,9 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
         "rates",
         "Rates",
-        "A city of 3 km with 4,320 buildings and 1.5 points a m², serial; the middle one of 3 runs. *Step 3* is "
-        "what stages\n`seams` and `columns` compute (3.1 to 3.5), then all that they do, with what they read and "
-        "write of the store; *written*\nare cells a second into VTU pieces.",
+        "Cities with 480 buildings a km² and 1.5 points a m², of 5 km at 10 m and of 3 km at 5 m, serial; the "
+        "middle one of 3\nruns. *Step 3* is what stages `seams` and `columns` compute (3.1 to 3.5), then all that "
+        "they do, with what they read and\nwrite of the store; *written* are cells a second into VTU pieces.",
         _rates,
     ),
     (
