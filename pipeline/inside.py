@@ -85,11 +85,9 @@ def find_inside(
     start, found = _find(xy, among, edges.start, edges.a, edges.b)
     polygon = np.repeat(np.arange(len(polygons)), np.diff(start))
     point, side = found >> 2, found & 3
-    unsure = np.flatnonzero(side == UNSURE)
-    if len(unsure) == 0:
+    if not (side == UNSURE).any():
         return polygon, point
-    inside = np.ones(len(point), np.bool_)
-    inside[unsure] = shapely.contains_xy(polygons[polygon[unsure]], *xy[point[unsure], :2].T)
+    inside = _settle(polygons, polygon, xy, point, side, closed=False)
     return polygon[inside], point[inside]
 
 
@@ -174,7 +172,7 @@ def are_inside(
     edges = list_edges(polygons) if edges is None else edges
     side = np.empty(len(polygon), np.int64)
     _locate(xy, polygon, edges.start, edges.a, edges.b, side)
-    return _settle(polygons, polygon, xy, side, closed=closed)
+    return _settle(polygons, polygon, xy, np.arange(len(xy)), side, closed=closed)
 
 
 def find_owner(polygons: NDArray[np.object_], xy: Array) -> Index:
@@ -201,14 +199,14 @@ def find_owner(polygons: NDArray[np.object_], xy: Array) -> Index:
 
 
 def _settle(
-    polygons: NDArray[np.object_], polygon: Index, xy: Array, side: Index, *, closed: bool
+    polygons: NDArray[np.object_], polygon: Index, xy: Array, point: Index, side: Index, *, closed: bool
 ) -> NDArray[np.bool_]:
-    """Ask GEOS where the crossings leave a doubt."""
+    """Ask GEOS of those points, rows of `xy`, of which the crossings leave a doubt."""
     inside: NDArray[np.bool_] = side == INSIDE
     unsure = np.flatnonzero(side == UNSURE)
     if len(unsure):
         predicate = shapely.intersects_xy if closed else shapely.contains_xy
-        inside[unsure] = predicate(polygons[polygon[unsure]], xy[unsure, 0], xy[unsure, 1])
+        inside[unsure] = predicate(polygons[polygon[unsure]], *xy[point[unsure], :2].T)
     return inside
 
 

@@ -21,7 +21,6 @@ from pipeline.terrain import Dtm, cut_terrain, sample_dtm
 
 REACH = 3.0  # domain heights; terrain farther from a mesh counts for nothing
 BLOCK = 1.0  # domain heights; side of the squares that `lift_places` works in
-
 SUMS = 0.25  # of the grid's shorter side; for fewer rows or columns, sums are faster than a transform
 
 Bounds = tuple[float, float, float, float]

@@ -86,9 +86,7 @@ def _costs(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
     """Edges of a strip, what each costs, and the vertices on walls or in buildings."""
     neighbour = triangle_neighbours(strip.triangles)
-    worst = np.ones(len(strip.xy))
-    on_wall, built = np.zeros(len(strip.xy), np.bool_), np.zeros(len(strip.xy), np.bool_)
-    _look_at_vertices(strip.xy, strip.triangles, neighbour, strip.building, worst, on_wall, built)
+    worst, on_wall, built = _look_at_vertices(strip.xy, strip.triangles, neighbour, strip.building)
     edges, cost = _cost_edges(strip.xy, strip.triangles, neighbour, strip.building, worst, on_wall, offset)
     return edges, cost, on_wall | built
 
@@ -99,14 +97,13 @@ def _look_at_vertices(
     triangles: NDArray[np.int32],
     neighbour: NDArray[np.int32],
     building: NDArray[np.int32],
-    worst: NDArray[np.float64],
-    on_wall: NDArray[np.bool_],
-    built: NDArray[np.bool_],
-) -> None:
-    """Find vertices on walls and in buildings, and the worst shape of the triangles at each vertex.
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Find the worst shape of the triangles at each vertex, and the vertices on walls and in buildings.
 
     A shape is the area over the squared edges, 1 if the triangle is equilateral.
     """
+    worst = np.ones(len(xy))
+    on_wall, built = np.zeros(len(xy), np.bool_), np.zeros(len(xy), np.bool_)
     for t in range(len(triangles)):
         a, b, c = triangles[t]
         ux, uy = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
@@ -122,6 +119,7 @@ def _look_at_vertices(
             if u >= 0 and building[u] != building[t]:
                 on_wall[triangles[t, (k + 1) % 3]] = True
                 on_wall[triangles[t, (k + 2) % 3]] = True
+    return worst, on_wall, built
 
 
 @numba.njit(cache=True, nogil=True)
@@ -134,6 +132,7 @@ def _cost_edges(
     on_wall: NDArray[np.bool_],
     offset: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Edges, each once, int64 (e, 2), and what each costs."""
     edges, cost = np.empty((3 * len(triangles), 2), np.int64), np.empty(3 * len(triangles))
     n = 0
     for t in range(len(triangles)):

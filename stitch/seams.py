@@ -10,7 +10,7 @@ from pipeline.mesh import PlaneMesh
 from pipeline.plane import order_plane
 from pipeline.sizes import SizeField, largest_size, local_sizes
 from stitch.corners import Corner
-from stitch.grid import SeamKey, TileGrid, is_border
+from stitch.grid import Bounds, SeamKey, TileGrid, is_border
 from stitch.paths import find_path
 from stitch.strips import Strip, centres, improve_around, mesh_strip, strip_core
 from stitch.walls import find_on_walls
@@ -103,10 +103,10 @@ def trace_seam(
     ring = order_plane(strip.xy, strip.triangles[around], strip.building[around])
     near = ring
     if surroundings:
-        size = local_sizes(sizes, centres(strip.xy, strip.triangles), mesh_size=mesh_size)
+        centre = centres(strip.xy, strip.triangles)
         core = strip_core(grid, key, mesh_size=largest_size(sizes, mesh_size=mesh_size))
-        reach = surroundings * np.broadcast_to(size, len(strip.triangles))
-        rows = around | _are_near(strip, np.array(core), xy, reach)
+        reach = surroundings * np.broadcast_to(local_sizes(sizes, centre, mesh_size=mesh_size), len(centre))
+        rows = around | _are_near(centre, core, xy, reach)
         near = order_plane(strip.xy, strip.triangles[rows], strip.building[rows])
     return Seam(xy, xy[np.unique(on)], False, ring, find_vertices(ring.xy, xy), near)
 
@@ -144,10 +144,9 @@ def find_vertices(among: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArra
 
 
 def _are_near(
-    strip: Strip, core: NDArray[np.float64], line: NDArray[np.float64], reach: NDArray[np.float64]
+    centre: NDArray[np.float64], core: Bounds, line: NDArray[np.float64], reach: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Whether triangles have their centres close to a line, and where it is known what holds them."""
-    centre = centres(strip.xy, strip.triangles)
     near: NDArray[np.bool_] = np.all((centre >= core[:2]) & (centre <= core[2:]), axis=1)
     longest = float(np.sqrt((np.diff(line, axis=0) ** 2).sum(axis=1).max()))
     _leave_near(centre, line, longest, reach, near)

@@ -125,7 +125,7 @@ def improve_around(
     -----
     A path on open ground is hardly left any more: what is within `CORRIDOR` triangles of it is improved, and its
     edges cost less then, all others what they did. A path that touches a house is left where better triangles
-    let another through a gap, so all are improved. Cost is that of the triangles that are.
+    let another through a gap, so all are improved.
     """
     rows = _rows_around(strip, path)
     vertex, local = np.unique(strip.triangles[rows], return_inverse=True)

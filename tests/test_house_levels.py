@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.building_points import extract_building_points
-from pipeline.city import CityOptions
 from pipeline.citymodel import Footprints
 from pipeline.house_levels import HouseParts, LevelOptions, split_levels
 from pipeline.houses import divide_houses
@@ -21,6 +20,7 @@ from pipeline.raster import Dtm
 from pipeline.rings import make_canonical
 from pipeline.roof_points import RoofPoints, locate_roof_points
 from pipeline.tile import build_city
+from tests import test_tile
 
 Array = NDArray[np.float64]
 Roof = Callable[[Array, Array], Array]
@@ -82,23 +82,7 @@ def test_parts_have_the_points_that_are_found_in_and_around_each() -> None:
     count = len(xyz) - len(soil.xyz), len(soil.xyz)
     cloud = PointCloud(xyz, np.repeat(np.array([BUILDING, GROUND], np.uint8), count))
     footprints = Footprints(houses, np.array(["a", "b", "c"]), np.full(3, np.nan))
-    options = CityOptions(
-        min_building_area=5.0,
-        vertex_tolerance=0.01,
-        ground_margin=1.0,
-        ground_percentile=10.0,
-        roof_percentile=90.0,
-        default_height=6.0,
-        roof_clearance=2.0,
-        border="drop",
-        simplify="clearance",
-        clearance=0.5,
-        clearance_floor=0.1,
-        min_courtyard_area=10.0,
-        split_levels=True,
-        roof_group=2.0,
-        manifold=False,
-    )
+    options = replace(test_tile.OPTIONS, simplify="clearance", clearance=0.5, split_levels=True)
     dtm = Dtm(np.zeros((80, 80)), -10, -10, 1.0)
     city = build_city(cloud, footprints, dtm, (-20.0, -20.0, 60.0, 60.0), options)
     divided = divide_houses(city, cloud, options)

@@ -106,6 +106,11 @@ def test_tasks_of_each_stage_are_those_of_a_run(city: Config) -> None:
     assert "join-1" in tasks
 
 
+def amsterdam(shared_data: Path, **given: Any) -> Config:
+    folder = shared_data / "amsterdam"
+    return Config((str(folder / "tiles"),), str(folder / "footprints.shp"), **given)
+
+
 @pytest.mark.parametrize(
     ("mesher", "mesh_size", "height", "cells"),
     [
@@ -119,14 +124,8 @@ def test_tasks_of_each_stage_are_those_of_a_run(city: Config) -> None:
 def test_cells_of_a_dense_city(
     shared_data: Path, mesher: str, mesh_size: float, height: float, cells: int
 ) -> None:
-    config = Config(
-        (str(shared_data / "amsterdam/tiles"),),
-        str(shared_data / "amsterdam/footprints.shp"),
-        tile_size=300.0,
-        mesh_size=mesh_size,
-        mesher=mesher,
-        domain_height=height,
-    )
+    given = {"tile_size": 300.0, "mesh_size": mesh_size, "mesher": mesher, "domain_height": height}
+    config = amsterdam(shared_data, **given)
     assert cells / 1.25 < forecast_of(config).loads.cells.sum() < 1.25 * cells
 
 
@@ -144,13 +143,7 @@ def test_cells_of_a_dense_city(
 def test_time_of_a_dense_city(
     shared_data: Path, mesher: str, mesh_size: float, tile_size: float, seconds: float
 ) -> None:
-    config = Config(
-        (str(shared_data / "amsterdam/tiles"),),
-        str(shared_data / "amsterdam/footprints.shp"),
-        tile_size=tile_size,
-        mesh_size=mesh_size,
-        mesher=mesher,
-    )
+    config = amsterdam(shared_data, tile_size=tile_size, mesh_size=mesh_size, mesher=mesher)
     assert seconds / 2 < forecast_of(config).work < 2 * seconds
 
 

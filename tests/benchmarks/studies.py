@@ -147,7 +147,7 @@ def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
 def study_rates(cities: Cities, out: Path) -> list[dict[str, Any]]:
     """Both meshers at 10 and 5 m, and a dense cloud; serially, tiles of the default size; the middle one of 3.
 
-    Cities of some 20 tiles at 10 m and 30 at 5 m: in a few, compiled code that is read for the first time counts.
+    Cities of 16 tiles at 10 m and some 30 at 5 m: in a few, compiled code that is read for the first time counts.
     """
     wide, city, dense = cities.make(5000, 12_000), cities.make(3000, 4320), cities.make(1000, 480, 16.0)
     rows = []
