@@ -24,6 +24,7 @@ from pipeline.trim import check_headroom, count_removed_layers, first_kept, firs
 
 MIN_GAP = 0.1  # of a layer's height: what the repair leaves between two levels of a column
 GRID_FACTOR = 1.0  # grid of the fast step 3.3, in mesh sizes
+CHOICE_GRID = 0.1  # of the domain's height; grid on which layers are chosen, unless the mesh is coarser
 
 Smoother = Literal["columns", "fem"]
 
@@ -161,7 +162,7 @@ def choose_layers(
     -----
     What a building gets depends on the buildings of its cluster, which touch each other, and on the terrain in
     reach alone: every tile that has a part of it may choose for the cluster, or one for all. Levels are looked
-    up along the walls, a mesh size apart at most.
+    up along the walls, a mesh size apart at most, on a grid that is no finer than a choice among them needs.
     """
     check_groups(roof, group)
     if len(roof) == 0:
@@ -175,7 +176,7 @@ def choose_layers(
         bounds,
         domain_height=options.domain_height,
         n_layers=n_layers,
-        grid_spacing=GRID_FACTOR * options.mesh_size,
+        grid_spacing=max(GRID_FACTOR * options.mesh_size, CHOICE_GRID * options.domain_height),
         shape=shape,
     )
     group = join_equal_roofs(pairs, roof, group)

@@ -21,6 +21,7 @@ from pipeline.terrain import Dtm, cut_terrain, sample_dtm
 
 REACH = 3.0  # domain heights; terrain farther from a mesh counts for nothing
 BLOCK = 1.0  # domain heights; side of the squares that `lift_places` works in
+STEEPEST = 300.0  # exponent by which a mode fades from a level to the next at most; what is left is nothing
 SUMS = 0.25  # of the grid's shorter side; for fewer rows or columns, sums are faster than a transform
 
 Bounds = tuple[float, float, float, float]
@@ -175,15 +176,20 @@ def smooth_slab(
     nodes = _nodes_around(position, n_x, n_y)
     node, weight = _bilinear(position, n_x, n_y, nodes)
     back = _choose_way_back(spectrum.shape, nodes)
-    bottom = 1 / (1 + np.exp(-2 * wave * domain_height))
+    levels = domain_height * np.arange(n_layers + 1) / n_layers if shape is None else shape.levels
+    rises = np.full(n_layers, domain_height / n_layers) if shape is None else np.diff(levels)
     z = np.empty((len(xy), n_layers + 1))
     z[:, 0] = sample_dtm(dtm, xy)
+    # cosh(k (H - z)) / cosh(k H) has a part that fades with the height z, and one that grows: exp(k (z - 2 H)).
+    fading = spectrum / (1 + np.exp(-2 * wave * domain_height))
+    growing = fading * np.exp(-2 * wave * domain_height)
     for level in range(1, n_layers + 1):
-        height = domain_height * level / n_layers if shape is None else float(shape.levels[level])
-        # cosh(k (H - z)) / cosh(k H), written so that nothing overflows.
-        damping = np.exp(-wave * height) * (1 + np.exp(-2 * wave * (domain_height - height))) * bottom
-        lifted = back(spectrum * damping).ravel()
-        z[:, level] = height + (lifted[node] * weight).sum(axis=1)
+        if level == 1 or rises[level - 1] != rises[level - 2]:
+            fade = np.exp(-np.minimum(wave * rises[level - 1], STEEPEST))
+        fading *= fade
+        growing /= fade
+        lifted = back(fading + growing).ravel()
+        z[:, level] = levels[level] + (lifted[node] * weight).sum(axis=1)
     return z if shape is None else shape_levels(z, shape)
 
 

@@ -16,7 +16,7 @@ from pipeline.layered import LayeredOptions, choose_layers, fill_layers, mesh_la
 from pipeline.nodes import SeamColumns, take_columns
 from pipeline.plane import mesh_plane
 from pipeline.quality import measure_cells
-from pipeline.slab import lift_places, slab_reach, slab_window, smooth_slab
+from pipeline.slab import SlabShape, lift_places, slab_reach, slab_window, smooth_slab
 from pipeline.terrain import Dtm
 from stitch.corners import place_corner
 from stitch.grid import Key, SeamKey, is_border, make_grid, seam_keys
@@ -217,6 +217,34 @@ def test_sums_for_a_few_nodes_give_what_the_transform_gives(box: Bounds, monkeyp
         summed = smooth()
     np.testing.assert_allclose(summed, transformed, rtol=0, atol=1e-12)
     assert np.ptp(summed[:, 3]) > 0.3
+
+
+GROWN = np.array([0.0, 0.5, 1.25, 2.5, 5.0, 9.0, 20.0, 60.0])
+
+
+@pytest.mark.parametrize(
+    ("levels", "shaped"),
+    [(np.linspace(0, 60, 13), False), (GROWN, True), (np.array([0.0, 4000.0, 8000.0]), False)],
+    ids=["equal", "growing", "coarse"],
+)
+def test_a_wave_of_the_terrain_fades_as_the_equation_says(levels: NDArray[np.float64], shaped: bool) -> None:
+    east, north = np.meshgrid(np.arange(81.0), np.arange(61.0))
+    wave = np.pi * np.hypot(3 / 80, 2 / 60)
+    z = 5.0 * np.cos(np.pi * 3 * east / 80) * np.cos(np.pi * 2 * north / 60)
+    xy = np.random.default_rng(3).integers((0, 0), (81, 61), (40, 2)).astype(np.float64)
+    found = smooth_slab(
+        Dtm(z, 0, 0, 1.0),
+        xy,
+        (0.0, 0.0, 80.0, 60.0),
+        domain_height=levels[-1],
+        n_layers=len(levels) - 1,
+        grid_spacing=1.0,
+        shape=SlabShape(levels, 0.0, None) if shaped else None,
+    )
+    height = levels[-1]
+    share = (np.exp(-wave * levels) + np.exp(wave * (levels - 2 * height))) / (1 + np.exp(-2 * wave * height))
+    ground = z[xy[:, 1].astype(int), xy[:, 0].astype(int)]
+    np.testing.assert_allclose(found, levels + ground[:, None] * share, rtol=0, atol=1e-11)
 
 
 STREET = [shapely.box(100, 90, 130, 180), shapely.box(152, 90, 180, 180), shapely.box(300, 300, 310, 310)]

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.bench import COMMAND, citystitch, record_of
-from tests.benchmarks.studies_report import DOCS, MEASURED, step_seconds, write_report
+from tests.benchmarks.studies_report import CHOICE, DOCS, MEASURED, step_seconds, write_report
 
 KEPT = DOCS / "studies.json"
 MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
@@ -46,6 +46,7 @@ def measure(city: Path, out: Path, *options: str, cores: int = 1) -> dict[str, A
         "points": record["counts"]["points read"],
         "seams": record["seconds"]["seams"],
         "columns": record["seconds"]["columns"],
+        "layers": record["seconds"].get(CHOICE, 0.0),
         "seams computed": computed_seconds(record, "seams"),
         "columns computed": computed_seconds(record, "columns"),
         "written": record["seconds"]["pieces: 3.6 write pieces"],

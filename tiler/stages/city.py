@@ -116,7 +116,8 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=3)
+    version = 4 if layered else 3
+    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=version)
 
 
 def chooses_layers_later(config: Config) -> bool:
@@ -282,10 +283,11 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     model = city.model
     layers, parted = np.zeros(len(model), np.int32), 0
     if isinstance(mesh, LayeredOptions):
-        pairs = adjacent_houses(model.polygons)
-        layers, parted = choose_layers(
-            model.polygons, model.roof, city.wall_ground, city.group, pairs, dtm, bounds, mesh
-        )
+        with task.step("3.4 choose layers"):
+            pairs = adjacent_houses(model.polygons)
+            layers, parted = choose_layers(
+                model.polygons, model.roof, city.wall_ground, city.group, pairs, dtm, bounds, mesh
+            )
     cloud = _points_near(task, extent, options.ground_margin, shapes.polygons, (BUILDING,))
     with task.step("2.4 fit of roofs"):
         roofs = locate_roof_points(cloud, city.model.polygons, building_class=True)

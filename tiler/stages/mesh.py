@@ -68,7 +68,7 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     seams, columns = (
         (make_seam_with_soil, make_columns_with_soil) if config.underground else (make_seam, make_columns)
     )
-    version = 4 if config.mesher == "layered" else 3
+    version = 5 if config.mesher == "layered" else 3
     return [
         Stage("seams", Scope.SEAM, seams, tuple(reads), parameters, version=version),
         Stage("columns", Scope.TILE, columns, (*reads, Read("seams", beside=True)), parameters, version=version),
