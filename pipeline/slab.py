@@ -166,7 +166,7 @@ def smooth_slab(
 
     Notes
     -----
-    Memory is that of one level of the grid and of the result.
+    Memory is that of a few levels of the grid and of the result.
     """
     low, size = np.array(bounds[:2]), np.array(bounds[2:]) - np.array(bounds[:2])
     n_x, n_y = (max(int(n), 1) for n in np.rint(size / grid_spacing))
