@@ -1,6 +1,8 @@
 """Inputs are read once: points dealt out to cells, footprints to a grid, both found again by box."""
 
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import laspy
@@ -20,7 +22,10 @@ from tests.test_vectors import RD, square, write, write_parquet
 from tiler import clouds, layers
 from tiler.cells import Box, select_cells
 from tiler.clouds import find_clouds, read_points
+from tiler.config import Config
 from tiler.copc import read_index
+from tiler.engine import Engine
+from tiler.executors import Serial
 from tiler.footprint_index import (
     FOOTPRINT_CELL,
     FootprintBlock,
@@ -33,9 +38,15 @@ from tiler.ingest import CELL, PointBlock, read_cells
 from tiler.lasheader import read_promise
 from tiler.layers import describe_layer, scan_layer
 from tiler.repeated_ids import find_repeated_ids
+from tiler.stage import Layout
+from tiler.stages import inputs
+from tiler.stages.inputs import input_stages
+from tiler.store import Store
+from tiler.tables import unpack_polygons
 from tiler.vectors import read_footprints
 
 SIDE = 1000.0
+NEAR = [(-2, -2), (-1, 0), (0, 0), (1, 1)]  # tiles
 
 
 def sorted_rows(cloud: PointCloud) -> np.ndarray:
@@ -350,6 +361,44 @@ def test_footprints_of_a_box_are_those_that_meet_it(tmp_path: Path, name: str) -
         assert_same(read_footprints(path, crs=RD, bounds=box, height_attribute="h")[0], expected)
     assert len(in_box(blocks, (X + 2900, Y + 2900, X + 3000, Y + 3000)).ids) == 0
     assert count_notes(notes_of(blocks)) == {"footprint-height-missing": int(np.isnan(heights).sum())}
+
+
+def test_a_tile_reads_the_rows_of_its_cells_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes, fields = houses()
+    fields["id"] = np.array([f"{name}{'é' * (len(name) + k % 3)}" for k, name in enumerate(fields["id"])], object)
+    path = write_any(tmp_path / "houses.gpkg", shapes, fields)
+    monkeypatch.setattr(inputs, "scan_footprints", partial(scan_footprints, batch=150))
+    tiles = {f"{i}_{j}": (X + 900.0 * i, Y + 900.0 * j, X + 900.0 * (i + 1), Y + 900.0 * (j + 1)) for i, j in NEAR}
+    parameters = SimpleNamespace(
+        footprints=str(path), footprints_identity="", layer="", id_attribute="", height_attribute="h"
+    )
+    context = SimpleNamespace(crs=RD.to_wkt(), bounds=REGION)
+    layout = Layout(tiles=tiles, bounds=REGION)
+    engine = Engine(tmp_path / "s.zarr", layout, parameters=parameters, context=context, executor=Serial())
+    given = Config(("points",), str(path))
+    footprints, outlines = (stage for stage in input_stages(given) if stage.name in ("footprints", "outlines"))
+    engine.run(footprints)
+    asked = record_rows(monkeypatch)
+    engine.run(outlines)
+    for name, box in tiles.items():
+        arrays, _ = engine.store.read("outlines", name)
+        found = Footprints(unpack_polygons(arrays, "outline"), arrays["ids"], arrays["given_height"])
+        assert_same(found, read_footprints(path, crs=RD, bounds=box, height_attribute="h")[0])
+        assert len(found.ids) > 3
+    assert {array for array, _ in asked} == {"wkb", "wkb_end", "id", "id_end", "given_height", "box"}
+    assert max(count for array, count in asked if array.endswith("_end")) < 30
+
+
+def record_rows(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """List the arrays and numbers of rows that are read from now on."""
+    asked, read = list[tuple[str, int]](), Store.read_rows
+
+    def read_rows(store: Store, stage: str, name: str, array: str, start: int, stop: int) -> np.ndarray:
+        asked.append((array, stop - start))
+        return read(store, stage, name, array, start, stop)
+
+    monkeypatch.setattr(Store, "read_rows", read_rows)
+    return asked
 
 
 def test_rows_are_sorted_by_cell_and_id(tmp_path: Path) -> None:

@@ -196,14 +196,17 @@ def read_outlines(task: Task) -> Footprints:
         def rows(array: str, first: int, last: int) -> NDArray[Any]:
             return task.read_rows("footprints", found.name, array, first, last)
 
-        byte, letter = (np.cumsum([0, *rows(size, 0, found.facts["n"])]) for size in ("wkb_size", "id_size"))
+        def cuts(array: str, first: int, last: int) -> NDArray[np.int64]:
+            ends = rows(array, max(first - 1, 0), last)
+            return ends if first else np.append(0, ends)
+
         start = np.append(arrays["cell_start"], arrays["end"])
         for first, last in select_footprints(arrays["cell_box"], start, task.box):
-            text = rows("id", letter[first], letter[last]).tobytes()
-            cuts = (letter[first : last + 1] - letter[first]).tolist()
-            ids = np.array([text[a:b].decode() for a, b in pairwise(cuts)], np.str_)
-            wkb, height = rows("wkb", byte[first], byte[last]), rows("given_height", first, last)
-            parts.append(FootprintRows(wkb, byte[first : last + 1], ids, height, rows("box", first, last)))
+            byte, letter = cuts("wkb_end", first, last), cuts("id_end", first, last)
+            text = rows("id", letter[0], letter[-1]).tobytes()
+            ids = np.array([text[a:b].decode() for a, b in pairwise((letter - letter[0]).tolist())], np.str_)
+            wkb, height = rows("wkb", byte[0], byte[-1]), rows("given_height", first, last)
+            parts.append(FootprintRows(wkb, byte, ids, height, rows("box", first, last)))
     return join_footprints(parts, task.box)
 
 

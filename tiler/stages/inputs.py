@@ -48,6 +48,7 @@ def input_stages(config: Config) -> list[Stage]:
             Scope.REGION,
             read_footprint_file,
             parameters=("footprints", "footprints_identity", "layer", "id_attribute", "height_attribute"),
+            version=2,
         ),
         # What a tile needs of the footprints: it does not run again when others change.
         Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),), version=2),
@@ -122,7 +123,7 @@ def read_footprint_file(task: Task) -> Facts:
     given = task.parameters
     if not given.footprints:
         return {"n": 0, "part_like": []}
-    n, first = 0, 0
+    n = first = n_bytes = n_letters = 0
     blocks, part_like = [0], set[str]()
     for block in scan_footprints(
         place(given.footprints),
@@ -135,17 +136,19 @@ def read_footprint_file(task: Task) -> Facts:
         task.notes(block.notes)
         rows = block.rows
         names = [name.encode() for name in rows.ids.tolist()]
+        letters = np.frombuffer(b"".join(names), np.uint8)
+        # Where rows end in the whole: a tile finds its own without those before them.
         task.append(
             wkb=rows.wkb,
-            wkb_size=np.diff(rows.wkb_start),
-            id=np.frombuffer(b"".join(names), np.uint8),
-            id_size=np.array([len(name) for name in names], np.int64),
+            wkb_end=n_bytes + rows.wkb_start[1:] - rows.wkb_start[0],
+            id=letters,
+            id_end=n_letters + np.cumsum([len(name) for name in names], dtype=np.int64),
             given_height=rows.given_height,
             box=rows.box.reshape(-1, 4),
             cell_box=block.cell_box.reshape(-1, 4),
             cell_start=block.start[:-1] + n,
         )
-        n += len(rows)
+        n, n_bytes, n_letters = n + len(rows), n_bytes + len(rows.wkb), n_letters + len(letters)
         first += len(block.cell)
         blocks.append(first)
         part_like |= {name for name in rows.ids.tolist() if "-part" in name}
