@@ -159,6 +159,9 @@ def read_known_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) 
     return join_terrain(_read_rasters(task, stage, window), window)
 
 
+Ranges = list[tuple[int, int]]
+
+
 def join_rasters(task: Task, stage: str, window: NodeWindow, spacing: float) -> Dtm:
     """Read the nodes of a window from the rasters of a stage; NaN where none has them, there may be no raster."""
     parts = _read_rasters(task, stage, window)
@@ -186,28 +189,49 @@ def region_window(box: Box, spacing: float, bounds: Bounds) -> NodeWindow:
 
 
 def read_outlines(task: Task) -> Footprints:
-    """Read the footprints that meet the task's box, from the stage ``footprints``."""
-    parts = []
+    """Read the footprints that meet the task's box, from the stage ``footprints``: the rows of its cells alone."""
     (found,) = task.read("footprints", ())
-    if found.facts["n"] > 0:
-        names = ("cell_box", "cell_start", "end")
-        arrays, _ = task.store.read("footprints", found.name, names=names)
+    if found.facts["n"] == 0:
+        return join_footprints([], task.box)
+    arrays, _ = task.store.read("footprints", found.name, names=("cell_box", "cell_start", "end"))
+    ranges = select_footprints(arrays["cell_box"], np.append(arrays["cell_start"], arrays["end"]), task.box)
 
-        def rows(array: str, first: int, last: int) -> NDArray[Any]:
-            return task.read_rows("footprints", found.name, array, first, last)
+    def rows(ranges: Ranges, *names: str) -> Iterator[NDArray[Any]]:
+        read = task.read_ranges("footprints", found.name, names, ranges)
+        return (read[name] for name in names)
 
-        def cuts(array: str, first: int, last: int) -> NDArray[np.int64]:
-            ends = rows(array, max(first - 1, 0), last)
-            return ends if first else np.append(0, ends)
+    # A row begins where the one before it ends.
+    ends = rows([(max(first - 1, 0), last) for first, last in ranges], "wkb_end", "id_end")
+    (bytes_of, byte), (letters_of, letter) = (_cut_ranges(end, ranges) for end in ends)
+    (wkb,), (letters,) = rows(bytes_of, "wkb"), rows(letters_of, "id")
+    text = letters.tobytes()
+    ids = np.array([text[first:last].decode() for first, last in pairwise(letter.tolist())], np.str_)
+    return join_footprints([FootprintRows(wkb, byte, ids, *rows(ranges, "given_height", "box"))], task.box)
 
-        start = np.append(arrays["cell_start"], arrays["end"])
-        for first, last in select_footprints(arrays["cell_box"], start, task.box):
-            byte, letter = cuts("wkb_end", first, last), cuts("id_end", first, last)
-            text = rows("id", letter[0], letter[-1]).tobytes()
-            ids = np.array([text[a:b].decode() for a, b in pairwise((letter - letter[0]).tolist())], np.str_)
-            wkb, height = rows("wkb", byte[0], byte[-1]), rows("given_height", first, last)
-            parts.append(FootprintRows(wkb, byte, ids, height, rows("box", first, last)))
-    return join_footprints(parts, task.box)
+
+def _cut_ranges(ends: NDArray[np.int64], ranges: Ranges) -> tuple[Ranges, NDArray[np.int64]]:
+    """Where ranges of rows are in an array that has one row behind the other, and where each begins in them.
+
+    Parameters
+    ----------
+    ends : int64
+        Where rows end in that array: those of the ranges, and the one before each but for the first of all.
+    ranges : list of (first, last)
+        Rows.
+
+    Examples
+    --------
+    >>> _cut_ranges(np.array([2, 3, 7, 9, 12]), [(0, 2), (4, 6)])
+    ([(0, 3), (7, 12)], array([0, 2, 3, 5, 8]))
+    """
+    spans, sizes, row = list[tuple[int, int]](), [np.zeros(1, np.int64)], 0
+    for first, last in ranges:
+        count = last - first + (first > 0)
+        found = ends[row : row + count] if first else np.append(0, ends[:count])
+        row += count
+        spans.append((int(found[0]), int(found[-1])))
+        sizes.append(np.diff(found))
+    return spans, np.cumsum(np.concatenate(sizes))
 
 
 def read_buildings(task: Task, box: Box) -> Buildings:
