@@ -27,6 +27,7 @@ GRID = 0.001
 ATTRIBUTES = ("number", "ground_height", "roof_height", "height", "members")
 RUN = 512  # buildings that are written at once, and share their vertices
 COPY_BYTES = 1 << 20
+ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 GROUND, ROOF, WALL = range(3)
 # Semantic surfaces of every solid, by the numbers above.
 SURFACES = ("GroundSurface", "RoofSurface", "WallSurface")
@@ -178,7 +179,8 @@ class _Writer:
             places = solids.vertices * GRID + self.origin
             self.box = np.vstack((self.box, places.min(axis=0), places.max(axis=0)))
             self.box = np.stack((self.box.min(axis=0), self.box.max(axis=0)))
-            text = ",\n".join(_text(row) for row in solids.vertices.tolist())
+            # All at once, then one a line: a call for each takes four times as long.
+            text = _text(solids.vertices.tolist())[1:-1].replace("],[", "],\n[")
             self.spool.write(f"{',' if self.n_vertices else ''}\n{text}".encode("ascii"))
             self.n_vertices += len(solids.vertices)
 
@@ -384,7 +386,7 @@ def _solid(floor: list[list[int]], roof: list[list[int]], walls: list[list[list[
 
 
 def _text(document: object) -> str:
-    return json.dumps(document, separators=(",", ":"), allow_nan=False)
+    return ENCODER.encode(document)
 
 
 def _parse(document: dict[str, Any]) -> CityModel:
