@@ -2,7 +2,6 @@
 
 import argparse
 import gc
-import importlib
 import json
 import logging
 import os
@@ -18,6 +17,7 @@ from tiler import fork_server
 from tiler.api import with_file
 from tiler.config import Config, annotated_defaults, make_config
 from tiler.export import FORMATS
+from tiler.importing import uncollected
 from tiler.jobs.commands import describe_job, find_run, job_line
 from tiler.parser import Handler, build_parser
 from tiler.places import place, refuse_bucket
@@ -123,12 +123,12 @@ def _run_config(
 ) -> int:
     if config.workers and not config.on_cluster:
         fork_server.begin()
-    from tiler.events import EventLog, open_log
-    from tiler.out_folder import refuse_result
-    from tiler.run import run
-    from tiler.terminal import make_views, print_last_line, print_summary
+    with uncollected():
+        from tiler.events import EventLog, open_log
+        from tiler.out_folder import refuse_result
+        from tiler.run import run
+        from tiler.terminal import make_views, print_last_line, print_summary
 
-    importlib.import_module("tiler.frozen")  # after all others, once a process
     if report:
         refuse_bucket(config.out, "--report")
     out = place(config.out)

@@ -20,7 +20,7 @@ ENVIRONMENT: Mapping[str, int] = {
     "MALLOC_TRIM_THRESHOLD_": 2**28,
     "MALLOC_MMAP_THRESHOLD_": 2**25,
 }
-MODULES = ["distributed.nanny", "tiler.run", "tiler.frozen"]
+PRELOAD = "tiler.preload"
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 
 
@@ -28,7 +28,7 @@ def begin() -> None:
     """Start it in the background, unless it runs; a second call does nothing."""
     if METHOD != "forkserver":
         return
-    multiprocessing.set_forkserver_preload(MODULES)
+    multiprocessing.set_forkserver_preload([PRELOAD])
     earlier = {name: os.environ.get(name) for name in ENVIRONMENT}
     os.environ.update({name: str(value) for name, value in ENVIRONMENT.items()})
     try:

@@ -1,0 +1,11 @@
+"""Imported by the process that workers are forked from: what all of them need, see `tiler.fork_server`."""
+
+import importlib
+
+from tiler.importing import uncollected
+
+MODULES = ("distributed.nanny", "tiler.run")
+
+with uncollected():
+    for name in MODULES:
+        importlib.import_module(name)
