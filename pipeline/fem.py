@@ -5,7 +5,6 @@ is symmetric and positive definite, so conjugate gradients reach the same soluti
 """
 
 import numpy as np
-import pyamg
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
@@ -79,6 +78,8 @@ def solve_laplace(
     SolverError
         If the residual is not finite or above its bound.
     """
+    import pyamg  # here, as it takes 60 ms and hardly a run needs it
+
     matrix = stiffness_matrix(mesh)
     free = np.flatnonzero(~fixed)
     given = np.where(fixed, values, 0.0)

@@ -9,8 +9,8 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
+import scipy  # what is asked of it is imported then
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from pipeline.pointcloud import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED, PointCloud
 
@@ -120,7 +120,7 @@ def _find_cells(xy: NDArray[np.float64], bounds: Bounds) -> NDArray[np.int64]:
 
 def _fill_gaps(surface: NDArray[np.float64]) -> NDArray[np.float64]:
     for _ in range(GAP):
-        beside = ndimage.minimum_filter(surface, size=3, mode="constant", cval=np.inf)
+        beside = scipy.ndimage.minimum_filter(surface, size=3, mode="constant", cval=np.inf)
         surface = np.where(np.isinf(surface), beside, surface)
     return surface
 
@@ -131,9 +131,9 @@ def _open_progressively(surface: NDArray[np.float64]) -> NDArray[np.float64]:
     terrain = surface.copy()
     for half_width in WINDOWS:
         size = 2 * math.ceil(half_width / CELL) + 1
-        eroded = ndimage.minimum_filter(terrain, size=size, mode="constant", cval=np.inf)
+        eroded = scipy.ndimage.minimum_filter(terrain, size=size, mode="constant", cval=np.inf)
         eroded[gap] = -np.inf
-        opened = ndimage.maximum_filter(eroded, size=size, mode="constant", cval=-np.inf)
+        opened = scipy.ndimage.maximum_filter(eroded, size=size, mode="constant", cval=-np.inf)
         object_cells = ~gap & (terrain > opened + (SLOPE * half_width + STEP))
         terrain = np.where(object_cells, opened, terrain)
     return terrain

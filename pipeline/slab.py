@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+import scipy  # what is asked of it is imported then
 from numpy.typing import NDArray
-from scipy.fft import dctn, idctn
 
 from pipeline.raster import node_window
 from pipeline.terrain import Dtm, cut_terrain, sample_dtm
@@ -170,7 +170,7 @@ def smooth_slab(
     """
     low, size = np.array(bounds[:2]), np.array(bounds[2:]) - np.array(bounds[:2])
     n_x, n_y = (max(int(n), 1) for n in np.rint(size / grid_spacing))
-    spectrum = dctn(_terrain_on_grid(dtm, bounds, n_x, n_y), type=1)
+    spectrum = scipy.fft.dctn(_terrain_on_grid(dtm, bounds, n_x, n_y), type=1)
     wave = np.hypot(np.pi / size[0] * np.arange(n_x + 1), np.pi / size[1] * np.arange(n_y + 1)[:, None])
     position = (xy - low) / size * [n_x, n_y]
     nodes = _nodes_around(position, n_x, n_y)
@@ -235,7 +235,7 @@ def _choose_way_back(shape: tuple[int, ...], nodes: Nodes) -> Callable[[NDArray[
     row, last_row, column, last_column = nodes
     rows, columns = np.arange(row, last_row + 1), np.arange(column, last_column + 1)
     if min(len(rows), len(columns)) > SUMS * min(shape):
-        return lambda spectrum: idctn(spectrum, type=1)[row : last_row + 1, column : last_column + 1]
+        return lambda spectrum: scipy.fft.idctn(spectrum, type=1)[row : last_row + 1, column : last_column + 1]
     along_y, along_x = _cosines(rows, shape[0]), _cosines(columns, shape[1])
     if len(rows) <= len(columns):
         along_x = np.ascontiguousarray(along_x.T)

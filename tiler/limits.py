@@ -24,6 +24,13 @@ from tiler.task import Failure, Record, Task, run_task
 TASKS = ".tasks"  # folder beside the store, with a file for every task that runs
 TIMEOUT = "Timeout ("  # how the fault handler begins at the time limit
 REFUSE_AT, KILL_AT = 0.9, 0.95  # of the limit: no more is given; a process is ended whose memory was not counted
+CONTAINER_MEMORY = (  # where Linux tells what a container may take (bytes): control groups of version 1, then of 2
+    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+    "/sys/fs/cgroup/memory/memory.soft_limit_in_bytes",
+    "/sys/fs/cgroup/memory.max",
+    "/sys/fs/cgroup/memory.high",
+    "/sys/fs/cgroup/memory.low",
+)
 ADVICE = "use fewer workers, give each more memory (--memory-limit), or make tiles smaller"
 
 
@@ -140,7 +147,9 @@ def limit_memory(memory: int) -> None:
 
 
 def machine_memory() -> int:
-    """Memory of this machine, or of the container it is (bytes)."""
-    from distributed.system import MEMORY_LIMIT
-
-    return int(MEMORY_LIMIT)
+    """Memory of this machine, or of the container it is (bytes): what Dask finds, whose import takes 0.2 s."""
+    found = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), resource.getrlimit(resource.RLIMIT_RSS)[1]]
+    for path in CONTAINER_MEMORY:
+        with suppress(OSError, ValueError):  # not there, or "max"
+            found.append(int(Path(path).read_text()))
+    return min(memory for memory in found if memory > 0)

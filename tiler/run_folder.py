@@ -9,7 +9,6 @@ from json import JSONDecodeError
 from pathlib import Path
 from typing import Any
 
-import meshio
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -172,6 +171,8 @@ def read_volume(path: Path, *, regions: bool = False) -> tuple[TetMesh, NDArray[
     -----
     meshio takes some 130 bytes a cell for a moment.
     """
+    import meshio  # here, as it takes 50 ms and a run needs it not
+
     try:
         mesh = meshio.vtu.read(str(path))
     # A damaged file shows in many ways, SystemExit among them.
