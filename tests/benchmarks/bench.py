@@ -21,14 +21,15 @@ COMMAND = [sys.executable, "-m", "tiler.cli"]
 
 
 def citystitch(*arguments: str, cores: int = 2) -> None:
-    """Run a command on some cores, without further threads of the numerical libraries."""
+    """Run a command on some cores, without further threads of the numerical libraries; modules compiled once."""
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+    fixed = threads | {"PYTHONDONTWRITEBYTECODE": ""}
     pin: Callable[[], None] | None = None
     if hasattr(os, "sched_setaffinity"):
         chosen = sorted(os.sched_getaffinity(0))[:cores]
         pin = lambda: os.sched_setaffinity(0, chosen)  # noqa: E731
     subprocess.run(
-        [*COMMAND, *arguments], check=True, env=os.environ | threads, preexec_fn=pin, stdout=subprocess.DEVNULL
+        [*COMMAND, *arguments], check=True, env=os.environ | fixed, preexec_fn=pin, stdout=subprocess.DEVNULL
     )
 
 
