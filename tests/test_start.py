@@ -9,16 +9,29 @@ from distributed.system import memory_limit
 from tiler.importing import uncollected
 from tiler.limits import machine_memory
 
+DRIVER = ("tiler.terminal", "tiler.run", "tiler.worker_setup")
 UNNEEDED = ("dask", "distributed", "meshio", "pyamg", "scipy.fft", "scipy.io", "scipy.ndimage")
 
 
-def test_a_run_in_one_process_imports_what_it_needs_alone() -> None:
+def find_imported(names: tuple[str, ...], modules: tuple[str, ...]) -> list[str]:
+    """Which of the names there are in a fresh process that has imported some modules, and looked at its memory."""
     code = (
-        "import sys, tiler.run, tiler.terminal; from tiler.limits import machine_memory; machine_memory(); "
-        f"print(*(name for name in {UNNEEDED} if name in sys.modules))"
+        f"import sys, {', '.join(modules)}; from tiler.limits import machine_memory; machine_memory(); "
+        f"print(*(name for name in {names} if name in sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "\n"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+
+
+def test_a_run_in_one_process_imports_what_it_needs_alone() -> None:
+    assert find_imported(UNNEEDED, ("tiler.run", "tiler.terminal")) == []
+
+
+def test_what_only_sends_tasks_to_workers_does_not_wait_for_zarr() -> None:
+    assert find_imported(("zarr",), DRIVER) == []
+
+
+def test_workers_are_born_with_what_tasks_import_as_they_run() -> None:
+    assert find_imported(("distributed", "zarr"), ("tiler.preload",)) == ["distributed", "zarr"]
 
 
 def test_the_memory_of_this_machine_is_what_dask_finds() -> None:

@@ -4,7 +4,7 @@ import importlib
 
 from tiler.importing import uncollected
 
-MODULES = ("distributed.nanny", "tiler.run")
+MODULES = ("distributed.nanny", "tiler.cli", "tiler.run", "zarr")
 
 with uncollected():
     for name in MODULES:
