@@ -104,8 +104,8 @@ def front(expected: dict[str, int], counts: dict[str, int]) -> str:
 
 
 def start(command: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
-    """Start a process group whose words go to a file."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    """Start a process group whose words go to a file, as Python writes to files where nothing else is asked."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": ""}
     with log.open("wb") as words:
         return subprocess.Popen(
             command, stdout=words, stderr=subprocess.STDOUT, start_new_session=True, env=environment, cwd=ROOT

@@ -71,6 +71,7 @@ from tiler.joining import lease
 folder_lock._place = lambda: f"machine {os.getpid()}"
 folder_lock.BEAT, folder_lock.SILENCE, lease.BEAT, lease.SILENCE = 0.3, 4.0, 0.3, 4.0
 """
+SAY = "import time; from tiler.cli import say; say('works as a'); time.sleep(600)"
 MAIN = "sys.exit(main(sys.argv[2:]))"
 
 
@@ -460,6 +461,19 @@ def test_more_tasks_are_in_flight_when_workers_come(tmp_path: Path) -> None:
     assert engine._window == LEAST_WINDOW
     executor.workers = 10
     assert engine._window == 10 * PER_WORKER
+
+
+def test_words_are_in_a_log_file_at_once(tmp_path: Path) -> None:
+    process = start([sys.executable, "-c", SAY], tmp_path / "log")
+    try:
+        end = time.monotonic() + 60
+        while (tmp_path / "log").read_text() != "works as a\n":
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        assert process.poll() is None
+    finally:
+        process.kill()
+        process.wait()
 
 
 @pytest.fixture(scope="module")

@@ -69,8 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def say(text: str) -> None:
-    """Print one line, whatever a path or an attribute in it holds."""
-    print(printable(text))
+    """Print one line at once, whatever a path or an attribute in it holds; into a log file, too."""
+    print(printable(text), flush=True)
 
 
 def _find_cache() -> None:
