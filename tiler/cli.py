@@ -150,8 +150,9 @@ def _run_config(
 def _join(options: argparse.Namespace) -> int:
     config = make_config(with_file(vars(options)))
     fork_server.begin()
-    from tiler.joining.join import join
-    from tiler.terminal import make_views, print_last_line, print_summary
+    with uncollected():
+        from tiler.joining.join import join
+        from tiler.terminal import make_views, print_last_line, print_summary
 
     joined = join(
         config,

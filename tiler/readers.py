@@ -36,6 +36,8 @@ CHUNK_ROWS = CHUNK_BYTES // 12  # of coordinates in the store, three units of 4 
 BAND = 3 * CHUNK_ROWS  # rows of points that are read at a time, 1.05 million
 CLASSES = 256  # that a point may have
 
+Ranges = list[tuple[int, int]]  # first row and the one behind the last, ascending and apart from each other
+
 
 def grow(box: Box, by: float) -> Box:
     """Grow a box on all sides (m)."""
@@ -159,9 +161,6 @@ def read_known_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) 
     return join_terrain(_read_rasters(task, stage, window), window)
 
 
-Ranges = list[tuple[int, int]]
-
-
 def join_rasters(task: Task, stage: str, window: NodeWindow, spacing: float) -> Dtm:
     """Read the nodes of a window from the rasters of a stage; NaN where none has them, there may be no raster."""
     parts = _read_rasters(task, stage, window)
@@ -196,17 +195,17 @@ def read_outlines(task: Task) -> Footprints:
     arrays, _ = task.store.read("footprints", found.name, names=("cell_box", "cell_start", "end"))
     ranges = select_footprints(arrays["cell_box"], np.append(arrays["cell_start"], arrays["end"]), task.box)
 
-    def rows(ranges: Ranges, *names: str) -> Iterator[NDArray[Any]]:
-        read = task.read_ranges("footprints", found.name, names, ranges)
-        return (read[name] for name in names)
+    def read(ranges: Ranges, *names: str) -> dict[str, NDArray[Any]]:
+        return task.read_ranges("footprints", found.name, names, ranges)
 
     # A row begins where the one before it ends.
-    ends = rows([(max(first - 1, 0), last) for first, last in ranges], "wkb_end", "id_end")
-    (bytes_of, byte), (letters_of, letter) = (_cut_ranges(end, ranges) for end in ends)
-    (wkb,), (letters,) = rows(bytes_of, "wkb"), rows(letters_of, "id")
-    text = letters.tobytes()
+    ends = read([(max(first - 1, 0), last) for first, last in ranges], "wkb_end", "id_end")
+    wkb_ranges, byte = _cut_ranges(ends["wkb_end"], ranges)
+    id_ranges, letter = _cut_ranges(ends["id_end"], ranges)
+    wkb, text = read(wkb_ranges, "wkb")["wkb"], read(id_ranges, "id")["id"].tobytes()
     ids = np.array([text[first:last].decode() for first, last in pairwise(letter.tolist())], np.str_)
-    return join_footprints([FootprintRows(wkb, byte, ids, *rows(ranges, "given_height", "box"))], task.box)
+    rest = read(ranges, "given_height", "box")
+    return join_footprints([FootprintRows(wkb, byte, ids, rest["given_height"], rest["box"])], task.box)
 
 
 def _cut_ranges(ends: NDArray[np.int64], ranges: Ranges) -> tuple[Ranges, NDArray[np.int64]]:
@@ -256,7 +255,7 @@ class _FileRows:
     """Rows of a file to read, as ranges, and what it says of their units and classes."""
 
     name: str
-    ranges: list[tuple[int, int]]
+    ranges: Ranges
     scale: Triple
     offset: Triple
     marks_buildings: bool
@@ -275,7 +274,7 @@ def _cut_bands(files: Sequence[_FileRows]) -> Iterator[list[_FileRows]]:
     band: list[_FileRows] = []
     room = BAND
     for file in files:
-        ranges: list[tuple[int, int]] = []
+        ranges: Ranges = []
         for begin, stop in file.ranges:
             first = begin
             while stop - first > room:
@@ -331,7 +330,7 @@ def _read_files(
 
 def _ranges_of_blocks(
     cell: NDArray[np.int64], row: NDArray[np.int64], block: NDArray[np.int64], box: Box
-) -> list[tuple[int, int]]:
+) -> Ranges:
     """Ranges of rows to read, ascending."""
     blocks = pairwise(block.tolist())
     return [
