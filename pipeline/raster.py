@@ -203,6 +203,26 @@ def sample_dtm(dtm: Dtm, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     return height
 
 
+def sample_grid(dtm: Dtm, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sample ground heights at all nodes of a grid, as `sample_dtm` does.
+
+    Parameters
+    ----------
+    dtm : Dtm
+        Terrain without empty nodes.
+    x, y : float64, (nx,) and (ny,)
+        Coordinates of its columns and of its rows (m).
+
+    Returns
+    -------
+    float64, (ny, nx)
+        Heights (m).
+    """
+    height = np.empty((len(y), len(x)))
+    _sample_grid(dtm.z, dtm.i0, dtm.j0, dtm.spacing, x, y, height)
+    return height
+
+
 def measure_over(dtm: Dtm, xyz: NDArray[np.float64], among: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Measure how high terrain is over points: `sample_dtm` minus their own heights.
 
@@ -234,6 +254,21 @@ def _sample(
 ) -> None:
     for k in range(len(xy)):
         height[k] = _height_at(z, i0, j0, spacing, xy[k, 0], xy[k, 1])
+
+
+@numba.njit(cache=True, nogil=True)
+def _sample_grid(
+    z: NDArray[np.float64],
+    i0: int,
+    j0: int,
+    spacing: float,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    height: NDArray[np.float64],
+) -> None:
+    for row in range(len(y)):
+        for column in range(len(x)):
+            height[row, column] = _height_at(z, i0, j0, spacing, x[column], y[row])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ What the terrain at some place adds fades with the distance d like exp(-pi d / (
 tile is as good as the region: `slab_window` for a mesh, `lift_places` for places that belong to none.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numba
@@ -17,7 +17,7 @@ import scipy  # what is asked of it is imported then
 from numpy.typing import NDArray
 
 from pipeline.raster import node_window
-from pipeline.terrain import Dtm, cut_terrain, sample_dtm
+from pipeline.terrain import Dtm, cut_terrain, sample_dtm, sample_grid
 
 REACH = 3.0  # domain heights; terrain farther from a mesh counts for nothing
 BLOCK = 1.0  # domain heights; side of the squares that `lift_places` works in
@@ -103,30 +103,30 @@ def lift_places(
     -----
     The plane is divided into squares as wide as the domain is high, aligned to the CRS; all places of one have
     a common window, which ends a domain height short of `slab_reach` beyond the square; nodes of tiles that are
-    absent are filled from that window alone. Levels jump between
-    squares by what that leaves out, some 4 % of the relief's changes there: good for choosing a layer, not
-    for a mesh. Cost is one small transform a square.
+    absent are filled from that window alone. Levels jump between squares by what that leaves out, some 4 % of the
+    relief's changes there: good for choosing a layer, not for a mesh. Cost is one small transform a square, and
+    a sum of its modes at the square's nodes for each level.
     """
-    side = BLOCK * domain_height
+    side, margin = BLOCK * domain_height, (REACH - BLOCK) * domain_height
+    levels = _even_levels(domain_height, n_layers) if shape is None else shape.levels
+    complete = not np.isnan(dtm.z).any()
     within = np.clip(xy, region[:2], region[2:])
     block, member = np.unique(np.floor(within / side), axis=0, return_inverse=True)
-    margin = (REACH - BLOCK) * domain_height
     z = np.empty((len(xy), n_layers + 1))
     order = np.argsort(member.reshape(-1), kind="stable")
     ends = np.searchsorted(member.reshape(-1)[order], np.arange(len(block) + 1))
+    lifts: dict[tuple[Bounds, Bounds], _SquareLift] = {}
     for corner, begin, end in zip(block, ends[:-1], ends[1:], strict=True):
         rows = order[begin:end]
+        square = _clip(corner * side, (corner + 1) * side, region)
         window = _clip(corner * side - margin, (corner + 1) * side + margin, region)
-        z[rows] = smooth_slab(
-            cut_terrain(dtm, node_window(window, dtm.spacing)),
-            within[rows],
-            window,
-            domain_height=domain_height,
-            n_layers=n_layers,
-            grid_spacing=grid_spacing,
-            shape=shape,
-        )
-    return z
+        kind = _seen_from(square, window), _seen_from(window, window)
+        if kind not in lifts:
+            lifts[kind] = _prepare_lift(*kind, levels, grid_spacing)
+        terrain = dtm if complete else cut_terrain(dtm, node_window(window, dtm.spacing))
+        z[rows, 0] = sample_dtm(terrain, within[rows])
+        z[rows, 1:] = levels[1:] + lifts[kind](terrain, within[rows], window)
+    return z if shape is None else shape_levels(z, shape)
 
 
 def smooth_slab(
@@ -169,27 +169,17 @@ def smooth_slab(
     Memory is that of a few levels of the grid and of the result.
     """
     low, size = np.array(bounds[:2]), np.array(bounds[2:]) - np.array(bounds[:2])
-    n_x, n_y = (max(int(n), 1) for n in np.rint(size / grid_spacing))
+    n_x, n_y = _count_cells(size, grid_spacing)
     spectrum = scipy.fft.dctn(_terrain_on_grid(dtm, bounds, n_x, n_y), type=1)
-    wave = np.hypot(np.pi / size[0] * np.arange(n_x + 1), np.pi / size[1] * np.arange(n_y + 1)[:, None])
     position = (xy - low) / size * [n_x, n_y]
     nodes = _nodes_around(position, n_x, n_y)
-    node, weight = _bilinear(position, n_x, n_y, nodes)
+    node, weight = _bilinear(position, nodes)
     back = _choose_way_back(spectrum.shape, nodes)
-    levels = domain_height * np.arange(n_layers + 1) / n_layers if shape is None else shape.levels
-    rises = np.full(n_layers, domain_height / n_layers) if shape is None else np.diff(levels)
+    levels = _even_levels(domain_height, n_layers) if shape is None else shape.levels
     z = np.empty((len(xy), n_layers + 1))
     z[:, 0] = sample_dtm(dtm, xy)
-    # cosh(k (H - z)) / cosh(k H) has a part that fades with the height z, and one that grows: exp(k (z - 2 H)).
-    fading = spectrum / (1 + np.exp(-2 * wave * domain_height))
-    growing = fading * np.exp(-2 * wave * domain_height)
-    for level in range(1, n_layers + 1):
-        if level == 1 or rises[level - 1] != rises[level - 2]:
-            fade = np.exp(-np.minimum(wave * rises[level - 1], STEEPEST))
-        fading *= fade
-        growing /= fade
-        lifted = back(fading + growing).ravel()
-        z[:, level] = levels[level] + (lifted[node] * weight).sum(axis=1)
+    for level, damped in enumerate(_damp(spectrum, size, levels), 1):
+        z[:, level] = levels[level] + (back(damped).ravel()[node] * weight).sum(axis=1)
     return z if shape is None else shape_levels(z, shape)
 
 
@@ -217,10 +207,85 @@ def _clip(low: NDArray[np.float64], high: NDArray[np.float64], region: Bounds) -
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
+@dataclass(frozen=True, eq=False)
+class _SquareLift:
+    """How the terrain in a window lifts the levels in a square of it: the same for all squares that lie alike.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Cells of the window's grid along x and y.
+    nodes : (int, int, int, int)
+        Nodes around the square, as from `_nodes_around`.
+    along_y, along_x : float64, (r, ny + 1) and (nx + 1, c)
+        What each mode adds at their rows and at their columns.
+    damping : float64, (n_layers, ny + 1, nx + 1)
+        What is left of each mode at every level but the ground.
+    """
+
+    shape: tuple[int, int]
+    nodes: Nodes
+    along_y: NDArray[np.float64]
+    along_x: NDArray[np.float64]
+    damping: NDArray[np.float64]
+
+    def __call__(self, dtm: Dtm, xy: NDArray[np.float64], window: Bounds) -> NDArray[np.float64]:
+        """Terrain at places in the square, as it is felt at every level but the ground (m); (n, n_layers)."""
+        low, size = np.array(window[:2]), np.subtract(window[2:], window[:2])
+        spectrum = scipy.fft.dctn(_terrain_on_grid(dtm, window, *self.shape), type=1)
+        node, weight = _bilinear((xy - low) / size * self.shape, self.nodes)
+        lifted = _sum_damped(spectrum, self.damping, self.along_y, self.along_x)
+        felt: NDArray[np.float64] = (lifted.reshape(len(lifted), -1)[:, node] * weight).sum(axis=2).T
+        return felt
+
+
+def _prepare_lift(square: Bounds, window: Bounds, levels: NDArray[np.float64], grid_spacing: float) -> _SquareLift:
+    size = np.array(window[2:])
+    n_x, n_y = _count_cells(size, grid_spacing)
+    nodes = _nodes_around(np.reshape(square, (2, 2)) / size * [n_x, n_y], n_x, n_y)
+    damping = np.array(list(_damp(np.ones((n_y + 1, n_x + 1)), size, levels)))
+    along_y = _cosines(np.arange(nodes[0], nodes[1] + 1), n_y + 1)
+    along_x = _cosines(np.arange(nodes[2], nodes[3] + 1), n_x + 1)
+    return _SquareLift((n_x, n_y), nodes, along_y, np.ascontiguousarray(along_x.T), damping)
+
+
+def _seen_from(area: Bounds, window: Bounds) -> Bounds:
+    """An area in coordinates that start at a window's corner, in whole millimetres."""
+    west, south, east, north = np.round(np.subtract(area, window[:2] * 2), 3).tolist()
+    return west, south, east, north
+
+
+def _even_levels(domain_height: float, n_layers: int) -> NDArray[np.float64]:
+    return domain_height * np.arange(n_layers + 1) / n_layers
+
+
+def _count_cells(size: NDArray[np.float64], grid_spacing: float) -> tuple[int, int]:
+    """Cells of a grid along x and y."""
+    n_x, n_y = (max(int(n), 1) for n in np.rint(size / grid_spacing))
+    return n_x, n_y
+
+
+def _damp(
+    spectrum: NDArray[np.float64], size: NDArray[np.float64], levels: NDArray[np.float64]
+) -> Iterator[NDArray[np.float64]]:
+    """What is left of the modes of a slab's bottom (ny + 1, nx + 1) at each level above it, in turn."""
+    n_y, n_x = spectrum.shape
+    wave = np.hypot(np.pi / size[0] * np.arange(n_x), np.pi / size[1] * np.arange(n_y)[:, None])
+    # cosh(k (H - z)) / cosh(k H) has a part that fades with the height z, and one that grows: exp(k (z - 2 H)).
+    fading = spectrum / (1 + np.exp(-2 * wave * levels[-1]))
+    growing = fading * np.exp(-2 * wave * levels[-1])
+    before = 0.0
+    for rise in np.diff(levels):
+        if rise != before:
+            fade, before = np.exp(-np.minimum(wave * rise, STEEPEST)), rise
+        fading *= fade
+        growing /= fade
+        yield fading + growing
+
+
 def _terrain_on_grid(dtm: Dtm, bounds: Bounds, n_x: int, n_y: int) -> NDArray[np.float64]:
     x, y = np.linspace(bounds[0], bounds[2], n_x + 1), np.linspace(bounds[1], bounds[3], n_y + 1)
-    nodes = np.column_stack((np.tile(x, n_y + 1), np.repeat(y, n_x + 1)))
-    return sample_dtm(dtm, nodes).reshape(n_y + 1, n_x + 1)
+    return sample_grid(dtm, x, y)
 
 
 def _nodes_around(position: NDArray[np.float64], n_x: int, n_y: int) -> Nodes:
@@ -255,6 +320,20 @@ def _cosines(place: NDArray[np.int64], n: int) -> NDArray[np.float64]:
 
 
 @numba.njit(cache=True, nogil=True)
+def _sum_damped(
+    spectrum: NDArray[np.float64],
+    damping: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    columns: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """`_sum_modes` at every level, damped as there; float64, (n_layers, r, c)."""
+    found = np.empty((len(damping), len(rows), columns.shape[1]))
+    for level in range(len(damping)):
+        found[level] = _sum_modes(damping[level] * spectrum, rows, columns)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
 def _sum_modes(
     spectrum: NDArray[np.float64], rows: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -271,12 +350,10 @@ def _sum_modes(
     return found
 
 
-def _bilinear(
-    position: NDArray[np.float64], n_x: int, n_y: int, nodes: Nodes
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _bilinear(position: NDArray[np.float64], nodes: Nodes) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Flat indices among some nodes and weights of the four around each position, given in units of the grid."""
-    row, _, column, last_column = nodes
-    cell = np.clip(np.floor(position).astype(np.int64), 0, [n_x - 1, n_y - 1])
+    row, last_row, column, last_column = nodes
+    cell = np.clip(np.floor(position).astype(np.int64), [column, row], [last_column - 1, last_row - 1])
     s, t = (position - cell).T
     wide = last_column - column + 1
     first = (cell[:, 1] - row) * wide + cell[:, 0] - column

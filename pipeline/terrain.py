@@ -21,6 +21,7 @@ from pipeline.raster import (
     join_dtm,
     node_window,
     sample_dtm,
+    sample_grid,
     window_of,
     windows_meet,
 )
@@ -36,6 +37,7 @@ __all__ = [
     "fill_dtm",
     "join_terrain",
     "sample_dtm",
+    "sample_grid",
 ]
 
 

@@ -198,6 +198,22 @@ def test_windows_differ_by_little_from_the_region() -> None:
     assert near.tobytes() == alone.tobytes()
 
 
+@pytest.mark.parametrize("size", [(150.0, 120.0), (163.7, 97.3), (118.0, 60.0)])
+@pytest.mark.parametrize("shaped", [False, True])
+def test_places_are_lifted_as_meshes_where_both_see_the_region(size: tuple[float, float], shaped: bool) -> None:
+    bounds = (300.0, 240.0, 300.0 + size[0], 240.0 + size[1])
+    dtm = hilly_dtm(bounds, relief=40.0, length=80.0, noise=1.0)
+    shape = SlabShape(np.array([0.0, 4.0, 12.0, 20.0, 40.0, 60.0]), 12.0, 90.0) if shaped else None
+    xy = np.random.default_rng(0).uniform(bounds[:2], bounds[2:], (300, 2))
+    xy[:3] = bounds[:2], bounds[2:], (360.0, 300.0)
+    lifted, meshed = (
+        way(dtm, xy, bounds, domain_height=60.0, n_layers=5, grid_spacing=10.0, shape=shape)
+        for way in (lift_places, smooth_slab)
+    )
+    np.testing.assert_allclose(lifted, meshed, rtol=0, atol=1e-5)
+    assert np.ptp(lifted[:, 3]) > 1
+
+
 @pytest.mark.parametrize("box", [(0.0, 0.0, 9.0, 9.0), (700.0, 40.0, 725.0, 690.0), (0.0, 380.0, 700.0, 410.0)])
 def test_sums_for_a_few_nodes_give_what_the_transform_gives(box: Bounds, monkeypatch: pytest.MonkeyPatch) -> None:
     bounds = (0.0, 0.0, 730.0, 690.0)

@@ -116,7 +116,7 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    version = 4 if layered else 3
+    version = 5 if layered else 3
     return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=version)
 
 

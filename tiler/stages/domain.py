@@ -39,7 +39,7 @@ def layer_stages(config: Config, domain: Domain) -> list[Stage]:
     reach = mesh_reach(config, domain) + 2 * config.dtm_spacing
     reads = (Read("model", own=True), Read(terrain_stage(config), reach, around="model"))
     parameters = (*layer_parameters(config), "dtm_spacing", *(PAD_PARAMETERS[:1] if config.padded else ()))
-    return [Stage("layers", Scope.TILE, choose_tile_layers, reads, parameters, version=2)]
+    return [Stage("layers", Scope.TILE, choose_tile_layers, reads, parameters, version=3)]
 
 
 def mesh_reach(config: Config, domain: Domain) -> float:
