@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo docs test test-long lint bench bench-tiles bench-exports simulate studies quality reliability clean
+.PHONY: demo docs test test-long lint bench bench-tiles bench-exports kernels simulate quality reliability clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("citystitch needs Python 3.11 or newer, this is " + sys.version) if sys.version_info < (3, 11) else None'
@@ -31,14 +31,15 @@ lint: $(STAMP)
 	$(BIN)/mypy
 
 bench: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check py-spy
 	$(BIN)/python -m tests.benchmarks.bench
+	$(BIN)/python -m pytest -o addopts= tests/benchmarks
+
+kernels: $(STAMP)
+	$(BIN)/python -m pytest -o addopts= -q --benchmark-disable tests/benchmarks
 
 bench-tiles: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.tiles
-
-studies: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check py-spy
-	$(BIN)/python -m tests.benchmarks.studies
 
 bench-exports: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.exports

@@ -1,170 +1,326 @@
-"""`make bench`: time and memory of whole runs on synthetic cities, medians, written to docs/benchmarks.md.
+"""`make bench`: how cost grows with cells, buildings, area, workers and tile size, and where the time goes.
 
-Every figure is of a fresh process, after one run that fills numba's cache.
+The first two are the paper's studies (its section 2.2): (a) cost against the number of cells, (b) against that of
+buildings. What is measured is kept in docs/benchmarks.json, a study each, and docs/benchmarks.md and its pictures
+are written from that: `python -m tests.benchmarks.bench cells` measures one study anew and leaves the others.
 """
 
 import json
 import os
-import platform
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-RUNS = 3
-REPORT = Path(__file__).resolve().parents[2] / "docs" / "benchmarks.md"
-INGEST = ("points", "footprints")
-COMMAND = [sys.executable, "-m", "tiler.cli"]
+import numpy as np
+
+from tests.benchmarks.bench_report import CHOICE, DOCS, MEASURED, step_seconds, write_report
+from tests.benchmarks.runs import COMMAND, citystitch, record_of
+
+KEPT = DOCS / "benchmarks.json"
+MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
+BUILDINGS = (100, 300, 1000, 3000, 10_000, 20_000, 50_000)
+SIDES = (1000, 2000, 3000, 5000)  # m
+LARGE = 10_000  # m, with --large
+TILES_A_SIDE = (8, 16, 32)
+TILES = (250, 500, 850, 1250, 2500)  # m, on 2.5 km
+WAYS = (
+    "",
+    "--mesher layered",
+    "--simplify paper --mesher layered",
+    "--simplify paper --mesher layered --smoother fem",
+)
 
 
-def citystitch(*arguments: str, cores: int = 2) -> None:
-    """Run a command on some cores, without further threads of the numerical libraries; modules compiled once."""
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    fixed = threads | {"PYTHONDONTWRITEBYTECODE": ""}
-    pin: Callable[[], None] | None = None
-    if hasattr(os, "sched_setaffinity"):
-        chosen = sorted(os.sched_getaffinity(0))[:cores]
-        pin = lambda: os.sched_setaffinity(0, chosen)  # noqa: E731
-    subprocess.run(
-        [*COMMAND, *arguments], check=True, env=os.environ | fixed, preexec_fn=pin, stdout=subprocess.DEVNULL
-    )
-
-
-def record_of(city: Path, out: Path, *options: str, cores: int = 2) -> dict[str, Any]:
-    """Mesh the city and return what run.json says."""
-    footprints = ("--footprints", str(city / "footprints.shp"))
-    citystitch("run", str(city / "tiles"), *footprints, "--out", str(out), "--overwrite", *options, cores=cores)
-    record: dict[str, Any] = json.loads((out / "run.json").read_text())
-    return record
-
-
-def stage_seconds(record: dict[str, Any]) -> dict[str, float]:
-    """Seconds of each stage, all items together."""
-    return {name: seconds for name, seconds in record["seconds"].items() if ": " not in name}
-
-
-def after_ingest(record: dict[str, Any]) -> float:
-    """Wall time of the stages after those that read the input (s)."""
-    begin = max(record["finished"][stage] for stage in INGEST)
-    return float(max(record["finished"].values()) - begin)
-
-
-def summarise(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians over runs that differ in nothing."""
-    total = [record["seconds_total"] for record in records]
+def measure(city: Path, out: Path, *options: str, cores: int = 1) -> dict[str, Any]:
+    """Mesh a city; what a study keeps of run.json."""
+    record = record_of(city, out, *options, cores=cores)
     return {
-        "cells": records[0]["counts"]["cells"],
-        "total": median(total),
-        "spread": (min(total), max(total)),
-        "after": median(after_ingest(record) for record in records),
-        "peak": median(record["peak_memory_bytes"] for record in records),
-        "driver": median(record["driver_memory_bytes"] for record in records),
-        "stages": {
-            name: median(stage_seconds(record)[name] for record in records) for name in stage_seconds(records[0])
-        },
+        "cells": record["counts"]["cells"],
+        "total": record["seconds_total"],
+        "steps": step_seconds(record),
+        "peak": record["peak_memory_bytes"],
+        "driver": record["driver_memory_bytes"],
+        "tiles": record["tiles"] if isinstance(record["tiles"], int) else len(record["tiles"]),
+        "ran": sum(record["ran"].values()),
+        "points": record["counts"]["points read"],
+        "seams": record["seconds"]["seams"],
+        "columns": record["seconds"]["columns"],
+        "layers": record["seconds"].get(CHOICE, 0.0),
+        "seams computed": computed_seconds(record, "seams"),
+        "columns computed": computed_seconds(record, "columns"),
+        "written": record["seconds"]["pieces: 3.6 write pieces"],
     }
 
 
+def computed_seconds(record: Mapping[str, Any], stage: str) -> float:
+    """Seconds that a stage computes, without those in which it reads and writes results."""
+    return float(sum(value for name, value in record["seconds"].items() if name.startswith(f"{stage}: ")))
+
+
+class Cities:
+    """Synthetic cities, made when they are asked for."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+
+    def make(self, size: int, buildings: int, density: float = 1.5) -> Path:
+        """Folder of a city of `size` metres with so many buildings, and points a square metre."""
+        folder = self.home / f"city-{size}-{buildings}-{density:g}"
+        if not folder.exists():
+            words = ("--size", str(size), "--buildings", str(buildings), "--density", f"{density:g}")
+            citystitch("synth", str(folder), *words)
+        return folder
+
+
+def study_cells(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(a) One kilometre with 480 buildings, in one process on one core, by mesh size."""
+    city = cities.make(1000, 480)
+    return [
+        measure(city, out, "--mesh-size", str(size), "--workers", "0") | {"mesh size": size} for size in MESH_SIZES
+    ]
+
+
+def study_buildings(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(b) 6.25 km2 with more and more buildings, in one process on one core."""
+    return [
+        measure(cities.make(2500, n), out, "--tile-size", "625", "--workers", "0") | {"buildings": n}
+        for n in BUILDINGS
+    ]
+
+
+def study_area(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(c) 480 buildings a km2 on more and more of them, one worker; the middle one of 3 runs, the largest once."""
+    rows = []
+    for side in SIDES * 3 + (LARGE,) * ("--large" in sys.argv):
+        city = cities.make(side, round(480 * side**2 / 1e6))
+        found = measure(city, out, "--tile-size", "500", "--workers", "1", cores=2)
+        rows.append(found | {"area": side**2 / 1e6})
+    return middle_ones(rows, "area")
+
+
+def study_driver(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """Memory of the driver by the number of tiles, small ones of 150 m with hardly a house, two workers."""
+    rows = []
+    for n in TILES_A_SIDE:
+        city = cities.make(150 * n, n * n // 2, 0.5)
+        rows.append(measure(city, out, "--tile-size", "150", "--workers", "2", cores=2) | {"tiles a side": n})
+    return rows
+
+
+def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(d) The city of 2.5 km serially, with one and with two workers, a larger one too; runs take turns."""
+    rows = []
+    for side, several in ((2500, ("0", "1", "2")), (5000, ("0", "2"))):
+        city = cities.make(side, 480 * side**2 // 10**6)
+        for workers in several * 3:
+            found = measure(city, out, "--workers", workers, cores=2)
+            rows.append(found | {"workers": int(workers), "side": side})
+    return middle_ones(rows, "side", "workers")
+
+
+def middle_ones(rows: Sequence[dict[str, Any]], *keys: str) -> list[dict[str, Any]]:
+    """Of the rows with the same values of some keys the one whose run took neither longest nor shortest."""
+    kinds: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        kinds.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return [sorted(some, key=lambda row: float(row["total"]))[len(some) // 2] for some in kinds.values()]
+
+
+def study_tiles(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(e) The city of 2.5 km with tiles of several sizes, two workers."""
+    city = cities.make(2500, 3000)
+    return [
+        measure(city, out, "--tile-size", str(size), "--workers", "2", cores=2) | {"tile size": size}
+        for size in TILES
+    ]
+
+
+def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """The city of 2.5 km at 10, 5 and 2.5 m with two workers."""
+    city = cities.make(2500, 3000)
+    return [
+        measure(city, out, "--mesh-size", str(size), "--workers", "2", cores=2) | {"mesh size": size}
+        for size in (10.0, 5.0, 2.5)
+    ]
+
+
+def study_rates(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """Both meshers at 10 and 5 m, and a dense cloud; serially, tiles of the default size; the middle one of 3.
+
+    Cities of 16 tiles at 10 m and some 30 at 5 m, and 36 million points: in less, compiled code that is read for
+    the first time counts.
+    """
+    wide, city, dense = cities.make(5000, 12_000), cities.make(3000, 4320), cities.make(1500, 1080, 16.0)
+    rows = []
+    for _ in range(3):
+        for mesher in ("adaptive", "layered"):
+            for size, place in ((10.0, wide), (5.0, city)):
+                found = measure(place, out, "--mesher", mesher, "--mesh-size", str(size), "--workers", "0")
+                rows.append(found | {"mesher": f"{mesher}, {size:g} m"})
+        rows.append(measure(dense, out, "--workers", "0") | {"mesher": "adaptive, 10 m, 1.5 km, 16 points a m2"})
+    return middle_ones(rows, "mesher")
+
+
+def study_ways(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """The paper's own way beside ours on one kilometre, in one process on one core; the middle one of 3 runs."""
+    city = cities.make(1000, 480)
+    rows = [measure(city, out, "--workers", "0", *way.split()) | {"way": way} for way in WAYS * 3]
+    return middle_ones(rows, "way")
+
+
+def study_profile(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """(f) Samples of a serial run of the city of 2.5 km by our function that was at work, with py-spy.
+
+    The main thread's alone, those in which it waits for zarr's threads among them.
+    """
+    if shutil.which("py-spy") is None:
+        raise SystemExit("no py-spy; python -m pip install py-spy")
+    city, raw = cities.make(2500, 3000), out.parent / "samples"
+    words = [*COMMAND, "run", str(city / "tiles"), "--footprints", str(city / "footprints.shp")]
+    words += ["--workers", "0", "--overwrite", "--out", str(out)]
+    subprocess.run(
+        ["py-spy", "record", "-r", "100", "-t", "-i", "-f", "raw", "-o", str(raw), "--", *words],
+        check=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    counts: dict[tuple[str, str], int] = {}
+    total = 0
+    for line in raw.read_text().splitlines():
+        stack, _, number = line.rpartition(" ")
+        if "MainThread" not in stack:
+            continue
+        frames = [_frame(frame) for frame in stack.split(";")]
+        ours = [frame for frame in frames if frame[0].split("/")[0] in ("pipeline", "stitch", "tiler")]
+        in_task = any(name == "run_task" for _, name in ours)
+        key = ours[-1] if in_task else ("driver", "outside of tasks")
+        counts[key] = counts.get(key, 0) + int(number)
+        total += int(number)
+    rows = sorted(counts.items(), key=lambda item: -item[1])[:30]
+    return [{"place": f"{file}: {name}", "share": round(n / total, 4)} for (file, name), n in rows]
+
+
+def _frame(text: str) -> tuple[str, str]:
+    """File, from its package on, and function of a sample's frame."""
+    name, _, place = text.partition(" (")
+    path = Path(place.rstrip(")").rpartition(":")[0])
+    return "/".join(path.parts[-2:]) if "stages" not in path.parts else "/".join(path.parts[-3:]), name
+
+
+def study_startup(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """From the command to the end of its help, and to the begin of the first task of a run: medians of 7."""
+    city = cities.make(1000, 480)
+    found: dict[str, list[float]] = {}
+    for _ in range(7):
+        start = time.perf_counter()
+        citystitch("--help")
+        found.setdefault("the end of `citystitch --help`", []).append(time.perf_counter() - start)
+        for workers in ("0", "2"):
+            shutil.rmtree(out, ignore_errors=True)
+            began = time.time()
+            record_of(city, out, "--workers", workers)
+            done = (json.loads(line) for line in (out / "events.jsonl").read_text().splitlines())
+            first = min(event["t"] - event["seconds"] for event in done if event["event"] == "done")
+            found.setdefault(f"the first task of a run with {workers} workers", []).append(first - began)
+    return [{"until": until, "seconds": round(median(seconds), 3)} for until, seconds in found.items()]
+
+
+def study_limits(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """What the machine does at best: LAZ decompression alone, a copy in memory, a file written and flushed.
+
+    And what its cores take from each other: serial runs of the city of 2.5 km alone, then two of them at once.
+    """
+    import laspy
+
+    from tiler.las_chunks import FIELDS
+
+    files = sorted((cities.make(2500, 3000) / "tiles").glob("*.laz"))
+    start, n_points = time.perf_counter(), 0
+    for path in files:
+        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, decompression_selection=FIELDS) as reader:
+            n_points += len(reader.read().points)
+    laz = n_points / (time.perf_counter() - start)
+    block = np.ones(2**25)
+    target = np.empty_like(block)
+    start = time.perf_counter()
+    for _ in range(8):
+        np.copyto(target, block)
+    copy = 8 * 2 * block.nbytes / (time.perf_counter() - start)
+    path = out.parent / "block"
+    start = time.perf_counter()
+    with path.open("wb") as file:
+        for _ in range(4):
+            file.write(block.data)
+        file.flush()
+        os.fsync(file.fileno())
+    disk = 4 * block.nbytes / (time.perf_counter() - start)
+    path.unlink()
+    slower = _two_at_once(cities.make(2500, 3000), out)
+    return [
+        {"limit": "two serial runs at once, over one alone", "value": f"{slower:.2f} times the time"},
+        {"limit": "hence two cores are at best", "value": f"{2 / slower:.2f} times one"},
+        {"limit": "LAZ decompression by lazrs, one core", "value": f"{laz / 1e6:.2f} M points/s"},
+        {"limit": "copy in memory, read and written, one core", "value": f"{copy / 1e9:.1f} GB/s"},
+        {"limit": "file written and flushed", "value": f"{disk / 1e6:.0f} MB/s"},
+    ]
+
+
+def _two_at_once(city: Path, out: Path) -> float:
+    """Time of a serial run beside another one over that of a run alone: the median of three."""
+    both = [out.with_name(f"{out.name}-{k}") for k in range(2)]
+    found = []
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(3):
+            alone = measure(city, both[0], "--workers", "0", cores=2)["total"]
+            runs = [pool.submit(measure, city, b, "--workers", "0", cores=2) for b in both]
+            found.append(sum(run.result()["total"] for run in runs) / 2 / alone)
+    for folder in both:
+        shutil.rmtree(folder)
+    return float(median(found))
+
+
+Study = Callable[[Cities, Path], list[dict[str, Any]]]
+STUDIES: Mapping[str, Study] = {
+    "cells": study_cells,
+    "buildings": study_buildings,
+    "area": study_area,
+    "driver": study_driver,
+    "workers": study_workers,
+    "tiles": study_tiles,
+    "fine": study_fine,
+    "rates": study_rates,
+    "ways": study_ways,
+    "profile": study_profile,
+    "startup": study_startup,
+    "limits": study_limits,
+}
+
+
 def main() -> None:
-    """Measure and write the report."""
+    """Measure the studies that are named, or all; write what is known."""
+    names = [word for word in sys.argv[1:] if not word.startswith("-")] or list(STUDIES)
+    unknown = sorted(set(names) - STUDIES.keys())
+    if unknown:
+        raise SystemExit(f"no study {unknown[0]!r}; there are {', '.join(STUDIES)}")
+    kept: dict[str, Any] = json.loads(KEPT.read_text()) if KEPT.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
-        home = Path(folder)
-        out = home / "out"
-        cities = {size: home / f"city{size}" for size in (1000, 2000, 2500, 4000)}
-        for size, buildings in ((1000, 480), (2000, 1920), (2500, 3000), (4000, 7680)):
-            citystitch("synth", str(cities[size]), "--size", str(size), "--buildings", str(buildings))
-        record_of(cities[1000], out)
-        # Runs to compare take turns, so that what else the machine does falls on all of them.
-        by_workers: dict[str, list[dict[str, Any]]] = {"0": [], "1": [], "2": []}
-        for _ in range(RUNS):
-            for workers, records in by_workers.items():
-                records.append(record_of(cities[2500], out, "--workers", workers))
-        by_area = {
-            size: summarise([record_of(cities[size], out, "--tile-size", "500", "--workers", "1")])
-            for size in (1000, 2000, 4000)
-        }
-        by_mesh = {
-            title: summarise([record_of(cities[1000], out, *options, cores=1) for _ in range(RUNS)])
-            for title, options in (
-                ("`--mesh-size 10`", ()),
-                ("the paper's way, 10 m", ("--simplify", "paper", "--mesher", "layered")),
-                ("`--mesh-size 5`", ("--mesh-size", "5")),
-            )
-        }
-    text = report({name: summarise(records) for name, records in by_workers.items()}, by_area, by_mesh)
-    # What other benchmarks have written stands behind, between their markers.
-    _, marker, others = REPORT.read_text().partition("\n<!-- ")
-    REPORT.write_text(text + marker + others)
-    print(text)
-
-
-def report(
-    by_workers: dict[str, dict[str, Any]], by_area: dict[int, dict[str, Any]], by_mesh: dict[str, dict[str, Any]]
-) -> str:
-    """Write the measurements as Markdown."""
-    lines = [
-        "# Benchmarks",
-        "",
-        "Written by `make bench`; do not edit. Synthetic cities (`citystitch synth`), `citystitch run CITY/tiles",
-        "--footprints CITY/footprints.shp`, LAZ to written pieces, numba's cache warm. The machine is shared:",
-        "compare within a table.",
-        "",
-        f"Machine: {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}.",
-        "",
-        "## A city of 2.5 km with 3,000 buildings at 10 m",
-        "",
-        f"Medians of {RUNS} runs that take turns. *After ingest* is the wall time of all stages but those that",
-        "read LAZ and SHP; the ratio is that of 1 worker to this row. Peak memory is of the largest process that",
-        "runs tasks.",
-        "",
-        "| workers | cells | whole run (min-max) | after ingest | ratio | peak memory | driver |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    one = by_workers["1"]["after"]
-    for name, row in by_workers.items():
-        spread = f"{row['spread'][0]:.1f}-{row['spread'][1]:.1f}"
-        lines.append(
-            f"| {name} | {row['cells'] / 1e6:.2f} M | {row['total']:.1f} s ({spread}) | {row['after']:.1f} s "
-            f"| {one / row['after']:.2f} | {row['peak'] / 2**20:.0f} MiB | {row['driver'] / 2**20:.0f} MiB |"
-        )
-    lines += [
-        "",
-        "## Area",
-        "",
-        "480 buildings a km², tiles of 500 m, one worker, one run each.",
-        "",
-        "| area | tiles | cells | whole run | worker's peak | driver and scheduler |",
-        "|---|---|---|---|---|---|",
-    ]
-    for size, row in by_area.items():
-        n_tiles = (size // 500) ** 2
-        lines.append(
-            f"| {size**2 / 1e6:.0f} km² | {n_tiles} | {row['cells'] / 1e6:.2f} M | {row['total']:.1f} s "
-            f"| {row['peak'] / 2**20:.0f} MiB | {row['driver'] / 2**20:.0f} MiB |"
-        )
-    lines += [
-        "",
-        "## One kilometre with 480 buildings, one process on one core",
-        "",
-        f"Medians of {RUNS} runs.",
-        "",
-        "| run | cells | whole run (min-max) | seams and columns | cells/s in these | peak memory |",
-        "|---|---|---|---|---|---|",
-    ]
-    for title, row in by_mesh.items():
-        spread = f"{row['spread'][0]:.1f}-{row['spread'][1]:.1f}"
-        meshing = row["stages"]["seams"] + row["stages"]["columns"]
-        lines.append(
-            f"| {title} | {row['cells'] / 1e6:.2f} M | {row['total']:.1f} s ({spread}) | {meshing:.2f} s "
-            f"| {row['cells'] / meshing / 1e6:.1f} M | {row['peak'] / 2**20:.0f} MiB |"
-        )
-    lines += ["", "| stage | 10 m, seconds | 5 m, seconds |", "|---|---|---|"]
-    fine, coarse = by_mesh["`--mesh-size 5`"]["stages"], by_mesh["`--mesh-size 10`"]["stages"]
-    lines += [f"| `{name}` | {seconds:.2f} | {fine[name]:.2f} |" for name, seconds in coarse.items()]
-    return "\n".join(lines) + "\n"
+        cities, out = Cities(Path(folder)), Path(folder) / "out"
+        measure(cities.make(1000, 480), out)  # fills numba's cache
+        for name in names:
+            start = time.perf_counter()
+            kept[name] = STUDIES[name](cities, out)
+            kept.setdefault(MEASURED, {})[name] = datetime.now(UTC).date().isoformat()
+            KEPT.write_text(json.dumps(kept, indent=1) + "\n")
+            print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+    write_report(kept)
 
 
 if __name__ == "__main__":

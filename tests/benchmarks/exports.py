@@ -15,8 +15,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.bench import REPORT, citystitch, record_of
+from tests.benchmarks.bench_report import REPORT
 from tests.benchmarks.reliability import replace_between
+from tests.benchmarks.runs import citystitch, record_of
 from tiler.export import FORMATS, export_run
 
 BOUND = 2**30  # bytes of memory that no export may exceed: all of them stream

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.columns import expand_cells
 from pipeline.quality import Quality, measure_cells
-from tests.benchmarks.bench import citystitch
+from tests.benchmarks.runs import citystitch
 from tiler.results import read_columns
 from tiler.store import Store
 

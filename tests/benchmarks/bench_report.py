@@ -1,4 +1,4 @@
-"""docs/studies.md and its pictures, written of what `tests.benchmarks.studies` measured."""
+"""docs/benchmarks.md and its pictures, written of what `tests.benchmarks.bench` measured."""
 
 import os
 import platform
@@ -14,9 +14,10 @@ import numpy as np
 from tests.benchmarks.log_plot import draw_log_plot
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-REPORT = DOCS / "studies.md"
+REPORT = DOCS / "benchmarks.md"
 LEAST_SECONDS = 0.1  # less is not fitted
 MEASURED = "measured"  # day of each study, beside the studies
+OTHERS = "<!-- exports -->"  # what `make bench-exports` has written begins here
 
 Rows = list[dict[str, Any]]
 
@@ -66,11 +67,11 @@ def fit_exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float | No
 
 
 def write_report(kept: Mapping[str, Any]) -> None:
-    """Write docs/studies.md and its pictures of what was measured."""
+    """Write docs/benchmarks.md and its pictures of what was measured."""
     lines = [
-        "# Studies of cost",
+        "# Benchmarks",
         "",
-        "Written by `make studies` (one study: `python -m tests.benchmarks.studies cells`); do not edit.",
+        "Written by `make bench` (one part: `python -m tests.benchmarks.bench cells`); do not edit.",
         "Synthetic cities (`citystitch synth`), LAZ and SHP to written pieces, mesh size 10 m, tiles of the",
         "default size, numba's cache warm, one run each, where nothing else is said. The machine is shared:",
         "compare within a table.",
@@ -87,7 +88,8 @@ def write_report(kept: Mapping[str, Any]) -> None:
                 "",
                 *body(kept[study]),
             ]
-    REPORT.write_text("\n".join(lines) + "\n")
+    _, marker, others = REPORT.read_text().partition(OTHERS)
+    REPORT.write_text("\n".join([*lines, "", marker + others]))
 
 
 def _growth(rows: Rows, name: str, key: str) -> list[str]:
@@ -137,6 +139,22 @@ def _rates(rows: Rows) -> list[str]:
         early = sum(seconds for step, seconds in row["steps"].items() if step[0] in "12")
         told.append(f"{row['points'] / early / 1e6:.2f} M")
         lines.append(f"| {row['mesher']} | {row['cells'] / 1e6:.2f} M | {' | '.join(told)} |")
+    return lines
+
+
+def _ways(rows: Rows) -> list[str]:
+    lines = ["| run | cells | whole run | step 3 | step 3, cells/s | peak |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        step = row["seams computed"] + row["columns computed"] + row["layers"]
+        told = [
+            f"`{row['way']}`" if row["way"] else "as it is",
+            f"{row['cells'] / 1e6:.2f} M",
+            f"{row['total']:.1f} s",
+            f"{step:.2f} s",
+            f"{row['cells'] / step / 1e6:.2f} M",
+            f"{row['peak'] / 2**20:.0f} MiB",
+        ]
+        lines.append(f"| {' | '.join(told)} |")
     return lines
 
 
@@ -204,7 +222,7 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
         "area",
         "(c) Area",
-        "480 buildings a km², tiles of 500 m, one worker.",
+        "480 buildings a km², tiles of 500 m, one worker; the middle one of 3 runs up to 25 km².",
         lambda rows: _growth(rows, "area", "area"),
     ),
     (
@@ -245,6 +263,12 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
         "they do, with what they read and\nwrite of the store; the layers of roofs, which `model` chooses, count "
         "in both. *Written* are cells a second into VTU pieces.",
         _rates,
+    ),
+    (
+        "ways",
+        "The paper's way",
+        "One kilometre with 480 buildings, serial; the middle one of 3 runs. *Step 3* as in the rates.",
+        _ways,
     ),
     (
         "profile",
