@@ -17,6 +17,8 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 REPORT = DOCS / "benchmarks.md"
 LEAST_SECONDS = 0.1  # less is not fitted
 MEASURED = "measured"  # day of each study, beside the studies
+# Key and title of a table's first column, where they are not the study's own key.
+TITLES = {"cells": ("mesh size", "mesh size (m)"), "area": ("area", "area (km²)")}
 OTHERS = "<!-- exports -->"  # what `make bench-exports` has written begins here
 
 Rows = list[dict[str, Any]]
@@ -100,7 +102,7 @@ def _growth(rows: Rows, name: str, key: str) -> list[str]:
     whole = [sum(row["steps"].values()) for row in rows]
     draw_log_plot(DOCS / f"study-{name}.png", sizes, {**series, "all": whole}, x=key, y="seconds")
     lines = [
-        *_runs(rows, "mesh size" if key == "cells" else key),
+        *_runs(rows, *TITLES.get(key, (key,))),
         "",
         "| step | exponent, all sizes | upper half |",
         "|---|---|---|",
@@ -112,9 +114,9 @@ def _growth(rows: Rows, name: str, key: str) -> list[str]:
     return [*lines, "", f"![Seconds of each step against {key}](study-{name}.png)"]
 
 
-def _runs(rows: Rows, key: str) -> list[str]:
+def _runs(rows: Rows, key: str, title: str = "") -> list[str]:
     lines = [
-        f"| {key} | tiles | cells | whole run | worker's peak | driver | tasks |",
+        f"| {title or key} | tiles | cells | whole run | worker's peak | driver | tasks |",
         "|---|---|---|---|---|---|---|",
     ]
     lines.extend(
@@ -198,7 +200,10 @@ def _table(left: str, right: str, rows: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def _shares(rows: Rows) -> list[str]:
-    lines = ["| step | " + " | ".join(f"{row['workers']} workers" for row in rows) + " |", "|---|---|---|---|"]
+    titles = (
+        ("one process", "1 worker")[n] if n < 2 else f"{n} workers" for n in (row["workers"] for row in rows)
+    )
+    lines = [f"| step | {' | '.join(titles)} |", "|---|---|---|---|"]
     for step in (*STEPS, "rest"):
         parts = (f"{100 * row['steps'][step] / sum(row['steps'].values()):.1f} %" for row in rows)
         lines.append(f"| {step} | " + " | ".join(parts) + " |")
@@ -241,13 +246,13 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
         "tiles",
         "(e) Tile size",
         "The city of 2.5 km, two workers.",
-        lambda rows: _runs(rows, "tile size"),
+        lambda rows: _runs(rows, "tile size", "tile size (m)"),
     ),
     (
         "fine",
         "Fine meshes",
         "The city of 2.5 km, two workers.",
-        lambda rows: _runs(rows, "mesh size"),
+        lambda rows: _runs(rows, "mesh size", "mesh size (m)"),
     ),
     (
         "workers",
