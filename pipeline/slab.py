@@ -108,7 +108,7 @@ def lift_places(
     a sum of its modes at the square's nodes for each level.
     """
     side, margin = BLOCK * domain_height, (REACH - BLOCK) * domain_height
-    levels = _even_levels(domain_height, n_layers) if shape is None else shape.levels
+    levels, rises = _find_levels(domain_height, n_layers, shape)
     complete = not np.isnan(dtm.z).any()
     within = np.clip(xy, region[:2], region[2:])
     block, member = np.unique(np.floor(within / side), axis=0, return_inverse=True)
@@ -122,7 +122,7 @@ def lift_places(
         window = _clip(corner * side - margin, (corner + 1) * side + margin, region)
         kind = _seen_from(square, window), _seen_from(window, window)
         if kind not in lifts:
-            lifts[kind] = _prepare_lift(*kind, levels, grid_spacing)
+            lifts[kind] = _prepare_lift(*kind, rises, domain_height, grid_spacing)
         terrain = dtm if complete else cut_terrain(dtm, node_window(window, dtm.spacing))
         z[rows, 0] = sample_dtm(terrain, within[rows])
         z[rows, 1:] = levels[1:] + lifts[kind](terrain, within[rows], window)
@@ -175,10 +175,10 @@ def smooth_slab(
     nodes = _nodes_around(position, n_x, n_y)
     node, weight = _bilinear(position, nodes)
     back = _choose_way_back(spectrum.shape, nodes)
-    levels = _even_levels(domain_height, n_layers) if shape is None else shape.levels
+    levels, rises = _find_levels(domain_height, n_layers, shape)
     z = np.empty((len(xy), n_layers + 1))
     z[:, 0] = sample_dtm(dtm, xy)
-    for level, damped in enumerate(_damp(spectrum, size, levels), 1):
+    for level, damped in enumerate(_damp(spectrum, size, rises, domain_height), 1):
         z[:, level] = levels[level] + (back(damped).ravel()[node] * weight).sum(axis=1)
     return z if shape is None else shape_levels(z, shape)
 
@@ -239,11 +239,13 @@ class _SquareLift:
         return felt
 
 
-def _prepare_lift(square: Bounds, window: Bounds, levels: NDArray[np.float64], grid_spacing: float) -> _SquareLift:
+def _prepare_lift(
+    square: Bounds, window: Bounds, rises: NDArray[np.float64], domain_height: float, grid_spacing: float
+) -> _SquareLift:
     size = np.array(window[2:])
     n_x, n_y = _count_cells(size, grid_spacing)
     nodes = _nodes_around(np.reshape(square, (2, 2)) / size * [n_x, n_y], n_x, n_y)
-    damping = np.array(list(_damp(np.ones((n_y + 1, n_x + 1)), size, levels)))
+    damping = np.array(list(_damp(np.ones((n_y + 1, n_x + 1)), size, rises, domain_height)))
     along_y = _cosines(np.arange(nodes[0], nodes[1] + 1), n_y + 1)
     along_x = _cosines(np.arange(nodes[2], nodes[3] + 1), n_x + 1)
     return _SquareLift((n_x, n_y), nodes, along_y, np.ascontiguousarray(along_x.T), damping)
@@ -255,8 +257,13 @@ def _seen_from(area: Bounds, window: Bounds) -> Bounds:
     return west, south, east, north
 
 
-def _even_levels(domain_height: float, n_layers: int) -> NDArray[np.float64]:
-    return domain_height * np.arange(n_layers + 1) / n_layers
+def _find_levels(
+    domain_height: float, n_layers: int, shape: SlabShape | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Heights of the levels on flat ground, and of the layers: of equal ones, bit for bit the same."""
+    if shape is None:
+        return domain_height * np.arange(n_layers + 1) / n_layers, np.full(n_layers, domain_height / n_layers)
+    return shape.levels, np.diff(shape.levels)
 
 
 def _count_cells(size: NDArray[np.float64], grid_spacing: float) -> tuple[int, int]:
@@ -266,16 +273,16 @@ def _count_cells(size: NDArray[np.float64], grid_spacing: float) -> tuple[int, i
 
 
 def _damp(
-    spectrum: NDArray[np.float64], size: NDArray[np.float64], levels: NDArray[np.float64]
+    spectrum: NDArray[np.float64], size: NDArray[np.float64], rises: NDArray[np.float64], domain_height: float
 ) -> Iterator[NDArray[np.float64]]:
     """What is left of the modes of a slab's bottom (ny + 1, nx + 1) at each level above it, in turn."""
     n_y, n_x = spectrum.shape
     wave = np.hypot(np.pi / size[0] * np.arange(n_x), np.pi / size[1] * np.arange(n_y)[:, None])
     # cosh(k (H - z)) / cosh(k H) has a part that fades with the height z, and one that grows: exp(k (z - 2 H)).
-    fading = spectrum / (1 + np.exp(-2 * wave * levels[-1]))
-    growing = fading * np.exp(-2 * wave * levels[-1])
+    fading = spectrum / (1 + np.exp(-2 * wave * domain_height))
+    growing = fading * np.exp(-2 * wave * domain_height)
     before = 0.0
-    for rise in np.diff(levels):
+    for rise in rises:
         if rise != before:
             fade, before = np.exp(-np.minimum(wave * rise, STEEPEST)), rise
         fading *= fade

@@ -16,7 +16,7 @@ from pipeline.layered import LayeredOptions, choose_layers, fill_layers, mesh_la
 from pipeline.nodes import SeamColumns, take_columns
 from pipeline.plane import mesh_plane
 from pipeline.quality import measure_cells
-from pipeline.slab import SlabShape, lift_places, slab_reach, slab_window, smooth_slab
+from pipeline.slab import SlabShape, _find_levels, lift_places, slab_reach, slab_window, smooth_slab
 from pipeline.terrain import Dtm
 from stitch.corners import place_corner
 from stitch.grid import Key, SeamKey, is_border, make_grid, seam_keys
@@ -212,6 +212,14 @@ def test_places_are_lifted_as_meshes_where_both_see_the_region(size: tuple[float
     )
     np.testing.assert_allclose(lifted, meshed, rtol=0, atol=1e-5)
     assert np.ptp(lifted[:, 3]) > 1
+
+
+@pytest.mark.parametrize(("height", "n"), [(100.0, 10), (100.0, 30), (83.7, 7), (143.21, 23)])
+def test_equal_layers_are_equal_bit_for_bit(height: float, n: int) -> None:
+    """What fades from one level to the next is then computed once; differences of levels would not do."""
+    levels, rises = _find_levels(height, n, None)
+    assert np.unique(rises).tolist() == [height / n]
+    np.testing.assert_allclose(np.diff(levels), rises, rtol=1e-12)
 
 
 @pytest.mark.parametrize("box", [(0.0, 0.0, 9.0, 9.0), (700.0, 40.0, 725.0, 690.0), (0.0, 380.0, 700.0, 410.0)])

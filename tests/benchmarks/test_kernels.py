@@ -4,6 +4,7 @@
 ``--benchmark-compare`` after it, the two are set side by side. Nothing is asserted about time.
 """
 
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,12 +69,14 @@ def test_plane_mesh(benchmark: BenchmarkFixture, scene: Scene) -> None:
 def test_adaptive_columns(benchmark: BenchmarkFixture, scene: Scene) -> None:
     city, group = scene.city, np.arange(len(scene.city), dtype=np.int32)
     mesh, _ = benchmark(mesh_adaptive, scene.plane, scene.dtm, city.roof, group, city.ids, ADAPTIVE)
-    benchmark.extra_info["cells"] = len(expand_cells(mesh).cells)
+    benchmark.extra_info["cells"] = n_cells = len(expand_cells(mesh).cells)
+    assert n_cells > len(scene.plane.triangles)
 
 
 def test_layered_columns(benchmark: BenchmarkFixture, scene: Scene) -> None:
     mesh, _ = benchmark(mesh_layers, scene.plane, scene.dtm, scene.city, scene.wall_ground, BOUNDS, LAYERED)
-    benchmark.extra_info["cells"] = len(expand_cells(mesh).cells)
+    benchmark.extra_info["cells"] = n_cells = len(expand_cells(mesh).cells)
+    assert n_cells > len(scene.plane.triangles)
 
 
 @pytest.mark.parametrize("lifts", ["mesh", "places"])
@@ -99,3 +102,4 @@ def test_compression_of_a_block(benchmark: BenchmarkFixture, scene: Scene) -> No
     block = np.repeat(scene.plane.triangles, 20, axis=0)
     packed = benchmark(compress_block, block, np.dtype(np.int64))
     benchmark.extra_info["share"] = len(packed) / (8 * block.size)
+    assert zlib.decompress(packed) == block.astype("<i8").tobytes()
