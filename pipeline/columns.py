@@ -6,8 +6,6 @@ order compares two columns by what these two are, so the faces over an edge are 
 triangles: the mesh conforms.
 """
 
-from dataclasses import replace
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +19,14 @@ Bounds = tuple[float, float, float, float]
 
 def count_cells(mesh: ColumnMesh) -> int:
     """Count the tetrahedra that the columns stand for."""
-    triangles = mesh.plane.triangles
-    levels = np.diff(mesh.z_start)[triangles]
-    return int((levels - 1 - mesh.bottom).sum())
+    return int(count_by_triangle(mesh).sum())
+
+
+def count_by_triangle(mesh: ColumnMesh) -> NDArray[np.int64]:
+    """Count the tetrahedra over each triangle, int64 (m,)."""
+    levels = np.diff(mesh.z_start)[mesh.plane.triangles]
+    counts: NDArray[np.int64] = (levels - 1 - mesh.bottom).sum(axis=1)
+    return counts
 
 
 def expand_cells(mesh: ColumnMesh) -> TetMesh:
@@ -35,35 +38,33 @@ def expand_cells(mesh: ColumnMesh) -> TetMesh:
         Points in the order of `ColumnMesh.z`: column by column from below. Cells triangle by triangle.
     """
     column = np.repeat(np.arange(len(mesh.plane.xy)), np.diff(mesh.z_start))
-    return TetMesh(np.column_stack((mesh.plane.xy[column], mesh.z)), _merge(mesh))
+    cells = merge_columns(mesh, slice(None), signed_areas(mesh.plane) < 0, count_cells(mesh))
+    return TetMesh(np.column_stack((mesh.plane.xy[column], mesh.z)), cells)
 
 
-def expand_again(mesh: ColumnMesh, cells: NDArray[np.int32], moved: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Write the cells anew over the triangles of some levels, in place.
+def merge_columns(mesh: ColumnMesh, part: slice, clockwise: NDArray[np.bool_], n_cells: int) -> NDArray[np.int32]:
+    """Merge the columns over some triangles.
 
     Parameters
     ----------
     mesh : ColumnMesh
-        Columns that ascend.
-    cells : int32, (n_cells, 4)
-        Its cells as `expand_cells` gave them at other heights, which are brought up to date.
-    moved : bool, (z_start[-1],)
-        Levels whose heights are others than they were then.
+        The mesh.
+    part : slice
+        Triangles, one after the other.
+    clockwise : bool, (m,)
+        Which of all triangles have a negative area.
+    n_cells : int
+        Cells over those that are wanted, see `count_by_triangle`.
 
     Returns
     -------
-    int64, (k,)
-        The cells that were written.
+    int32, (n_cells, 4)
+        Levels of `ColumnMesh.z`, triangle by triangle.
     """
-    plane = mesh.plane
-    touched = np.zeros(len(plane.xy), np.bool_)
-    touched[np.searchsorted(mesh.z_start, np.flatnonzero(moved), side="right") - 1] = True
-    again = touched[plane.triangles].any(axis=1)
-    count = (np.diff(mesh.z_start)[plane.triangles] - 1 - mesh.bottom).sum(axis=1)
-    rows = np.flatnonzero(np.repeat(again, count))
-    part = replace(plane, triangles=plane.triangles[again], building=plane.building[again])
-    cells[rows] = _merge(replace(mesh, plane=part, bottom=mesh.bottom[again]))
-    return rows
+    cells = np.empty((n_cells, 4), np.int32)
+    triangles, by_height = mesh.plane.triangles[part], mesh.order == "heights"
+    _merge_columns(triangles, mesh.bottom[part], mesh.z_start, mesh.z, by_height, clockwise[part], cells)
+    return cells
 
 
 def find_used_points(mesh: ColumnMesh) -> NDArray[np.bool_]:
@@ -73,19 +74,15 @@ def find_used_points(mesh: ColumnMesh) -> NDArray[np.bool_]:
     -----
     A column of a seam has a level for the ground or roof of every tile, also where this tile begins higher.
     """
-    n = len(mesh.plane.xy)
-    lowest = np.full(n, np.iinfo(np.int32).max)
+    count = np.diff(mesh.z_start)
+    lowest = count.astype(np.int32)
     np.minimum.at(lowest, mesh.plane.triangles, mesh.bottom)
-    column = np.repeat(np.arange(n), np.diff(mesh.z_start))
-    used: NDArray[np.bool_] = np.arange(len(mesh.z)) - mesh.z_start[column] >= lowest[column]
+    below = np.flatnonzero(lowest)
+    skipped = lowest[below]
+    begin = np.cumsum(skipped) - skipped
+    used = np.ones(len(mesh.z), np.bool_)
+    used[np.arange(skipped.sum()) + np.repeat(mesh.z_start[below] - begin, skipped)] = False
     return used
-
-
-def drop_points(mesh: TetMesh, boundary: Boundary, used: NDArray[np.bool_]) -> tuple[TetMesh, Boundary]:
-    """Take out the points that no cell uses; the others keep their order."""
-    index = (np.cumsum(used) - 1).astype(np.int32)
-    cells = TetMesh(mesh.points[used], index[mesh.cells])
-    return cells, Boundary(index[boundary.facets], boundary.marker, boundary.building)
 
 
 def lowest_gap(mesh: ColumnMesh) -> tuple[float, int]:
@@ -162,14 +159,6 @@ def split_boundary(
     same columns there, so what one leaves out the other does not have.
     """
     return _extract_boundary(mesh, numbers, bounds, seams, strict=True)
-
-
-def _merge(mesh: ColumnMesh) -> NDArray[np.int32]:
-    cells = np.empty((count_cells(mesh), 4), np.int32)
-    clockwise = signed_areas(mesh.plane) < 0
-    by_height = mesh.order == "heights"
-    _merge_columns(mesh.plane.triangles, mesh.bottom, mesh.z_start, mesh.z, by_height, clockwise, cells)
-    return cells
 
 
 def _oriented(facets: NDArray[np.int32], swap: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -282,6 +271,48 @@ def _comes_first(z: NDArray[np.float64], by_height: bool, i: int, end_i: int, j:
 
 
 @numba.njit(cache=True, nogil=True)
+def merge_triangle(
+    triangle: NDArray[np.int32],
+    bottom: NDArray[np.int32],
+    z_start: NDArray[np.int64],
+    z: NDArray[np.float64],
+    by_height: bool,
+    clockwise: bool,
+    cells: NDArray[np.int32],
+    cell: int,
+) -> int:
+    """Write the cells over one triangle, from a row on, and give the row after them; called from compiled code.
+
+    Arguments are rows of `ColumnMesh`: the triangle's vertices, int32 (3,), and the levels where its cells begin.
+    """
+    a, b, c = z_start[triangle[0]] + bottom[0], z_start[triangle[1]] + bottom[1], z_start[triangle[2]] + bottom[2]
+    end_a, end_b, end_c = (
+        z_start[triangle[0] + 1] - 1,
+        z_start[triangle[1] + 1] - 1,
+        z_start[triangle[2] + 1] - 1,
+    )
+    while a < end_a or b < end_b or c < end_c:
+        cells[cell, 0] = a
+        cells[cell, 1] = c if clockwise else b
+        cells[cell, 2] = b if clockwise else c
+        if _comes_first(z, by_height, a, end_a, b, end_b):
+            if _comes_first(z, by_height, a, end_a, c, end_c):
+                a += 1
+                cells[cell, 3] = a
+            else:
+                c += 1
+                cells[cell, 3] = c
+        elif _comes_first(z, by_height, b, end_b, c, end_c):
+            b += 1
+            cells[cell, 3] = b
+        else:
+            c += 1
+            cells[cell, 3] = c
+        cell += 1
+    return cell
+
+
+@numba.njit(cache=True, nogil=True)
 def _merge_columns(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
@@ -293,30 +324,7 @@ def _merge_columns(
 ) -> None:
     cell = 0
     for t in range(len(triangles)):
-        a = z_start[triangles[t, 0]] + bottom[t, 0]
-        b = z_start[triangles[t, 1]] + bottom[t, 1]
-        c = z_start[triangles[t, 2]] + bottom[t, 2]
-        end_a = z_start[triangles[t, 0] + 1] - 1
-        end_b = z_start[triangles[t, 1] + 1] - 1
-        end_c = z_start[triangles[t, 2] + 1] - 1
-        while a < end_a or b < end_b or c < end_c:
-            cells[cell, 0] = a
-            cells[cell, 1] = c if clockwise[t] else b
-            cells[cell, 2] = b if clockwise[t] else c
-            if _comes_first(z, by_height, a, end_a, b, end_b):
-                if _comes_first(z, by_height, a, end_a, c, end_c):
-                    a += 1
-                    cells[cell, 3] = a
-                else:
-                    c += 1
-                    cells[cell, 3] = c
-            elif _comes_first(z, by_height, b, end_b, c, end_c):
-                b += 1
-                cells[cell, 3] = b
-            else:
-                c += 1
-                cells[cell, 3] = c
-            cell += 1
+        cell = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, cell)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -71,6 +71,11 @@ def count_values(values: NDArray[np.floating], limits: tuple[float, float], bins
     return Histogram(low, high, counts, least, greatest)
 
 
+def no_values(limits: tuple[float, float], bins: int) -> Histogram:
+    """Histogram of no values, to which others are added."""
+    return count_values(np.empty(0, np.float32), limits, bins)
+
+
 @numba.njit(cache=True, nogil=True)
 def _count(
     values: NDArray[np.floating], low: float, high: float, counts: NDArray[np.int64]

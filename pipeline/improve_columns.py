@@ -11,14 +11,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns import expand_again, expand_cells
+from pipeline.columns import count_by_triangle, merge_triangle
 from pipeline.mesh import ColumnMesh
+from pipeline.plane import signed_areas
 
 WORST = 0.5  # levels of cells with a radius ratio below this may move
 SEARCH_SWEEPS = 10
 FIRST_STEP = 0.15  # of the column's spacing
 LAST_STEP = 0.02  # of the first step
-BLOCK = 64  # cells that are measured side by side
 
 
 def improve_columns(
@@ -57,53 +57,101 @@ def improve_columns(
     Notes
     -----
     Merging anew changes cells beside those that were looked at; of all rounds, the mesh with the least sum over
-    all its cells is kept.
+    all its cells is kept. Memory is that of the levels, and of the cells around those that may move: all others
+    are made and measured a triangle at a time.
     """
-    step = np.repeat(FIRST_STEP * spacing, np.diff(mesh.z_start))
-    expanded = expand_cells(mesh)
-    points, cells = expanded.points, expanded.cells
-    ratio = radius_ratios(points, cells)
-    best, least_cost = mesh, _total_cost(ratio, cells, free, flat_cells)
-    before = after = float(ratio.min())
+    survey = ColumnSurvey(mesh, free, flat_cells)
+    best, least_cost = mesh, survey.cost
+    before = after = survey.worst
     n_moved = 0
-    for _ in range(passes):
-        active = _levels_of(cells, ratio < WORST, len(mesh.z)) & free
-        start, of_level = _cells_of_levels(cells, active)
-        n_moved += _search(points, cells, np.flatnonzero(active), start, of_level, step)
-        moved = mesh.z != points[:, 2]
-        mesh = replace(mesh, z=points[:, 2].copy())
-        again = expand_again(mesh, cells, moved)
-        ratio[again] = radius_ratios(points, cells[again])
-        cost = _total_cost(ratio, cells, free, flat_cells)
-        if cost < least_cost:
-            best, least_cost, after = mesh, cost, float(ratio.min())
+    for k in range(passes):
+        z, moved = survey.search(FIRST_STEP * spacing)
+        n_moved += moved
+        survey.move(z, last=k == passes - 1)
+        if survey.cost < least_cost:
+            best, least_cost, after = replace(mesh, z=z), survey.cost, survey.worst
     return best, (before, after), n_moved
 
 
-def radius_ratios(points: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Measure 3 x inscribed over circumscribed radius of every cell; negative for an inverted one.
+class ColumnSurvey:
+    """How good the cells over each triangle are, and which levels the bad ones have.
 
-    Examples
-    --------
-    >>> corners = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-    >>> float(radius_ratios(corners, np.array([[0, 1, 3, 2]], np.int32))[0].round(12))
-    1.0
+    Parameters
+    ----------
+    mesh, free, flat_cells
+        As for `improve_columns`.
+
+    Attributes
+    ----------
+    of_cells : float64, (m,)
+        What the search minimises, of the cells over each triangle that count.
+    least : float64, (m,)
+        Smallest radius ratio over each triangle; negative where a cell is inverted.
+    bad : bool, (z_start[-1],)
+        Levels of cells that are worse than `WORST`.
     """
-    ratio: NDArray[np.float64] = _measure(points, cells)
-    return ratio
 
+    def __init__(self, mesh: ColumnMesh, free: NDArray[np.bool_], flat_cells: bool) -> None:
+        n, m = len(mesh.plane.xy), len(mesh.plane.triangles)
+        self._mesh, self._free, self._flat_cells = mesh, free, flat_cells
+        self._column = np.repeat(np.arange(n, dtype=np.int32), np.diff(mesh.z_start))
+        self._clockwise = signed_areas(mesh.plane) < 0
+        self._most = int(count_by_triangle(mesh).max(initial=0))
+        self._z = mesh.z
+        self.of_cells, self.least = np.empty(m), np.empty(m)
+        self._measure(np.ones(m, np.bool_))
 
-def _total_cost(
-    ratio: NDArray[np.float64], cells: NDArray[np.int32], free: NDArray[np.bool_], flat_cells: bool
-) -> float:
-    """What the search minimises, over all cells that count."""
-    return float(_add_costs(ratio[free[cells].any(axis=1)] if flat_cells else ratio))
+    @property
+    def cost(self) -> float:
+        """What the search minimises, over all cells that count."""
+        return float(self.of_cells.sum())
 
+    @property
+    def worst(self) -> float:
+        """Smallest radius ratio of all cells."""
+        return float(self.least.min())
 
-def _levels_of(cells: NDArray[np.int32], chosen: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:
-    levels = np.zeros(n, np.bool_)
-    levels[cells[chosen]] = True
-    return levels
+    def search(self, first_step: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+        """Move free levels of bad cells, by first steps of each column (m): all heights, and how many moved."""
+        active = self.bad & self._free
+        level = np.flatnonzero(active)
+        holds = np.zeros(len(self._mesh.plane.xy), np.bool_)
+        holds[self._column[level]] = True
+        over = holds[self._mesh.plane.triangles].any(axis=1)
+        cells = _gather(*self._merged(), over, self._most, self._clockwise, active)
+        start, of_level = _cells_of_levels(cells, active)
+        z, step = self._z.copy(), first_step[self._column[level]]
+        return z, _search(self._mesh.plane.xy, self._column, z, cells, level, start, of_level, step)
+
+    def move(self, z: NDArray[np.float64], *, last: bool) -> None:
+        """Take other heights; after the last search nobody asks which levels are bad."""
+        touched = np.zeros(len(self._mesh.plane.xy), np.bool_)
+        touched[self._column[z != self._z]] = True
+        again = np.any(touched[self._mesh.plane.triangles], axis=1)
+        self._z = z
+        if not last:
+            again |= self.least < WORST
+        self._measure(again)
+
+    def _merged(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64], NDArray[np.float64], bool]:
+        mesh = self._mesh
+        return mesh.plane.triangles, mesh.bottom, mesh.z_start, self._z, mesh.order == "heights"
+
+    def _measure(self, wanted: NDArray[np.bool_]) -> None:
+        self.bad = np.zeros(len(self._z), np.bool_)
+        _survey(
+            *self._merged(),
+            wanted,
+            self._most,
+            self._clockwise,
+            self._mesh.plane.xy,
+            self._column,
+            self._free,
+            self._flat_cells,
+            self.of_cells,
+            self.least,
+            self.bad,
+        )
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -140,12 +188,18 @@ def _inverse_power(ratio: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _lay_out(points: NDArray[np.float64], cell: NDArray[np.int32], at: NDArray[np.float64], i: int) -> None:
+def _lay_out(
+    xy: NDArray[np.float64],
+    column: NDArray[np.int32],
+    z: NDArray[np.float64],
+    cell: NDArray[np.int32],
+    at: NDArray[np.float64],
+    i: int,
+) -> None:
     """Write the corners of a cell into column i, a row for each coordinate."""
     for c in range(4):
         p = cell[c]
-        for k in range(3):
-            at[3 * c + k, i] = points[p, k]
+        at[3 * c, i], at[3 * c + 1, i], at[3 * c + 2, i] = xy[column[p], 0], xy[column[p], 1], z[p]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -159,17 +213,72 @@ def _measure_block(at: NDArray[np.float64], n: int, ratio: NDArray[np.float64]) 
 
 
 @numba.njit(cache=True, nogil=True)
-def _measure(points: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Radius ratio of every cell."""
-    ratio, block = np.empty(len(cells)), np.empty(BLOCK)
-    at = np.empty((12, BLOCK))
-    for first in range(0, len(cells), BLOCK):
-        n = min(BLOCK, len(cells) - first)
+def _survey(
+    triangles: NDArray[np.int32],
+    bottom: NDArray[np.int32],
+    z_start: NDArray[np.int64],
+    z: NDArray[np.float64],
+    by_height: bool,
+    wanted: NDArray[np.bool_],
+    most: int,
+    clockwise: NDArray[np.bool_],
+    xy: NDArray[np.float64],
+    column: NDArray[np.int32],
+    free: NDArray[np.bool_],
+    flat_cells: bool,
+    of_cells: NDArray[np.float64],
+    least: NDArray[np.float64],
+    bad: NDArray[np.bool_],
+) -> None:
+    """Make and measure the cells over the triangles that are wanted: at most so many over one."""
+    cells, at, ratio = np.empty((most, 4), np.int32), np.empty((12, most)), np.empty(most)
+    for t in range(len(triangles)):
+        if not wanted[t]:
+            continue
+        n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, 0)
         for i in range(n):
-            _lay_out(points, cells[first + i], at, i)
-        _measure_block(at, n, block)
-        ratio[first : first + n] = block[:n]
-    return ratio
+            _lay_out(xy, column, z, cells[i], at, i)
+        _measure_block(at, n, ratio)
+        of_cells[t], least[t] = 0.0, np.inf
+        for i in range(n):
+            least[t] = min(least[t], ratio[i])
+            a, b, c, d = cells[i]
+            if not flat_cells or free[a] or free[b] or free[c] or free[d]:
+                of_cells[t] += _inverse_power(ratio[i])
+            if ratio[i] < WORST:
+                bad[a] = bad[b] = bad[c] = bad[d] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(
+    triangles: NDArray[np.int32],
+    bottom: NDArray[np.int32],
+    z_start: NDArray[np.int64],
+    z: NDArray[np.float64],
+    by_height: bool,
+    wanted: NDArray[np.bool_],
+    most: int,
+    clockwise: NDArray[np.bool_],
+    active: NDArray[np.bool_],
+) -> NDArray[np.int32]:
+    """Cells with an active level over the triangles that are wanted, in their order."""
+    cells = np.empty((most, 4), np.int32)
+    found = np.empty((0, 4), np.int32)
+    for _ in range(2):  # count them, then write them
+        row = 0
+        for t in range(len(triangles)):
+            if not wanted[t]:
+                continue
+            n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, 0)
+            for i in range(n):
+                a, b, c, d = cells[i]
+                if active[a] or active[b] or active[c] or active[d]:
+                    if row < len(found):
+                        found[row, 0], found[row, 1], found[row, 2], found[row, 3] = a, b, c, d
+                    row += 1
+        if len(found) == 0:
+            found = np.empty((row, 4), np.int32)
+    return found
 
 
 @numba.njit(cache=True, nogil=True)
@@ -215,40 +324,42 @@ def _cost(at: NDArray[np.float64], row: NDArray[np.int64], z: float, n: int, rat
 
 @numba.njit(cache=True, nogil=True)
 def _search(
-    points: NDArray[np.float64],
+    xy: NDArray[np.float64],
+    column: NDArray[np.int32],
+    z: NDArray[np.float64],
     cells: NDArray[np.int32],
     level: NDArray[np.int64],
     start: NDArray[np.int64],
     of_level: NDArray[np.int32],
     first_step: NDArray[np.float64],
 ) -> int:
-    """Try a step up or down at each level in turn, the last good direction first."""
-    step = first_step[level]
+    """Try a step up or down at each level in turn, the last good direction first; heights are moved in place."""
+    step = first_step.copy()
     moved = np.zeros(len(level), np.bool_)
     most = np.diff(start).max() if len(level) else 0
     at, ratio, row = np.empty((12, most)), np.empty(most), np.empty(most, np.int64)
     for _ in range(SEARCH_SWEEPS):
         for k in range(len(level)):
             p = level[k]
-            if abs(step[k]) < LAST_STEP * first_step[p]:
+            if abs(step[k]) < LAST_STEP * first_step[k]:
                 continue
             around = of_level[start[k] : start[k + 1]]
             n = len(around)
             for i in range(n):
                 cell = cells[around[i]]
-                _lay_out(points, cell, at, i)
+                _lay_out(xy, column, z, cell, at, i)
                 for c in range(4):
                     if cell[c] == p:
                         row[i] = 3 * c + 2
-            z = points[p, 2]
-            here = _cost(at, row, z, n, ratio)
-            if _cost(at, row, z + step[k], n, ratio) < here:
-                points[p, 2] = z + step[k]
+            height = z[p]
+            here = _cost(at, row, height, n, ratio)
+            if _cost(at, row, height + step[k], n, ratio) < here:
+                z[p] = height + step[k]
                 step[k] *= 1.25
                 moved[k] = True
                 continue
-            if _cost(at, row, z - step[k], n, ratio) < here:
-                points[p, 2] = z - step[k]
+            if _cost(at, row, height - step[k], n, ratio) < here:
+                z[p] = height - step[k]
                 step[k] *= -1.25
                 moved[k] = True
                 continue

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns import Bounds, expand_cells, find_used_points, split_boundary
+from pipeline.cell_blocks import CellBlocks
+from pipeline.columns import Bounds, count_cells, find_used_points, split_boundary
 from pipeline.edges import plane_edges
 from pipeline.levels import stagger_columns
-from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
+from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges
 from pipeline.nodes import GROUND_SURFACE, Levels, SeamColumns, join_levels, take_columns
 from pipeline.sizes import SizeField, local_sizes
 from pipeline.spacing import SpacingLimits, mean_edges, vertical_spacing
@@ -224,25 +225,31 @@ def count_soil_cells(mesh: SoilMesh) -> int:
     return int(mesh.top[mesh.columns.plane.triangles].sum())
 
 
-def expand_regions(mesh: SoilMesh) -> tuple[TetMesh, NDArray[np.int8]]:
-    """Write air and soil out as tetrahedra of positive volume.
+def expand_regions(mesh: SoilMesh, number: NDArray[np.int32]) -> tuple[CellBlocks, NDArray[np.int8]]:
+    """Tell the tetrahedra of positive volume that air and soil stand for.
+
+    Parameters
+    ----------
+    mesh : SoilMesh
+        The tile's mesh.
+    number : int32, (n_levels,)
+        Number of each level as a point, see `find_used` and `number_used`.
 
     Returns
     -------
-    TetMesh
-        Points column by column from below; the air's cells, then the soil's, each triangle by triangle.
+    CellBlocks
+        The air's cells, then the soil's, each triangle by triangle.
     int8, (m,)
         `Region` of each cell.
     """
-    air = expand_cells(mesh.columns)
     soil, rows = _take_soil(mesh)
-    below = rows[expand_cells(soil).cells]
-    region = np.repeat([Region.AIR, Region.SOIL], [len(air.cells), len(below)]).astype(np.int8)
-    return TetMesh(air.points, np.concatenate((air.cells, below))), region
+    count = [count_cells(mesh.columns), count_cells(soil)]
+    region = np.repeat(np.array([Region.AIR, Region.SOIL], np.int8), count)
+    return CellBlocks([(mesh.columns, number), (soil, number[rows])]), region
 
 
 def find_used(mesh: SoilMesh) -> NDArray[np.bool_]:
-    """Tell which points of `expand_regions` belong to a cell, bool (n_points,)."""
+    """Tell which levels of a mesh with soil belong to a cell, bool (n_levels,)."""
     used = find_used_points(mesh.columns)
     used[_take_soil(mesh)[1]] = True
     return used

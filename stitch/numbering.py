@@ -145,7 +145,8 @@ def number_points(mesh: ColumnMesh, shared: NDArray[np.int32], lowest: Ints, fir
         raise ValueError("two seams of a tile number a corner differently")
     own = begin < 0
     begin[own] = first + np.cumsum(count[own]) - count[own]
-    ids: Ints = np.arange(len(mesh.z)) - np.repeat(mesh.z_start[:-1] - begin, count)
+    ids: Ints = np.repeat(begin - mesh.z_start[:-1], count)
+    ids += np.arange(len(mesh.z))
     return ids
 
 

@@ -12,11 +12,13 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.cell_blocks import number_used, place_points
 from pipeline.errors import ConfigError, InputError
 from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
 from pipeline.nodes import GROUND_SURFACE, TOP_SURFACE, Levels, SeamColumns, no_seam
 from pipeline.spacing import SpacingLimits
 from pipeline.underground import (
+    SoilMesh,
     SoilOptions,
     add_soil,
     count_soil_cells,
@@ -134,7 +136,7 @@ def test_soil_goes_on_under_a_house() -> None:
     # The house's roof is 2 m above the ground at its wall; its far corner, vertex 1, has no ground.
     air = air_over(plane, [0.0, 2.0, 0.0, 0.0], [[0, 0, 0], [1, 0, 1]])
     mesh, raised, lowered = add_soil(air, np.array([9.0, 0.5, 9.0, 9.0]), no_seam(), no_seam(), OPTIONS)
-    cells, region = expand_regions(mesh)
+    cells, region = _expand(mesh)
     assert len(lowered) == 0
     assert (mesh.top + 1 - raised).tolist() == [1, 0, 1, 1]
     volume, flat = compute_cell_volumes(cells.points, cells.cells)
@@ -185,8 +187,26 @@ def test_terrain_that_reaches_a_roof_from_inside_is_lowered() -> None:
     assert (compute_cell_volumes(*_points_and_cells(mesh))[0] > 0).all()
 
 
-def _points_and_cells(mesh: Any) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    cells, _ = expand_regions(mesh)
+def test_cells_of_soil_come_after_those_of_air_in_any_block() -> None:
+    plane = two_triangles(-1, 0)
+    air = air_over(plane, [0.0, 2.0, 0.0, 0.0], [[0, 0, 0], [1, 0, 1]])
+    mesh, _, _ = add_soil(air, np.array([9.0, 0.5, 9.0, 9.0]), no_seam(), no_seam(), OPTIONS)
+    blocks, region = expand_regions(mesh, number_used(find_used(mesh)))
+    whole, first = blocks.make(0, blocks.n_cells), int((region == Region.AIR).sum())
+    assert 1 < first < blocks.n_cells - 1
+    for begin in range(blocks.n_cells):
+        for end in range(begin, blocks.n_cells + 1):
+            assert np.array_equal(blocks.make(begin, end), whole[begin:end])
+
+
+def _expand(mesh: SoilMesh) -> tuple[TetMesh, NDArray[np.int8]]:
+    used = find_used(mesh)
+    blocks, region = expand_regions(mesh, number_used(used))
+    return TetMesh(place_points(mesh.columns, used), blocks.make(0, blocks.n_cells)), region
+
+
+def _points_and_cells(mesh: SoilMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    cells, _ = _expand(mesh)
     return cells.points, cells.cells
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions
-from pipeline.columns import drop_points, expand_cells, find_used_points, split_boundary
+from pipeline.cell_blocks import CellBlocks, number_used, place_points, renumber_boundary
+from pipeline.columns import find_used_points, split_boundary
 from pipeline.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
 from pipeline.terrain import Dtm, sample_dtm
 from stitch.facets import Side, find_seam_edges
@@ -85,10 +86,14 @@ def split_all(city: City, gone: Collection[Key] = ()) -> dict[Key, Split]:
 
 def cut_city(city: City, gone: Collection[Key] = ()) -> Pieces:
     """Make the pieces that are written: cells and boundary of each tile."""
-    return {
-        key: drop_points(expand_cells(mesh), boundary, find_used_points(mesh))
-        for key, (mesh, boundary, _) in split_all(city, gone).items()
-    }
+    pieces: Pieces = {}
+    for key, (mesh, boundary, _) in split_all(city, gone).items():
+        used = find_used_points(mesh)
+        number = number_used(used)
+        blocks = CellBlocks([(mesh, number)])
+        cells = TetMesh(place_points(mesh, used), blocks.make(0, blocks.n_cells))
+        pieces[key] = cells, renumber_boundary(boundary, number)
+    return pieces
 
 
 def number_city(city: City) -> dict[Key, NDArray[np.int64]]:

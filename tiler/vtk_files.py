@@ -4,7 +4,7 @@ Arrays are appended raw in zlib blocks, little-endian, so a file streams to disk
 twice. ParaView and vtk read all four kinds, meshio the volume.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path, PurePath
@@ -98,10 +98,45 @@ def write_vtu(path: Path, mesh: TetMesh, *, point_data: Arrays = NO_ARRAYS, cell
     -----
     Same input, same bytes. Beside the input, memory holds one block.
     """
-    n_points, n_cells = len(mesh.points), len(mesh.cells)
+    write_vtu_blocks(
+        path,
+        mesh.points,
+        len(mesh.cells),
+        lambda begin, end: mesh.cells[begin:end],
+        point_data=point_data,
+        cell_data=cell_data,
+    )
+
+
+def write_vtu_blocks(
+    path: Path,
+    points: NDArray[np.float64],
+    n_cells: int,
+    cells: Callable[[int, int], NDArray[np.int32]],
+    *,
+    point_data: Arrays = NO_ARRAYS,
+    cell_data: Arrays = NO_ARRAYS,
+) -> None:
+    """Write a volume mesh as a VTU file, with cells that are made a block at a time.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it appears whole or not at all.
+    points : float64, (n, 3)
+        Coordinates (m).
+    n_cells : int
+        Number of cells.
+    cells : callable
+        ``cells(i, j)`` makes the cells ``i`` to ``j`` as int32 (j - i, 4), indices of the points. Each is asked
+        for once, in their order, 16,384 at a time.
+    point_data, cell_data : mapping of name to array
+        As for `write_vtu`, and so are errors.
+    """
+    n_points = len(points)
     sections = {
-        "Points": [make_stream("Points", mesh.points, np.float64)],
-        "Cells": [*_connectivity(mesh.cells, n_points), stream_types(n_cells)],
+        "Points": [make_stream("Points", points, np.float64)],
+        "Cells": [*_stream_rows(cells, n_cells, 4, n_points), stream_types(n_cells)],
         "PointData": _data_streams(point_data, n_points),
         "CellData": _data_streams(cell_data, n_cells),
     }
@@ -136,7 +171,7 @@ def write_vtp(
     used = np.zeros(len(points), np.bool_)
     used[boundary.facets.ravel()] = True
     vertex = np.flatnonzero(used)
-    local = np.cumsum(used, dtype=np.int64) - 1
+    local = np.cumsum(used, dtype=np.int32 if len(points) < 2**31 else np.int64) - 1
     compact = {name: np.asarray(array)[vertex] for name, array in _checked(point_data, len(points)).items()}
     n_facets = len(boundary.facets)
     sections = {
@@ -249,8 +284,17 @@ def read_piece_paths(path: Path) -> list[Path]:
 
 def _connectivity(rows: NDArray[Any], n_points: int) -> list[Stream]:
     n_rows, width = rows.shape
-    index = np.int32 if n_points < 2**31 else np.int64
-    return [make_stream("connectivity", rows.reshape(-1), index), stream_offsets(n_rows, width)]
+    return _stream_rows(lambda begin, end: rows[begin:end], n_rows, width, n_points)
+
+
+def _stream_rows(rows: Callable[[int, int], NDArray[Any]], n_rows: int, width: int, n_points: int) -> list[Stream]:
+    index = np.dtype(np.int32 if n_points < 2**31 else np.int64)
+
+    def items(i: int, j: int) -> NDArray[Any]:
+        first = i // width
+        return rows(first, -(-j // width)).reshape(-1)[i - first * width : j - first * width]
+
+    return [stream_items("connectivity", index, 1, n_rows * width, items), stream_offsets(n_rows, width)]
 
 
 def stream_offsets(n_rows: int, width: int) -> Stream:

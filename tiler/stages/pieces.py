@@ -8,19 +8,18 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.building_facts import fidelity_table
-from pipeline.columns import drop_points, expand_cells, find_used_points, split_boundary
+from pipeline.cell_blocks import CellBlocks, QualityMeter, number_used, place_points, renumber_boundary
+from pipeline.columns import find_used_points, split_boundary
 from pipeline.errors import GeometryError
 from pipeline.histograms import (
     QUALITY_BINS,
     Histogram,
     histogram_percentiles,
     merge_histograms,
-    quality_histograms,
 )
 from pipeline.mesh import ColumnMesh, SeamEdges
 from pipeline.point_fidelity import KINDS, FidelitySums, conclude_fidelity, merge_fidelity, sum_fidelity
 from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
-from pipeline.quality import measure_cells
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
 from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
 from stitch.grid import Key, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
@@ -35,7 +34,7 @@ from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import unpack_polygons
 from tiler.task import Result, Task
-from tiler.vtk_files import write_vtp, write_vtu
+from tiler.vtk_files import write_vtp, write_vtu_blocks
 from tiler.written import FILES, state_files
 
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
@@ -93,7 +92,7 @@ def number_parts(task: Task) -> Facts:
 
 
 def write_piece(task: Task) -> Facts:
-    """Write a tile's cells and its boundary as files, and measure the cells (step 3.6)."""
+    """Write a tile's cells and its boundary as files, and measure the cells as they pass by (step 3.6)."""
     key = tile_key(task.name)
     arrays, attributes = task.store.read("columns", task.name, names=(*COLUMN_ARRAYS, *EDGE_ARRAYS, *ID_ARRAYS))
     mesh, numbers = unpack_columns(arrays, attributes["facts"]["order"])
@@ -103,32 +102,40 @@ def write_piece(task: Task) -> Facts:
         arrays["edge_building"],
         arrays["edge_missing"] | ~_there(task, key)[arrays["edge_seam"]],
     )
+    # A column of a seam has levels that only the tile beyond uses, below a roof whose wall is the seam.
     region: dict[str, NDArray[np.int8]] = {}
     if "soil" in attributes["facts"]:
         soil = SoilMesh(mesh, task.store.read("columns", task.name, names=("soil",))[0]["soil"])
-        cells, region[REGION] = expand_regions(soil)
-        boundary, shared = split_regions(soil, numbers, task.context.bounds, edges)
         used = find_used(soil)
+        number = number_used(used)
+        cells, region[REGION] = expand_regions(soil, number)
+        boundary, shared = split_regions(soil, numbers, task.context.bounds, edges)
     else:
-        cells = expand_cells(mesh)
-        boundary, shared = split_boundary(mesh, numbers, task.context.bounds, edges)
         used = find_used_points(mesh)
-    seams = _digest_seams(mesh, cells.points, shared, arrays["edge"], arrays["edge_seam"], key)
-    # A column of a seam has levels that only the tile beyond uses, below a roof whose wall is the seam.
-    cells, boundary = drop_points(cells, boundary, used)
+        number = number_used(used)
+        cells = CellBlocks([(mesh, number)])
+        boundary, shared = split_boundary(mesh, numbers, task.context.bounds, edges)
+    seams = _digest_seams(mesh, shared, arrays["edge"], arrays["edge_seam"], key)
+    points, boundary = place_points(mesh, used), renumber_boundary(boundary, number)
+    meter = QualityMeter(points)
+
+    def make_measured(begin: int, end: int) -> NDArray[np.int32]:
+        made = cells.make(begin, end)
+        with task.step("3.6 measure cells"):
+            meter.take(made)
+        return made
+
     with task.step("3.6 write pieces"), task.output() as out:
         ids = number_points(mesh, arrays["shared"], arrays["shared_id"], first_id(tile_part(key)))
-        number = {VERTEX_ID: ids[used]}
+        data = {VERTEX_ID: ids[used]}
         files = out / "mesh" / f"{task.name}.vtu", out / "boundary" / f"{task.name}.vtp"
-        write_vtu(files[0], cells, point_data=number, cell_data=region)
-        write_vtp(files[1], cells.points, boundary, point_data=number)
+        write_vtu_blocks(files[0], points, cells.n_cells, make_measured, point_data=data, cell_data=region)
+        write_vtp(files[1], points, boundary, point_data=data)
         written = state_files(out, files)
-    with task.step("3.6 measure cells"):
-        histograms = quality_histograms(measure_cells(cells))
-    for name, histogram in histograms.items():
+    for name, histogram in meter.histograms.items():
         task.put(**{name: histogram.counts, f"{name}_range": _range(histogram)})
     return {
-        "counts": {"cells": len(cells.cells), "facets": len(boundary.facets), "seam faces": len(shared)},
+        "counts": {"cells": cells.n_cells, "facets": len(boundary.facets), "seam faces": len(shared)},
         "seams": seams,
         FILES: written,
     }
@@ -222,7 +229,6 @@ def _there(task: Task, key: Key) -> NDArray[np.bool_]:
 
 def _digest_seams(
     mesh: ColumnMesh,
-    points: NDArray[np.float64],
     shared: NDArray[np.int32],
     edge: NDArray[np.int32],
     edge_seam: NDArray[np.int32],
@@ -237,8 +243,9 @@ def _digest_seams(
     side = edge_seam[order[np.searchsorted(wanted, code, sorter=order)]]
     found = {}
     for k, seam in enumerate(seams_of_tile(key)):
-        corners = points[shared[side == k]]
-        if len(corners):
+        here = side == k
+        if here.any():
+            corners = np.dstack((mesh.plane.xy[column[here]], mesh.z[shared[here]]))
             found[seam_name(seam)] = {"faces": len(corners), "hash": _hash_faces(corners)}
     return found
 
