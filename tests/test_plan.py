@@ -226,10 +226,10 @@ def test_the_first_footprints_stand_for_those_of_a_large_file(city: Config) -> N
 def test_tiles_that_do_not_fit_into_memory_are_told_with_a_size_that_does(city: Config) -> None:
     large = replace(city, tile_size=300.0, mesh_size=4.0, workers=2)
     assert not forecast_of(large, memory=4e9).warnings
-    (warning,) = forecast_of(large, memory=9.2e8).warnings
+    (warning,) = forecast_of(large, memory=8.0e8).warnings
     assert "--tile-size" in warning
     size = float(warning.split("--tile-size ")[1].split(",")[0])
-    assert not forecast_of(replace(large, tile_size=size), memory=9.2e8).warnings
+    assert not forecast_of(replace(large, tile_size=size), memory=8.0e8).warnings
     (warning,) = forecast_of(large, memory=5e8).warnings
     assert "--tile-size" not in warning
     assert "fewer --workers" in warning
