@@ -26,7 +26,9 @@ def number_used(used: NDArray[np.bool_]) -> NDArray[np.int32]:
     >>> number_used(np.array([True, False, True]))
     array([ 0, -1,  1], dtype=int32)
     """
-    return np.where(used, np.cumsum(used, dtype=np.int32) - 1, np.int32(UNUSED)).astype(np.int32, copy=False)
+    number = np.cumsum(used, dtype=np.int32) - 1
+    number[~used] = UNUSED
+    return number
 
 
 def place_points(mesh: ColumnMesh, used: NDArray[np.bool_]) -> NDArray[np.float64]:

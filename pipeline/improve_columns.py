@@ -115,23 +115,25 @@ class ColumnSurvey:
         """Move free levels of bad cells, by first steps of each column (m): all heights, and how many moved."""
         active = self.bad & self._free
         level = np.flatnonzero(active)
-        holds = np.zeros(len(self._mesh.plane.xy), np.bool_)
-        holds[self._column[level]] = True
-        over = holds[self._mesh.plane.triangles].any(axis=1)
-        cells = _gather(*self._merged(), over, self._most, self._clockwise, active)
+        cells = _gather(*self._merged(), self._find_triangles(active), self._most, self._clockwise, active)
         start, of_level = _cells_of_levels(cells, active)
         z, step = self._z.copy(), first_step[self._column[level]]
         return z, _search(self._mesh.plane.xy, self._column, z, cells, level, start, of_level, step)
 
     def move(self, z: NDArray[np.float64], *, last: bool) -> None:
         """Take other heights; after the last search nobody asks which levels are bad."""
-        touched = np.zeros(len(self._mesh.plane.xy), np.bool_)
-        touched[self._column[z != self._z]] = True
-        again = np.any(touched[self._mesh.plane.triangles], axis=1)
+        again = self._find_triangles(z != self._z)
         self._z = z
         if not last:
             again |= self.least < WORST
         self._measure(again)
+
+    def _find_triangles(self, levels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Find the triangles with one of some levels in a column, bool (m,)."""
+        holds = np.zeros(len(self._mesh.plane.xy), np.bool_)
+        holds[self._column[levels]] = True
+        found: NDArray[np.bool_] = np.any(holds[self._mesh.plane.triangles], axis=1)
+        return found
 
     def _merged(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64], NDArray[np.float64], bool]:
         mesh = self._mesh

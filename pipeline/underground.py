@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.cell_blocks import CellBlocks
-from pipeline.columns import Bounds, count_cells, find_used_points, split_boundary
+from pipeline.columns import Bounds, find_used_points, split_boundary
 from pipeline.edges import plane_edges
 from pipeline.levels import stagger_columns
 from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges
@@ -243,9 +243,9 @@ def expand_regions(mesh: SoilMesh, number: NDArray[np.int32]) -> tuple[CellBlock
         `Region` of each cell.
     """
     soil, rows = _take_soil(mesh)
-    count = [count_cells(mesh.columns), count_cells(soil)]
-    region = np.repeat(np.array([Region.AIR, Region.SOIL], np.int8), count)
-    return CellBlocks([(mesh.columns, number), (soil, number[rows])]), region
+    cells, n_soil = CellBlocks([(mesh.columns, number), (soil, number[rows])]), count_soil_cells(mesh)
+    region = np.repeat(np.array([Region.AIR, Region.SOIL], np.int8), [cells.n_cells - n_soil, n_soil])
+    return cells, region
 
 
 def find_used(mesh: SoilMesh) -> NDArray[np.bool_]:
