@@ -1,9 +1,33 @@
-"""What campaigns of tests leave for `make reliability`: JSON in the folder of ``CITYSTITCH_RELIABILITY``."""
+"""Campaigns of tests: `make reliability` runs all rounds and keeps what came of them, CI runs some.
+
+The environment variable ``CITYSTITCH_RELIABILITY`` names the folder of what is kept, and asks for all rounds.
+"""
 
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+Round = TypeVar("Round")
+FOLDER = "CITYSTITCH_RELIABILITY"
+ALL_ROUNDS = bool(os.environ.get(FOLDER))
+
+
+def rounds(some: Iterable[Round], others: Iterable[Round]) -> list[Round]:
+    """Give the rounds of a campaign: some, and the others too where all are asked for.
+
+    Parameters
+    ----------
+    some, others : iterable
+        What a test is parametrized with; `some` has each kind of kill or fault at least once.
+
+    Returns
+    -------
+    list
+        Of the same.
+    """
+    return [*some, *others] if ALL_ROUNDS else [*some]
 
 
 def keep_outcome(campaign: str, **outcome: Any) -> None:
@@ -16,7 +40,7 @@ def keep_outcome(campaign: str, **outcome: Any) -> None:
     **outcome
         Plain JSON values.
     """
-    folder = os.environ.get("CITYSTITCH_RELIABILITY")
+    folder = os.environ.get(FOLDER)
     if not folder:
         return
     path = Path(folder) / f"{campaign}.json"

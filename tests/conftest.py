@@ -1,6 +1,7 @@
 """Fixtures that all tests share."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -38,15 +39,23 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def amsterdam_run(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Finished run of central Amsterdam on four tiles, not to be changed."""
+    return run_amsterdam(shared_data, tmp_path_factory.mktemp("amsterdam") / "out", tile_size=300.0)
+
+
+@pytest.fixture(scope="session")
+def amsterdam_blocks_run(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished run of some blocks of Amsterdam on four tiles, for solvers; not to be changed."""
+    bounds = [120_750.0, 486_000.0, 121_050.0, 486_300.0]
+    return run_amsterdam(shared_data, tmp_path_factory.mktemp("blocks") / "out", tile_size=150.0, bounds=bounds)
+
+
+def run_amsterdam(shared_data: Path, out: Path, **given: Any) -> Path:
+    """Mesh central Amsterdam; gives the folder of the run."""
     from tiler.config import make_config
     from tiler.run import run
 
     data = shared_data / "amsterdam"
-    given = {
-        "pointcloud": [str(path) for path in sorted((data / "tiles").iterdir())],
-        "footprints": str(data / "footprints.gpkg"),
-        "out": str(tmp_path_factory.mktemp("amsterdam") / "out"),
-        "tile_size": 300.0,
-    }
-    run(make_config(given))
-    return Path(str(given["out"]))
+    clouds = [str(path) for path in sorted((data / "tiles").iterdir())]
+    inputs = {"pointcloud": clouds, "footprints": str(data / "footprints.gpkg"), "out": str(out)}
+    run(make_config(inputs | given))
+    return out

@@ -1,7 +1,7 @@
 """Faults of every kind in single items of 25 tiles: the rest finishes, the record names them, mending heals.
 
-Which items fail is drawn from seeds. With the environment variable ``CITYSTITCH_RELIABILITY`` set to a folder,
-what was injected is written there as ``faults.json``.
+Which items fail is drawn from seeds. `make reliability` has every kind of fault at every place, CI each kind and
+each place at least once; what was injected is kept as ``faults.json`` (`tests.campaigns`).
 """
 
 import json
@@ -16,7 +16,7 @@ import pytest
 
 from pipeline.errors import CityError
 from stitch.grid import tiles_of_seam
-from tests.campaigns import keep_outcome
+from tests.campaigns import keep_outcome, rounds
 from tests.faults import hangs, hangs_in_c, injected, is_killed, raises, segfaults, swallows_memory
 from tests.sparse_city import SparseCity, make_city
 from tests.test_run import hashes
@@ -40,6 +40,9 @@ KINDS: dict[str, tuple[Fault, str]] = {
 EARLY = ("ground", "houses", "shapes-0")  # a tile each, before there is a city model
 LATE = ("columns", "pieces", "fit", "own")  # a tile each, afterwards; seams and proofs come to these
 ASIDE = ("proofs", "fit", "own")  # what takes no tile with it
+OTHER = {"early": "late", "late": "early"}
+# Each kind before there is a city model, or after it.
+PAIRS = list(zip(KINDS, ("early", "late") * 3, strict=True))
 REGION = ("coarse", "join-0", "citymodel", "numbers")
 # One worker a core; a task that hangs is ended soon, one that allocates is refused.
 LIMITS = {"workers": 2, "time_limit": 6.0, "memory_limit": 1.0, "retries": 0}
@@ -124,9 +127,9 @@ def prove(city: SparseCity, out: Path, items: dict[str, str], kinds: dict[str, s
 
 @pytest.mark.long
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("early", [True, False], ids=["early", "late"])
-@pytest.mark.parametrize("kind", KINDS)
-def test_each_kind_of_fault_at_each_stage(city: SparseCity, tmp_path: Path, kind: str, early: bool) -> None:
+@pytest.mark.parametrize(("kind", "when"), rounds(PAIRS, [(kind, OTHER[when]) for kind, when in PAIRS]))
+def test_each_kind_of_fault_at_each_stage(city: SparseCity, tmp_path: Path, kind: str, when: str) -> None:
+    early = when == "early"
     seed = 2 * list(KINDS).index(kind) + early
     items = draw(city, np.random.default_rng(seed), early=early)
     out = tmp_path / "out"
@@ -137,7 +140,7 @@ def test_each_kind_of_fault_at_each_stage(city: SparseCity, tmp_path: Path, kind
 
 @pytest.mark.long
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("seed", [100, 101])
+@pytest.mark.parametrize("seed", rounds([100], [101]))
 def test_all_kinds_in_one_run_from_the_start(city: SparseCity, tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     items = draw(city, rng, early=False)
@@ -147,7 +150,7 @@ def test_all_kinds_in_one_run_from_the_start(city: SparseCity, tmp_path: Path, s
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("kind", ["exception", "segmentation fault", "hang", "allocation", "kill -9"])
+@pytest.mark.parametrize("kind", rounds(["exception", "kill -9"], ["segmentation fault", "hang", "allocation"]))
 def test_a_file_takes_the_tiles_below_it(city: SparseCity, tmp_path: Path, kind: str) -> None:
     (name, *_) = Store(city.out / "store.zarr").names("points")
     out = tmp_path / "out"
@@ -171,8 +174,13 @@ def test_a_file_takes_the_tiles_below_it(city: SparseCity, tmp_path: Path, kind:
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("stage", REGION)
-@pytest.mark.parametrize("kind", ["exception", "segmentation fault"])
+@pytest.mark.parametrize(
+    ("stage", "kind"),
+    rounds(
+        zip(REGION, ("exception", "segmentation fault") * 2, strict=True),
+        zip(REGION, ("segmentation fault", "exception") * 2, strict=True),
+    ),
+)
 def test_a_stage_of_the_region_ends_the_run(city: SparseCity, tmp_path: Path, stage: str, kind: str) -> None:
     out = tmp_path / "out"
     shutil.copytree(city.out, out)

@@ -1,8 +1,8 @@
 """Bad inputs from seeds: documented exit codes, one line, no crash, no hang, nothing written elsewhere.
 
 Each family changes the files or the command line of a tiny city by a seeded generator: case k of a family is the
-same on every machine. The everyday tests take the first cases of each, `pytest -m long` all. With the environment
-variable ``CITYSTITCH_RELIABILITY`` set to a folder, the outcomes are written there as ``fuzz-input.json``.
+same on every machine. The everyday tests take the first cases of each, `pytest -m long` more, `make reliability`
+all and keeps the outcomes as ``fuzz-input.json`` (`tests.campaigns`).
 """
 
 import json
@@ -22,12 +22,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.bad_input import BOUNDS, CODES, HOUSE, QUICK, write_city, write_houses, write_parquet
+from tests.campaigns import ALL_ROUNDS, FOLDER
 from tests.fuzz_worker import HUNG, Worker
 from tests.test_ingest import write_copc
 from tiler.config import Config
 
 LIMIT = 30.0  # s a call may take on a busy machine; most take half a second
-FEW, MANY = 10, 60  # cases of a family in the everyday tests and in the campaign
+FEW, MANY = 10, 60 if ALL_ROUNDS else 25  # cases of a family in the everyday tests and in the campaign
 Rng = np.random.Generator
 
 # Fixed fields of a LAS header: place and form.
@@ -221,7 +222,7 @@ class Tally:
 
     def write(self) -> None:
         """Write the outcomes as JSON where the environment asks for it."""
-        place = os.environ.get("CITYSTITCH_RELIABILITY")
+        place = os.environ.get(FOLDER)
         if not place:
             return
         path = Path(place) / "fuzz-input.json"

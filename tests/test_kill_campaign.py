@@ -1,8 +1,8 @@
 """Kills at random moments: workers, the driver, all, the scheduler; every run ends with the same bytes.
 
 The moments are numbers of committed results, drawn from seeds, spread evenly over a run and its stages. The same
-run is killed and gone on with several times before it may end. With the environment variable
-``CITYSTITCH_RELIABILITY`` set to a folder, what was killed when is written there as ``kills.json``.
+run is killed and gone on with several times before it may end. `make reliability` kills twelve runs, CI one for
+each kind; what was killed when is kept as ``kills.json`` (`tests.campaigns`).
 """
 
 import json
@@ -21,7 +21,7 @@ import numpy as np
 import psutil
 import pytest
 
-from tests.campaigns import keep_outcome
+from tests.campaigns import keep_outcome, rounds
 from tests.sparse_city import (
     SparseCity,
     children,
@@ -38,8 +38,10 @@ KILLS = 5  # of one run
 END = 240.0  # s that a run, or what is left of a killed one, may take
 LOST = "the connection to the Dask scheduler is lost; all that was done is kept"
 CLUSTER = "scheduler"
-ROUNDS = [("worker", 0), ("worker", 1), *((kind, seed) for seed in range(3) for kind in ("driver", "group"))]
-ROUNDS += [("mixed", 0), ("mixed", 1), (CLUSTER, 0), (CLUSTER, 1)]
+KINDS = ("worker", "driver", "group", "mixed", CLUSTER)
+ROUNDS = rounds(
+    [(kind, 0) for kind in KINDS], [*((kind, 1) for kind in KINDS), *((kind, 2) for kind in ("driver", "group"))]
+)
 
 
 @pytest.fixture(scope="module")

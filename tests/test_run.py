@@ -18,6 +18,7 @@ import shapely
 from pipeline.columns import expand_cells
 from pipeline.errors import CityError
 from pipeline.pointcloud import BUILDING, GROUND
+from tests.campaigns import keep_outcome, rounds
 from tests.cities import Bounds, cloud_over
 from tiler.check import check_run
 from tiler.cli import main
@@ -502,7 +503,7 @@ def test_real_data_with_finite_elements_is_the_same_city(shared_data: Path, tmp_
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", rounds(range(6), range(6, 20)))
 def test_random_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
     """Synthetic cities of any density and relief, from files to files."""
     rng = np.random.default_rng(seed)
@@ -522,7 +523,9 @@ def test_random_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
     record = run(make_config(config))
     report = check_run(tmp_path / "out", StoredTerrain)
     assert report.ok, report.lines()
-    assert record["counts"]["buildings"] > 0
+    counts, way = record["counts"], f"{config['mesher']}, {config['simplify']}"
+    assert counts["buildings"] > 0
+    keep_outcome("cities", seed=seed, way=way, **{what: counts[what] for what in ("tiles", "buildings", "cells")})
 
 
 PAPER = {"simplify": "paper", "mesher": "layered", "roof_height": "percentile"}

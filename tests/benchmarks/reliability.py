@@ -1,9 +1,9 @@
 """`make reliability`: run the campaigns, and write their tables into docs/reliability.md between markers.
 
-A campaign is a file of tests that are marked `long` and write their outcomes as JSON into the folder that the
-environment variable ``CITYSTITCH_RELIABILITY`` names, as CI does. Another one is an entry of `CAMPAIGNS`: the test
-files, and a function that makes lines of Markdown of its JSON. ``--from FOLDER`` writes the tables of outcomes
-that are there already.
+A campaign is tests that are marked `long` and write their outcomes as JSON into the folder that the environment
+variable ``CITYSTITCH_RELIABILITY`` names, which has them run all their rounds, too (`tests.campaigns`). Another
+one is an entry of `CAMPAIGNS`: the tests, and a function that makes lines of Markdown of its JSON.
+``--from FOLDER`` writes the tables of outcomes that are there already.
 """
 
 import json
@@ -110,12 +110,31 @@ def rebuild_table(record: Any) -> list[str]:
     return lines
 
 
+def cities_table(record: Any) -> list[str]:
+    """Make the table of the random cities that were meshed and proved: by mesher and simplification."""
+    lines = ["| way | cities | tiles | buildings | cells |", "|---|---|---|---|---|"]
+    ways: dict[str, list[Any]] = {}
+    for run in record:
+        ways.setdefault(run["way"], []).append(run)
+    for way, runs in [*sorted(ways.items()), ("**all**", record)]:
+        tiles, buildings, cells = (sum(run[what] for run in runs) for what in ("tiles", "buildings", "cells"))
+        lines.append(f"| {way} | {len(runs)} | {tiles:,} | {buildings:,} | {cells / 1e6:.1f} M |")
+    return lines
+
+
 # By the name of the JSON file and of the markers.
 CAMPAIGNS: dict[str, tuple[tuple[str, ...], Callable[[Any], list[str]]]] = {
     "kills": (("tests/test_kill_campaign.py",), kills_table),
     "faults": (("tests/test_fault_campaign.py",), faults_table),
     "damage": (("tests/test_store_audit.py", "tests/test_power_loss.py"), damage_table),
     "rebuild": (("tests/test_rebuild.py",), rebuild_table),
+    "cities": (
+        (
+            "tests/test_tiles.py::test_random_tiled_cities_are_meshed_and_proved",
+            "tests/test_run.py::test_random_cities_are_meshed_and_proved",
+        ),
+        cities_table,
+    ),
     "fuzz-input": (("tests/test_fuzz_input.py",), fuzz_table),
 }
 
