@@ -12,7 +12,7 @@ from distributed import get_worker
 from tests.test_engine import grid_layout, make
 from tiler import fork_server
 from tiler.executors import local
-from tiler.limits import Limits
+from tiler.limits import TRIM_AT, Limits, resident_memory
 from tiler.stage import Facts, Scope, Stage
 from tiler.task import Task
 
@@ -42,3 +42,28 @@ def test_workers_are_forked_with_their_settings_and_the_driver_keeps_its_own(tmp
     facts = engine.records["looks", "region"].facts
     expected = sorted(f"{name}={value}" for name, value in fork_server.ENVIRONMENT.items())
     assert facts == {"environment": expected, "server": True, "imported": True, "frozen": True, "sampled": False}
+
+
+KEPT: list[bytearray] = []
+
+
+def fragment(task: Task) -> Facts:
+    """Take much memory in small pieces and free almost all; what is kept lies between what was freed."""
+    taken = [bytearray(os.urandom(16) * 4096) for _ in range(3 * TRIM_AT // 2 // 65536)]
+    KEPT.extend(taken[::100])
+    return {"resident": resident_memory()}
+
+
+def tell_memory_now(task: Task) -> Facts:
+    return {"resident": resident_memory()}
+
+
+def test_a_worker_that_holds_much_gives_it_back_before_the_next_task(tmp_path: Path) -> None:
+    fork_server.begin()
+    with local(1, Limits(memory=2 * 2**30)) as executor:
+        engine = make(tmp_path, executor, layout=grid_layout())
+        engine.run(Stage("fragments", Scope.REGION, fragment))
+        engine.run(Stage("tells", Scope.REGION, tell_memory_now))
+    facts = {stage: record.facts["resident"] for (stage, _), record in engine.records.items()}
+    assert facts["fragments"] > 1.5 * TRIM_AT
+    assert facts["tells"] < 0.75 * TRIM_AT

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from multiprocessing import forkserver
 
 # One thread a worker. Dask's own settings of malloc give memory back at once, and it costs a third of a run's
-# time to get it again page by page; with these a worker keeps some 200 MB at most that it does not use.
+# time to get it again page by page; with these a worker keeps some 200 MB that it does not use, and gives them
+# back before a task where it holds much (`tiler.limits`).
 ENVIRONMENT: Mapping[str, int] = {
     "OMP_NUM_THREADS": 1,
     "MKL_NUM_THREADS": 1,

@@ -23,6 +23,7 @@ from tiler.task import Failure, Record, Task, run_task
 
 TASKS = ".tasks"  # folder beside the store, with a file for every task that runs
 TIMEOUT = "Timeout ("  # how the fault handler begins at the time limit
+TRIM_AT = 400 * 2**20  # bytes that a worker holds before a task when it gives back what it does not use
 REFUSE_AT, KILL_AT = 0.9, 0.95  # of the limit: no more is given; a process is ended whose memory was not counted
 CONTAINER_MEMORY = (  # where Linux tells what a container may take (bytes): control groups of version 1, then of 2
     "/sys/fs/cgroup/memory/memory.limit_in_bytes",
@@ -71,6 +72,8 @@ def run_guarded(function: Callable[[Task], Facts], task: Task, seconds: float) -
     The fault handler's watchdog is no Python thread: it acts even while the task holds the interpreter. There is
     one for the process, so workers of several threads have no time limit.
     """
+    if resident_memory() > TRIM_AT:
+        trim_memory()
     path = trace_file(task)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -144,6 +147,28 @@ def limit_memory(memory: int) -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     bound = memory + max(mapped - resident, 0)
     resource.setrlimit(resource.RLIMIT_DATA, (bound if hard == resource.RLIM_INFINITY else min(bound, hard), hard))
+
+
+def resident_memory() -> int:
+    """Memory that this process holds now (bytes); 0 where the system does not tell."""
+    with suppress(OSError):
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0
+
+
+def trim_memory() -> None:
+    """Give freed memory back to the system, between what is in use too; nothing happens but with GNU's C library.
+
+    Notes
+    -----
+    A worker keeps what it freed (`tiler.fork_server`), and small things that live on keep all that lies below. To
+    give it back takes time, and so does getting it anew: for workers that hold much.
+    """
+    import ctypes
+
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def machine_memory() -> int:
