@@ -1,17 +1,18 @@
-"""Cells of columns made a block at a time (step 3.6): a tile never has all its cells in memory.
+"""Points and cells of columns made a block at a time (step 3.6): a tile never has all of them in memory.
 
 There are some five cells to a point: 16 bytes for each of these, and what is measured of them, would be most of
-what a tile takes.
+what a tile takes; next come 24 bytes for each point.
 """
 
 from collections.abc import Sequence
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.columns import count_by_triangle, merge_columns
 from pipeline.histograms import QUALITY_BINS, Histogram, merge_histograms, no_values, quality_histograms
-from pipeline.mesh import Boundary, ColumnMesh, TetMesh
+from pipeline.mesh import ColumnMesh, TetMesh
 from pipeline.plane import signed_areas
 from pipeline.quality import measure_cells
 
@@ -31,19 +32,71 @@ def number_used(used: NDArray[np.bool_]) -> NDArray[np.int32]:
     return number
 
 
-def place_points(mesh: ColumnMesh, used: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Give the coordinates of some points of a mesh, float64 (k, 3), column by column from below (m)."""
-    column = np.repeat(np.arange(len(mesh.plane.xy), dtype=np.int32), np.diff(mesh.z_start))[used]
-    points = np.empty((len(column), 3))
-    for k in range(2):  # one after the other, as both would take as much again
-        points[:, k] = mesh.plane.xy[:, k][column]
-    points[:, 2] = mesh.z[used]
-    return points
+class UsedPoints:
+    """The points that cells of columns use, made when they are asked for: column by column from below.
+
+    Parameters
+    ----------
+    mesh : ColumnMesh
+        The columns.
+    used : bool, (n_levels,)
+        Levels that cells use, see `find_used_points`.
+
+    Attributes
+    ----------
+    n_points : int
+        Number of points.
+    number : int32, (n_levels,)
+        Number of each level as a point, `UNUSED` for others.
+    column : int32, (n_levels,)
+        Column of each level.
+
+    Notes
+    -----
+    Memory is 8 bytes a level, where coordinates would be 24.
+
+    Examples
+    --------
+    >>> from pipeline.mesh import PlaneMesh
+    >>> plane = PlaneMesh(np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]], np.int32), np.array([-1]))
+    >>> start, z = np.array([0, 2, 4, 6]), np.array([0.0, 1, 0, 1, 0, 1])
+    >>> prism = ColumnMesh(plane, start, z, np.zeros((1, 3), np.int32))
+    >>> points = UsedPoints(prism, np.array([True, True, False, True, True, True]))
+    >>> points.levels(1, 4), points.place(points.levels(2, 3))
+    (array([1, 3, 4], dtype=int32), array([[1., 0., 1.]]))
+    """
+
+    def __init__(self, mesh: ColumnMesh, used: NDArray[np.bool_]) -> None:
+        self._mesh = mesh
+        unused = np.flatnonzero(~used)
+        self._before = unused - np.arange(len(unused))  # points below each level that is not used
+        self.n_points = len(used) - len(unused)
+        self.number = number_used(used)
+        self.column = np.repeat(np.arange(len(mesh.plane.xy), dtype=np.int32), np.diff(mesh.z_start))
+
+    def levels(self, begin: int, end: int) -> NDArray[np.int32]:
+        """Tell which levels the points from one to before another are, int32 (end - begin,)."""
+        points = np.arange(begin, end)
+        return (points + np.searchsorted(self._before, points, side="right")).astype(np.int32)
+
+    def place(self, levels: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Give the coordinates of levels (k,), float64 (k, 3) (m)."""
+        points = np.empty((len(levels), 3))
+        _place(self._mesh.plane.xy, self.column, self._mesh.z, levels, points)
+        return points
 
 
-def renumber_boundary(boundary: Boundary, number: NDArray[np.int32]) -> Boundary:
-    """Give facets the numbers of the points that are used."""
-    return Boundary(number[boundary.facets], boundary.marker, boundary.building)
+@numba.njit(cache=True, nogil=True)
+def _place(
+    xy: NDArray[np.float64],
+    column: NDArray[np.int32],
+    z: NDArray[np.float64],
+    levels: NDArray[np.int32],
+    points: NDArray[np.float64],
+) -> None:
+    for k in range(len(levels)):
+        at = column[levels[k]]
+        points[k, 0], points[k, 1], points[k, 2] = xy[at, 0], xy[at, 1], z[levels[k]]
 
 
 class CellBlocks:
@@ -51,8 +104,8 @@ class CellBlocks:
 
     Parameters
     ----------
-    parts : sequence of (ColumnMesh, int32 (n_levels,))
-        Meshes whose cells come one after the other, and the number that each level has as a point.
+    parts : sequence of (ColumnMesh, int32 (n_levels,) or None)
+        Meshes whose cells come one after the other, and which of all levels theirs are: the same without.
 
     Attributes
     ----------
@@ -65,13 +118,13 @@ class CellBlocks:
     >>> plane = PlaneMesh(np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]], np.int32), np.array([-1]))
     >>> start, z = np.array([0, 2, 4, 6]), np.array([0.0, 1, 0, 1, 0, 1])
     >>> prism = ColumnMesh(plane, start, z, np.zeros((1, 3), np.int32))
-    >>> blocks = CellBlocks([(prism, np.arange(6, dtype=np.int32))])
+    >>> blocks = CellBlocks([(prism, None)])
     >>> blocks.n_cells, blocks.make(1, 3).shape
     (3, (2, 4))
     """
 
-    def __init__(self, parts: Sequence[tuple[ColumnMesh, NDArray[np.int32]]]) -> None:
-        self._parts = [(mesh, number, signed_areas(mesh.plane) < 0) for mesh, number in parts]
+    def __init__(self, parts: Sequence[tuple[ColumnMesh, NDArray[np.int32] | None]]) -> None:
+        self._parts = [(mesh, level, signed_areas(mesh.plane) < 0) for mesh, level in parts]
         counts = [count_by_triangle(mesh) for mesh, _ in parts]
         self._starts = [np.concatenate(([0], np.cumsum(count))) for count in counts]
         self._first = np.concatenate(([0], np.cumsum([start[-1] for start in self._starts]))).tolist()
@@ -88,7 +141,7 @@ class CellBlocks:
         Returns
         -------
         int32, (end - begin, 4)
-            Numbers of their points.
+            Levels that are their corners.
         """
         found = [
             self._make(k, max(begin - first, 0), min(end, self._first[k + 1]) - first)
@@ -101,21 +154,16 @@ class CellBlocks:
 
     def _make(self, k: int, begin: int, end: int) -> NDArray[np.int32]:
         """Make cells of one mesh: those over all triangles that they are over, and of these the ones asked for."""
-        (mesh, number, clockwise), start = self._parts[k], self._starts[k]
+        (mesh, level, clockwise), start = self._parts[k], self._starts[k]
         low = int(np.searchsorted(start, begin, side="right")) - 1
         high = int(np.searchsorted(start, end, side="left"))
         cells = merge_columns(mesh, slice(low, high), clockwise, int(start[high] - start[low]))
-        rows: NDArray[np.int32] = number[cells[begin - start[low] : end - start[low]]]
-        return rows
+        cells = cells[begin - start[low] : end - start[low]]
+        return cells if level is None else level[cells]
 
 
 class QualityMeter:
     """Measures cells as they pass by, on their way to a file.
-
-    Parameters
-    ----------
-    points : float64, (n, 3)
-        Coordinates of the points that cells refer to (m).
 
     Attributes
     ----------
@@ -123,13 +171,13 @@ class QualityMeter:
         Counts of each measure of the cells so far, as from `quality_histograms`.
     """
 
-    def __init__(self, points: NDArray[np.float64]) -> None:
-        self._points = points
+    def __init__(self) -> None:
         self.histograms: dict[str, Histogram] = {
             name: no_values(limits, bins) for name, (limits, bins) in QUALITY_BINS.items()
         }
 
-    def take(self, cells: NDArray[np.int32]) -> None:
-        """Measure cells, int32 (k, 4): some thousands at a time stay in the processor's cache."""
-        found = quality_histograms(measure_cells(TetMesh(self._points, cells)))
+    def take(self, corners: NDArray[np.float64]) -> None:
+        """Measure cells by their corners, float64 (4 k, 3): some thousands at a time stay in the cache."""
+        cells = np.arange(len(corners), dtype=np.int32).reshape(-1, 4)
+        found = quality_histograms(measure_cells(TetMesh(corners, cells)))
         self.histograms = {name: merge_histograms([self.histograms[name], part]) for name, part in found.items()}

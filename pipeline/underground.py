@@ -225,25 +225,23 @@ def count_soil_cells(mesh: SoilMesh) -> int:
     return int(mesh.top[mesh.columns.plane.triangles].sum())
 
 
-def expand_regions(mesh: SoilMesh, number: NDArray[np.int32]) -> tuple[CellBlocks, NDArray[np.int8]]:
+def expand_regions(mesh: SoilMesh) -> tuple[CellBlocks, NDArray[np.int8]]:
     """Tell the tetrahedra of positive volume that air and soil stand for.
 
     Parameters
     ----------
     mesh : SoilMesh
         The tile's mesh.
-    number : int32, (n_levels,)
-        Number of each level as a point, see `find_used` and `number_used`.
 
     Returns
     -------
     CellBlocks
-        The air's cells, then the soil's, each triangle by triangle.
+        The air's cells, then the soil's, each triangle by triangle; corners are levels of `SoilMesh.columns`.
     int8, (m,)
         `Region` of each cell.
     """
     soil, rows = _take_soil(mesh)
-    cells, n_soil = CellBlocks([(mesh.columns, number), (soil, number[rows])]), count_soil_cells(mesh)
+    cells, n_soil = CellBlocks([(mesh.columns, None), (soil, rows)]), count_soil_cells(mesh)
     region = np.repeat(np.array([Region.AIR, Region.SOIL], np.int8), [cells.n_cells - n_soil, n_soil])
     return cells, region
 

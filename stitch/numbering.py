@@ -114,8 +114,8 @@ def seam_ids(key: SeamKey, levels: Levels) -> Ints:
     return ids
 
 
-def number_points(mesh: ColumnMesh, shared: NDArray[np.int32], lowest: Ints, first: int) -> Ints:
-    """Give the points of a tile their region-wide ids.
+def number_columns(mesh: ColumnMesh, shared: NDArray[np.int32], lowest: Ints, first: int) -> Ints:
+    """Give the points of a tile their region-wide ids: those of the lowest, as the others of a column follow.
 
     Parameters
     ----------
@@ -130,8 +130,8 @@ def number_points(mesh: ColumnMesh, shared: NDArray[np.int32], lowest: Ints, fir
 
     Returns
     -------
-    int64, (n_points,)
-        Id of each point, in the order of `expand_cells`.
+    int64, (n,)
+        Id of the lowest level of each column of the tile.
 
     Raises
     ------
@@ -139,14 +139,12 @@ def number_points(mesh: ColumnMesh, shared: NDArray[np.int32], lowest: Ints, fir
         If a corner is given with two ids.
     """
     count = np.diff(mesh.z_start)
-    begin = np.full(len(count), -1, np.int64)
-    begin[shared] = lowest
-    if (begin[shared] != lowest).any():
+    ids = np.full(len(count), -1, np.int64)
+    ids[shared] = lowest
+    if (ids[shared] != lowest).any():
         raise ValueError("two seams of a tile number a corner differently")
-    own = begin < 0
-    begin[own] = first + np.cumsum(count[own]) - count[own]
-    ids: Ints = np.repeat(begin - mesh.z_start[:-1], count)
-    ids += np.arange(len(mesh.z))
+    own = ids < 0
+    ids[own] = first + np.cumsum(count[own]) - count[own]
     return ids
 
 

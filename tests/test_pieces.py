@@ -28,7 +28,7 @@ from stitch.numbering import (
     collect_ids,
     corner_part,
     first_id,
-    number_points,
+    number_columns,
     number_without_gaps,
     seam_part,
     tile_part,
@@ -303,7 +303,7 @@ def test_runs_of_ids_are_numbered_as_their_sorted_list(seed: int) -> None:
 def test_corners_with_two_ids_are_refused(crowded: City) -> None:
     mesh = crowded.tiles[Key(0, 0)].mesh
     with pytest.raises(ValueError, match="number a corner differently"):
-        number_points(mesh, np.array([0, 1, 0], np.int32), np.array([0, 40, 7]), 100)
+        number_columns(mesh, np.array([0, 1, 0], np.int32), np.array([0, 40, 7]), 100)
 
 
 # --- one file of all pieces ------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.cell_blocks import number_used, place_points
+from pipeline.cell_blocks import UsedPoints
 from pipeline.errors import ConfigError, InputError
 from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
 from pipeline.nodes import GROUND_SURFACE, TOP_SURFACE, Levels, SeamColumns, no_seam
@@ -191,7 +191,7 @@ def test_cells_of_soil_come_after_those_of_air_in_any_block() -> None:
     plane = two_triangles(-1, 0)
     air = air_over(plane, [0.0, 2.0, 0.0, 0.0], [[0, 0, 0], [1, 0, 1]])
     mesh, _, _ = add_soil(air, np.array([9.0, 0.5, 9.0, 9.0]), no_seam(), no_seam(), OPTIONS)
-    blocks, region = expand_regions(mesh, number_used(find_used(mesh)))
+    blocks, region = expand_regions(mesh)
     whole, first = blocks.make(0, blocks.n_cells), int((region == Region.AIR).sum())
     assert 1 < first < blocks.n_cells - 1
     for begin in range(blocks.n_cells):
@@ -200,9 +200,10 @@ def test_cells_of_soil_come_after_those_of_air_in_any_block() -> None:
 
 
 def _expand(mesh: SoilMesh) -> tuple[TetMesh, NDArray[np.int8]]:
-    used = find_used(mesh)
-    blocks, region = expand_regions(mesh, number_used(used))
-    return TetMesh(place_points(mesh.columns, used), blocks.make(0, blocks.n_cells)), region
+    blocks, region = expand_regions(mesh)
+    points = UsedPoints(mesh.columns, find_used(mesh))
+    places = points.place(points.levels(0, points.n_points))
+    return TetMesh(places, points.number[blocks.make(0, blocks.n_cells)]), region
 
 
 def _points_and_cells(mesh: SoilMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]]:

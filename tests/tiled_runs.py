@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions
-from pipeline.cell_blocks import CellBlocks, number_used, place_points, renumber_boundary
+from pipeline.cell_blocks import CellBlocks, UsedPoints
 from pipeline.columns import find_used_points, split_boundary
 from pipeline.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
 from pipeline.terrain import Dtm, sample_dtm
@@ -21,7 +21,7 @@ from stitch.numbering import (
     count_points,
     first_id,
     make_offsets,
-    number_points,
+    number_columns,
     seam_ids,
     seam_part,
     tile_part,
@@ -88,11 +88,10 @@ def cut_city(city: City, gone: Collection[Key] = ()) -> Pieces:
     """Make the pieces that are written: cells and boundary of each tile."""
     pieces: Pieces = {}
     for key, (mesh, boundary, _) in split_all(city, gone).items():
-        used = find_used_points(mesh)
-        number = number_used(used)
-        blocks = CellBlocks([(mesh, number)])
-        cells = TetMesh(place_points(mesh, used), blocks.make(0, blocks.n_cells))
-        pieces[key] = cells, renumber_boundary(boundary, number)
+        points, blocks = UsedPoints(mesh, find_used_points(mesh)), CellBlocks([(mesh, None)])
+        places = points.place(points.levels(0, points.n_points))
+        cells = TetMesh(places, points.number[blocks.make(0, blocks.n_cells)])
+        pieces[key] = cells, replace(boundary, facets=points.number[boundary.facets])
     return pieces
 
 
@@ -102,9 +101,11 @@ def number_city(city: City) -> dict[Key, NDArray[np.int64]]:
     for key, tile in city.tiles.items():
         shared = [find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy) for seam in tile.columns]
         lowest = [seam_ids(seam, levels) for seam, levels in tile.columns.items()]
-        ids[key] = number_points(
+        start = tile.mesh.z_start
+        column = number_columns(
             tile.mesh, np.concatenate(shared), np.concatenate(lowest), first_id(tile_part(key))
         )
+        ids[key] = np.repeat(column - start[:-1], np.diff(start)) + np.arange(start[-1])
     return ids
 
 

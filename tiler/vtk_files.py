@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from tiler.vtk_xml import (
     Stream,
     compress_block,
     damaged,
-    make_stream,
     opened,
     parse_xml,
     read_data_file,
@@ -34,6 +33,66 @@ from tiler.vtk_xml import (
 TETRA = 10  # VTK_TETRA
 Arrays = Mapping[str, NDArray[Any]]
 NO_ARRAYS: Arrays = {}
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """An array on its way to a file, some rows of it at a time.
+
+    Attributes
+    ----------
+    n_rows, width : int
+        Number of rows, and of numbers in each.
+    dtype : dtype
+        Their type.
+    make : callable
+        ``make(i, j)`` makes the rows ``i`` to before ``j``: (j - i,) or (j - i, width). A row in which a block of
+        the file ends is asked for twice: none, where the width is a power of two.
+    """
+
+    n_rows: int
+    width: int
+    dtype: np.dtype[Any]
+    make: Callable[[int, int], NDArray[Any]]
+
+    @classmethod
+    def of(cls, array: NDArray[Any]) -> Self:
+        """Take the rows of an array (n,) or (n, width)."""
+        width = array.shape[1] if array.ndim == 2 else 1
+        return cls(len(array), width, array.dtype, lambda i, j: array[i:j])
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """What points have, made for those of them that are asked for.
+
+    Attributes
+    ----------
+    width : int
+        Numbers of each point.
+    dtype : dtype
+        Their type.
+    take : callable
+        ``take(index)`` makes those of some points: (k,) or (k, width).
+    """
+
+    width: int
+    dtype: np.dtype[Any]
+    take: Callable[[NDArray[Any]], NDArray[Any]]
+
+    @classmethod
+    def of(cls, array: NDArray[Any]) -> Self:
+        """Take the values of an array (n,) or (n, width)."""
+        return cls(array.shape[1] if array.ndim == 2 else 1, array.dtype, lambda index: array[index])
+
+    def rows(self, n_rows: int, index: Callable[[int, int], NDArray[Any]]) -> Rows:
+        """Make rows of them: those of the points ``index(i, j)`` are rows ``i`` to before ``j``."""
+        return Rows(n_rows, self.width, self.dtype, lambda i, j: self.take(index(i, j)))
+
+
+RowArrays = Mapping[str, Rows]
+ValueArrays = Mapping[str, Values]
+VERTEX = Values(1, np.dtype(np.int64), np.asarray)  # index of each point
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,47 +159,41 @@ def write_vtu(path: Path, mesh: TetMesh, *, point_data: Arrays = NO_ARRAYS, cell
     """
     write_vtu_blocks(
         path,
-        mesh.points,
-        len(mesh.cells),
-        lambda begin, end: mesh.cells[begin:end],
-        point_data=point_data,
-        cell_data=cell_data,
+        Rows.of(mesh.points),
+        Rows.of(mesh.cells),
+        point_data=_rows_of(point_data, len(mesh.points)),
+        cell_data=_rows_of(cell_data, len(mesh.cells)),
     )
 
 
 def write_vtu_blocks(
-    path: Path,
-    points: NDArray[np.float64],
-    n_cells: int,
-    cells: Callable[[int, int], NDArray[np.int32]],
-    *,
-    point_data: Arrays = NO_ARRAYS,
-    cell_data: Arrays = NO_ARRAYS,
+    path: Path, points: Rows, cells: Rows, *, point_data: RowArrays, cell_data: RowArrays
 ) -> None:
-    """Write a volume mesh as a VTU file, with cells that are made a block at a time.
+    """Write a volume mesh as a VTU file, with points and cells that are made a block at a time.
 
     Parameters
     ----------
     path : Path
         The file; it appears whole or not at all.
-    points : float64, (n, 3)
-        Coordinates (m).
-    n_cells : int
-        Number of cells.
-    cells : callable
-        ``cells(i, j)`` makes the cells ``i`` to ``j`` as int32 (j - i, 4), indices of the points. Each is asked
-        for once, in their order, 16,384 at a time.
-    point_data, cell_data : mapping of name to array
-        As for `write_vtu`, and so are errors.
+    points : Rows
+        Coordinates, float64 (n, 3) (m).
+    cells : Rows
+        Tetrahedra, int32 (m, 4), indices of the points. Each is asked for once, in their order, 16,384 at a time.
+    point_data, cell_data : mapping of name to Rows
+        Further arrays, of n and m rows.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
-    n_points = len(points)
     sections = {
-        "Points": [make_stream("Points", points, np.float64)],
-        "Cells": [*_stream_rows(cells, n_cells, 4, n_points), stream_types(n_cells)],
-        "PointData": _data_streams(point_data, n_points),
-        "CellData": _data_streams(cell_data, n_cells),
+        "Points": [_stream("Points", points)],
+        "Cells": [*_connectivity(cells, points.n_rows), stream_types(cells.n_rows)],
+        "PointData": [_stream(name, rows) for name, rows in point_data.items()],
+        "CellData": [_stream(name, rows) for name, rows in cell_data.items()],
     }
-    counts = {"NumberOfPoints": n_points, "NumberOfCells": n_cells}
+    counts = {"NumberOfPoints": points.n_rows, "NumberOfCells": cells.n_rows}
     write_data_file(path, "UnstructuredGrid", counts, sections)
 
 
@@ -168,26 +221,54 @@ def write_vtp(
     ValueError
         If an array has another length or type.
     """
-    used = np.zeros(len(points), np.bool_)
-    used[boundary.facets.ravel()] = True
-    vertex = np.flatnonzero(used)
-    local = np.cumsum(used, dtype=np.int32 if len(points) < 2**31 else np.int64) - 1
-    compact = {name: np.asarray(array)[vertex] for name, array in _checked(point_data, len(points)).items()}
-    n_facets = len(boundary.facets)
-    sections = {
-        "Points": [make_stream("Points", points[vertex], np.float64)],
-        "Polys": _connectivity(local[boundary.facets].reshape(-1, 3), len(vertex)),
-        "PointData": [make_stream("vertex", vertex, np.int64), *_data_streams(compact, len(vertex))],
-        "CellData": _data_streams(
-            {
-                "marker": boundary.marker.astype(np.int32, copy=False),
-                "building": boundary.building.astype(np.int64, copy=False),
-            },
-            n_facets,
-        ),
+    checked = _checked(point_data, len(points))
+    data = {"vertex": VERTEX} | {name: Values.of(array) for name, array in checked.items()}
+    write_vtp_blocks(path, len(points), boundary, Values.of(points), point_data=data)
+
+
+def write_vtp_blocks(
+    path: Path, n_points: int, boundary: Boundary, points: Values, *, point_data: ValueArrays
+) -> None:
+    """Write the boundary of a volume mesh as a VTP file, with points that are made a block at a time.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it appears whole or not at all.
+    n_points : int
+        Number of what facets may refer to.
+    boundary : Boundary
+        Marked facets; `marker` and `building` become cell arrays.
+    points : Values
+        Coordinates, float64, three of each point (m).
+    point_data : mapping of name to Values
+        All arrays of points; `read_vtp` wants ``vertex``, each point's index in the volume mesh.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    local = np.zeros(n_points, np.int32 if n_points < 2**31 else np.int64)
+    local[boundary.facets.ravel()] = 1
+    used = np.flatnonzero(local)
+    np.cumsum(local, out=local)
+    n_used, facets = len(used), boundary.facets
+    polygons = Rows(len(facets), 3, local.dtype, lambda i, j: local[facets[i:j]] - 1)
+    marks: Arrays = {
+        "marker": boundary.marker.astype(np.int32, copy=False),
+        "building": boundary.building.astype(np.int64, copy=False),
     }
-    counts = {"NumberOfPoints": len(vertex), "NumberOfVerts": 0, "NumberOfLines": 0}
-    counts |= {"NumberOfStrips": 0, "NumberOfPolys": n_facets}
+    named = {"Points": points, **point_data}
+    streams = [_stream(name, values.rows(n_used, lambda i, j: used[i:j])) for name, values in named.items()]
+    sections = {
+        "Points": streams[:1],
+        "Polys": _connectivity(polygons, n_used),
+        "PointData": streams[1:],
+        "CellData": [_stream(name, Rows.of(array)) for name, array in marks.items()],
+    }
+    counts = {"NumberOfPoints": n_used, "NumberOfVerts": 0, "NumberOfLines": 0}
+    counts |= {"NumberOfStrips": 0, "NumberOfPolys": len(facets)}
     write_data_file(path, "PolyData", counts, sections)
 
 
@@ -282,19 +363,25 @@ def read_piece_paths(path: Path) -> list[Path]:
     return pieces
 
 
-def _connectivity(rows: NDArray[Any], n_points: int) -> list[Stream]:
-    n_rows, width = rows.shape
-    return _stream_rows(lambda begin, end: rows[begin:end], n_rows, width, n_points)
-
-
-def _stream_rows(rows: Callable[[int, int], NDArray[Any]], n_rows: int, width: int, n_points: int) -> list[Stream]:
+def _connectivity(rows: Rows, n_points: int) -> list[Stream]:
     index = np.dtype(np.int32 if n_points < 2**31 else np.int64)
+    flat = stream_items("connectivity", index, 1, rows.n_rows * rows.width, _items(rows))
+    return [flat, stream_offsets(rows.n_rows, rows.width)]
+
+
+def _stream(name: str, rows: Rows) -> Stream:
+    return stream_items(name, rows.dtype, rows.width, rows.n_rows * rows.width, _items(rows))
+
+
+def _items(rows: Rows) -> Callable[[int, int], NDArray[Any]]:
+    """Make numbers ``i`` to before ``j`` of all that rows have, whichever rows these are in."""
 
     def items(i: int, j: int) -> NDArray[Any]:
-        first = i // width
-        return rows(first, -(-j // width)).reshape(-1)[i - first * width : j - first * width]
+        first = i // rows.width
+        made = rows.make(first, -(-j // rows.width)).reshape(-1)
+        return made[i - first * rows.width : j - first * rows.width]
 
-    return [stream_items("connectivity", index, 1, n_rows * width, items), stream_offsets(n_rows, width)]
+    return items
 
 
 def stream_offsets(n_rows: int, width: int) -> Stream:
@@ -313,9 +400,8 @@ def stream_types(n_cells: int) -> Stream:
     return stream_items("types", np.dtype(np.uint8), 1, n_cells, lambda i, j: np.full(j - i, TETRA, np.uint8))
 
 
-def _data_streams(arrays: Arrays, n_rows: int) -> list[Stream]:
-    checked = _checked(arrays, n_rows)
-    return [make_stream(name, array, array.dtype) for name, array in checked.items()]
+def _rows_of(arrays: Arrays, n_rows: int) -> RowArrays:
+    return {name: Rows.of(array) for name, array in _checked(arrays, n_rows).items()}
 
 
 def _checked(arrays: Arrays, n_rows: int) -> Arrays:

@@ -8,7 +8,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.building_facts import fidelity_table
-from pipeline.cell_blocks import CellBlocks, QualityMeter, number_used, place_points, renumber_boundary
+from pipeline.cell_blocks import CellBlocks, QualityMeter, UsedPoints
 from pipeline.columns import find_used_points, split_boundary
 from pipeline.errors import GeometryError
 from pipeline.histograms import (
@@ -23,7 +23,7 @@ from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
 from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
 from stitch.grid import Key, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
-from stitch.numbering import corner_part, first_id, make_offsets, number_points, seam_part, tile_part
+from stitch.numbering import corner_part, first_id, make_offsets, number_columns, seam_part, tile_part
 from tiler.config import Config
 from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
 from tiler.merged import VERTEX_ID
@@ -34,7 +34,7 @@ from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import unpack_polygons
 from tiler.task import Result, Task
-from tiler.vtk_files import write_vtp, write_vtu_blocks
+from tiler.vtk_files import Rows, Values, write_vtp_blocks, write_vtu_blocks
 from tiler.written import FILES, state_files
 
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
@@ -107,30 +107,39 @@ def write_piece(task: Task) -> Facts:
     if "soil" in attributes["facts"]:
         soil = SoilMesh(mesh, task.store.read("columns", task.name, names=("soil",))[0]["soil"])
         used = find_used(soil)
-        number = number_used(used)
-        cells, region[REGION] = expand_regions(soil, number)
+        cells, region[REGION] = expand_regions(soil)
         boundary, shared = split_regions(soil, numbers, task.context.bounds, edges)
     else:
         used = find_used_points(mesh)
-        number = number_used(used)
-        cells = CellBlocks([(mesh, number)])
+        cells = CellBlocks([(mesh, None)])
         boundary, shared = split_boundary(mesh, numbers, task.context.bounds, edges)
     seams = _digest_seams(mesh, shared, arrays["edge"], arrays["edge_seam"], key)
-    points, boundary = place_points(mesh, used), renumber_boundary(boundary, number)
-    meter = QualityMeter(points)
+    points, meter = UsedPoints(mesh, used), QualityMeter()
+    lowest = number_columns(mesh, arrays["shared"], arrays["shared_id"], first_id(tile_part(key)))
 
     def make_measured(begin: int, end: int) -> NDArray[np.int32]:
         made = cells.make(begin, end)
         with task.step("3.6 measure cells"):
-            meter.take(made)
-        return made
+            meter.take(points.place(made.ravel()))
+        return points.number[made]
 
+    def make_ids(levels: NDArray[np.int64]) -> NDArray[np.int64]:
+        column = points.column[levels]
+        return lowest[column] + (levels - mesh.z_start[column])
+
+    places, ids = Values(3, np.dtype(np.float64), points.place), Values(1, np.dtype(np.int64), make_ids)
+    vertex = Values(1, np.dtype(np.int64), lambda levels: points.number[levels])
     with task.step("3.6 write pieces"), task.output() as out:
-        ids = number_points(mesh, arrays["shared"], arrays["shared_id"], first_id(tile_part(key)))
-        data = {VERTEX_ID: ids[used]}
         files = out / "mesh" / f"{task.name}.vtu", out / "boundary" / f"{task.name}.vtp"
-        write_vtu_blocks(files[0], points, cells.n_cells, make_measured, point_data=data, cell_data=region)
-        write_vtp(files[1], points, boundary, point_data=data)
+        write_vtu_blocks(
+            files[0],
+            places.rows(points.n_points, points.levels),
+            Rows(cells.n_cells, 4, np.dtype(np.int32), make_measured),
+            point_data={VERTEX_ID: ids.rows(points.n_points, points.levels)},
+            cell_data={name: Rows.of(array) for name, array in region.items()},
+        )
+        data = {"vertex": vertex, VERTEX_ID: ids}
+        write_vtp_blocks(files[1], len(mesh.z), boundary, places, point_data=data)
         written = state_files(out, files)
     for name, histogram in meter.histograms.items():
         task.put(**{name: histogram.counts, f"{name}_range": _range(histogram)})
