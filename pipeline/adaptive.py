@@ -132,20 +132,21 @@ def mesh_adaptive(
     levels, bottom, moves = _fill_columns(plane, dtm, roof, ids, options, seam, sizes)
     mesh = ColumnMesh(plane, levels.start, levels.z, bottom, "heights")
     free = np.isnan(levels.surface)
-    count = np.diff(levels.start)
+    count, n_shared = np.diff(levels.start), _count_shared(levels)
     free &= ~np.repeat(np.isin(np.arange(len(plane.xy)), seam.vertex), count)
     size = local_sizes(sizes, plane.xy, mesh_size=options.mesh_size)
     spacing = vertical_spacing(mean_edges(plane), size, options.limits)
     if options.growth is not None:
         lowest = sample_dtm(dtm, plane.xy) + movable_height(spacing, options.growth)
         free &= levels.z > np.repeat(lowest, count)
+    del levels  # its surfaces are as large as its heights
     mesh, worst, improved = improve_columns(
         mesh, free, spacing, passes=options.passes, flat_cells=options.growth is not None
     )
     report = AdaptiveReport(
         n_columns=len(plane.xy),
-        n_levels=len(levels.z),
-        shared_columns=_count_shared(levels),
+        n_levels=len(mesh.z),
+        shared_columns=n_shared,
         moved_nodes=int((moves > 0).sum()),
         largest_move=float(moves.max(initial=0.0)),
         improved_levels=improved,
@@ -219,5 +220,5 @@ def _check_top(
 
 
 def _count_shared(levels: Levels) -> int:
-    column = np.repeat(np.arange(len(levels.start) - 1), np.diff(levels.start))
-    return int((np.bincount(column[np.isfinite(levels.surface)]) > 1).sum())
+    column = np.searchsorted(levels.start, np.flatnonzero(np.isfinite(levels.surface)), side="right")
+    return int((np.bincount(column) > 1).sum())

@@ -5,6 +5,7 @@ what a tile takes; next come 24 bytes for each point.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numba
 import numpy as np
@@ -46,14 +47,12 @@ class UsedPoints:
     ----------
     n_points : int
         Number of points.
-    number : int32, (n_levels,)
-        Number of each level as a point, `UNUSED` for others.
     column : int32, (n_levels,)
         Column of each level.
 
     Notes
     -----
-    Memory is 8 bytes a level, where coordinates would be 24.
+    Memory is 4 bytes a level, where coordinates would be 24.
 
     Examples
     --------
@@ -64,20 +63,25 @@ class UsedPoints:
     >>> points = UsedPoints(prism, np.array([True, True, False, True, True, True]))
     >>> points.levels(1, 4), points.place(points.levels(2, 3))
     (array([1, 3, 4], dtype=int32), array([[1., 0., 1.]]))
+    >>> points.numbers(np.array([1, 4]))
+    array([1, 3])
     """
 
     def __init__(self, mesh: ColumnMesh, used: NDArray[np.bool_]) -> None:
         self._mesh = mesh
-        unused = np.flatnonzero(~used)
-        self._before = unused - np.arange(len(unused))  # points below each level that is not used
-        self.n_points = len(used) - len(unused)
-        self.number = number_used(used)
+        self._unused = np.flatnonzero(~used)
+        self._before = self._unused - np.arange(len(self._unused))  # points before each level that is not used
+        self.n_points = len(used) - len(self._unused)
         self.column = np.repeat(np.arange(len(mesh.plane.xy), dtype=np.int32), np.diff(mesh.z_start))
 
     def levels(self, begin: int, end: int) -> NDArray[np.int32]:
         """Tell which levels the points from one to before another are, int32 (end - begin,)."""
         points = np.arange(begin, end)
         return (points + np.searchsorted(self._before, points, side="right")).astype(np.int32)
+
+    def numbers(self, levels: NDArray[Any]) -> NDArray[np.int64]:
+        """Tell which points some levels are that are used, int64 (k,); for all of them see `number_used`."""
+        return levels - np.searchsorted(self._unused, levels)
 
     def place(self, levels: NDArray[np.int32]) -> NDArray[np.float64]:
         """Give the coordinates of levels (k,), float64 (k, 3) (m)."""

@@ -19,6 +19,8 @@ WORST = 0.5  # levels of cells with a radius ratio below this may move
 SEARCH_SWEEPS = 10
 FIRST_STEP = 0.15  # of the column's spacing
 LAST_STEP = 0.02  # of the first step
+INACTIVE = -1  # level that is not searched
+MOST_LEVELS = 50_000  # that are searched together: some 400 bytes each, for the cells around them
 
 
 def improve_columns(
@@ -57,8 +59,8 @@ def improve_columns(
     Notes
     -----
     Merging anew changes cells beside those that were looked at; of all rounds, the mesh with the least sum over
-    all its cells is kept. Memory is that of the levels, and of the cells around those that may move: all others
-    are made and measured a triangle at a time.
+    all its cells is kept. Memory is that of the levels, and of the cells around those that may move, an area after
+    the other where they are many: all others are made and measured a triangle at a time.
     """
     survey = ColumnSurvey(mesh, free, flat_cells)
     best, least_cost = mesh, survey.cost
@@ -71,6 +73,43 @@ def improve_columns(
         if survey.cost < least_cost:
             best, least_cost, after = replace(mesh, z=z), survey.cost, survey.worst
     return best, (before, after), n_moved
+
+
+def split_columns(xy: NDArray[np.float64], count: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:
+    """Split columns into areas of the plane with at most so many levels each, halved across their longer side.
+
+    Parameters
+    ----------
+    xy : float64, (n, 2)
+        Columns (m).
+    count : int64, (n,)
+        Levels of each; columns without any are in no area.
+    most : int
+        Levels of an area, unless one column alone has more.
+
+    Returns
+    -------
+    list of int64 (k,)
+        Columns of each area.
+
+    Examples
+    --------
+    >>> split_columns(np.array([[0.0, 0], [9, 0], [3, 0], [1, 1]]), np.array([2, 2, 2, 0]), 4)
+    [array([0, 2]), array([1])]
+    """
+    waiting, areas = [np.flatnonzero(count)], []
+    while waiting:
+        columns = waiting.pop()
+        total = count[columns].sum()
+        if total > most and len(columns) > 1:
+            axis = int(np.ptp(xy[columns], axis=0).argmax())
+            ordered = columns[np.argsort(xy[columns, axis], kind="stable")]
+            half = int(np.searchsorted(np.cumsum(count[ordered]), total / 2)) + 1
+            half = min(half, len(columns) - 1)
+            waiting += [ordered[half:], ordered[:half]]
+        elif total:
+            areas.append(columns)
+    return areas
 
 
 class ColumnSurvey:
@@ -113,12 +152,20 @@ class ColumnSurvey:
 
     def search(self, first_step: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
         """Move free levels of bad cells, by first steps of each column (m): all heights, and how many moved."""
-        active = self.bad & self._free
-        level = np.flatnonzero(active)
-        cells = _gather(*self._merged(), self._find_triangles(active), self._most, self._clockwise, active)
-        start, of_level = _cells_of_levels(cells, active)
-        z, step = self._z.copy(), first_step[self._column[level]]
-        return z, _search(self._mesh.plane.xy, self._column, z, cells, level, start, of_level, step)
+        xy, z, n_moved = self._mesh.plane.xy, self._z.copy(), 0
+        level = np.flatnonzero(self.bad & self._free)
+        count = np.bincount(self._column[level], minlength=len(xy))
+        number = np.full(len(z), INACTIVE, np.int32)
+        for columns in split_columns(xy, count, MOST_LEVELS):
+            here = np.zeros(len(xy), np.bool_)
+            here[columns] = True
+            part = level[here[self._column[level]]]
+            number[part] = np.arange(len(part), dtype=np.int32)
+            cells = _gather(*self._merged(), self._touch(here), self._most, self._clockwise, number)
+            start, of_level = _cells_of_levels(cells, number, len(part))
+            number[part] = INACTIVE
+            n_moved += _search(xy, self._column, z, cells, part, start, of_level, first_step[self._column[part]])
+        return z, n_moved
 
     def move(self, z: NDArray[np.float64], *, last: bool) -> None:
         """Take other heights; after the last search nobody asks which levels are bad."""
@@ -130,9 +177,13 @@ class ColumnSurvey:
 
     def _find_triangles(self, levels: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Find the triangles with one of some levels in a column, bool (m,)."""
-        holds = np.zeros(len(self._mesh.plane.xy), np.bool_)
-        holds[self._column[levels]] = True
-        found: NDArray[np.bool_] = np.any(holds[self._mesh.plane.triangles], axis=1)
+        columns = np.zeros(len(self._mesh.plane.xy), np.bool_)
+        columns[self._column[levels]] = True
+        return self._touch(columns)
+
+    def _touch(self, columns: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Find the triangles with one of some columns (n,), bool (m,)."""
+        found: NDArray[np.bool_] = np.any(columns[self._mesh.plane.triangles], axis=1)
         return found
 
     def _merged(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64], NDArray[np.float64], bool]:
@@ -261,9 +312,9 @@ def _gather(
     wanted: NDArray[np.bool_],
     most: int,
     clockwise: NDArray[np.bool_],
-    active: NDArray[np.bool_],
+    number: NDArray[np.int32],
 ) -> NDArray[np.int32]:
-    """Cells with an active level over the triangles that are wanted, in their order."""
+    """Cells with an active level, which has a number, over the triangles that are wanted, in their order."""
     cells = np.empty((most, 4), np.int32)
     found = np.empty((0, 4), np.int32)
     for _ in range(2):  # count them, then write them
@@ -274,7 +325,7 @@ def _gather(
             n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, 0)
             for i in range(n):
                 a, b, c, d = cells[i]
-                if active[a] or active[b] or active[c] or active[d]:
+                if number[a] >= 0 or number[b] >= 0 or number[c] >= 0 or number[d] >= 0:
                     if row < len(found):
                         found[row, 0], found[row, 1], found[row, 2], found[row, 3] = a, b, c, d
                     row += 1
@@ -293,14 +344,13 @@ def _add_costs(ratio: NDArray[np.float64]) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _cells_of_levels(
-    cells: NDArray[np.int32], active: NDArray[np.bool_]
+    cells: NDArray[np.int32], number: NDArray[np.int32], n_active: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Cells around each active level: those of the k-th are ``of_level[start[k]:start[k + 1]]``."""
-    number = np.cumsum(active) - 1
-    start = np.zeros(active.sum() + 1, np.int64)
+    start = np.zeros(n_active + 1, np.int64)
     for i in range(len(cells)):
         for k in range(4):
-            if active[cells[i, k]]:
+            if number[cells[i, k]] >= 0:
                 start[number[cells[i, k]] + 1] += 1
     for p in range(len(start) - 1):
         start[p + 1] += start[p]
@@ -308,8 +358,8 @@ def _cells_of_levels(
     of_level = np.empty(start[-1], np.int32)
     for i in range(len(cells)):
         for k in range(4):
-            if active[cells[i, k]]:
-                p = number[cells[i, k]]
+            p = number[cells[i, k]]
+            if p >= 0:
                 of_level[place[p]] = i
                 place[p] += 1
     return start, of_level

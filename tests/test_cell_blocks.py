@@ -13,6 +13,7 @@ from pipeline.cell_blocks import (
     CellBlocks,
     QualityMeter,
     UsedPoints,
+    number_used,
 )
 from pipeline.columns import count_cells, expand_cells, find_used_points
 from pipeline.histograms import quality_histograms
@@ -67,8 +68,9 @@ def test_points_are_those_that_cells_use_and_keep_their_order(step: int) -> None
     assert levels.dtype == np.int32
     assert levels.tolist() == np.flatnonzero(used).tolist()
     assert np.array_equal(points.place(levels), whole.points[used])
-    assert points.number[used].tolist() == list(range(points.n_points))
-    assert (points.number[~used] == UNUSED).all()
+    assert points.numbers(levels).tolist() == list(range(points.n_points))
+    assert number_used(used)[levels].tolist() == list(range(points.n_points))
+    assert (number_used(used)[~used] == UNUSED).all()
     assert np.array_equal(mesh.plane.xy[points.column], whole.points[:, :2])
 
 

@@ -12,7 +12,7 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.cell_blocks import UsedPoints
+from pipeline.cell_blocks import UsedPoints, number_used
 from pipeline.errors import ConfigError, InputError
 from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
 from pipeline.nodes import GROUND_SURFACE, TOP_SURFACE, Levels, SeamColumns, no_seam
@@ -201,9 +201,10 @@ def test_cells_of_soil_come_after_those_of_air_in_any_block() -> None:
 
 def _expand(mesh: SoilMesh) -> tuple[TetMesh, NDArray[np.int8]]:
     blocks, region = expand_regions(mesh)
-    points = UsedPoints(mesh.columns, find_used(mesh))
+    used = find_used(mesh)
+    points = UsedPoints(mesh.columns, used)
     places = points.place(points.levels(0, points.n_points))
-    return TetMesh(places, points.number[blocks.make(0, blocks.n_cells)]), region
+    return TetMesh(places, number_used(used)[blocks.make(0, blocks.n_cells)]), region
 
 
 def _points_and_cells(mesh: SoilMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]]:

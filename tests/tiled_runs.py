@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions
-from pipeline.cell_blocks import CellBlocks, UsedPoints
+from pipeline.cell_blocks import CellBlocks, UsedPoints, number_used
 from pipeline.columns import find_used_points, split_boundary
 from pipeline.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
 from pipeline.terrain import Dtm, sample_dtm
@@ -88,10 +88,11 @@ def cut_city(city: City, gone: Collection[Key] = ()) -> Pieces:
     """Make the pieces that are written: cells and boundary of each tile."""
     pieces: Pieces = {}
     for key, (mesh, boundary, _) in split_all(city, gone).items():
-        points, blocks = UsedPoints(mesh, find_used_points(mesh)), CellBlocks([(mesh, None)])
+        used, blocks = find_used_points(mesh), CellBlocks([(mesh, None)])
+        points, number = UsedPoints(mesh, used), number_used(used)
         places = points.place(points.levels(0, points.n_points))
-        cells = TetMesh(places, points.number[blocks.make(0, blocks.n_cells)])
-        pieces[key] = cells, replace(boundary, facets=points.number[boundary.facets])
+        cells = TetMesh(places, number[blocks.make(0, blocks.n_cells)])
+        pieces[key] = cells, replace(boundary, facets=number[boundary.facets])
     return pieces
 
 

@@ -8,7 +8,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.building_facts import fidelity_table
-from pipeline.cell_blocks import CellBlocks, QualityMeter, UsedPoints
+from pipeline.cell_blocks import CellBlocks, QualityMeter, UsedPoints, number_used
 from pipeline.columns import find_used_points, split_boundary
 from pipeline.errors import GeometryError
 from pipeline.histograms import (
@@ -117,24 +117,18 @@ def write_piece(task: Task) -> Facts:
     points, meter = UsedPoints(mesh, used), QualityMeter()
     lowest = number_columns(mesh, arrays["shared"], arrays["shared_id"], first_id(tile_part(key)))
 
-    def make_measured(begin: int, end: int) -> NDArray[np.int32]:
-        made = cells.make(begin, end)
-        with task.step("3.6 measure cells"):
-            meter.take(points.place(made.ravel()))
-        return points.number[made]
-
     def make_ids(levels: NDArray[np.int64]) -> NDArray[np.int64]:
         column = points.column[levels]
         return lowest[column] + (levels - mesh.z_start[column])
 
     places, ids = Values(3, np.dtype(np.float64), points.place), Values(1, np.dtype(np.int64), make_ids)
-    vertex = Values(1, np.dtype(np.int64), lambda levels: points.number[levels])
+    vertex = Values(1, np.dtype(np.int64), points.numbers)
     with task.step("3.6 write pieces"), task.output() as out:
         files = out / "mesh" / f"{task.name}.vtu", out / "boundary" / f"{task.name}.vtp"
         write_vtu_blocks(
             files[0],
             places.rows(points.n_points, points.levels),
-            Rows(cells.n_cells, 4, np.dtype(np.int32), make_measured),
+            _measured_rows(task, cells, points, number_used(used), meter),
             point_data={VERTEX_ID: ids.rows(points.n_points, points.levels)},
             cell_data={name: Rows.of(array) for name, array in region.items()},
         )
@@ -148,6 +142,20 @@ def write_piece(task: Task) -> Facts:
         "seams": seams,
         FILES: written,
     }
+
+
+def _measured_rows(
+    task: Task, cells: CellBlocks, points: UsedPoints, number: NDArray[np.int32], meter: QualityMeter
+) -> Rows:
+    """Make cells as they are written, of numbers of points, and measure them as they pass by."""
+
+    def make(begin: int, end: int) -> NDArray[np.int32]:
+        made = cells.make(begin, end)
+        with task.step("3.6 measure cells"):
+            meter.take(points.place(made.ravel()))
+        return number[made]
+
+    return Rows(cells.n_cells, 4, np.dtype(np.int32), make)
 
 
 def prove_seam(task: Task) -> Facts:
