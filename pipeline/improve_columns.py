@@ -20,7 +20,7 @@ SEARCH_SWEEPS = 10
 FIRST_STEP = 0.15  # of the column's spacing
 LAST_STEP = 0.02  # of the first step
 INACTIVE = -1  # level that is not searched
-MOST_LEVELS = 50_000  # that are searched together: some 400 bytes each, for the cells around them
+MOST_LEVELS = 20_000  # that are searched together: some 400 bytes each, for the cells around them
 
 
 def improve_columns(

@@ -14,7 +14,7 @@ from pipeline.columns import expand_cells, extract_boundary, lowest_gap
 from pipeline.edges import plane_edges, sort_triangles, triangle_neighbours
 from pipeline.errors import GeometryError
 from pipeline.heights import highest_wall_ground, raise_low_roofs
-from pipeline.improve_columns import ColumnSurvey, improve_columns
+from pipeline.improve_columns import ColumnSurvey, improve_columns, split_columns
 from pipeline.improve_plane import improve_plane
 from pipeline.levels import fill_levels, stagger_columns
 from pipeline.mesh import ColumnMesh, Marker, MergeOrder, PlaneMesh, TetMesh
@@ -532,6 +532,45 @@ def test_what_is_kept_of_triangles_is_what_all_of_them_measured_anew_have(flat_c
     assert np.array_equal(survey.least, anew.least)
     assert np.array_equal(survey.bad, anew.bad)
     assert survey.bad[mesh.plane.xy[column, 0] < 60].any()
+
+
+@pytest.mark.parametrize("most", [1, 40, 300])
+def test_levels_searched_an_area_at_a_time_get_about_as_good_as_all_together(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh, free, step = _roughened()
+    column = np.repeat(np.arange(len(step)), np.diff(mesh.z_start))
+    free &= mesh.plane.xy[column, 0] > 30
+    survey = ColumnSurvey(mesh, free, flat_cells=False)
+    searched = int((survey.bad & free).sum())
+    before, (together, _) = survey.cost, survey.search(step)
+    monkeypatch.setattr("pipeline.improve_columns.MOST_LEVELS", most)
+    z, moved = survey.search(step)
+    assert searched > most
+    assert not np.array_equal(z, together)
+    assert 0.9 * searched < moved <= searched
+    assert np.array_equal(z[~free], mesh.z[~free])
+    costs = [ColumnSurvey(dataclasses.replace(mesh, z=at), free, flat_cells=False).cost for at in (together, z)]
+    assert costs[1] < before - 0.9 * (before - costs[0])
+
+
+@pytest.mark.parametrize("most", [1, 7, 50, 10_000])
+def test_areas_hold_every_column_with_levels_once_and_lie_apart(most: int) -> None:
+    rng = np.random.default_rng(7)
+    xy, count = rng.uniform(0, 100, (300, 2)) * [3, 1], rng.integers(0, 9, 300)
+    areas = split_columns(xy, count, most)
+    assert sorted(np.concatenate(areas).tolist()) == np.flatnonzero(count).tolist()
+    assert all(count[area].sum() <= most or len(area) == 1 for area in areas)
+    boxes = [(*xy[area].min(axis=0), *xy[area].max(axis=0)) for area in areas]
+    for k, (x0, y0, x1, y1) in enumerate(boxes):
+        assert all(x1 < u0 or u1 < x0 or y1 < v0 or v1 < y0 for u0, v0, u1, v1 in boxes[:k])
+
+
+def test_columns_at_one_place_are_split_too_and_none_make_no_area() -> None:
+    areas = split_columns(np.zeros((5, 2)), np.full(5, 3), 6)
+    assert sorted(np.concatenate(areas).tolist()) == list(range(5))
+    assert max(map(len, areas)) <= 2
+    assert split_columns(np.zeros((5, 2)), np.zeros(5, np.int64), 6) == []
 
 
 def test_rounds_in_one_call_are_those_of_calls_one_after_the_other() -> None:
