@@ -19,7 +19,6 @@ WORST = 0.5  # levels of cells with a radius ratio below this may move
 SEARCH_SWEEPS = 10
 FIRST_STEP = 0.15  # of the column's spacing
 LAST_STEP = 0.02  # of the first step
-INACTIVE = -1  # level that is not searched
 MOST_LEVELS = 20_000  # that are searched together: some 400 bytes each, for the cells around them
 
 
@@ -131,9 +130,8 @@ class ColumnSurvey:
     """
 
     def __init__(self, mesh: ColumnMesh, free: NDArray[np.bool_], flat_cells: bool) -> None:
-        n, m = len(mesh.plane.xy), len(mesh.plane.triangles)
+        m = len(mesh.plane.triangles)
         self._mesh, self._free, self._flat_cells = mesh, free, flat_cells
-        self._column = np.repeat(np.arange(n, dtype=np.int32), np.diff(mesh.z_start))
         self._clockwise = signed_areas(mesh.plane) < 0
         self._most = int(count_by_triangle(mesh).max(initial=0))
         self._z = mesh.z
@@ -152,34 +150,35 @@ class ColumnSurvey:
 
     def search(self, first_step: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
         """Move free levels of bad cells, by first steps of each column (m): all heights, and how many moved."""
-        xy, z, n_moved = self._mesh.plane.xy, self._z.copy(), 0
+        xy, triangles = self._mesh.plane.xy, self._mesh.plane.triangles
+        z, n_moved = self._z.copy(), 0
         level = np.flatnonzero(self.bad & self._free)
-        count = np.bincount(self._column[level], minlength=len(xy))
-        number = np.full(len(z), INACTIVE, np.int32)
+        column = self._columns_of(level)
+        count = np.bincount(column, minlength=len(xy))
         for columns in split_columns(xy, count, MOST_LEVELS):
             here = np.zeros(len(xy), np.bool_)
             here[columns] = True
-            part = level[here[self._column[level]]]
-            number[part] = np.arange(len(part), dtype=np.int32)
-            cells = _gather(*self._merged(), self._touch(here), self._most, self._clockwise, number)
-            start, of_level = _cells_of_levels(cells, number, len(part))
-            number[part] = INACTIVE
-            n_moved += _search(xy, self._column, z, cells, part, start, of_level, first_step[self._column[part]])
+            part = here[column]
+            searched, first = level[part], np.concatenate([[0], np.cumsum(np.where(here, count, 0))])
+            cells, over = _gather(*self._merged(), self._touch(here), self._most, self._clockwise, searched, first)
+            around = _cells_of_levels(cells, over, triangles, self._clockwise, searched, first)
+            step = first_step[column[part]]
+            n_moved += _search(xy, triangles, self._clockwise, z, cells, over, searched, *around, step)
         return z, n_moved
 
     def move(self, z: NDArray[np.float64], *, last: bool) -> None:
         """Take other heights; after the last search nobody asks which levels are bad."""
-        again = self._find_triangles(z != self._z)
+        moved = np.zeros(len(self._mesh.plane.xy), np.bool_)
+        moved[self._columns_of(np.flatnonzero(z != self._z))] = True
+        again = self._touch(moved)
         self._z = z
         if not last:
             again |= self.least < WORST
         self._measure(again)
 
-    def _find_triangles(self, levels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Find the triangles with one of some levels in a column, bool (m,)."""
-        columns = np.zeros(len(self._mesh.plane.xy), np.bool_)
-        columns[self._column[levels]] = True
-        return self._touch(columns)
+    def _columns_of(self, level: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Column of each of some levels (k,)."""
+        return np.searchsorted(self._mesh.z_start, level, side="right") - 1
 
     def _touch(self, columns: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Find the triangles with one of some columns (n,), bool (m,)."""
@@ -198,7 +197,6 @@ class ColumnSurvey:
             self._most,
             self._clockwise,
             self._mesh.plane.xy,
-            self._column,
             self._free,
             self._flat_cells,
             self.of_cells,
@@ -241,18 +239,31 @@ def _inverse_power(ratio: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+def _columns_of_cell(
+    triangle: NDArray[np.int32], clockwise: bool, cell: NDArray[np.int32]
+) -> tuple[np.int32, np.int32, np.int32, np.int32]:
+    """Columns of the corners of a cell over a triangle, by the order in which `merge_triangle` writes them."""
+    a, b, c = triangle[0], triangle[2 if clockwise else 1], triangle[1 if clockwise else 2]
+    above = cell[3] - 1  # the last corner is the level above one of the others
+    return a, b, c, a if above == cell[0] else b if above == cell[1] else c
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
 def _lay_out(
     xy: NDArray[np.float64],
-    column: NDArray[np.int32],
+    triangle: NDArray[np.int32],
+    clockwise: bool,
     z: NDArray[np.float64],
     cell: NDArray[np.int32],
     at: NDArray[np.float64],
     i: int,
 ) -> None:
-    """Write the corners of a cell into column i, a row for each coordinate."""
-    for c in range(4):
-        p = cell[c]
-        at[3 * c, i], at[3 * c + 1, i], at[3 * c + 2, i] = xy[column[p], 0], xy[column[p], 1], z[p]
+    """Write the corners of a cell over a triangle into column i, a row for each coordinate."""
+    a, b, c, d = _columns_of_cell(triangle, clockwise, cell)
+    at[0, i], at[1, i], at[2, i] = xy[a, 0], xy[a, 1], z[cell[0]]
+    at[3, i], at[4, i], at[5, i] = xy[b, 0], xy[b, 1], z[cell[1]]
+    at[6, i], at[7, i], at[8, i] = xy[c, 0], xy[c, 1], z[cell[2]]
+    at[9, i], at[10, i], at[11, i] = xy[d, 0], xy[d, 1], z[cell[3]]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -276,7 +287,6 @@ def _survey(
     most: int,
     clockwise: NDArray[np.bool_],
     xy: NDArray[np.float64],
-    column: NDArray[np.int32],
     free: NDArray[np.bool_],
     flat_cells: bool,
     of_cells: NDArray[np.float64],
@@ -290,7 +300,7 @@ def _survey(
             continue
         n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, 0)
         for i in range(n):
-            _lay_out(xy, column, z, cells[i], at, i)
+            _lay_out(xy, triangles[t], clockwise[t], z, cells[i], at, i)
         _measure_block(at, n, ratio)
         of_cells[t], least[t] = 0.0, np.inf
         for i in range(n):
@@ -303,6 +313,19 @@ def _survey(
 
 
 @numba.njit(cache=True, nogil=True)
+def _find_level(level: NDArray[np.int64], low: int, high: int, p: int) -> int:
+    """Place of a level among those from low to high, which ascend; -1 if it is not there."""
+    end = high
+    while low < high:
+        middle = (low + high) // 2
+        if level[middle] < p:
+            low = middle + 1
+        else:
+            high = middle
+    return low if low < end and level[low] == p else -1
+
+
+@numba.njit(cache=True, nogil=True)
 def _gather(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
@@ -312,11 +335,12 @@ def _gather(
     wanted: NDArray[np.bool_],
     most: int,
     clockwise: NDArray[np.bool_],
-    number: NDArray[np.int32],
-) -> NDArray[np.int32]:
-    """Cells with an active level, which has a number, over the triangles that are wanted, in their order."""
+    level: NDArray[np.int64],
+    first: NDArray[np.int64],
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Cells with one of some levels, over the triangles that are wanted, in their order; and those triangles."""
     cells = np.empty((most, 4), np.int32)
-    found = np.empty((0, 4), np.int32)
+    found, over = np.empty((0, 4), np.int32), np.empty(0, np.int32)
     for _ in range(2):  # count them, then write them
         row = 0
         for t in range(len(triangles)):
@@ -324,14 +348,17 @@ def _gather(
                 continue
             n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, 0)
             for i in range(n):
-                a, b, c, d = cells[i]
-                if number[a] >= 0 or number[b] >= 0 or number[c] >= 0 or number[d] >= 0:
+                has_one, columns = False, _columns_of_cell(triangles[t], clockwise[t], cells[i])
+                for k in range(4):
+                    has_one |= _find_level(level, first[columns[k]], first[columns[k] + 1], cells[i, k]) >= 0
+                if has_one:
                     if row < len(found):
-                        found[row, 0], found[row, 1], found[row, 2], found[row, 3] = a, b, c, d
+                        found[row] = cells[i]
+                        over[row] = t
                     row += 1
         if len(found) == 0:
-            found = np.empty((row, 4), np.int32)
-    return found
+            found, over = np.empty((row, 4), np.int32), np.empty(row, np.int32)
+    return found, over
 
 
 @numba.njit(cache=True, nogil=True)
@@ -344,21 +371,29 @@ def _add_costs(ratio: NDArray[np.float64]) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _cells_of_levels(
-    cells: NDArray[np.int32], number: NDArray[np.int32], n_active: int
+    cells: NDArray[np.int32],
+    over: NDArray[np.int32],
+    triangles: NDArray[np.int32],
+    clockwise: NDArray[np.bool_],
+    level: NDArray[np.int64],
+    first: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Cells around each active level: those of the k-th are ``of_level[start[k]:start[k + 1]]``."""
-    start = np.zeros(n_active + 1, np.int64)
+    """Cells around each of some levels: those of the k-th are ``of_level[start[k]:start[k + 1]]``."""
+    start = np.zeros(len(level) + 1, np.int64)
     for i in range(len(cells)):
+        columns = _columns_of_cell(triangles[over[i]], clockwise[over[i]], cells[i])
         for k in range(4):
-            if number[cells[i, k]] >= 0:
-                start[number[cells[i, k]] + 1] += 1
-    for p in range(len(start) - 1):
+            p = _find_level(level, first[columns[k]], first[columns[k] + 1], cells[i, k])
+            if p >= 0:
+                start[p + 1] += 1
+    for p in range(len(level)):
         start[p + 1] += start[p]
     place = start[:-1].copy()
     of_level = np.empty(start[-1], np.int32)
     for i in range(len(cells)):
+        columns = _columns_of_cell(triangles[over[i]], clockwise[over[i]], cells[i])
         for k in range(4):
-            p = number[cells[i, k]]
+            p = _find_level(level, first[columns[k]], first[columns[k] + 1], cells[i, k])
             if p >= 0:
                 of_level[place[p]] = i
                 place[p] += 1
@@ -377,9 +412,11 @@ def _cost(at: NDArray[np.float64], row: NDArray[np.int64], z: float, n: int, rat
 @numba.njit(cache=True, nogil=True)
 def _search(
     xy: NDArray[np.float64],
-    column: NDArray[np.int32],
+    triangles: NDArray[np.int32],
+    clockwise: NDArray[np.bool_],
     z: NDArray[np.float64],
     cells: NDArray[np.int32],
+    over: NDArray[np.int32],
     level: NDArray[np.int64],
     start: NDArray[np.int64],
     of_level: NDArray[np.int32],
@@ -398,8 +435,8 @@ def _search(
             around = of_level[start[k] : start[k + 1]]
             n = len(around)
             for i in range(n):
-                cell = cells[around[i]]
-                _lay_out(xy, column, z, cell, at, i)
+                cell, t = cells[around[i]], over[around[i]]
+                _lay_out(xy, triangles[t], clockwise[t], z, cell, at, i)
                 for c in range(4):
                     if cell[c] == p:
                         row[i] = 3 * c + 2
