@@ -61,8 +61,8 @@ def retires_its_worker(task: Task) -> Facts:
 
 
 @contextmanager
-def queued(broken: str = "", **worker: Any) -> Iterator[QueuedDask]:
-    """Make the executor over two workers of this machine."""
+def queued(workers: int = 2, broken: str = "") -> Iterator[QueuedDask]:
+    """Make the executor over workers of this machine."""
     from dask import config
     from distributed import Client, LocalCluster
 
@@ -70,8 +70,8 @@ def queued(broken: str = "", **worker: Any) -> Iterator[QueuedDask]:
     with (
         config.set(dict(SETTINGS) | HERE),
         LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
-            silence_logs="CRITICAL", **worker,
+            n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
+            silence_logs="CRITICAL",
         ) as cluster,
         Client(cluster) as client,
     ):  # fmt: skip
@@ -103,7 +103,7 @@ def test_a_task_on_a_retiring_worker_is_not_lost(tmp_path: Path) -> None:
 def test_workers_that_never_come_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tiler.executors.LOOK", 0.2)
     with (
-        queued(broken="5 worker jobs in a row ended before their worker was there") as executor,
+        queued(workers=0, broken="5 worker jobs in a row ended before their worker was there") as executor,
         pytest.raises(ClusterError, match="5 worker jobs in a row"),
     ):
         make(tmp_path, executor).run(Stage("dies", Scope.REGION, dies))
