@@ -19,7 +19,7 @@ COMPOSING = {"pipeline.tile", "pipeline.simplify"}
 HOMES = {
     "dask": ("tiler/",),
     "distributed": ("tiler/",),
-    "zarr": ("tiler/result_writer.py",),
+    "zarr": ("tiler/zarr_files.py",),
     "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py"),
     "laspy": ("tiler/",),
     "pyogrio": ("tiler/",),

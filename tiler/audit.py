@@ -11,11 +11,11 @@ from pipeline.errors import CityError, InputError
 from tiler.folder_lock import is_held
 from tiler.manifest import Entry, read_manifest
 from tiler.out_folder import INDEXES, MANIFEST_PATH, PIECES, RUN_RECORD, STORE
-from tiler.result_reader import GROUP
 from tiler.seal import is_sealed
 from tiler.store import Store
 from tiler.task import APART
 from tiler.written import FILES, GONE, tell_change
+from tiler.zarr_files import GROUP
 
 STRAY = "is not of this run"
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 CHUNK_BYTES = 4 * 2**20  # about what one read or write moves at a time
 SQUARE = 256  # rows and columns of a raster's chunks: what a neighbour reads of it is seldom more than a strip
-PACKED_BYTES = 128 * 2**10  # smaller arrays share one array of bytes: an array of its own costs 3 ms to write
+PACKED_BYTES = 128 * 2**10  # smaller arrays share one array of bytes: one of its own takes two files
 INLINE_BYTES = 16 * 2**10  # and if all of them are smaller than this, that one is spared too
 BLOSC_VERSIONS = (1, 2)  # of its format, in the first byte
 CHUNK_HEAD = 16  # bytes of the header of a Blosc chunk
@@ -55,13 +55,6 @@ def plain_array(name: str, values: ArrayLike) -> NDArray[Any]:
 def raw_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
     """View a plain array as its bytes, (n_bytes,)."""
     return array.reshape(-1).view(np.uint8)
-
-
-def as_rows(array: NDArray[Any]) -> NDArray[Any]:
-    """View strings as rows of bytes, since zarr v3 has no settled type for them; others stay."""
-    if array.dtype.kind != "U":
-        return array
-    return raw_bytes(array).reshape(*array.shape, array.dtype.itemsize)
 
 
 def rows_per_chunk(array: NDArray[Any]) -> int:

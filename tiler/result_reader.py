@@ -2,27 +2,21 @@
 
 import base64
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from numcodecs import Blosc
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError, OutputError
-from tiler.packing import CHUNK_HEAD, Table, check_chunk, check_entry, checksums, count_columns, verified_chunks
-from tiler.places import read_at_most
+from tiler.packing import Table, check_entry, checksums, count_columns, verified_chunks
 from tiler.seal import is_sealed
+from tiler.zarr_files import GROUP, ChunkForm
 
 PACKED = "_packed"
-CODECS = ["bytes", "blosc"]  # what chunks are written with
-DECODER = Blosc()  # takes how a chunk was compressed from its head
 RESERVED = ("arrays", "checksum", "digest", "files")
-GROUP = "zarr.json"  # the file of a result's attributes
 
 
 def read_group(folder: Path) -> dict[str, Any]:
@@ -83,7 +77,7 @@ def read_chunks(
         return strips[0] if len(strips) == 1 else np.concatenate(strips)
     n_read, held = 0, -1
     with damage(folder, stage, name, array):
-        form = _ChunkForm.of(entry)
+        form = ChunkForm.of(entry)
         form.check((folder / array / GROUP).read_bytes())
         rows = np.empty((sum(stop - start for start, stop in wanted), *form.shape[1:]), form.dtype)
         for start, stop in wanted:
@@ -111,7 +105,7 @@ def read_window(
     (top, bottom), (left, right) = rows, columns
     height, width, beside = entry["chunk"], entry["columns"], count_columns(entry)
     with damage(folder, stage, name, array):
-        form = _ChunkForm.of(entry)
+        form = ChunkForm.of(entry)
         form.check((folder / array / GROUP).read_bytes())
         found = np.empty((bottom - top, right - left), form.dtype)
         for j in range(top // height, -(-bottom // height)):
@@ -124,49 +118,6 @@ def read_window(
                 y, x = max(y, 0), max(x, 0)
                 found[y : y + inner.shape[0], x : x + inner.shape[1]] = inner
     return found
-
-
-@dataclass(frozen=True)
-class _ChunkForm:
-    """How zarr keeps an array of some type and shape: in chunks of rows (and columns), compressed by Blosc.
-
-    zarr itself needs 2 ms to open and read a small array, a fifth of a run: its files are read here, by its codec.
-    """
-
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-    chunk: tuple[int, ...]
-
-    @classmethod
-    def of(cls, entry: Mapping[str, Any]) -> Self:
-        """Take the form from what the store says of an array."""
-        shape = tuple(entry["shape"])
-        further = (entry["columns"],) if "columns" in entry else (max(n, 1) for n in shape[1:])
-        return cls(np.dtype(entry["dtype"]), shape, (entry["chunk"], *further))
-
-    def check(self, text: bytes) -> None:
-        """Hold zarr's own description of the array against the form; ValueError if they differ."""
-        found = json.loads(text)
-        tail = (self.dtype.itemsize,) if self.dtype.kind == "U" else ()
-        name = "uint8" if tail else self.dtype.name
-        shape, expected = tuple(found["shape"]), (*self.shape, *tail)
-        if shape != expected:
-            raise ValueError(f"shape {shape} instead of {expected}")
-        chunks = tuple(found["chunk_grid"]["configuration"]["chunk_shape"])
-        codecs = [codec["name"] for codec in found["codecs"]]
-        if found["data_type"] != name or chunks != (*self.chunk, *tail) or codecs != CODECS:
-            raise ValueError(f"chunks {chunks} of {found['data_type']} by {', '.join(codecs)}")
-
-    def read(self, folder: Path, *at: int) -> NDArray[Any]:
-        """Decompress the chunk at a place, after its size and form are known to be right, cut to the array."""
-        n_bytes = math.prod(self.chunk) * self.dtype.itemsize
-        at += (0,) * (len(self.chunk) - len(at))
-        further = (0,) * (self.dtype.kind == "U")
-        data = read_at_most(folder / "c" / "/".join(map(str, (*at, *further))), n_bytes + CHUNK_HEAD + 1)
-        check_chunk(data, n_bytes)
-        raw = np.frombuffer(DECODER.decode(data), np.uint8)
-        left = [size - k * step for size, k, step in zip(self.shape, at, self.chunk, strict=True)]
-        return raw.view(self.dtype).reshape(self.chunk)[tuple(map(slice, left))]
 
 
 def join_rows(parts: Sequence[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:

@@ -1,7 +1,4 @@
-"""One result of the store on its way there: see `tiler.store` for what it is made of.
-
-zarr is imported where it is used: it takes 0.2 s, which who only sends tasks to workers need not wait for.
-"""
+"""One result of the store on its way there: see `tiler.store` for what it is made of."""
 
 import base64
 import errno
@@ -17,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from deflate import crc32
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import OutputError
@@ -26,7 +24,6 @@ from tiler.packing import (
     SQUARE,
     RowBuffer,
     Table,
-    as_rows,
     check_name,
     checksums,
     pack,
@@ -36,9 +33,9 @@ from tiler.packing import (
     square_checksums,
 )
 from tiler.places import in_bucket
-from tiler.result_reader import GROUP, PACKED, RESERVED
+from tiler.result_reader import PACKED, RESERVED
 from tiler.seal import seal
-from tiler.written import state_files
+from tiler.zarr_files import GROUP, ChunkForm, describe_group
 
 if TYPE_CHECKING:
     from tiler.objects.path import ObjectPath
@@ -68,6 +65,8 @@ class Writer:
         self._buffers: dict[str, RowBuffer] = {}
         self._table: Table = {}
         self._hashes: dict[str, hashlib.blake2b] = {}
+        self._files: dict[str, list[int]] = {}  # size and CRC-32 by path
+        self._folders: set[Path] = set()
 
     def __enter__(self) -> Self:
         with self._disk():
@@ -137,6 +136,7 @@ class Writer:
         for name in self._table:
             shutil.rmtree(self._partial / name, ignore_errors=True)
         self._small, self._buffers, self._table, self._hashes = {}, {}, {}, {}
+        self._files, self._folders = {}, set()
 
     def commit(self, attributes: Mapping[str, Any] | None = None, *, apart: Collection[str] = ()) -> str:
         """Make the result visible, in place of an earlier one.
@@ -161,8 +161,6 @@ class Writer:
         OutputError
             If the disk refuses.
         """
-        import zarr
-
         kept = plain_json(dict(attributes or {}))
         if set(kept) & set(RESERVED):
             raise ValueError(f"attributes may not be named {' or '.join(RESERVED)}")
@@ -183,11 +181,12 @@ class Writer:
         kept["digest"] = digest
         kept["arrays"] = plain_json(self._table)
         with self._disk():
-            files = sorted(path for path in self._partial.rglob("*") if path.is_file())
-            kept |= {"files": state_files(self._partial, files), "checksum": "0" * 8}
-            zarr.create_group(str(self._partial), zarr_format=3, attributes=dict(sorted(kept.items())))
-            group = self._partial / GROUP
-            group.write_bytes(seal(group.read_bytes()))
+            for name, entry in self._table.items():
+                if "crc" in entry:
+                    self._write(f"{name}/{GROUP}", ChunkForm.of(entry).describe())
+            files = dict(sorted(self._files.items(), key=lambda one: one[0].split("/")))
+            kept |= {"files": files, "checksum": "0" * 8}
+            self._write(GROUP, seal(describe_group(dict(sorted(kept.items())))))
             self._replace()
         return digest
 
@@ -220,11 +219,7 @@ class Writer:
             self._create(name, array, square=square)
 
     def _create(self, name: str, array: NDArray[Any], *, square: bool = False) -> None:
-        import zarr
-        from zarr.codecs import BloscCodec
-
-        rows = as_rows(array)
-        chunk, *further = (max(n, 1) for n in rows.shape)
+        chunk, *further = (max(n, 1) for n in array.shape)
         entry: dict[str, Any] = {"dtype": array.dtype.str, "shape": list(array.shape)}
         if square:
             chunk, further = min(chunk, SQUARE), [min(further[0], SQUARE)]
@@ -233,34 +228,32 @@ class Writer:
             chunk = min(chunk, rows_per_chunk(array))
             entry |= {"chunk": chunk, "crc": checksums(array, chunk)}
         self._table[name] = entry
-        with self._disk():
-            # Bytes of numbers apart, then LZ4: written three times as fast as with zarr's default, a tenth more on
-            # disk. zarr calls it from threads of its own, where Blosc uses one thread: bytes are always the same.
-            # Chunks of zeros are written too: how zarr tells -0.0 from 0.0 is its versions' own affair.
-            zarr.create_array(
-                str(self._partial / name),
-                data=rows,
-                chunks=(chunk, *further),
-                zarr_format=3,
-                compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
-                config={"write_empty_chunks": True},
-            )
+        self._compress(name, array)
 
     def _extend(self, name: str, rows: NDArray[Any]) -> None:
         """Add rows to an array on disk that ends with a whole chunk."""
         if name not in self._table:
             self._create(name, rows)
             return
-        import zarr
-
         entry = self._table[name]
-        n_old, n_new = entry["shape"][0], entry["shape"][0] + len(rows)
-        with self._disk():
-            array = zarr.open_array(str(self._partial / name), mode="r+", config={"write_empty_chunks": True})
-            array.resize((n_new, *array.shape[1:]))
-            array[n_old:n_new] = as_rows(rows)
-        entry["shape"][0] = n_new
+        first = len(entry["crc"])
+        entry["shape"][0] += len(rows)
         entry["crc"] += checksums(rows, entry["chunk"])
+        self._compress(name, rows, first)
+
+    def _compress(self, name: str, values: NDArray[Any], first: int = 0) -> None:
+        """Write the chunks of an array, or of further rows of it."""
+        with self._disk():
+            for file, data in ChunkForm.of(self._table[name]).compress(values, first):
+                self._write(f"{name}/{file}", data)
+
+    def _write(self, file: str, data: bytes) -> None:
+        path = self._partial / file
+        if path.parent not in self._folders:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._folders.add(path.parent)
+        path.write_bytes(data)
+        self._files[file] = [len(data), crc32(data)]
 
     def _replace(self) -> None:
         """Rename into place; another writer of the same result may do so at the same moment."""

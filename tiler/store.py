@@ -22,7 +22,6 @@ from pipeline.errors import OutputError
 from tiler.packing import raw_bytes, unpack
 from tiler.places import in_bucket
 from tiler.result_reader import (
-    GROUP,
     PACKED,
     damage,
     find_entry,
@@ -35,6 +34,7 @@ from tiler.result_reader import (
 )
 from tiler.result_writer import PARTIAL, Writer, delete, hash_content, withdraw
 from tiler.written import GONE, find_changed_files
+from tiler.zarr_files import GROUP
 
 MANIFEST = "manifest.jsonl"  # the only file beside the stages, see `tiler.manifest`
 

@@ -1,0 +1,63 @@
+"""What the store writes without zarr is what zarr writes: the same files, byte for byte."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import BloscCodec
+
+from tiler.store import Store
+from tiler.zarr_files import GROUP, ChunkForm, describe_group
+
+RNG = np.random.default_rng(5)
+ARRAYS: dict[str, tuple[NDArray[Any], tuple[int, ...]]] = {
+    "rows": (RNG.standard_normal((1000, 3)), (400, 3)),
+    "whole chunks": (RNG.integers(0, 9, 800).astype(np.int32), (400,)),
+    "raster": (np.cumsum(RNG.standard_normal((70, 50)).astype(np.float32), axis=0), (32, 32)),
+    "nothing but zeros": (np.zeros((70, 50)), (32, 32)),
+    "booleans": (RNG.random(900) < 0.5, (256,)),
+    "bytes": (RNG.integers(0, 255, 900).astype(np.uint8), (256,)),
+    "small integers": (RNG.integers(-99, 99, (300, 2, 2)).astype(np.int16), (100, 2, 2)),
+    "negative zero, infinity, no number": (np.array([-0.0, np.inf, np.nan, 1.0]), (3,)),
+}
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+def test_files_are_those_of_zarr(kind: str, tmp_path: Path) -> None:
+    array, chunk = ARRAYS[kind]
+    zarr.create_array(
+        str(tmp_path),
+        data=array,
+        chunks=chunk,
+        zarr_format=3,
+        compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
+        config={"write_empty_chunks": True},
+    )
+    form = ChunkForm(array.dtype, array.shape, chunk)
+    assert dict(form.compress(array)) | {GROUP: form.describe()} == files_below(tmp_path)
+
+
+def test_further_rows_are_those_of_zarr(tmp_path: Path) -> None:
+    array, chunk = ARRAYS["rows"]
+    form = ChunkForm(array.dtype, array.shape, chunk)
+    assert dict(form.compress(array[:400])) | dict(form.compress(array[400:], 1)) == dict(form.compress(array))
+
+
+def test_zarr_reads_rows_of_strings(tmp_path: Path) -> None:
+    names = np.array([f"house {k}" for k in range(5000)])
+    Store(tmp_path).write("houses", "all", {"name": names})
+    found = zarr.open_array(str(tmp_path / "houses" / "all" / "name"), mode="r")[:]
+    assert (np.asarray(found).view(names.dtype)[:, 0] == names).all()
+
+
+def test_groups_are_those_of_zarr(tmp_path: Path) -> None:
+    attributes = {"key": "0af3", "facts": {"n": 3, "extent": None}}
+    zarr.create_group(str(tmp_path), zarr_format=3, attributes=attributes)
+    assert describe_group(attributes) == (tmp_path / GROUP).read_bytes()
+
+
+def files_below(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
