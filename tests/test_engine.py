@@ -206,7 +206,7 @@ def test_what_meets_in_a_corner_only_is_not_beside(tmp_path: Path) -> None:
 
 
 def test_of_others_by_name_only_presence_counts(tmp_path: Path) -> None:
-    reader = Stage("reader", Scope.TILE, seen, (Read("source", beside=True, others_by_name=True),))
+    reader = Stage("reader", Scope.TILE, told, (Read("source", beside=True, others_by_name=True),))
     source = Stage("source", Scope.TILE, names_scale, parameters=("scale",))
     first = make(tmp_path)
     first.run(source, reader)
@@ -642,6 +642,11 @@ def wait_until(true: Callable[[], bool], *, seconds: float) -> None:
 
 def nothing(task: Task) -> Facts:
     return {}
+
+
+def told(task: Task) -> Facts:
+    """What an item reads, by its names alone."""
+    return {stage: list(names) for stage, names in task.refs.items()}
 
 
 def seen(task: Task) -> Facts:

@@ -4,22 +4,25 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from pipeline.errors import GeometryError, OutputError
 from tests.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
-from tests.test_engine import contents, grid_layout, make, nothing, seen
+from tests.test_engine import contents, grid_layout, make, nothing, seen, told
 from tiler.engine import Engine, StoppedError
 from tiler.executors import Executor, Serial, local
 from tiler.failures import Policy
 from tiler.limits import TASKS, Limits
-from tiler.stage import Read, Scope, Stage
+from tiler.stage import Facts, Read, Scope, Stage
 from tiler.task import Record, Task
 
 A = Stage("a", Scope.TILE, nothing)
 B = Stage("b", Scope.TILE, seen, (Read("a", 1.0),))
 C = Stage("c", Scope.TILE, seen, (Read("a", 1.0, optional=True),))
+BY_NAME = Stage("by-name", Scope.TILE, told, (Read("a", 1.0, optional=True, others_by_name=True),))
+OF_THESE = Stage("of-these", Scope.TILE, seen, (Read("by-name", optional=True),))
 ASIDE = Policy(retries=1, set_aside=True)
 MEMORY, SECONDS = 2**30, 3.0
 
@@ -42,6 +45,12 @@ def no_geometry(_: Task) -> None:
 
 def full_disk(_: Task) -> None:
     raise OutputError("disk full")
+
+
+def leaves_its_time(task: Task) -> Facts:
+    (Path(task.parameters.begun) / f"{task.stage} {task.name}").write_text(repr(time.time()))
+    time.sleep(0.05)
+    return {}
 
 
 def test_what_needs_a_failed_item_is_not_run_and_the_rest_is(tmp_path: Path) -> None:
@@ -76,6 +85,40 @@ def test_a_later_call_knows_what_failed(tmp_path: Path) -> None:
     assert contents(engine.store.path) == contents(whole.store.path)
 
 
+@pytest.mark.parametrize("tile", ["0.0", "2.2"])
+def test_what_took_a_failed_item_to_be_there_is_run_again(tile: str, tmp_path: Path) -> None:
+    """The first tile fails before others ask, the last after they took it to be there: results are the same."""
+    ran: list[str] = []
+
+    def tell(stage: str, done: int, total: int, record: Record) -> None:
+        ran.extend([] if record.reused else [f"{stage} {record.name}"])
+
+    failing = faulty(A, **{f"t{tile.replace('.', '_')}": raises})
+    engine = make(tmp_path, policy=ASIDE, window=1, progress=tell)
+    engine.run(failing, BY_NAME, OF_THESE)
+    assert ran[1].startswith("by-name")  # it does not wait for its neighbours
+    waited = make(tmp_path / "waited", policy=ASIDE)
+    waited.run(failing)
+    waited.run(BY_NAME)
+    waited.run(OF_THESE)
+    assert {name for stage, name in engine.blocked if stage == "by-name"} == {tile}
+    assert engine.blocked == waited.blocked
+    for item, record in waited.records.items():
+        assert (record.key, record.facts) == (engine.records[item].key, engine.records[item].facts)
+    assert contents(engine.store.path) == contents(waited.store.path)
+    assert ran.count("by-name 1.1") == (2 if tile == "2.2" else 1)
+    assert ran.count("by-name 0.1") == 1
+
+
+def test_what_is_run_again_may_fail_too(tmp_path: Path) -> None:
+    """A chain of such reads ends."""
+    chain = Stage("chain", Scope.TILE, told, (Read("by-name", 1.0, optional=True, others_by_name=True),))
+    engine = make(tmp_path, policy=ASIDE)
+    engine.run(faulty(A, t2_2=raises), faulty(BY_NAME, t1_1=raises), chain)
+    assert set(engine.set_aside) == {("a", "2.2"), ("by-name", "1.1")}
+    assert engine.records["chain", "0.0"].facts["by-name"] == ["0.0", "0.1", "1.0"]
+
+
 @pytest.mark.parametrize(("fault", "attempts"), [(raises, 3), (no_geometry, 1)])
 def test_errors_that_would_come_again_are_not_tried_again(
     fault: Callable[[Task], None], attempts: int, tmp_path: Path
@@ -97,6 +140,21 @@ def test_a_full_disk_and_a_failed_region_end_the_run(tmp_path: Path) -> None:
         make(tmp_path, policy=ASIDE).run(faulty(A, t0_0=full_disk))
     with pytest.raises(ZeroDivisionError):
         make(tmp_path, policy=ASIDE).run(faulty(Stage("all", Scope.REGION, nothing), tregion=raises))
+
+
+def test_of_what_waits_for_a_worker_the_lowest_rank_begins_first(tmp_path: Path) -> None:
+    begun = tmp_path / "begun"
+    begun.mkdir()
+    with local(1) as executor:
+        engine = make(tmp_path, executor, parameters=SimpleNamespace(begun=str(begun)))
+        engine.run(
+            *(Stage(name, Scope.TILE, leaves_its_time, parameters=("begun",)) for name in ("filler", "needed"))
+        )
+    times = {path.name: float(path.read_text()) for path in begun.iterdir()}
+    order = sorted(times, key=times.__getitem__)
+    assert len(order) == 18
+    assert all(name.startswith("needed") for name in order[:9])
+    assert order[:9] == sorted(order[:9])
 
 
 def test_a_trace_file_that_cannot_be_written_ends_the_run(workers: Executor, tmp_path: Path) -> None:

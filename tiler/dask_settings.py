@@ -3,8 +3,9 @@
 No array is in Dask's hands, so there is nothing to spill and nothing to pause for. Its logs of transitions, of
 its own load and of what was submitted hold on to memory: they are kept short, and its samples of what a worker's
 thread is at, 0.2 MB a second that stay for an hour, are not taken. It looks at itself and at its memory less often
-than it would. A worker is given one task at a time, so that those of the highest priority begin first; what waits
-for a worker that is at work goes to one that is not within a tenth of a second, not within one.
+than it would. All tasks in flight lie with the workers, each of which begins with those of the highest priority:
+Dask would keep the many of one stage back, behind the few of all others. What waits for a worker that is at work
+goes to one that is not within a tenth of a second, not within one.
 """
 
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ from tiler.limits import KILL_AT
 
 SCHEDULER: Mapping[str, Any] = {
     "distributed.scheduler.allowed-failures": 0,
-    "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.scheduler.worker-saturation": "inf",
     "distributed.scheduler.work-stealing-interval": "100ms",
     "distributed.diagnostics.computations.max-history": 1,
 }

@@ -5,7 +5,7 @@ knows Dask: see `tiler.executors`.
 """
 
 import heapq
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,7 @@ from tiler.task_graph import (
     list_items,
     list_refs,
     order_stages,
+    readers,
     reads_everything,
 )
 
@@ -72,6 +73,11 @@ class _Planned:
     first: int
     digest: bytes
     parameters: Declared
+
+    @property
+    def by_name(self) -> set[str]:
+        """Stages of which it counts by its content only the item of the reader's own name."""
+        return {read.stage for read in self.stage.reads if read.others_by_name}
 
 
 class StoppedError(CityError):
@@ -161,7 +167,8 @@ class Engine:
         """Run stages whose reads are among them or were run before.
 
         A task is submitted when all that it reads is done; of those that may run, those of later stages go first,
-        then those of larger tiles, then in the order of names.
+        then those of larger tiles, then in the order of names. Of what counts by its name alone it is taken for
+        granted that it will be there; what was misled by that is run again in the end.
 
         Parameters
         ----------
@@ -194,11 +201,14 @@ class Engine:
             self.store.sweep(planned.stage.name)
             for name in (items or {}).get(planned.stage.name, planned.items.names):
                 self._forget((planned.stage.name, name))
+        started = _Run(self, plan)
         try:
-            _Run(self, plan).drive()
+            started.drive()
         finally:
             for planned in plan:
                 self._items[planned.stage.name] = (planned.stage.scope, self._recorded(planned))
+        if misled := started.find_misled():
+            self.run(*(planned.stage for planned in plan if planned.stage.name in misled), items=misled)
 
     def add_parameters(self, **values: Any) -> None:
         """Give values to parameters that only what was run so far decides; those of the same name are replaced."""
@@ -357,7 +367,12 @@ class _Run:
         self.engine, self.plan = engine, plan
         place = {planned.stage.name: planned for planned in plan}
         n_tasks = sum(len(planned.items.names) for planned in plan)
-        links = [(p.first, refs, place[refs.stage].first) for p in plan for refs in p.refs if refs.stage in place]
+        links = [
+            (p.first, _contents(p, refs, place[refs.stage].items), place[refs.stage].first)
+            for p in plan
+            for refs in p.refs
+            if refs.stage in place
+        ]
         self.start, self.waiting = invert(links, n_tasks)
         self.rank = np.repeat(np.arange(len(plan)), [len(planned.items.names) for planned in plan])
         earlier = [engine._settled((p.stage.name, name)) for p in plan for name in p.items.names]
@@ -372,6 +387,7 @@ class _Run:
         self.in_flight: set[int] = set()
         self.tried: Counter[int] = Counter()
         self.tasks: dict[int, Task] = {}
+        self.lost: defaultdict[str, set[str]] = defaultdict(set)  # names of what failed or was not run, by stage
         if engine._watch is not None:
             for planned in plan:
                 engine._watch.planned(planned.stage.name, planned.stage.scope, len(planned.items.names))
@@ -420,12 +436,15 @@ class _Run:
         xmin, ymin, xmax, ymax = planned.items.boxes[item].tolist()
         box = (xmin, ymin, xmax, ymax)
         digest = engine.records.digest
-        by_name = {read.stage for read in stage.reads if read.others_by_name}
         found = (
-            (source, [(n, "" if source in by_name and n != name else digest(source, n)) for n in names])
+            (source, [(n, "" if source in planned.by_name and n != name else digest(source, n)) for n in names])
             for source, names in refs.items()
         )
-        key = item_key(planned.digest, name, box, identity, found, engine._find_gaps(stage.scope, box, refs))
+        held = {
+            source: [n for n in names if n == name or source not in planned.by_name]
+            for source, names in refs.items()
+        }
+        key = item_key(planned.digest, name, box, identity, found, engine._find_gaps(stage.scope, box, held))
         parameters, context, store = planned.parameters, engine.context, engine.store
         self.tasks[ticket] = Task(
             stage.name, name, stage.scope, box, parameters, context, path, store, refs, key, engine._folder
@@ -442,14 +461,37 @@ class _Run:
         refs = {}
         for r in planned.refs:
             names = self._names(r, item)
-            refs[r.stage] = tuple(n for n in names if (r.stage, n) in engine.records)
+            ahead = {n for n in names if r.stage in planned.by_name and not engine._settled((r.stage, n))}
+            refs[r.stage] = tuple(n for n in names if n in ahead or (r.stage, n) in engine.records)
             same = engine._items[r.stage][0] is stage.scope
-            wanted += [(r.stage, n) for n in names if r.stage in needed or (same and n == name)]
+            wanted += [
+                (r.stage, n) for n in names if n not in ahead and (r.stage in needed or (same and n == name))
+            ]
         return refs, [one for one in wanted if one not in engine.records]
+
+    def find_misled(self) -> dict[str, set[str]]:
+        """Find the items that were run as if something were there that failed later, by stage.
+
+        Those that read by its name an item that failed, and those that read them.
+        """
+        misled: dict[str, set[str]] = {}
+        for planned in self.plan if self.lost else ():
+            hit = np.zeros(len(planned.items.names), np.bool_)
+            for refs in planned.refs:
+                bad = misled.get(refs.stage, set()) | (
+                    self.lost[refs.stage] if refs.stage in planned.by_name else set()
+                )
+                if bad:
+                    names = self.engine._items[refs.stage][1].names
+                    is_bad = np.array([name in bad for name in names], np.bool_)
+                    hit[readers(refs)[is_bad[refs.index]]] = True
+            if hit.any():
+                misled[planned.stage.name] = {planned.items.names[k] for k in np.flatnonzero(hit).tolist()}
+        return misled
 
     def _submit(self, ticket: int) -> None:
         function = self.plan[self.rank[ticket]].stage.function
-        self.engine._executor.submit(ticket, function, self.tasks[ticket])
+        self.engine._executor.submit(ticket, function, self.tasks[ticket], int(self.order[ticket]))
         self.in_flight.add(ticket)
 
     def _names(self, refs: Refs, item: int) -> tuple[str, ...]:
@@ -495,8 +537,10 @@ class _Run:
 
     def _lose(self, ticket: int, name: str, reason: str, needs: Item | None = None) -> None:
         """Go on without an item."""
+        stage = self.plan[self.rank[ticket]].stage.name
+        self.lost[stage].add(name)
         if self.engine._watch is not None:
-            self.engine._watch.failed(self.plan[self.rank[ticket]].stage.name, name, reason, needs)
+            self.engine._watch.failed(stage, name, reason, needs)
         self._settle_one(ticket)
 
     def _settle_one(self, ticket: int) -> None:
@@ -515,13 +559,24 @@ class _Run:
             self.in_flight.discard(ticket)
 
 
+def _contents(planned: _Planned, refs: Refs, source: Items) -> Refs:
+    """Leave out the refs that count by name alone: a reader does not wait for these."""
+    if refs.stage not in planned.by_name:
+        return refs
+    place = {name: k for k, name in enumerate(source.names)}
+    same = np.array([place.get(name, -1) for name in planned.items.names], np.int64)
+    reader = readers(refs)
+    own = same[reader] == refs.index
+    return Refs(refs.stage, np.searchsorted(reader[own], np.arange(len(refs.start))), refs.index[own])
+
+
 def _among(found: Refs, reach: Items, run: Items, stage: Stage) -> Refs:
     """Number refs among the items that are run; ValueError if one is not and the reader cannot do without."""
     position = {name: k for k, name in enumerate(run.names)}
     renumbered = np.array([position.get(name, -1) for name in reach.names], dtype=np.int32)
     index = renumbered[found.index]
     if all(read.optional for read in stage.reads if read.stage == found.stage):
-        reader = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))[index >= 0]
+        reader = readers(found)[index >= 0]
         return Refs(found.stage, np.searchsorted(reader, np.arange(len(found.start))), index[index >= 0])
     if (index < 0).any():
         missing = sorted({reach.names[k] for k in found.index[index < 0].tolist()})

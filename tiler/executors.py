@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from queue import Empty, SimpleQueue
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from pipeline.errors import CityError
 from tiler import fork_server
@@ -34,13 +34,22 @@ class ClusterError(CityError):
     """The Dask cluster of a run is gone: start it again, the same command goes on."""
 
 
+class _Given(NamedTuple):
+    """A task as the engine gave it."""
+
+    ticket: int
+    function: Function
+    task: Task
+    rank: int
+
+
 class Executor(Protocol):
     """What the engine asks of an executor; ``ticket`` is any number of the engine's."""
 
     workers: int
 
-    def submit(self, ticket: int, function: Function, task: Task) -> None:
-        """Take a task."""
+    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
+        """Take a task; of those that wait, an executor may let the one of the lowest rank begin first."""
 
     def wait(self) -> tuple[int, Record | Failure]:
         """Wait until any task is done; give its ticket and what came of it."""
@@ -57,8 +66,8 @@ class Serial:
     def __init__(self) -> None:
         self._queue: deque[tuple[int, Function, Task]] = deque()
 
-    def submit(self, ticket: int, function: Function, task: Task) -> None:
-        """Take a task."""
+    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
+        """Take a task; they run as they come."""
         self._queue.append((ticket, function, task))
 
     def wait(self) -> tuple[int, Record | Failure]:
@@ -111,18 +120,18 @@ class Dask:
         self.workers, self.scheduler = workers, scheduler
         self._limits = limits or Limits()
         self._client, self._terms = client, terms
-        self._unsent: list[tuple[int, Function, Task]] = []
-        self._flying: dict[str, tuple[Any, int, Function, Task]] = {}
+        self._unsent: list[_Given] = []
+        self._flying: dict[str, tuple[Any, _Given]] = {}
         self._ready: SimpleQueue[tuple[str, Any]] = SimpleQueue()  # key, and the result or the error
         self._sent: Counter[int] = Counter()
         self._submitted = 0
         self._lost = False
 
-    def submit(self, ticket: int, function: Function, task: Task) -> None:
-        """Take a task; ClusterError if the scheduler is lost."""
+    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
+        """Take a task, the lower its rank the sooner it begins; ClusterError if the scheduler is lost."""
         self._check_scheduler()
         self._forget_names()
-        self._unsent.append((ticket, function, task))
+        self._unsent.append(_Given(ticket, function, task, rank))
 
     def wait(self) -> tuple[int, Record | Failure]:
         """Wait for the scheduler; the result is released there at once.
@@ -138,29 +147,29 @@ class Dask:
             key, found = self._next()
             if key not in self._flying:
                 continue
-            future, ticket, function, task = self._flying[key]
-            outcome = self._outcome(found, ticket, task)
+            future, given = self._flying[key]
+            outcome = self._outcome(found, given.ticket, given.task)
             future.release()
             del self._flying[key]
             if outcome is not None:
-                self._sent.pop(ticket, None)
-                return ticket, outcome
-            self._sent[ticket] += 1
-            self.submit(ticket, function, task)
+                self._sent.pop(given.ticket, None)
+                return given.ticket, outcome
+            self._sent[given.ticket] += 1
+            self.submit(*given)
 
     def drop_waiting(self) -> set[int]:
         """Cancel all that is not done, and wait until no worker holds or runs any of it.
 
         Without a scheduler nobody can be asked; what workers then still commit is what a task of that key gives.
         """
-        unsent = {ticket for ticket, _, _ in self._unsent}
+        unsent = {given.ticket for given in self._unsent}
         self._unsent.clear()
         try:
             return unsent | self._cancel()
         except (OSError, RuntimeError, CancelledError):
             if not self._is_lost():
                 raise
-        dropped = {ticket for _, ticket, _, _ in self._flying.values()}
+        dropped = {given.ticket for _, given in self._flying.values()}
         self._flying.clear()
         return unsent | dropped
 
@@ -174,21 +183,28 @@ class Dask:
         self._ready.put((future.key, found))
 
     def _send(self) -> None:
-        """Send what was taken, the tasks of a function at once: most of what a graph costs, it costs for all."""
+        """Send what was taken, the tasks of a function at once: most of what a graph costs, it costs for all.
+
+        Each is told its rank, as Dask would begin with the first one of every call.
+        """
+        from dask import annotate
+
         guard: Callable[..., Any] = run_guarded
         given: dict[str, Any] = {"seconds": self._limits.seconds}
         if self._terms is not None:
             guard, given = run_on_terms, given | {"terms": self._terms}
         while self._unsent:
-            function = self._unsent[0][1]
-            together = [one for one in self._unsent if one[1] is function]
-            tickets, functions, tasks = zip(*together, strict=True)
+            function = self._unsent[0].function
+            together = [one for one in self._unsent if one.function is function]
             # Never met again, not even by a second try.
-            keys = [f"{task.stage}-{uuid.uuid4().hex}" for task in tasks]
-            futures = self._client.map(guard, functions, tasks, key=keys, pure=False, retries=0, **given)
-            self._unsent = [one for one in self._unsent if one[1] is not function]
-            for future, ticket, task in zip(futures, tickets, tasks, strict=True):
-                self._flying[future.key] = (future, ticket, function, task)
+            keys = [f"{one.task.stage}-{uuid.uuid4().hex}" for one in together]
+            urgency = {key: -one.rank for key, one in zip(keys, together, strict=True)}
+            functions, tasks = [function] * len(together), [one.task for one in together]
+            with annotate(priority=urgency.get):
+                futures = self._client.map(guard, functions, tasks, key=keys, pure=False, retries=0, **given)
+            self._unsent = [one for one in self._unsent if one.function is not function]
+            for future, one in zip(futures, together, strict=True):
+                self._flying[future.key] = (future, one)
                 self._client.loop.add_callback(self._follow, future)
 
     def _forget_names(self) -> None:
@@ -267,7 +283,7 @@ class Dask:
     def _cancel(self) -> set[int]:
         if self._is_lost():
             raise CancelledError
-        futures = [future for future, *_ in self._flying.values() if not future.done()]
+        futures = [future for future, _ in self._flying.values() if not future.done()]
         keys = {future.key for future in futures}
         self._client.cancel(futures)
         clean = 0
@@ -277,7 +293,7 @@ class Dask:
                 raise CancelledError
             held = set().union(*self._client.run(_held, on_error="ignore").values())
             clean = 0 if held & keys else clean + 1
-        return {self._flying.pop(key)[1] for key in keys}
+        return {self._flying.pop(key)[1].ticket for key in keys}
 
     def _outcome(self, found: Any, ticket: int, task: Task) -> Record | Failure | None:
         """What came of a task; None if it must be sent again."""

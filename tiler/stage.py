@@ -56,7 +56,8 @@ class Read:
         it and itself are read, of the seams its own four.
     others_by_name : bool
         Of all items but the one of the reader's own name it counts only that they are there, not what they hold:
-        their content is in no key, and the reader must not look at it.
+        their content is in no key, and the reader must not look at it. It does not wait for them either: they are
+        taken to be there, and the reader runs again in the end if one of them failed.
     """
 
     stage: str

@@ -194,12 +194,18 @@ def invert(refs: Sequence[tuple[int, Refs, int]], n_tasks: int) -> tuple[NDArray
         Their numbers.
     """
     none = np.empty(0, np.int32)
-    readers = [none, *(_readers(r) + np.int32(first) for first, r, _ in refs)]
+    reading = [none, *(readers(r) + np.int32(first) for first, r, _ in refs)]
     sources = [none, *(r.index + np.int32(base) for _, r, base in refs)]
-    reader, source = np.concatenate(readers), np.concatenate(sources)
+    reader, source = np.concatenate(reading), np.concatenate(sources)
     order = np.argsort(source, kind="stable")
     start = np.searchsorted(source[order], np.arange(n_tasks + 1)).astype(np.int64)
     return start, reader[order].astype(np.int32)
+
+
+def readers(refs: Refs) -> NDArray[np.int32]:
+    """Give the reading item of each ref."""
+    counts = np.diff(refs.start)
+    return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
 
 
 def joined_reads(stage: Stage) -> list[tuple[str, list[Read]]]:
@@ -221,8 +227,3 @@ def _query(
         pairs = pairs[:, (common > 0).any(axis=1)]
     pairs[0] = some[pairs[0]] if len(some) else pairs[0]
     return pairs
-
-
-def _readers(refs: Refs) -> NDArray[np.int32]:
-    counts = np.diff(refs.start)
-    return np.repeat(np.arange(len(counts), dtype=np.int32), counts)

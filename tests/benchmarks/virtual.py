@@ -129,8 +129,8 @@ class VirtualWorkers:
         self._running: list[tuple[float, int, int, Record | Failure]] = []
         self._serial = 0
 
-    def submit(self, ticket: int, function: Function, task: Task) -> None:
-        """Take a task."""
+    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
+        """Take a task; they begin as they come."""
         begin = time.perf_counter()
         self.in_flight += 1
         self._queue.append((ticket, task))

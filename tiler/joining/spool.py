@@ -113,8 +113,8 @@ class Spool:
         self._pause = Pause()
         self.sent: Counter[str] = Counter()
 
-    def submit(self, ticket: int, function: Function, task: Task) -> None:
-        """Take a task."""
+    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
+        """Take a task; they are given out as they come."""
         self._queue.append(Given(ticket, function, task))
 
     def wait(self) -> tuple[int, Record | Failure]:
