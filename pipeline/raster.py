@@ -166,6 +166,9 @@ def join_dtm(parts: Sequence[Dtm], window: NodeWindow) -> Dtm:
         common = grow_window(window_of(part), 0, within=window)
         target = cut_nodes(z, window, common)
         source = cut_nodes(part.z, window_of(part), common)
+        if np.isnan(target).all():  # as between tiles, which share no node
+            target[...] = source
+            continue
         if ((target != source) & ~np.isnan(target) & ~np.isnan(source)).any():
             raise ValueError(f"rasters to join have different heights at nodes of {common}")
         np.copyto(target, source, where=~np.isnan(source))

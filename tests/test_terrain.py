@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
@@ -221,6 +222,33 @@ def test_a_flooded_tile_depends_on_its_halo_only_and_needs_all_of_it() -> None:
         part = flood_terrain(join_dtm([raw], halo), window)
         equal.append(part.dtm.z.tobytes() == expected.tobytes() and part.ring.tobytes() == ring.tobytes())
     assert equal == [True, False]
+
+
+def flood_by_definition(z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Fill rings one by one, each from what was known before it; ring -1 where none reaches."""
+    z, ring = z.copy(), np.where(np.isnan(z), -1, 0)
+    for r in range(1, FILL_RINGS + 1):
+        known, before = ring >= 0, z.copy()
+        for j, i in np.argwhere(~known).tolist():
+            near = np.s_[max(j - 1, 0) : j + 2, max(i - 1, 0) : i + 2]
+            if known[near].any():
+                # In rows, one after the other: the order of a sum shows in its last bits.
+                z[j, i] = sum(before[near][known[near]].tolist()) / np.count_nonzero(known[near])
+                ring[j, i] = r
+    return z, ring
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (2, 2), (2, 30), (3, 3), (24, 31)])
+@pytest.mark.parametrize("share", [0.3, 0.9, 1.0])
+def test_a_flood_is_what_its_definition_says_at_every_border(shape: tuple[int, int], share: float) -> None:
+    rng = np.random.default_rng(1)
+    z = rng.normal(0.0, 10.0, shape)
+    z[rng.random(shape) < share] = np.nan
+    expected, ring = flood_by_definition(z)
+    raw = Dtm(z, 3, -4, 1.0)
+    flooded = flood_terrain(raw, window_of(raw))
+    assert flooded.dtm.z.tobytes() == expected.tobytes()
+    assert flooded.ring.tolist() == np.where(ring < 0, DEEPER, ring).tolist()
 
 
 def test_rings_count_nodes_along_the_larger_axis() -> None:

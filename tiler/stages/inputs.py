@@ -60,7 +60,7 @@ def input_stages(config: Config) -> list[Stage]:
             flood_tile,
             (Read("ground", (FILL_RINGS + 2) * spacing),),
             ("dtm_spacing",),
-            version=2,
+            version=3,
         ),
         Stage("coarse", Scope.REGION, join_coarse, (Read("flooded"),), ("dtm_spacing",)),
         # What a tile needs of the coarse level, which is nothing but in wide lakes.
@@ -216,9 +216,11 @@ def flood_tile(task: Task) -> Facts:
     within = node_window(task.context.bounds, spacing)
     window = grow_window(own, FILL_RINGS, within=within)
     flooded = flood_terrain(join_rasters(task, "ground", window, spacing), own)
-    sums = coarsen(flooded)
-    task.put(z=flooded.dtm.z, ring=flooded.ring, node=sums.node.reshape(-1, 2), total=sums.total, count=sums.count)
-    return _raster_facts(flooded.dtm) | {"known": sums.n_known, "deep": count_deep(flooded)}
+    sums, n_deep = coarsen(flooded), count_deep(flooded)
+    task.put(z=flooded.dtm.z, node=sums.node.reshape(-1, 2), total=sums.total, count=sums.count)
+    if n_deep:
+        task.put(ring=flooded.ring)
+    return _raster_facts(flooded.dtm) | {"known": sums.n_known, "deep": n_deep}
 
 
 def join_coarse(task: Task) -> Facts:
@@ -249,17 +251,18 @@ def take_coarse(task: Task) -> Facts:
 
 def fill_tile(task: Task) -> Facts:
     """Fill the large empty areas of a tile's terrain (step 1.3)."""
-    (own,) = task.read("flooded", ("z", "ring"))
-    flooded = FloodedDtm(_raster(own.arrays["z"], own.facts), own.arrays["ring"])
-    (lakes,) = task.read("lakes")
-    coarse = _raster(lakes.arrays.get("z", np.empty((0, 0))), lakes.facts)
-    filled, counts = fill_terrain(flooded, coarse)
-    task.put_rasters(z=filled.z)
-    return _raster_facts(filled) | {
+    (own,) = task.read("flooded")
+    terrain, n_deep = _raster(own.arrays["z"], own.facts), own.facts["deep"]
+    if n_deep:
+        (lakes,) = task.read("lakes")
+        flooded = FloodedDtm(terrain, own.arrays["ring"])
+        terrain, _ = fill_terrain(flooded, _raster(lakes.arrays["z"], lakes.facts))
+    task.put_rasters(z=terrain.z)
+    return _raster_facts(terrain) | {
         "counts": {
-            "terrain nodes": filled.z.size,
-            "terrain nodes filled": counts.filled,
-            "terrain nodes from coarse level": counts.coarse,
+            "terrain nodes": terrain.z.size,
+            "terrain nodes filled": terrain.z.size - own.facts["known"],
+            "terrain nodes from coarse level": n_deep,
         }
     }
 
