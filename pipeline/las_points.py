@@ -1,5 +1,7 @@
 """Points as a LAS file has them, in whole units: coordinates, what is usable, and cuts to a box (step 1.1)."""
 
+from dataclasses import dataclass
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,26 @@ HEIGHT_LIMIT = 10_000.0  # m; no ground, building or return lies beyond
 
 Box = tuple[float, float, float, float]
 Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class UnitPoints:
+    """Points of one file in its own units.
+
+    Attributes
+    ----------
+    units : int32, (n, 3)
+        Coordinates in units of the file, as in `find_coordinates`.
+    scale, offset : tuple of 3 floats
+        Size of a unit along each axis, and place of unit 0 (m).
+    classification : uint8, (n,)
+        ASPRS class of each point.
+    """
+
+    units: NDArray[np.int32]
+    scale: Triple
+    offset: Triple
+    classification: NDArray[np.uint8]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -100,7 +122,7 @@ def judge_points(
     """
     verdict = np.empty(len(x), np.uint8)
     for k in range(len(x)):
-        if not _is_within(x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1], box):
+        if not is_within(x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1], box):
             verdict[k] = OUTSIDE
         elif withheld[k]:
             verdict[k] = WITHHELD
@@ -162,7 +184,7 @@ def cut_units(
         if new == LEFT_OUT:
             continue
         x, y = units[k, 0] * scale[0] + offset[0], units[k, 1] * scale[1] + offset[1]
-        if not _is_within(x, y, box):
+        if not is_within(x, y, box):
             continue
         if cover is None or is_covered(x, y, cover[0], cover[1], cover[2]):
             xyz[n, 0], xyz[n, 1], xyz[n, 2] = x, y, units[k, 2] * scale[2] + offset[2]
@@ -172,5 +194,6 @@ def cut_units(
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _is_within(x: float, y: float, box: Box) -> bool:
+def is_within(x: float, y: float, box: Box) -> bool:
+    """Tell whether a place is in a box; the borders belong to it."""
     return box[0] <= x <= box[2] and box[1] <= y <= box[3]

@@ -1,6 +1,6 @@
 """Step 1.3: the digital terrain map (DTM), bin means of ground points with all empty nodes filled.
 
-A region in one piece takes `compute_dtm`. Tiles take the same steps one by one: `bin_nodes` for their own nodes,
+A region in one piece takes `compute_dtm`. Tiles take the same steps one by one: `bin_units` for their own nodes,
 `raster.join_dtm` with the neighbours' as far as `terrain_fill.FILL_RINGS`, `flood_terrain`, `coarsen`; then
 `merge_coarse` and `coarse_terrain` for the region; then `fill_terrain`. The bytes are the same.
 """
@@ -11,6 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.las_points import Box, Triple, UnitPoints, is_within
 from pipeline.pointcloud import GROUND, WATER, PointCloud
 from pipeline.raster import (
     HEIGHT_UNIT,
@@ -32,6 +33,7 @@ __all__ = [
     "Dtm",
     "bin_ground",
     "bin_nodes",
+    "bin_units",
     "compute_dtm",
     "cut_terrain",
     "fill_dtm",
@@ -70,9 +72,37 @@ def bin_nodes(
     total, count = np.zeros((window.ny, window.nx)), np.zeros((window.ny, window.nx), np.int64)
     for cloud in clouds:
         _sum_bins(cloud.xyz, cloud.classification, spacing, window.i0, window.j0, total, count)
-    mean = np.full(count.shape, np.nan)
-    np.divide(total * HEIGHT_UNIT, count, out=mean, where=count > 0)
-    return Dtm(mean, window.i0, window.j0, spacing), count
+    return Dtm(_average_bins(total, count), window.i0, window.j0, spacing), count
+
+
+def bin_units(parts: Iterable[UnitPoints], box: Box, window: NodeWindow, *, spacing: float) -> Dtm:
+    """Average the ground points within a box around each node, as `bin_nodes` does, from units of their files.
+
+    Parameters
+    ----------
+    parts : iterable of UnitPoints
+        Points, each looked at once; those of other classes or outside the box are passed over.
+    box : tuple of 4 floats
+        xmin, ymin, xmax, ymax (m); the borders belong to the box.
+    window : NodeWindow
+        Nodes.
+    spacing : float
+        Distance between nodes (m).
+
+    Returns
+    -------
+    Dtm
+        Bin means, NaN where a bin is empty.
+
+    Notes
+    -----
+    Coordinates in metres, twice as many bytes as the units, are nowhere in memory.
+    """
+    total, count = np.zeros((window.ny, window.nx)), np.zeros((window.ny, window.nx), np.int64)
+    for part in parts:
+        rows = part.units, part.scale, part.offset, part.classification
+        _sum_units(*rows, box, spacing, window.i0, window.j0, total, count)
+    return Dtm(_average_bins(total, count), window.i0, window.j0, spacing)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -86,14 +116,57 @@ def _sum_bins(
     count: NDArray[np.int64],
 ) -> None:
     """Add the heights of ground points to the total around each node, in whole `HEIGHT_UNIT`, and count them."""
-    ny, nx = total.shape
     for k in range(len(xyz)):
-        if classification[k] != GROUND and classification[k] != WATER:
-            continue
-        i, j = int(np.rint(xyz[k, 0] / spacing)) - i0, int(np.rint(xyz[k, 1] / spacing)) - j0
-        if 0 <= i < nx and 0 <= j < ny:
-            total[j, i] += np.rint(xyz[k, 2] / HEIGHT_UNIT)
-            count[j, i] += 1
+        if classification[k] == GROUND or classification[k] == WATER:
+            _add_point(xyz[k, 0], xyz[k, 1], xyz[k, 2], spacing, i0, j0, total, count)
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_units(
+    units: NDArray[np.int32],
+    scale: Triple,
+    offset: Triple,
+    classification: NDArray[np.uint8],
+    box: Box,
+    spacing: float,
+    i0: int,
+    j0: int,
+    total: NDArray[np.float64],
+    count: NDArray[np.int64],
+) -> None:
+    """Do what `_sum_bins` does, for points in units of a file, and within a box."""
+    for k in range(len(units)):
+        if classification[k] == GROUND or classification[k] == WATER:
+            x, y = units[k, 0] * scale[0] + offset[0], units[k, 1] * scale[1] + offset[1]
+            if is_within(x, y, box):
+                _add_point(x, y, units[k, 2] * scale[2] + offset[2], spacing, i0, j0, total, count)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _add_point(
+    x: float,
+    y: float,
+    z: float,
+    spacing: float,
+    i0: int,
+    j0: int,
+    total: NDArray[np.float64],
+    count: NDArray[np.int64],
+) -> None:
+    i, j = int(np.rint(x / spacing)) - i0, int(np.rint(y / spacing)) - j0
+    if 0 <= i < total.shape[1] and 0 <= j < total.shape[0]:
+        total[j, i] += np.rint(z / HEIGHT_UNIT)
+        count[j, i] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _average_bins(total: NDArray[np.float64], count: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Turn sums of heights, in `HEIGHT_UNIT`, into means (m), NaN where nothing is counted."""
+    mean = np.empty(total.shape)
+    for j in range(total.shape[0]):
+        for i in range(total.shape[1]):
+            mean[j, i] = total[j, i] * HEIGHT_UNIT / count[j, i] if count[j, i] else np.nan
+    return mean
 
 
 def bin_ground(

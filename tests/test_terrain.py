@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from pipeline.las_points import UnitPoints
 from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
 from pipeline.raster import (
     HEIGHT_UNIT,
@@ -20,7 +21,7 @@ from pipeline.raster import (
     node_window,
     window_of,
 )
-from pipeline.terrain import Dtm, bin_ground, bin_nodes, compute_dtm, fill_dtm, sample_dtm
+from pipeline.terrain import Dtm, bin_ground, bin_nodes, bin_units, compute_dtm, fill_dtm, sample_dtm
 from pipeline.terrain_fill import (
     COARSE,
     DEEPER,
@@ -171,6 +172,24 @@ def test_bins_of_tiles_are_those_of_the_region_from_points_half_a_spacing_beyond
         n_points += int(found.sum())
     assert join_dtm(parts[::-1], window_of(whole)).z.tobytes() == whole.z.tobytes()
     assert n_points == count.sum()
+
+
+def test_bins_of_units_are_those_of_points_within_the_box() -> None:
+    rng = np.random.default_rng(3)
+    n, scale, offset = 5000, (0.01, 0.01, 0.002), (100.0, -50.0, 7.0)
+    units = rng.integers(0, 1500, (n, 3)).astype(np.int32)
+    units[::7, :2] = units[::7, :2] // 50 * 50  # on the borders of the box, and between two nodes
+    classes = rng.choice(np.array([GROUND, WATER, BUILDING], np.uint8), n)
+    xyz = units * np.array(scale) + np.array(offset)
+    box, window = (103.5, -46.5, 112.5, -39.5), NodeWindow(104, -46, 9, 7)
+    within = ((xyz[:, :2] >= box[:2]) & (xyz[:, :2] <= box[2:])).all(axis=1)
+    expected, count = bin_nodes([PointCloud(xyz[within], classes[within])], window, spacing=1.0)
+    parts = [UnitPoints(units[k::3], scale, offset, classes[k::3]) for k in range(3)]
+    assert bin_units(parts, box, window, spacing=1.0).z.tobytes() == expected.z.tobytes()
+    smaller = (103.6, -46.5, 112.5, -39.5)
+    assert bin_units(parts, smaller, window, spacing=1.0).z.tobytes() != expected.z.tobytes()
+    assert count.all()
+    assert np.isnan(bin_units([], box, window, spacing=1.0).z).all()
 
 
 def raster_with_lakes(seed: int, nx: int, ny: int) -> Dtm:

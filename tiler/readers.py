@@ -13,7 +13,7 @@ from pipeline.building_points import NEVER_ROOF
 from pipeline.citymodel import Footprints
 from pipeline.ground_filter import FILTER_REACH, classify_above, find_terrain
 from pipeline.inside import Cover, are_covered
-from pipeline.las_points import LEFT_OUT, Triple, cut_units
+from pipeline.las_points import LEFT_OUT, Triple, UnitPoints, cut_units
 from pipeline.pointcloud import BUILDING, PointCloud
 from pipeline.raster import (
     Dtm,
@@ -133,6 +133,16 @@ def read_bands(
         if cover is not None:
             kept &= are_covered(cover, cloud.xyz)
         yield PointCloud(cloud.xyz[kept], new[kept].astype(np.uint8))
+
+
+def read_units(task: Task, box: Box) -> Iterator[UnitPoints]:
+    """Read the points of a box's cells in bands, as files have them, from the stage ``points``.
+
+    Bands are those of `read_bands`, file by file. Points of these cells that lie outside the box are among them.
+    """
+    for files in _cut_bands(_find_files(task, box)):
+        for file in files:
+            yield _read_units(task, file)
 
 
 def _read_all(task: Task, box: Box) -> Iterator[tuple[PointCloud, NDArray[np.bool_]]]:
@@ -321,11 +331,15 @@ def _read_files(
     count: list[int] = []
     cells = None if cover is None else (cover.i0, cover.j0, cover.marked)
     for file, table in zip(files, become, strict=True):
-        rows = task.read_ranges("points", file.name, ("units", "classification"), file.ranges)
-        n = sum(count)
-        found = rows["units"], rows["classification"], file.scale, file.offset
-        count.append(cut_units(*found, box, table, cells, xyz[n:], classes[n:]))
+        found, n = _read_units(task, file), sum(count)
+        rows = found.units, found.classification, found.scale, found.offset
+        count.append(cut_units(*rows, box, table, cells, xyz[n:], classes[n:]))
     return PointCloud(xyz[: sum(count)], classes[: sum(count)]), count
+
+
+def _read_units(task: Task, file: _FileRows) -> UnitPoints:
+    rows = task.read_ranges("points", file.name, ("units", "classification"), file.ranges)
+    return UnitPoints(rows["units"], file.scale, file.offset, rows["classification"])
 
 
 def _ranges_of_blocks(

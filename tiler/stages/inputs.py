@@ -11,7 +11,7 @@ from pipeline.errors import InputError
 from pipeline.notes import Note
 from pipeline.pointcloud import BUILDING, GROUND, WATER
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
-from pipeline.terrain import bin_nodes
+from pipeline.terrain import bin_nodes, bin_units
 from pipeline.terrain_fill import (
     COARSE,
     FILL_RINGS,
@@ -31,7 +31,7 @@ from tiler.context import tile_key
 from tiler.footprint_index import scan_footprints
 from tiler.ingest import read_cells
 from tiler.places import place
-from tiler.readers import clip, grow, join_rasters, read_bands, read_outlines
+from tiler.readers import clip, grow, join_rasters, read_bands, read_outlines, read_units
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.tables import pack_polygons
 from tiler.task import Task
@@ -203,8 +203,11 @@ def bin_tile(task: Task) -> Facts:
         (window.j0 + window.ny - 1) * spacing,
     )
     box = grow(box, spacing / 2)
-    bands = read_bands(task, box, classes=(GROUND, WATER), ground_filter=task.parameters.ground_filter)
-    raster, _ = bin_nodes(bands, window, spacing=spacing)
+    if task.parameters.ground_filter:
+        bands = read_bands(task, box, classes=(GROUND, WATER), ground_filter=True)
+        raster, _ = bin_nodes(bands, window, spacing=spacing)
+    else:
+        raster = bin_units(read_units(task, box), box, window, spacing=spacing)
     task.put_rasters(z=raster.z)
     return _raster_facts(raster)
 
