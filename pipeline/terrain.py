@@ -45,7 +45,7 @@ __all__ = [
 
 def bin_nodes(
     clouds: Iterable[PointCloud], window: NodeWindow, *, spacing: float
-) -> tuple[Dtm, NDArray[np.int64]]:
+) -> tuple[Dtm, NDArray[np.int32]]:
     """Average the ground points (classes 2 and 9) around each node.
 
     Parameters
@@ -62,14 +62,14 @@ def bin_nodes(
     -------
     Dtm
         Bin means, NaN where a bin is empty.
-    int64, (ny, nx)
+    int32, (ny, nx)
         Points in each bin.
 
     Notes
     -----
     Heights are summed as whole numbers: neither the order of the points matters nor how they are parted.
     """
-    total, count = np.zeros((window.ny, window.nx)), np.zeros((window.ny, window.nx), np.int64)
+    total, count = np.zeros((window.ny, window.nx)), np.zeros((window.ny, window.nx), np.int32)
     for cloud in clouds:
         _sum_bins(cloud.xyz, cloud.classification, spacing, window.i0, window.j0, total, count)
     return Dtm(_average_bins(total, count), window.i0, window.j0, spacing), count
@@ -98,7 +98,7 @@ def bin_units(parts: Iterable[UnitPoints], box: Box, window: NodeWindow, *, spac
     -----
     Coordinates in metres, twice as many bytes as the units, are nowhere in memory.
     """
-    total, count = np.zeros((window.ny, window.nx)), np.zeros((window.ny, window.nx), np.int64)
+    total, count = np.zeros((window.ny, window.nx)), np.zeros((window.ny, window.nx), np.int32)
     for part in parts:
         rows = part.units, part.scale, part.offset, part.classification
         _sum_units(*rows, box, spacing, window.i0, window.j0, total, count)
@@ -113,7 +113,7 @@ def _sum_bins(
     i0: int,
     j0: int,
     total: NDArray[np.float64],
-    count: NDArray[np.int64],
+    count: NDArray[np.int32],
 ) -> None:
     """Add the heights of ground points to the total around each node, in whole `HEIGHT_UNIT`, and count them."""
     for k in range(len(xyz)):
@@ -132,7 +132,7 @@ def _sum_units(
     i0: int,
     j0: int,
     total: NDArray[np.float64],
-    count: NDArray[np.int64],
+    count: NDArray[np.int32],
 ) -> None:
     """Do what `_sum_bins` does, for points in units of a file, and within a box."""
     for k in range(len(units)):
@@ -151,7 +151,7 @@ def _add_point(
     i0: int,
     j0: int,
     total: NDArray[np.float64],
-    count: NDArray[np.int64],
+    count: NDArray[np.int32],
 ) -> None:
     i, j = int(np.rint(x / spacing)) - i0, int(np.rint(y / spacing)) - j0
     if 0 <= i < total.shape[1] and 0 <= j < total.shape[0]:
@@ -160,7 +160,7 @@ def _add_point(
 
 
 @numba.njit(cache=True, nogil=True)
-def _average_bins(total: NDArray[np.float64], count: NDArray[np.int64]) -> NDArray[np.float64]:
+def _average_bins(total: NDArray[np.float64], count: NDArray[np.int32]) -> NDArray[np.float64]:
     """Turn sums of heights, in `HEIGHT_UNIT`, into means (m), NaN where nothing is counted."""
     mean = np.empty(total.shape)
     for j in range(total.shape[0]):
@@ -171,7 +171,7 @@ def _average_bins(total: NDArray[np.float64], count: NDArray[np.int64]) -> NDArr
 
 def bin_ground(
     cloud: PointCloud, bounds: tuple[float, float, float, float], *, spacing: float
-) -> tuple[Dtm, NDArray[np.int64]]:
+) -> tuple[Dtm, NDArray[np.int32]]:
     """Average the ground points around each node of a region, as `bin_nodes` does.
 
     Parameters
