@@ -277,6 +277,15 @@ def test_another_cloud_in_place_of_one_reaches_the_tiles_under_it(nine: Town, tm
     prove_fresh(town, tmp_path / "fresh")
 
 
+def test_rings_and_coarse_nodes_are_kept_only_where_a_lake_is_deep(nine: Town) -> None:
+    store = Store(nine.out / "store.zarr")
+    tiles = store.names("flooded")
+    deep = {tile for tile in tiles if store.attributes("flooded", tile)["facts"]["deep"]}
+    assert 0 < len(deep) < len(tiles)
+    assert {tile for tile in tiles if "ring" in store.shapes("flooded", tile)} == deep
+    assert {tile for tile in tiles if "z" in store.shapes("lakes", tile)} == deep
+
+
 @pytest.mark.parametrize(
     ("change", "first"),
     [
