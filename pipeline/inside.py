@@ -16,6 +16,9 @@ POLYGON = 3  # GEOS's number of that type
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Box = tuple[float, float, float, float]  # xmin, ymin, xmax, ymax (m)
+
+EVERYWHERE: Box = (-np.inf, -np.inf, np.inf, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +54,53 @@ def list_edges(polygons: NDArray[np.object_]) -> Edges:
     return Edges(start, xy[first], xy[first + 1])
 
 
+@dataclass(frozen=True, eq=False)
+class PolygonIndex:
+    """Polygons listed in the square cells that they have a part of.
+
+    Attributes
+    ----------
+    cells : tuple of int
+        Column and row of the first cell, number of columns and rows.
+    start : int64, (cells + 1,)
+        Cell ``c``, row by row, has the entries ``start[c]`` to ``start[c + 1]``.
+    polygon : int32, (m,)
+        Polygon of each entry.
+    edges : int64, (m, 2)
+        First and last of its edges that meet the row of cells; none where the whole cell is inside.
+    a, b : float64, (k, 2)
+        These edges, from and to (m).
+    """
+
+    cells: tuple[int, int, int, int]
+    start: Index
+    polygon: NDArray[np.int32]
+    edges: Index
+    a: Array
+    b: Array
+
+
+def index_polygons(polygons: NDArray[np.object_], box: Box = EVERYWHERE) -> PolygonIndex:
+    """List polygons, valid shapely Polygons or MultiPolygons (n,), in cells, for `find_inside` in a box.
+
+    Parameters
+    ----------
+    polygons : object, (n,)
+        The polygons.
+    box : (xmin, ymin, xmax, ymax)
+        Box in which points may be looked for (m), its borders included; all of the plane by default.
+    """
+    edges = list_edges(polygons)
+    cells = _find_cells(box, edges.a, edges.b) if len(edges.a) else (0, 0, 0, 0)
+    return PolygonIndex(cells, *_put_into_cells(cells, edges.start, edges.a, edges.b))
+
+
 def find_inside(
-    xy: Array, polygons: NDArray[np.object_], *, among: NDArray[np.bool_] | None = None
+    xy: Array,
+    polygons: NDArray[np.object_],
+    *,
+    among: NDArray[np.bool_] | None = None,
+    index: PolygonIndex | None = None,
 ) -> tuple[Index, Index]:
     """Find the points inside each polygon, those on its outline left out.
 
@@ -64,6 +112,8 @@ def find_inside(
         Valid shapely Polygons; a point in several of them is found in each.
     among : bool, (k,), optional
         Points to look for; all by default.
+    index : PolygonIndex, optional
+        The polygons in cells, where that is known; points beyond its box are not looked for.
 
     Returns
     -------
@@ -78,11 +128,11 @@ def find_inside(
     """
     if len(xy) == 0 or len(polygons) == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    edges = list_edges(polygons)
-    if len(edges.a) == 0:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
     among = np.ones(len(xy), np.bool_) if among is None else among
-    start, found = _find(xy, among, edges.start, edges.a, edges.b)
+    index = index_polygons(polygons, _box_of(xy, among)) if index is None else index
+    start, found = _find(
+        xy, among, len(polygons), index.cells, index.start, index.polygon, index.edges, index.a, index.b
+    )
     polygon = np.repeat(np.arange(len(polygons)), np.diff(start))
     point, side = found >> 2, found & 3
     if not (side == UNSURE).any():
@@ -110,13 +160,9 @@ class Cover:
 
 def cover_polygons(polygons: NDArray[np.object_]) -> Cover:
     """Mark the cells that polygons, valid shapely Polygons or MultiPolygons (n,), have a part of."""
-    edges = list_edges(polygons)
-    if len(edges.a) == 0:
-        return Cover(0, 0, np.zeros((0, 0), np.bool_))
-    cells = _find_cells(edges.a, np.ones(len(edges.a), np.bool_), edges.a, edges.b)
-    i0, j0, width, height = cells
-    cell_start = _put_into_cells(cells, edges.start, edges.a, edges.b)[0]
-    return Cover(i0, j0, (np.diff(cell_start) > 0).reshape(height, width))
+    index = index_polygons(polygons)
+    i0, j0, width, height = index.cells
+    return Cover(i0, j0, (np.diff(index.start) > 0).reshape(height, width))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -271,14 +317,21 @@ def _side_of_cell(left: float, under: float, near: Index, a: Array, b: Array) ->
 
 
 @numba.njit(cache=True, nogil=True)
-def _find_cells(xy: Array, among: NDArray[np.bool_], a: Array, b: Array) -> tuple[int, int, int, int]:
-    """Column and row of the first cell that has both points and edges around it, number of columns and rows."""
+def _box_of(xy: Array, among: NDArray[np.bool_]) -> Box:
+    """Box of some points; inside out where there are none."""
     low_x = low_y = np.inf
     high_x = high_y = -np.inf
     for k in range(len(xy)):
         if among[k]:
             low_x, high_x = min(low_x, xy[k, 0]), max(high_x, xy[k, 0])
             low_y, high_y = min(low_y, xy[k, 1]), max(high_y, xy[k, 1])
+    return low_x, low_y, high_x, high_y
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_cells(box: Box, a: Array, b: Array) -> tuple[int, int, int, int]:
+    """Column and row of the first cell that both the box and edges are around, number of columns and rows."""
+    low_x, low_y, high_x, high_y = box
     low_x, high_x = max(low_x, min(a[:, 0].min(), b[:, 0].min())), min(high_x, max(a[:, 0].max(), b[:, 0].max()))
     low_y, high_y = max(low_y, min(a[:, 1].min(), b[:, 1].min())), min(high_y, max(a[:, 1].max(), b[:, 1].max()))
     if not (low_x <= high_x and low_y <= high_y):
@@ -361,12 +414,17 @@ def _group(group: NDArray[np.integer], n: int) -> tuple[Index, Index]:
 
 @numba.njit(cache=True, nogil=True)
 def _find(
-    xy: Array, among: NDArray[np.bool_], edge_start: Index, edge_a: Array, edge_b: Array
+    xy: Array,
+    among: NDArray[np.bool_],
+    n_polygons: int,
+    cells: tuple[int, int, int, int],
+    cell_start: Index,
+    polygon: NDArray[np.int32],
+    edges: Index,
+    a: Array,
+    b: Array,
 ) -> tuple[Index, Index]:
     """For each polygon, four times the point plus its side, of all points that are not surely outside."""
-    n_polygons = len(edge_start) - 1
-    cells = _find_cells(xy, among, edge_a, edge_b)
-    cell_start, polygon, edges, a, b = _put_into_cells(cells, edge_start, edge_a, edge_b)
     most = np.max(np.diff(cell_start)) if len(polygon) else 0
     owner, found = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int64)
     n = 0

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.inside import are_inside, find_inside
+from pipeline.inside import EVERYWHERE, Box, PolygonIndex, are_inside, find_inside, index_polygons
 from pipeline.pointcloud import GROUND, WATER, PointCloud
 from pipeline.raster import Dtm, measure_over
 from pipeline.residuals import Residuals, ResidualSums, conclude, merge_residuals, sum_residuals, summarise
@@ -18,9 +18,11 @@ __all__ = [
     "KINDS",
     "FidelitySums",
     "HouseFidelity",
+    "IndexedModel",
     "PointFidelity",
     "Residuals",
     "conclude_fidelity",
+    "index_model",
     "measure_fidelity",
     "measure_houses",
     "merge_fidelity",
@@ -132,30 +134,70 @@ def measure_fidelity(
     -----
     All points count, outliers too. The result does not depend on the order of the points.
     """
-    found = _find_residuals(cloud, dtm, polygons, roof, footprints, building_class)
+    model = index_model(polygons, roof, footprints=footprints)
+    found = _find_residuals(cloud, dtm, model, building_class, np.ones(len(cloud.xyz), np.bool_))
     return PointFidelity(**{kind: summarise(residual) for kind, residual in found.items()})
 
 
-def sum_fidelity(
-    cloud: PointCloud,
-    dtm: Dtm,
+@dataclass(frozen=True, eq=False)
+class IndexedModel:
+    """A city model and the footprints that it was made of, in which points are looked for.
+
+    Attributes
+    ----------
+    polygons : object, (n,)
+        Buildings that have a roof, then footprints.
+    roof : float64, (b,)
+        Absolute roof heights (m) of the first ``b``, the buildings.
+    index : PolygonIndex
+        All of them in cells.
+    """
+
+    polygons: NDArray[np.object_]
+    roof: NDArray[np.float64]
+    index: PolygonIndex
+
+
+def index_model(
     polygons: NDArray[np.object_],
     roof: NDArray[np.float64],
     *,
     footprints: NDArray[np.object_],
-    building_class: bool,
+    box: Box = EVERYWHERE,
+) -> IndexedModel:
+    """Prepare a city model for `sum_fidelity` of several clouds within a box.
+
+    Parameters
+    ----------
+    polygons, roof, footprints
+        As in `measure_fidelity`: all that touch the box, also those that the tiles around it own.
+    box : (xmin, ymin, xmax, ymax)
+        Box of all points (m), its borders included.
+    """
+    built = np.isfinite(roof)
+    both = np.concatenate((polygons[built], footprints))
+    return IndexedModel(both, roof[built], index_polygons(both, box))
+
+
+def sum_fidelity(
+    cloud: PointCloud, dtm: Dtm, model: IndexedModel, *, building_class: bool, among: NDArray[np.bool_]
 ) -> FidelitySums:
     """Measure a tile's points as `measure_fidelity` does, for adding up.
 
     Parameters
     ----------
     cloud : PointCloud
+        Points within the box of the model.
+    dtm : Dtm
+        As in `measure_fidelity`.
+    model : IndexedModel
+        The city model, from `index_model`.
+    building_class : bool
+        As in `measure_fidelity`; a question to the whole region.
+    among : bool, (n,)
         The tile's own points: each point of the region in one tile.
-    dtm, polygons, roof, footprints, building_class
-        As in `measure_fidelity`: all that touch the tile, also those that its neighbours own. Whether there is a
-        building class is a question to the whole region.
     """
-    found = _find_residuals(cloud, dtm, polygons, roof, footprints, building_class)
+    found = _find_residuals(cloud, dtm, model, building_class, among)
     return FidelitySums(**{kind: sum_residuals(residual) for kind, residual in found.items()})
 
 
@@ -194,42 +236,23 @@ def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roof: NDAr
 
 
 def _find_residuals(
-    cloud: PointCloud,
-    dtm: Dtm,
-    polygons: NDArray[np.object_],
-    roof: NDArray[np.float64],
-    footprints: NDArray[np.object_],
-    building_class: bool,
+    cloud: PointCloud, dtm: Dtm, model: IndexedModel, building_class: bool, among: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.float64]]:
-    """Find the residuals (m) of the points of each kind."""
-    built = np.isfinite(roof)
-    polygons, roof = polygons[built], roof[built]
-    xyz = cloud.xyz
-    is_roof = select_roof(cloud, building_class=building_class)
-    building, point, original = _find_in_both(xyz, is_roof, polygons, footprints)
-    missed = original & ~_mark(len(xyz), point)
-
-    is_ground = (cloud.classification == GROUND) | (cloud.classification == WATER)
-    over, below, original = _find_in_both(xyz, is_ground, polygons, footprints)
-    open_ground = is_ground & ~_mark(len(xyz), below)
+    """Find the residuals (m) of the points of each kind among some."""
+    xyz, roof = cloud.xyz, model.roof
+    is_roof = among & select_roof(cloud, building_class=building_class)
+    is_ground = among & ((cloud.classification == GROUND) | (cloud.classification == WATER))
+    polygon, point = find_inside(xyz, model.polygons, among=is_roof | is_ground, index=model.index)
+    n = int(np.searchsorted(polygon, len(roof)))
+    building, point, original = polygon[:n], point[:n], _mark(len(xyz), point[n:])
+    outside = ~_mark(len(xyz), point)
+    residual = roof[building] - xyz[point, 2]
     return {
-        "roof": roof[building] - xyz[point, 2],
-        "missed": measure_over(dtm, xyz, missed),
-        "ground": measure_over(dtm, xyz, open_ground),
-        "swallowed": (roof[over] - xyz[below, 2])[~original[below]],
+        "roof": residual[is_roof[point]],
+        "missed": measure_over(dtm, xyz, is_roof & original & outside),
+        "ground": measure_over(dtm, xyz, is_ground & outside),
+        "swallowed": residual[(is_ground & ~original)[point]],
     }
-
-
-def _find_in_both(
-    xyz: NDArray[np.float64],
-    among: NDArray[np.bool_],
-    polygons: NDArray[np.object_],
-    footprints: NDArray[np.object_],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Find the points in each polygon, as `find_inside`, and tell which points are in a footprint."""
-    polygon, point = find_inside(xyz, np.concatenate((polygons, footprints)), among=among)
-    n = int(np.searchsorted(polygon, len(polygons)))
-    return polygon[:n], point[:n], _mark(len(xyz), point[n:])
 
 
 def _mark(n: int, index: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -8,7 +8,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.group_order import sort_points, sort_values
-from pipeline.inside import INDEX_CELL, are_covered, are_inside, cover_polygons, find_inside, find_owner
+from pipeline.inside import (
+    INDEX_CELL,
+    are_covered,
+    are_inside,
+    cover_polygons,
+    find_inside,
+    find_owner,
+    index_polygons,
+)
 
 Array = NDArray[np.float64]
 
@@ -29,10 +37,18 @@ def check(xy: Array, polygons: NDArray[np.object_]) -> None:
     assert (
         list(zip(*(index.tolist() for index in find_inside(xy, polygons, among=some)), strict=True)) == some_pairs
     )
+    low = xy.min(axis=0, initial=1e9)
+    high = (low + xy.max(axis=0, initial=-1e9)) / 2
+    near = ((xy >= low) & (xy <= high)).all(axis=1)
+    index = index_polygons(polygons, (*low.tolist(), *high.tolist()))
+    found = find_inside(xy, polygons, among=near, index=index)
+    assert list(zip(*(rows.tolist() for rows in found), strict=True)) == [
+        (a, b) for a, b in zip(*pairs, strict=True) if near[b]
+    ]
     polygon, point = np.divmod(np.arange(len(polygons) * len(xy)), max(len(xy), 1))
     for closed in (False, True):
-        found = are_inside(polygons, polygon, xy[point], closed=closed)
-        assert found.tolist() == by_geos(xy, polygons, closed=closed).ravel().tolist()
+        inside = are_inside(polygons, polygon, xy[point], closed=closed)
+        assert inside.tolist() == by_geos(xy, polygons, closed=closed).ravel().tolist()
 
 
 def star(rng: np.random.Generator, *, whole: bool) -> shapely.Polygon:

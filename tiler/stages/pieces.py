@@ -18,8 +18,15 @@ from pipeline.histograms import (
     merge_histograms,
 )
 from pipeline.mesh import ColumnMesh, SeamEdges
-from pipeline.point_fidelity import KINDS, FidelitySums, conclude_fidelity, merge_fidelity, sum_fidelity
-from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
+from pipeline.point_fidelity import (
+    KINDS,
+    FidelitySums,
+    conclude_fidelity,
+    index_model,
+    merge_fidelity,
+    sum_fidelity,
+)
+from pipeline.pointcloud import BUILDING, GROUND, WATER
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
 from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
 from stitch.grid import Key, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
@@ -188,14 +195,12 @@ def measure_fit(task: Task) -> Facts:
     for result in task.read("houses", ("outline", "outline_start")):
         polygons = unpack_polygons(result.arrays, "outline")
         outlines.append(polygons[shapely.intersects(shapely.box(*task.box), polygons)])
-    model, footprints = buildings.model, np.concatenate(outlines)
-    parts = []
-    for cloud in read_bands(task, task.box, classes=FIT_CLASSES, ground_filter=given.ground_filter):
-        own = find_owned(task.box, bounds, cloud.xyz[:, :2])
-        mine = cloud if own.all() else PointCloud(cloud.xyz[own], cloud.classification[own])
-        parts.append(
-            sum_fidelity(mine, dtm, model.polygons, model.roof, footprints=footprints, building_class=True)
-        )
+    footprints = np.concatenate(outlines)
+    model = index_model(buildings.model.polygons, buildings.model.roof, footprints=footprints, box=task.box)
+    parts = [
+        sum_fidelity(cloud, dtm, model, building_class=True, among=find_owned(task.box, bounds, cloud.xyz[:, :2]))
+        for cloud in read_bands(task, task.box, classes=FIT_CLASSES, ground_filter=given.ground_filter)
+    ]
     sums = merge_fidelity(parts)
     facts = {}
     for kind in KINDS:
