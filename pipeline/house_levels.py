@@ -1,12 +1,14 @@
 """Houses divided where their roofs step: a low annex behind a tall front house (after step 1.5, ours)."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.cuts import cut_best, share_vertices
+from pipeline.group_order import sort_points
 from pipeline.inside import find_owner
 from pipeline.regions import join_cells
 from pipeline.rings import make_canonical
@@ -105,15 +107,27 @@ def split_levels(polygons: NDArray[np.object_], points: RoofPoints, options: Lev
     each house that contains them. 1.6 ms a house of Amsterdam.
     """
     _check(polygons, points, options)
-    parts: list[shapely.Polygon] = []
-    house: list[int] = []
-    for i, polygon in enumerate(polygons):
-        found = _split(polygon, points.xyz[points.start[i] : points.start[i + 1]], options)
-        parts.extend(found)
-        house.extend([i] * len(found))
+    found = _divide(polygons, points, options)
+    parts = [part for i, polygon in enumerate(polygons) for part in found.get(i, [polygon])]
+    count = np.ones(len(polygons), np.int64)
+    count[list(found)] = [len(pieces) for pieces in found.values()]
     result = np.empty(len(parts), dtype=object)
     result[:] = parts
-    return HouseParts(result, np.array(house, dtype=np.int64))
+    return HouseParts(result, np.repeat(np.arange(len(polygons)), count))
+
+
+def _divide(
+    polygons: NDArray[np.object_], points: RoofPoints, options: LevelOptions
+) -> dict[int, list[shapely.Polygon]]:
+    """Try all houses whose heights alone leave room for a step; of each of them its parts, or itself."""
+    found, areas = {}, shapely.area(polygons).tolist()
+    for i, (first, stop) in enumerate(pairwise(points.start.tolist() if options.max_depth else [])):
+        z = points.z[first:stop]
+        if _may_step(areas[i], z, options) and _squares(z) >= _least_squares(len(z), areas[i], options):
+            # What is found must not depend on the order of the points; most houses need not be sorted for it.
+            xyz = sort_points(np.array([0, stop - first]), points.xyz[first:stop])
+            found[i] = _split(polygons[i], xyz, options)
+    return found
 
 
 def _split(polygon: shapely.Polygon, xyz: Array, options: LevelOptions) -> list[shapely.Polygon]:
@@ -142,11 +156,10 @@ def _cut_to_cells(
     cells: list[shapely.Polygon] = []
     points: list[Array] = []
     corners = np.empty((0, 2))
-    smallest = len(xyz) * options.min_area / polygon.area  # points of the smallest part
-    least = max(SPREAD * len(xyz), smallest * options.min_step**2)
+    least = _least_squares(len(xyz), polygon.area, options)
     while todo:
         piece, inside, depth = todo.pop()
-        if depth > 0 and _may_step(piece, inside[:, 2], options) and _squares(inside[:, 2]) >= least:
+        if depth > 0 and _may_step(piece.area, inside[:, 2], options) and _squares(inside[:, 2]) >= least:
             pieces, ends = cut_best(
                 share_vertices(piece, corners),
                 inside,
@@ -164,11 +177,17 @@ def _cut_to_cells(
     return np.array([share_vertices(cell, corners) for cell in cells], dtype=object), points
 
 
-def _may_step(polygon: shapely.Polygon, z: Array, options: LevelOptions) -> bool:
+def _may_step(area: float, z: Array, options: LevelOptions) -> bool:
     """Tell whether two parts with medians `min_step` apart are possible; `z` is ascending."""
     half = max(options.min_points // 2, 1)
-    enough = len(z) >= 2 * options.min_points and polygon.area >= 2 * options.min_area
+    enough = len(z) >= 2 * options.min_points and area >= 2 * options.min_area
     return enough and bool(z[-half] - z[half - 1] >= options.min_step)
+
+
+def _least_squares(n_points: int, area: float, options: LevelOptions) -> float:
+    """Squares around the mean height of a house of so many points, or of its piece, below which it stays whole."""
+    smallest = n_points * options.min_area / area  # points of the smallest part
+    return max(SPREAD * n_points, smallest * options.min_step**2)
 
 
 def _squares(z: Array) -> float:

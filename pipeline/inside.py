@@ -273,8 +273,8 @@ def _cross(x: float, y: float, xa: float, ya: float, xb: float, yb: float) -> in
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _side(x: float, y: float, first: int, last: int, a: NDArray[np.float64], b: NDArray[np.float64]) -> int:
-    """Side of a place from the ring of edges ``first`` to ``last``."""
+def side_of(x: float, y: float, first: int, last: int, a: Array, b: Array) -> int:
+    """Tell for kernels the side of a place from the rings of some edges; where it is `UNSURE`, GEOS knows."""
     side = OUTSIDE
     for e in range(first, last):
         crossed = _cross(x, y, a[e, 0], a[e, 1], b[e, 0], b[e, 1])
@@ -465,7 +465,7 @@ def _find_some(
         cell = j * width + i
         for m in range(cell_start[cell], cell_start[cell + 1]):
             begin, end = edges[m, 0], edges[m, 1]
-            side = INSIDE if begin == end else _side(x, y, begin, end, a, b)
+            side = INSIDE if begin == end else side_of(x, y, begin, end, a, b)
             if side != OUTSIDE:
                 owner[n], found[n] = polygon[m], 4 * np.int64(k) + side
                 n += 1
@@ -483,7 +483,7 @@ def _locate(
 ) -> None:
     for k in range(len(polygon)):
         p = polygon[k]
-        sides[k] = _side(xy[k, 0], xy[k, 1], edge_start[p], edge_start[p + 1], a, b)
+        sides[k] = side_of(xy[k, 0], xy[k, 1], edge_start[p], edge_start[p + 1], a, b)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -499,7 +499,7 @@ def _find_owners(
     n_unsure = 0
     for k in range(len(xy)):
         for p in range(len(edge_start) - 1):
-            side = _side(xy[k, 0], xy[k, 1], edge_start[p], edge_start[p + 1], a, b)
+            side = side_of(xy[k, 0], xy[k, 1], edge_start[p], edge_start[p + 1], a, b)
             if side == UNSURE:
                 unsure[n_unsure] = k
                 n_unsure += 1

@@ -8,7 +8,17 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.inside import EVERYWHERE, Box, PolygonIndex, are_inside, find_inside, index_polygons
+from pipeline.inside import (
+    EVERYWHERE,
+    INSIDE,
+    UNSURE,
+    Box,
+    PolygonIndex,
+    find_inside,
+    index_polygons,
+    list_edges,
+    side_of,
+)
 from pipeline.pointcloud import GROUND, WATER, PointCloud
 from pipeline.raster import Dtm, measure_over
 from pipeline.residuals import Residuals, ResidualSums, conclude, merge_residuals, sum_residuals, summarise
@@ -224,15 +234,15 @@ def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roof: NDAr
         Absolute roof heights (m).
     """
     n_points = np.diff(points.start)
-    house = np.repeat(np.arange(len(n_points)), n_points)
-    residual = roof[house] - points.xyz[:, 2]
-    some = np.where(n_points > 0, n_points, np.nan)
-    return HouseFidelity(
-        n_points,
-        np.sqrt(np.bincount(house, residual**2, len(n_points)) / some),
-        np.bincount(house, residual, len(n_points)) / some,
-        _measure_coverage(points, polygons),
+    edges = list_edges(polygons)
+    low, size = _cells_under(shapely.bounds(polygons).reshape(-1, 4))
+    total, squares, filled, cells, unsure = _measure_each(
+        points.start, points.xyz, points.z, roof, low, size, edges.start, edges.a, edges.b
     )
+    house = unsure[:, 0].astype(np.int64)
+    cells += np.bincount(house[shapely.contains_xy(polygons[house], *unsure[:, 1:].T)], minlength=len(cells))
+    some = np.where(n_points > 0, n_points, np.nan)
+    return HouseFidelity(n_points, np.sqrt(squares / some), total / some, filled / np.maximum(cells, 1))
 
 
 def _find_residuals(
@@ -261,34 +271,50 @@ def _mark(n: int, index: NDArray[np.int64]) -> NDArray[np.bool_]:
     return marked
 
 
-def _measure_coverage(points: RoofPoints, polygons: NDArray[np.object_]) -> NDArray[np.float64]:
-    """Share of the cells of each house that have a point; points lie within the box of their house."""
-    low, size = _cells_under(shapely.bounds(polygons).reshape(-1, 4))
-    count = size[:, 0] * size[:, 1]
-    begin = np.cumsum(count) - count
-    box = np.repeat(np.arange(len(polygons)), count)
-    row, column = np.divmod(np.arange(len(box)) - begin[box], size[box, 0])
-    belongs = are_inside(polygons, box, (low[box] + np.column_stack((column, row)) + 0.5) * COVERAGE_CELL)
-    filled = _find_filled(points.start, points.xyz, low, size[:, 0], begin, np.zeros(len(box), np.bool_))
-    n_filled = np.bincount(box[filled], minlength=len(polygons))
-    return n_filled / np.maximum(np.bincount(box[belongs | filled], minlength=len(polygons)), 1)
-
-
 @numba.njit(cache=True, nogil=True)
-def _find_filled(
+def _measure_each(
     start: NDArray[np.int64],
     xyz: NDArray[np.float64],
+    z: NDArray[np.float64],
+    roof: NDArray[np.float64],
     low: NDArray[np.int64],
-    width: NDArray[np.int64],
-    begin: NDArray[np.int64],
-    filled: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
-    """Mark the cells that have a point of their house: those of house h begin at ``begin[h]``, row by row."""
-    for h in range(len(begin)):
-        for x, y, _ in xyz[start[h] : start[h + 1]]:
-            i, j = int(np.floor(x / COVERAGE_CELL)) - low[h, 0], int(np.floor(y / COVERAGE_CELL)) - low[h, 1]
-            filled[begin[h] + j * width[h] + i] = True
-    return filled
+    size: NDArray[np.int64],
+    edge_start: NDArray[np.int64],
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Sum up the residuals of each house and their squares, by height; count its cells.
+
+    Gives the sums, the number of cells that have a point, and of those that belong to the house; and house and
+    centre of cells without a point of which crossings do not tell.
+    """
+    n, n_unsure = len(roof), 0
+    total, squares = np.zeros(n), np.zeros(n)
+    n_filled, n_cells = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    unsure = np.empty(((size[:, 0] * size[:, 1]).sum(), 3))
+    for h in range(n):
+        for k in range(start[h], start[h + 1]):
+            residual = roof[h] - z[k]
+            total[h] += residual
+            squares[h] += residual * residual
+        filled = np.zeros((size[h, 1], size[h, 0]), np.bool_)
+        for k in range(start[h], start[h + 1]):
+            i, j = int(np.floor(xyz[k, 0] / COVERAGE_CELL)), int(np.floor(xyz[k, 1] / COVERAGE_CELL))
+            filled[j - low[h, 1], i - low[h, 0]] = True
+        for j in range(size[h, 1]):
+            y = (low[h, 1] + j + 0.5) * COVERAGE_CELL
+            for i in range(size[h, 0]):
+                x = (low[h, 0] + i + 0.5) * COVERAGE_CELL
+                if filled[j, i]:
+                    n_filled[h] += 1
+                    n_cells[h] += 1
+                    continue
+                side = side_of(x, y, edge_start[h], edge_start[h + 1], a, b)
+                n_cells[h] += side == INSIDE
+                if side == UNSURE:
+                    unsure[n_unsure, 0], unsure[n_unsure, 1], unsure[n_unsure, 2] = h, x, y
+                    n_unsure += 1
+    return total, squares, n_filled, n_cells, unsure[:n_unsure].copy()
 
 
 def _cells_under(boxes: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

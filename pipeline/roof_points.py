@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.building_points import NEVER_ROOF
-from pipeline.group_order import sort_points
+from pipeline.group_order import sort_values
 from pipeline.inside import find_inside
 from pipeline.pointcloud import BUILDING, PointCloud
 
@@ -20,11 +20,25 @@ class RoofPoints:
     start : int64, (n + 1,)
         Building ``i`` has the points ``xyz[start[i]:start[i + 1]]``.
     xyz : float64, (k, 3)
-        Coordinates (m), by height, then y, then x within each building.
+        Coordinates (m), in any order within each building.
+    z : float64, (k,)
+        Heights (m), ascending within each building: not in the order of `xyz`.
     """
 
     start: NDArray[np.int64]
     xyz: NDArray[np.float64]
+    z: NDArray[np.float64]
+
+
+def make_roof_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> RoofPoints:
+    """Put the heights of each building's points in order.
+
+    Examples
+    --------
+    >>> make_roof_points(np.array([0, 1, 3]), np.array([[0.0, 0, 9], [1, 0, 7], [2, 0, 5]])).z
+    array([9., 5., 7.])
+    """
+    return RoofPoints(start, xyz, sort_values(start, xyz[:, 2]))
 
 
 def select_roof(cloud: PointCloud, *, building_class: bool) -> NDArray[np.bool_]:
@@ -61,7 +75,7 @@ def locate_roof_points(cloud: PointCloud, polygons: NDArray[np.object_], *, buil
     start = np.concatenate(([0], np.cumsum(np.bincount(polygon, minlength=len(polygons)))))
     xyz = np.take(cloud.xyz, point, axis=0)  # in half of the time of an index
     del polygon, point  # they are as large as what is sorted
-    return RoofPoints(start, sort_points(start, xyz))
+    return make_roof_points(start, xyz)
 
 
 def keep_roof_points(points: RoofPoints, kept: NDArray[np.bool_]) -> RoofPoints:
@@ -69,7 +83,7 @@ def keep_roof_points(points: RoofPoints, kept: NDArray[np.bool_]) -> RoofPoints:
 
     Examples
     --------
-    >>> points = RoofPoints(np.array([0, 1, 3, 3]), np.array([[0.0, 0, 9], [1, 0, 5], [2, 0, 5]]))
+    >>> points = make_roof_points(np.array([0, 1, 3, 3]), np.array([[0.0, 0, 9], [1, 0, 5], [2, 0, 5]]))
     >>> found = keep_roof_points(points, np.array([False, True, True]))
     >>> found.start.tolist(), found.xyz[:, 0].tolist()
     ([0, 2, 2], [1.0, 2.0])
@@ -77,4 +91,5 @@ def keep_roof_points(points: RoofPoints, kept: NDArray[np.bool_]) -> RoofPoints:
     if kept.all():
         return points
     count = np.diff(points.start)
-    return RoofPoints(np.concatenate(([0], np.cumsum(count[kept]))), points.xyz[np.repeat(kept, count)])
+    rows = np.repeat(kept, count)
+    return RoofPoints(np.concatenate(([0], np.cumsum(count[kept]))), points.xyz[rows], points.z[rows])

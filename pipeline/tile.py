@@ -139,7 +139,7 @@ def measure_city(
             footprints.polygons,
             margin=options.ground_margin,
             building_class=building_class,
-            roof=None if roofs is None else (roofs.start, roofs.xyz[:, 2]),
+            roof=None if roofs is None else (roofs.start, roofs.z),
         )
     with trace("1.6 building heights"):
         heights = measure_heights(points, footprints.polygons, dtm, footprints.given_height, options)

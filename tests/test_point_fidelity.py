@@ -17,7 +17,7 @@ from pipeline.house_levels import LevelOptions, split_levels
 from pipeline.inside import find_inside
 from pipeline.point_fidelity import Residuals, measure_fidelity, measure_houses, summarise
 from pipeline.pointcloud import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER, PointCloud
-from pipeline.roof_points import RoofPoints, locate_roof_points
+from pipeline.roof_points import locate_roof_points, make_roof_points
 from tests.cities import tilted_dtm
 from tiler.clouds import find_clouds, read_points
 
@@ -112,7 +112,7 @@ def test_points_in_two_polygons_are_located_in_each() -> None:
 
 def measure_one(house: shapely.Polygon, *points: tuple[float, float, float]) -> tuple[int, float, float, float]:
     xyz = np.array(points).reshape(-1, 3)
-    found = measure_houses(RoofPoints(np.array([0, len(xyz)]), xyz), polygons(house), np.array([10.0]))
+    found = measure_houses(make_roof_points(np.array([0, len(xyz)]), xyz), polygons(house), np.array([10.0]))
     return int(found.n_points[0]), float(found.rmse[0]), float(found.bias[0]), float(found.coverage[0])
 
 
@@ -133,6 +133,17 @@ def test_cells_on_the_rim_count_where_they_have_a_point() -> None:
     assert measure_one(shapely.box(10, 10, 10.3, 10.3), (10.2, 10.2, 9))[3] == 1.0
 
 
+def test_a_cell_whose_centre_is_on_the_outline_is_none_of_the_house() -> None:
+    assert measure_one(shapely.box(10, 10, 12.5, 11), (10.5, 10.5, 9))[3] == 0.5
+    assert measure_one(shapely.Polygon([(10, 10), (13, 10), (10, 13)]), (10.5, 10.5, 9))[3] == 1 / 3
+
+
+def test_the_order_of_the_points_of_a_house_does_not_matter() -> None:
+    rng = np.random.default_rng(8)
+    xyz = rng.uniform(10, 20, (500, 3))
+    assert measure_one(HOUSE, *xyz) == measure_one(HOUSE, *rng.permutation(xyz))
+
+
 def test_a_courtyard_is_no_cell_of_the_house() -> None:
     ring = shapely.Polygon(shapely.box(0, 0, 3, 3).exterior, [shapely.box(1, 1, 2, 2).exterior])
     assert measure_one(ring, (0.5, 0.5, 9))[3] == 1 / 8
@@ -142,7 +153,7 @@ def test_a_house_without_points_is_told() -> None:
     n, rmse, bias, coverage = measure_one(HOUSE)
     assert (n, coverage) == (0, 0.0)
     assert np.isnan([rmse, bias]).all()
-    found = measure_houses(RoofPoints(np.array([0]), np.empty((0, 3))), polygons(), np.empty(0))
+    found = measure_houses(make_roof_points(np.array([0]), np.empty((0, 3))), polygons(), np.empty(0))
     assert len(found.rmse) == len(found.coverage) == 0
 
 
