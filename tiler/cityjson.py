@@ -5,6 +5,7 @@ import json
 import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
+from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any, BinaryIO
@@ -30,7 +31,8 @@ COPY_BYTES = 1 << 20
 ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 GROUND, ROOF, WALL = range(3)
 # Semantic surfaces of every solid, by the numbers above.
-SURFACES = ("GroundSurface", "RoofSurface", "WallSurface")
+SURFACES = '[{"type":"GroundSurface"},{"type":"RoofSurface"},{"type":"WallSurface"}]'
+WITHOUT_COMMA = {bool, int, float, type(None)}  # types of values whose text has no comma
 Attributes = Mapping[str, Sequence[object]]
 
 
@@ -171,10 +173,13 @@ class _Writer:
         self._check_ids(model.ids)
         solids, notes = build_solids(model, self.origin, grid=GRID)
         self.notes += notes
-        for name, row in _objects(model, columns, _geometry(solids, self.n_vertices)):
-            self._object(name, row)
-            for house in row.get("parents", ()):
+        attributes, geometry = _attribute_texts(columns, len(model)), _geometry_texts(solids, self.n_vertices)
+        objects = []
+        for name, house, *told in zip(model.ids.tolist(), model.house.tolist(), attributes, geometry, strict=True):
+            objects.append(_object_text(name, house, *told))
+            if house != name:
                 self.children.setdefault(house, []).append(name)
+        self._objects(objects)
         if len(solids.vertices):
             places = solids.vertices * GRID + self.origin
             self.box = np.vstack((self.box, places.min(axis=0), places.max(axis=0)))
@@ -190,7 +195,8 @@ class _Writer:
         for is_row, (house, children) in zip(mixed.tolist(), self.children.items(), strict=True):
             if is_row:
                 raise ValueError(f"building {house}: is a row and has parts, it may be one of these")
-            self._object(house, {"type": "Building", "children": children})
+            content = _text({"type": "Building", "children": children})
+            self._objects([f"{_text(house)}:{content}"])
         self._write(b'\n},\n"vertices":[')
         self.spool.seek(0)
         while piece := self.spool.read(COPY_BYTES):
@@ -206,10 +212,12 @@ class _Writer:
             raise ValueError(f"building {ids[again][0]}: 2 buildings have this id, at most 1 may")
         self.seen = np.concatenate((self.seen, new))
 
-    def _object(self, name: str, content: Mapping[str, Any]) -> None:
-        comma = "," if self.n_objects else ""
-        self._write(f"{comma}\n{json.dumps(name)}:{_text(content)}".encode("ascii"))
-        self.n_objects += 1
+    def _objects(self, texts: Sequence[str]) -> None:
+        """Write objects one a line."""
+        if texts:
+            before = ",\n" if self.n_objects else "\n"
+            self._write((before + ",\n".join(texts)).encode("ascii"))
+            self.n_objects += len(texts)
 
     def _write(self, data: bytes) -> None:
         self.digest.update(data)
@@ -298,39 +306,41 @@ def _take_rows(block: tuple[CityModel, Attributes], rows: slice) -> tuple[CityMo
     return taken, {name: column[rows] for name, column in columns.items()}
 
 
-def _objects(
-    model: CityModel, columns: Mapping[str, Sequence[object]], geometry: Sequence[object]
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Make the city objects: a building a row, or a part of the house that the row names."""
-    for i, (name, house) in enumerate(zip(model.ids.tolist(), model.house.tolist(), strict=True)):
-        row: dict[str, Any] = {"type": "Building" if name == house else "BuildingPart"}
-        row["attributes"] = {key: column[i] for key, column in columns.items()}
-        row["geometry"] = geometry[i]
-        if name != house:
-            row["parents"] = [house]
-        yield name, row
+def _object_text(name: str, house: str, attributes: str, geometry: str) -> str:
+    """Write a city object: a building, or a part of the house that the row names."""
+    kind, parents = ("Building", "") if name == house else ("BuildingPart", f',"parents":[{_text(house)}]')
+    return f'{_text(name)}:{{"type":"{kind}","attributes":{attributes},"geometry":{geometry}{parents}}}'
 
 
-def _columns(model: CityModel, extra: Mapping[str, Sequence[object]]) -> dict[str, list[object]]:
-    """Gather the attributes by name, as values that JSON knows."""
+def _columns(model: CityModel, extra: Attributes) -> dict[str, Sequence[object]]:
+    """Gather the attributes by name."""
     for name in extra:
         if name in ATTRIBUTES:
             raise ValueError(f"attribute {name!r} is one of ours; rename the column")
-    own: tuple[Iterable[object], ...] = (
-        model.numbers,
-        model.ground,
-        model.roof,
-        model.roof - model.ground,
+    own: tuple[Sequence[object], ...] = (
+        model.numbers.tolist(),
+        model.ground.tolist(),
+        model.roof.tolist(),
+        (model.roof - model.ground).tolist(),
         [[str(name) for name in names] for names in model.members],
     )
-    columns = {**dict(zip(ATTRIBUTES, own, strict=True)), **extra}
-    return {name: [_plain(value) for value in column] for name, column in columns.items()}
+    return {**dict(zip(ATTRIBUTES, own, strict=True)), **extra}
 
 
-def _plain(value: object) -> object:
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def _attribute_texts(columns: Attributes, n: int) -> list[str]:
+    """Write the attributes of each of n buildings."""
+    form = ",".join(f"{_text(name).replace('%', '%%')}:%s" for name in columns)
+    texts = [_value_texts(column) for column in columns.values()]
+    return [f"{{{form}}}" % row for row in zip(*texts, strict=True)] if n else []
+
+
+def _value_texts(column: Sequence[object]) -> list[str]:
+    """Write each value of a column; NaN and infinity as null."""
+    plain = [value.item() if isinstance(value, np.generic) else value for value in column]
+    values = [None if isinstance(value, float) and not isfinite(value) else value for value in plain]
+    if set(map(type, values)) <= WITHOUT_COMMA:
+        return _text(values)[1:-1].split(",")  # all at once: a call for each takes ten times as long
+    return [_text(value) for value in values]
 
 
 def _reference_system(crs: str) -> str | None:
@@ -349,40 +359,39 @@ def _extent(bounds: Sequence[float], points: NDArray[np.floating]) -> list[float
     return [round(float(value), 3) for value in (*low, *high)]
 
 
-def _geometry(solids: Solids, first: int) -> list[list[dict[str, Any]]]:
-    """Give the geometry of each building, LoD0 and LoD1.2 if it has a solid, on vertices from `first` on."""
-    floors, roofs = _surfaces(solids, solids.low + first), _surfaces(solids, solids.high + first)
-    walls = (solids.walls[:, None] + first).tolist()
-    wall_start = solids.ring_start[solids.building_start]
-    geometry: list[list[dict[str, Any]]] = []
-    for i, (floor, roof) in enumerate(zip(floors, roofs, strict=True)):
-        objects: list[dict[str, Any]] = []
-        if floor:
-            objects.append({"type": "MultiSurface", "lod": "0", "boundaries": [floor]})
-        if floor and solids.has_solid[i]:
-            objects.append(_solid(floor, roof, walls[wall_start[i] : wall_start[i + 1]]))
-        geometry.append(objects)
-    return geometry
+def _geometry_texts(solids: Solids, first: int) -> list[str]:
+    """Write the geometry of each building, LoD0 and LoD1.2 if it has a solid, on vertices from `first` on.
+
+    Text is put together here: of a million lists, Python's encoder would take twice as long as all else.
+    """
+    low, high = ([str(vertex) for vertex in (corners + first).tolist()] for corners in (solids.low, solids.high))
+    walls = [f"[[{a},{b},{c},{d}]]" for a, b, c, d in (solids.walls + first).tolist()]
+    start, building = solids.ring_start.tolist(), solids.building_start.tolist()
+    texts = []
+    for has_solid, (ring, end) in zip(solids.has_solid.tolist(), pairwise(building), strict=True):
+        rings = list(pairwise(start[ring : end + 1]))
+        objects = [_floor_text(low, rings)] if rings else []
+        if rings and has_solid:
+            objects.append(_solid_text(low, high, walls[start[ring] : start[end]], rings))
+        texts.append(f"[{','.join(objects)}]")
+    return texts
 
 
-def _surfaces(solids: Solids, corners: NDArray[np.int64]) -> list[list[list[int]]]:
-    """Nest the corners as rings of buildings."""
-    flat, start, building = corners.tolist(), solids.ring_start.tolist(), solids.building_start.tolist()
-    rings = [flat[a:b] for a, b in pairwise(start)]
-    return [rings[a:b] for a, b in pairwise(building)]
+def _floor_text(low: list[str], rings: list[tuple[int, int]]) -> str:
+    floor = ",".join(f"[{','.join(low[a:b])}]" for a, b in rings)
+    return f'{{"type":"MultiSurface","lod":"0","boundaries":[[{floor}]]}}'
 
 
-def _solid(floor: list[list[int]], roof: list[list[int]], walls: list[list[list[int]]]) -> dict[str, Any]:
+def _solid_text(low: list[str], high: list[str], walls: list[str], rings: list[tuple[int, int]]) -> str:
     """Put one closed shell together; the floor is turned over to look down."""
-    return {
-        "type": "Solid",
-        "lod": "1.2",
-        "boundaries": [[[ring[::-1] for ring in floor], roof, *walls]],
-        "semantics": {
-            "surfaces": [{"type": kind} for kind in SURFACES],
-            "values": [[GROUND, ROOF] + [WALL] * len(walls)],
-        },
-    }
+    floor = ",".join(f"[{','.join(reversed(low[a:b]))}]" for a, b in rings)
+    roof = ",".join(f"[{','.join(high[a:b])}]" for a, b in rings)
+    kinds = f"{GROUND},{ROOF}" + f",{WALL}" * len(walls)
+    shell = ",".join((f"[{floor}]", f"[{roof}]", *walls))
+    return (
+        f'{{"type":"Solid","lod":"1.2","boundaries":[[{shell}]],'
+        f'"semantics":{{"surfaces":{SURFACES},"values":[[{kinds}]]}}}}'
+    )
 
 
 def _text(document: object) -> str:
