@@ -18,6 +18,7 @@ from shapely.affinity import rotate, translate
 from pipeline.citymodel import CityModel, number_ids
 from pipeline.errors import ConfigError, InputError, OutputError
 from pipeline.notes import Note
+from pipeline.solids import build_solids
 from tests.cityjson_rules import area_vector, broken, file_faults, solid_faults, volume
 from tiler import cityjson
 from tiler.cityjson import read_city_model, write_city_blocks, write_city_model
@@ -437,6 +438,28 @@ def test_any_star_shaped_house_is_a_valid_solid(
     assert file_faults(town) == set()
     if not notes:
         assert solid_faults(town) == {"b0": set()}
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), grid=st.sampled_from([0.001, 0.05, 0.25]), steps=st.booleans())
+def test_corners_are_where_the_noded_overlay_rounds_them_to(seed: int, grid: float, steps: bool) -> None:
+    rng = np.random.default_rng(seed)
+    polygons = []
+    for corners in rng.integers(3, 12, 30).tolist():
+        turn = np.sort(rng.uniform(0, 2 * np.pi, corners))
+        ring = 3 * np.column_stack([np.cos(turn), np.sin(turn)]) * rng.uniform(0.3, 1, (corners, 1)) + 121100.0
+        polygon = shapely.Polygon(np.rint(ring * 8) / 8 if steps else ring)  # an eighth is half of the last grid
+        hole = shapely.box(121099.9, 121099.9, 121100.2, 121100.1)
+        if corners % 4 == 0 and polygon.is_valid:
+            polygon = polygon.difference(hole)
+        polygons.append(polygon if isinstance(polygon, shapely.Polygon) and polygon.is_valid else hole)
+    model, origin = make_model(*polygons, *shapely.reverse(polygons)), np.array([121000.0, 121000.0, 0.0])
+    solids, _ = build_solids(model, origin, grid=grid)
+    expected = shapely.set_precision(model.polygons, grid)
+    parts = [max(shapely.get_parts(polygon), key=shapely.area, default=polygon) for polygon in expected]
+    rings = shapely.get_rings(shapely.orient_polygons(np.array(parts)))
+    xy = np.concatenate([shapely.get_coordinates(ring)[1:] for ring in rings])
+    assert solids.vertices[solids.low, :2].tolist() == np.rint((xy - origin[:2]) / grid).astype(int).tolist()
 
 
 def test_real_footprints_make_valid_solids(shared_data: Path, target: Path) -> None:
