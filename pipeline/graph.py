@@ -6,6 +6,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.rounding import round_corners
+
 MILLIMETRES = 1000.0  # grid steps a metre
 Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
 
@@ -53,7 +55,7 @@ class WallGraph:
 
     def keep(self, edges: NDArray[np.bool_]) -> "WallGraph":
         """Drop the other edges, then all that dangles."""
-        return make_graph(self.xy, self.cluster, self.edges[edges], self.slack[edges])
+        return _prune(self.xy, self.cluster, self.edges[edges], self.slack[edges])
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +96,22 @@ def make_graph(
     first = np.ones(len(ends), np.bool_)
     first[1:] = (ends[1:] != ends[:-1]).any(axis=1)
     ends, slack = ends[first], slack[first]
-    while len(ends):
-        holds = (np.bincount(ends.reshape(-1), minlength=len(rows))[ends] > 1).all(axis=1)
+    return _prune(rows[:, 1:], rows[:, 0].astype(np.int64), ends, slack)
+
+
+def _prune(
+    xy: NDArray[np.float64], cluster: NDArray[np.int64], edges: NDArray[np.int64], slack: NDArray[np.float64]
+) -> WallGraph:
+    """Drop dangling edges and lone vertices; all else is in order already."""
+    while len(edges):
+        holds = (np.bincount(edges.reshape(-1), minlength=len(xy))[edges] > 1).all(axis=1)
         if holds.all():
             break
-        ends, slack = ends[holds], slack[holds]
-    used, index = np.unique(ends, return_inverse=True)
-    return WallGraph(rows[used, 1:], rows[used, 0].astype(np.int64), index.reshape(-1, 2), slack)
+        edges, slack = edges[holds], slack[holds]
+    used = np.zeros(len(xy), np.bool_)
+    used[edges] = True
+    number = np.cumsum(used) - 1
+    return WallGraph(xy[used], cluster[used], number[edges], slack)
 
 
 def join_graphs(graphs: list[WallGraph]) -> WallGraph:
@@ -124,16 +135,22 @@ def node_walls(polygons: NDArray[np.object_], cluster: NDArray[np.int64]) -> Wal
     cluster : int64, (n,)
         The cluster of each; walls of different clusters do not meet.
     """
-    names, owner = np.unique(cluster, return_inverse=True)
-    order = np.argsort(owner, kind="stable")
-    rings, index = shapely.get_rings(polygons[order], return_index=True)
-    walls = shapely.multilinestrings(rings, indices=owner[order][index])
-    noded = shapely.union_all(walls[:, None], grid_size=1.0, axis=1)
+    names, owner, count = np.unique(cluster, return_inverse=True, return_counts=True)
+    rounded, clear = round_corners(polygons, 1.0)
+    clear &= count[owner] == 1  # walls of several houses may cross
+    rings, ring_owner = shapely.get_rings(rounded[clear], return_index=True)
+    ring_owner = owner[clear][ring_owner]
+    others = np.flatnonzero(~clear)
+    others = others[np.argsort(owner[others], kind="stable")]
+    walls, index = shapely.get_rings(polygons[others], return_index=True)
+    several, number = np.unique(owner[others][index], return_inverse=True)
+    noded = shapely.union_all(shapely.multilinestrings(walls, indices=number)[:, None], grid_size=1.0, axis=1)
     lines, line_owner = shapely.get_parts(noded, return_index=True)
-    xy, line = shapely.get_coordinates(lines, return_index=True)
+    xy, line = shapely.get_coordinates(np.concatenate((rings, lines)), return_index=True)
     start = np.flatnonzero(line[1:] == line[:-1])
     edges = np.column_stack((start, start + 1))
-    return make_graph(np.rint(xy), names[line_owner[line]], edges, np.zeros(len(edges)))
+    name = names[np.concatenate((ring_owner, several[line_owner]))]
+    return make_graph(np.rint(xy), name[line], edges, np.zeros(len(edges)))
 
 
 def thread_edges(

@@ -83,9 +83,12 @@ def label_faces(faces: Faces, territories: Territories) -> NDArray[np.int64]:
     # Sums in one order, whatever other clusters are in the tree.
     order = np.lexsort((by, at))
     at, by = at[order], by[order]
-    area = shapely.area(shapely.intersection(faces.polygons[at], territories.polygons[by]))
+    face_area = shapely.area(faces.polygons)
+    area = face_area[at]
+    other = ~shapely.equals_identical(faces.polygons[at], territories.polygons[by])
+    area[other] = shapely.area(shapely.intersection(faces.polygons[at[other]], territories.polygons[by[other]]))
     pairs, index = np.unique(np.column_stack((at, territories.house[by])), axis=0, return_inverse=True)
-    share = np.bincount(index.reshape(-1), area) / shapely.area(faces.polygons)[pairs[:, 0]]
+    share = np.bincount(index.reshape(-1), area) / face_area[pairs[:, 0]]
     order = np.lexsort((pairs[:, 1], -share, pairs[:, 0]))
     face, first = np.unique(pairs[order, 0], return_index=True)
     built = np.bincount(pairs[:, 0], share, len(faces.polygons))[face] >= BUILT_SHARE

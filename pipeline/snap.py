@@ -246,7 +246,9 @@ def _is_empty(graph: WallGraph, vertex: NDArray[np.int64], sides: NDArray[np.int
     corners = np.column_stack((vertex, sides))
     xy = graph.xy[corners]
     boxes = shapely.box(*xy.min(axis=1).T, *xy.max(axis=1).T)
-    triangle, point = shapely.STRtree(shapely.points(graph.xy)).query(boxes)
+    around = np.flatnonzero(np.isin(graph.cluster, graph.cluster[vertex]))
+    triangle, point = shapely.STRtree(shapely.points(graph.xy[around])).query(boxes)
+    point = around[point]
     other = (corners[triangle] != point[:, None]).all(axis=1) & (
         graph.cluster[vertex[triangle]] == graph.cluster[point]
     )

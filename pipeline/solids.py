@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.citymodel import CityModel
 from pipeline.notes import Note
-
-CLEAR = 4  # spacings; corners and walls that are farther apart are out of the noder's reach
-HALF = 0.499  # of a spacing; what lies farther from the grid is rounded to either side
+from pipeline.rounding import round_corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +139,9 @@ def _check(model: CityModel) -> None:
 def _round(model: CityModel, grid: float) -> tuple[NDArray[np.object_], list[Note]]:
     """Put footprints on the grid, still valid, shells counter-clockwise."""
     notes = []
-    polygons, clear = _round_clear(model.polygons, grid)
+    polygons, clear = round_corners(model.polygons, grid)
+    clear &= shapely.get_num_interior_rings(polygons) == 0
+    polygons[clear] = _begin_earlier(shapely.orient_polygons(polygons[clear]))
     polygons[~clear] = shapely.set_precision(model.polygons[~clear], grid, mode="valid_output")
     for i in np.flatnonzero(shapely.get_type_id(polygons) != shapely.GeometryType.POLYGON):
         parts = shapely.get_parts(polygons[i])
@@ -154,28 +154,14 @@ def _round(model: CityModel, grid: float) -> tuple[NDArray[np.object_], list[Not
     return shapely.orient_polygons(polygons), notes
 
 
-def _round_clear(polygons: NDArray[np.object_], grid: float) -> tuple[NDArray[np.object_], NDArray[np.bool_]]:
-    """Round corners to the grid, and tell for which footprints that is what the noded overlay gives, too.
-
-    Those are valid rings without courtyards whose corners and walls stay farther apart than a noder looks. They
-    begin where its rings do, at the corner before the first. A quarter of the time.
-    """
-    polygons = shapely.orient_polygons(polygons)
+def _begin_earlier(polygons: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Begin each ring of polygons without courtyards one corner earlier, as those of a noded overlay begin."""
     xy, owner = shapely.get_coordinates(polygons, return_index=True)
-    steps = xy / grid
-    places = np.rint(steps)
-    doubtful = (np.abs(steps - places) > HALF).any(axis=1)
-    doubtful[1:] |= (places[1:] == places[:-1]).all(axis=1) & (owner[1:] == owner[:-1])
     n_corners = np.bincount(owner, minlength=len(polygons))
-    single = (n_corners > 0) & (shapely.get_num_interior_rings(polygons) == 0)
-    clear = single & (np.bincount(owner, doubtful, len(polygons)) == 0)
-
-    first = np.cumsum(n_corners) - n_corners
-    before = np.arange(len(xy)) - single[owner]
-    before[first[single]] += n_corners[single] - 1  # the last corner of a ring is its first again
-    rounded = shapely.set_coordinates(polygons, places[before] * grid)
-    clear &= (shapely.minimum_clearance(rounded) > CLEAR * grid) & shapely.is_valid(rounded)
-    return rounded, clear
+    before = np.arange(len(xy)) - 1
+    before[np.cumsum(n_corners) - n_corners] += n_corners - 1  # the last corner of a ring is its first again
+    turned: NDArray[np.object_] = shapely.set_coordinates(polygons, xy[before])
+    return turned
 
 
 def _to_grid(values: NDArray[np.float64], origin: NDArray[np.float64], grid: float) -> NDArray[np.int64]:

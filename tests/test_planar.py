@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely import Polygon, box
 
+import pipeline.graph
 import pipeline.shaping
 import pipeline.snap
 from pipeline.cells import draw_cells
@@ -273,6 +274,26 @@ def test_a_vertex_stays_where_the_straight_wall_would_cross_another() -> None:
     inside = Polygon([(5000, 50), (4000, -3000), (6000, -3000)])
     blocked = straighten(node_walls(np.array([blunt, inside]), np.zeros(2, np.int64)), 200.0)
     assert (len(blocked[0].xy), blocked[1].tolist()) == (8, [])
+
+
+def test_walls_of_houses_that_stand_alone_are_noded_as_all_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    houses = []
+    for k in range(300):
+        turn = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 9)))
+        ring = rng.uniform(3, 40, (len(turn), 1)) * np.column_stack((np.cos(turn), np.sin(turn)))
+        house = Polygon(np.rint(ring * 2) / 2 if k % 2 else ring)  # halves, and walls closer than a noder looks
+        courtyard = Polygon(ring * 0.4)
+        houses.append(house.difference(courtyard) if house.is_valid and courtyard.is_valid else box(0, 0, k, 9))
+    polygons = np.array([house for house in houses if isinstance(house, Polygon)], dtype=object)
+    cluster = rng.integers(0, len(polygons), len(polygons))
+    found = node_walls(polygons, cluster)
+    monkeypatch.setattr(
+        pipeline.graph, "round_corners", lambda walls, grid: (walls, np.zeros(len(walls), np.bool_))
+    )
+    expected = node_walls(polygons, cluster)
+    for name in ("xy", "cluster", "edges", "slack"):
+        assert getattr(found, name).tolist() == getattr(expected, name).tolist()
 
 
 def test_cells_that_meet_in_a_corner_get_a_third_one() -> None:
