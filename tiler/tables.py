@@ -84,20 +84,26 @@ def pack_houses(houses: Houses) -> Arrays:
     }
 
 
-HOUSE_ARRAYS = (
-    *("outline", "outline_start", "ids", "given_height", "part", "part_start", "part_house"),
-    *("roof_start", "roof_z", "ground_start", "ground_z"),
-)
+POINTS = ("roof", "ground")
+HOUSE_ROWS = ("ids", "given_height", "part_house")
+# What simplifying houses takes, and giving them heights after that.
+ARRAYS_TO_SHAPE = (*HOUSE_ROWS, "part", "part_start")
+ARRAYS_TO_RAISE = (*HOUSE_ROWS, "outline", "outline_start", "roof_start", "roof_z", "ground_start", "ground_z")
 
 
 def unpack_houses(arrays: Arrays) -> Houses:
-    """Read what `pack_houses` wrote."""
+    """Read what `pack_houses` wrote: of arrays that are not there, polygons are None and points none."""
+    n, n_parts = len(arrays["ids"]), len(arrays["part_house"])
+    none = np.zeros(n_parts + 1, np.int64), np.empty(0)
+    roof, ground = ((arrays.get(f"{name}_start", none[0]), arrays.get(f"{name}_z", none[1])) for name in POINTS)
     return Houses(
         arrays["ids"],
-        unpack_polygons(arrays, "outline"),
+        unpack_polygons(arrays, "outline") if "outline" in arrays else np.full(n, None),
         arrays["given_height"],
-        HouseParts(unpack_polygons(arrays, "part"), arrays["part_house"]),
-        BuildingPoints(*(arrays[name] for name in ("roof_start", "roof_z", "ground_start", "ground_z"))),
+        HouseParts(
+            unpack_polygons(arrays, "part") if "part" in arrays else np.full(n_parts, None), arrays["part_house"]
+        ),
+        BuildingPoints(*roof, *ground),
     )
 
 

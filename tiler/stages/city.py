@@ -33,7 +33,8 @@ from tiler.readers import grow, read_cloud, read_known_terrain
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import (
-    HOUSE_ARRAYS,
+    ARRAYS_TO_RAISE,
+    ARRAYS_TO_SHAPE,
     make_buildings,
     pack_buildings,
     pack_houses,
@@ -240,7 +241,7 @@ def list_members(task: Task) -> Facts:
 
 def shape_members(task: Task) -> Facts:
     """Simplify the clusters that a tile owns and that are new (step 2.1)."""
-    gathered = _gather(task, _members(task))
+    gathered = _gather(task, _members(task), ARRAYS_TO_SHAPE)
     fresh = np.where(gathered.changed, gathered.cluster, -1)
     with task.step("2.1 simplify"):
         shapes = shape_clusters(gathered.houses.parts, fresh, city_options(task.parameters))
@@ -270,7 +271,7 @@ def make_model_without_layers(task: Task) -> Facts:
 def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Facts:
     given, bounds = task.parameters, task.context.bounds
     options = city_options(given)
-    gathered = _gather(task, _members(task))
+    gathered = _gather(task, _members(task), ARRAYS_TO_RAISE)
     shapes = _earlier_shapes(task, replace(gathered, changed=np.zeros(len(gathered.houses), np.bool_)))
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0
     shapes = _keep_within(task, shapes, gathered.houses)
@@ -369,11 +370,11 @@ def _members(task: Task) -> Result:
     return members
 
 
-def _gather(task: Task, members: Result) -> "_Gathered":
-    """Read the houses of the tile's clusters, by ascending id."""
+def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
+    """Read some arrays of the houses of the tile's clusters, by ascending id."""
     house, cluster, changed = (members.arrays[name] for name in ("house", "cluster", "changed"))
     several, order = [], []
-    for result in task.read("houses", HOUSE_ARRAYS):
+    for result in task.read("houses", arrays):
         mine = np.flatnonzero((house[:, :2] == tile_key(result.name)).all(axis=1))
         several.append(take_houses(unpack_houses(result.arrays), house[mine, 2]))
         order.append(mine)
