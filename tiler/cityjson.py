@@ -21,6 +21,7 @@ from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note
 from pipeline.solids import Solids, build_solids
 from tiler.atomic import replacing
+from tiler.number_set import NumberSet
 
 # Coordinates are whole multiples of this length (m).
 GRID = 0.001
@@ -163,7 +164,7 @@ class _Writer:
         self.box = np.empty((0, 3))
         self.notes: list[Note] = []
         self.children: dict[str, list[str]] = {}
-        self.seen = np.empty(0, np.int64)
+        self.seen = NumberSet()
         self.n_objects = self.n_vertices = 0
         self._write(b'"CityObjects":{')
 
@@ -191,7 +192,7 @@ class _Writer:
 
     def finish(self) -> None:
         """Write the houses that have parts, and the vertices."""
-        mixed = np.isin(_hash_names(self.children), self.seen)
+        mixed = self.seen.has(_hash_names(self.children))
         for is_row, (house, children) in zip(mixed.tolist(), self.children.items(), strict=True):
             if is_row:
                 raise ValueError(f"building {house}: is a row and has parts, it may be one of these")
@@ -206,11 +207,11 @@ class _Writer:
     def _check_ids(self, ids: NDArray[np.str_]) -> None:
         """Refuse two rows of one id."""
         new = _hash_names(ids.tolist())
-        again = np.isin(new, self.seen)
+        again = self.seen.has(new)
         again[np.argsort(new, kind="stable")[1:]] |= np.diff(np.sort(new)) == 0
         if again.any():
             raise ValueError(f"building {ids[again][0]}: 2 buildings have this id, at most 1 may")
-        self.seen = np.concatenate((self.seen, new))
+        self.seen.add(new)
 
     def _objects(self, texts: Sequence[str]) -> None:
         """Write objects one a line."""
