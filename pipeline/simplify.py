@@ -177,28 +177,29 @@ def _settle_clusters(
     shapes: Shapes, heights: Heights, wall_ground: NDArray[np.float64], ids: NDArray[np.str_], options: CityOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Settle the roofs of each cluster by themselves; groups are numbered through."""
-    pairs = adjacent_houses(shapes.polygons)
     area = shapely.area(shapes.polygons)
     roof = np.maximum(heights.roof, wall_ground + options.roof_clearance)  # of a building that is alone
-    group, n_groups = np.zeros(len(ids), np.int32), 0
+    group = np.zeros(len(ids), np.int32)
     order = np.argsort(shapes.cluster, kind="stable")
-    number = np.empty(len(order), np.int64)
-    for rows in np.split(order, np.flatnonzero(np.diff(shapes.cluster[order])) + 1) if len(order) else []:
-        group[rows] = n_groups
-        if len(rows) > 1:
-            number[rows] = np.arange(len(rows))
-            mine = pairs[np.isin(pairs[:, 0], rows)]
-            roof[rows], found = settle_roofs(
-                heights.roof[rows],
-                area[rows],
-                wall_ground[rows],
-                number[mine],
-                key=ids[rows],
-                threshold=options.roof_group,
-                clearance=options.roof_clearance,
-            )
-            group[rows] += found
-        n_groups = int(group[rows].max()) + 1
+    cluster, start, count = np.unique(shapes.cluster[order], return_index=True, return_counts=True)
+    pairs = adjacent_houses(shapes.polygons)
+    pairs = pairs[np.argsort(shapes.cluster[pairs[:, 0]], kind="stable")]
+    pair_start = np.searchsorted(shapes.cluster[pairs[:, 0]], [cluster, cluster + 1])
+    number, n_groups = np.empty(len(order), np.int64), np.ones(len(cluster), np.int32)
+    for k in np.flatnonzero(count > 1):
+        rows = order[start[k] : start[k] + count[k]]
+        number[rows] = np.arange(len(rows))
+        roof[rows], group[rows] = settle_roofs(
+            heights.roof[rows],
+            area[rows],
+            wall_ground[rows],
+            number[pairs[slice(*pair_start[:, k])]],
+            key=ids[rows],
+            threshold=options.roof_group,
+            clearance=options.roof_clearance,
+        )
+        n_groups[k] = group[rows].max() + 1
+    group[order] += np.repeat(np.cumsum(n_groups) - n_groups, count).astype(np.int32)
     return roof, group
 
 
