@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.benchmarks.bench_report import CHOICE, DOCS, MEASURED, step_seconds, write_report
+from tests.benchmarks.bench_report import CHOICE, DOCS, JOINED, MEASURED, step_seconds, write_report
 from tests.benchmarks.runs import COMMAND, citystitch, record_of
 
 KEPT = DOCS / "benchmarks.json"
@@ -39,9 +39,9 @@ WAYS = (
 )
 
 
-def measure(city: Path, out: Path, *options: str, cores: int = 1) -> dict[str, Any]:
+def measure(city: Path, out: Path, *options: str, cores: int = 1, command: str = "run") -> dict[str, Any]:
     """Mesh a city; what a study keeps of run.json."""
-    record = record_of(city, out, *options, cores=cores)
+    record = record_of(city, out, *options, cores=cores, command=command)
     return {
         "cells": record["counts"]["cells"],
         "total": record["seconds_total"],
@@ -116,14 +116,18 @@ def study_driver(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(d) The city of 2.5 km serially, with one and with two workers, a larger one too; runs take turns."""
+    """(d) The city of 2.5 km and a larger one serially, with workers of Dask, and as a member of `join`.
+
+    Runs take turns. A member's workers are the same processes without Dask between them and the engine.
+    """
+    kinds = (("one process", "run", 0), ("1 worker", "run", 1), ("2 workers", "run", 2), (JOINED, "join", 2))
     rows = []
-    for side, several in ((2500, ("0", "1", "2")), (5000, ("0", "2"))):
+    for side in (2500, 5000):
         city = cities.make(side, 480 * side**2 // 10**6)
-        for workers in several * 3:
-            found = measure(city, out, "--workers", workers, cores=2)
-            rows.append(found | {"workers": int(workers), "side": side})
-    return middle_ones(rows, "side", "workers")
+        for told, command, n in kinds * 3:
+            found = measure(city, out, "--workers", str(n), cores=2, command=command)
+            rows.append(found | {"run as": told, "side": side})
+    return middle_ones(rows, "side", "run as")
 
 
 def middle_ones(rows: Sequence[dict[str, Any]], *keys: str) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -24,9 +25,10 @@ def citystitch(*arguments: str, cores: int = 2) -> None:
     )
 
 
-def record_of(city: Path, out: Path, *options: str, cores: int = 2) -> dict[str, Any]:
-    """Mesh the city and return what run.json says."""
+def record_of(city: Path, out: Path, *options: str, cores: int = 2, command: str = "run") -> dict[str, Any]:
+    """Mesh the city into an empty folder and return what run.json says."""
     footprints = ("--footprints", str(city / "footprints.shp"))
-    citystitch("run", str(city / "tiles"), *footprints, "--out", str(out), "--overwrite", *options, cores=cores)
+    shutil.rmtree(out, ignore_errors=True)
+    citystitch(command, str(city / "tiles"), *footprints, "--out", str(out), *options, cores=cores)
     record: dict[str, Any] = json.loads((out / "run.json").read_text())
     return record
