@@ -8,6 +8,7 @@ import heapq
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
@@ -74,7 +75,7 @@ class _Planned:
     digest: bytes
     parameters: Declared
 
-    @property
+    @cached_property
     def by_name(self) -> set[str]:
         """Stages of which it counts by its content only the item of the reader's own name."""
         return {read.stage for read in self.stage.reads if read.others_by_name}

@@ -71,7 +71,7 @@ class ChunkForm:
     def read(self, folder: Path, *at: int) -> NDArray[Any]:
         """Decompress the chunk at a place, after its size and form are known to be right, cut to the array."""
         n_bytes = math.prod(self.chunk) * self.dtype.itemsize
-        at = self._whole(at)
+        at += (0,) * (len(self.chunk) - len(at))
         data = read_at_most(folder / self._file(at), n_bytes + CHUNK_HEAD + 1)
         check_chunk(data, n_bytes)
         raw = np.frombuffer(DECODER.decode(data), np.uint8)
@@ -100,9 +100,6 @@ class ChunkForm:
     @property
     def _tail(self) -> tuple[int, ...]:
         return (self.dtype.itemsize,) if self.dtype.kind == "U" else ()
-
-    def _whole(self, at: Place) -> Place:
-        return (*at, *(0,) * (len(self.chunk) - len(at)))
 
     def _file(self, at: Place) -> str:
         """Name the file of a chunk, below the array's folder."""
