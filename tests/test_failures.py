@@ -5,14 +5,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from distributed import Client
 
 from pipeline.errors import GeometryError, OutputError
 from tests.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
 from tests.test_engine import contents, grid_layout, make, nothing, seen, told
 from tiler.engine import Engine, StoppedError
-from tiler.executors import Executor, Serial, local
+from tiler.executors import Dask, Executor, Serial, local
 from tiler.failures import Policy
 from tiler.limits import TASKS, Limits
 from tiler.stage import Facts, Read, Scope, Stage
@@ -45,6 +47,11 @@ def no_geometry(_: Task) -> None:
 
 def full_disk(_: Task) -> None:
     raise OutputError("disk full")
+
+
+def sleeps(_: Task) -> Facts:
+    time.sleep(0.15)
+    return {}
 
 
 def leaves_its_time(task: Task) -> Facts:
@@ -155,6 +162,75 @@ def test_of_what_waits_for_a_worker_the_lowest_rank_begins_first(tmp_path: Path)
     assert len(order) == 18
     assert all(name.startswith("needed") for name in order[:9])
     assert order[:9] == sorted(order[:9])
+
+
+def fills(executor: Executor) -> list[int]:
+    """Number of tasks in each batch that an executor sends from now on."""
+    assert isinstance(executor, Dask)
+    sizes: list[int] = []
+    take = executor._next_batch
+
+    def take_and_count() -> list[Any]:
+        batch = take()
+        sizes.extend([len(batch)] if batch else [])
+        return batch
+
+    executor._next_batch = take_and_count  # type: ignore[method-assign]
+    return sizes
+
+
+def test_short_tasks_go_together_once_they_are_known(tmp_path: Path) -> None:
+    layout = grid_layout(8)
+    with local(2) as executor:
+        sizes = fills(executor)
+        engine = make(tmp_path, executor, layout=layout)
+        engine.run(A, B)
+        assert len(engine.store.names("a")) == len(engine.store.names("b")) == 64
+        assert sum(sizes) == 128
+        # No worker gets all that is left as long as another could take half of it.
+        assert sizes[:8] == [1] * 8
+        assert 2 < max(sizes) <= 8
+        sizes.clear()
+        slow = replace(A, name="slow", function=sleeps, parameters=())
+        make(tmp_path / "slow", executor, layout=grid_layout(3)).run(slow)
+        assert set(sizes) == {1}
+
+
+def test_what_is_told_need_not_be_fetched_and_what_is_not_heard_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetched: list[str] = []
+    gather = Client._gather_remote
+
+    async def count(self: Any, direct: bool, local_worker: Any) -> Any:
+        fetched.append("some")
+        return await gather(self, direct, local_worker)
+
+    monkeypatch.setattr(Client, "_gather_remote", count)
+    with local(1) as executor:
+        assert isinstance(executor, Dask)
+        heard = make(tmp_path / "heard", executor)
+        heard.run(A)
+        assert not fetched
+        executor._client.unsubscribe_topic(executor._topic)
+        deaf = make(tmp_path / "deaf", executor)
+        deaf.run(A)
+        assert fetched
+        assert not executor._told
+    assert contents(heard.store.path) == contents(deaf.store.path)
+
+
+def test_of_tasks_that_go_together_only_the_one_that_kills_is_blamed(workers: Executor, tmp_path: Path) -> None:
+    """Those before it are there, those after it go again."""
+    sizes = fills(workers)
+    names = {f"t{i}_{j}" for i in range(3, 8) for j in (2, 5)}
+    engine = make(tmp_path, workers, policy=ASIDE, layout=grid_layout(8))
+    engine.run(faulty(replace(A, name="batched"), **dict.fromkeys(names, segfaults)))
+    assert max(sizes) > 1
+    assert {(name, one.kind, one.attempts) for (_, name), one in engine.set_aside.items()} == {
+        (name[1:].replace("_", "."), "crash", 2) for name in names
+    }
+    assert len(engine.store.names("batched")) == 64 - len(names)
 
 
 def test_a_trace_file_that_cannot_be_written_ends_the_run(workers: Executor, tmp_path: Path) -> None:

@@ -19,8 +19,8 @@ from pipeline.errors import CityError, ConfigError, InputError
 from tests.sparse_city import SparseCity, children, make_city, start, wait_for_results, wait_until_gone
 from tests.test_run import hashes
 from tiler.config import make_config
-from tiler.engine import LEAST_WINDOW, PER_WORKER, Engine
-from tiler.executors import Serial
+from tiler.engine import Engine
+from tiler.executors import LEAST_WINDOW, WINDOW
 from tiler.folder_lock import is_held, only_run
 from tiler.joining import lease as leases
 from tiler.joining import mailbox
@@ -455,12 +455,11 @@ def test_a_folder_that_another_run_holds_is_waited_for(tmp_path: Path, monkeypat
     assert not (tmp_path / SPOOL).exists()
 
 
-def test_more_tasks_are_in_flight_when_workers_come(tmp_path: Path) -> None:
-    executor = Serial()
-    engine = Engine(tmp_path / "store.zarr", Layout({}, {}, {}, (0, 0, 1, 1)), parameters=None, executor=executor)
+def test_more_tasks_are_in_flight_when_workers_come(tmp_path: Path, spool: Spool) -> None:
+    engine = Engine(tmp_path / "store.zarr", Layout({}, {}, {}, (0, 0, 1, 1)), parameters=None, executor=spool)
     assert engine._window == LEAST_WINDOW
-    executor.workers = 10
-    assert engine._window == 10 * PER_WORKER
+    spool.workers = 10
+    assert engine._window == 10 * WINDOW
 
 
 def test_words_are_in_a_log_file_at_once(tmp_path: Path) -> None:

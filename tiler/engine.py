@@ -61,9 +61,6 @@ class Watch(Protocol):
         """Take note of an item that failed, or that is not run because it needs one that is not there."""
 
 
-PER_WORKER, LEAST_WINDOW = 4, 8  # tasks in flight
-
-
 @dataclass(frozen=True, eq=False)
 class _Planned:
     """A stage of this call: its items are the tasks ``first`` to ``first + len(items.names)``."""
@@ -103,7 +100,7 @@ class Engine:
     executor : Executor
         Where tasks run, see `tiler.executors`.
     window : int, optional
-        Largest number of tasks in flight; 4 a worker and at least 8 by default.
+        Largest number of tasks in flight; what the executor wants by default.
     folder : Path, optional
         Where the files are that results state as the fact ``"files"``; beside the store by default.
     progress : callable, optional
@@ -160,9 +157,7 @@ class Engine:
     @property
     def _window(self) -> int:
         """Tasks in flight: more when workers come."""
-        if self._given_window is not None:
-            return self._given_window
-        return max(PER_WORKER * self._executor.workers, LEAST_WINDOW)
+        return self._executor.window if self._given_window is None else self._given_window
 
     def run(self, *stages: Stage, items: Mapping[str, Collection[str]] | None = None) -> None:
         """Run stages whose reads are among them or were run before.

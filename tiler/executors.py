@@ -1,11 +1,14 @@
 """Where tasks run: in this process, in worker processes of this machine, or in a Dask cluster anywhere."""
 
+import heapq
+import itertools
+import math
 import os
 import signal
 import time
 import uuid
-from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from queue import Empty, SimpleQueue
@@ -22,7 +25,12 @@ from tiler.stage import Facts
 from tiler.task import Failure, Record, Task, run_task
 
 Function = Callable[[Task], Facts]
+Guard = Callable[..., Any]  # runs a task
 
+WINDOW, LEAST_WINDOW = 4, 8  # tasks in hand for each worker, and at least
+BATCHES = 4  # in flight for each worker of Dask
+TOGETHER = 16  # batches at most that are waited for, to send as many at once
+BATCH = 0.25  # s that the tasks of a batch take together, unless one alone takes longer
 FORGET = 1000  # tasks after which Dask's table of the names of tasks is emptied, which would hold 100,000
 BYSTANDER = 20  # how often a task may wait in a process that dies of another one, before it is an error
 LOOK = 5.0  # s without a word of the scheduler, after which it is asked whether it has workers
@@ -43,10 +51,21 @@ class _Given(NamedTuple):
     rank: int
 
 
+class _Done(NamedTuple):
+    """What comes back of a batch: what came of each of its tasks, and the time that they took together (s)."""
+
+    outcomes: list[Any]
+    seconds: float
+
+
 class Executor(Protocol):
     """What the engine asks of an executor; ``ticket`` is any number of the engine's."""
 
     workers: int
+
+    @property
+    def window(self) -> int:
+        """Number of tasks that it wants in hand, done or not; more when workers come."""
 
     def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
         """Take a task; of those that wait, an executor may let the one of the lowest rank begin first."""
@@ -62,6 +81,7 @@ class Serial:
     """One task after the other in this process; no limits, and a crash ends all."""
 
     workers = 1
+    window = LEAST_WINDOW
 
     def __init__(self) -> None:
         self._queue: deque[tuple[int, Function, Task]] = deque()
@@ -104,6 +124,11 @@ class Dask:
 
     Notes
     -----
+    A task of Dask costs some 4 ms of the processors, so short tasks of a stage go together as one: as many as
+    take `BATCH` seconds, fewer where that would leave another worker without any. What was not sent waits here.
+    What came of a batch is told as an event, which takes half of the messages that it takes to fetch a result;
+    what was not heard is fetched.
+
     Where a worker dies, Dask blames all tasks that it had. Here a task is blamed if it had begun, which its file
     tells (`tiler.limits`); the others are sent again.
     """
@@ -120,18 +145,27 @@ class Dask:
         self.workers, self.scheduler = workers, scheduler
         self._limits = limits or Limits()
         self._client, self._terms = client, terms
-        self._unsent: list[_Given] = []
-        self._flying: dict[str, tuple[Any, _Given]] = {}
+        self._waiting: defaultdict[str, list[tuple[int, int, _Given]]] = defaultdict(list)  # heap of a stage
+        self._flying: dict[str, tuple[Any, list[_Given]]] = {}
+        self._topic, self._told = f"citystitch-{uuid.uuid4().hex}", dict[str, bytes]()
         self._ready: SimpleQueue[tuple[str, Any]] = SimpleQueue()  # key, and the result or the error
+        self._done: deque[tuple[int, Record | Failure]] = deque()
+        self._mean: dict[str, float] = {}  # s a task of a stage, of late
         self._sent: Counter[int] = Counter()
         self._submitted = 0
         self._lost = False
+        client.subscribe_topic(self._topic, self._hear)
+
+    @property
+    def window(self) -> int:
+        """As many as fill its batches."""
+        return max(2 * WINDOW * self.workers, LEAST_WINDOW)
 
     def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
         """Take a task, the lower its rank the sooner it begins; ClusterError if the scheduler is lost."""
         self._check_scheduler()
         self._forget_names()
-        self._unsent.append(_Given(ticket, function, task, rank))
+        self._wait_with(_Given(ticket, function, task, rank))
 
     def wait(self) -> tuple[int, Record | Failure]:
         """Wait for the scheduler; the result is released there at once.
@@ -141,71 +175,124 @@ class Dask:
         ClusterError
             If the scheduler is lost, or has had no worker for `NO_WORKERS` seconds.
         """
-        while True:
+        while not self._done:
             if self._ready.empty():  # what is there is taken first, so that more can be sent together
                 self._send()
-            key, found = self._next()
-            if key not in self._flying:
-                continue
-            future, given = self._flying[key]
-            outcome = self._outcome(found, given.ticket, given.task)
-            future.release()
-            del self._flying[key]
-            if outcome is not None:
-                self._sent.pop(given.ticket, None)
-                return given.ticket, outcome
-            self._sent[given.ticket] += 1
-            self.submit(*given)
+            self._take(*self._next())
+        return self._done.popleft()
 
     def drop_waiting(self) -> set[int]:
         """Cancel all that is not done, and wait until no worker holds or runs any of it.
 
         Without a scheduler nobody can be asked; what workers then still commit is what a task of that key gives.
         """
-        unsent = {given.ticket for given in self._unsent}
-        self._unsent.clear()
+        dropped = {given.ticket for heap in self._waiting.values() for _, _, given in heap}
+        self._waiting.clear()
+        self._told.clear()
         try:
-            return unsent | self._cancel()
+            return dropped | self._cancel()
         except (OSError, RuntimeError, CancelledError):
             if not self._is_lost():
                 raise
-        dropped = {given.ticket for _, given in self._flying.values()}
+        dropped |= {given.ticket for _, batch in self._flying.values() for given in batch}
         self._flying.clear()
-        return unsent | dropped
+        return dropped
+
+    def _wait_with(self, given: _Given) -> None:
+        heapq.heappush(self._waiting[given.task.stage], (given.rank, given.ticket, given))
+
+    def _take(self, key: str, found: Any) -> None:
+        """Take what came of a batch; what had not begun when its worker died waits again."""
+        if key not in self._flying:
+            return
+        future, batch = self._flying[key]
+        told = [found] * len(batch)
+        if isinstance(found, _Done):
+            told, stage = found.outcomes, batch[0].task.stage
+            seconds = found.seconds / len(batch)
+            self._mean[stage] = (self._mean.get(stage, seconds) + seconds) / 2
+        outcomes = [self._outcome(one, given.ticket, given.task) for one, given in zip(told, batch, strict=True)]
+        future.release()
+        del self._flying[key]
+        for given, outcome in zip(batch, outcomes, strict=True):
+            if outcome is not None:
+                self._sent.pop(given.ticket, None)
+                self._done.append((given.ticket, outcome))
+            else:
+                self._sent[given.ticket] += 1
+                self._wait_with(given)
 
     async def _follow(self, future: Any) -> None:
-        """Fetch a result as soon as it is there: no other waits for a worker that is out of reach."""
-        found: Any
-        try:
-            found = await future
-        except Exception as error:
-            found = error
+        """Note what came of a batch as soon as it is known: no other waits for a worker that is out of reach.
+
+        What it told has come before, and need not be fetched by way of the scheduler.
+        """
+        from distributed.protocol.pickle import loads
+
+        found: Any = await future.exception()
+        told = self._told.pop(future.key, None)
+        if found is None:
+            try:
+                found = await future if told is None else loads(told)
+            except Exception as error:
+                found = error
         self._ready.put((future.key, found))
 
+    def _hear(self, event: tuple[float, tuple[str, bytes]]) -> None:
+        _, (key, told) = event
+        self._told[key] = told
+
     def _send(self) -> None:
-        """Send what was taken, the tasks of a function at once: most of what a graph costs, it costs for all.
+        """Send batches in one call: most of what a graph costs, it costs for all of them.
 
         Each is told its rank, as Dask would begin with the first one of every call.
         """
         from dask import annotate
 
-        guard: Callable[..., Any] = run_guarded
+        free = BATCHES * self.workers - len(self._flying)
+        if free < min(BATCHES * self.workers // 2, TOGETHER):
+            return
+        batches: list[list[_Given]] = []
+        while len(batches) < free and (batch := self._next_batch()):
+            batches.append(batch)
+        if not batches:
+            return
+        guard: Guard = run_guarded
         given: dict[str, Any] = {"seconds": self._limits.seconds}
         if self._terms is not None:
             guard, given = run_on_terms, given | {"terms": self._terms}
-        while self._unsent:
-            function = self._unsent[0].function
-            together = [one for one in self._unsent if one.function is function]
-            # Never met again, not even by a second try.
-            keys = [f"{one.task.stage}-{uuid.uuid4().hex}" for one in together]
-            urgency = {key: -one.rank for key, one in zip(keys, together, strict=True)}
-            functions, tasks = [function] * len(together), [one.task for one in together]
+        # Never met again, not even by a second try.
+        keys = [f"{batch[0].task.stage}-{uuid.uuid4().hex}" for batch in batches]
+        urgency = {key: -batch[0].rank for key, batch in zip(keys, batches, strict=True)}
+        functions = [batch[0].function for batch in batches]
+        tasks = [[one.task for one in batch] for batch in batches]
+        how = {"guard": guard, "given": given, "topic": self._topic}
+        try:
             with annotate(priority=urgency.get):
-                futures = self._client.map(guard, functions, tasks, key=keys, pure=False, retries=0, **given)
-            self._unsent = [one for one in self._unsent if one.function is not function]
-            for future, one in zip(futures, together, strict=True):
-                self._flying[future.key] = (future, one)
-                self._client.loop.add_callback(self._follow, future)
+                futures = self._client.map(_run_batch, functions, tasks, key=keys, pure=False, retries=0, **how)
+        except Exception:  # a function that cannot be sent
+            for given_back in itertools.chain(*batches):
+                self._wait_with(given_back)
+            raise
+        for future, batch in zip(futures, batches, strict=True):
+            self._flying[future.key] = (future, batch)
+            self._client.loop.add_callback(self._follow, future)
+
+    def _next_batch(self) -> list[_Given]:
+        """Take the next tasks to go together out of those that wait; empty if none does.
+
+        They are of the stage that has the task of the lowest rank. How long one takes is known by those that were
+        done; before that each goes alone.
+        """
+        if not self._waiting:
+            return []
+        stage = min(self._waiting, key=lambda one: self._waiting[one][0][:2])
+        heap, mean = self._waiting[stage], self._mean.get(stage, BATCH)
+        size = min(math.ceil(len(heap) / self.workers), max(int(BATCH / max(mean, 1e-3)), 1))
+        batch = [heapq.heappop(heap)[2] for _ in range(size)]
+        if not heap:
+            del self._waiting[stage]
+        return batch
 
     def _forget_names(self) -> None:
         from dask.utils import key_split
@@ -293,7 +380,7 @@ class Dask:
                 raise CancelledError
             held = set().union(*self._client.run(_held, on_error="ignore").values())
             clean = 0 if held & keys else clean + 1
-        return {self._flying.pop(key)[1].ticket for key in keys}
+        return {given.ticket for key in keys for given in self._flying.pop(key)[1]}
 
     def _outcome(self, found: Any, ticket: int, task: Task) -> Record | Failure | None:
         """What came of a task; None if it must be sent again."""
@@ -316,6 +403,21 @@ class Dask:
                 self._check_scheduler()
         # What Dask itself raises: a module that a worker lacks.
         return Failure(self._find_mismatch() or found)
+
+
+def _run_batch(
+    function: Function, tasks: Sequence[Task], *, guard: Guard, given: Mapping[str, Any], topic: str
+) -> _Done:
+    """Run tasks one after the other, in a worker; what came of them is told, and given to who asks for it."""
+    from distributed import get_worker
+    from distributed.protocol.pickle import dumps
+
+    begin = time.perf_counter()
+    outcomes = [guard(function, task, **given) for task in tasks]
+    done = _Done(outcomes, time.perf_counter() - begin)
+    worker = get_worker()
+    worker.log_event(topic, (worker.get_current_task(), dumps(done)))
+    return done
 
 
 @contextmanager

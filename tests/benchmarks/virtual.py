@@ -119,7 +119,7 @@ class VirtualWorkers:
     """
 
     def __init__(self, workers: int, store: StandInStore | None = None, fail: float = 0.0) -> None:
-        self.workers = workers
+        self.workers, self.window = workers, max(4 * workers, 8)
         self.clock = self.busy = self.own = 0.0
         self.done = self.reused = self.in_flight = 0
         self.flying = 0.0  # integral of the number of tasks in flight over virtual time

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tiler.executors import LEAST_WINDOW, WINDOW
 from tiler.joining.crew import Crew, Function, Given, Outcome
 from tiler.joining.lease import (
     LOOK,
@@ -112,6 +113,11 @@ class Spool:
         self._looked = -math.inf
         self._pause = Pause()
         self.sent: Counter[str] = Counter()
+
+    @property
+    def window(self) -> int:
+        """Some a worker."""
+        return max(WINDOW * self.workers, LEAST_WINDOW)
 
     def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
         """Take a task; they are given out as they come."""
