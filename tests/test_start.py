@@ -4,9 +4,11 @@ import gc
 import subprocess
 import sys
 
+import pytest
 from distributed.system import memory_limit
 
 from tiler.importing import uncollected
+from tiler.kept_memory import GARBAGE
 from tiler.limits import machine_memory
 
 DRIVER = ("tiler.terminal", "tiler.run", "tiler.worker_setup")
@@ -47,3 +49,30 @@ def test_what_is_imported_without_collector_is_left_alone_afterwards() -> None:
         assert gc.get_freeze_count() > 50_000
     finally:
         gc.unfreeze()
+
+
+def tell_in_fresh_process(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_workers_and_a_run_in_one_process_look_for_garbage_seldom() -> None:
+    assert tell_in_fresh_process("import gc, tiler.preload; print(gc.get_threshold()[0])") == str(GARBAGE)
+    nowhere = "main(['run', 'no/such.laz', '--workers', '0'])"
+    told = f"import gc; from tiler.cli import main; {nowhere}; print(gc.get_threshold()[0])"
+    assert tell_in_fresh_process(told) == str(GARBAGE)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="GNU's C library alone can be told")
+def test_a_run_in_one_process_keeps_the_memory_that_it_freed() -> None:
+    code = """
+import resource
+from tiler.cli import main
+main(["run", "no/such.laz", "--workers", "0"])
+def take(): return [bytearray(30_000_000) for _ in range(4)]
+take()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(5): take()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+    pages_of_one = 30_000_000 // 4096
+    assert int(tell_in_fresh_process(code)) < pages_of_one

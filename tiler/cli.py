@@ -19,6 +19,7 @@ from tiler.config import Config, annotated_defaults, make_config
 from tiler.export import FORMATS
 from tiler.importing import uncollected
 from tiler.jobs.commands import describe_job, find_run, job_line
+from tiler.kept_memory import keep_memory, look_seldom
 from tiler.parser import Handler, build_parser
 from tiler.places import place, refuse_bucket
 from tiler.plain_text import printable
@@ -123,6 +124,9 @@ def _run_config(
 ) -> int:
     if config.workers and not config.on_cluster:
         fork_server.begin()
+    look_seldom()
+    if not config.workers:
+        keep_memory()
     with uncollected():
         from tiler.events import EventLog, open_log
         from tiler.out_folder import refuse_result
