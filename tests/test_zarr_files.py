@@ -9,8 +9,9 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec
 
+from tiler.packing import shorten_chunk
 from tiler.store import Store
-from tiler.zarr_files import GROUP, ChunkForm, describe_group
+from tiler.zarr_files import DECODER, GROUP, ChunkForm, describe_group
 
 RNG = np.random.default_rng(5)
 ARRAYS: dict[str, tuple[NDArray[Any], tuple[int, ...]]] = {
@@ -61,3 +62,25 @@ def test_groups_are_those_of_zarr(tmp_path: Path) -> None:
 
 def files_below(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_chunk_that_the_array_hardly_fills_is_unpacked_as_far_as_it_does(tmp_path: Path) -> None:
+    array, chunk = RNG.integers(0, 9, (30_000, 3)).astype(np.int32), (300_000, 3)
+    form = ChunkForm(array.dtype, array.shape, chunk)
+    ((file, data),) = form.compress(array)
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_bytes(data)
+    assert (form.read(tmp_path, 0) == array).all()
+    shorter = shorten_chunk(data, array.nbytes)
+    unpacked = DECODER.decode(shorter)
+    assert len(shorter) == len(data)
+    assert array.nbytes <= len(unpacked) < array.nbytes + 2**20
+    assert unpacked[: array.nbytes] == array.tobytes()
+
+
+@pytest.mark.parametrize("rows", [1, 7, 399, 400])
+def test_any_number_of_rows_of_any_chunk_is_unpacked(rows: int) -> None:
+    for name, (array, _) in ARRAYS.items():
+        some = np.ascontiguousarray(array[:rows])
+        ((_, data),) = ChunkForm(some.dtype, some.shape, (1000, *some.shape[1:])).compress(some)
+        assert DECODER.decode(shorten_chunk(data, some.nbytes))[: some.nbytes] == some.tobytes(), name

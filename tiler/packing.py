@@ -15,6 +15,7 @@ PACKED_BYTES = 128 * 2**10  # smaller arrays share one array of bytes: one of it
 INLINE_BYTES = 16 * 2**10  # and if all of them are smaller than this, that one is spared too
 BLOSC_VERSIONS = (1, 2)  # of its format, in the first byte
 CHUNK_HEAD = 16  # bytes of the header of a Blosc chunk
+MEMCPYED = 2  # flag of a Blosc chunk that is stored as it was
 MOST_ROW = 2**30  # bytes; the longest row of a terrain has some 10^5
 MOST_AXES = 8
 DTYPE = re.compile(r"[<|][biuf][1248]|[<|]b1|<U[1-9][0-9]{0,6}")
@@ -157,6 +158,34 @@ def check_chunk(data: bytes, n_bytes: int) -> None:
         raise ValueError(f"a chunk claims {claimed} bytes instead of {n_bytes}")
     if size != len(data):
         raise ValueError(f"a chunk claims {size} compressed bytes and has {len(data)}")
+
+
+def shorten_chunk(data: bytes, n_bytes: int) -> bytes:
+    """Make a compressed chunk claim no more blocks than its first bytes are in, so that no others are unpacked.
+
+    Parameters
+    ----------
+    data : bytes
+        The chunk, which has passed `check_chunk`.
+    n_bytes : int
+        Uncompressed bytes that are wanted, from the first on.
+
+    Returns
+    -------
+    bytes
+        A chunk that unpacks to these and the rest of their last block; the same where that is all.
+
+    Notes
+    -----
+    The last chunk of an array is filled up with zeros, most of it where an array is small. Blocks do not depend on
+    each other, and the head tells where each begins; a chunk that is stored as it was is one copy (flag 2). The
+    zeros are under no checksum but that of the file: damage there is found by `Store.find_damage` alone.
+    """
+    claimed, block = (int.from_bytes(data[k : k + 4], "little") for k in (4, 8))
+    shorter = -(-n_bytes // block) * block if block else claimed
+    if shorter >= claimed or data[2] & MEMCPYED:
+        return data
+    return data[:4] + shorter.to_bytes(4, "little") + data[8:]
 
 
 def unpack(packed: NDArray[np.uint8], entry: Mapping[str, Any]) -> NDArray[Any]:

@@ -18,7 +18,7 @@ import numpy as np
 from numcodecs import Blosc, blosc
 from numpy.typing import NDArray
 
-from tiler.packing import CHUNK_HEAD, check_chunk
+from tiler.packing import CHUNK_HEAD, check_chunk, shorten_chunk
 from tiler.places import read_at_most
 
 GROUP = "zarr.json"  # the file of what is said of an array, or of a group
@@ -74,9 +74,11 @@ class ChunkForm:
         at += (0,) * (len(self.chunk) - len(at))
         data = read_at_most(folder / self._file(at), n_bytes + CHUNK_HEAD + 1)
         check_chunk(data, n_bytes)
-        raw = np.frombuffer(DECODER.decode(data), np.uint8)
         left = [size - k * step for size, k, step in zip(self.shape, at, self.chunk, strict=True)]
-        return raw.view(self.dtype).reshape(self.chunk)[tuple(map(slice, left))]
+        rows, row_bytes = min(left[0], self.chunk[0]), n_bytes // self.chunk[0]
+        raw = np.frombuffer(DECODER.decode(shorten_chunk(data, rows * row_bytes)), np.uint8)
+        whole = raw[: rows * row_bytes].view(self.dtype).reshape(rows, *self.chunk[1:])
+        return whole[tuple(map(slice, left))]
 
     def compress(self, values: NDArray[Any], first: int = 0) -> Iterator[tuple[str, bytes]]:
         """Compress rows of the array, whole chunks from the chunk row ``first`` on: file and bytes of each.
