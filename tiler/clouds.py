@@ -14,7 +14,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError, OutputError
-from pipeline.las_points import KEPT, REASONS, judge_points
+from pipeline.las_points import KEPT, REASONS, count_values, judge_points
 from pipeline.pointcloud import PointCloud
 from tiler.copc import NODE_SLACK, CopcIndex, read_index, read_nodes
 from tiler.las_chunks import FIELDS, classes_of, coordinates_of, ends_of, scaling_of, units_of
@@ -220,7 +220,7 @@ def select_usable(chunk: laspy.ScaleAwarePointRecord, bounds: Box, counts: dict[
     verdict = judge_points(
         *units_of(chunk), *scaling_of(chunk), classes_of(chunk), np.asarray(chunk.withheld) != 0, bounds
     )
-    for reason, number in zip(REASONS, np.bincount(verdict, minlength=len(REASONS)).tolist(), strict=True):
+    for reason, number in zip(REASONS, count_values(verdict)[: len(REASONS)].tolist(), strict=True):
         counts[reason] += number
     counts["read"] += len(chunk)
     return np.asarray(verdict == KEPT)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.las_points import Triple, put_units
+from pipeline.las_points import Triple, count_values, put_units
 from tiler.cells import Box, find_places
 from tiler.clouds import read_chunks, select_usable
 from tiler.las_chunks import classes_of, scaling_of, units_of
@@ -102,7 +102,7 @@ def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator
         _check_density(as_place(path), total, size)
         all_classes = classes_of(chunk)
         units, classes = put_units(x, y, z, all_classes, place, int(start[-1]))
-        there = np.flatnonzero(np.bincount(all_classes, minlength=1)).astype(np.uint8)
+        there = np.flatnonzero(count_values(all_classes)).astype(np.uint8)
         yield PointBlock(units, scale, offset, classes, cell, start, there, counts)
 
 
