@@ -185,8 +185,8 @@ class _Writer:
             places = solids.vertices * GRID + self.origin
             self.box = np.vstack((self.box, places.min(axis=0), places.max(axis=0)))
             self.box = np.stack((self.box.min(axis=0), self.box.max(axis=0)))
-            # All at once, then one a line: a call for each takes four times as long.
-            text = _text(solids.vertices.tolist())[1:-1].replace("],[", "],\n[")
+            # All at once: a call for each takes twelve times as long, the encoder of lists three times.
+            text = ",\n".join(["[%d,%d,%d]"] * len(solids.vertices)) % tuple(solids.vertices.reshape(-1).tolist())
             self.spool.write(f"{',' if self.n_vertices else ''}\n{text}".encode("ascii"))
             self.n_vertices += len(solids.vertices)
 
