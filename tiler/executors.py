@@ -229,13 +229,14 @@ class Dask:
         """
         from distributed.protocol.pickle import loads
 
-        found: Any = await future.exception()
-        told = self._told.pop(future.key, None)
-        if found is None:
-            try:
+        found: Any
+        try:
+            found = await future.exception()
+            told = self._told.pop(future.key, None)
+            if found is None:
                 found = await future if told is None else loads(told)
-            except Exception as error:
-                found = error
+        except Exception as error:
+            found = error
         self._ready.put((future.key, found))
 
     def _hear(self, event: tuple[float, tuple[str, bytes]]) -> None:

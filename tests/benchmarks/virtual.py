@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.errors import CityError
 from tests.benchmarks.recorded import choose, draw, make_facts
-from tiler.executors import Function
+from tiler.executors import LEAST_WINDOW, WINDOW, Function
 from tiler.stage import Box, Facts, Layout, Scope
 from tiler.store import Store
 from tiler.task import Failure, Record, Task, run_task
@@ -119,7 +119,7 @@ class VirtualWorkers:
     """
 
     def __init__(self, workers: int, store: StandInStore | None = None, fail: float = 0.0) -> None:
-        self.workers, self.window = workers, max(4 * workers, 8)
+        self.workers, self.window = workers, max(WINDOW * workers, LEAST_WINDOW)
         self.clock = self.busy = self.own = 0.0
         self.done = self.reused = self.in_flight = 0
         self.flying = 0.0  # integral of the number of tasks in flight over virtual time
