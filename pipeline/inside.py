@@ -151,6 +151,7 @@ class Cover:
         Column and row of the first cell; cell (i, j) begins at ``i * INDEX_CELL``, ``j * INDEX_CELL``.
     marked : bool, (rows, columns)
         Whether a polygon has a part of the cell; it may be marked where one only comes within rounding of it.
+        There is at least one cell.
     """
 
     i0: int
@@ -162,14 +163,16 @@ def cover_polygons(polygons: NDArray[np.object_]) -> Cover:
     """Mark the cells that polygons, valid shapely Polygons or MultiPolygons (n,), have a part of."""
     index = index_polygons(polygons)
     i0, j0, width, height = index.cells
-    return Cover(i0, j0, (np.diff(index.start) > 0).reshape(height, width))
+    marked = (np.diff(index.start) > 0).reshape(height, width)
+    return Cover(i0, j0, marked if marked.size else np.zeros((1, 1), np.bool_))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def is_covered(x: float, y: float, i0: int, j0: int, marked: NDArray[np.bool_]) -> bool:
     """Tell for kernels whether a place lies in a cell of the cover with these attributes."""
     i, j = int(np.floor(x / INDEX_CELL)) - i0, int(np.floor(y / INDEX_CELL)) - j0
-    return bool(0 <= i < marked.shape[1] and 0 <= j < marked.shape[0] and marked[j, i])
+    there = (i >= 0) & (i < marked.shape[1]) & (j >= 0) & (j < marked.shape[0])
+    return bool(there & marked[j * there, i * there])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -322,9 +325,9 @@ def _box_of(xy: Array, among: NDArray[np.bool_]) -> Box:
     low_x = low_y = np.inf
     high_x = high_y = -np.inf
     for k in range(len(xy)):
-        if among[k]:
-            low_x, high_x = min(low_x, xy[k, 0]), max(high_x, xy[k, 0])
-            low_y, high_y = min(low_y, xy[k, 1]), max(high_y, xy[k, 1])
+        x, y = xy[k, 0], xy[k, 1]
+        low_x, high_x = min(low_x, x if among[k] else np.inf), max(high_x, x if among[k] else -np.inf)
+        low_y, high_y = min(low_y, y if among[k] else np.inf), max(high_y, y if among[k] else -np.inf)
     return low_x, low_y, high_x, high_y
 
 

@@ -194,6 +194,11 @@ def cut_units(
     ------
     ValueError
         If there is no room for all points.
+
+    Notes
+    -----
+    Each point is written, and the next one over it if it was not wanted: no processor can guess which are, and to
+    guess wrong takes longer than to write.
     """
     if min(len(xyz), len(classes)) < len(units):
         raise ValueError("no room for all points")
@@ -203,16 +208,16 @@ def cut_units(
         if new == LEFT_OUT:
             continue
         x, y = units[k, 0] * scale[0] + offset[0], units[k, 1] * scale[1] + offset[1]
-        if not is_within(x, y, box):
-            continue
-        if cover is None or is_covered(x, y, cover[0], cover[1], cover[2]):
-            xyz[n, 0], xyz[n, 1], xyz[n, 2] = x, y, units[k, 2] * scale[2] + offset[2]
-            classes[n] = new
-            n += 1
+        wanted = is_within(x, y, box)
+        if cover is not None:
+            wanted &= is_covered(x, y, cover[0], cover[1], cover[2])
+        xyz[n, 0], xyz[n, 1], xyz[n, 2] = x, y, units[k, 2] * scale[2] + offset[2]
+        classes[n] = new
+        n += wanted
     return n
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def is_within(x: float, y: float, box: Box) -> bool:
     """Tell whether a place is in a box; the borders belong to it."""
-    return box[0] <= x <= box[2] and box[1] <= y <= box[3]
+    return (box[0] <= x) & (x <= box[2]) & (box[1] <= y) & (y <= box[3])

@@ -28,6 +28,7 @@ CODE = (
     "pyogrio",
     "pyproj",
     "deflate",
+    "blake3",
 )
 
 

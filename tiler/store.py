@@ -8,7 +8,6 @@ the CRC-32 of the file that the attributes are in. In a bucket each file is an o
 is put last (`tiler.objects.results`).
 """
 
-import hashlib
 import os
 import uuid
 from collections.abc import Collection, Mapping, Sequence
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from blake3 import blake3
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import OutputError
@@ -32,7 +32,7 @@ from tiler.result_reader import (
     read_packed,
     read_window,
 )
-from tiler.result_writer import PARTIAL, Writer, delete, hash_content, withdraw
+from tiler.result_writer import DIGEST_BYTES, PARTIAL, Writer, delete, hash_content, withdraw
 from tiler.written import GONE, find_changed_files
 from tiler.zarr_files import GROUP
 
@@ -288,7 +288,7 @@ class Store:
         arrays = []
         for array in sorted(set(table) - {PACKED}):
             entry = find_entry(folder, table, array, stage, name)
-            found = hashlib.blake2b(digest_size=16)
+            found = blake3()
             if "offset" in entry:
                 found.update(raw_bytes(unpack(packed, entry)).data)
             else:
@@ -296,5 +296,5 @@ class Store:
                     stop = min(start + entry["chunk"], entry["shape"][0])
                     rows = read_chunks(folder, stage, name, array, entry, [(start, stop)])
                     found.update(raw_bytes(rows).data)
-            arrays.append([array, entry["dtype"], entry["shape"], found.hexdigest()])
+            arrays.append([array, entry["dtype"], entry["shape"], found.hexdigest(DIGEST_BYTES)])
         return hash_content(arrays, {key: value for key, value in attributes.items() if key not in apart})

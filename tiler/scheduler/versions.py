@@ -16,7 +16,7 @@ MISSING = "missing"
 OURS = ("pipeline", "stitch", "tiler")  # the packages of citystitch, whose sources count
 TRANSPORT = ("dask", "distributed")  # what carries tasks
 LIBRARIES = (
-    *("deflate", "laspy", "lazrs", "numba", "numcodecs", "numpy", "pyamg", "pyogrio", "pyproj", "scipy"),
+    *("blake3", "deflate", "laspy", "lazrs", "numba", "numcodecs", "numpy", "pyamg", "pyogrio", "pyproj", "scipy"),
     *("shapely", "triangle", "zarr"),
 )
 NATIVE = {  # libraries within those, by the module and the attribute that tell
