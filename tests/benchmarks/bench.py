@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.bench_report import CHOICE, DOCS, JOINED, MEASURED, step_seconds, write_report
-from tests.benchmarks.runs import COMMAND, citystitch, record_of
+from tests.benchmarks.runs import COMMAND, citystitch, record_of, set_aside
 
 KEPT = DOCS / "benchmarks.json"
 MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
@@ -189,7 +189,8 @@ def study_profile(cities: Cities, out: Path) -> list[dict[str, Any]]:
         raise SystemExit("no py-spy; python -m pip install py-spy")
     city, raw = cities.make(2500, 3000), out.parent / "samples"
     words = [*COMMAND, "run", str(city / "tiles"), "--footprints", str(city / "footprints.shp")]
-    words += ["--workers", "0", "--overwrite", "--out", str(out)]
+    words += ["--workers", "0", "--out", str(out)]
+    set_aside(out)
     subprocess.run(
         ["py-spy", "record", "-r", "100", "-t", "-i", "-f", "raw", "-o", str(raw), "--", *words],
         check=True,
@@ -228,7 +229,7 @@ def study_startup(cities: Cities, out: Path) -> list[dict[str, Any]]:
         citystitch("--help")
         found.setdefault("the end of `citystitch --help`", []).append(time.perf_counter() - start)
         for workers in ("0", "2"):
-            shutil.rmtree(out, ignore_errors=True)
+            set_aside(out)
             began = time.time()
             record_of(city, out, "--workers", workers)
             done = (json.loads(line) for line in (out / "events.jsonl").read_text().splitlines())
@@ -286,8 +287,6 @@ def _two_at_once(city: Path, out: Path) -> float:
             alone = measure(city, both[0], "--workers", "0", cores=2)["total"]
             runs = [pool.submit(measure, city, b, "--workers", "0", cores=2) for b in both]
             found.append(sum(run.result()["total"] for run in runs) / 2 / alone)
-    for folder in both:
-        shutil.rmtree(folder)
     return float(median(found))
 
 
