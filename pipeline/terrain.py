@@ -21,6 +21,7 @@ from pipeline.raster import (
     grow_window,
     join_dtm,
     node_window,
+    round_height,
     sample_dtm,
     sample_grid,
     window_of,
@@ -67,7 +68,8 @@ def bin_nodes(
 
     Notes
     -----
-    Heights are summed as whole numbers: neither the order of the points matters nor how they are parted.
+    Heights are summed as whole numbers of `HEIGHT_UNIT`: neither the order of the points matters nor how they are
+    parted. Means are rounded to it.
     """
     total, count = np.zeros((window.ny, window.nx)), np.zeros((window.ny, window.nx), np.int32)
     for cloud in clouds:
@@ -165,7 +167,7 @@ def _average_bins(total: NDArray[np.float64], count: NDArray[np.int32]) -> NDArr
     mean = np.empty(total.shape)
     for j in range(total.shape[0]):
         for i in range(total.shape[1]):
-            mean[j, i] = total[j, i] * HEIGHT_UNIT / count[j, i] if count[j, i] else np.nan
+            mean[j, i] = round_height(total[j, i] * HEIGHT_UNIT / count[j, i]) if count[j, i] else np.nan
     return mean
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.raster import HEIGHT_UNIT, Dtm, NodeWindow, cut_nodes, hull_windows, window_of
+from pipeline.raster import HEIGHT_UNIT, Dtm, NodeWindow, cut_nodes, hull_windows, round_height, window_of
 
 FILL_RINGS = 64  # rings that are flooded; also how many nodes beyond its own a tile must read
 RIM = FILL_RINGS // 2  # deeper than this ring, the coarse level has a weight
@@ -99,9 +99,9 @@ def flood_terrain(raw: Dtm, window: NodeWindow) -> FloodedDtm:
 
     Notes
     -----
-    A node gets the mean of those of its eight neighbours that were known before its ring began. A node in
-    ring r so depends on the nodes within r of it alone: the result is that of the whole region, bit for bit.
-    Cost is linear in the nodes.
+    A node gets the mean of those of its eight neighbours that were known before its ring began, rounded to
+    `HEIGHT_UNIT`. A node in ring r so depends on the nodes within r of it alone: the result is that of the whole
+    region, bit for bit. Cost is linear in the nodes.
     """
     outer = window_of(raw)
     if not _covers(outer, window):
@@ -291,7 +291,7 @@ def _flood(
                         ring[q, p] = r + 1
                         queue[tail, 0], queue[tail, 1] = q, p
                         tail += 1
-            z[j, i] = total / count
+            z[j, i] = round_height(total / count)
         head = end
         r += 1
 
@@ -313,7 +313,7 @@ def _fill_first(raw: NDArray[np.float64], z: NDArray[np.float64], ring: NDArray[
                     total += 0.0 if np.isnan(near) else near
                     count += not np.isnan(near)
             known = not np.isnan(raw[j, i])
-            z[j, i] = raw[j, i] if known or count == 0 else total / max(count, 1)
+            z[j, i] = raw[j, i] if known or count == 0 else round_height(total / max(count, 1))
             ring[j, i] = 0 if known else (1 if count else deeper)
     for j in range(ny):
         for i in range(0, nx, 1 if j in (0, ny - 1) else max(nx - 1, 1)):
@@ -334,7 +334,7 @@ def _fill_first_at_border(
             count += 1
     ring[j, i] = 1 if count else deeper
     if count:
-        z[j, i] = total / count
+        z[j, i] = round_height(total / count)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -372,8 +372,7 @@ def _blend(
             below = (1 - u) * coarse[low, left] + u * coarse[low, right]
             above = (1 - u) * coarse[high, left] + u * coarse[high, right]
             deep = (1 - v) * below + v * above
-            if ring[j, i] == DEEPER:
-                z[j, i] = deep
-            else:
+            if ring[j, i] < DEEPER:
                 weight = (ring[j, i] - RIM) / (FILL_RINGS - RIM)
-                z[j, i] = (1 - weight) * z[j, i] + weight * deep
+                deep = (1 - weight) * z[j, i] + weight * deep
+            z[j, i] = round_height(deep)
