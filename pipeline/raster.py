@@ -58,7 +58,7 @@ class NodeWindow:
 @numba.njit(cache=True, nogil=True, inline="always")
 def round_height(z: float) -> float:
     """Round a height of the terrain (m) for kernels, to the closest whole number of `HEIGHT_UNIT`; NaN stays."""
-    return np.rint(z / HEIGHT_UNIT) * HEIGHT_UNIT
+    return float(np.rint(z / HEIGHT_UNIT) * HEIGHT_UNIT)
 
 
 def node_window(
