@@ -398,7 +398,7 @@ def in_tmux(words: list[str], width: int, folder: Path) -> Iterator[str]:
 @pytest.mark.long
 @pytest.mark.parametrize("width", [80, 200])
 def test_a_run_in_a_terminal_looks_right(town: Town, tmp_path: Path, width: int) -> None:
-    words = run_words(town, tmp_path / "out", "--workers", "2")
+    words = run_words(town, tmp_path / "out", "--workers", "2", "--mesh-size", "1.5")  # takes some seconds
     screens = list(in_tmux([sys.executable, "-m", "tiler.cli", *words], width, tmp_path))
     views = [rows for screen in screens[:-1] if "in hand" in screen for rows in [screen.rstrip().split("\n")]]
     assert len(views) > 3, screens[-1]
