@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ def set_aside(out: Path) -> None:
     if out.exists():
         home = out.parent / "emptied"
         home.mkdir(exist_ok=True)
-        before = out.rename(home / str(len(os.listdir(home))))
+        before = out.rename(tempfile.mkdtemp(dir=home))
         for path in before.rglob("*"):
             if path.is_file():
                 os.truncate(path, 0)
