@@ -53,16 +53,18 @@ def input_stages(config: Config) -> list[Stage]:
         # What a tile needs of the footprints: it does not run again when others change.
         Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),), version=2),
         Stage("reserved", Scope.REGION, list_reserved, (Read("footprints"),)),
-        Stage("ground", Scope.TILE, bin_tile, (Read("points", halo_of_points(config, spacing)),), ground),
+        Stage(
+            "ground", Scope.TILE, bin_tile, (Read("points", halo_of_points(config, spacing)),), ground, version=2
+        ),
         Stage(
             "flooded",
             Scope.TILE,
             flood_tile,
             (Read("ground", (FILL_RINGS + 2) * spacing),),
             ("dtm_spacing",),
-            version=3,
+            version=4,
         ),
-        Stage("coarse", Scope.REGION, join_coarse, (Read("flooded"),), ("dtm_spacing",)),
+        Stage("coarse", Scope.REGION, join_coarse, (Read("flooded"),), ("dtm_spacing",), version=2),
         # What a tile needs of the coarse level, which is nothing but in wide lakes.
         Stage("lakes", Scope.TILE, take_coarse, (Read("flooded", own=True), Read("coarse")), ("dtm_spacing",)),
         Stage(
@@ -71,7 +73,7 @@ def input_stages(config: Config) -> list[Stage]:
             fill_tile,
             (Read("flooded", own=True), Read("lakes", own=True)),
             ("dtm_spacing",),
-            version=2,
+            version=3,
         ),
     ]
 
