@@ -220,6 +220,18 @@ def test_what_is_told_need_not_be_fetched_and_what_is_not_heard_is(
     assert contents(heard.store.path) == contents(deaf.store.path)
 
 
+def test_messages_go_at_once_also_to_a_worker_that_takes_the_place_of_another(tmp_path: Path) -> None:
+    with local(1) as executor:
+        assert isinstance(executor, Dask)
+        assert executor.scheduler is not None
+        first = set(executor.scheduler.stream_comms)
+        assert executor._client.scheduler_comm.interval == 0.0
+        assert [to_worker.interval for to_worker in executor.scheduler.stream_comms.values()] == [0.0]
+        make(tmp_path, executor, policy=ASIDE).run(faulty(A, t0_0=Once(is_killed, tmp_path / "mark")))
+        assert not first & set(executor.scheduler.stream_comms)
+        assert [to_worker.interval for to_worker in executor.scheduler.stream_comms.values()] == [0.0]
+
+
 def test_of_tasks_that_go_together_only_the_one_that_kills_is_blamed(workers: Executor, tmp_path: Path) -> None:
     """Those before it are there, those after it go again."""
     sizes = fills(workers)

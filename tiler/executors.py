@@ -127,7 +127,8 @@ class Dask:
     A task of Dask costs some 4 ms of the processors, so short tasks of a stage go together as one: as many as
     take `BATCH` seconds, fewer where that would leave another worker without any. What was not sent waits here.
     What came of a batch is told as an event, which takes half of the messages that it takes to fetch a result;
-    what was not heard is fetched.
+    what was not heard is fetched. Messages to the scheduler go as they come: Dask would let 10 ms pass after each,
+    also after the one that lets go of a result, and a task that waits for another one so long.
 
     Where a worker dies, Dask blames all tasks that it had. Here a task is blamed if it had begun, which its file
     tells (`tiler.limits`); the others are sent again.
@@ -155,6 +156,11 @@ class Dask:
         self._submitted = 0
         self._lost = False
         client.subscribe_topic(self._topic, self._hear)
+        client.scheduler_comm.interval = 0.0
+        if scheduler is not None:
+            from tiler.scheduler.prompt import Prompt
+
+            Prompt(scheduler)
 
     @property
     def window(self) -> int:

@@ -1,4 +1,7 @@
-"""Imported by the process that workers are forked from: what all of them need, see `tiler.fork_server`."""
+"""Imported by the process that workers are forked from: what all of them need, see `tiler.fork_server`.
+
+The types and functions that numba knows of are among it: it looks them up at the first kernel, 0.15 s in each.
+"""
 
 import importlib
 
@@ -10,4 +13,8 @@ MODULES = ("distributed.nanny", "tiler.cli", "tiler.run", "zarr")
 with uncollected():
     for name in MODULES:
         importlib.import_module(name)
+    from numba.core.registry import cpu_target
+
+    cpu_target.typing_context.refresh()
+    cpu_target.target_context.refresh()
 look_seldom()
