@@ -8,7 +8,7 @@ import importlib
 from tiler.importing import uncollected
 from tiler.kept_memory import look_seldom
 
-MODULES = ("distributed.nanny", "tiler.cli", "tiler.run", "zarr")
+MODULES = ("distributed.nanny", "tiler.cli", "tiler.executors", "tiler.own_stages", "tiler.worker_setup", "zarr")
 
 with uncollected():
     for name in MODULES:
