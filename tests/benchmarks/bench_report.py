@@ -232,7 +232,7 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
         "area",
         "(c) Area",
-        "480 buildings a km², tiles of 500 m, one worker; the middle one of 3 runs.",
+        "480 buildings a km², tiles of 500 m, one worker; the middle one of 3 runs up to 25 km².",
         lambda rows: _growth(rows, "area", "area"),
     ),
     (
