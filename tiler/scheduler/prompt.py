@@ -16,8 +16,8 @@ class Prompt(SchedulerPlugin):  # type: ignore[misc]  # distributed has no types
 
     def __init__(self, scheduler: Any) -> None:
         scheduler.add_plugin(self)
-        for worker in list(scheduler.stream_comms):
-            self.add_worker(scheduler, worker)
+        for to_worker in list(scheduler.stream_comms.values()):
+            to_worker.interval = 0.0
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
         """Take the pause from what a worker is sent by."""
