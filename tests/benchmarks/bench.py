@@ -2,7 +2,8 @@
 
 The first two are the paper's studies (its section 2.2): (a) cost against the number of cells, (b) against that of
 buildings. What is measured is kept in docs/benchmarks.json, a study each, and docs/benchmarks.md and its pictures
-are written from that: `python -m tests.benchmarks.bench cells` measures one study anew and leaves the others.
+are written from that: `python -m tests.benchmarks.bench cells` measures one study anew and leaves the others, and
+`--large` adds the city of 10 km to those of area and workers (17 and 33 minutes in all).
 """
 
 import json
@@ -28,7 +29,7 @@ KEPT = DOCS / "benchmarks.json"
 MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
 BUILDINGS = (100, 300, 1000, 3000, 10_000, 20_000, 50_000)
 SIDES = (1000, 2000, 3000, 5000)  # m
-LARGE = 10_000  # m, with --large
+LARGEST = (10_000,) if "--large" in sys.argv else ()  # m
 TILES_A_SIDE = (8, 16, 32)
 TILES = (250, 500, 850, 1250, 2500)  # m, on 2.5 km
 WAYS = (
@@ -45,6 +46,7 @@ def measure(city: Path, out: Path, *options: str, cores: int = 1, command: str =
     return {
         "cells": record["counts"]["cells"],
         "total": record["seconds_total"],
+        "command": record["seconds_of_command"],
         "steps": step_seconds(record),
         "peak": record["peak_memory_bytes"],
         "driver": record["driver_memory_bytes"],
@@ -97,9 +99,9 @@ def study_buildings(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_area(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(c) 480 buildings a km2 on more and more of them, one worker; the middle one of 3 runs, the largest once."""
+    """(c) 480 buildings a km2 on more and more of them, one worker; the middle one of 3 runs."""
     rows = []
-    for side in SIDES * 3 + (LARGE,) * ("--large" in sys.argv):
+    for side in (SIDES + LARGEST) * 3:
         city = cities.make(side, round(480 * side**2 / 1e6))
         found = measure(city, out, "--tile-size", "500", "--workers", "1", cores=2)
         rows.append(found | {"area": side**2 / 1e6})
@@ -116,18 +118,27 @@ def study_driver(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(d) The city of 2.5 km and a larger one serially, with workers of Dask, and as a member of `join`.
+    """(d) Cities of 2.5 km and more serially, with workers of Dask, and as a member of `join`.
 
-    Runs take turns. A member's workers are the same processes without Dask between them and the engine.
+    Runs take turns. A member's workers are the same processes without Dask between them and the engine. The time
+    is that of the command, with all that it imports.
     """
-    kinds = (("one process", "run", 0), ("1 worker", "run", 1), ("2 workers", "run", 2), (JOINED, "join", 2))
+    kinds = (("one process", "run", 0), ("2 workers", "run", 2), (JOINED, "join", 2), ("1 worker", "run", 1))
     rows = []
-    for side in (2500, 5000):
+    for side in (2500, 5000, *LARGEST):
         city = cities.make(side, 480 * side**2 // 10**6)
-        for told, command, n in kinds * 3:
+        for told, command, n in kinds[:3] * 3 if side in LARGEST else kinds * 5:
             found = measure(city, out, "--workers", str(n), cores=2, command=command)
-            rows.append(found | {"run as": told, "side": side})
-    return middle_ones(rows, "side", "run as")
+            rows.append(found | {"total": found["command"], "run as": told, "side": side})
+    return with_totals(rows, "side", "run as")
+
+
+def with_totals(rows: Sequence[dict[str, Any]], *keys: str) -> list[dict[str, Any]]:
+    """The `middle_ones`, each with the totals of all rows of its kind."""
+    return [
+        row | {"totals": [one["total"] for one in rows if all(one[key] == row[key] for key in keys)]}
+        for row in middle_ones(rows, *keys)
+    ]
 
 
 def middle_ones(rows: Sequence[dict[str, Any]], *keys: str) -> list[dict[str, Any]]:
@@ -148,12 +159,14 @@ def study_tiles(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """The city of 2.5 km at 10, 5 and 2.5 m with two workers."""
+    """The city of 2.5 km at 10, 5 and 2.5 m, in one process and with two workers, in turn; the command's time."""
     city = cities.make(2500, 3000)
-    return [
-        measure(city, out, "--mesh-size", str(size), "--workers", "2", cores=2) | {"mesh size": size}
-        for size in (10.0, 5.0, 2.5)
-    ]
+    rows = []
+    for size in (10.0, 5.0, 2.5):
+        for n, told in ((0, "one process"), (2, "2 workers")) * 3:
+            found = measure(city, out, "--mesh-size", str(size), "--workers", str(n), cores=2)
+            rows.append(found | {"total": found["command"], "run as": told, "mesh size": size})
+    return with_totals(rows, "mesh size", "run as")
 
 
 def study_rates(cities: Cities, out: Path) -> list[dict[str, Any]]:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -43,9 +44,11 @@ def set_aside(out: Path) -> None:
 
 
 def record_of(city: Path, out: Path, *options: str, cores: int = 2, command: str = "run") -> dict[str, Any]:
-    """Mesh the city into a new folder and return what run.json says."""
+    """Mesh the city into a new folder; what run.json says, and how long the command took (s)."""
     footprints = ("--footprints", str(city / "footprints.shp"))
     set_aside(out)
+    start = time.perf_counter()
     citystitch(command, str(city / "tiles"), *footprints, "--out", str(out), *options, cores=cores)
+    seconds = round(time.perf_counter() - start, 3)
     record: dict[str, Any] = json.loads((out / "run.json").read_text())
-    return record
+    return record | {"seconds_of_command": seconds}
