@@ -130,23 +130,22 @@ def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
         for told, command, n in kinds[:3] * 3 if side in LARGEST else kinds * 5:
             found = measure(city, out, "--workers", str(n), cores=2, command=command)
             rows.append(found | {"total": found["command"], "run as": told, "side": side})
-    return with_totals(rows, "side", "run as")
-
-
-def with_totals(rows: Sequence[dict[str, Any]], *keys: str) -> list[dict[str, Any]]:
-    """The `middle_ones`, each with the totals of all rows of its kind."""
-    return [
-        row | {"totals": [one["total"] for one in rows if all(one[key] == row[key] for key in keys)]}
-        for row in middle_ones(rows, *keys)
-    ]
+    return middle_ones(rows, "side", "run as")
 
 
 def middle_ones(rows: Sequence[dict[str, Any]], *keys: str) -> list[dict[str, Any]]:
-    """Of the rows with the same values of some keys the one whose run took neither longest nor shortest."""
+    """Of the rows with the same values of some keys the one whose run took neither longest nor shortest.
+
+    Each with the ``totals`` of all of its kind, in their order.
+    """
     kinds: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in rows:
         kinds.setdefault(tuple(row[key] for key in keys), []).append(row)
-    return [sorted(some, key=lambda row: float(row["total"]))[len(some) // 2] for some in kinds.values()]
+    return [
+        sorted(some, key=lambda row: float(row["total"]))[len(some) // 2]
+        | {"totals": [row["total"] for row in some]}
+        for some in kinds.values()
+    ]
 
 
 def study_tiles(cities: Cities, out: Path) -> list[dict[str, Any]]:
@@ -166,7 +165,7 @@ def study_fine(cities: Cities, out: Path) -> list[dict[str, Any]]:
         for n, told in ((0, "one process"), (2, "2 workers")) * 3:
             found = measure(city, out, "--mesh-size", str(size), "--workers", str(n), cores=2)
             rows.append(found | {"total": found["command"], "run as": told, "mesh size": size})
-    return with_totals(rows, "mesh size", "run as")
+    return middle_ones(rows, "mesh size", "run as")
 
 
 def study_rates(cities: Cities, out: Path) -> list[dict[str, Any]]:
