@@ -22,7 +22,7 @@ from tiler.quarantine import (
 )
 from tiler.settling import settle_domain
 from tiler.stage import REGION_ITEM
-from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
+from tiler.stages.city import first_round, house_stage, later_round, member_stage, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.inputs import input_stages
 from tiler.stages.mesh import mesh_stages
@@ -84,6 +84,8 @@ def run_city_stages(engine: Engine, config: Config) -> int:
         if not engine.records[f"join-{last + 1}", REGION_ITEM].facts["joined"]:
             break
         last += 1
+        engine.run(member_stage(last))
+        stop_at_holes(engine)
         engine.run(shape_stage(last))
         stop_at_holes(engine)
     engine.run(model_stage(config, last))

@@ -68,8 +68,13 @@ def first_round(config: Config) -> list[Stage]:
             ("clearance",),
         ),
         Stage("join-0", Scope.REGION, join_houses_in_clusters, (Read("houses"), Read("near-0")), version=2),
-        Stage("members-0", Scope.TILE, list_members, (Read("join-0"),), version=2),
+        member_stage(0),
     ]
+
+
+def member_stage(number: int) -> Stage:
+    """Stage that lists the clusters of a round which a tile owns; where none were joined, nothing asks for it."""
+    return Stage(f"members-{number}", Scope.TILE, list_members, (Read(f"join-{number}"),), version=2)
 
 
 def shape_stage(number: int) -> Stage:
@@ -80,7 +85,7 @@ def shape_stage(number: int) -> Stage:
 
 
 def later_round(config: Config, number: int) -> list[Stage]:
-    """Stages that join the clusters whose results came too close in the round before."""
+    """Stages that join the clusters whose results came too close in the round before, if any did."""
     before, after = number - 1, number
     return [
         Stage(
@@ -97,7 +102,6 @@ def later_round(config: Config, number: int) -> list[Stage]:
             (Read(f"join-{before}"), Read(f"near-{after}")),
             version=2,
         ),
-        Stage(f"members-{after}", Scope.TILE, list_members, (Read(f"join-{after}"),), version=2),
     ]
 
 
