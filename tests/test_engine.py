@@ -133,6 +133,24 @@ class Shuffled(Serial):
         return super().wait()
 
 
+class Planned:
+    """Tells which stages have how many items."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def __call__(self, stage: str, done: int, total: int, record: Record) -> None: ...
+
+    def laid_out(self, layout: Layout) -> None: ...
+
+    def planned(self, stage: str, scope: Scope, total: int) -> None:
+        self.told.append(f"{stage} {total}")
+
+    def submitted(self, stage: str, name: str) -> None: ...
+
+    def failed(self, stage: str, name: str, reason: str, needs: tuple[str, str] | None = None) -> None: ...
+
+
 @pytest.fixture(scope="module")
 def one_worker() -> Iterator[Executor]:
     with local(1) as executor:
@@ -508,6 +526,22 @@ def test_some_items_now_and_others_later(tmp_path: Path) -> None:
     engine.run(source, reader, items={"source": ["1.1"], "reader": ["0.0"]})
     assert told == ["source 1.1 4/4", "reader 0.0 1/1"]
     assert engine.records["reader", "0.0"].facts["source"] == ["0.0", "0.1", "1.0", "1.1"]
+
+
+def test_of_its_own_a_reader_may_do_without_what_was_not_run(tmp_path: Path) -> None:
+    watch = Planned()
+    source, other = Stage("source", Scope.TILE, nothing), Stage("other", Scope.TILE, nothing)
+    reads = (Read("source", own=True, optional=True), Read("other", own=True, optional=True))
+    reader = Stage("reader", Scope.TILE, seen, reads)
+    engine = make(tmp_path, progress=watch)
+    engine.run(source, other, reader, items={"source": ["0.1"], "other": []})
+    assert sorted(watch.told) == ["reader 9", "source 1"]  # a stage without items is not at work
+    for name in ("0.0", "0.1"):
+        facts = engine.records["reader", name].facts
+        assert (facts["source"], facts["other"]) == ([name] if name == "0.1" else [], [])
+    strict = Stage("strict", Scope.TILE, seen, (Read("source", own=True),))
+    with pytest.raises(ValueError, match=r"stage source has no item 0\.0, "):
+        engine.run(strict)
 
 
 def test_records_tell_time_and_memory_and_the_store_does_not(serial_run: Engine, tmp_path: Path) -> None:

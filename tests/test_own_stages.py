@@ -116,7 +116,7 @@ def divides(_: Any) -> dict[str, Any]:
     return {"n": 1 // 0}
 
 
-@pytest.mark.parametrize("name", ["terrain", "near-7", "pieces"])
+@pytest.mark.parametrize("name", ["terrain", "lakes", "near-7", "pieces"])
 def test_names_of_ours_are_taken(name: str) -> None:
     with pytest.raises(ValueError, match=f"stage {name}: a stage of citystitch has such a name"):
         check_own(make_config({"pointcloud": ["a.laz"]}), [Stage(name, Scope.TILE, divides)], {})

@@ -404,7 +404,7 @@ def test_a_run_in_a_terminal_looks_right(town: Town, tmp_path: Path, width: int)
     assert len(views) > 3, screens[-1]
     bar = min(60, width - 58)
     for rows in views:
-        assert re.fullmatch(rf"  all {{14}}[━─]{{{bar}}} +\d+%.* \d+ of 27 stages", rows[-2])
+        assert re.fullmatch(rf"  all {{14}}[━─]{{{bar}}} +\d+%.* \d+ of 26 stages", rows[-2])
         assert re.fullmatch(r"  0:00:\d\d, 2 workers, \d+ tasks? in hand.*", rows[-1])
         # One view, and above it nothing but finished stages and stages at work: no row was wrapped or left behind.
         assert sum("in hand" in row and "workers" in row for row in rows) == 1
@@ -420,7 +420,7 @@ def test_a_run_in_a_terminal_looks_right(town: Town, tmp_path: Path, width: int)
     text = "\n".join(last)
     assert "━" not in text
     assert "─" not in text
-    assert len(re.findall(r"^  [a-z0-9-]+ \(\d+\) +[\d.]+ s$", text, re.MULTILINE)) == 27
+    assert len(re.findall(r"^  [a-z0-9-]+ \(\d+\) +[\d.]+ s$", text, re.MULTILINE)) == 26
     assert "quality, percentile" in text
     assert " cells, " in text
 

@@ -341,10 +341,11 @@ class Engine:
             raise ValueError(f"stage {stage.name} reads {source} both by box and by extent")
         everything = reads_everything(stage.scope, scope)
         (first, *_) = (read for read in stage.reads if read.stage == source)
-        if first.own or first.named_by:
-            listed = {
-                name: (name,) if first.own else tuple(self._listed(first.named_by, name)) for name in here.names
-            }
+        if first.own:
+            there = set(run.names if first.optional else here.names)
+            return list_refs(here, source, run, {name: (name,) if name in there else () for name in here.names})
+        if first.named_by:
+            listed = {name: tuple(self._listed(first.named_by, name)) for name in here.names}
             return list_refs(here, source, run, listed)
         if first.around:
             here = self._extents(here, first.around)
@@ -386,7 +387,8 @@ class _Run:
         self.lost: defaultdict[str, set[str]] = defaultdict(set)  # names of what failed or was not run, by stage
         if engine._watch is not None:
             for planned in plan:
-                engine._watch.planned(planned.stage.name, planned.stage.scope, len(planned.items.names))
+                if planned.items.names:
+                    engine._watch.planned(planned.stage.name, planned.stage.scope, len(planned.items.names))
 
     def _order(self) -> NDArray[np.int32]:
         """Where each task stands among those that may run: later stages first, then larger tiles, then names.

@@ -22,7 +22,7 @@ from tiler.stages.approach import approach_stages
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.domain import domain_stages, layer_stages
-from tiler.stages.inputs import input_stages
+from tiler.stages.inputs import fill_stage, input_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import fit_stage, piece_stages
 
@@ -186,6 +186,7 @@ def list_stages(config: Config) -> list[Stage]:
     """List the stages that every run has, in their order."""
     return [
         *input_stages(config),
+        fill_stage(),
         house_stage(config),
         *first_round(config),
         shape_stage(0),

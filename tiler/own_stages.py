@@ -15,7 +15,7 @@ from tiler.stages.approach import approach_stages
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.domain import domain_stages, layer_stages
-from tiler.stages.inputs import input_stages
+from tiler.stages.inputs import fill_stage, input_stages, lake_stage
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import fit_stage, piece_stages
 
@@ -37,8 +37,8 @@ class OwnStages:
 
 
 def list_stages(config: Config) -> list[Stage]:
-    """List the stages of a run in their order, as if its clusters of houses were simplified once."""
-    stages = [*input_stages(config), house_stage(config), *first_round(config), shape_stage(0)]
+    """List the stages of a run in their order, as if it had no lakes, and simplified clusters of houses once."""
+    stages = [*input_stages(config), fill_stage(), house_stage(config), *first_round(config), shape_stage(0)]
     stages += [*later_round(config, 1), model_stage(config, 0), *domain_stages(config)]
     stages += [*approach_stages(config), *layer_stages(config, Domain(config.expected_height, None))]
     stages += [*city_model_stages(), fit_stage(config)]
@@ -62,7 +62,7 @@ def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, 
     """
     own = OwnStages(tuple(stages), dict(parameters or {}))
     # Rounds of simplification are numbered: near-0, near-1, and so on.
-    names = {stage.name.rstrip("0123456789") for stage in list_stages(config)}
+    names = {stage.name.rstrip("0123456789") for stage in [*list_stages(config), lake_stage()]}
     taken = sorted(stage.name for stage in own.stages if stage.name.rstrip("0123456789") in names)
     if taken:
         raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")

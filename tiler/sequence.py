@@ -24,7 +24,7 @@ from tiler.settling import settle_domain
 from tiler.stage import REGION_ITEM
 from tiler.stages.city import first_round, house_stage, later_round, member_stage, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
-from tiler.stages.inputs import input_stages
+from tiler.stages.inputs import fill_stage, input_stages, lake_stage
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import fit_stage, piece_stages
 
@@ -70,6 +70,9 @@ def run_city_stages(engine: Engine, config: Config) -> int:
         If an item was set aside.
     """
     engine.run(*input_stages(config))
+    stop_at_holes(engine)
+    deep = engine.records["coarse", REGION_ITEM].facts["deep"]
+    engine.run(lake_stage(), fill_stage(), items={"lakes": deep})
     stop_at_holes(engine)
     engine.run(house_stage(config))
     stop_at_holes(engine)

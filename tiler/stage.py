@@ -50,7 +50,7 @@ class Read:
         same item.
     optional : bool
         An item that was set aside is left out. Otherwise, and where it is the item of the reader's own name, the
-        reader is not run either.
+        reader is not run either. With `own`, an item that the stage was not run for is left out, too.
     beside : bool
         Leave out the items that meet the reader's box in a corner only: of the tiles around a tile the four beside
         it and itself are read, of the seams its own four.

@@ -13,7 +13,6 @@ from pipeline.pointcloud import BUILDING, GROUND, WATER
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
 from pipeline.terrain import bin_nodes, bin_units
 from pipeline.terrain_fill import (
-    COARSE,
     FILL_RINGS,
     CoarseSums,
     FloodedDtm,
@@ -38,7 +37,7 @@ from tiler.task import Task
 
 
 def input_stages(config: Config) -> list[Stage]:
-    """Stages from the files to the terrain."""
+    """Stages from the files to the coarse level of the terrain."""
     spacing = config.dtm_spacing
     ground = ("dtm_spacing", "ground_filter")
     return [
@@ -64,18 +63,23 @@ def input_stages(config: Config) -> list[Stage]:
             ("dtm_spacing",),
             version=4,
         ),
-        Stage("coarse", Scope.REGION, join_coarse, (Read("flooded"),), ("dtm_spacing",), version=2),
-        # What a tile needs of the coarse level, which is nothing but in wide lakes.
-        Stage("lakes", Scope.TILE, take_coarse, (Read("flooded", own=True), Read("coarse")), ("dtm_spacing",)),
-        Stage(
-            "terrain",
-            Scope.TILE,
-            fill_tile,
-            (Read("flooded", own=True), Read("lakes", own=True)),
-            ("dtm_spacing",),
-            version=3,
-        ),
+        Stage("coarse", Scope.REGION, join_coarse, (Read("flooded"),), ("dtm_spacing",), version=3),
     ]
+
+
+def lake_stage() -> Stage:
+    """Stage of what a tile needs of the coarse level, for the tiles alone that the facts of ``"coarse"`` list.
+
+    Such a tile does not run again when the coarse level of others changes.
+    """
+    reads = (Read("flooded", own=True), Read("coarse"))
+    return Stage("lakes", Scope.TILE, take_coarse, reads, ("dtm_spacing",))
+
+
+def fill_stage() -> Stage:
+    """Stage of the whole terrain of each tile."""
+    reads = (Read("flooded", own=True), Read("lakes", own=True, optional=True))
+    return Stage("terrain", Scope.TILE, fill_tile, reads, ("dtm_spacing",), version=3)
 
 
 def halo_of_points(config: Config, reach: float) -> float:
@@ -230,24 +234,23 @@ def flood_tile(task: Task) -> Facts:
 
 def join_coarse(task: Task) -> Facts:
     """Make the coarse level that the middles of large empty areas take (step 1.3)."""
-    sums = []
+    sums, deep = [], []
     for result in task.read("flooded", ("node", "total", "count")):
         facts, arrays = result.facts, result.arrays
+        if facts["deep"]:
+            deep.append(result.name)
         window = NodeWindow(facts["i0"], facts["j0"], facts["nx"], facts["ny"])
         sums.append(
             CoarseSums(arrays["node"], arrays["total"], arrays["count"], window, facts["known"], facts["spacing"])
         )
     raster = coarse_terrain(merge_coarse(sums))
     task.put(z=raster.z)
-    return _raster_facts(raster)
+    return _raster_facts(raster) | {"deep": sorted(deep)}
 
 
 def take_coarse(task: Task) -> Facts:
-    """Take the coarse nodes that a tile needs, none where nothing in it is empty and deep (step 1.3)."""
+    """Take the coarse nodes that a tile needs whose middles are empty and deep (step 1.3)."""
     (own,) = (result.facts for result in task.read("flooded", ()))
-    nothing = Dtm(np.empty((0, 0)), 0, 0, COARSE * task.parameters.dtm_spacing)
-    if not own["deep"]:
-        return _raster_facts(nothing)
     (coarse,) = (_raster(result.arrays["z"], result.facts) for result in task.read("coarse"))
     around = coarse_around(coarse, NodeWindow(own["i0"], own["j0"], own["nx"], own["ny"]))
     task.put(z=around.z)
