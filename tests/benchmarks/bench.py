@@ -24,6 +24,7 @@ import numpy as np
 
 from tests.benchmarks.bench_report import CHOICE, DOCS, JOINED, MEASURED, step_seconds, write_report
 from tests.benchmarks.runs import COMMAND, citystitch, record_of, set_aside
+from tiler.events import read_events
 
 KEPT = DOCS / "benchmarks.json"
 MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
@@ -131,6 +132,38 @@ def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
             found = measure(city, out, "--workers", str(n), cores=2, command=command)
             rows.append(found | {"total": found["command"], "run as": told, "side": side})
     return middle_ones(rows, "side", "run as")
+
+
+def study_waits(cities: Cities, out: Path) -> list[dict[str, Any]]:
+    """What two workers lose to one process: a longer start, longer tasks, and time without one."""
+    kinds = (("one process", "run", 0), ("2 workers", "run", 2), (JOINED, "join", 2))
+    rows = []
+    for side in (2500, 5000):
+        city = cities.make(side, 480 * side**2 // 10**6)
+        for told, command, n in kinds * 3:
+            found = measure(city, out, "--workers", str(n), cores=2, command=command)
+            row = {"run as": told, "side": side, "total": found["command"]}
+            rows.append(row | find_waits(out, max(n, 1), time.time() - found["command"]))
+    return middle_ones(rows, "side", "run as")
+
+
+def find_waits(out: Path, workers: int, began: float) -> dict[str, float]:
+    """Find how long a run took to its first task, all tasks together, and a worker without one (s).
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the run.
+    workers : int
+        Number of workers.
+    began : float
+        When its command began (s since 1970).
+    """
+    done = [event for event in read_events(out / "events.jsonl") if event["event"] == "done"]
+    first = min(event["t"] - event["seconds"] for event in done)
+    tasks = sum(event["seconds"] for event in done)
+    idle = done[-1]["t"] - first - tasks / workers
+    return {"start": first - began, "tasks": tasks, "idle": idle}
 
 
 def middle_ones(rows: Sequence[dict[str, Any]], *keys: str) -> list[dict[str, Any]]:
@@ -309,6 +342,7 @@ STUDIES: Mapping[str, Study] = {
     "area": study_area,
     "driver": study_driver,
     "workers": study_workers,
+    "waits": study_waits,
     "tiles": study_tiles,
     "fine": study_fine,
     "rates": study_rates,

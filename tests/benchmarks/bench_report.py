@@ -194,6 +194,17 @@ def _workers(rows: Rows) -> list[str]:
     return [*lines, *_speedups(rows, "side", "km", 1000, "2 workers", JOINED)]
 
 
+def _waits(rows: Rows) -> list[str]:
+    lines = [
+        "| city | run as | whole command | before the first task | tasks together | without a task, a worker |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        seconds = " | ".join(f"{row[key]:.2f} s" for key in ("total", "start", "tasks", "idle"))
+        lines.append(f"| {row['side'] / 1000:g} km | {row['run as']} | {seconds} |")
+    return lines
+
+
 def _fine(rows: Rows) -> list[str]:
     two = [row for row in rows if row["run as"] == "2 workers"]
     return [
@@ -259,6 +270,14 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
         "Cities with 480 buildings a km²; the time of the command, the middle one of 5 runs, of 3 above 5 km, in "
         "turn.\n`citystitch join` has the same worker processes, without Dask.",
         _workers,
+    ),
+    (
+        "waits",
+        "What two workers lose",
+        "By the events of runs in turn; the middle one of 3 by the time of the command. Imports take most of what "
+        "comes\nbefore the first task. Tasks take longer beside another one, and beside Dask's driver. A worker "
+        "is without a task\nwhere all wait for the last tile of a stage, and between one task and the next.",
+        _waits,
     ),
     (
         "tiles",
