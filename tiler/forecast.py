@@ -12,19 +12,11 @@ from stitch.grid import Bounds, TileGrid, seams_present, tiles_present
 from stitch.least import LEAST_TILE
 from tiler.clouds import CloudHeader
 from tiler.config import Config
-from tiler.domain import Domain
 from tiler.footprint_sample import FootprintSample
 from tiler.options import expected_levels, size_rule
-from tiler.own_stages import stages_of_pad
+from tiler.own_stages import list_stages, stages_of_pad
 from tiler.planning import Survey
-from tiler.stage import Scope, Stage
-from tiler.stages.approach import approach_stages
-from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
-from tiler.stages.citymodel import city_model_stages
-from tiler.stages.domain import domain_stages, layer_stages
-from tiler.stages.inputs import fill_stage, input_stages
-from tiler.stages.mesh import mesh_stages
-from tiler.stages.pieces import fit_stage, piece_stages
+from tiler.stage import Scope
 
 # Measured on synthetic cities and Amsterdam with mesh sizes of 4 to 20 m: see docs/plan.md.
 TRIANGLES = 3.07  # on open ground, in one squared mesh size
@@ -180,26 +172,6 @@ def _count_items(grid: TileGrid, n_files: int) -> dict[Scope, int]:
         Scope.SEAM: int(seams[0].sum() + seams[1].sum()),
         Scope.REGION: 1,
     }
-
-
-def list_stages(config: Config) -> list[Stage]:
-    """List the stages that every run has, in their order."""
-    return [
-        *input_stages(config),
-        fill_stage(),
-        house_stage(config),
-        *first_round(config),
-        shape_stage(0),
-        *later_round(config, 1),
-        model_stage(config, 0),
-        *domain_stages(config),
-        *approach_stages(config),
-        *layer_stages(config, Domain(config.expected_height, None)),
-        *city_model_stages(),
-        fit_stage(config),
-        *mesh_stages(config),
-        *piece_stages(),
-    ]
 
 
 def spread_points(grid: TileGrid, clouds: Sequence[CloudHeader], core: Bounds) -> NDArray[np.float64]:

@@ -33,6 +33,8 @@ SIDES = (1000, 2000, 3000, 5000)  # m
 LARGEST = (10_000,) if "--large" in sys.argv else ()  # m
 TILES_A_SIDE = (8, 16, 32)
 TILES = (250, 500, 850, 1250, 2500)  # m, on 2.5 km
+# What a run is called, its command, and its workers.
+KINDS = (("one process", "run", 0), ("2 workers", "run", 2), (JOINED, "join", 2))
 WAYS = (
     "",
     "--mesher layered",
@@ -124,11 +126,10 @@ def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
     Runs take turns. A member's workers are the same processes without Dask between them and the engine. The time
     is that of the command, with all that it imports.
     """
-    kinds = (("one process", "run", 0), ("2 workers", "run", 2), (JOINED, "join", 2), ("1 worker", "run", 1))
     rows = []
     for side in (2500, 5000, *LARGEST):
         city = cities.make(side, 480 * side**2 // 10**6)
-        for told, command, n in kinds[:3] * 3 if side in LARGEST else kinds * 5:
+        for told, command, n in KINDS * 3 if side in LARGEST else (*KINDS, ("1 worker", "run", 1)) * 5:
             found = measure(city, out, "--workers", str(n), cores=2, command=command)
             rows.append(found | {"total": found["command"], "run as": told, "side": side})
     return middle_ones(rows, "side", "run as")
@@ -136,11 +137,10 @@ def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 def study_waits(cities: Cities, out: Path) -> list[dict[str, Any]]:
     """What two workers lose to one process: a longer start, longer tasks, and time without one."""
-    kinds = (("one process", "run", 0), ("2 workers", "run", 2), (JOINED, "join", 2))
     rows = []
     for side in (2500, 5000):
         city = cities.make(side, 480 * side**2 // 10**6)
-        for told, command, n in kinds * 3:
+        for told, command, n in KINDS * 3:
             found = measure(city, out, "--workers", str(n), cores=2, command=command)
             row = {"run as": told, "side": side, "total": found["command"]}
             rows.append(row | find_waits(out, max(n, 1), time.time() - found["command"]))
