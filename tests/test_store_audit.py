@@ -62,18 +62,19 @@ def change_digit(path: Path, rng: np.random.Generator) -> None:
 
 
 DAMAGES = [flip, truncate, delete]
+# those of which there is one file come first, before one of the others is chosen of the same result
 KINDS = {
-    "chunk": "store.zarr/*/*/*/c/**/*",
-    "array": "store.zarr/*/*/*/zarr.json",
-    "attributes": "store.zarr/*/*/zarr.json",
-    "volume": "mesh/*.vtu",
-    "boundary": "boundary/*.vtp",
     "volume index": "mesh.pvtu",
     "boundary index": "boundary.pvtp",
     "city model": "citymodel.city.json",
     "full city model": "citymodel-full.city.json",
     "record": "run.json",
     "manifest": "store.zarr/manifest.jsonl",
+    "volume": "mesh/*.vtu",
+    "boundary": "boundary/*.vtp",
+    "chunk": "store.zarr/*/*/*/c/**/*",
+    "array": "store.zarr/*/*/*/zarr.json",
+    "attributes": "store.zarr/*/*/zarr.json",
 }
 
 
