@@ -128,14 +128,17 @@ def children(process: "subprocess.Popen[bytes]") -> list[psutil.Process]:
 
 
 def workers(process: "subprocess.Popen[bytes]") -> list[psutil.Process]:
-    """List the worker processes of a run that lives: forked, or begun from nothing where systems cannot fork."""
+    """List the worker processes of a run that lives.
+
+    They are forked from it or from the process that is there for that, or begun from nothing on some systems.
+    """
     found, servers = [], set()
     for child in children(process):
         try:
             words = " ".join(child.cmdline())
             if "multiprocessing.forkserver" in words and child.ppid() == process.pid:
                 servers.add(child.pid)
-            elif child.ppid() in servers or "spawn_main" in words:
+            elif "multiprocessing.resource_tracker" not in words:
                 found.append(child)
         except psutil.NoSuchProcess:
             continue

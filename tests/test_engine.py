@@ -6,8 +6,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +19,11 @@ import pytest
 
 from pipeline.errors import CityError, GeometryError, InputError
 from pipeline.notes import Note
+from tiler.crew import Crew
 from tiler.engine import Engine
-from tiler.executors import Executor, Serial, local
+from tiler.executors import Executor, Processes, Serial, local
 from tiler.keys import item_key, stage_digest
+from tiler.limits import Limits
 from tiler.scheduler.reach import connect
 from tiler.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
 from tiler.store import Store
@@ -164,16 +168,23 @@ def two_workers() -> Iterator[Executor]:
 
 
 @pytest.fixture(scope="module")
+def two_processes() -> Iterator[Executor]:
+    with closing(Crew(2, Limits(memory=2**30))) as crew:
+        yield Processes(crew)
+
+
+@pytest.fixture(scope="module")
 def serial_run(tmp_path_factory: pytest.TempPathFactory) -> Engine:
     return run_all(make(tmp_path_factory.mktemp("serial")))
 
 
 def test_any_executor_and_any_order_give_the_same_bytes(
-    serial_run: Engine, one_worker: Executor, two_workers: Executor, tmp_path: Path
+    serial_run: Engine, one_worker: Executor, two_workers: Executor, two_processes: Executor, tmp_path: Path
 ) -> None:
     expected = contents(serial_run.store.path)
     assert len(expected) == 3 + 9 + 12 + 9 + 1 + 2 * 12  # groups, and twelve zarr arrays of one chunk each
-    executors = {"one": one_worker, "two": two_workers} | {f"shuffled{k}": Shuffled(k) for k in range(3)}
+    executors = {"one": one_worker, "two": two_workers, "processes": two_processes}
+    executors |= {f"shuffled{k}": Shuffled(k) for k in range(3)}
     for name, executor in executors.items():
         engine = run_all(make(tmp_path / name, executor))
         assert contents(engine.store.path) == expected, name
@@ -436,11 +447,11 @@ def test_what_killed_runs_left_is_swept(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.partial"))
 
 
-@pytest.mark.parametrize("where", ["serial", "two"])
+@pytest.mark.parametrize("where", ["serial", "dask", "processes"])
 def test_the_first_error_names_stage_and_item_and_leaves_nothing(
-    where: str, two_workers: Executor, tmp_path: Path
+    where: str, two_workers: Executor, two_processes: Executor, tmp_path: Path
 ) -> None:
-    executor = two_workers if where == "two" else Serial()
+    executor = {"serial": Serial(), "dask": two_workers, "processes": two_processes}[where]
     engine = make(tmp_path, executor, layout=grid_layout(6))
     with pytest.raises(GeometryError, match=r"^stage fails, tile 1\.1: no valid result$") as caught:
         engine.run(Stage("fails", Scope.TILE, fails, parameters=("scale",)))
@@ -453,8 +464,10 @@ def test_the_first_error_names_stage_and_item_and_leaves_nothing(
     assert len(engine.store.names("after")) == 36
 
 
-def test_other_errors_keep_their_type_and_say_where(two_workers: Executor, tmp_path: Path) -> None:
-    for executor in (Serial(), two_workers):
+def test_other_errors_keep_their_type_and_say_where(
+    two_workers: Executor, two_processes: Executor, tmp_path: Path
+) -> None:
+    for executor in (Serial(), two_workers, two_processes):
         with pytest.raises(ZeroDivisionError) as caught:
             make(tmp_path, executor).run(Stage("divides", Scope.REGION, divides))
         notes = "\n".join(caught.value.__notes__)
@@ -462,6 +475,21 @@ def test_other_errors_keep_their_type_and_say_where(two_workers: Executor, tmp_p
         assert "in divides" in notes
         with pytest.raises(RuntimeError, match="one that cannot be sent"):
             make(tmp_path, executor).run(Stage("odd", Scope.REGION, raises_unpicklable))
+
+
+def test_what_cannot_be_sent_or_read_is_an_error_and_what_waits_is_dropped(
+    two_processes: Executor, tmp_path: Path
+) -> None:
+    """Functions of a notebook or a script are sent as they are."""
+    engine = make(tmp_path, two_processes)
+    lock = threading.Lock()
+    with pytest.raises(TypeError, match=r"cannot pickle '_thread\.lock'"):
+        engine.run(Stage("unsent", Scope.TILE, lambda task: {"locked": lock.locked()}))
+    with pytest.raises(RuntimeError, match="cannot be read by a worker: ValueError"):
+        engine.run(Stage("unread", Scope.REGION, Unreadable()))
+    word = "local"
+    engine.run(Stage("local", Scope.REGION, lambda task: {"stage": task.stage, "word": word}))
+    assert engine.records["local", "region"].facts == {"stage": "local", "word": "local"}
 
 
 def test_a_killed_worker_is_an_error_that_names_the_item(tmp_path: Path) -> None:
@@ -642,11 +670,13 @@ def test_connect_runs_on_a_foreign_scheduler(serial_run: Engine, two_workers: Ex
     assert contents(engine.store.path) == contents(serial_run.store.path)
 
 
-def test_an_interrupt_leaves_no_processes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("executor", ["local(1)", "closing(Processes(Crew(1, Limits())))"])
+def test_an_interrupt_leaves_no_processes(executor: str, tmp_path: Path) -> None:
     code = (
         "from tests.test_engine import *\n"
+        "Processes.close = lambda self: self._crew.close()\n"
         "if __name__ == '__main__':\n"
-        "    with local(1) as executor:\n"
+        f"    with {executor} as executor:\n"
         f"        make(Path({str(tmp_path)!r}), executor).run(Stage('sleeps', Scope.TILE, sleeps))\n"
     )
     script = tmp_path / "main.py"
@@ -734,6 +764,16 @@ class UnpicklableError(Exception):
 
 def raises_unpicklable(task: Task) -> Facts:
     raise UnpicklableError
+
+
+class Unreadable:
+    """A function that fails where it arrives."""
+
+    def __call__(self, task: Task) -> Facts:
+        return {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (int, ("x",))
 
 
 def dies(task: Task) -> Facts:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,8 +14,9 @@ from distributed import Client
 from pipeline.errors import GeometryError, OutputError
 from tests.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
 from tests.test_engine import contents, grid_layout, make, nothing, seen, told
+from tiler.crew import Crew
 from tiler.engine import Engine, StoppedError
-from tiler.executors import Dask, Executor, Serial, local
+from tiler.executors import Dask, Executor, Processes, Serial, local
 from tiler.failures import Policy
 from tiler.limits import TASKS, Limits
 from tiler.stage import Facts, Read, Scope, Stage
@@ -30,9 +32,21 @@ MEMORY, SECONDS = 2**30, 3.0
 
 
 @pytest.fixture(scope="module")
-def workers() -> Iterator[Executor]:
+def dask() -> Iterator[Executor]:
     with local(2, Limits(SECONDS, MEMORY)) as executor:
         yield executor
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[Executor]:
+    with closing(Crew(2, Limits(SECONDS, MEMORY))) as crew:
+        yield Processes(crew)
+
+
+@pytest.fixture(params=["dask", "processes"])
+def workers(request: pytest.FixtureRequest) -> Executor:
+    executor: Executor = request.getfixturevalue(request.param)
+    return executor
 
 
 def faulty(stage: Stage, **faults: Callable[[Task], None]) -> Stage:
@@ -232,11 +246,11 @@ def test_messages_go_at_once_also_to_a_worker_that_takes_the_place_of_another(tm
         assert [to_worker.interval for to_worker in executor.scheduler.stream_comms.values()] == [0.0]
 
 
-def test_of_tasks_that_go_together_only_the_one_that_kills_is_blamed(workers: Executor, tmp_path: Path) -> None:
+def test_of_tasks_that_go_together_only_the_one_that_kills_is_blamed(dask: Executor, tmp_path: Path) -> None:
     """Those before it are there, those after it go again."""
-    sizes = fills(workers)
+    sizes = fills(dask)
     names = {f"t{i}_{j}" for i in range(3, 8) for j in (2, 5)}
-    engine = make(tmp_path, workers, policy=ASIDE, layout=grid_layout(8))
+    engine = make(tmp_path, dask, policy=ASIDE, layout=grid_layout(8))
     engine.run(faulty(replace(A, name="batched"), **dict.fromkeys(names, segfaults)))
     assert max(sizes) > 1
     assert {(name, one.kind, one.attempts) for (_, name), one in engine.set_aside.items()} == {
@@ -278,16 +292,21 @@ def test_a_process_that_was_killed_is_nobodys_fault_at_first(workers: Executor, 
 
 
 @pytest.mark.long
-def test_processes_that_die_again_and_again_are_replaced(tmp_path: Path) -> None:
+@pytest.mark.parametrize("where", ["dask", "processes"])
+def test_processes_that_die_again_and_again_are_replaced(where: str, tmp_path: Path) -> None:
     """One that is just starting when Dask gives up its predecessor, 15 s after that died, lives on."""
     begin = time.monotonic()
-    with local(2, Limits(0.0, MEMORY)) as executor:
+    with ExitStack() as stack:
+        if where == "dask":
+            executor = stack.enter_context(local(2, Limits(0.0, MEMORY)))
+        else:
+            executor = Processes(stack.enter_context(closing(Crew(2, Limits(0.0, MEMORY)))))
         for k in range(1000):
             faults = {f"t{i}_{j}": is_killed for i, j in ((0, 0), (1, 1), (2, 2))[: 1 + k % 3]}
             engine = make(tmp_path / f"{k}", executor, policy=Policy(retries=0, set_aside=True))
             engine.run(faulty(A, **faults))
             assert len(engine.set_aside) == len(faults)
-            if time.monotonic() - begin > 90:
+            if time.monotonic() - begin > (90 if where == "dask" else 15):
                 break
 
 

@@ -20,12 +20,12 @@ from pipeline.errors import CityError, ConfigError, InputError
 from tests.sparse_city import SparseCity, children, make_city, start, wait_for_results, wait_until_gone
 from tests.test_run import hashes
 from tiler.config import make_config
+from tiler.crew import Crew, Given
 from tiler.engine import Engine
 from tiler.executors import LEAST_WINDOW, WINDOW
 from tiler.folder_lock import is_held, only_run
 from tiler.joining import lease as leases
 from tiler.joining import mailbox
-from tiler.joining.crew import Crew, Given
 from tiler.joining.join import ARRAY_INDEX, describe_member, join, name_member
 from tiler.joining.lease import (
     Holder,
@@ -51,7 +51,8 @@ END = 240.0  # s that members may take
 MEMBER = """
 import sys, time
 from pathlib import Path
-from tiler.joining import crew, join
+from tiler import crew
+from tiler.joining import join
 from tiler.cli import main
 give = crew.Crew.give
 def give_slowly(self, given):
@@ -216,7 +217,7 @@ def make_task(folder: Path, name: str) -> Task:
 class IdleCrew(Crew):
     """A crew whose workers never have a hand free: all is the members' to do."""
 
-    def __init__(self, workers: int = 1, limits: Limits | None = None) -> None:
+    def __init__(self, workers: int = 1, limits: Limits | None = None, *, forked: bool = False) -> None:
         self.workers, self.limits, self._hands = workers, limits or Limits(), []
 
     def collect(self, seconds: float) -> list[tuple[Given, Record | Failure]]:
@@ -403,6 +404,7 @@ def test_workers_that_die_are_told_and_replaced(tmp_path: Path) -> None:
     [
         ({"overwrite": True}, "overwrite: members of a run work with what is in its folder"),
         ({"scheduler": "tcp://a:1"}, "scheduler: members of a run"),
+        ({"workers": 2, "dask": True}, "dask: members of a run"),
         ({"out": "s3://bucket/run"}, "s3://bucket/run: members of a run share a folder"),
         ({}, "no point cloud"),
     ],

@@ -33,7 +33,12 @@ def test_what_only_sends_tasks_to_workers_does_not_wait_for_zarr() -> None:
 
 
 def test_workers_are_born_with_what_tasks_import_as_they_run() -> None:
-    assert find_imported(("distributed", "zarr"), ("tiler.preload",)) == ["distributed", "zarr"]
+    assert find_imported(("distributed", "zarr"), ("tiler.preload",)) == ["zarr"]
+    assert find_imported(("distributed", "zarr"), ("tiler.preload_dask",)) == ["distributed", "zarr"]
+
+
+def test_a_run_with_workers_imports_no_dask() -> None:
+    assert find_imported(("dask", "distributed"), ("tiler.run", "tiler.terminal", "tiler.preload")) == []
 
 
 def test_the_memory_of_this_machine_is_what_dask_finds() -> None:

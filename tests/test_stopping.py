@@ -26,11 +26,11 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
     return Town(start.folder, start.out, run(start.config(start.out)))
 
 
-def start(town: Town, out: Path, workers: int) -> "subprocess.Popen[str]":
+def start(town: Town, out: Path, workers: int, *, dask: bool = False) -> "subprocess.Popen[str]":
     config = town.config(out)
     command = [sys.executable, "-m", "tiler.cli", "run", *config.pointcloud, "--footprints", config.footprints]
     command += ["--out", str(out), "--tile-size", str(config.tile_size), "--domain-height", "70"]
-    command += ["--workers", str(workers)]
+    command += ["--workers", str(workers), *(["--dask"] if dask else [])]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     )
@@ -48,10 +48,15 @@ def interrupt(process: "subprocess.Popen[str]", number: int = signal.SIGINT) -> 
     os.killpg(process.pid, number)
 
 
-@pytest.mark.parametrize(("workers", "number"), [(0, signal.SIGINT), (2, signal.SIGINT), (2, signal.SIGTERM)])
-def test_one_ctrl_c_lets_what_runs_end(workers: int, number: int, town: Town, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("workers", "dask"), [(0, False), (2, False), pytest.param(2, True, marks=pytest.mark.long)]
+)
+def test_one_ctrl_c_lets_what_runs_end(
+    workers: int, number: int, town: Town, tmp_path: Path, *, dask: bool
+) -> None:
     out = tmp_path / "out"
-    process = start(town, out, workers)
+    process = start(town, out, workers, dask=dask)
     wait_for(out, "ground")
     if number == signal.SIGINT:
         interrupt(process)
@@ -69,15 +74,17 @@ def test_one_ctrl_c_lets_what_runs_end(workers: int, number: int, town: Town, tm
     assert hashes(out) == hashes(town.out)
 
 
-def test_two_end_at_once_and_nothing_is_lost(town: Town, tmp_path: Path) -> None:
+@pytest.mark.parametrize("dask", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_two_end_at_once_and_nothing_is_lost(town: Town, tmp_path: Path, *, dask: bool) -> None:
     out = tmp_path / "out"
-    process = start(town, out, 2)
+    process = start(town, out, 2, dask=dask)
     wait_for(out, "ground")
     interrupt(process)
     time.sleep(0.05)
     interrupt(process)
     text, _ = process.communicate(timeout=60)
-    assert process.returncode == STOPPED, text
+    # The second one may meet an interpreter that is ending; a shell tells both as 130.
+    assert process.returncode in (STOPPED, -signal.SIGINT), text
     assert "Traceback" not in text
     run(town.config(out))
     assert hashes(out) == hashes(town.out)

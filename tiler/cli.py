@@ -9,6 +9,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,16 +123,23 @@ def _run_config(
     dashboard: str | None = None,
     report: bool = False,
 ) -> int:
-    if config.workers and not config.on_cluster:
-        fork_server.begin()
+    if config.has_crew:
+        fork_server.limit_threads()
+    elif config.workers and not config.on_cluster:
+        fork_server.begin(dask=True)
     look_seldom()
     if not config.workers:
         keep_memory()
     with uncollected():
+        from tiler.crew import Crew
         from tiler.events import EventLog, open_log
+        from tiler.limits import limit_workers
         from tiler.out_folder import refuse_result
         from tiler.run import run
         from tiler.terminal import make_views, print_last_line, print_summary
+
+        if config.has_crew:
+            import tiler.preload  # noqa: F401
 
     if report:
         refuse_bucket(config.out, "--report")
@@ -140,7 +148,11 @@ def _run_config(
     if log is not None:
         refuse_result(out, log)
         watchers.append(EventLog(log, open_log(log), every=0.0))
-    record = run(config, watchers=watchers, dashboard=dashboard)
+    with ExitStack() as stack:
+        crew = None
+        if config.has_crew:
+            crew = stack.enter_context(closing(Crew(config.workers, limit_workers(config), forked=True)))
+        record = run(config, watchers=watchers, dashboard=dashboard, crew=crew)
     if report:
         _report_run(out, quiet=quiet)
     if quiet:
@@ -153,10 +165,13 @@ def _run_config(
 
 def _join(options: argparse.Namespace) -> int:
     config = make_config(with_file(vars(options)))
-    fork_server.begin()
+    fork_server.limit_threads()
+    look_seldom()
     with uncollected():
         from tiler.joining.join import join
         from tiler.terminal import make_views, print_last_line, print_summary
+
+        import tiler.preload  # noqa: F401  # isort: skip
 
     joined = join(
         config,

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple, Protocol
 from pipeline.errors import CityError
 from tiler import fork_server
 from tiler.addresses import ANYWHERE
+from tiler.crew import BYSTANDER, WEIGH, Crew, Given
 from tiler.dask_settings import BOTH, SCHEDULER, WORKER
-from tiler.limits import REFUSE_AT, Limits, WorkerError, machine_memory, run_guarded, tell_death, tell_memory
+from tiler.limits import REFUSE_AT, Limits, WorkerError, run_guarded, share_memory, tell_death, tell_memory
 from tiler.scheduler.check import ClusterMismatchError, UnansweredError, check_cluster, tell_refusal
 from tiler.scheduler.terms import Refusal, Terms, run_on_terms
 from tiler.stage import Facts
@@ -32,10 +33,8 @@ BATCHES = 4  # in flight for each worker of Dask
 TOGETHER = 16  # batches at most that are waited for, to send as many at once
 BATCH = 0.25  # s that the tasks of a batch take together, unless one alone takes longer
 FORGET = 1000  # tasks after which Dask's table of the names of tasks is emptied, which would hold 100,000
-BYSTANDER = 20  # how often a task may wait in a process that dies of another one, before it is an error
 LOOK = 5.0  # s without a word of the scheduler, after which it is asked whether it has workers
 NO_WORKERS = 300.0  # s without any worker, after which a run ends; a busy machine starts them slowly
-MEMORY_SHARE = 0.9  # of the machine, for all workers together
 
 
 class ClusterError(CityError):
@@ -103,6 +102,50 @@ class Serial:
         dropped = {ticket for ticket, _, _ in self._queue}
         self._queue.clear()
         return dropped
+
+
+class Processes:
+    """Tasks in the worker processes of a crew.
+
+    Parameters
+    ----------
+    crew : Crew
+        The processes.
+    """
+
+    def __init__(self, crew: Crew) -> None:
+        self.workers, self._crew = crew.workers, crew
+        self._waiting: list[tuple[int, int, Given]] = []  # heap
+        self._done: deque[tuple[int, Record | Failure]] = deque()
+
+    @property
+    def window(self) -> int:
+        """Some a worker."""
+        return max(2 * WINDOW * self.workers, LEAST_WINDOW)
+
+    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
+        """Take a task; of those that wait, the one of the lowest rank begins first."""
+        heapq.heappush(self._waiting, (rank, ticket, Given(ticket, function, task)))
+
+    def wait(self) -> tuple[int, Record | Failure]:
+        """Wait until any task is done, and give it."""
+        while not self._done:
+            while self._waiting and self._crew.n_free:
+                self._crew.give(self._waiting[0][2])
+                heapq.heappop(self._waiting)
+            self._collect()
+        return self._done.popleft()
+
+    def drop_waiting(self) -> set[int]:
+        """Forget what has not begun, and wait for the rest."""
+        dropped = {ticket for _, ticket, _ in self._waiting}
+        self._waiting.clear()
+        while self._crew.n_busy:
+            self._collect()
+        return dropped
+
+    def _collect(self) -> None:
+        self._done.extend((given.ticket, outcome) for given, outcome in self._crew.collect(WEIGH))
 
 
 class Dask:
@@ -435,7 +478,7 @@ def serial() -> Iterator[Executor]:
 
 @contextmanager
 def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHERE) -> Iterator[Executor]:
-    """Run tasks in worker processes of one thread each on this machine; they end with the context.
+    """Run tasks in Dask's worker processes of one thread each on this machine; they end with the context.
 
     Parameters
     ----------
@@ -447,7 +490,7 @@ def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHE
     dashboard : str
         Where the HTTP server of the scheduler listens, ``HOST:PORT``.
     """
-    fork_server.begin()
+    fork_server.begin(dask=True)
     from dask import config
     from distributed import Client, LocalCluster
 
@@ -493,11 +536,6 @@ def _kill_workers(cluster: Any) -> None:
         nanny.auto_restart = False
         with suppress(OSError, TypeError):
             os.kill(nanny.pid, signal.SIGKILL)
-
-
-def share_memory(workers: int) -> int:
-    """Share of the machine's memory for each of so many workers (bytes)."""
-    return int(MEMORY_SHARE * machine_memory() / max(workers, 1))
 
 
 def _held(dask_worker: Any) -> list[str]:

@@ -21,15 +21,26 @@ ENVIRONMENT: Mapping[str, int] = {
     "MALLOC_TRIM_THRESHOLD_": 2**28,
     "MALLOC_MMAP_THRESHOLD_": 2**25,
 }
-PRELOAD = "tiler.preload"
+PRELOAD, PRELOAD_DASK = "tiler.preload", "tiler.preload_dask"
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 
 
-def begin() -> None:
-    """Start it in the background, unless it runs; a second call does nothing."""
+def limit_threads() -> None:
+    """Keep the libraries that this process imports from now on to one thread: for one that forks itself."""
+    os.environ.update({name: str(value) for name, value in ENVIRONMENT.items() if name.endswith("_THREADS")})
+
+
+def begin(*, dask: bool = False) -> None:
+    """Start it in the background, unless it runs; a second call does nothing.
+
+    Parameters
+    ----------
+    dask : bool
+        Whether the workers are Dask's.
+    """
     if METHOD != "forkserver":
         return
-    multiprocessing.set_forkserver_preload([PRELOAD])
+    multiprocessing.set_forkserver_preload([PRELOAD_DASK if dask else PRELOAD])
     earlier = {name: os.environ.get(name) for name in ENVIRONMENT}
     os.environ.update({name: str(value) for name, value in ENVIRONMENT.items()})
     try:

@@ -11,7 +11,7 @@ from tiler.fork_server import ENVIRONMENT
 
 GARBAGE = 10_000  # new objects after which cycles are looked for
 # Numbers of GNU's mallopt for what workers are given in their environment.
-_SETTINGS = ((-1, "MALLOC_TRIM_THRESHOLD_"), (-3, "MALLOC_MMAP_THRESHOLD_"))
+_SETTINGS = ((-1, "MALLOC_TRIM_THRESHOLD_"), (-3, "MALLOC_MMAP_THRESHOLD_"), (-8, "MALLOC_ARENA_MAX"))
 
 
 def look_seldom() -> None:

@@ -1,4 +1,8 @@
-"""Vector files: what a layer says about itself, and its features within a box (step 1.2)."""
+"""Vector files: what a layer says about itself, and its features within a box (step 1.2).
+
+pyogrio is imported where it is used: few tasks need it, and it brings pyarrow, where that is there, whose memory
+has a thread of its own; a process is forked while it has one thread alone (`tiler.crew`).
+"""
 
 import os
 import struct
@@ -11,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio
 import pyproj
 from numpy.typing import NDArray
 
@@ -108,6 +111,8 @@ def describe_layer(path: Path, layer: str = "") -> Layer:
         return Layer(path, "", *geoparquet.describe(path))
     check_form(path)
     _check_shapefile(path)
+    import pyogrio
+
     with _gdal_as_input_error(path, []):
         table = pyogrio.list_layers(path)
         name = _choose(path, [str(row[0]) for row in table if row[1] is not None], layer)
@@ -180,6 +185,8 @@ def list_some(names: Sequence[str]) -> str:
 def _stream(
     layer: Layer, columns: Sequence[str], box: Box | None, geometry: bool, batch: int
 ) -> Iterator[Features]:
+    import pyogrio
+
     with ExitStack() as stack:
         warned: list[str] = []
         with _gdal_as_input_error(layer.path, warned):
@@ -211,6 +218,8 @@ def _stream(
 def _read_at_once(
     layer: Layer, columns: Sequence[str], box: Box | None, geometry: bool, _batch: int
 ) -> Iterator[Features]:
+    import pyogrio
+
     warned: list[str] = []
     with _gdal_as_input_error(layer.path, warned):
         meta, fids, wkb, values = pyogrio.raw.read(
@@ -232,6 +241,8 @@ def _check_readable(layer: Layer) -> None:
     A stream of GDAL ends at a damaged page of a GPKG without a word. The number that a layer claims may be
     stale too, and that is no damage.
     """
+    import pyogrio
+
     with _gdal_as_input_error(layer.path, []):
         pyogrio.raw.read(layer.path, layer=layer.name, columns=[], read_geometry=False, return_fids=True)
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TextIO
 
 from pipeline.errors import CityError, OutputError
+from tiler.config import Config
 from tiler.places import in_bucket
 from tiler.stage import Facts
 from tiler.task import Failure, Record, Task, run_task
@@ -32,6 +33,7 @@ CONTAINER_MEMORY = (  # where Linux tells what a container may take (bytes): con
     "/sys/fs/cgroup/memory.high",
     "/sys/fs/cgroup/memory.low",
 )
+MEMORY_SHARE = 0.9  # of the machine, for all workers together
 ADVICE = "use fewer workers, give each more memory (--memory-limit), or make tiles smaller"
 
 
@@ -178,3 +180,14 @@ def machine_memory() -> int:
         with suppress(OSError, ValueError):  # not there, or "max"
             found.append(int(Path(path).read_text()))
     return min(memory for memory in found if memory > 0)
+
+
+def share_memory(workers: int) -> int:
+    """Share of the machine's memory for each of so many workers (bytes)."""
+    return int(MEMORY_SHARE * machine_memory() / max(workers, 1))
+
+
+def limit_workers(config: Config) -> Limits:
+    """What a task may take in a worker of this machine; where no number of workers is given, there is one."""
+    workers = max(config.workers, 1)
+    return Limits(config.time_limit, int(config.memory_limit * 2**30) or share_memory(workers))

@@ -1,4 +1,4 @@
-"""Imported by the process that workers are forked from: what all of them need, see `tiler.fork_server`.
+"""Imported by a process that workers are forked from: what all of them need, see `tiler.crew`.
 
 The types and functions that numba knows of are among it: it looks them up at the first kernel, 0.15 s in each.
 """
@@ -8,7 +8,7 @@ import importlib
 from tiler.importing import uncollected
 from tiler.kept_memory import look_seldom
 
-MODULES = ("distributed.nanny", "tiler.cli", "tiler.executors", "tiler.own_stages", "tiler.worker_setup", "zarr")
+MODULES = ("tiler.cli", "tiler.executors", "tiler.own_stages", "zarr")
 
 with uncollected():
     for name in MODULES:

@@ -7,7 +7,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,17 @@ from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.config import Config
+from tiler.crew import Crew
 from tiler.dashboard.server import read_address, watched
 from tiler.engine import StoppedError
-from tiler.executors import Executor, local, serial, share_memory
+from tiler.executors import Executor, Processes, local, serial
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
 from tiler.jobs.table import read_cluster
 from tiler.joining.lease import LostFolderError
 from tiler.joining.spool import SPOOL
 from tiler.keys import code_versions
-from tiler.limits import TASKS, Limits, machine_memory
+from tiler.limits import TASKS, Limits, limit_workers, machine_memory
 from tiler.manifest import find_remade, write_manifest
 from tiler.out_folder import (
     INDEXES,
@@ -81,12 +82,15 @@ class _Means:
         Makes the executor of one who brings it.
     cluster : Executor or None
         Of the scheduler that was asked for.
+    crew : Crew or None
+        Worker processes of one who brings them.
     """
 
     dashboard: str | None
     shown: Path
     own_executor: OwnExecutor | None
     cluster: Executor | None
+    crew: Crew | None
 
 
 def run(
@@ -99,6 +103,7 @@ def run(
     watchers: Sequence[Watcher] = (),
     dashboard: str | None = None,
     executor: OwnExecutor | None = None,
+    crew: Crew | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -122,6 +127,8 @@ def run(
     executor : callable, optional
         Given what tells the run's watchers a sentence, makes the executor of all tasks, a context; by default
         that which `config` asks for.
+    crew : Crew, optional
+        Worker processes to run tasks in; by default they are started if `config` asks for workers of this machine.
 
     Returns
     -------
@@ -157,7 +164,7 @@ def run(
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
             with reach_cluster(config) as cluster:
-                means = _Means(dashboard, shown, executor, cluster)
+                means = _Means(dashboard, shown, executor, cluster, crew)
                 return _run(config, out, earlier, damage, own, announce, told, means)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
@@ -300,9 +307,14 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
             table, folder, Limits(config.time_limit), dashboard=means.dashboard or ANYWHERE, say=say
         ) as executor:
             yield executor
+    elif config.has_crew:
+        if means.crew is not None:
+            yield Processes(means.crew)
+        else:
+            with closing(Crew(config.workers, limit_workers(config))) as crew:
+                yield Processes(crew)
     elif config.workers:
-        limits = Limits(config.time_limit, int(config.memory_limit * 2**30) or share_memory(config.workers))
-        with local(config.workers, limits, dashboard=means.dashboard or ANYWHERE) as executor:
+        with local(config.workers, limit_workers(config), dashboard=means.dashboard or ANYWHERE) as executor:
             yield executor
     else:
         with serial() as executor:

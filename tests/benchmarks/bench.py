@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.benchmarks.bench_report import CHOICE, DOCS, JOINED, MEASURED, step_seconds, write_report
+from tests.benchmarks.bench_report import CHOICE, DASK, DOCS, JOINED, MEASURED, step_seconds, write_report
 from tests.benchmarks.runs import COMMAND, citystitch, record_of, set_aside
 from tiler.events import read_events
 
@@ -33,8 +33,15 @@ SIDES = (1000, 2000, 3000, 5000)  # m
 LARGEST = (10_000,) if "--large" in sys.argv else ()  # m
 TILES_A_SIDE = (8, 16, 32)
 TILES = (250, 500, 850, 1250, 2500)  # m, on 2.5 km
-# What a run is called, its command, and its workers.
-KINDS = (("one process", "run", 0), ("2 workers", "run", 2), (JOINED, "join", 2))
+# What a run is called, its command, its workers and further options.
+Kind = tuple[str, str, int, tuple[str, ...]]
+KINDS: tuple[Kind, ...] = (
+    ("one process", "run", 0, ()),
+    ("2 workers", "run", 2, ()),
+    (DASK, "run", 2, ("--dask",)),
+    (JOINED, "join", 2, ()),
+)
+ONE_WORKER: Kind = ("1 worker", "run", 1, ())
 WAYS = (
     "",
     "--mesher layered",
@@ -112,25 +119,25 @@ def study_area(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_driver(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """Memory of the driver by the number of tiles, small ones of 150 m with hardly a house, two workers."""
+    """Memory of the driver by the number of tiles, of 150 m with hardly a house, two workers of Dask."""
     rows = []
     for n in TILES_A_SIDE:
         city = cities.make(150 * n, n * n // 2, 0.5)
-        rows.append(measure(city, out, "--tile-size", "150", "--workers", "2", cores=2) | {"tiles a side": n})
+        found = measure(city, out, "--tile-size", "150", "--workers", "2", "--dask", cores=2)
+        rows.append(found | {"tiles a side": n})
     return rows
 
 
 def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(d) Cities of 2.5 km and more serially, with workers of Dask, and as a member of `join`.
+    """(d) Cities of 2.5 km and more serially, with workers, with those of Dask, and as a member of `join`.
 
-    Runs take turns. A member's workers are the same processes without Dask between them and the engine. The time
-    is that of the command, with all that it imports.
+    Runs take turns. The time is that of the command, with all that it imports.
     """
     rows = []
     for side in (2500, 5000, *LARGEST):
         city = cities.make(side, 480 * side**2 // 10**6)
-        for told, command, n in KINDS * 3 if side in LARGEST else (*KINDS, ("1 worker", "run", 1)) * 5:
-            found = measure(city, out, "--workers", str(n), cores=2, command=command)
+        for told, command, n, more in KINDS * 3 if side in LARGEST else (*KINDS, ONE_WORKER) * 5:
+            found = measure(city, out, "--workers", str(n), *more, cores=2, command=command)
             rows.append(found | {"total": found["command"], "run as": told, "side": side})
     return middle_ones(rows, "side", "run as")
 
@@ -140,8 +147,8 @@ def study_waits(cities: Cities, out: Path) -> list[dict[str, Any]]:
     rows = []
     for side in (2500, 5000):
         city = cities.make(side, 480 * side**2 // 10**6)
-        for told, command, n in KINDS * 3:
-            found = measure(city, out, "--workers", str(n), cores=2, command=command)
+        for told, command, n, more in KINDS * 3:
+            found = measure(city, out, "--workers", str(n), *more, cores=2, command=command)
             row = {"run as": told, "side": side, "total": found["command"]}
             rows.append(row | find_waits(out, max(n, 1), time.time() - found["command"]))
     return middle_ones(rows, "side", "run as")

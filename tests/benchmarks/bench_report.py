@@ -19,7 +19,7 @@ LEAST_SECONDS = 0.05  # less is not fitted
 MEASURED = "measured"  # day of each study, beside the studies
 # Key and title of a table's first column, where they are not the study's own key.
 TITLES = {"cells": ("mesh size", "mesh size (m)"), "area": ("area", "area (km²)")}
-JOINED = "`join` with 2 workers"
+DASK, JOINED = "2 workers of Dask", "`join` with 2 workers"
 OTHERS = "<!-- exports -->"  # what `make bench-exports` has written begins here
 
 Rows = list[dict[str, Any]]
@@ -191,7 +191,7 @@ def _workers(rows: Rows) -> list[str]:
     lines = []
     for side in dict.fromkeys(row["side"] for row in rows):
         lines += [*_runs([row for row in rows if row["side"] == side], "run as"), ""]
-    return [*lines, *_speedups(rows, "side", "km", 1000, "2 workers", JOINED)]
+    return [*lines, *_speedups(rows, "side", "km", 1000, "2 workers", DASK, JOINED)]
 
 
 def _waits(rows: Rows) -> list[str]:
@@ -231,7 +231,7 @@ def _table(left: str, right: str, rows: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def _shares(rows: Rows) -> list[str]:
-    lines = [f"| step | {' | '.join(row['run as'] for row in rows)} |", "|---|---|---|---|---|"]
+    lines = [f"| step | {' | '.join(row['run as'] for row in rows)} |", "|---" * (1 + len(rows)) + "|"]
     for step in (*STEPS, "rest"):
         parts = (f"{100 * row['steps'][step] / sum(row['steps'].values()):.1f} %" for row in rows)
         lines.append(f"| {step} | " + " | ".join(parts) + " |")
@@ -261,22 +261,22 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
         "driver",
         "Memory of the driver",
-        "Tiles of 150 m with hardly a house; client and Dask's scheduler in one process, two workers.",
+        "Tiles of 150 m with hardly a house; client and Dask's scheduler in one process, two workers (`--dask`).",
         _driver,
     ),
     (
         "workers",
         "(d) Workers",
         "Cities with 480 buildings a km²; the time of the command, the middle one of 5 runs, of 3 above 5 km, in "
-        "turn.\n`citystitch join` has the same worker processes, without Dask.",
+        "turn.\n`citystitch join` has the same worker processes, and looks for members in its folder.",
         _workers,
     ),
     (
         "waits",
         "What two workers lose",
         "By the events of runs in turn; the middle one of 3 by the time of the command. Imports take most of what "
-        "comes\nbefore the first task. Tasks take longer beside another one, and beside Dask's driver. A worker "
-        "is without a task\nwhere all wait for the last tile of a stage, and between one task and the next.",
+        "comes\nbefore the first task. Tasks take longer beside another one, and beside Dask's driver (`--dask`). "
+        "A\nworker is without one where all wait for the last tile of a stage, and between one task and the next.",
         _waits,
     ),
     (

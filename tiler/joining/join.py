@@ -13,17 +13,17 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import CityError, ConfigError, OutputError
 from tiler.config import Config
+from tiler.crew import Crew
 from tiler.engine import StoppedError
-from tiler.executors import Executor, share_memory
+from tiler.executors import Executor
 from tiler.folder_lock import is_held
-from tiler.joining.crew import Crew
 from tiler.joining.lease import (
     LOOK,
     PREFIX,
@@ -42,7 +42,7 @@ from tiler.joining.lease import (
 from tiler.joining.member import Ended, Left, serve
 from tiler.joining.spool import HOLDER, SPOOL, Spool
 from tiler.keys import code_versions
-from tiler.limits import Limits
+from tiler.limits import limit_workers
 from tiler.out_folder import RUN_RECORD, check_folder
 from tiler.places import is_url
 from tiler.plain_text import say_nothing, shorten
@@ -107,10 +107,10 @@ def join(
     CityError
         What `tiler.run.run` raises, in the process that drives; and if the folder is not free in time.
     """
-    if config.overwrite or config.on_cluster:
-        what = "overwrite" if config.overwrite else "scheduler" if config.scheduler else "cluster"
+    refused = [what for what in ("overwrite", "scheduler", "cluster", "dask") if getattr(config, what)]
+    if refused:
         raise ConfigError(
-            f"{what}: members of a run work with what is in its folder, and without a scheduler; leave it out"
+            f"{refused[0]}: members of a run work with what is in its folder, without a scheduler; leave it out"
         )
     if not max_idle > 0:
         raise ConfigError(f"--max-idle {max_idle:g} s: must be above 0 s")
@@ -122,14 +122,9 @@ def join(
     spool = Path(config.out) / SPOOL
     if spool.is_symlink():
         raise ConfigError(f"{spool}: is a symbolic link; remove it")
-    workers = max(config.workers, 1)
-    memory = int(config.memory_limit * 2**30) or share_memory(workers)
-    crew = Crew(workers, Limits(config.time_limit, memory))
-    try:
-        me = this_holder(name, workers, describe_member(config))
+    with closing(Crew(max(config.workers, 1), limit_workers(config), forked=True)) as crew:
+        me = this_holder(name, crew.workers, describe_member(config))
         return _Joining(config, me, crew, max_idle, views, say or say_nothing).go()
-    finally:
-        crew.close()
 
 
 def name_member(given: str) -> str:

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tiler.crew import Crew, Function, Given, Outcome
 from tiler.executors import LEAST_WINDOW, WINDOW
-from tiler.joining.crew import Crew, Function, Given, Outcome
 from tiler.joining.lease import (
     LOOK,
     SILENCE,

@@ -1,19 +1,29 @@
-"""The worker processes of one member of a run: one task each at a time, with the limits of any worker."""
+"""Worker processes of this machine: one task each at a time, with the limits of any worker.
+
+Where the program has imported what tasks need and has one thread, it forks them itself, so that all is imported
+once and the first task begins at once. Else, and where one takes the place of a dead one, they are forked from the
+process that is there for it (`tiler.fork_server`).
+"""
 
 import multiprocessing
 import os
+import pickle
 import queue
 import signal
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
+
 from tiler import fork_server
-from tiler.executors import BYSTANDER
+from tiler.kept_memory import keep_memory
 from tiler.limits import (
     KILL_AT,
     REFUSE_AT,
@@ -30,6 +40,8 @@ from tiler.task import Failure, Record, Task
 Function = Callable[[Task], Facts]
 Outcome = Record | Failure
 WEIGH = 0.5  # s between two looks at the memory of the processes
+BYSTANDER = 20  # how often a task may be given to a process that dies before it begins, before it is an error
+THREADS = Path("/proc/self/task")  # a folder for each thread of this process, also of those that are not Python's
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +74,7 @@ class _Hand:
 
 
 class Crew:
-    """Worker processes of one thread each on this machine; what dies is replaced.
+    """Worker processes of one thread each on this machine; what dies is replaced. `close` ends them.
 
     Parameters
     ----------
@@ -70,15 +82,15 @@ class Crew:
         Number of processes.
     limits : Limits
         What a task may take.
+    forked : bool
+        Fork the first ones from this process if it has one thread; it should have imported `tiler.preload`.
     """
 
-    def __init__(self, workers: int, limits: Limits) -> None:
+    def __init__(self, workers: int, limits: Limits, *, forked: bool = False) -> None:
         self.workers, self.limits = workers, limits
-        self._methods: Any = multiprocessing.get_context(fork_server.METHOD)
-        fork_server.begin()
         self._weighed = time.monotonic()
         self._hands: list[_Hand] = []
-        self._hire()
+        self._hire("fork" if forked and has_one_thread() else fork_server.METHOD)
 
     @property
     def n_free(self) -> int:
@@ -91,7 +103,7 @@ class Crew:
         return len(self._hands) - self.n_free
 
     def give(self, given: Given) -> None:
-        """Give a task to a process that has none; ValueError if all have one."""
+        """Give a task to a process that has none; ValueError if all have one, pickle's if it cannot go."""
         for hand in self._hands:
             if hand.given is None:
                 self._send(hand, given, 0)
@@ -116,7 +128,7 @@ class Crew:
         """End all processes at once and replace them; gives what they had in hand."""
         had = [hand.given for hand in self._hands if hand.given is not None]
         self.close()
-        self._hire()
+        self._hire(fork_server.METHOD)
         return had
 
     def close(self) -> None:
@@ -128,23 +140,28 @@ class Crew:
             hand.pipe.close()
         self._hands = []
 
-    def _hire(self) -> None:
-        self._hands = [self._start() for _ in range(self.workers)]
+    def _hire(self, method: str) -> None:
+        for _ in range(self.workers):
+            self._hands.append(self._start(method))
 
-    def _start(self) -> _Hand:
-        ours, theirs = self._methods.Pipe()
+    def _start(self, method: str) -> _Hand:
+        """Start a process; one that is forked from this one has the pipes of those before it, and closes them."""
+        if method != "fork":
+            fork_server.begin()
+        methods: Any = multiprocessing.get_context(method)
+        ours, theirs = methods.Pipe()
+        others = [ours, *(hand.pipe for hand in self._hands)] if method == "fork" else []
         memory = int(REFUSE_AT * self.limits.memory)
-        process = self._methods.Process(target=_work, args=(theirs, memory, self.limits.seconds), daemon=True)
+        process = methods.Process(target=_work, args=(theirs, others, memory, self.limits.seconds), daemon=True)
         process.start()
         theirs.close()
         return _Hand(process, ours)
 
     def _send(self, hand: _Hand, given: Given, deaths: int) -> None:
+        sent = cloudpickle.dumps((given.function, given.task))  # also what a notebook or a script defines
         hand.given, hand.deaths = given, deaths
-        try:
-            hand.pipe.send((given.function, given.task))
-        except OSError:  # it has died: seen when it is asked
-            return
+        with suppress(OSError):  # it has died: seen when it is asked
+            hand.pipe.send_bytes(sent)
 
     def _receive(self, hand: _Hand) -> Outcome | None:
         """Take the outcome of a process; replace it if it has died."""
@@ -161,7 +178,7 @@ class Crew:
         hand.process.join()
         hand.pipe.close()
         given, deaths = hand.given, hand.deaths + 1
-        fresh = self._start()
+        fresh = self._start(fork_server.METHOD)
         hand.process, hand.pipe = fresh.process, fresh.pipe
         if given is None:
             return None
@@ -190,23 +207,42 @@ def _resident(pid: int) -> int:
         return 0
 
 
-def _work(pipe: Any, memory: int, seconds: float) -> None:
-    """Run tasks until the other end is gone; signals are the member's affair."""
+def has_one_thread() -> bool:
+    """Tell whether this process may be forked: what its other threads hold would be held for ever in a copy."""
+    try:
+        return sys.platform == "linux" and len(os.listdir(THREADS)) == 1
+    except OSError:
+        return False
+
+
+def _work(pipe: Any, others: Sequence[Any], memory: int, seconds: float) -> None:
+    """Run tasks until the other end is gone; signals are the driver's affair."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    for other in others:
+        other.close()
+    keep_memory()
     if memory:
         limit_memory(memory)
-    tasks: queue.SimpleQueue[tuple[Function, Task]] = queue.SimpleQueue()
+    tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(pipe, tasks), daemon=True).start()
     while True:
-        function, task = tasks.get()
-        pipe.send(run_guarded(function, task, seconds))
+        pipe.send(_run(tasks.get(), seconds))
 
 
-def _listen(pipe: Any, tasks: "queue.SimpleQueue[tuple[Function, Task]]") -> None:
-    """Take tasks; whose member has died ends at once."""
+def _run(sent: bytes, seconds: float) -> Outcome:
+    """Run a task as it was sent; an error of its own reading is its outcome."""
+    try:
+        function, task = pickle.loads(sent)
+    except Exception as error:
+        return Failure(RuntimeError(f"cannot be read by a worker: {type(error).__name__}: {error}"))
+    return run_guarded(function, task, seconds)
+
+
+def _listen(pipe: Any, tasks: "queue.SimpleQueue[bytes]") -> None:
+    """Take tasks; whose driver has died ends at once."""
     while True:
         try:
-            tasks.put(pipe.recv())
+            tasks.put(pipe.recv_bytes())
         except Exception:
             os._exit(1)
