@@ -82,6 +82,7 @@ def test_the_command_forks_its_workers_itself_and_another_process_those_that_rep
         assert process.wait(240) == 0
     finally:
         process.kill()
+        process.wait()
     assert hashes(tmp_path / "again") == city.hashes
 
 
