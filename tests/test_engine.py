@@ -536,6 +536,18 @@ def test_of_a_stage_larger_tiles_go_first(tmp_path: Path) -> None:
     assert order[4:] == ["small", "wide"]
 
 
+def test_of_files_and_seams_those_go_first_that_the_larger_tiles_read(tmp_path: Path) -> None:
+    order: list[str] = []
+    boxes = {"a": (0.0, 0.0, 1.0, 1.0), "b": (1.0, 0.0, 3.0, 1.0), "c": (3.0, 0.0, 6.0, 1.0)}
+    seams = {"1": (0.5, 0.0, 0.5, 0.0), "2": (1.5, 0.0, 1.5, 0.0), "3": (3.5, 0.0, 3.5, 0.0)}
+    layout = Layout({}, boxes, seams, (0.0, 0.0, 6.0, 1.0))
+    engine = make(
+        tmp_path, layout=layout, window=1, progress=lambda *told: order.append(f"{told[0]} {told[3].name}")
+    )
+    engine.run(Stage("seams", Scope.SEAM, nothing), Stage("tiles", Scope.TILE, nothing, (Read("seams", 0.0),)))
+    assert order == ["seams 3", "tiles c", "seams 2", "tiles b", "seams 1", "tiles a"]
+
+
 def test_progress_counts_to_the_end(tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
     engine = make(tmp_path, progress=lambda stage, done, total, record: told.append((stage, done, total)))

@@ -163,8 +163,8 @@ class Engine:
         """Run stages whose reads are among them or were run before.
 
         A task is submitted when all that it reads is done; of those that may run, those of later stages go first,
-        then those of larger tiles, then in the order of names. Of what counts by its name alone it is taken for
-        granted that it will be there; what was misled by that is run again in the end.
+        then those of larger tiles and what these read, then in the order of names. Of what counts by its name
+        alone it is taken for granted that it will be there; what was misled by that is run again in the end.
 
         Parameters
         ----------
@@ -393,13 +393,18 @@ class _Run:
     def _order(self) -> NDArray[np.int32]:
         """Where each task stands among those that may run: later stages first, then larger tiles, then names.
 
-        What takes longest begins first, so that no worker is left with it alone at the end of a stage.
+        What takes longest begins first, so that no worker is left with it alone at the end of a stage; so does
+        what it waits for: files and seams count by the largest of the tiles that read them.
         """
         area = np.zeros(len(self.rank))
         for planned in self.plan:
             if planned.stage.scope is Scope.TILE:
                 xmin, ymin, xmax, ymax = planned.items.boxes.T
                 area[planned.first : planned.first + len(xmin)] = np.rint((xmax - xmin) * (ymax - ymin))
+        read = np.flatnonzero(np.diff(self.start))
+        of_readers = np.zeros_like(area)
+        of_readers[read] = np.maximum.reduceat(area[self.waiting], self.start[read])
+        area = np.where(area > 0, area, of_readers)
         order = np.empty(len(area), np.int32)
         order[np.lexsort((-area, -self.rank))] = np.arange(len(area), dtype=np.int32)
         return order
