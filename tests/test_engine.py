@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,11 @@ import pytest
 
 from pipeline.errors import CityError, GeometryError, InputError
 from pipeline.notes import Note
-from tiler.crew import Crew
 from tiler.engine import Engine
-from tiler.executors import Executor, Processes, Serial, local
+from tiler.executors import Executor, Serial, processes
 from tiler.keys import item_key, stage_digest
 from tiler.limits import Limits
+from tiler.scheduler.executor import local
 from tiler.scheduler.reach import connect
 from tiler.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
 from tiler.store import Store
@@ -169,8 +168,8 @@ def two_workers() -> Iterator[Executor]:
 
 @pytest.fixture(scope="module")
 def two_processes() -> Iterator[Executor]:
-    with closing(Crew(2, Limits(memory=2**30))) as crew:
-        yield Processes(crew)
+    with processes(2, Limits(memory=2**30)) as executor:
+        yield executor
 
 
 @pytest.fixture(scope="module")
@@ -682,11 +681,10 @@ def test_connect_runs_on_a_foreign_scheduler(serial_run: Engine, two_workers: Ex
     assert contents(engine.store.path) == contents(serial_run.store.path)
 
 
-@pytest.mark.parametrize("executor", ["local(1)", "closing(Processes(Crew(1, Limits())))"])
+@pytest.mark.parametrize("executor", ["local(1)", "processes(1)"])
 def test_an_interrupt_leaves_no_processes(executor: str, tmp_path: Path) -> None:
     code = (
         "from tests.test_engine import *\n"
-        "Processes.close = lambda self: self._crew.close()\n"
         "if __name__ == '__main__':\n"
         f"    with {executor} as executor:\n"
         f"        make(Path({str(tmp_path)!r}), executor).run(Stage('sleeps', Scope.TILE, sleeps))\n"

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,11 +14,11 @@ from distributed import Client
 from pipeline.errors import GeometryError, OutputError
 from tests.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
 from tests.test_engine import contents, grid_layout, make, nothing, seen, told
-from tiler.crew import Crew
 from tiler.engine import Engine, StoppedError
-from tiler.executors import Dask, Executor, Processes, Serial, local
+from tiler.executors import Executor, Serial, processes
 from tiler.failures import Policy
 from tiler.limits import TASKS, Limits
+from tiler.scheduler.executor import Dask, local
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.task import Record, Task
 
@@ -38,12 +38,12 @@ def dask() -> Iterator[Executor]:
 
 
 @pytest.fixture(scope="module")
-def processes() -> Iterator[Executor]:
-    with closing(Crew(2, Limits(SECONDS, MEMORY))) as crew:
-        yield Processes(crew)
+def plain() -> Iterator[Executor]:
+    with processes(2, Limits(SECONDS, MEMORY)) as executor:
+        yield executor
 
 
-@pytest.fixture(params=["dask", "processes"])
+@pytest.fixture(params=["dask", "plain"])
 def workers(request: pytest.FixtureRequest) -> Executor:
     executor: Executor = request.getfixturevalue(request.param)
     return executor
@@ -292,21 +292,19 @@ def test_a_process_that_was_killed_is_nobodys_fault_at_first(workers: Executor, 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("where", ["dask", "processes"])
-def test_processes_that_die_again_and_again_are_replaced(where: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("where", "seconds"), [(local, 90), (processes, 15)])
+def test_processes_that_die_again_and_again_are_replaced(
+    where: Callable[..., AbstractContextManager[Executor]], seconds: float, tmp_path: Path
+) -> None:
     """One that is just starting when Dask gives up its predecessor, 15 s after that died, lives on."""
     begin = time.monotonic()
-    with ExitStack() as stack:
-        if where == "dask":
-            executor = stack.enter_context(local(2, Limits(0.0, MEMORY)))
-        else:
-            executor = Processes(stack.enter_context(closing(Crew(2, Limits(0.0, MEMORY)))))
+    with where(2, Limits(0.0, MEMORY)) as executor:
         for k in range(1000):
             faults = {f"t{i}_{j}": is_killed for i, j in ((0, 0), (1, 1), (2, 2))[: 1 + k % 3]}
             engine = make(tmp_path / f"{k}", executor, policy=Policy(retries=0, set_aside=True))
             engine.run(faulty(A, **faults))
             assert len(engine.set_aside) == len(faults)
-            if time.monotonic() - begin > (90 if where == "dask" else 15):
+            if time.monotonic() - begin > seconds:
                 break
 
 

@@ -3,8 +3,6 @@
 import gc
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
 from pathlib import Path
 
 import psutil
@@ -15,19 +13,13 @@ from tests.sparse_city import children, make_city, start, workers
 from tests.test_engine import grid_layout, make, wait_until
 from tests.test_run import hashes
 from tiler import fork_server
-from tiler.crew import Crew
-from tiler.executors import Executor, Processes, local
+from tiler.executors import processes
 from tiler.limits import TRIM_AT, Limits, resident_memory
+from tiler.scheduler.executor import local
 from tiler.stage import Facts, Scope, Stage
 from tiler.task import Task
 
 pytestmark = pytest.mark.skipif(fork_server.METHOD != "forkserver", reason="workers are forked on Linux alone")
-
-
-@contextmanager
-def in_processes(workers: int, limits: Limits) -> Iterator[Executor]:
-    with closing(Crew(workers, limits)) as crew:
-        yield Processes(crew)
 
 
 def look(task: Task) -> Facts:
@@ -57,7 +49,7 @@ def test_workers_are_forked_with_their_settings_and_the_driver_keeps_its_own(
     fork_server.begin()
     assert dict(os.environ) == earlier
     limits = Limits(memory=2**30)
-    with local(1, limits) if dask else in_processes(1, limits) as executor:
+    with local(1, limits) if dask else processes(1, limits) as executor:
         engine = make(tmp_path, executor, layout=grid_layout())
         engine.run(Stage("looks", Scope.REGION, look_at_dask if dask else look))
     facts = engine.records["looks", "region"].facts
@@ -101,7 +93,7 @@ def tell_memory_now(task: Task) -> Facts:
 
 
 def test_a_worker_that_holds_much_gives_it_back_before_the_next_task(tmp_path: Path) -> None:
-    with in_processes(1, Limits(memory=2 * 2**30)) as executor:
+    with processes(1, Limits(memory=2 * 2**30)) as executor:
         engine = make(tmp_path, executor, layout=grid_layout())
         engine.run(Stage("fragments", Scope.REGION, fragment))
         engine.run(Stage("tells", Scope.REGION, tell_memory_now))

@@ -14,11 +14,11 @@ import pytest
 from pipeline.errors import CityError
 from tests.test_engine import make
 from tiler import fork_server
-from tiler.executors import ClusterError
 from tiler.jobs.jobqueue import LOSSES, SETTINGS, UNBORN, QueuedDask, _Jobs, read_worker_jobs
 from tiler.jobs.queues import QueueError
 from tiler.jobs.table import Cluster
 from tiler.limits import Limits
+from tiler.scheduler.executor import ClusterError
 from tiler.stage import Facts, Scope, Stage
 from tiler.task import Task
 
@@ -101,7 +101,7 @@ def test_a_task_on_a_retiring_worker_is_not_lost(tmp_path: Path) -> None:
 
 
 def test_workers_that_never_come_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tiler.executors.LOOK", 0.2)
+    monkeypatch.setattr("tiler.scheduler.executor.LOOK", 0.2)
     with (
         queued(workers=0, broken="5 worker jobs in a row ended before their worker was there") as executor,
         pytest.raises(ClusterError, match="5 worker jobs in a row"),

@@ -56,11 +56,14 @@ class Given:
         Function of its stage.
     task : Task
         The task.
+    rank : int
+        Of those that wait, the one of the lowest goes first.
     """
 
     ticket: int
     function: Function
     task: Task
+    rank: int = 0
 
 
 @dataclass(eq=False)

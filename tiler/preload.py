@@ -8,7 +8,7 @@ import importlib
 from tiler.importing import uncollected
 from tiler.kept_memory import look_seldom
 
-MODULES = ("tiler.cli", "tiler.executors", "tiler.own_stages", "zarr")
+MODULES = ("tiler.cli", "tiler.crew", "tiler.own_stages", "zarr")
 
 with uncollected():
     for name in MODULES:

@@ -5,5 +5,5 @@ import importlib
 from tiler.importing import uncollected
 
 with uncollected():
-    for name in ("distributed.nanny", "tiler.preload", "tiler.worker_setup"):
+    for name in ("distributed.nanny", "tiler.preload", "tiler.scheduler.executor", "tiler.worker_setup"):
         importlib.import_module(name)

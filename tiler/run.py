@@ -7,7 +7,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from tiler.config import Config
 from tiler.crew import Crew
 from tiler.dashboard.server import read_address, watched
 from tiler.engine import StoppedError
-from tiler.executors import Executor, Processes, local, serial
+from tiler.executors import Executor, Processes, processes, serial
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
 from tiler.jobs.table import read_cluster
@@ -53,6 +53,7 @@ from tiler.quarantine import (
     save_config,
 )
 from tiler.run_watchers import begin_watching
+from tiler.scheduler.executor import local
 from tiler.scheduler.reach import reach_cluster, spell_out
 from tiler.seal import seal
 from tiler.sequence import make_engine, run_stages
@@ -311,8 +312,8 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
         if means.crew is not None:
             yield Processes(means.crew)
         else:
-            with closing(Crew(config.workers, limit_workers(config))) as crew:
-                yield Processes(crew)
+            with processes(config.workers, limit_workers(config)) as executor:
+                yield executor
     elif config.workers:
         with local(config.workers, limit_workers(config), dashboard=means.dashboard or ANYWHERE) as executor:
             yield executor

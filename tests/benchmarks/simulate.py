@@ -20,7 +20,7 @@ from tests.benchmarks.recorded import record
 from tests.benchmarks.virtual import StandInStore, VirtualWorkers, instant
 from tiler.config import Config, make_config
 from tiler.engine import Engine, StoppedError
-from tiler.executors import Executor, local
+from tiler.executors import Executor
 from tiler.manifest import find_remade, write_manifest
 from tiler.out_folder import MANIFEST_PATH, STORE
 from tiler.own_stages import OwnStages, list_stages
@@ -28,6 +28,7 @@ from tiler.planning import Plan, make_plan
 from tiler.progress import RunProgress
 from tiler.quarantine import HolesError, Missing, find_missing, leave_holes
 from tiler.records import Records
+from tiler.scheduler.executor import local
 from tiler.sequence import make_engine, run_stages
 from tiler.summary import summarise_run
 from tiler.task import Record
@@ -190,7 +191,7 @@ def run_dask(country: str, n_tiles: int, workers: int, folder: Path) -> dict[str
     config, plan, told = survey(country, n_tiles, folder)
     shutil.rmtree(config.out, ignore_errors=True)
     store = StandInStore(Path(config.out) / STORE, plan.layout, config.tile_size)
-    with local(workers) as executor, patch("tiler.executors.run_guarded", instant):
+    with local(workers) as executor, patch("tiler.scheduler.executor.run_guarded", instant):
         time.sleep(SETTLE)
         gc.collect()
         told["memory_cluster"] = memory()

@@ -12,7 +12,8 @@ import numpy as np
 
 from pipeline.errors import CityError
 from tests.benchmarks.recorded import choose, draw, make_facts
-from tiler.executors import LEAST_WINDOW, WINDOW, Function
+from tiler.crew import Function
+from tiler.executors import LEAST_WINDOW, WINDOW
 from tiler.stage import Box, Facts, Layout, Scope
 from tiler.store import Store
 from tiler.task import Failure, Record, Task, run_task

@@ -1,4 +1,4 @@
-"""Workers as jobs of a batch system, brought up by dask-jobqueue as there is work; see `tiler.executors`."""
+"""Workers as jobs of a batch system, brought up by dask-jobqueue as there is work, see `tiler.scheduler`."""
 
 import asyncio
 import json
@@ -16,11 +16,12 @@ from tiler import fork_server
 from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.dask_settings import BOTH, SCHEDULER, WORKER, as_variables
-from tiler.executors import ClusterError, Dask, Executor
+from tiler.executors import Executor
 from tiler.jobs.queues import QUEUES, JobSize, Queue, QueueError
 from tiler.jobs.table import Cluster
 from tiler.limits import REFUSE_AT, Limits
 from tiler.plain_text import say_nothing
+from tiler.scheduler.executor import ClusterError, Dask
 from tiler.task import Failure, Task
 
 JOB = "job"  # folder in that of a run, with all that its jobs need and print

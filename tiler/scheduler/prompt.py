@@ -9,7 +9,7 @@ class Prompt(SchedulerPlugin):  # type: ignore[misc]  # distributed has no types
     """Sends what workers are told as it comes, also to those that come later.
 
     Dask lets 5 ms pass between two messages to a worker, so that more go together. What goes together here is in
-    batches already (`tiler.executors.Dask`), and a task that another waits for would wait that long.
+    batches already (`tiler.scheduler.executor.Dask`), and a task that another waits for would wait that long.
     """
 
     name = "citystitch-prompt"

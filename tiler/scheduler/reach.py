@@ -9,10 +9,11 @@ from pathlib import Path
 from pipeline.errors import CityError
 from tiler.clouds import find_clouds
 from tiler.config import Config
-from tiler.executors import Dask, Executor
+from tiler.executors import Executor
 from tiler.limits import Limits
 from tiler.places import absolute, is_url
 from tiler.scheduler.check import check_cluster
+from tiler.scheduler.executor import Dask
 from tiler.scheduler.terms import Terms, offer_terms, own_terms
 from tiler.scheduler.transport import NO_FILES, TlsFiles, check_answer, make_security
 
@@ -98,8 +99,8 @@ def connect(
     Notes
     -----
     A worker that dies is not replaced: the others take its tasks. A lost scheduler ends the run with a
-    `ClusterError`, and so does a cluster that has had no worker for `tiler.executors.NO_WORKERS` seconds. A link
-    to the scheduler that is cut is lost after `PATIENCE`, or what Dask's configuration has for it if that is more.
+    `ClusterError`, and so does a cluster that has had no worker for `NO_WORKERS` seconds. A link to the scheduler
+    that is cut is lost after `PATIENCE`, or what Dask's configuration has for it if that is more.
     """
     from dask import config
     from dask.utils import parse_timedelta
