@@ -95,7 +95,7 @@ def test_a_run_at_work(
     assert (status["state"], status["held"], status["pid"]) == ("running", True, os.getpid())
     stages = status["stages"]
     assert "finished" in stages["model"]
-    assert (stages["columns"]["total"], stages["columns"]["done"]) == (4, 0)
+    assert (stages["columns"]["total"], stages["columns"]["done"] < 4) == (4, True)
     assert (stages["seams"]["done"], stages["seams"]["finished"] > 0) == (12, True)
     running = Counter(item["stage"] for item in status["running"])
     assert running == {name: stage["running"] for name, stage in stages.items() if stage["running"]}
