@@ -2,6 +2,8 @@
 
 import gc
 import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import pytest
 from distributed import get_worker
 
 from tests.sparse_city import children, make_city, start, workers
-from tests.test_engine import grid_layout, make, wait_until
+from tests.test_engine import ROOT, grid_layout, make, wait_until
 from tests.test_run import hashes
 from tiler import fork_server
 from tiler.executors import processes
@@ -76,6 +78,48 @@ def test_the_command_forks_its_workers_itself_and_another_process_those_that_rep
         process.kill()
         process.wait()
     assert hashes(tmp_path / "again") == city.hashes
+
+
+# The worker that was forked last hangs, and cannot see that its driver is dead; the other one must.
+KILLED = """
+import os, signal, sys, time
+from pathlib import Path
+from tests.faults import hangs_in_c
+from tests.test_join import give_one, make_task
+from tiler import crew
+from tiler.crew import Crew, Given
+from tiler.limits import Limits, trace_file
+crew.has_one_thread = lambda: True  # but for one of pyarrow's memory
+crew = Crew(2, Limits(), forked=True)
+folder = Path(sys.argv[1])
+crew.give(Given(0, give_one, make_task(folder, "a")))
+hanging = make_task(folder, "b")
+crew.give(Given(1, hangs_in_c, hanging))
+while not crew.collect(1.0) or not trace_file(hanging).exists():
+    pass
+time.sleep(0.5)
+print(*(f"{type(hand.process).__name__} {hand.process.pid}" for hand in crew._hands), flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def lives(pid: int) -> bool:
+    return bool(psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+
+
+def test_a_worker_ends_with_its_driver_whatever_those_forked_after_it_do(tmp_path: Path) -> None:
+    one_thread = {name: "1" for name in fork_server.ENVIRONMENT if name.endswith("_THREADS")}
+    command = [sys.executable, "-c", KILLED, str(tmp_path)]
+    with (tmp_path / "told.txt").open("w") as told:  # a pipe would be open as long as the worker that hangs
+        subprocess.run(command, cwd=ROOT, env=os.environ | one_thread, stdout=told, check=False)
+    words = (tmp_path / "told.txt").read_text().split()
+    assert words[::2] == ["ForkProcess"] * 2
+    first, last = map(int, words[1::2])
+    try:
+        assert lives(last)
+        wait_until(lambda: not lives(first), seconds=20)
+    finally:
+        os.kill(last, signal.SIGKILL)
 
 
 KEPT: list[bytearray] = []
