@@ -5,6 +5,7 @@ import gc
 import json
 import logging
 import os
+import signal
 import sys
 import tempfile
 import warnings
@@ -67,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_FAILED
     finally:
         if arguments is None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said; Python would end with a traceback
             gc.freeze()  # the process ends: a last look for garbage in all that was imported takes 0.2 s
 
 
