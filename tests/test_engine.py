@@ -477,7 +477,7 @@ def test_other_errors_keep_their_type_and_say_where(
 
 
 def test_what_cannot_be_sent_or_read_is_an_error_and_what_waits_is_dropped(
-    two_processes: Executor, tmp_path: Path
+    two_processes: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Functions of a notebook or a script are sent as they are."""
     engine = make(tmp_path, two_processes)
@@ -489,6 +489,11 @@ def test_what_cannot_be_sent_or_read_is_an_error_and_what_waits_is_dropped(
     word = "local"
     engine.run(Stage("local", Scope.REGION, lambda task: {"stage": task.stage, "word": word}))
     assert engine.records["local", "region"].facts == {"stage": "local", "word": "local"}
+    main: dict[str, Any] = {"__name__": "__main__"}
+    exec("def in_notebook(task):\n    return {'stage': task.stage}", main)
+    monkeypatch.setattr(sys.modules["__main__"], "in_notebook", main["in_notebook"], raising=False)
+    engine.run(Stage("main", Scope.REGION, main["in_notebook"]))
+    assert engine.records["main", "region"].facts == {"stage": "main"}
 
 
 def test_a_killed_worker_is_an_error_that_names_the_item(tmp_path: Path) -> None:

@@ -161,7 +161,7 @@ class Crew:
         return _Hand(process, ours)
 
     def _send(self, hand: _Hand, given: Given, deaths: int) -> None:
-        sent = cloudpickle.dumps((given.function, given.task))  # also what a notebook or a script defines
+        sent = _pack((given.function, given.task))
         hand.given, hand.deaths = given, deaths
         with suppress(OSError):  # it has died: seen when it is asked
             hand.pipe.send_bytes(sent)
@@ -231,6 +231,16 @@ def _work(pipe: Any, others: Sequence[Any], memory: int, seconds: float) -> None
     threading.Thread(target=_listen, args=(pipe, tasks), daemon=True).start()
     while True:
         pipe.send(_run(tasks.get(), seconds))
+
+
+def _pack(content: tuple[Function, Task]) -> bytes:
+    """Pickle what goes to a worker; what a notebook or a script defines goes whole, which takes longer."""
+    with suppress(Exception):
+        sent = pickle.dumps(content)
+        if b"__main__" not in sent:
+            return sent
+    packed: bytes = cloudpickle.dumps(content)
+    return packed
 
 
 def _run(sent: bytes, seconds: float) -> Outcome:

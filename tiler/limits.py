@@ -189,5 +189,4 @@ def share_memory(workers: int) -> int:
 
 def limit_workers(config: Config) -> Limits:
     """What a task may take in a worker of this machine; where no number of workers is given, there is one."""
-    workers = max(config.workers, 1)
-    return Limits(config.time_limit, int(config.memory_limit * 2**30) or share_memory(workers))
+    return Limits(config.time_limit, int(config.memory_limit * 2**30) or share_memory(config.workers))

@@ -284,9 +284,8 @@ def study_startup(cities: Cities, out: Path) -> list[dict[str, Any]]:
             set_aside(out)
             began = time.time()
             record_of(city, out, "--workers", workers)
-            done = (json.loads(line) for line in (out / "events.jsonl").read_text().splitlines())
-            first = min(event["t"] - event["seconds"] for event in done if event["event"] == "done")
-            found.setdefault(f"the first task of a run with {workers} workers", []).append(first - began)
+            first = find_waits(out, max(int(workers), 1), began)["start"]
+            found.setdefault(f"the first task of a run with {workers} workers", []).append(first)
     return [{"until": until, "seconds": round(median(seconds), 3)} for until, seconds in found.items()]
 
 
