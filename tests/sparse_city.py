@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import psutil
 
 from tests.test_run import hashes
+from tiler import fork_server
 from tiler.config import Config, make_config
 from tiler.own_stages import list_stages
 from tiler.run import run
@@ -128,20 +130,12 @@ def children(process: "subprocess.Popen[bytes]") -> list[psutil.Process]:
 
 
 def workers(process: "subprocess.Popen[bytes]") -> list[psutil.Process]:
-    """List the worker processes of a run that lives.
-
-    They are forked from it or from the process that is there for that, or begun from nothing on some systems.
-    """
-    found, servers = [], set()
+    """List the worker processes of a run that lives: those below the process that is there to fork them."""
+    found = []
     for child in children(process):
-        try:
-            words = " ".join(child.cmdline())
-            if "multiprocessing.forkserver" in words and child.ppid() == process.pid:
-                servers.add(child.pid)
-            elif "multiprocessing.resource_tracker" not in words:
+        with suppress(psutil.NoSuchProcess):
+            if child.ppid() != process.pid or fork_server.METHOD != "forkserver":
                 found.append(child)
-        except psutil.NoSuchProcess:
-            continue
     return sorted(found, key=lambda child: child.pid)
 
 

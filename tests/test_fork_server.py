@@ -5,14 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import psutil
 import pytest
 from distributed import get_worker
 
-from tests.sparse_city import make_city, start, workers
+from tests.sparse_city import make_city, start, wait_until_gone, workers
 from tests.test_engine import ROOT, grid_layout, make, wait_until
 from tests.test_run import hashes
 from tiler import fork_server
@@ -61,44 +60,50 @@ def test_workers_are_forked_with_their_settings_and_the_driver_keeps_its_own(
     assert facts == {"environment": expected, **({"sampled": []} if dask else {}), **told}
 
 
-def test_the_command_forks_its_workers_itself(tmp_path: Path) -> None:
-    """All is imported once: the command has one thread when it has imported what tasks need."""
+def test_the_command_forks_itself_the_process_that_workers_are_forked_from(tmp_path: Path) -> None:
+    """What driver and workers need is imported once: the command has one thread when it has imported that."""
     city = make_city(tmp_path, 2, buildings=12)
     process = start(city.command(tmp_path / "again", "--workers", "2"), tmp_path / "log.txt")
-    parents: list[int] = []
+    servers: set[psutil.Process] = set()
 
     def look() -> bool:
-        with suppress(psutil.NoSuchProcess):
-            parents[:] = [worker.ppid() for worker in workers(process)]
-        return len(parents) == 2
+        found = workers(process)
+        servers.update(worker.parent() for worker in found)
+        return len(found) == 2
 
     try:
         wait_until(look, seconds=60)
-        assert parents == [process.pid] * 2
+        (server,) = servers
+        assert server.ppid() == process.pid
+        assert server.cmdline() == psutil.Process(process.pid).cmdline()
         assert process.wait(240) == 0
+        assert wait_until_gone([server], seconds=20) == []
     finally:
         process.kill()
         process.wait()
     assert hashes(tmp_path / "again") == city.hashes
+    assert "Traceback" not in (tmp_path / "log.txt").read_text()
 
 
-# The worker that was forked last hangs, and cannot see that its driver is dead; the other one must.
+# One worker hangs, and cannot see that its driver is dead; the other one must.
 KILLED = """
 import os, signal, sys, time
 from pathlib import Path
 from tests.faults import hangs_in_c
 from tests.test_join import give_one, make_task
-from tiler import crew
+from tiler import fork_server
 from tiler.crew import Crew, Given
 from tiler.limits import Limits, trace_file
-crew.has_one_thread = lambda: True  # but for one of pyarrow's memory
-crew = Crew(2, Limits(), forked=True)
+fork_server.has_one_thread = lambda: True  # but for one of pyarrow's memory
+fork_server.begin(forked=True)
+crew = Crew(2, Limits())
 folder = Path(sys.argv[1])
 crew.give(Given(0, give_one, make_task(folder, "a")))
 hanging = make_task(folder, "b")
 crew.give(Given(1, hangs_in_c, hanging))
-while not crew.collect(1.0) or not trace_file(hanging).exists():
-    pass
+done = []
+while not (done and trace_file(hanging).exists()):
+    done += crew.collect(1.0)
 time.sleep(0.5)
 print(*(f"{type(hand.process).__name__} {hand.process.pid}" for hand in crew._hands), flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
@@ -115,7 +120,7 @@ def test_a_worker_ends_with_its_driver_whatever_those_forked_after_it_do(tmp_pat
     with (tmp_path / "told.txt").open("w") as told:  # a pipe would be open as long as the worker that hangs
         subprocess.run(command, cwd=ROOT, env=os.environ | one_thread, stdout=told, check=False)
     words = (tmp_path / "told.txt").read_text().split()
-    assert words[::2] == ["ForkProcess"] * 2
+    assert words[::2] == ["ForkServerProcess"] * 2
     first, last = map(int, words[1::2])
     try:
         assert lives(last)

@@ -216,8 +216,12 @@ def make_task(folder: Path, name: str) -> Task:
 class IdleCrew(Crew):
     """A crew whose workers never have a hand free: all is the members' to do."""
 
-    def __init__(self, workers: int = 1, limits: Limits | None = None, *, forked: bool = False) -> None:
+    def __init__(self, workers: int = 1, limits: Limits | None = None) -> None:
         self.workers, self.limits, self._hands = workers, limits or Limits(), []
+
+    @property
+    def n_free(self) -> int:
+        return 0
 
     def collect(self, seconds: float) -> list[tuple[Given, Record | Failure]]:
         time.sleep(min(seconds, 0.01))

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -133,15 +132,12 @@ def _run_config(
     if not config.workers:
         keep_memory()
     with uncollected():
-        from tiler.crew import Crew
+        if config.has_crew:
+            fork_server.begin(forked=True)
         from tiler.events import EventLog, open_log
-        from tiler.limits import limit_workers
         from tiler.out_folder import refuse_result
         from tiler.run import run
         from tiler.terminal import make_views, print_last_line, print_summary
-
-        if config.has_crew:
-            import tiler.preload  # noqa: F401
 
     if report:
         refuse_bucket(config.out, "--report")
@@ -150,11 +146,7 @@ def _run_config(
     if log is not None:
         refuse_result(out, log)
         watchers.append(EventLog(log, open_log(log), every=0.0))
-    with ExitStack() as stack:
-        crew = None
-        if config.has_crew:
-            crew = stack.enter_context(closing(Crew(config.workers, limit_workers(config), forked=True)))
-        record = run(config, watchers=watchers, dashboard=dashboard, crew=crew)
+    record = run(config, watchers=watchers, dashboard=dashboard)
     if report:
         _report_run(out, quiet=quiet)
     if quiet:
@@ -170,10 +162,9 @@ def _join(options: argparse.Namespace) -> int:
     fork_server.limit_threads()
     look_seldom()
     with uncollected():
+        fork_server.begin(forked=True)
         from tiler.joining.join import join
         from tiler.terminal import make_views, print_last_line, print_summary
-
-        import tiler.preload  # noqa: F401  # isort: skip
 
     joined = join(
         config,

@@ -1,8 +1,6 @@
 """Worker processes of this machine: one task each at a time, with the limits of any worker.
 
-Where the program has imported what tasks need and has one thread, it forks them itself, so that all is imported
-once and the first task begins at once. Else, and where one takes the place of a dead one, they are forked from the
-process that is there for it (`tiler.fork_server`).
+They are forked from the process that is there for it, see `tiler.fork_server`.
 """
 
 import multiprocessing
@@ -10,10 +8,9 @@ import os
 import pickle
 import queue
 import signal
-import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import connection
@@ -41,7 +38,6 @@ Function = Callable[[Task], Facts]
 Outcome = Record | Failure
 WEIGH = 0.5  # s between two looks at the memory of the processes
 BYSTANDER = 20  # how often a task may be given to a process that dies before it begins, before it is an error
-THREADS = Path("/proc/self/task")  # a folder for each thread of this process, also of those that are not Python's
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,39 +75,41 @@ class _Hand:
 class Crew:
     """Worker processes of one thread each on this machine; what dies is replaced. `close` ends them.
 
+    Each is started when there is a task for it.
+
     Parameters
     ----------
     workers : int
         Number of processes.
     limits : Limits
         What a task may take.
-    forked : bool
-        Fork the first ones from this process if it has one thread; it should have imported `tiler.preload`.
     """
 
-    def __init__(self, workers: int, limits: Limits, *, forked: bool = False) -> None:
+    def __init__(self, workers: int, limits: Limits) -> None:
         self.workers, self.limits = workers, limits
         self._weighed = time.monotonic()
         self._hands: list[_Hand] = []
-        self._hire("fork" if forked and has_one_thread() else fork_server.METHOD)
+        fork_server.begin()
 
     @property
     def n_free(self) -> int:
         """Number of processes without a task."""
-        return sum(hand.given is None for hand in self._hands)
+        return self.workers - self.n_busy
 
     @property
     def n_busy(self) -> int:
         """Number of processes with a task."""
-        return len(self._hands) - self.n_free
+        return sum(hand.given is not None for hand in self._hands)
 
     def give(self, given: Given) -> None:
         """Give a task to a process that has none; ValueError if all have one, pickle's if it cannot go."""
-        for hand in self._hands:
-            if hand.given is None:
-                self._send(hand, given, 0)
-                return
-        raise ValueError(f"all {self.workers} workers have a task")
+        if not self.n_free:
+            raise ValueError(f"all {self.workers} workers have a task")
+        hand = next((one for one in self._hands if one.given is None), None)
+        if hand is None:
+            hand = self._start()
+            self._hands.append(hand)
+        self._send(hand, given, 0)
 
     def collect(self, seconds: float) -> list[tuple[Given, Outcome]]:
         """Take what is done, after so many seconds (s) at most; a process that died tells why by its file."""
@@ -128,10 +126,9 @@ class Crew:
         return found
 
     def kill(self) -> list[Given]:
-        """End all processes at once and replace them; gives what they had in hand."""
+        """End all processes at once; gives what they had in hand. Others are started for what comes next."""
         had = [hand.given for hand in self._hands if hand.given is not None]
         self.close()
-        self._hire(fork_server.METHOD)
         return had
 
     def close(self) -> None:
@@ -143,19 +140,12 @@ class Crew:
             hand.pipe.close()
         self._hands = []
 
-    def _hire(self, method: str) -> None:
-        for _ in range(self.workers):
-            self._hands.append(self._start(method))
-
-    def _start(self, method: str) -> _Hand:
-        """Start a process; one that is forked from this one has the pipes of those before it, and closes them."""
-        if method != "fork":
-            fork_server.begin()
-        methods: Any = multiprocessing.get_context(method)
+    def _start(self) -> _Hand:
+        fork_server.begin()
+        methods: Any = multiprocessing.get_context(fork_server.METHOD)
         ours, theirs = methods.Pipe()
-        others = [ours, *(hand.pipe for hand in self._hands)] if method == "fork" else []
         memory = int(REFUSE_AT * self.limits.memory)
-        process = methods.Process(target=_work, args=(theirs, others, memory, self.limits.seconds), daemon=True)
+        process = methods.Process(target=_work, args=(theirs, memory, self.limits.seconds), daemon=True)
         process.start()
         theirs.close()
         return _Hand(process, ours)
@@ -181,7 +171,7 @@ class Crew:
         hand.process.join()
         hand.pipe.close()
         given, deaths = hand.given, hand.deaths + 1
-        fresh = self._start(fork_server.METHOD)
+        fresh = self._start()
         hand.process, hand.pipe = fresh.process, fresh.pipe
         if given is None:
             return None
@@ -210,20 +200,10 @@ def _resident(pid: int) -> int:
         return 0
 
 
-def has_one_thread() -> bool:
-    """Tell whether this process may be forked: what its other threads hold would be held for ever in a copy."""
-    try:
-        return sys.platform == "linux" and len(os.listdir(THREADS)) == 1
-    except OSError:
-        return False
-
-
-def _work(pipe: Any, others: Sequence[Any], memory: int, seconds: float) -> None:
+def _work(pipe: Any, memory: int, seconds: float) -> None:
     """Run tasks until the other end is gone; signals are the driver's affair."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    for other in others:
-        other.close()
     keep_memory()
     if memory:
         limit_memory(memory)

@@ -1,14 +1,23 @@
 """The process that the workers of this machine are forked from: it imports once what all of them need.
 
-Started before the driver's own imports, it is ready when the workers are. Where the system cannot fork well (all
-but Linux), workers start from nothing instead, which takes them some seconds.
+A command forks it from itself when it has imported what both need, and goes on while the rest is imported there;
+from Python it is a program of its own, started before the driver's own imports. Where the system cannot fork well
+(all but Linux), workers start from nothing instead, which takes them some seconds.
 """
 
+import fcntl
+import importlib
 import multiprocessing
 import os
+import signal
 import sys
-from collections.abc import Mapping
-from multiprocessing import forkserver
+import traceback
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
+from multiprocessing import forkserver, resource_tracker, util
+from pathlib import Path
+from typing import Any
 
 # One thread a worker. Dask's own settings of malloc give memory back at once, and it costs a third of a run's
 # time to get it again page by page; with these a worker keeps some 200 MB that it does not use, and gives them
@@ -21,33 +30,99 @@ ENVIRONMENT: Mapping[str, int] = {
     "MALLOC_TRIM_THRESHOLD_": 2**28,
     "MALLOC_MMAP_THRESHOLD_": 2**25,
 }
+SHARED = ("tiler.cli", "tiler.crew", "tiler.own_stages")  # what a driver needs, too
 PRELOAD, PRELOAD_DASK = "tiler.preload", "tiler.preload_dask"
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
+THREADS = Path("/proc/self/task")  # a folder for each thread of this process, also of those that are not Python's
+FILES = Path("/proc/self/fd")
 
 
 def limit_threads() -> None:
-    """Keep the libraries that this process imports from now on to one thread: for one that forks itself."""
+    """Keep the libraries that this process imports from now on to one thread: for one that is forked itself."""
     os.environ.update({name: str(value) for name, value in ENVIRONMENT.items() if name.endswith("_THREADS")})
 
 
-def begin(*, dask: bool = False) -> None:
+def begin(*, dask: bool = False, forked: bool = False) -> None:
     """Start it in the background, unless it runs; a second call does nothing.
 
     Parameters
     ----------
     dask : bool
         Whether the workers are Dask's.
+    forked : bool
+        Import what it shares with a driver here, and fork it from this process if that has one thread.
     """
     if METHOD != "forkserver":
         return
-    multiprocessing.set_forkserver_preload([PRELOAD_DASK if dask else PRELOAD])
+    modules = [PRELOAD_DASK if dask else PRELOAD]
+    multiprocessing.set_forkserver_preload(modules)
+    resource_tracker.ensure_running()  # a program of its own, whatever the server is
+    if forked:
+        for name in SHARED:
+            importlib.import_module(name)
+    with _environment(), _forked(modules) if forked and has_one_thread() else nullcontext():
+        forkserver.ensure_running()
+
+
+def has_one_thread() -> bool:
+    """Tell whether this process may be forked: what its other threads hold would be held for ever in a copy."""
+    try:
+        return len(os.listdir(THREADS)) == 1
+    except OSError:
+        return False
+
+
+@contextmanager
+def _environment() -> Iterator[None]:
     earlier = {name: os.environ.get(name) for name in ENVIRONMENT}
     os.environ.update({name: str(value) for name, value in ENVIRONMENT.items()})
     try:
-        forkserver.ensure_running()
+        yield
     finally:
         for name, value in earlier.items():
             if value is None:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def _forked(modules: list[str]) -> Iterator[None]:
+    """Let `multiprocessing` fork where it would start a program: it has no such choice of its own."""
+    start, name = util.spawnv_passfds, "spawnv_passfds"
+    setattr(util, name, partial(_fork, modules))
+    try:
+        yield
+    finally:
+        setattr(util, name, start)
+
+
+def _fork(modules: list[str], path: str, words: Sequence[str], passed: Sequence[int]) -> int:
+    """Do in a copy of this process what the program would that is called for; gives its number.
+
+    It is given where it is asked for workers, and what ends with this process; from Python 3.14 on, a key too.
+    """
+    pid = os.fork()
+    if pid:
+        return pid
+    code = 1
+    try:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        _close_files(passed)
+        asked, alive, *key = passed
+        serve: Any = forkserver.main
+        serve(asked, alive, modules, **dict(zip(("authkey_r",), key, strict=False)))
+    except SystemExit:
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def _close_files(passed: Collection[int]) -> None:
+    """Close what a program would not be given: the other ends of pipes, by which it knows that a process ended."""
+    for name in os.listdir(FILES):
+        with suppress(OSError):  # the one that lists them
+            if int(name) not in passed and fcntl.fcntl(int(name), fcntl.F_GETFD) & fcntl.FD_CLOEXEC:
+                os.close(int(name))

@@ -1,7 +1,7 @@
 """Vector files: what a layer says about itself, and its features within a box (step 1.2).
 
 pyogrio is imported where it is used: few tasks need it, and it brings pyarrow, where that is there, whose memory
-has a thread of its own; a process is forked while it has one thread alone (`tiler.crew`).
+has a thread of its own; a process is forked while it has one thread alone (`tiler.fork_server`).
 """
 
 import os

@@ -17,10 +17,9 @@ from tiler.addresses import ANYWHERE
 from tiler.atomic import replacing
 from tiler.audit import Audit
 from tiler.config import Config
-from tiler.crew import Crew
 from tiler.dashboard.server import read_address, watched
 from tiler.engine import StoppedError
-from tiler.executors import Executor, Processes, processes, serial
+from tiler.executors import Executor, processes, serial
 from tiler.folder_lock import only_run
 from tiler.forecast import warn_of_memory
 from tiler.jobs.table import read_cluster
@@ -83,15 +82,12 @@ class _Means:
         Makes the executor of one who brings it.
     cluster : Executor or None
         Of the scheduler that was asked for.
-    crew : Crew or None
-        Worker processes of one who brings them.
     """
 
     dashboard: str | None
     shown: Path
     own_executor: OwnExecutor | None
     cluster: Executor | None
-    crew: Crew | None
 
 
 def run(
@@ -104,7 +100,6 @@ def run(
     watchers: Sequence[Watcher] = (),
     dashboard: str | None = None,
     executor: OwnExecutor | None = None,
-    crew: Crew | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -128,8 +123,6 @@ def run(
     executor : callable, optional
         Given what tells the run's watchers a sentence, makes the executor of all tasks, a context; by default
         that which `config` asks for.
-    crew : Crew, optional
-        Worker processes to run tasks in; by default they are started if `config` asks for workers of this machine.
 
     Returns
     -------
@@ -165,7 +158,7 @@ def run(
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
             with reach_cluster(config) as cluster:
-                means = _Means(dashboard, shown, executor, cluster, crew)
+                means = _Means(dashboard, shown, executor, cluster)
                 return _run(config, out, earlier, damage, own, announce, told, means)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
@@ -309,11 +302,8 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
         ) as executor:
             yield executor
     elif config.has_crew:
-        if means.crew is not None:
-            yield Processes(means.crew)
-        else:
-            with processes(config.workers, limit_workers(config)) as executor:
-                yield executor
+        with processes(config.workers, limit_workers(config)) as executor:
+            yield executor
     elif config.workers:
         with local(config.workers, limit_workers(config), dashboard=means.dashboard or ANYWHERE) as executor:
             yield executor

@@ -122,7 +122,7 @@ def join(
     spool = Path(config.out) / SPOOL
     if spool.is_symlink():
         raise ConfigError(f"{spool}: is a symbolic link; remove it")
-    with closing(Crew(max(config.workers, 1), limit_workers(config), forked=True)) as crew:
+    with closing(Crew(max(config.workers, 1), limit_workers(config))) as crew:
         me = this_holder(name, crew.workers, describe_member(config))
         return _Joining(config, me, crew, max_idle, views, say or say_nothing).go()
 
