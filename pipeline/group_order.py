@@ -43,10 +43,9 @@ def sort_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> NDArray[n
     >>> sort_points(np.array([0, 1, 3]), np.array([[0.0, 0, 9], [2, 2, 5], [3, 1, 5]]))[:, 0]
     array([0., 3., 2.])
     """
-    ordered = np.empty_like(xyz)
+    ordered = xyz.copy()
     for g in range(len(start) - 1):
         group = ordered[start[g] : start[g + 1]]
-        group[:] = xyz[start[g] : start[g + 1]]
         bins = _deal_out(group, 2)
         for k in range(len(bins) - 1):
             _sort_run(group[bins[k] : bins[k + 1]])
@@ -61,7 +60,9 @@ def _deal_out(xyz: NDArray[np.float64], axis: int) -> NDArray[np.int64]:
     if n == 0:
         return start
     values = xyz[:, axis]
-    low, high = values.min(), values.max()
+    low = high = values[0]
+    for value in values:
+        low, high = min(low, value), max(high, value)
     scale = (n - 1) / (high - low) if high > low else 0.0
     place = np.empty(n, np.int64)
     for k in range(n):
@@ -96,14 +97,16 @@ def _sort_some(xyz: NDArray[np.float64]) -> None:
     if len(xyz) <= FEW:
         _insert(xyz)
         return
-    rows = np.argsort(xyz[:, 2])
+    old, rows = xyz.copy(), np.arange(len(xyz))
+    _order_rows(rows, old[:, 2])
     i = 0
     while i < len(rows):
-        j = _end_of_run(xyz[:, 2], rows, i)
+        j = _end_of_run(old[:, 2], rows, i)
         if j > i + 1:
-            rows[i:j] = _sort_by_place(xyz, rows[i:j])
+            _order_by_place(rows[i:j], old)
         i = j
-    xyz[:] = xyz[rows]
+    for k in range(len(rows)):
+        xyz[k, 0], xyz[k, 1], xyz[k, 2] = old[rows[k], 0], old[rows[k], 1], old[rows[k], 2]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -126,16 +129,24 @@ def _is_before(x: float, y: float, z: float, x2: float, y2: float, z2: float) ->
 
 
 @numba.njit(cache=True, nogil=True)
-def _sort_by_place(xyz: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Order rows by y, then x."""
-    rows = rows[np.argsort(xyz[:, 1][rows])]
+def _order_by_place(rows: NDArray[np.int64], xyz: NDArray[np.float64]) -> None:
+    """Order rows by y, then x, in place."""
+    _order_rows(rows, xyz[:, 1])
     i = 0
     while i < len(rows):
         j = _end_of_run(xyz[:, 1], rows, i)
         if j > i + 1:
-            rows[i:j] = rows[i:j][np.argsort(xyz[:, 0][rows[i:j]])]
+            _order_rows(rows[i:j], xyz[:, 0])
         i = j
-    return rows
+
+
+@numba.njit(cache=True, nogil=True)
+def _order_rows(rows: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+    """Order rows by their values, in place."""
+    old = rows.copy()
+    order = np.argsort(values[old])
+    for k in range(len(rows)):
+        rows[k] = old[order[k]]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -425,7 +425,9 @@ def _search(
     """Try a step up or down at each level in turn, the last good direction first; heights are moved in place."""
     step = first_step.copy()
     moved = np.zeros(len(level), np.bool_)
-    most = np.diff(start).max() if len(level) else 0
+    most = 0
+    for k in range(len(level)):
+        most = max(most, start[k + 1] - start[k])
     at, ratio, row = np.empty((12, most)), np.empty(most), np.empty(most, np.int64)
     for _ in range(SEARCH_SWEEPS):
         for k in range(len(level)):

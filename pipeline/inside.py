@@ -361,7 +361,9 @@ def _put_into_cells(
         e0, e1 = edge_start[p], edge_start[p + 1]
         if e0 == e1:
             continue
-        low_y, high_y = min(a[e0:e1, 1].min(), b[e0:e1, 1].min()), max(a[e0:e1, 1].max(), b[e0:e1, 1].max())
+        low_y, high_y = np.inf, -np.inf
+        for e in range(e0, e1):
+            low_y, high_y = min(low_y, a[e, 1], b[e, 1]), max(high_y, a[e, 1], b[e, 1])
         bottom = max(int(np.floor(low_y / size)) - j0, 0)
         top = min(int(np.floor(high_y / size)) - j0, height - 1)
         for row in range(bottom, top + 1):
@@ -428,7 +430,9 @@ def _find(
     b: Array,
 ) -> tuple[Index, Index]:
     """For each polygon, four times the point plus its side, of all points that are not surely outside."""
-    most = np.max(np.diff(cell_start)) if len(polygon) else 0
+    most = 0
+    for cell in range(len(cell_start) - 1):
+        most = max(most, cell_start[cell + 1] - cell_start[cell])
     owner, found = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int64)
     n = 0
     for first in range(0, len(xy) if most else 0, BLOCK):

@@ -77,7 +77,7 @@ def find_nodes(
     n = 0
     for e in range(len(a)):
         if abs(side_a[e]) < clearance:
-            nodes[n] = a[e]
+            nodes[n, 0], nodes[n, 1] = a[e, 0], a[e, 1]
             n += 1
     for e in range(len(a)):
         if not side_a[e] * side_b[e] < 0:
@@ -169,20 +169,30 @@ def divide_edges(a: Array, b: Array, ends: Array, edge: NDArray[np.int64]) -> Ar
     for k in range(2 * len(ends) - 1, -1, -1):
         if edge[k // 2, k % 2] >= 0:
             wall[edge[k // 2, k % 2]] = k
-    n_cut = (wall >= 0).sum()
+    n_cut = 0
+    for e in range(len(a)):
+        n_cut += wall[e] >= 0
     segments = np.empty((len(a) + n_cut + len(ends), 2, 2))
     whole, half = 0, len(a) - n_cut
     for e in range(len(a)):
         if wall[e] < 0:
-            segments[whole, 0], segments[whole, 1] = a[e], b[e]
+            _put(segments, whole, a[e], b[e])
             whole += 1
         else:
             place = ends[wall[e] // 2, wall[e] % 2]
-            segments[half, 0], segments[half, 1] = a[e], place
-            segments[half + n_cut, 0], segments[half + n_cut, 1] = place, b[e]
+            _put(segments, half, a[e], place)
+            _put(segments, half + n_cut, place, b[e])
             half += 1
-    segments[len(a) + n_cut :] = ends
+    for k in range(len(ends)):
+        _put(segments, len(a) + n_cut + k, ends[k, 0], ends[k, 1])
     return segments
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _put(segments: Array, row: int, start: Array, end: Array) -> None:
+    """Write a segment number by number: a kernel that assigns rows takes thrice as long to load."""
+    segments[row, 0, 0], segments[row, 0, 1] = start[0], start[1]
+    segments[row, 1, 0], segments[row, 1, 1] = end[0], end[1]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -210,13 +220,13 @@ def insert_corners(xy: Array, ring: NDArray[np.int64], corners: Array) -> tuple[
     away = np.empty(len(corners))
     n = 0
     for v in range(len(xy)):
-        new_xy[n], new_ring[n] = xy[v], ring[v]
+        new_xy[n, 0], new_xy[n, 1], new_ring[n] = xy[v, 0], xy[v, 1], ring[v]
         n += 1
         if v + 1 == len(xy) or ring[v] != ring[v + 1]:
             continue
         first = n
         for c in range(len(corners)):
-            x, y = corners[c]
+            x, y = corners[c, 0], corners[c, 1]
             if not _distance(x, y, xy[v, 0], xy[v, 1], xy[v + 1, 0], xy[v + 1, 1]) <= ON_EDGE:
                 continue
             from_start = math.hypot(xy[v, 0] - x, xy[v, 1] - y)
@@ -224,8 +234,9 @@ def insert_corners(xy: Array, ring: NDArray[np.int64], corners: Array) -> tuple[
                 continue
             k = n
             while k > first and away[k - 1 - first] > from_start:
-                new_xy[k], away[k - first] = new_xy[k - 1], away[k - 1 - first]
+                new_xy[k, 0], new_xy[k, 1] = new_xy[k - 1, 0], new_xy[k - 1, 1]
+                away[k - first] = away[k - 1 - first]
                 k -= 1
-            new_xy[k], new_ring[n], away[k - first] = corners[c], ring[v], from_start
+            new_xy[k, 0], new_xy[k, 1], new_ring[n], away[k - first] = x, y, ring[v], from_start
             n += 1
     return new_xy[:n].copy(), new_ring[:n].copy()

@@ -74,7 +74,6 @@ def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.boo
     return CellOrder(order, cell, start)
 
 
-@numba.njit(cache=True, nogil=True)
 def find_places(
     x: NDArray[Any], y: NDArray[Any], scale: Pair, offset: Pair, among: NDArray[np.bool_], size: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -98,7 +97,18 @@ def find_places(
     cell, start : int64
         As in `CellOrder`.
     """
-    place = np.full(len(x), -1, np.int64)
+    place, n_cells, first, low, width = _number_cells(x, y, scale, offset, among, size)
+    key, count = _put_in_order(place, n_cells) if n_cells <= MOST_CELLS else _sort_keys(place)
+    cell = np.column_stack([key % width + first, key // width + low])
+    return place, cell, np.concatenate([[0], np.cumsum(count)])
+
+
+@numba.njit(cache=True, nogil=True)
+def _number_cells(
+    x: NDArray[Any], y: NDArray[Any], scale: Pair, offset: Pair, among: NDArray[np.bool_], size: float
+) -> tuple[NDArray[np.int64], int, int, int, int]:
+    """Number the cells around some rows; gives each row's, how many, the first (i, j), and how many in a line."""
+    number = np.full(len(x), -1, np.int64)
     low_x = low_y = np.inf
     high_x = high_y = -np.inf
     for k in range(len(x)):
@@ -107,21 +117,14 @@ def find_places(
             low_x, high_x = min(low_x, at_x), max(high_x, at_x)
             low_y, high_y = min(low_y, at_y), max(high_y, at_y)
     if low_x > high_x:
-        return place, np.empty((0, 2), np.int64), np.zeros(1, np.int64)
+        return number, 0, 0, 0, 1
     first, low = int(np.floor(low_x / size)), int(np.floor(low_y / size))
     width = int(np.floor(high_x / size)) - first + 1
-    n_cells = (int(np.floor(high_y / size)) - low + 1) * width
     for k in range(len(x)):
         if among[k]:
             at_x, at_y = x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1]
-            place[k] = (int(np.floor(at_y / size)) - low) * width + int(np.floor(at_x / size)) - first
-    key, count = _put_in_order(place, n_cells) if n_cells <= MOST_CELLS else _sort_keys(place)
-    start = np.zeros(len(key) + 1, np.int64)
-    cell = np.empty((len(key), 2), np.int64)
-    for c in range(len(key)):
-        start[c + 1] = start[c] + count[c]
-        cell[c, 0], cell[c, 1] = key[c] % width + first, key[c] // width + low
-    return place, cell, start
+            number[k] = (int(np.floor(at_y / size)) - low) * width + int(np.floor(at_x / size)) - first
+    return number, (int(np.floor(high_y / size)) - low + 1) * width, first, low, width
 
 
 def select_cells(
@@ -175,33 +178,31 @@ def row_ranges(wanted: NDArray[np.bool_], start: NDArray[np.int64]) -> list[tupl
     return [(int(first), int(stop)) for first, stop in rows if stop > first]
 
 
-@numba.njit(cache=True, nogil=True)
 def _put_in_order(place: NDArray[np.int64], n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Turn keys below n into their places in ascending order, equal ones in their old order; -1 stays.
 
     Gives the keys that there are, and how many rows have each.
     """
-    count = np.zeros(n, np.int64)
-    for key in place:
-        if key >= 0:
-            count[key] += 1
-    free = np.cumsum(count) - count
+    count = np.bincount(place[place >= 0], minlength=n)
+    _take_places(place, np.cumsum(count) - count)
+    key = np.flatnonzero(count)
+    return key, count[key]
+
+
+@numba.njit(cache=True, nogil=True)
+def _take_places(place: NDArray[np.int64], free: NDArray[np.int64]) -> None:
+    """Give each key its next free place."""
     for k in range(len(place)):
         key = place[k]
         if key >= 0:
             place[k] = free[key]
             free[key] += 1
-    there = np.flatnonzero(count)
-    return there, count[there]
 
 
-@numba.njit(cache=True, nogil=True)
 def _sort_keys(place: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Do what `_put_in_order` does, for keys of any size."""
     rows = np.flatnonzero(place >= 0)
-    rows = rows[np.argsort(place[rows], kind="mergesort")]
-    key = place[rows]
-    begin = np.concatenate((np.zeros(1, np.int64), np.flatnonzero(np.diff(key)) + 1))
-    for k in range(len(rows)):
-        place[rows[k]] = k
-    return key[begin], np.diff(np.append(begin, len(rows)))
+    rows = rows[np.argsort(place[rows], kind="stable")]
+    key, count = np.unique(place[rows], return_counts=True)
+    place[rows] = np.arange(len(rows))
+    return key, count
