@@ -190,7 +190,7 @@ def divide_edges(a: Array, b: Array, ends: Array, edge: NDArray[np.int64]) -> Ar
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _put(segments: Array, row: int, start: Array, end: Array) -> None:
-    """Write a segment number by number: a kernel that assigns rows takes thrice as long to load."""
+    """Write a segment number by number: assigning rows brings numpy's errors, and strings, into a kernel."""
     segments[row, 0, 0], segments[row, 0, 1] = start[0], start[1]
     segments[row, 1, 0], segments[row, 1, 1] = end[0], end[1]
 
