@@ -45,21 +45,26 @@ def sort_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> NDArray[n
     """
     ordered = xyz.copy()
     for g in range(len(start) - 1):
-        group = ordered[start[g] : start[g + 1]]
-        bins = _deal_out(group, 2)
-        for k in range(len(bins) - 1):
-            _sort_run(group[bins[k] : bins[k + 1]])
+        sort_group(ordered[start[g] : start[g + 1]])
     return ordered
 
 
 @numba.njit(cache=True, nogil=True)
-def _deal_out(xyz: NDArray[np.float64], axis: int) -> NDArray[np.int64]:
-    """Put points in order of as many bins of equal width along an axis; give where each bin starts."""
+def sort_group(xyz: NDArray[np.float64]) -> None:
+    """Sort the points of one group, (n, 3), in place, as `sort_points` does; for kernels."""
+    bins = _deal_out(xyz)
+    for k in range(len(bins) - 1):
+        _sort(xyz[bins[k] : bins[k + 1]])
+
+
+@numba.njit(cache=True, nogil=True)
+def _deal_out(xyz: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Put points in order of as many bins of equal height; give where each bin starts."""
     n = len(xyz)
     start = np.zeros(n + 1, np.int64)
     if n == 0:
         return start
-    values = xyz[:, axis]
+    values = xyz[:, 2]
     low = high = values[0]
     for value in values:
         low, high = min(low, value), max(high, value)
@@ -79,34 +84,35 @@ def _deal_out(xyz: NDArray[np.float64], axis: int) -> NDArray[np.int64]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _sort_run(xyz: NDArray[np.float64]) -> None:
-    """Sort points of about the same height in place; many of the very same height by bins again."""
-    if len(xyz) <= FEW:
-        _insert(xyz)
-    elif xyz[:, 2].min() == xyz[:, 2].max():
-        bins = _deal_out(xyz, 1)
-        for k in range(len(bins) - 1):
-            _sort_some(xyz[bins[k] : bins[k + 1]])
-    else:
-        _sort_some(xyz)
+def _sort(xyz: NDArray[np.float64]) -> None:
+    """Sort points in place: a few at a time, and what is sorted is merged."""
+    n = len(xyz)
+    for first in range(0, n, FEW):
+        _insert(xyz[first : min(first + FEW, n)])
+    if n <= FEW:
+        return
+    room, width = np.empty((n, 3)), np.int64(FEW)  # for a constant, numba would compile `_merge` once more
+    while width < n:
+        for first in range(0, n - width, 2 * width):
+            _merge(xyz[first : min(first + 2 * width, n)], width, room)
+        width *= 2
 
 
 @numba.njit(cache=True, nogil=True)
-def _sort_some(xyz: NDArray[np.float64]) -> None:
-    """Sort points in place, whatever they are."""
-    if len(xyz) <= FEW:
-        _insert(xyz)
-        return
-    old, rows = xyz.copy(), np.arange(len(xyz))
-    _order_rows(rows, old[:, 2])
-    i = 0
-    while i < len(rows):
-        j = _end_of_run(old[:, 2], rows, i)
-        if j > i + 1:
-            _order_by_place(rows[i:j], old)
-        i = j
-    for k in range(len(rows)):
-        xyz[k, 0], xyz[k, 1], xyz[k, 2] = old[rows[k], 0], old[rows[k], 1], old[rows[k], 2]
+def _merge(xyz: NDArray[np.float64], middle: int, room: NDArray[np.float64]) -> None:
+    """Merge the sorted points before the middle with those after it, in place."""
+    for k in range(middle):
+        room[k, 0], room[k, 1], room[k, 2] = xyz[k, 0], xyz[k, 1], xyz[k, 2]
+    first, second, to = 0, middle, 0
+    while first < middle:
+        x, y, z = room[first, 0], room[first, 1], room[first, 2]
+        while second < len(xyz) and _is_before(xyz[second, 0], xyz[second, 1], xyz[second, 2], x, y, z):
+            xyz[to, 0], xyz[to, 1], xyz[to, 2] = xyz[second, 0], xyz[second, 1], xyz[second, 2]
+            second += 1
+            to += 1
+        xyz[to, 0], xyz[to, 1], xyz[to, 2] = x, y, z
+        first += 1
+        to += 1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -126,33 +132,3 @@ def _is_before(x: float, y: float, z: float, x2: float, y2: float, z2: float) ->
     if z != z2:
         return z < z2
     return y < y2 or (y == y2 and x < x2)
-
-
-@numba.njit(cache=True, nogil=True)
-def _order_by_place(rows: NDArray[np.int64], xyz: NDArray[np.float64]) -> None:
-    """Order rows by y, then x, in place."""
-    _order_rows(rows, xyz[:, 1])
-    i = 0
-    while i < len(rows):
-        j = _end_of_run(xyz[:, 1], rows, i)
-        if j > i + 1:
-            _order_rows(rows[i:j], xyz[:, 0])
-        i = j
-
-
-@numba.njit(cache=True, nogil=True)
-def _order_rows(rows: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-    """Order rows by their values, in place."""
-    old = rows.copy()
-    order = np.argsort(values[old])
-    for k in range(len(rows)):
-        rows[k] = old[order[k]]
-
-
-@numba.njit(cache=True, nogil=True)
-def _end_of_run(values: NDArray[np.float64], rows: NDArray[np.int64], i: int) -> int:
-    """First place after ``i`` at which the rows have another value."""
-    j = i + 1
-    while j < len(rows) and values[rows[j]] == values[rows[i]]:
-        j += 1
-    return j

@@ -295,10 +295,11 @@ def _survey(
 ) -> None:
     """Make and measure the cells over the triangles that are wanted: at most so many over one."""
     cells, at, ratio = np.empty((most, 4), np.int32), np.empty((12, most)), np.empty(most)
+    first = np.int64(0)  # for a constant, numba would compile `merge_triangle` once more
     for t in range(len(triangles)):
         if not wanted[t]:
             continue
-        n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, 0)
+        n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, first)
         for i in range(n):
             _lay_out(xy, triangles[t], clockwise[t], z, cells[i], at, i)
         _measure_block(at, n, ratio)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 INDEX_CELL = 2.0  # m, side of a cell of the point index; a power of two, so that borders of cells are exact
 BLOCK = 1 << 13  # points that room is made for at a time
+ROOM = 1 << 10  # cells, and edges, that room is made for at first
 DOUBT = 1e-15  # share of its two products within which rounding may have chosen the sign of a turn
 OUTSIDE, INSIDE, UNSURE = range(3)
 POLYGON = 3  # GEOS's number of that type
@@ -334,9 +335,12 @@ def _box_of(xy: Array, among: NDArray[np.bool_]) -> Box:
 @numba.njit(cache=True, nogil=True)
 def _find_cells(box: Box, a: Array, b: Array) -> tuple[int, int, int, int]:
     """Column and row of the first cell that both the box and edges are around, number of columns and rows."""
-    low_x, low_y, high_x, high_y = box
-    low_x, high_x = max(low_x, min(a[:, 0].min(), b[:, 0].min())), min(high_x, max(a[:, 0].max(), b[:, 0].max()))
-    low_y, high_y = max(low_y, min(a[:, 1].min(), b[:, 1].min())), min(high_y, max(a[:, 1].max(), b[:, 1].max()))
+    low_x = low_y = np.inf
+    high_x = high_y = -np.inf
+    for e in range(len(a)):
+        low_x, high_x = min(low_x, a[e, 0], b[e, 0]), max(high_x, a[e, 0], b[e, 0])
+        low_y, high_y = min(low_y, a[e, 1], b[e, 1]), max(high_y, a[e, 1], b[e, 1])
+    low_x, low_y, high_x, high_y = max(box[0], low_x), max(box[1], low_y), min(box[2], high_x), min(box[3], high_y)
     if not (low_x <= high_x and low_y <= high_y):
         return 0, 0, 0, 0
     i0, j0 = int(np.floor(low_x / INDEX_CELL)), int(np.floor(low_y / INDEX_CELL))
@@ -355,8 +359,8 @@ def _put_into_cells(
     i0, j0, width, height = cells
     size = INDEX_CELL
     n, n_near = 0, 0
-    cell, polygon, edges = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty((1024, 2), np.int64)
-    near = np.empty(1024, np.int64)
+    cell, polygon = np.empty(ROOM, np.int64), np.empty(ROOM, np.int32)
+    begin, end, near = np.empty(ROOM, np.int64), np.empty(ROOM, np.int64), np.empty(ROOM, np.int64)
     for p in range(len(edge_start) - 1):
         e0, e1 = edge_start[p], edge_start[p + 1]
         if e0 == e1:
@@ -382,22 +386,35 @@ def _put_into_cells(
             left = max(int(np.floor(low_x / size)) - i0, 0)
             right = min(int(np.floor(high_x / size)) - i0, width - 1)
             while n + right + 1 - left > len(cell):
-                cell, polygon, edges = _lengthen(cell), _lengthen(polygon), _lengthen(edges)
+                cell, polygon, begin, end = _lengthen(cell), _lengthen(polygon), _lengthen(begin), _lengthen(end)
             for column in range(left, right + 1):
                 side = _side_of_cell((column + i0) * size, under, near[first:n_near], a, b)
                 if side != OUTSIDE:
                     cell[n], polygon[n] = row * width + column, p
-                    edges[n, 0], edges[n, 1] = first, n_near if side == UNSURE else first
+                    begin[n], end[n] = first, n_near if side == UNSURE else first
                     n += 1
     start, order = _group(cell[:n], width * height)
-    return start, polygon[:n][order], edges[:n][order], a[near[:n_near]], b[near[:n_near]]
+    ordered, edges = np.empty(n, np.int32), np.empty((n, 2), np.int64)
+    for k in range(n):
+        ordered[k], edges[k, 0], edges[k, 1] = polygon[order[k]], begin[order[k]], end[order[k]]
+    return start, ordered, edges, _take(a, near[:n_near]), _take(b, near[:n_near])
+
+
+@numba.njit(cache=True, nogil=True)
+def _take(xy: Array, rows: Index) -> Array:
+    """Rows of an array (n, 2); quicker to compile than an index."""
+    taken = np.empty((len(rows), 2))
+    for k in range(len(rows)):
+        taken[k, 0], taken[k, 1] = xy[rows[k], 0], xy[rows[k], 1]
+    return taken
 
 
 @numba.njit(cache=True, nogil=True)
 def _lengthen(values: NDArray[Any]) -> NDArray[Any]:
     """Twice the room, with the values in its first half."""
-    room = np.empty((2 * len(values), *values.shape[1:]), values.dtype)
-    room[: len(values)] = values
+    room = np.empty(2 * len(values), values.dtype)
+    for k in range(len(values)):  # a slice would bring the words of an error of shapes into the kernel
+        room[k] = values[k]
     return room
 
 
@@ -434,14 +451,17 @@ def _find(
     for cell in range(len(cell_start) - 1):
         most = max(most, cell_start[cell + 1] - cell_start[cell])
     owner, found = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int64)
-    n = 0
+    n = np.int64(0)  # for a constant, numba would compile what it is given to once more
     for first in range(0, len(xy) if most else 0, BLOCK):
         last = min(first + BLOCK, len(xy))
         while n + (last - first) * most > len(found):
             owner, found = _lengthen(owner), _lengthen(found)
         n = _find_some(xy, among, first, last, cells, cell_start, polygon, edges, a, b, owner, found, n)
     start, order = _group(owner[:n], n_polygons)
-    return start, found[order]
+    ordered = np.empty(n, np.int64)
+    for k in range(n):
+        ordered[k] = found[order[k]]
+    return start, ordered
 
 
 @numba.njit(cache=True, nogil=True)

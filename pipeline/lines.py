@@ -6,6 +6,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.group_order import sort_group
+
 MAX_DIRECTIONS = 4  # directions of walls along which lines are tried, those with most wall first
 SAME_DIRECTION = 0.0872  # sine of 5 degrees; walls that differ by less count as one direction
 MAX_TRIES = 4  # lines that are handed on, the best first
@@ -56,7 +58,7 @@ def rank_lines(a: Array, b: Array, xyz: Array, *, clearance: float, min_points: 
     ranked: list[tuple[float, Line]] = []
     for along in _directions(a, b) if total > 0 else ():
         normal = np.array([-along[1], along[0]])
-        across, vertex = xyz[:, :2] @ normal, a @ normal
+        across, vertex = xyz[:, :2] @ normal, np.sort(a @ normal)
         for gain, offset in zip(*_best_lines(across, z, vertex, total, clearance, min_points), strict=True):
             if gain >= MIN_GAIN:
                 ranked.append((gain, Line(along, normal, offset)))
@@ -64,19 +66,30 @@ def rank_lines(a: Array, b: Array, xyz: Array, *, clearance: float, min_points: 
     return [line for _, line in ranked[:MAX_TRIES]]
 
 
-@numba.njit(cache=True, nogil=True)
 def _directions(a: Array, b: Array) -> Array:
     """Unit vectors of the directions with most wall, each that of its longest wall."""
     d = b - a
     length = np.hypot(d[:, 0], d[:, 1])
-    left = np.argsort(-length, kind="mergesort")
-    found, total, same = np.empty_like(d), np.empty(len(d)), np.empty(len(d))
+    found, total = _group_directions(d / length[:, None], length, np.argsort(-length, kind="stable"))
+    most: Array = found[np.argsort(-total, kind="stable")[:MAX_DIRECTIONS]]
+    return most
+
+
+@numba.njit(cache=True, nogil=True)
+def _group_directions(along: Array, length: Array, left: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Group walls of about the same direction, in the order that is given; gives directions and length of all.
+
+    The order is used up.
+    """
+    n = len(left)
+    found, total, same = np.empty((n, 2)), np.empty(n), np.empty(n)
     n_found = 0
-    while len(left):
-        x, y = d[left[0]] / length[left[0]]
+    while n:
+        x, y = along[left[0], 0], along[left[0], 1]
         n_same = n_left = 0
-        for e in left:
-            if abs(d[e, 0] / length[e] * y - d[e, 1] / length[e] * x) <= SAME_DIRECTION:
+        for k in range(n):
+            e = left[k]
+            if abs(along[e, 0] * y - along[e, 1] * x) <= SAME_DIRECTION:
                 same[n_same] = length[e]
                 n_same += 1
             else:
@@ -84,8 +97,8 @@ def _directions(a: Array, b: Array) -> Array:
                 n_left += 1
         found[n_found, 0], found[n_found, 1], total[n_found] = x, y, _sum_pairwise(same[:n_same])
         n_found += 1
-        left = left[:n_left]
-    return found[np.argsort(-total[:n_found], kind="mergesort")[:MAX_DIRECTIONS]]
+        n = n_left
+    return found[:n_found], total[:n_found]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -120,7 +133,7 @@ def _best_lines(
     across, z : float64, (n,)
         Places of the points across the line, and their heights from the mean (m).
     vertex : float64, (m,)
-        Places of the vertices across the line (m).
+        Places of the vertices across the line, ascending (m).
     total : float
         Sum of the squares of `z` (m²).
 
@@ -131,24 +144,26 @@ def _best_lines(
         where there is no such line.
     """
     n = len(across)
-    order = _argsort(across)
+    points = np.empty((n, 3))  # in order across the line, and as they come where they are on one line
+    for k in range(n):
+        points[k, 0], points[k, 1], points[k, 2] = z[k], k, across[k]
+    sort_group(points)
     gain = np.zeros(n + 1)
     running = 0.0
     for left in range(1, n + 1):  # points before the line
-        running += z[order[left - 1]]
+        running += points[left - 1, 0]
         if min_points <= left <= n - min_points:
             gain[left] = running * running * n / (left * (n - left)) / total
-    vertex = np.sort(vertex)
     best, offset = np.full(2, -1.0), np.zeros(2)
     left = 0
     for v in vertex:
-        while left < n and across[order[left]] < v:
+        while left < n and points[left, 2] < v:
             left += 1
         if gain[left] > best[0]:
             best[0], offset[0] = gain[left], v
     after = 0
     for left in range(1, n):
-        low, high = across[order[left - 1]], across[order[left]]
+        low, high = points[left - 1, 2], points[left, 2]
         middle = (high + low) / 2
         while after < len(vertex) and vertex[after] < middle:
             after += 1
@@ -156,18 +171,3 @@ def _best_lines(
         if room >= clearance and high > low and gain[left] > best[1]:
             best[1], offset[1] = gain[left], middle
     return best, offset
-
-
-@numba.njit(cache=True, nogil=True)
-def _argsort(values: Array) -> NDArray[np.int64]:
-    """Order values; equal ones stay in their order. Faster than numba's own stable sort."""
-    order = np.argsort(values)
-    i = 0
-    while i < len(order):
-        j = i + 1
-        while j < len(order) and values[order[j]] == values[order[i]]:
-            j += 1
-        if j > i + 1:
-            order[i:j].sort()
-        i = j
-    return order

@@ -132,7 +132,7 @@ def test_the_best_lines_are_those_of_arrays(seed: int, levels: int) -> None:
         if len(offset):
             best = int(np.argmax(gain[place]))
             expected[k] = (gain[place[best]], offset[best])
-    best_gain, best_offset = _best_lines(across, z, vertex, total, clearance, least)
+    best_gain, best_offset = _best_lines(across, z, corner, total, clearance, least)
     assert list(zip(best_gain.tolist(), best_offset.tolist(), strict=True)) == expected
     assert MIN_GAIN > 0  # a line that is not there has no gain and falls away
 
