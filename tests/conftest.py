@@ -1,6 +1,8 @@
 """Fixtures that all tests share."""
 
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,14 @@ def pytest_configure() -> None:
     """Let interrupts through: what a shell starts in the background ignores them, and so do its children."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile kernels before tests begin, once: the first of those with a time limit would have to."""
+    from tiler.kernels import are_compiled
+
+    if not hasattr(session.config, "workerinput") and not are_compiled():
+        subprocess.run([sys.executable, "-m", "tiler.cli", "kernels"], check=False, stdout=subprocess.DEVNULL)
 
 
 @pytest.fixture(scope="session")

@@ -60,9 +60,10 @@ def program(name: str, source: str) -> str:
 
 
 def words(pod: dict[str, Any]) -> list[str]:
-    """Command of a pod's only container."""
+    """What a pod's only container does; it begins as the image says."""
     (container,) = pod["containers"]
-    given: list[str] = container.get("command", container.get("args"))
+    assert "command" not in container
+    given: list[str] = container["args"]
     return given
 
 
@@ -159,6 +160,27 @@ def test_the_image_has_what_its_build_asks_for() -> None:
     assert re.search(r"^USER 10001:10001$", text, re.MULTILINE)
 
 
+def test_a_container_begins_with_the_kernels_of_its_image(tmp_path: Path) -> None:
+    kernels, kept = tmp_path / "kernels", tmp_path / "numba"
+    kernels.mkdir()
+    (kernels / "one").write_text("compiled")
+    kernels.chmod(0o555)
+    given = os.environ | {"KERNELS": str(kernels), "NUMBA_CACHE_DIR": str(kept)}
+    command = [
+        "sh",
+        str(DEPLOY / "entrypoint.sh"),
+        "sh",
+        "-c",
+        'cat "$NUMBA_CACHE_DIR/one"; echo more > "$0"; exit 3',
+    ]
+    for expected in ("compiled", "more\n"):  # a volume keeps what was compiled
+        done = subprocess.run([*command, kept / "one"], env=given, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (3, expected, "")
+    text = (DEPLOY / "Dockerfile").read_text()
+    assert 'ENTRYPOINT ["sh", "/opt/entrypoint.sh"]' in text
+    assert text.count("ARG CPU=") == 2  # compiled for the processor that is told to containers
+
+
 @pytest.mark.long
 def test_manifests_are_valid_and_the_overlay_joins_them(tmp_path: Path) -> None:
     kubectl = shutil.which("kubectl")
@@ -220,7 +242,7 @@ def test_the_overlay_for_a_bucket_mounts_nothing_and_holds_no_secret(tmp_path: P
         mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"]}
         assert mounts.keys() == {volume["name"] for volume in pod["volumes"]}
         assert mounts["tmp"] == "/tmp"
-    assert container["command"][-1] == "--out=s3://bucket/run"
+    assert container["args"][-1] == "--out=s3://bucket/run"
     # What the job is given is a configuration, and all of it is in buckets.
     (given,) = (d["data"]["run.toml"] for d in documents if d["kind"] == "ConfigMap")
     (tmp_path / "run.toml").write_text(given)

@@ -135,6 +135,7 @@ def _run_config(
         if config.has_crew:
             fork_server.begin(forked=True)
         from tiler.events import EventLog, open_log
+        from tiler.kernels import count_cores
         from tiler.out_folder import refuse_result
         from tiler.run import run
         from tiler.terminal import make_views, print_last_line, print_summary
@@ -146,7 +147,7 @@ def _run_config(
     if log is not None:
         refuse_result(out, log)
         watchers.append(EventLog(log, open_log(log), every=0.0))
-    record = run(config, watchers=watchers, dashboard=dashboard)
+    record = run(config, watchers=watchers, dashboard=dashboard, compilers=config.workers or count_cores())
     if report:
         _report_run(out, quiet=quiet)
     if quiet:
@@ -339,6 +340,18 @@ def _export(options: argparse.Namespace) -> int:
     return 0
 
 
+def _kernels(options: argparse.Namespace) -> int:
+    from tiler.kernels import compile_kernels, count_cores, describe_kernels
+
+    if options.workers < 0:
+        raise ConfigError(f"--workers {options.workers}: must be 0 or above; 0 is one a core")
+    failed = compile_kernels(options.workers or count_cores())
+    for line in failed:
+        print(f"citystitch: not compiled: {printable(line)}", file=sys.stderr)
+    say(describe_kernels())
+    return EXIT_FAILED if failed else 0
+
+
 def _config(_: argparse.Namespace) -> int:
     print(annotated_defaults())
     return 0
@@ -357,6 +370,7 @@ HANDLERS: Mapping[str, Handler] = {
     "demo": _demo,
     "render": _render,
     "export": _export,
+    "kernels": _kernels,
     "config": _config,
 }
 

@@ -95,9 +95,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     synth = command("synth", "write a synthetic city: point cloud and footprints")
     synth.add_argument("directory", type=Path, help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
-    demo = command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one")
-    demo.add_argument("--out", type=Path, default=Path("demo"), help="folder to write to (default: demo)")
-    _add_city(demo, size=600.0, buildings=220)
+    _add_demo(command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one"))
     render = command("render", "draw a picture of a run")
     render.add_argument("directory", type=_on_disk, help="folder of a run")
     render.add_argument("-o", "--output", type=Path, required=True, help="PNG file to write")
@@ -110,8 +108,24 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     )
     add_job_commands(add, _add_inputs)
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
+    _add_kernels(
+        command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
+    )
     command("config", "print all parameters of a run, annotated, as a configuration file")
     return parser
+
+
+def _add_demo(demo: argparse.ArgumentParser) -> None:
+    """Add where the demonstration writes, and its city."""
+    demo.add_argument("--out", type=Path, default=Path("demo"), help="folder to write to (default: demo)")
+    _add_city(demo, size=600.0, buildings=220)
+
+
+def _add_kernels(kernels: argparse.ArgumentParser) -> None:
+    """Add how many processes compile."""
+    kernels.add_argument(
+        "--workers", type=int, default=0, metavar="NUMBER", help="processes; 0: one a core, 8 at most (default)"
+    )
 
 
 def _add_inputs(parser: argparse.ArgumentParser) -> None:

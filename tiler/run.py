@@ -25,6 +25,7 @@ from tiler.forecast import warn_of_memory
 from tiler.jobs.table import read_cluster
 from tiler.joining.lease import LostFolderError
 from tiler.joining.spool import SPOOL
+from tiler.kernels import prepare
 from tiler.keys import code_versions
 from tiler.limits import TASKS, Limits, limit_workers, machine_memory
 from tiler.manifest import find_remade, write_manifest
@@ -82,12 +83,16 @@ class _Means:
         Makes the executor of one who brings it.
     cluster : Executor or None
         Of the scheduler that was asked for.
+    compilers : int
+        Number of processes that compile kernels before the first task; 0 where they are compiled as they are
+        needed.
     """
 
     dashboard: str | None
     shown: Path
     own_executor: OwnExecutor | None
     cluster: Executor | None
+    compilers: int
 
 
 def run(
@@ -100,6 +105,7 @@ def run(
     watchers: Sequence[Watcher] = (),
     dashboard: str | None = None,
     executor: OwnExecutor | None = None,
+    compilers: int | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -123,6 +129,9 @@ def run(
     executor : callable, optional
         Given what tells the run's watchers a sentence, makes the executor of all tasks, a context; by default
         that which `config` asks for.
+    compilers : int, optional
+        Processes that compile kernels before the first task of a run on this machine, if that was not done here;
+        0: each when it is needed. By default as many as workers, so that a run in one process starts none.
 
     Returns
     -------
@@ -158,7 +167,9 @@ def run(
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
             with reach_cluster(config) as cluster:
-                means = _Means(dashboard, shown, executor, cluster)
+                here = executor is None and not config.on_cluster
+                processes = config.workers if compilers is None else compilers
+                means = _Means(dashboard, shown, executor, cluster, processes if here else 0)
                 return _run(config, out, earlier, damage, own, announce, told, means)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
@@ -252,6 +263,8 @@ def _mesh_region(
     does not touch has its result already. Where one fails later, its neighbours keep the seam with it.
     """
     missing = Missing()
+    if means.compilers:
+        _prepare(means.compilers, watchers.say)
     with (
         _executor(config, means, watchers.say) as executor,
         watched(means.shown, means.dashboard, getattr(executor, "scheduler", None), watchers.say),
@@ -284,6 +297,13 @@ def _mesh_region(
     write_manifest(out / MANIFEST_PATH, engine.records, indexes)
     summary = summarise_run(engine, plan, config, rounds, missing, dict(damage) | remade)
     return summary | {"driver_memory_bytes": peak_memory()}
+
+
+def _prepare(processes: int, say: Callable[[str], None]) -> None:
+    try:
+        prepare(processes, say)
+    except KeyboardInterrupt:
+        raise StoppedError("stopped before the first task; the same command begins again") from None
 
 
 @contextmanager

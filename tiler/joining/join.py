@@ -41,6 +41,7 @@ from tiler.joining.lease import (
 )
 from tiler.joining.member import Ended, Left, serve
 from tiler.joining.spool import HOLDER, SPOOL, Spool
+from tiler.kernels import prepare
 from tiler.keys import code_versions
 from tiler.limits import limit_workers
 from tiler.out_folder import RUN_RECORD, check_folder
@@ -122,7 +123,9 @@ def join(
     spool = Path(config.out) / SPOOL
     if spool.is_symlink():
         raise ConfigError(f"{spool}: is a symbolic link; remove it")
-    with closing(Crew(max(config.workers, 1), limit_workers(config))) as crew:
+    workers = max(config.workers, 1)
+    prepare(workers, say or say_nothing)
+    with closing(Crew(workers, limit_workers(config))) as crew:
         me = this_holder(name, crew.workers, describe_member(config))
         return _Joining(config, me, crew, max_idle, views, say or say_nothing).go()
 

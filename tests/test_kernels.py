@@ -1,0 +1,143 @@
+"""Kernels are compiled beforehand, side by side, and a run then finds them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numba.core.dispatcher import Dispatcher
+from numba.core.sigutils import normalize_signature
+
+from pipeline.errors import ConfigError
+from tests.record_kernels import record_apart
+from tests.sparse_city import SparseCity, make_city
+from tiler import kernels
+from tiler.cli import main
+from tiler.engine import StoppedError
+from tiler.kernels import OTHER, PARTS, RUN, are_compiled, compile_kernels, count_cores, prepare, read_list
+from tiler.run import run
+
+GROWTH = {"pipeline.growth": read_list()[OTHER]["pipeline.growth"]}  # compiled in no time
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory: pytest.TempPathFactory) -> SparseCity:
+    return make_city(tmp_path_factory.mktemp("sparse"), 1, buildings=2)
+
+
+class Deadly:
+    """What a process does not survive, in the place of a kernel."""
+
+    def compile(self, arguments: Any) -> None:
+        """Die."""
+        os._exit(9)
+
+
+DEADLY = Deadly()
+
+
+def listed(monkeypatch: pytest.MonkeyPatch, folder: Path, **parts: kernels.Kernels) -> None:
+    """Let there be only these kernels, and keep what says that they are compiled in a folder."""
+    path = folder / "kernels.json"
+    path.write_text(json.dumps({part: parts.get(part, {}) for part in PARTS}))
+    monkeypatch.setattr(kernels, "LIST", path)
+    monkeypatch.setattr(kernels, "find_folder", lambda: folder)
+
+
+def test_all_that_is_listed_is_a_kernel() -> None:
+    assert tuple(read_list()) == PARTS
+    for module, names in (entry for part in read_list().values() for entry in part.items()):
+        for name, signatures in names.items():
+            assert isinstance(kernels._kernel(module, name), Dispatcher)
+            assert all(normalize_signature(signature)[0] for signature in signatures)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_what_is_compiled_is_not_compiled_again(
+    processes: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    listed(monkeypatch, tmp_path, run=GROWTH)
+    said: list[str] = []
+    assert not are_compiled()
+    prepare(processes, said.append)
+    assert [line.startswith(kernels.WORDS) for line in said] == [True]
+    assert [are_compiled((RUN,)), are_compiled()] == [True, False]
+    prepare(processes, said.append)
+    assert len(said) == 1
+    assert compile_kernels(processes) == []
+    assert are_compiled()
+    listed(monkeypatch, tmp_path, run=GROWTH, other=GROWTH)  # other code
+    assert not are_compiled((RUN,))
+
+
+def test_what_cannot_be_compiled_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    wrong = {
+        "pipeline.growth": {"count_steps": ["(unicode_type,)"], "gone": ["(int64,)"]},
+        "pipeline.gone": {"f": ["(int64,)"]},
+    }
+    listed(monkeypatch, tmp_path, run=wrong)
+    said: list[str] = []
+    prepare(2, said.append)
+    assert len(said) == 4
+    told = sorted(said[1:])
+    assert told[0].startswith("not compiled beforehand: pipeline.gone.f(int64,): No module named")
+    assert told[1].startswith("not compiled beforehand: pipeline.growth.count_steps(unicode_type,): ")
+    assert told[2].startswith("not compiled beforehand: pipeline.growth.gone(int64,): ")
+    assert not are_compiled((RUN,))
+
+
+def test_a_process_that_dies_leaves_the_rest_to_the_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    deadly: kernels.Kernels = {__name__: {"DEADLY": ["(int64,)"]}}
+    listed(monkeypatch, tmp_path, run=deadly | GROWTH)
+    assert compile_kernels(2, (RUN,)) == [f"{__name__}: its process died"]
+    assert compile_kernels(1, (RUN,)) == [f"{__name__}: its process died", "pipeline.growth: no process is left"]
+    assert not are_compiled((RUN,))
+
+
+def test_a_run_compiles_with_as_many_processes_as_it_has_workers(
+    city: SparseCity, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr("tiler.run.prepare", lambda processes, say: asked.append(processes))
+    for number, (workers, compilers) in enumerate(((0, None), (0, 3), (1, None), (1, 0))):
+        run(city.config(tmp_path / str(number), workers=workers), compilers=compilers)
+    assert asked == [3, 1]
+
+
+def test_ctrl_c_while_kernels_are_compiled_stops_a_run(
+    city: SparseCity, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def interrupted(processes: int, say: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tiler.run.prepare", interrupted)
+    out = tmp_path / "out"
+    with pytest.raises(StoppedError, match="stopped before the first task"):
+        run(city.config(out, workers=1))
+    assert json.loads((out / "run.json").read_text())["status"] == "stopped"
+
+
+def test_the_command_refuses_a_number_below_zero(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["kernels", "--workers", "-1"]) == ConfigError.exit_code
+    assert "--workers -1: must be 0 or above" in capsys.readouterr().err
+
+
+def test_no_more_processes_than_cores_compile() -> None:
+    assert 1 <= count_cores() <= min(os.cpu_count() or 1, kernels.MOST)
+
+
+@pytest.mark.long
+def test_after_the_command_nothing_is_compiled(tmp_path: Path) -> None:
+    kept = {"NUMBA_CACHE_DIR": str(tmp_path / "numba")}
+    command = [sys.executable, "-m", "tiler.cli", "kernels"]
+    done = subprocess.run(command, env=os.environ | kept, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.rstrip().endswith(f"kept in {tmp_path / 'numba'}")
+    called, compiled = record_apart(tmp_path / "cities", **kept)
+    assert compiled == []
+    assert called == read_list(), "python -m tests.record_kernels writes the list anew"

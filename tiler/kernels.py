@@ -1,0 +1,211 @@
+"""Kernels: compiled for this machine before they are needed, side by side, once.
+
+numba compiles a kernel when it is first called, and keeps it on disk. Left to that, workers that begin together
+compile the same ones, each for itself.
+"""
+
+import hashlib
+import importlib
+import json
+import multiprocessing
+import os
+import platform
+import signal
+from collections import deque
+from collections.abc import Callable, Collection, Iterator
+from contextlib import closing, contextmanager, suppress
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import llvmlite.binding
+import numba
+from numba.core.sigutils import normalize_signature
+
+from tiler import fork_server
+
+LIST = Path(__file__).with_name("kernels.json")  # written by tests/record_kernels.py
+RUN, OTHER = PARTS = ("run", "other")  # of the list: what runs need by default; what other ways and commands do
+MOST = 8  # processes that compile side by side: the module that takes longest takes a seventh of all
+WORDS = "compiling kernels for this machine, once"
+
+Signatures = dict[str, list[str]]  # of kernels, as numba reads them
+Kernels = dict[str, Signatures]  # of modules
+
+
+def read_list() -> dict[str, Kernels]:
+    """Read by part which kernels Python calls, and with what; modules that take longest come first."""
+    parts: dict[str, Kernels] = json.loads(LIST.read_text())
+    return parts
+
+
+def count_cores() -> int:
+    """Number of processes that may compile side by side: one for each core that this process may use."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return min(cores or 1, MOST)
+
+
+def prepare(processes: int, say: Callable[[str], None]) -> None:
+    """Compile what a run needs by default, unless that was done on this machine with this code.
+
+    Parameters
+    ----------
+    processes : int
+        Number of processes.
+    say : callable
+        Called with a sentence where there is something to compile, and with what could not be.
+    """
+    if are_compiled((RUN,)):
+        return
+    say(f"{WORDS}, in {processes} processes" if processes > 1 else WORDS)
+    for line in compile_kernels(processes, (RUN,)):
+        say(f"not compiled beforehand: {line}")
+
+
+def are_compiled(parts: Collection[str] = PARTS) -> bool:
+    """Tell whether `compile_kernels` has done its work with this code, on a machine like this one."""
+    if numba.config.DISABLE_JIT:
+        return True
+    state = _state()
+    with suppress(OSError):
+        return all(_stamp(part).read_text() == state for part in parts)
+    return False
+
+
+def compile_kernels(processes: int, parts: Collection[str] = PARTS) -> list[str]:
+    """Compile the kernels that Python calls, or find them compiled.
+
+    Parameters
+    ----------
+    processes : int
+        Number of processes; each takes one module after the other.
+    parts : collection of str
+        Parts of the list.
+
+    Returns
+    -------
+    list of str
+        What could not be compiled, and why. Where nothing failed, `are_compiled` says so from then on.
+    """
+    failed = []
+    modules = [entry for part in parts for entry in read_list()[part].items()]
+    with _processes(processes) as pipes:
+        failed += _share_out(pipes, modules)
+        if not failed and processes > 1:  # of what two have written at the same time, one may be lost
+            failed += _share_out(pipes[:1], modules)
+    if not failed:
+        with suppress(OSError):  # they are looked at again the next time
+            for part in parts:
+                _stamp(part).write_text(_state())
+    return failed
+
+
+def describe_kernels() -> str:
+    """Say what there is to compile, for what, and where it is kept."""
+    numbers = [sum(len(names) for names in kernels.values()) for kernels in read_list().values()]
+    return f"{sum(numbers)} kernels for {describe_processor().rsplit(' ', 1)[0]}, kept in {find_folder().parent}"
+
+
+def find_folder() -> Path:
+    """Folder in which numba keeps what it compiles of our first package."""
+    module, kernels = next(iter(read_list()[RUN].items()))
+    return Path(_kernel(module, next(iter(kernels))).stats.cache_path)
+
+
+def _share_out(pipes: list[Any], modules: list[tuple[str, Signatures]]) -> list[str]:
+    """Give each process one module after the other; gives what they could not compile."""
+    failed: list[str] = []
+    idle, busy, waiting = list(pipes), dict[Any, str](), deque(modules)
+    while busy or (waiting and idle):
+        while waiting and idle:
+            pipe, given = idle.pop(), waiting.popleft()
+            busy[pipe] = given[0]
+            with suppress(OSError):  # it has died: seen when it is asked
+                pipe.send(given)
+        ready: list[Any] = connection.wait(list(busy))
+        for pipe in ready:
+            module = busy.pop(pipe)
+            try:
+                failed += pipe.recv()
+                idle.append(pipe)
+            except (EOFError, OSError):
+                failed.append(f"{module}: its process died")
+    return failed + [f"{module}: no process is left" for module, _ in waiting]
+
+
+@contextmanager
+def _processes(number: int) -> Iterator[list[Any]]:
+    """Give the pipes of as many processes that compile; they end with the context, at once."""
+    fork_server.begin()
+    methods: Any = multiprocessing.get_context(fork_server.METHOD)
+    started, pipes = [], []
+    try:
+        for _ in range(number):
+            ours, theirs = methods.Pipe()
+            pipes.append(ours)
+            with closing(theirs):
+                process = methods.Process(target=_work, args=(theirs,), daemon=True)
+                process.start()
+                started.append(process)
+        yield pipes
+    finally:
+        for process in started:
+            process.kill()
+        for process in started:
+            process.join()
+        for pipe in pipes:
+            pipe.close()
+
+
+def _work(pipe: Any) -> None:
+    """Compile modules until the other end is gone; signals are the affair of who has it."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    with suppress(EOFError, OSError):
+        while True:
+            pipe.send(_compile(*pipe.recv()))
+
+
+def _compile(module: str, kernels: Signatures) -> list[str]:
+    """Compile kernels of a module, or load them; gives what failed."""
+    failed = []
+    for name, signatures in kernels.items():
+        for signature in signatures:
+            try:
+                arguments, _ = normalize_signature(signature)  # it is found again by these, not by their words
+                _kernel(module, name).compile(arguments)
+            except Exception as error:
+                reason = (str(error) or type(error).__name__).splitlines()[0]
+                failed.append(f"{module}.{name}{signature}: {reason}")
+    return failed
+
+
+def _kernel(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(module), name)
+
+
+def _stamp(part: str) -> Path:
+    """File that says with what a part was compiled: one for each kind of processor, as they may share a folder."""
+    digest = hashlib.blake2b(describe_processor().encode(), digest_size=8).hexdigest()
+    return find_folder() / f"citystitch-{digest}-{part}"
+
+
+def describe_processor() -> str:
+    """Describe what is compiled for: this machine's processor, or what numba was told."""
+    name = numba.config.CPU_NAME or llvmlite.binding.get_host_cpu_name()
+    features = numba.config.CPU_FEATURES
+    if features is None:
+        features = llvmlite.binding.get_host_cpu_features().flatten()
+    return f"{platform.machine()} {name} {features}"
+
+
+def _state() -> str:
+    """Digest of what compiled kernels depend on: versions, the list, and the files of its modules."""
+    lines = [platform.python_version(), numba.__version__, llvmlite.__version__, LIST.read_text()]
+    root = Path(__file__).parents[1]
+    for module in sorted({module for part in read_list().values() for module in part}):
+        with suppress(OSError):  # compiling says so
+            file = root.joinpath(*module.split(".")).with_suffix(".py").stat()
+            lines.append(f"{module} {file.st_mtime_ns} {file.st_size}")
+    return hashlib.blake2b("\n".join(lines).encode(), digest_size=16).hexdigest()
