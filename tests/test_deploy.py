@@ -176,6 +176,7 @@ def test_a_container_begins_with_the_kernels_of_its_image(tmp_path: Path) -> Non
     for expected in ("compiled", "more\n"):  # a volume keeps what was compiled
         done = subprocess.run([*command, kept / "one"], env=given, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stdout, done.stderr) == (3, expected, "")
+    assert os.listdir(kept) == ["one"]
     text = (DEPLOY / "Dockerfile").read_text()
     assert 'ENTRYPOINT ["sh", "/opt/entrypoint.sh"]' in text
     assert text.count("ARG CPU=") == 2  # compiled for the processor that is told to containers
