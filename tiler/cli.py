@@ -348,8 +348,10 @@ def _kernels(options: argparse.Namespace) -> int:
     failed = compile_kernels(options.workers or count_cores())
     for line in failed:
         print(f"citystitch: not compiled: {printable(line)}", file=sys.stderr)
+    if failed:
+        return EXIT_FAILED
     say(describe_kernels())
-    return EXIT_FAILED if failed else 0
+    return 0
 
 
 def _config(_: argparse.Namespace) -> int:

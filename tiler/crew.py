@@ -3,11 +3,9 @@
 They are forked from the process that is there for it, see `tiler.fork_server`.
 """
 
-import multiprocessing
 import os
 import pickle
 import queue
-import signal
 import threading
 import time
 from collections.abc import Callable
@@ -141,14 +139,9 @@ class Crew:
         self._hands = []
 
     def _start(self) -> _Hand:
-        fork_server.begin()
-        methods: Any = multiprocessing.get_context(fork_server.METHOD)
-        ours, theirs = methods.Pipe()
         memory = int(REFUSE_AT * self.limits.memory)
-        process = methods.Process(target=_work, args=(theirs, memory, self.limits.seconds), daemon=True)
-        process.start()
-        theirs.close()
-        return _Hand(process, ours)
+        process, pipe = fork_server.start(_work, memory, self.limits.seconds)
+        return _Hand(process, pipe)
 
     def _send(self, hand: _Hand, given: Given, deaths: int) -> None:
         sent = _pack((given.function, given.task))
@@ -201,9 +194,7 @@ def _resident(pid: int) -> int:
 
 
 def _work(pipe: Any, memory: int, seconds: float) -> None:
-    """Run tasks until the other end is gone; signals are the driver's affair."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+    """Run tasks until the other end is gone."""
     keep_memory()
     if memory:
         limit_memory(memory)

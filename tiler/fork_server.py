@@ -12,8 +12,8 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext, suppress
 from functools import partial
 from multiprocessing import forkserver, resource_tracker, util
 from pathlib import Path
@@ -62,6 +62,34 @@ def begin(*, dask: bool = False, forked: bool = False) -> None:
             importlib.import_module(name)
     with _environment(), _forked(modules) if forked and has_one_thread() else nullcontext():
         forkserver.ensure_running()
+
+
+def start(target: Callable[..., None], *given: Any) -> tuple[Any, Any]:
+    """Start a process that is forked from it; signals are the affair of this one, with whom it ends at the latest.
+
+    Parameters
+    ----------
+    target : callable
+        Called there with the other end of the pipe, and with what is given.
+
+    Returns
+    -------
+    process, pipe
+        The process, and this end of a pipe to it.
+    """
+    begin()
+    methods: Any = multiprocessing.get_context(METHOD)
+    ours, theirs = methods.Pipe()
+    with closing(theirs):
+        process = methods.Process(target=_deaf, args=(target, theirs, *given), daemon=True)
+        process.start()
+    return process, ours
+
+
+def _deaf(target: Callable[..., None], *given: Any) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    target(*given)
 
 
 def has_one_thread() -> bool:

@@ -7,13 +7,11 @@ compile the same ones, each for itself.
 import hashlib
 import importlib
 import json
-import multiprocessing
 import os
 import platform
-import signal
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
@@ -27,7 +25,7 @@ from tiler import fork_server
 
 LIST = Path(__file__).with_name("kernels.json")  # written by tests/record_kernels.py
 RUN, OTHER = PARTS = ("run", "other")  # of the list: what runs need by default; what other ways and commands do
-MOST = 8  # processes that compile side by side: the module that takes longest takes a seventh of all
+MOST = 8  # processes that compile side by side: each module is one process's affair, and some take much longer
 WORDS = "compiling kernels for this machine, once"
 
 Signatures = dict[str, list[str]]  # of kernels, as numba reads them
@@ -103,8 +101,10 @@ def compile_kernels(processes: int, parts: Collection[str] = PARTS) -> list[str]
 
 def describe_kernels() -> str:
     """Say what there is to compile, for what, and where it is kept."""
-    numbers = [sum(len(names) for names in kernels.values()) for kernels in read_list().values()]
-    return f"{sum(numbers)} kernels for {describe_processor().rsplit(' ', 1)[0]}, kept in {find_folder().parent}"
+    kernels = {(module, name) for part in read_list().values() for module, names in part.items() for name in names}
+    machine, processor, _ = _target()
+    kept = numba.config.CACHE_DIR or f"{find_folder()} and the like"
+    return f"{len(kernels)} kernels for {machine} {processor}, kept in {kept}"
 
 
 def find_folder() -> Path:
@@ -137,17 +137,12 @@ def _share_out(pipes: list[Any], modules: list[tuple[str, Signatures]]) -> list[
 @contextmanager
 def _processes(number: int) -> Iterator[list[Any]]:
     """Give the pipes of as many processes that compile; they end with the context, at once."""
-    fork_server.begin()
-    methods: Any = multiprocessing.get_context(fork_server.METHOD)
     started, pipes = [], []
     try:
         for _ in range(number):
-            ours, theirs = methods.Pipe()
-            pipes.append(ours)
-            with closing(theirs):
-                process = methods.Process(target=_work, args=(theirs,), daemon=True)
-                process.start()
-                started.append(process)
+            process, pipe = fork_server.start(_work)
+            started.append(process)
+            pipes.append(pipe)
         yield pipes
     finally:
         for process in started:
@@ -159,9 +154,7 @@ def _processes(number: int) -> Iterator[list[Any]]:
 
 
 def _work(pipe: Any) -> None:
-    """Compile modules until the other end is gone; signals are the affair of who has it."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+    """Compile modules until the other end is gone."""
     with suppress(EOFError, OSError):
         while True:
             pipe.send(_compile(*pipe.recv()))
@@ -187,17 +180,16 @@ def _kernel(module: str, name: str) -> Any:
 
 def _stamp(part: str) -> Path:
     """File that says with what a part was compiled: one for each kind of processor, as they may share a folder."""
-    digest = hashlib.blake2b(describe_processor().encode(), digest_size=8).hexdigest()
+    digest = hashlib.blake2b(" ".join(_target()).encode(), digest_size=8).hexdigest()
     return find_folder() / f"citystitch-{digest}-{part}"
 
 
-def describe_processor() -> str:
-    """Describe what is compiled for: this machine's processor, or what numba was told."""
-    name = numba.config.CPU_NAME or llvmlite.binding.get_host_cpu_name()
+def _target() -> tuple[str, str, str]:
+    """What is compiled for, by this machine or as numba was told: kind of machine, processor and its features."""
     features = numba.config.CPU_FEATURES
     if features is None:
         features = llvmlite.binding.get_host_cpu_features().flatten()
-    return f"{platform.machine()} {name} {features}"
+    return platform.machine(), numba.config.CPU_NAME or llvmlite.binding.get_host_cpu_name(), features
 
 
 def _state() -> str:
