@@ -58,6 +58,19 @@ def sort_group(xyz: NDArray[np.float64]) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
+def order_values(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Rows of values, (n,), in ascending order, those of equal ones as they come; for kernels."""
+    n = len(values)
+    rows, order = np.empty((n, 3)), np.empty(n, np.int64)
+    for k in range(n):
+        rows[k, 0], rows[k, 1], rows[k, 2] = 0.0, k, values[k]
+    sort_group(rows)
+    for k in range(n):
+        order[k] = int(rows[k, 1])
+    return order
+
+
+@numba.njit(cache=True, nogil=True)
 def _deal_out(xyz: NDArray[np.float64]) -> NDArray[np.int64]:
     """Put points in order of as many bins of equal height; give where each bin starts."""
     n = len(xyz)

@@ -39,20 +39,62 @@ class Edges:
     b: Array
 
 
-def list_edges(polygons: NDArray[np.object_]) -> Edges:
-    """List the edges of polygons, shapely Polygons or MultiPolygons (n,), ring by ring; those of no length too."""
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """Closed rings of some polygons, one after the other.
+
+    Attributes
+    ----------
+    start : int64, (n + 1,)
+        Polygon ``i`` has the vertices ``start[i]`` to ``start[i + 1]``.
+    xy : float64, (m, 2)
+        Vertices (m), the first of a ring again as its last.
+    ring : int64, (m,)
+        Ring of each vertex, ascending; the shell of a polygon comes first.
+    """
+
+    start: Index
+    xy: Array
+    ring: Index
+
+
+def read_rings(polygons: NDArray[np.object_]) -> Rings:
+    """Read the rings of polygons, shapely Polygons or MultiPolygons (n,)."""
     if (shapely.get_type_id(polygons) == POLYGON).all() and not shapely.get_num_interior_rings(polygons).any():
-        xy, owner = shapely.get_coordinates(polygons, return_index=True)
-        first = np.flatnonzero(owner[1:] == owner[:-1])
-        owner = owner[first]
+        xy, ring = shapely.get_coordinates(polygons, return_index=True)
+        owner = ring
     else:
         parts, of_part = shapely.get_parts(polygons, return_index=True)
         rings, of_ring = shapely.get_rings(parts, return_index=True)
         xy, ring = shapely.get_coordinates(rings, return_index=True)
-        first = np.flatnonzero(ring[1:] == ring[:-1])
-        owner = of_part[of_ring[ring[first]]]
-    start = np.searchsorted(owner, np.arange(len(polygons) + 1))
-    return Edges(start, xy[first], xy[first + 1])
+        owner = of_part[of_ring[ring]]
+    return Rings(np.searchsorted(owner, np.arange(len(polygons) + 1)), xy, ring)
+
+
+def list_edges(polygons: NDArray[np.object_]) -> Edges:
+    """List the edges of polygons, shapely Polygons or MultiPolygons (n,), ring by ring; those of no length too."""
+    return edges_of_rings(read_rings(polygons))
+
+
+def edges_of_rings(rings: Rings) -> Edges:
+    """List the edges of rings; those of no length too."""
+    return Edges(*_edges_of_rings(rings.start, rings.xy, rings.ring))
+
+
+@numba.njit(cache=True, nogil=True)
+def _edges_of_rings(start: Index, xy: Array, ring: Index) -> tuple[Index, Array, Array]:
+    n = 0
+    for v in range(1, len(xy)):
+        n += ring[v] == ring[v - 1]
+    first, a, b = np.zeros(len(start), np.int64), np.empty((n, 2)), np.empty((n, 2))
+    n = 0
+    for i in range(len(start) - 1):
+        for v in range(start[i] + 1, start[i + 1]):
+            if ring[v] == ring[v - 1]:
+                a[n, 0], a[n, 1], b[n, 0], b[n, 1] = xy[v - 1, 0], xy[v - 1, 1], xy[v, 0], xy[v, 1]
+                n += 1
+        first[i + 1] = n
+    return first, a, b
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +239,7 @@ def are_covered(cover: Cover, xy: Array) -> NDArray[np.bool_]:
 
 
 def are_inside(
-    polygons: NDArray[np.object_], polygon: Index, xy: Array, *, closed: bool = False, edges: Edges | None = None
+    polygons: NDArray[np.object_], polygon: Index, xy: Array, *, closed: bool = False
 ) -> NDArray[np.bool_]:
     """Tell whether points are inside the polygon that is named for each.
 
@@ -211,21 +253,19 @@ def are_inside(
         Points (m).
     closed : bool
         Whether outlines count as inside.
-    edges : Edges, optional
-        The polygons' edges, where they are known.
 
     Returns
     -------
     bool, (k,)
         What `shapely.contains_xy` says, with `closed` `shapely.intersects_xy`. O(edges) a point.
     """
-    edges = list_edges(polygons) if edges is None else edges
+    edges = list_edges(polygons)
     side = np.empty(len(polygon), np.int64)
     _locate(xy, polygon, edges.start, edges.a, edges.b, side)
     return _settle(polygons, polygon, xy, np.arange(len(xy)), side, closed=closed)
 
 
-def find_owner(polygons: NDArray[np.object_], xy: Array) -> Index:
+def find_owner(polygons: NDArray[np.object_], xy: Array, *, edges: Edges | None = None) -> Index:
     """Find the polygon that each point is inside.
 
     Parameters
@@ -234,13 +274,15 @@ def find_owner(polygons: NDArray[np.object_], xy: Array) -> Index:
         Valid shapely Polygons that do not overlap, few of them.
     xy : float64, (k, 2) or (k, 3)
         Points (m).
+    edges : Edges, optional
+        The polygons' edges, where they are known.
 
     Returns
     -------
     int64, (k,)
         Row of the polygon; -1 for a point in none, on outlines too.
     """
-    edges = list_edges(polygons)
+    edges = list_edges(polygons) if edges is None else edges
     owner = np.full(len(xy), -1)
     for k in _find_owners(xy, edges.start, edges.a, edges.b, owner):
         found = np.flatnonzero(shapely.contains_xy(polygons, *xy[k, :2]))

@@ -1,12 +1,13 @@
 """Lines through a house, where its roof points fall best into two heights (for `house_levels`)."""
 
+import math
 from dataclasses import dataclass
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.group_order import sort_group
+from pipeline.group_order import order_values, sort_group
 
 MAX_DIRECTIONS = 4  # directions of walls along which lines are tried, those with most wall first
 SAME_DIRECTION = 0.0872  # sine of 5 degrees; walls that differ by less count as one direction
@@ -53,25 +54,60 @@ def rank_lines(a: Array, b: Array, xyz: Array, *, clearance: float, min_points: 
         The best line through a vertex and the best between vertices for each direction, the best first;
         none that takes away less than `MIN_GAIN`.
     """
-    z = xyz[:, 2] - xyz[:, 2].mean()
-    total = float(z @ z)
-    ranked: list[tuple[float, Line]] = []
-    for along in _directions(a, b) if total > 0 else ():
-        normal = np.array([-along[1], along[0]])
-        across, vertex = xyz[:, :2] @ normal, np.sort(a @ normal)
-        for gain, offset in zip(*_best_lines(across, z, vertex, total, clearance, min_points), strict=True):
-            if gain >= MIN_GAIN:
-                ranked.append((gain, Line(along, normal, offset)))
-    ranked.sort(key=lambda entry: -entry[0])
-    return [line for _, line in ranked[:MAX_TRIES]]
+    return [
+        Line(np.array([x, y]), np.array([-y, x]), offset)
+        for x, y, offset in _rank_lines(a, b, xyz, clearance, min_points).tolist()
+    ]
 
 
+@numba.njit(cache=True, nogil=True)
+def _rank_lines(a: Array, b: Array, xyz: Array, clearance: float, min_points: int) -> Array:
+    """Rank lines as `rank_lines` does; gives direction and offset of each, (k, 3)."""
+    n = len(xyz)
+    z = xyz[:, 2].copy()
+    mean, total = _sum_pairwise(z) / max(n, 1), sum_squares(z)
+    for k in range(n):
+        z[k] -= mean
+    if not total > 0:
+        return np.empty((0, 3))
+    directions = _directions(a, b)
+    n_found = 2 * len(directions)
+    found, loss = np.empty((n_found, 3)), np.empty(n_found)
+    across, vertex = np.empty(n), np.empty((len(a), 3))
+    for d in range(len(directions)):
+        along_x, along_y = directions[d, 0], directions[d, 1]
+        for k in range(n):
+            across[k] = xyz[k, 1] * along_x - xyz[k, 0] * along_y
+        for k in range(len(a)):
+            vertex[k, 0], vertex[k, 1], vertex[k, 2] = 0.0, 0.0, a[k, 1] * along_x - a[k, 0] * along_y
+        sort_group(vertex)
+        gain, offset = _best_lines(across, z, vertex[:, 2].copy(), total, clearance, min_points)
+        for k in range(2):
+            row = 2 * d + k
+            found[row, 0], found[row, 1], found[row, 2], loss[row] = along_x, along_y, offset[k], -gain[k]
+    lines = np.empty((min(n_found, MAX_TRIES), 3))
+    n_lines = 0
+    for row in order_values(loss)[:MAX_TRIES]:
+        if loss[row] <= -MIN_GAIN:
+            lines[n_lines, 0], lines[n_lines, 1], lines[n_lines, 2] = found[row, 0], found[row, 1], found[row, 2]
+            n_lines += 1
+    return lines[:n_lines].copy()
+
+
+@numba.njit(cache=True, nogil=True)
 def _directions(a: Array, b: Array) -> Array:
     """Unit vectors of the directions with most wall, each that of its longest wall."""
-    d = b - a
-    length = np.hypot(d[:, 0], d[:, 1])
-    found, total = _group_directions(d / length[:, None], length, np.argsort(-length, kind="stable"))
-    most: Array = found[np.argsort(-total, kind="stable")[:MAX_DIRECTIONS]]
+    n = len(a)
+    along, length = np.empty((n, 2)), np.empty(n)
+    for e in range(n):
+        x, y = b[e, 0] - a[e, 0], b[e, 1] - a[e, 1]
+        length[e] = math.hypot(x, y)
+        along[e, 0], along[e, 1] = x / length[e], y / length[e]
+    found, total = _group_directions(along, length, order_values(-length))
+    order = order_values(-total)
+    most = np.empty((min(len(found), MAX_DIRECTIONS), 2))
+    for k in range(len(most)):
+        most[k, 0], most[k, 1] = found[order[k], 0], found[order[k], 1]
     return most
 
 
@@ -99,6 +135,17 @@ def _group_directions(along: Array, length: Array, left: NDArray[np.int64]) -> t
         n_found += 1
         n = n_left
     return found[:n_found], total[:n_found]
+
+
+@numba.njit(cache=True, nogil=True)
+def sum_squares(z: Array) -> float:
+    """Sum the squares of heights around their mean (m²)."""
+    n = len(z)
+    mean, squares = _sum_pairwise(z) / max(n, 1), np.empty(n)
+    for k in range(n):
+        squares[k] = (z[k] - mean) * (z[k] - mean)
+    total: float = _sum_pairwise(squares)
+    return total
 
 
 @numba.njit(cache=True, nogil=True)

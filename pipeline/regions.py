@@ -1,68 +1,39 @@
 """Neighbouring cells of a house joined until the roof steps at every wall that is left (for `house_levels`)."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
 
+import numba
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
-from pipeline.segments import heights_beside, unite_places
+from pipeline.group_order import sort_group
+from pipeline.outlines import Outline
+from pipeline.segments import heights_beside
 
 STEP_REACH = 2.0  # m on both sides of a wall, where the roof has to step
 MIN_NEAR = 3  # points on each side of a wall, to see a step there
 TOO_SMALL, NO_STEP, APART = range(3)  # why two regions are joined, the first reason first; or not
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """Cells that are one part of a house.
-
-    Attributes
-    ----------
-    cells : list of int
-        Their rows.
-    area : float
-        Sum of their areas (m²).
-    z : float64, (n,)
-        Heights of their points (m), in no order.
-    height : float
-        Median of `z` (m); NaN without points.
-    """
-
-    cells: list[int]
-    area: float
-    z: Array
-    height: float
-
-
-@dataclass(frozen=True)
-class _Limits:
-    min_step: float
-    min_area: float
-    min_points: int
-
-
-# Heights of the points beside the wall between two regions, on the side of the first and of the second.
-_Borders = dict[tuple[int, int], tuple[Array, Array]]
+Index = NDArray[np.int64]
 
 
 def join_cells(
-    cells: NDArray[np.object_],
-    points: list[Array],
+    cells: Sequence[Outline],
+    points: Sequence[Array],
     *,
     min_step: float,
     min_area: float,
     min_points: int,
-) -> list[Region]:
+) -> tuple[Index, float]:
     """Join neighbouring cells until every region is large enough and the roof steps at each border.
 
     Parameters
     ----------
-    cells : object, (c,)
-        Polygons that share their vertices, to the bit, where they touch.
-    points : list of c float64 arrays (n, 3)
+    cells : sequence of c Outline
+        Cells that share their vertices, to the bit, where they touch.
+    points : sequence of c float64 arrays (n, 3)
         Points of each cell (m).
     min_step : float
         Least step (m): of the medians of both regions, and of the medians of the points within `STEP_REACH`
@@ -72,84 +43,273 @@ def join_cells(
 
     Returns
     -------
-    list of Region
-        By their first cell. A single region may be smaller.
+    region : int64, (c,)
+        Region of each cell, named by its first cell. A single region may be smaller.
+    within : float
+        Squares of the heights of all points around the mean of their region (m²).
 
     Notes
     -----
     Too small regions go first, then those without a step, closest medians first; ties by rows. Medians are
-    taken anew after each joining, at the cost of the points of the new region and its borders.
+    taken anew after each joining: all points of the house are looked at, which are in order of their heights.
     """
-    limits = _Limits(min_step, min_area, min_points)
-    areas = shapely.area(cells).tolist()
-    regions = {k: _region([k], areas[k], xyz[:, 2]) for k, xyz in enumerate(points)}
-    borders = _find_borders(cells, points)
-    ranks = {pair: _rank(pair, regions, borders, limits) for pair in borders}
-    while ranks:
-        pair = min(ranks, key=lambda pair: (ranks[pair], pair))
-        if ranks[pair][0] == APART:
+    start = np.cumsum([0, *(len(cell.xy) for cell in cells)])
+    xy, ring = np.concatenate([cell.xy for cell in cells]), np.concatenate([cell.ring for cell in cells])
+    first = np.cumsum([0, *map(len, points)])
+    xyz, area = np.concatenate(points), np.array([cell.area for cell in cells])
+    borders, (z, cell) = _find_borders(start, xy, ring, xyz, first), _order(xyz, first)
+    limits = float(min_step), float(min_area), min_points, MIN_NEAR
+    region, within = _join(*borders, area, z, cell, *limits)
+    return region, within
+
+
+@numba.njit(cache=True, nogil=True)
+def _order(xyz: Array, first: Index) -> tuple[Array, Index]:
+    """Give the heights of all points in order, and the cell of each."""
+    rows, z, cell = np.empty((len(xyz), 3)), np.empty(len(xyz)), np.empty(len(xyz), np.int64)
+    for c in range(len(first) - 1):
+        for k in range(first[c], first[c + 1]):
+            rows[k, 0], rows[k, 1], rows[k, 2] = 0.0, c, xyz[k, 2]
+    sort_group(rows)
+    for k in range(len(rows)):
+        z[k], cell[k] = rows[k, 2], int(rows[k, 1])
+    return z, cell
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_borders(start: Index, xy: Array, ring: Index, xyz: Array, first: Index) -> tuple[Index, Array, Index]:
+    """Find the edges that two cells share, and the heights of the points beside them.
+
+    Parameters
+    ----------
+    start, xy, ring
+        Vertices of all cells, as in `pipeline.inside.Rings`.
+    xyz : float64, (n, 3)
+        Points (m); cell ``c`` has those from ``first[c]`` to ``first[c + 1]``.
+
+    Returns
+    -------
+    border : int64, (b, 2)
+        Cells of each such edge.
+    near : float64, (k,)
+        Heights of the points beside them (m).
+    near_start : int64, (2 b + 1,)
+        Those on side ``s`` of border ``k`` begin at ``near_start[2 * k + s]``.
+    """
+    edges = _number_edges(start, xy, ring)
+    border, at = np.empty((len(edges) // 2, 2), np.int64), np.empty(len(edges) // 2, np.int64)
+    n = 0
+    for k in range(1, len(edges)):
+        if edges[k, 0] == edges[k - 1, 0] and edges[k, 1] == edges[k - 1, 1]:
+            border[n, 0], border[n, 1], at[n] = edges[k - 1, 2], edges[k, 2], edges[k - 1, 3]
+            n += 1
+    near_start = np.zeros(2 * n + 1, np.int64)
+    for k in range(n):
+        for side in range(2):
+            c = border[k, side]
+            near_start[2 * k + side + 1] = near_start[2 * k + side] + first[c + 1] - first[c]
+    near = np.empty(near_start[2 * n])  # room for all points of the cells
+    for k in range(n):
+        for side in range(2):
+            c, to = border[k, side], near_start[2 * k + side]
+            beside = heights_beside(xyz[first[c] : first[c + 1]], xy[at[k]], xy[at[k] + 1], STEP_REACH)
+            for i in range(len(beside)):
+                near[to + i] = beside[i]
+            near_start[2 * k + side + 1] = to + len(beside)
+    return border[:n].copy(), near[: near_start[2 * n]].copy(), near_start
+
+
+@numba.njit(cache=True, nogil=True)
+def _number_edges(start: Index, xy: Array, ring: Index) -> Index:
+    """List the edges of all cells in order: both vertices, the lesser first, cell, and row where it begins."""
+    n = len(xy)
+    rows, vertex = np.empty((n, 3)), np.empty(n, np.int64)
+    for v in range(n):
+        rows[v, 0], rows[v, 1], rows[v, 2] = v, xy[v, 1], xy[v, 0]
+    sort_group(rows)
+    for k in range(n):
+        same = k > 0 and rows[k, 1] == rows[k - 1, 1] and rows[k, 2] == rows[k - 1, 2]
+        vertex[int(rows[k, 0])] = vertex[int(rows[k - 1, 0])] if same else k
+    edges = np.empty((n, 4), np.int64)
+    n_edges = 0
+    for c in range(len(start) - 1):
+        for v in range(start[c] + 1, start[c + 1]):
+            if ring[v] == ring[v - 1]:
+                edges[n_edges, 0] = min(vertex[v - 1], vertex[v])
+                edges[n_edges, 1] = max(vertex[v - 1], vertex[v])
+                edges[n_edges, 2], edges[n_edges, 3] = c, v - 1
+                n_edges += 1
+    rows = np.empty((n_edges, 3))
+    for e in range(n_edges):
+        rows[e, 0], rows[e, 1], rows[e, 2] = e, edges[e, 1], edges[e, 0]
+    sort_group(rows)
+    ordered = np.empty((n_edges, 4), np.int64)
+    for k in range(n_edges):
+        for i in range(4):
+            ordered[k, i] = edges[int(rows[k, 0]), i]
+    return ordered
+
+
+@numba.njit(cache=True, nogil=True)
+def _join(
+    border: Index,
+    near: Array,
+    near_start: Index,
+    area: Array,
+    z: Array,
+    cell: Index,
+    min_step: float,
+    min_area: float,
+    min_points: int,
+    min_near: int,
+) -> tuple[Index, float]:
+    """Join cells as `join_cells` does; gives its results.
+
+    Parameters
+    ----------
+    border, near, near_start
+        As from `_find_borders`.
+    area : float64, (c,)
+        Areas of the cells (m²).
+    z, cell
+        As from `_order`.
+    min_step, min_area, min_points, min_near
+        As for `join_cells`, and `MIN_NEAR`.
+    """
+    region, area = np.arange(len(area)), area.copy()
+    count, height = np.empty(len(area), np.int64), np.empty(len(area))
+    for c in range(len(area)):
+        count[c], height[c] = _median_of(c, region, z, cell)
+    why, difference = np.full(len(border), np.int64(APART)), np.zeros(len(border))
+    touched = -1  # region whose borders are ranked anew; at first, all are
+    while True:
+        for k in range(len(border)):
+            one, two = _sides(border, k, region)
+            if one == two or (touched >= 0 and touched not in (one, two)):
+                continue
+            twin = 0  # the first edge between the same regions
+            while not _is_between(border, twin, region, one, two):
+                twin += 1
+            if twin < k:
+                why[k], difference[k] = why[twin], difference[twin]
+                continue
+            apart = height[one] - height[two]
+            difference[k] = 0.0 if math.isnan(apart) else abs(apart)
+            if min(count[one], count[two]) < min_points or min(area[one], area[two]) < min_area:
+                why[k] = TOO_SMALL
+            else:
+                step = _step_at(one, two, apart, border, near, near_start, region, min_near)
+                why[k] = APART if step >= min_step else NO_STEP
+        best = _find_best(why, difference, border, region)
+        if best < 0:
             break
-        first, second = pair
-        kept, gone = regions[first], regions.pop(second)
-        regions[first] = _region(kept.cells + gone.cells, kept.area + gone.area, np.concatenate((kept.z, gone.z)))
-        for other in [other for other in borders if first in other or second in other]:
-            sides = borders.pop(other)
-            ranks.pop(other)
-            if other != pair:
-                one, two = (first if end == second else end for end in other)
-                _add_border(borders, one, two, *sides)
-        for other in borders:
-            if first in other:
-                ranks[other] = _rank(other, regions, borders, limits)
-    return list(regions.values())
+        touched, gone = _sides(border, best, region)
+        for c in range(len(region)):
+            if region[c] == gone:
+                region[c] = touched
+        area[touched] += area[gone]
+        count[touched], height[touched] = _median_of(touched, region, z, cell)
+    return region, _squares_within(region, z, cell)
 
 
-def _region(cells: list[int], area: float, z: Array) -> Region:
-    return Region(cells, area, z, _median(z) if len(z) else float("nan"))
+@numba.njit(cache=True, nogil=True)
+def _find_best(why: Index, difference: Array, border: Index, region: Index) -> int:
+    """Find the border that is opened first; -1 if none is."""
+    best = -1
+    for k in range(len(border)):
+        one, two = _sides(border, k, region)
+        if one != two and why[k] != APART and (best < 0 or _goes_before(k, best, why, difference, border, region)):
+            best = k
+    return best
 
 
-def _rank(
-    pair: tuple[int, int], regions: dict[int, Region], borders: _Borders, limits: _Limits
-) -> tuple[int, float]:
-    """Whether two regions are joined, and the difference of their heights."""
-    one, two = regions[pair[0]], regions[pair[1]]
-    difference = one.height - two.height
-    if min(len(one.z), len(two.z)) < limits.min_points or min(one.area, two.area) < limits.min_area:
-        return TOO_SMALL, 0.0 if np.isnan(difference) else abs(difference)
-    step = abs(difference)
-    near_one, near_two = borders[pair]
-    if min(len(near_one), len(near_two)) >= MIN_NEAR:
-        step = min(step, (_median(near_one) - _median(near_two)) * float(np.sign(difference)))
-    return APART if step >= limits.min_step else NO_STEP, abs(difference)
+@numba.njit(cache=True, nogil=True)
+def _sides(border: Index, k: int, region: Index) -> tuple[int, int]:
+    """Regions on both sides of a border, the lesser first."""
+    one, two = region[border[k, 0]], region[border[k, 1]]
+    return min(one, two), max(one, two)
 
 
-def _find_borders(cells: NDArray[np.object_], points: list[Array]) -> _Borders:
-    """Find the cells that share an edge, and the heights of the points beside it."""
-    rings, owner = shapely.get_rings(cells, return_index=True)
-    xy, ring = shapely.get_coordinates(rings, return_index=True)
-    edge = np.flatnonzero(ring[1:] == ring[:-1])
-    cell = owner[ring[edge]]
-    _, vertex = unite_places(xy)
-    ends = np.sort(np.column_stack((vertex[edge], vertex[edge + 1])), axis=1)
-    order = np.lexsort((cell, ends[:, 1], ends[:, 0]))
-    again = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
-    borders: _Borders = {}
-    for e, f in zip(order[again].tolist(), order[again + 1].tolist(), strict=True):
-        a, b = xy[edge[e]], xy[edge[e] + 1]
-        beside = [heights_beside(points[cell[side]], a, b, STEP_REACH) for side in (e, f)]
-        _add_border(borders, int(cell[e]), int(cell[f]), beside[0], beside[1])
-    return borders
+@numba.njit(cache=True, nogil=True)
+def _is_between(border: Index, k: int, region: Index, one: int, two: int) -> bool:
+    """Whether a border lies between two regions."""
+    first, second = region[border[k, 0]], region[border[k, 1]]
+    return bool((first == one and second == two) or (first == two and second == one))
 
 
-def _add_border(borders: _Borders, one: int, two: int, near_one: Array, near_two: Array) -> None:
-    if one > two:
-        one, two, near_one, near_two = two, one, near_two, near_one
-    known_one, known_two = borders.get((one, two), (np.empty(0), np.empty(0)))
-    borders[one, two] = np.concatenate((known_one, near_one)), np.concatenate((known_two, near_two))
+@numba.njit(cache=True, nogil=True)
+def _goes_before(k: int, other: int, why: Index, difference: Array, border: Index, region: Index) -> bool:
+    """Whether a border is opened before another one."""
+    if why[k] != why[other]:
+        return bool(why[k] < why[other])
+    if difference[k] != difference[other]:
+        return bool(difference[k] < difference[other])
+    one, two = _sides(border, k, region)
+    other_one, other_two = _sides(border, other, region)
+    return bool(one < other_one or (one == other_one and two < other_two))
 
 
-def _median(z: Array) -> float:
-    """Median as numpy's, at a quarter of its cost for few values."""
-    half = len(z) // 2
-    z = np.partition(z, (half - 1, half)) if len(z) % 2 == 0 else np.partition(z, half)
-    return float(z[half]) if len(z) % 2 else float((z[half - 1] + z[half]) / 2)
+@numba.njit(cache=True, nogil=True)
+def _median_of(wanted: int, region: Index, z: Array, cell: Index) -> tuple[int, float]:
+    """Number and median height of the points of a region; NaN without points."""
+    n = 0
+    for k in range(len(z)):
+        n += region[cell[k]] == wanted
+    low = high = math.nan
+    seen = 0
+    for k in range(len(z)):
+        if region[cell[k]] == wanted:
+            if seen == (n - 1) // 2:
+                low = z[k]
+            if seen == n // 2:
+                high = z[k]
+                break
+            seen += 1
+    return n, (low + high) / 2
+
+
+@numba.njit(cache=True, nogil=True)
+def _step_at(
+    one: int,
+    two: int,
+    apart: float,
+    border: Index,
+    near: Array,
+    near_start: Index,
+    region: Index,
+    min_near: int,
+) -> float:
+    """Step of the roof between two regions (m): the lesser of that of their medians and that at their border."""
+    step, here = abs(apart), 0.0
+    for wanted in (one, two):
+        n = 0
+        for fill in range(2):
+            rows = np.empty((n, 3))
+            n = 0
+            for k in range(len(border)):
+                if not _is_between(border, k, region, one, two):
+                    continue
+                side = 2 * k + (0 if region[border[k, 0]] == wanted else 1)
+                for i in range(near_start[side], near_start[side + 1]):
+                    if fill:
+                        rows[n, 0], rows[n, 1], rows[n, 2] = 0.0, 0.0, near[i]
+                    n += 1
+        if n < min_near:
+            return step
+        sort_group(rows)
+        median = (rows[(n - 1) // 2, 2] + rows[n // 2, 2]) / 2
+        here = median if wanted == one else here - median
+    return min(step, here if apart > 0 else -here if apart < 0 else 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _squares_within(region: Index, z: Array, cell: Index) -> float:
+    """Squares of the heights around the means of their regions (m²)."""
+    total, count, squares = np.zeros(len(region)), np.zeros(len(region)), 0.0
+    for k in range(len(z)):
+        total[region[cell[k]]] += z[k]
+        count[region[cell[k]]] += 1
+    for k in range(len(z)):
+        r = region[cell[k]]
+        squares += (z[k] - total[r] / count[r]) ** 2
+    return squares

@@ -6,16 +6,34 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.group_order import order_values
+from pipeline.inside import INSIDE, side_of
+
 BLUNT = 0.866  # cosine of 30 degrees, the least angle between a new wall and another
 ON_EDGE = 1e-6  # m; a corner of a neighbour this close to an edge lies on it
 
 Array = NDArray[np.float64]
 
 
-def unite_places(xy: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Sort places, float64 (n, 2), by x, then y, without repetitions; also gives the row of each in the result."""
-    united, row = np.unique(np.ascontiguousarray(xy).view(np.complex128), return_inverse=True)
-    return united.view(np.float64).reshape(-1, 2), row.reshape(-1)
+@numba.njit(cache=True, nogil=True)
+def add_places(places: Array, more: Array) -> Array:
+    """Add places, float64 (k, 2), to others that are sorted by x, then y, without repetitions, and stay so."""
+    united = np.empty((len(places) + len(more), 2))
+    n = len(places)
+    for k in range(n):
+        united[k, 0], united[k, 1] = places[k, 0], places[k, 1]
+    for k in range(len(more)):
+        x, y = more[k, 0], more[k, 1]
+        to = n
+        while to > 0 and (x < united[to - 1, 0] or (x == united[to - 1, 0] and y < united[to - 1, 1])):
+            to -= 1
+        if to > 0 and united[to - 1, 0] == x and united[to - 1, 1] == y:
+            continue
+        for i in range(n, to, -1):
+            united[i, 0], united[i, 1] = united[i - 1, 0], united[i - 1, 1]
+        united[to, 0], united[to, 1] = x, y
+        n += 1
+    return united[:n].copy()
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -148,6 +166,59 @@ def _is_blunt(start: Array, end: Array, a: Array, b: Array) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
+def place_walls(
+    a: Array, b: Array, along: Array, offset: float, clearance: float
+) -> tuple[Array, NDArray[np.int64]]:
+    """Place walls along a line inside an outline, bent through the vertices within `clearance` of it.
+
+    Parameters
+    ----------
+    a, b : float64, (m, 2)
+        Ends of the edges of the outline (m).
+    along : float64, (2,)
+        Direction of the line, a unit vector; its normal is a quarter turn to the left.
+    offset : float
+        Distance of the line from the origin along its normal (m).
+    clearance : float
+        As for `find_nodes` and `are_clear`.
+
+    Returns
+    -------
+    ends : float64, (k, 2, 2)
+        Walls, from and to (m).
+    edge : int64, (k, 2)
+        Edge of the outline that each end divides, -1 where it is a vertex already.
+
+    Notes
+    -----
+    The middle of a wall that `are_clear` lets pass is away from all edges: no rounding decides where it is.
+    """
+    side_a, side_b = np.empty(len(a)), np.empty(len(a))
+    for e in range(len(a)):
+        side_a[e] = a[e, 1] * along[0] - a[e, 0] * along[1] - offset
+        side_b[e] = b[e, 1] * along[0] - b[e, 0] * along[1] - offset
+    found, crossed = find_nodes(a, b, side_a, side_b, clearance)
+    order = order_values(found[:, 0] * along[0] + found[:, 1] * along[1])
+    nodes, edge = np.empty((len(found), 2)), np.empty(len(found), np.int64)
+    for k in range(len(found)):
+        row = order[k]
+        nodes[k, 0], nodes[k, 1], edge[k] = found[row, 0], found[row, 1], crossed[row]
+    clear = are_clear(nodes[:-1], nodes[1:], a, b, clearance)
+    ends, divided = np.empty((len(clear), 2, 2)), np.empty((len(clear), 2), np.int64)
+    n = 0
+    for k in range(len(clear)):
+        if not clear[k]:
+            continue
+        x, y = (nodes[k, 0] + nodes[k + 1, 0]) / 2, (nodes[k, 1] + nodes[k + 1, 1]) / 2
+        if side_of(x, y, 0, len(a), a, b) == INSIDE:
+            for end in range(2):
+                ends[n, end, 0], ends[n, end, 1] = nodes[k + end, 0], nodes[k + end, 1]
+            divided[n, 0], divided[n, 1] = edge[k], edge[k + 1]
+            n += 1
+    return ends[:n].copy(), divided[:n].copy()
+
+
+@numba.njit(cache=True, nogil=True)
 def divide_edges(a: Array, b: Array, ends: Array, edge: NDArray[np.int64]) -> Array:
     """Divide the edges of an outline where walls end on them.
 
@@ -213,11 +284,9 @@ def insert_corners(xy: Array, ring: NDArray[np.int64], corners: Array) -> tuple[
     xy, ring
         With the corners, to the bit; those of one edge by their distance from its start.
     """
-    new_xy, new_ring = (
-        np.empty((len(xy) * (len(corners) + 1), 2)),
-        np.empty(len(xy) * (len(corners) + 1), np.int64),
-    )
-    away = np.empty(len(corners))
+    near = _take_near(xy, corners)
+    room = len(xy) * (len(near) + 1)
+    new_xy, new_ring, away = np.empty((room, 2)), np.empty(room, np.int64), np.empty(len(near))
     n = 0
     for v in range(len(xy)):
         new_xy[n, 0], new_xy[n, 1], new_ring[n] = xy[v, 0], xy[v, 1], ring[v]
@@ -225,8 +294,8 @@ def insert_corners(xy: Array, ring: NDArray[np.int64], corners: Array) -> tuple[
         if v + 1 == len(xy) or ring[v] != ring[v + 1]:
             continue
         first = n
-        for c in range(len(corners)):
-            x, y = corners[c, 0], corners[c, 1]
+        for c in range(len(near)):
+            x, y = near[c, 0], near[c, 1]
             if not _distance(x, y, xy[v, 0], xy[v, 1], xy[v + 1, 0], xy[v + 1, 1]) <= ON_EDGE:
                 continue
             from_start = math.hypot(xy[v, 0] - x, xy[v, 1] - y)
@@ -240,3 +309,21 @@ def insert_corners(xy: Array, ring: NDArray[np.int64], corners: Array) -> tuple[
             new_xy[k, 0], new_xy[k, 1], new_ring[n], away[k - first] = x, y, ring[v], from_start
             n += 1
     return new_xy[:n].copy(), new_ring[:n].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _take_near(xy: Array, corners: Array) -> Array:
+    """Take the corners that lie in the box around some vertices, or on its sides."""
+    near = np.empty((len(corners), 2))
+    left = under = math.inf
+    right = over = -math.inf
+    for v in range(len(xy)):
+        left, right = min(left, xy[v, 0]), max(right, xy[v, 0])
+        under, over = min(under, xy[v, 1]), max(over, xy[v, 1])
+    n = 0
+    for c in range(len(corners)):
+        x, y = corners[c, 0], corners[c, 1]
+        if left - ON_EDGE <= x <= right + ON_EDGE and under - ON_EDGE <= y <= over + ON_EDGE:
+            near[n, 0], near[n, 1] = x, y
+            n += 1
+    return near[:n]

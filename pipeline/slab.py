@@ -22,6 +22,7 @@ from pipeline.terrain import Dtm, cut_terrain, sample_dtm, sample_grid
 REACH = 3.0  # domain heights; terrain farther from a mesh counts for nothing
 BLOCK = 1.0  # domain heights; side of the squares that `lift_places` works in
 STEEPEST = 300.0  # exponent by which a mode fades from a level to the next at most; what is left is nothing
+UNDAMPED = np.ones((1, 1, 1))
 SUMS = 0.25  # of the grid's shorter side; for fewer rows or columns, sums are faster than a transform
 
 Bounds = tuple[float, float, float, float]
@@ -326,6 +327,14 @@ def _cosines(place: NDArray[np.int64], n: int) -> NDArray[np.float64]:
     return cosines
 
 
+def _sum_modes(
+    spectrum: NDArray[np.float64], rows: NDArray[np.float64], columns: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sum the modes of a spectrum at nodes: cosines of a few rows (r, ny), of columns (nx, c); float64, (r, c)."""
+    found: NDArray[np.float64] = _sum_damped(spectrum, UNDAMPED, rows, columns)[0]
+    return found
+
+
 @numba.njit(cache=True, nogil=True)
 def _sum_damped(
     spectrum: NDArray[np.float64],
@@ -334,18 +343,20 @@ def _sum_damped(
     columns: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """`_sum_modes` at every level, damped as there; float64, (n_layers, r, c)."""
-    found = np.empty((len(damping), len(rows), columns.shape[1]))
+    found = np.zeros((len(damping), len(rows), columns.shape[1]))
     for level in range(len(damping)):
-        found[level] = _sum_modes(damping[level] * spectrum, rows, columns)
+        _add_modes(damping[level] * spectrum, rows, columns, found[level])
     return found
 
 
 @numba.njit(cache=True, nogil=True)
-def _sum_modes(
-    spectrum: NDArray[np.float64], rows: NDArray[np.float64], columns: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Sum the modes of a spectrum at nodes: cosines of a few rows (r, ny), of columns (nx, c); float64, (r, c)."""
-    found, line = np.zeros((len(rows), columns.shape[1])), np.empty(spectrum.shape[1])
+def _add_modes(
+    spectrum: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    columns: NDArray[np.float64],
+    found: NDArray[np.float64],
+) -> None:
+    line = np.empty(spectrum.shape[1])
     for r in range(len(rows)):
         line[:] = 0.0
         for j in range(spectrum.shape[0]):
@@ -354,7 +365,6 @@ def _sum_modes(
         for i in range(spectrum.shape[1]):
             for c in range(columns.shape[1]):
                 found[r, c] += line[i] * columns[i, c]
-    return found
 
 
 def _bilinear(position: NDArray[np.float64], nodes: Nodes) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

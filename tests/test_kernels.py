@@ -1,5 +1,6 @@
 """Kernels are compiled beforehand, side by side, and a run then finds them."""
 
+import ast
 import json
 import os
 import subprocess
@@ -20,6 +21,7 @@ from tiler.engine import StoppedError
 from tiler.kernels import OTHER, PARTS, RUN, are_compiled, compile_kernels, count_cores, prepare, read_list
 from tiler.run import run
 
+ROOT = Path(__file__).parents[1]
 GROWTH = {"pipeline.growth": read_list()[OTHER]["pipeline.growth"]}  # compiled in no time
 
 
@@ -53,6 +55,31 @@ def test_all_that_is_listed_is_a_kernel() -> None:
         for name, signatures in names.items():
             assert isinstance(kernels._kernel(module, name), Dispatcher)
             assert all(normalize_signature(signature)[0] for signature in signatures)
+
+
+def test_no_kernel_is_for_kernels_and_gives_arrays_to_python() -> None:
+    # numba keeps the types of such arrays beside a kernel; where another kernel was loaded first that was compiled
+    # with it, they can be missing: "In 'NRT_adapt_ndarray_to_python', 'descr' is NULL".
+    jitted, used = dict[tuple[str, str], ast.FunctionDef](), set[tuple[str, str]]()
+    for file in [path for package in ("pipeline", "stitch", "tiler") for path in (ROOT / package).rglob("*.py")]:
+        module = ".".join(file.relative_to(ROOT).with_suffix("").parts)
+        tree = ast.parse(file.read_text())
+        places = {
+            alias.asname or alias.name: (node.module or "", alias.name)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef) and "njit" in "".join(map(ast.unparse, node.decorator_list)):
+                jitted[module, node.name] = node
+                names = {inner.id for inner in ast.walk(node) if isinstance(inner, ast.Name)} - {node.name}
+                used |= {places.get(name, (module, name)) for name in names}
+    called = {(module, name) for part in read_list().values() for module, names in part.items() for name in names}
+    assert called < jitted.keys()
+    assert len(used & jitted.keys()) > 20
+    result = {place: ast.unparse(jitted[place].returns or ast.Pass()) for place in called & used}
+    assert [place for place, kind in result.items() if kind not in ("None", "bool", "int", "float")] == []
 
 
 @pytest.mark.parametrize("processes", [1, 2])

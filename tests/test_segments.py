@@ -1,5 +1,9 @@
 """Kernels of the division of houses against array expressions that say the same, to the bit."""
 
+from collections.abc import Callable
+from typing import Any
+
+import numba
 import numpy as np
 import pytest
 import shapely
@@ -7,21 +11,36 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.lines import MIN_GAIN, _best_lines, _directions, _sum_pairwise
+from pipeline import lines, segments
+from pipeline.lines import MIN_GAIN, _sum_pairwise
 from pipeline.segments import (
     BLUNT,
     ON_EDGE,
-    are_clear,
+    add_places,
     distances_to_segments,
     divide_edges,
-    find_nodes,
-    heights_beside,
     insert_corners,
-    unite_places,
+    place_walls,
 )
 
 Array = NDArray[np.float64]
 SEEDS = st.integers(0, 10**6)
+
+
+def in_kernel(kernel: Any) -> Callable[..., Any]:
+    """A kernel as other kernels call it: see `test_no_kernel_is_for_kernels_and_gives_arrays_to_python`."""
+
+    @numba.njit  # type: ignore[untyped-decorator]
+    def call(*given: Any) -> Any:
+        return kernel(*given)
+
+    called: Callable[..., Any] = call
+    return called
+
+
+are_clear, find_nodes = in_kernel(segments.are_clear), in_kernel(segments.find_nodes)
+heights_beside = in_kernel(segments.heights_beside)
+best_lines, directions = in_kernel(lines._best_lines), in_kernel(lines._directions)
 
 
 def segments_away(xy: Array, a: Array, b: Array) -> Array:
@@ -132,7 +151,7 @@ def test_the_best_lines_are_those_of_arrays(seed: int, levels: int) -> None:
         if len(offset):
             best = int(np.argmax(gain[place]))
             expected[k] = (gain[place[best]], offset[best])
-    best_gain, best_offset = _best_lines(across, z, corner, total, clearance, least)
+    best_gain, best_offset = best_lines(across, z, corner, total, clearance, least)
     assert list(zip(best_gain.tolist(), best_offset.tolist(), strict=True)) == expected
     assert MIN_GAIN > 0  # a line that is not there has no gain and falls away
 
@@ -158,7 +177,7 @@ def test_directions_are_those_with_most_wall(seed: int) -> None:
         groups.append((length[left[same]].sum(), along))
         left = left[~same]
     groups.sort(key=lambda group: -group[0])
-    assert _directions(np.zeros((30, 2)), d).tolist() == [along.tolist() for _, along in groups[:4]]
+    assert directions(np.zeros((30, 2)), d).tolist() == [along.tolist() for _, along in groups[:4]]
 
 
 def test_corners_are_inserted_by_their_way_along_the_edge() -> None:
@@ -181,8 +200,29 @@ def test_edges_are_divided_where_walls_end() -> None:
     assert segments[6:].tolist() == walls.tolist()
 
 
-def test_places_are_united_in_order() -> None:
-    places, row = unite_places(np.array([[2.0, 1], [1, 5], [2, 1], [1, -5]]))
-    assert places.tolist() == [[1, -5], [1, 5], [2, 1]]
-    assert row.tolist() == [2, 1, 2, 0]
-    assert unite_places(np.empty((0, 2)))[0].shape == (0, 2)
+@settings(max_examples=50, deadline=None)
+@given(seed=SEEDS)
+def test_places_are_added_in_order_and_once(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, more = rng.integers(0, 4, (2, 9, 2)).astype(np.float64)
+    places = add_places(np.empty((0, 2)), first)
+    assert places.tolist() == np.unique(first, axis=0).tolist()
+    assert add_places(places, more).tolist() == np.unique(np.concatenate((first, more)), axis=0).tolist()
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=SEEDS)
+def test_walls_go_from_node_to_node_inside_the_outline(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ring, along, offset, clearance = outline(rng), np.array([0.6, 0.8]), rng.uniform(-5, 5), 0.3
+    a, b = ring[:-1], ring[1:]
+    side_a, side_b = (end[:, 1] * along[0] - end[:, 0] * along[1] - offset for end in (a, b))
+    nodes, edge = find_nodes(a, b, side_a, side_b, clearance)
+    order = np.argsort(nodes[:, 0] * along[0] + nodes[:, 1] * along[1], kind="stable")
+    nodes, edge = nodes[order], edge[order]
+    polygon = shapely.polygons(ring)
+    middle = (nodes[:-1] + nodes[1:]) / 2
+    wall = are_clear(nodes[:-1], nodes[1:], a, b, clearance) & shapely.contains_xy(polygon, *middle.T)
+    ends, divided = place_walls(a, b, along, offset, clearance)
+    assert ends.tolist() == np.stack((nodes[:-1], nodes[1:]), axis=1)[wall].tolist()
+    assert divided.tolist() == np.column_stack((edge[:-1], edge[1:]))[wall].tolist()

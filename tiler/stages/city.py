@@ -54,7 +54,7 @@ def house_stage(config: Config) -> Stage:
         Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
-    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN), version=2)
+    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN), version=3)
 
 
 def first_round(config: Config) -> list[Stage]:
