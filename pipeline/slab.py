@@ -22,7 +22,7 @@ from pipeline.terrain import Dtm, cut_terrain, sample_dtm, sample_grid
 REACH = 3.0  # domain heights; terrain farther from a mesh counts for nothing
 BLOCK = 1.0  # domain heights; side of the squares that `lift_places` works in
 STEEPEST = 300.0  # exponent by which a mode fades from a level to the next at most; what is left is nothing
-UNDAMPED = np.ones((1, 1, 1))
+UNDAMPED = np.ones((1, 1, 1))  # one level at which all modes are whole
 SUMS = 0.25  # of the grid's shorter side; for fewer rows or columns, sums are faster than a transform
 
 Bounds = tuple[float, float, float, float]

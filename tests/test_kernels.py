@@ -1,6 +1,7 @@
 """Kernels are compiled beforehand, side by side, and a run then finds them."""
 
 import ast
+import dataclasses
 import json
 import os
 import subprocess
@@ -18,6 +19,7 @@ from tests.sparse_city import SparseCity, make_city
 from tiler import kernels
 from tiler.cli import main
 from tiler.engine import StoppedError
+from tiler.joining.join import join
 from tiler.kernels import OTHER, PARTS, RUN, are_compiled, compile_kernels, count_cores, prepare, read_list
 from tiler.run import run
 
@@ -134,6 +136,28 @@ def test_a_run_compiles_with_as_many_processes_as_it_has_workers(
     for number, (workers, compilers) in enumerate(((0, None), (0, 3), (1, None), (1, 0))):
         run(city.config(tmp_path / str(number), workers=workers), compilers=compilers)
     assert asked == [3, 1]
+
+
+def test_the_same_run_again_compiles_nothing_beforehand(
+    city: SparseCity, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("tiler.run.prepare", lambda processes, say: asked.append("run"))
+    monkeypatch.setattr("tiler.joining.join.prepare", lambda processes, say: asked.append("join"))
+    config = city.config(tmp_path / "out", workers=1)
+    for _ in range(2):
+        run(config)
+    assert asked == ["run"]
+    join(config)
+    assert asked == ["run"]
+    run(dataclasses.replace(config, domain_height=90.0))
+    assert asked == ["run"] * 2
+    for _ in range(2):
+        run(dataclasses.replace(config, domain_height=90.0, overwrite=True))
+    assert asked == ["run"] * 4
+    (tmp_path / "out" / "run.json").write_text("[]")
+    join(config)
+    assert asked == ["run"] * 4 + ["join"]
 
 
 def test_ctrl_c_while_kernels_are_compiled_stops_a_run(

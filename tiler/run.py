@@ -130,8 +130,9 @@ def run(
         Given what tells the run's watchers a sentence, makes the executor of all tasks, a context; by default
         that which `config` asks for.
     compilers : int, optional
-        Processes that compile kernels before the first task of a run on this machine, if that was not done here;
-        0: each when it is needed. By default as many as workers, so that a run in one process starts none.
+        Processes that compile kernels before the first task of a run on this machine, if that was not done here,
+        and the same run has not been done before; 0: each when it is needed. By default as many as workers, so
+        that a run in one process starts none.
 
     Returns
     -------
@@ -169,7 +170,9 @@ def run(
             with reach_cluster(config) as cluster:
                 here = executor is None and not config.on_cluster
                 processes = config.workers if compilers is None else compilers
-                means = _Means(dashboard, shown, executor, cluster, processes if here else 0)
+                means = _Means(
+                    dashboard, shown, executor, cluster, 0 if not here or is_repeated(config) else processes
+                )
                 return _run(config, out, earlier, damage, own, announce, told, means)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
@@ -193,8 +196,7 @@ def _run(
         "schema": SCHEMA,
         "checksum": "0" * 8,
         "status": "running",
-        "parameters": dataclasses.asdict(config),
-        "versions": {"python": platform.python_version()} | dict(code_versions()),
+        **_describe(config),
     }
     failed = True
     try:
@@ -297,6 +299,21 @@ def _mesh_region(
     write_manifest(out / MANIFEST_PATH, engine.records, indexes)
     summary = summarise_run(engine, plan, config, rounds, missing, dict(damage) | remade)
     return summary | {"driver_memory_bytes": peak_memory()}
+
+
+def is_repeated(config: Config) -> bool:
+    """Tell whether the same was run to its end before: next to nothing is left to compute, and to compile."""
+    with suppress(OSError, ValueError, TypeError, OutputError):
+        known = json.loads((place(config.out, config.store_patience) / RUN_RECORD).read_bytes())
+        said: dict[str, Any] = json.loads(json.dumps(_describe(config), default=str))
+        return not config.overwrite and known == known | said | {"status": "done"}
+    return False
+
+
+def _describe(config: Config) -> dict[str, Any]:
+    """What a record says of the parameters of a run, and of the code."""
+    versions = {"python": platform.python_version()} | dict(code_versions())
+    return {"parameters": dataclasses.asdict(config), "versions": versions}
 
 
 def _prepare(processes: int, say: Callable[[str], None]) -> None:

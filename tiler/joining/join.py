@@ -48,7 +48,7 @@ from tiler.out_folder import RUN_RECORD, check_folder
 from tiler.places import is_url
 from tiler.plain_text import say_nothing, shorten
 from tiler.planning import check_sources
-from tiler.run import run, tell_error
+from tiler.run import is_repeated, run, tell_error
 from tiler.watching import Watcher
 
 MAX_IDLE = 600.0  # s that a member waits for a folder that another run holds
@@ -124,7 +124,8 @@ def join(
     if spool.is_symlink():
         raise ConfigError(f"{spool}: is a symbolic link; remove it")
     workers = max(config.workers, 1)
-    prepare(workers, say or say_nothing)
+    if not is_repeated(config):
+        prepare(workers, say or say_nothing)
     with closing(Crew(workers, limit_workers(config))) as crew:
         me = this_holder(name, crew.workers, describe_member(config))
         return _Joining(config, me, crew, max_idle, views, say or say_nothing).go()

@@ -291,8 +291,8 @@ def tell_parameters(facts: RunFacts) -> Iterator[str]:
         row = [entry.name, _tell_value(value), data["unit"], data["text"]]
         (others if value == entry.default else changed).append(row)
     head = ("parameter", "value", "unit", "meaning")
-    yield table("Parameters that are not the default's", head, changed, numbers=9)
-    yield folded(f"{len(others)} parameters that are", table("Parameters", head, others, numbers=9))
+    yield table("Parameters that differ from their defaults", head, changed, numbers=9)
+    yield folded(f"{len(others)} parameters at their defaults", table("Parameters", head, others, numbers=9))
     try:
         config = Config(**{name: _as_tuple(value) for name, value in given.items()})
         yield f"<p>The same again: <code>{text(command_line(config))}</code></p>"
