@@ -23,15 +23,19 @@ class Line:
 
     Attributes
     ----------
-    along, normal : float64, (2,)
-        Unit vectors along and across the line.
+    along : float64, (2,)
+        Unit vector along the line.
     offset : float
         Distance from the origin (m).
     """
 
     along: Array
-    normal: Array
     offset: float
+
+    @property
+    def normal(self) -> Array:
+        """Unit vector across the line, float64 (2,): a quarter turn to the left."""
+        return np.array([-self.along[1], self.along[0]])
 
 
 def rank_lines(a: Array, b: Array, xyz: Array, *, clearance: float, min_points: int) -> list[Line]:
@@ -55,8 +59,7 @@ def rank_lines(a: Array, b: Array, xyz: Array, *, clearance: float, min_points: 
         none that takes away less than `MIN_GAIN`.
     """
     return [
-        Line(np.array([x, y]), np.array([-y, x]), offset)
-        for x, y, offset in _rank_lines(a, b, xyz, clearance, min_points).tolist()
+        Line(np.array([x, y]), offset) for x, y, offset in _rank_lines(a, b, xyz, clearance, min_points).tolist()
     ]
 
 
@@ -73,15 +76,14 @@ def _rank_lines(a: Array, b: Array, xyz: Array, clearance: float, min_points: in
     directions = _directions(a, b)
     n_found = 2 * len(directions)
     found, loss = np.empty((n_found, 3)), np.empty(n_found)
-    across, vertex = np.empty(n), np.empty((len(a), 3))
+    across, vertex = np.empty(n), np.empty(len(a))
     for d in range(len(directions)):
         along_x, along_y = directions[d, 0], directions[d, 1]
         for k in range(n):
             across[k] = xyz[k, 1] * along_x - xyz[k, 0] * along_y
         for k in range(len(a)):
-            vertex[k, 0], vertex[k, 1], vertex[k, 2] = 0.0, 0.0, a[k, 1] * along_x - a[k, 0] * along_y
-        sort_group(vertex)
-        gain, offset = _best_lines(across, z, vertex[:, 2].copy(), total, clearance, min_points)
+            vertex[k] = a[k, 1] * along_x - a[k, 0] * along_y
+        gain, offset = _best_lines(across, z, vertex[order_values(vertex)], total, clearance, min_points)
         for k in range(2):
             row = 2 * d + k
             found[row, 0], found[row, 1], found[row, 2], loss[row] = along_x, along_y, offset[k], -gain[k]

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.inside import edges_of_rings, find_owner, read_rings
+from pipeline.inside import Rings, edges_of_rings, find_owner, read_rings
 from pipeline.segments import insert_corners
 
 Array = NDArray[np.float64]
@@ -45,8 +45,9 @@ class Outline:
     @cached_property
     def ends(self) -> tuple[Array, Array]:
         """From and to of each edge, float64 (m, 2) (m); none has no length."""
-        a, b = _ends(self.xy, self.ring)
-        return a, b
+        edges = edges_of_rings(Rings(np.array([0, len(self.xy)]), self.xy, self.ring))
+        long = (edges.a != edges.b).any(axis=1)
+        return (edges.a, edges.b) if long.all() else (edges.a[long], edges.b[long])
 
     @cached_property
     def area(self) -> float:
@@ -91,17 +92,6 @@ def deal_out(pieces: NDArray[np.object_], xyz: Array) -> Iterator[tuple[Outline,
     for k, piece in enumerate(pieces):
         begin, end = rings.start[k], rings.start[k + 1]
         yield Outline(rings.xy[begin:end], rings.ring[begin:end], piece), dealt[first[k] : first[k + 1]]
-
-
-@numba.njit(cache=True, nogil=True)
-def _ends(xy: Array, ring: Index) -> tuple[Array, Array]:
-    a, b = np.empty((len(xy), 2)), np.empty((len(xy), 2))
-    n = 0
-    for v in range(1, len(xy)):
-        if ring[v] == ring[v - 1] and (xy[v, 0] != xy[v - 1, 0] or xy[v, 1] != xy[v - 1, 1]):
-            a[n, 0], a[n, 1], b[n, 0], b[n, 1] = xy[v - 1, 0], xy[v - 1, 1], xy[v, 0], xy[v, 1]
-            n += 1
-    return a[:n], b[:n]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -7,7 +7,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.group_order import sort_group
+from pipeline.group_order import order_values, sort_group
 from pipeline.outlines import Outline
 from pipeline.segments import heights_beside
 
@@ -55,25 +55,14 @@ def join_cells(
     """
     start = np.cumsum([0, *(len(cell.xy) for cell in cells)])
     xy, ring = np.concatenate([cell.xy for cell in cells]), np.concatenate([cell.ring for cell in cells])
-    first = np.cumsum([0, *map(len, points)])
-    xyz, area = np.concatenate(points), np.array([cell.area for cell in cells])
-    borders, (z, cell) = _find_borders(start, xy, ring, xyz, first), _order(xyz, first)
-    limits = float(min_step), float(min_area), min_points, MIN_NEAR
-    region, within = _join(*borders, area, z, cell, *limits)
+    count = [len(some) for some in points]
+    xyz, first = np.concatenate(points), np.cumsum([0, *count])
+    order = np.argsort(xyz[:, 2], kind="stable")
+    z, cell = xyz[order, 2], np.repeat(np.arange(len(cells)), count)[order]
+    area = np.array([outline.area for outline in cells])
+    borders = _find_borders(start, xy, ring, xyz, first)
+    region, within = _join(*borders, area, z, cell, float(min_step), float(min_area), min_points, MIN_NEAR)
     return region, within
-
-
-@numba.njit(cache=True, nogil=True)
-def _order(xyz: Array, first: Index) -> tuple[Array, Index]:
-    """Give the heights of all points in order, and the cell of each."""
-    rows, z, cell = np.empty((len(xyz), 3)), np.empty(len(xyz)), np.empty(len(xyz), np.int64)
-    for c in range(len(first) - 1):
-        for k in range(first[c], first[c + 1]):
-            rows[k, 0], rows[k, 1], rows[k, 2] = 0.0, c, xyz[k, 2]
-    sort_group(rows)
-    for k in range(len(rows)):
-        z[k], cell[k] = rows[k, 2], int(rows[k, 1])
-    return z, cell
 
 
 @numba.njit(cache=True, nogil=True)
@@ -171,8 +160,10 @@ def _join(
         As from `_find_borders`.
     area : float64, (c,)
         Areas of the cells (m²).
-    z, cell
-        As from `_order`.
+    z : float64, (n,)
+        Heights of all points, ascending (m).
+    cell : int64, (n,)
+        Cell of each.
     min_step, min_area, min_points, min_near
         As for `join_cells`, and `MIN_NEAR`.
     """
@@ -280,26 +271,32 @@ def _step_at(
     min_near: int,
 ) -> float:
     """Step of the roof between two regions (m): the lesser of that of their medians and that at their border."""
-    step, here = abs(apart), 0.0
-    for wanted in (one, two):
-        n = 0
-        for fill in range(2):
-            rows = np.empty((n, 3))
-            n = 0
-            for k in range(len(border)):
-                if not _is_between(border, k, region, one, two):
-                    continue
-                side = 2 * k + (0 if region[border[k, 0]] == wanted else 1)
-                for i in range(near_start[side], near_start[side + 1]):
-                    if fill:
-                        rows[n, 0], rows[n, 1], rows[n, 2] = 0.0, 0.0, near[i]
-                    n += 1
-        if n < min_near:
-            return step
-        sort_group(rows)
-        median = (rows[(n - 1) // 2, 2] + rows[n // 2, 2]) / 2
-        here = median if wanted == one else here - median
-    return min(step, here if apart > 0 else -here if apart < 0 else 0.0)
+    n_one, at_one = _median_beside(one, two, border, near, near_start, region)
+    n_two, at_two = _median_beside(two, one, border, near, near_start, region)
+    step = abs(apart)
+    if min(n_one, n_two) >= min_near:
+        there = at_one - at_two
+        step = min(step, there if apart > 0 else -there if apart < 0 else 0.0)
+    return step
+
+
+@numba.njit(cache=True, nogil=True)
+def _median_beside(
+    wanted: int, other: int, border: Index, near: Array, near_start: Index, region: Index
+) -> tuple[int, float]:
+    """Number and median height of the points of a region beside another one; NaN without points."""
+    found = np.empty(len(near))
+    n = 0
+    for k in range(len(border)):
+        if _is_between(border, k, region, wanted, other):
+            side = 2 * k + (0 if region[border[k, 0]] == wanted else 1)
+            for i in range(near_start[side], near_start[side + 1]):
+                found[n] = near[i]
+                n += 1
+    if n == 0:
+        return 0, math.nan
+    order = order_values(found[:n])
+    return n, (found[order[(n - 1) // 2]] + found[order[n // 2]]) / 2
 
 
 @numba.njit(cache=True, nogil=True)

@@ -356,6 +356,7 @@ def _add_modes(
     columns: NDArray[np.float64],
     found: NDArray[np.float64],
 ) -> None:
+    """Add the modes of a spectrum to what is found at nodes, as `_sum_modes`."""
     line = np.empty(spectrum.shape[1])
     for r in range(len(rows)):
         line[:] = 0.0

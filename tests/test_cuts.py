@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 def level(y: float) -> Line:
     """Line of all places at height `y` of the plan."""
-    return Line(np.array([1.0, 0.0]), np.array([0.0, 1.0]), y)
+    return Line(np.array([1.0, 0.0]), y)
 
 
 def cut(

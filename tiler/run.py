@@ -169,10 +169,9 @@ def run(
             damage = _find_damage(out) if earlier and not config.overwrite else {}
             with reach_cluster(config) as cluster:
                 here = executor is None and not config.on_cluster
-                processes = config.workers if compilers is None else compilers
-                means = _Means(
-                    dashboard, shown, executor, cluster, 0 if not here or is_repeated(config) else processes
-                )
+                compilers = config.workers if compilers is None else compilers
+                beforehand = here and not is_repeated(config)
+                means = _Means(dashboard, shown, executor, cluster, compilers if beforehand else 0)
                 return _run(config, out, earlier, damage, own, announce, told, means)
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
