@@ -165,3 +165,10 @@ def test_distances_to_segments_are_shapelys() -> None:
     xy, a, b = rng.uniform(0, 10, (3, 7, 2))
     expected = shapely.distance(shapely.linestrings(np.stack((a, b), axis=1))[:, None], shapely.points(xy)[None])
     np.testing.assert_allclose(distances_to_segments(xy, a, b), expected, atol=1e-12)
+
+
+def test_walls_stand_where_the_normal_of_a_line_has_its_offset() -> None:
+    line = Line(np.array([0.6, 0.8]), -2.0)
+    _, corners = cut_along(open_outline(shapely.box(0, 0, 10, 20)), line, clearance=0.5)
+    assert len(corners) == 2
+    np.testing.assert_allclose(corners @ line.normal, line.offset, atol=1e-12)
