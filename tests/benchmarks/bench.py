@@ -8,6 +8,7 @@ are written from that: `python -m tests.benchmarks.bench cells` measures one stu
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -22,7 +23,16 @@ from typing import Any
 
 import numpy as np
 
-from tests.benchmarks.bench_report import CHOICE, DASK, DOCS, JOINED, MEASURED, step_seconds, write_report
+from tests.benchmarks.bench_report import (
+    AT_ONCE,
+    CHOICE,
+    DASK,
+    DOCS,
+    JOINED,
+    MEASURED,
+    step_seconds,
+    write_report,
+)
 from tests.benchmarks.runs import COMMAND, citystitch, record_of, set_aside
 from tiler.events import read_events
 
@@ -109,13 +119,39 @@ def study_buildings(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_area(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(c) 480 buildings a km2 on more and more of them, one worker; the middle one of 3 runs."""
+    """(c) 480 buildings a km2 on more and more of them, one worker; each step the median of 3 runs in turn."""
     rows = []
     for side in (SIDES + LARGEST) * 3:
         city = cities.make(side, round(480 * side**2 / 1e6))
         found = measure(city, out, "--tile-size", "500", "--workers", "1", cores=2)
-        rows.append(found | {"area": side**2 / 1e6})
-    return middle_ones(rows, "area")
+        rows.append(found | {"area": side**2 / 1e6, "inner": inner_seconds(out)})
+    middle = middle_ones(rows, "area")
+    for row in middle:
+        for part in ("steps", "inner"):
+            some = [other[part] for other in rows if other["area"] == row["area"]]
+            row[part] = {name: round(median(one[name] for one in some), 4) for name in row[part]}
+    return middle
+
+
+def inner_seconds(out: Path) -> dict[str, float]:
+    """Of each stage of files, tiles or seams what one that has others all around took: the median (s).
+
+    None of them is told where a region has no such. The region is a rectangle, and its items are named by where
+    they are in it.
+    """
+    found: dict[tuple[str, str], dict[tuple[int, int], float]] = {}
+    for event in read_events(out / "events.jsonl"):
+        place = event["event"] == "done" and re.fullmatch(r"([xy]?)(\d+)_(\d+)", event["name"])
+        if place:
+            kind, x, y = place.groups()
+            found.setdefault((event["stage"], kind), {})[int(x), int(y)] = event["seconds"]
+    inner: dict[str, list[float]] = {}
+    for (stage, _), seconds in found.items():
+        x, y = zip(*seconds, strict=True)
+        inner.setdefault(stage, []).extend(
+            taken for (i, j), taken in seconds.items() if min(x) < i < max(x) and min(y) < j < max(y)
+        )
+    return {stage: median(some) for stage, some in inner.items() if some}
 
 
 def study_driver(cities: Cities, out: Path) -> list[dict[str, Any]]:
@@ -136,10 +172,21 @@ def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
     rows = []
     for side in (2500, 5000, *LARGEST):
         city = cities.make(side, 480 * side**2 // 10**6)
-        for told, command, n, more in KINDS * 3 if side in LARGEST else (*KINDS, ONE_WORKER) * 5:
-            found = measure(city, out, "--workers", str(n), *more, cores=2, command=command)
-            rows.append(found | {"total": found["command"], "run as": told, "side": side})
+        for _ in range(3 if side in LARGEST else 5):
+            for told, command, n, more in KINDS if side in LARGEST else (*KINDS, ONE_WORKER):
+                found = measure(city, out, "--workers", str(n), *more, cores=2, command=command)
+                rows.append(found | {"total": found["command"], "run as": told, "side": side})
+            rows.append(measure_two(city, out) | {"run as": AT_ONCE, "side": side})
     return middle_ones(rows, "side", "run as")
+
+
+def measure_two(city: Path, out: Path) -> dict[str, Any]:
+    """Mesh a city twice at once, in one process each; what the first says, with the mean time of both."""
+    with ThreadPoolExecutor(2) as pool:
+        places = [out.with_name(f"{out.name}-{k}") for k in range(2)]
+        runs = [pool.submit(measure, city, place, "--workers", "0", cores=2) for place in places]
+        first, second = (run.result() for run in runs)
+    return first | {"total": (first["command"] + second["command"]) / 2}
 
 
 def study_waits(cities: Cities, out: Path) -> list[dict[str, Any]]:
@@ -290,10 +337,7 @@ def study_startup(cities: Cities, out: Path) -> list[dict[str, Any]]:
 
 
 def study_limits(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """What the machine does at best: LAZ decompression alone, a copy in memory, a file written and flushed.
-
-    And what its cores take from each other: serial runs of the city of 2.5 km alone, then two of them at once.
-    """
+    """What the machine does at best: LAZ decompression alone, a copy in memory, a file written and flushed."""
     import laspy
 
     from tiler.las_chunks import FIELDS
@@ -319,26 +363,11 @@ def study_limits(cities: Cities, out: Path) -> list[dict[str, Any]]:
         os.fsync(file.fileno())
     disk = 4 * block.nbytes / (time.perf_counter() - start)
     path.unlink()
-    slower = _two_at_once(cities.make(2500, 3000), out)
     return [
-        {"limit": "two serial runs at once, over one alone", "value": f"{slower:.2f} times the time"},
-        {"limit": "hence two cores are at best", "value": f"{2 / slower:.2f} times one"},
         {"limit": "LAZ decompression by lazrs, one core", "value": f"{laz / 1e6:.2f} M points/s"},
         {"limit": "copy in memory, read and written, one core", "value": f"{copy / 1e9:.1f} GB/s"},
         {"limit": "file written and flushed", "value": f"{disk / 1e6:.0f} MB/s"},
     ]
-
-
-def _two_at_once(city: Path, out: Path) -> float:
-    """Time of a serial run beside another one over that of a run alone: the median of three."""
-    both = [out.with_name(f"{out.name}-{k}") for k in range(2)]
-    found = []
-    with ThreadPoolExecutor(2) as pool:
-        for _ in range(3):
-            alone = measure(city, both[0], "--workers", "0", cores=2)["total"]
-            runs = [pool.submit(measure, city, b, "--workers", "0", cores=2) for b in both]
-            found.append(sum(run.result()["total"] for run in runs) / 2 / alone)
-    return float(median(found))
 
 
 Study = Callable[[Cities, Path], list[dict[str, Any]]]

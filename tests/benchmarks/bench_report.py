@@ -16,10 +16,12 @@ from tests.benchmarks.log_plot import draw_log_plot
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 REPORT = DOCS / "benchmarks.md"
 LEAST_SECONDS = 0.05  # less is not fitted
+LEAST_INNER = 0.004  # s: events tell thousandths
 MEASURED = "measured"  # day of each study, beside the studies
 # Key and title of a table's first column, where they are not the study's own key.
 TITLES = {"cells": ("mesh size", "mesh size (m)"), "area": ("area", "area (km²)")}
 DASK, JOINED = "2 workers of Dask", "`join` with 2 workers"
+AT_ONCE = "one process, beside another such run"
 OTHERS = "<!-- exports -->"  # what `make bench-exports` has written begins here
 
 Rows = list[dict[str, Any]]
@@ -115,6 +117,28 @@ def _growth(rows: Rows, name: str, key: str) -> list[str]:
     return [*lines, "", f"![Seconds of each step against {key}](study-{name}.png)"]
 
 
+def _inner(rows: Rows) -> list[str]:
+    """What an item with others all around takes, by stage and by the area of the region."""
+    rows = [row for row in rows if row["inner"]]
+    areas = [float(row["area"]) for row in rows]
+    lines = [
+        "A large region has more tiles with others all around, which read more than those at its border. Each of",
+        "these alone takes (ms; the median of a run, and of the runs):",
+        "",
+        f"| stage | {' | '.join(f'{area:g} km²' for area in areas)} | exponent against area |",
+        "|---" * (2 + len(rows)) + "|",
+    ]
+    series = {stage: [row["inner"][stage] for row in rows] for stage in rows[0]["inner"]}
+    series = {stage: seconds for stage, seconds in series.items() if min(seconds) >= LEAST_INNER}
+    series["all of these"] = [sum(seconds) for seconds in zip(*series.values(), strict=True)]
+    for stage, seconds in series.items():
+        shown = " | ".join(f"{1000 * value:.0f}" for value in seconds)
+        # So many of them are proportional to the area.
+        slope = np.polyfit(np.log(areas), np.log(seconds), 1)[0]
+        lines.append(f"| {stage} | {shown} | {1 + slope:.2f} |")
+    return lines
+
+
 def _runs(rows: Rows, key: str, title: str = "") -> list[str]:
     lines = [
         f"| {title or key} | tiles | cells | whole run | worker's peak | driver | tasks |",
@@ -191,7 +215,22 @@ def _workers(rows: Rows) -> list[str]:
     lines = []
     for side in dict.fromkeys(row["side"] for row in rows):
         lines += [*_runs([row for row in rows if row["side"] == side], "run as"), ""]
-    return [*lines, *_speedups(rows, "side", "km", 1000, "2 workers", DASK, JOINED)]
+    return [
+        *lines,
+        *_speedups(rows, "side", "km", 1000, "2 workers", DASK, JOINED),
+        "",
+        *_limit(rows),
+    ]
+
+
+def _limit(rows: Rows) -> list[str]:
+    """What two cores give at best: two runs in one process each, which wait for nothing, and have a start each."""
+    found = {(row["side"], row["run as"]): row for row in rows}
+    told = []
+    for side in dict.fromkeys(row["side"] for row in rows):
+        alone, beside = (found[side, kind]["total"] for kind in ("one process", AT_ONCE))
+        told.append(f"{2 * alone / beside:.2f} at {side / 1000:g} km")
+    return [f"What two cores give at best, by two runs at once that share nothing: {', '.join(told)}."]
 
 
 def _waits(rows: Rows) -> list[str]:
@@ -255,8 +294,9 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
         "area",
         "(c) Area",
-        "480 buildings a km², tiles of 500 m, one worker; the middle one of 3 runs.",
-        lambda rows: _growth(rows, "area", "area"),
+        "480 buildings a km², tiles of 500 m, one worker; of 3 runs in turn the middle one, the median of each "
+        "step.",
+        lambda rows: [*_growth(rows, "area", "area"), "", *_inner(rows)],
     ),
     (
         "driver",
@@ -295,7 +335,7 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
         "workers",
         "(f) Shares",
         "Of the city of 2.5 km.",
-        lambda rows: _shares([row for row in rows if row["side"] == rows[0]["side"]]),
+        lambda rows: _shares([r for r in rows if r["side"] == rows[0]["side"] and r["run as"] != AT_ONCE]),
     ),
     (
         "rates",
@@ -320,5 +360,5 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
         _profile,
     ),
     ("startup", "Start-up", "Medians of 7.", _startup),
-    ("limits", "What the machine can", "The last three on one core.", _limits),
+    ("limits", "What the machine can", "On one core.", _limits),
 )
