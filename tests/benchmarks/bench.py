@@ -136,8 +136,8 @@ def study_area(cities: Cities, out: Path) -> list[dict[str, Any]]:
 def inner_seconds(out: Path) -> dict[str, float]:
     """Of each stage of files, tiles or seams what one that has others all around took: the median (s).
 
-    None of them is told where a region has no such. The region is a rectangle, and its items are named by where
-    they are in it.
+    A stage without such an item is left out. The region is a rectangle, and its items are named by where they are
+    in it.
     """
     found: dict[tuple[str, str], dict[tuple[int, int], float]] = {}
     for event in read_events(out / "events.jsonl"):
@@ -147,9 +147,10 @@ def inner_seconds(out: Path) -> dict[str, float]:
             found.setdefault((event["stage"], kind), {})[int(x), int(y)] = event["seconds"]
     inner: dict[str, list[float]] = {}
     for (stage, _), seconds in found.items():
-        x, y = zip(*seconds, strict=True)
+        columns, rows = zip(*seconds, strict=True)
+        west, east, south, north = min(columns), max(columns), min(rows), max(rows)
         inner.setdefault(stage, []).extend(
-            taken for (i, j), taken in seconds.items() if min(x) < i < max(x) and min(y) < j < max(y)
+            taken for (x, y), taken in seconds.items() if west < x < east and south < y < north
         )
     return {stage: median(some) for stage, some in inner.items() if some}
 

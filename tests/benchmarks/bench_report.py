@@ -133,7 +133,7 @@ def _inner(rows: Rows) -> list[str]:
     series["all of these"] = [sum(seconds) for seconds in zip(*series.values(), strict=True)]
     for stage, seconds in series.items():
         shown = " | ".join(f"{1000 * value:.0f}" for value in seconds)
-        # So many of them are proportional to the area.
+        # Of one of them: their number goes with the area, so that all together grow by one power more.
         slope = np.polyfit(np.log(areas), np.log(seconds), 1)[0]
         lines.append(f"| {stage} | {shown} | {1 + slope:.2f} |")
     return lines
