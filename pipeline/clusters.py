@@ -14,10 +14,11 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.city import CityOptions
+from pipeline.components import join_pairs
 from pipeline.graph import MILLIMETRES
 from pipeline.house_levels import HouseParts
 from pipeline.merge import merge_footprints
-from pipeline.planar import PlanarCity, join_pairs, shape_planar
+from pipeline.planar import PlanarCity, shape_planar
 
 KEPT = 0.5  # a house that keeps less of its area than this is simplified again by its closed outline
 ROUNDING = 1e-4  # mm, of distances

@@ -5,9 +5,8 @@ is symmetric and positive definite, so conjugate gradients reach the same soluti
 """
 
 import numpy as np
+import scipy  # what is asked of it is imported then
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg
 
 from pipeline.errors import SolverError
 from pipeline.mesh import TetMesh
@@ -15,7 +14,7 @@ from pipeline.mesh import TetMesh
 MAX_ITERATIONS = 500
 
 
-def stiffness_matrix(mesh: TetMesh) -> sparse.csr_array:
+def stiffness_matrix(mesh: TetMesh) -> "scipy.sparse.csr_array":
     """Assemble the stiffness matrix of linear elements for Laplace's equation.
 
     Parameters
@@ -38,7 +37,7 @@ def stiffness_matrix(mesh: TetMesh) -> sparse.csr_array:
     rows = np.repeat(mesh.cells, 4, axis=1).ravel()
     columns = np.tile(mesh.cells, (1, 4)).ravel()
     n = len(mesh.points)
-    return sparse.coo_array((local.ravel(), (rows, columns)), shape=(n, n)).tocsr()
+    return scipy.sparse.coo_array((local.ravel(), (rows, columns)), shape=(n, n)).tocsr()
 
 
 def solve_laplace(
@@ -78,13 +77,14 @@ def solve_laplace(
     SolverError
         If the residual is not finite or above its bound.
     """
-    import pyamg  # here, as it takes 60 ms and hardly a run needs it
+    import pyamg  # here, as both take 0.3 s and hardly a run needs them
+    from scipy.sparse.linalg import cg
 
     matrix = stiffness_matrix(mesh)
     free = np.flatnonzero(~fixed)
     given = np.where(fixed, values, 0.0)
     right = -(matrix[free] @ given)
-    inner = sparse.csr_matrix(matrix[free][:, free])  # pyamg knows the older type only
+    inner = scipy.sparse.csr_matrix(matrix[free][:, free])  # pyamg knows the older type only
     hierarchy = pyamg.smoothed_aggregation_solver(inner, max_coarse=100)
     count = 0
 
@@ -92,7 +92,7 @@ def solve_laplace(
         nonlocal count
         count += 1
 
-    preconditioner: LinearOperator = hierarchy.aspreconditioner(cycle="V")
+    preconditioner = hierarchy.aspreconditioner(cycle="V")
     solution, _ = cg(
         inner,
         right,

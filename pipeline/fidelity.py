@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from pipeline.graph import MILLIMETRES, WallGraph, find_close, find_crossings, make_graph
+from pipeline.graph import MILLIMETRES, WallGraph, find_close, find_crossings, find_near, make_graph
 
 # Clearances above this (m) are not measured: walls are as good as apart.
 FARTHEST = 5.0
@@ -103,8 +102,7 @@ def _measure_clearance(walls: WallGraph) -> float:
     if len(find_crossings(walls)[0]):
         return 0.0
     _, to_walls = find_close(walls, far)
-    pairs = cKDTree(walls.xy).query_pairs(far, output_type="ndarray").reshape(-1, 2)
-    apart = np.hypot(*(walls.xy[pairs[:, 0]] - walls.xy[pairs[:, 1]]).T)
+    _, apart = find_near(walls, far)
     return float(min(to_walls.min(initial=far), apart.min(initial=far)))
 
 

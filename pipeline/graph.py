@@ -204,9 +204,8 @@ def find_close(graph: WallGraph, distance: float) -> tuple[Pairs, NDArray[np.flo
     """
     if not len(graph.edges):
         return (np.zeros(0, np.int64), np.zeros(0, np.int64)), np.zeros(0)
-    x, y = graph.xy.T
-    boxes = shapely.box(x - distance, y - distance, x + distance, y + distance)
-    vertex, edge = shapely.STRtree(shapely.linestrings(graph.xy[graph.edges])).query(boxes)
+    tree = shapely.STRtree(shapely.linestrings(graph.xy[graph.edges]))
+    vertex, edge = tree.query(_boxes_around(graph.xy, distance))
     foreign = (graph.edges[edge] != vertex[:, None]).all(axis=1)
     foreign &= graph.cluster[vertex] == graph.edge_clusters()[edge]
     vertex, edge = vertex[foreign], edge[foreign]
@@ -217,6 +216,38 @@ def find_close(graph: WallGraph, distance: float) -> tuple[Pairs, NDArray[np.flo
     close = np.flatnonzero(far < distance)
     close = close[np.lexsort((edge[close], vertex[close]))]
     return (vertex[close], edge[close]), far[close]
+
+
+def find_near(graph: WallGraph, distance: float) -> tuple[Pairs, NDArray[np.float64]]:
+    """Find the pairs of vertices of one cluster closer than a distance.
+
+    Parameters
+    ----------
+    graph : WallGraph
+        Graph.
+    distance : float
+        Bound (mm).
+
+    Returns
+    -------
+    i, j : pair of int64, (k,)
+        Each pair once, ``i < j``, in no settled order.
+    distances : float64, (k,)
+        Their distances (mm).
+    """
+    i, j = shapely.STRtree(shapely.points(graph.xy)).query(_boxes_around(graph.xy, distance))
+    later = (i < j) & (graph.cluster[i] == graph.cluster[j])
+    i, j = i[later], j[later]
+    far = np.hypot(*(graph.xy[i] - graph.xy[j]).T)
+    near = far < distance
+    return (i[near], j[near]), far[near]
+
+
+def _boxes_around(xy: NDArray[np.float64], distance: float) -> NDArray[np.object_]:
+    """Boxes that hold all that is within a distance of each point."""
+    x, y = xy.T
+    boxes: NDArray[np.object_] = shapely.box(x - distance, y - distance, x + distance, y + distance)
+    return boxes
 
 
 def find_crossings(graph: WallGraph) -> Pairs:

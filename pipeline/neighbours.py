@@ -7,9 +7,8 @@ lie on different layers, in the order of their heights; roofs of equal height mu
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
+from pipeline.components import join_pairs
 from pipeline.errors import GeometryError
 
 
@@ -46,14 +45,12 @@ def join_equal_roofs(
     Returns
     -------
     int32, (b,)
-        A group for each building.
+        A group for each building, named by the smallest index in it.
     """
     equal = pairs[roof[pairs[:, 0]] == roof[pairs[:, 1]]]
     _, first, member = np.unique(group, return_index=True, return_inverse=True)
-    links = (np.concatenate((equal[:, 0], first[member])), np.concatenate((equal[:, 1], np.arange(len(roof)))))
-    graph = sparse.coo_array((np.ones(len(links[0])), links), shape=(len(roof), len(roof)))
-    joined: NDArray[np.int32] = connected_components(graph, directed=False)[1].astype(np.int32)
-    return joined
+    links = np.concatenate((equal, np.column_stack((first[member], np.arange(len(roof))))))
+    return join_pairs(len(roof), links).astype(np.int32)
 
 
 def part_neighbours(

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from pipeline.components import join_pairs
 from pipeline.errors import GeometryError
 from pipeline.graph import MILLIMETRES
 from pipeline.rings import make_canonical, sort_canonically
@@ -157,21 +156,6 @@ def shape_planar(
     houses, order, rules = _prepare(polygons, clearance, chain_tolerance, min_area, min_courtyard_area, manifold)
     shaped, counts = shape_clusters(houses, cluster[order], rules)
     return _finish(shaped, cluster[order], counts, order, polygons)
-
-
-def join_pairs(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Name the connected components of n things, int64 (n,), by the smallest index in each.
-
-    Examples
-    --------
-    >>> join_pairs(4, np.array([[3, 1]]))
-    array([0, 1, 2, 1])
-    """
-    links = (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1]))
-    _, component = connected_components(coo_array(links, shape=(n, n)), directed=False)
-    _, first, index = np.unique(component, return_index=True, return_inverse=True)
-    named: NDArray[np.int64] = first[index.reshape(-1)].astype(np.int64)
-    return named
 
 
 def find_clusters(polygons: NDArray[np.object_], clearance: float) -> NDArray[np.int64]:

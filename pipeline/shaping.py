@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pipeline.cells import draw_cells
 from pipeline.corners import find_touches, mend_corners
-from pipeline.graph import Faces, WallGraph, find_close, find_crossings, node_walls, trace_faces
+from pipeline.graph import Faces, WallGraph, find_close, find_crossings, find_near, node_walls, trace_faces
 from pipeline.labels import OPEN, Territories, claim_ground, dissolve, drop_small_faces, label_faces
 from pipeline.snap import settle
 
@@ -205,9 +204,7 @@ def _find_changed(before: WallGraph, after: WallGraph) -> NDArray[np.int64]:
 def _find_broken(outcome: Outcome, territories: Territories, rules: Rules) -> NDArray[np.int64]:
     """Find the clusters that break a promise."""
     graph, faces = outcome.graph, outcome.faces
-    pairs = cKDTree(graph.xy).query_pairs(rules.clearance, output_type="ndarray").reshape(-1, 2)
-    near = np.hypot(*(graph.xy[pairs[:, 0]] - graph.xy[pairs[:, 1]]).T) < rules.clearance
-    near &= graph.cluster[pairs[:, 0]] == graph.cluster[pairs[:, 1]]
+    (near, _), _ = find_near(graph, rules.clearance)
     (vertex, _), _ = find_close(graph, rules.clearance)
     crossing, _ = find_crossings(graph)
     built = outcome.label != OPEN
@@ -220,7 +217,7 @@ def _find_broken(outcome: Outcome, territories: Territories, rules: Rules) -> ND
     )
     off = np.flatnonzero(np.abs(got - owned) > allowed)
     broken = (
-        graph.cluster[pairs[near, 0]],
+        graph.cluster[near],
         graph.cluster[vertex],
         graph.edge_clusters()[crossing],
         faces.cluster[built & ~shapely.is_valid(faces.polygons)],

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pipeline.graph import (
     WallGraph,
     find_close,
     find_crossings,
+    find_near,
     join_graphs,
     make_graph,
     thread_edges,
@@ -108,12 +108,8 @@ def straighten(graph: WallGraph, tolerance: float) -> Step:
 
 def collapse(graph: WallGraph, clearance: float) -> Step:
     """Unite the vertices closer than the clearance with the most important one around."""
-    pairs = cKDTree(graph.xy).query_pairs(clearance, output_type="ndarray").astype(np.int64)
-    i, j = pairs.reshape(-1, 2).T
-    distance = np.hypot(*(graph.xy[i] - graph.xy[j]).T)
-    close = (distance < clearance) & (graph.cluster[i] == graph.cluster[j])
-    i, j = np.concatenate((i[close], j[close])), np.concatenate((j[close], i[close]))
-    distance = np.tile(distance[close], 2)
+    (i, j), distance = find_near(graph, clearance)
+    i, j, distance = np.concatenate((i, j)), np.concatenate((j, i)), np.tile(distance, 2)
     rank = _rank(graph)
     state = _choose_keepers(rank, i, j)
     target = np.arange(len(graph.xy))

@@ -3,13 +3,12 @@
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import dijkstra
 
 from pipeline.edges import triangle_neighbours
 from pipeline.errors import GeometryError
 from stitch.corners import Corner
 from stitch.grid import SeamKey, TileGrid, band_width
+from stitch.shortest import find_shortest
 from stitch.strips import Strip
 
 SLOPES = (0.7, 0.95)  # of the wedges at both corners; the second where the first has no path
@@ -65,7 +64,7 @@ def find_path(grid: TileGrid, seam: SeamKey, ends: tuple[Corner, Corner], strip:
         for open_only in (True, False):
             usable = within & ~shut if open_only else within
             usable[[first[-1], last[0]]] = True
-            middle = _shortest(edges, cost, usable, int(first[-1]), int(last[0]))
+            middle = find_shortest(edges, cost, usable, int(first[-1]), int(last[0]))
             if len(middle):
                 return np.concatenate((first, middle[1:-1], last))
     raise GeometryError(
@@ -150,19 +149,3 @@ def _cost_edges(
             cost[n] = np.sqrt(dx * dx + dy * dy) * (1 + OFFSET_COST * mean_offset * mean_offset) * (1 + extra)
             n += 1
     return edges[:n].copy(), cost[:n].copy()
-
-
-def _shortest(
-    edges: NDArray[np.int64], cost: NDArray[np.float64], usable: NDArray[np.bool_], start: int, end: int
-) -> NDArray[np.int64]:
-    """Vertices of the shortest path, none if there is no path."""
-    kept = usable[edges].all(axis=1)
-    n = len(usable)
-    graph = sparse.csr_array((cost[kept], (edges[kept, 0], edges[kept, 1])), shape=(n, n))
-    before = dijkstra(graph, directed=False, indices=np.array([start]), return_predecessors=True)[1][0]
-    path = [end]
-    while path[-1] != start:
-        if path[-1] < 0:
-            return np.empty(0, np.int64)
-        path.append(int(before[path[-1]]))
-    return np.array(path[::-1])

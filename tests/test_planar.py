@@ -16,7 +16,7 @@ import pipeline.snap
 from pipeline.cells import draw_cells
 from pipeline.errors import GeometryError
 from pipeline.fidelity import FARTHEST, measure_simplification
-from pipeline.graph import WallGraph, make_graph, node_walls, trace_faces
+from pipeline.graph import WallGraph, find_near, make_graph, node_walls, trace_faces
 from pipeline.labels import Territories
 from pipeline.planar import COUNTS, PlanarCity, find_clusters, simplify_planar
 from pipeline.snap import node_crossings, straighten
@@ -32,6 +32,19 @@ def simplify(*polygons: Polygon, clearance: float = EPS, manifold: bool = False)
         min_courtyard_area=MIN_COURTYARD,
         manifold=manifold,
     )
+
+
+def test_near_vertices_are_the_pairs_of_one_cluster_that_are_closer_than_the_bound() -> None:
+    rng = np.random.default_rng(4)
+    rows = np.unique(np.column_stack((rng.integers(0, 3, 400), rng.integers(0, 40, (400, 2)))), axis=0)
+    cluster, xy = rows[:, 0], rows[:, 1:].astype(np.float64)
+    graph = WallGraph(xy, cluster, np.zeros((0, 2), np.int64), np.zeros(0))
+    (i, j), distance = find_near(graph, 5.0)
+    apart = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+    close = np.triu((apart < 5) & (cluster[:, None] == cluster[None]), 1)
+    assert (apart == 5).any()
+    assert sorted(zip(i.tolist(), j.tolist(), strict=True)) == list(map(tuple, np.argwhere(close).tolist()))
+    assert (distance == apart[i, j]).all()
 
 
 def shapes(city: PlanarCity) -> dict[int, list[str]]:

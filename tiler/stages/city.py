@@ -11,12 +11,12 @@ from pipeline.adaptive import AdaptiveOptions
 from pipeline.building_points import reach_of_points
 from pipeline.citymodel import Footprints
 from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leave_out, shape_clusters
+from pipeline.components import join_pairs
 from pipeline.groups import adjacent_houses
 from pipeline.houses import Houses, divide_houses, join_houses, take_houses
 from pipeline.inside import cover_polygons
 from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
-from pipeline.planar import join_pairs
 from pipeline.point_fidelity import measure_houses
 from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
 from pipeline.raster import Dtm, window_of

@@ -1,0 +1,46 @@
+"""Connected components: things that belong together by chains of pairs."""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+
+def join_pairs(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Name the connected components of n things by the smallest index in each.
+
+    Parameters
+    ----------
+    n : int
+        Number of things.
+    pairs : int64, (p, 2)
+        Indices of things that belong together.
+
+    Returns
+    -------
+    int64, (n,)
+        Name of each thing's component.
+
+    Examples
+    --------
+    >>> join_pairs(4, np.array([[3, 1]]))
+    array([0, 1, 2, 1])
+    """
+    name: NDArray[np.int64] = _unite(np.arange(n), np.ascontiguousarray(pairs, np.int64))
+    return name
+
+
+@numba.njit(cache=True, nogil=True)
+def _unite(parent: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Unite sets that are trees, with path halving; a parent is never above its child."""
+    for k in range(len(pairs)):
+        a, b = pairs[k]
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        while parent[b] != b:
+            parent[b] = parent[parent[b]]
+            b = parent[b]
+        parent[max(a, b)] = min(a, b)
+    for i in range(len(parent)):
+        parent[i] = parent[parent[i]]
+    return parent
