@@ -3,6 +3,7 @@
 import gc
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from distributed.system import memory_limit
@@ -10,9 +11,11 @@ from distributed.system import memory_limit
 from tiler.importing import uncollected
 from tiler.kept_memory import GARBAGE
 from tiler.limits import machine_memory
+from tiler.synth import write_city
 
-DRIVER = ("tiler.terminal", "tiler.run", "tiler.worker_setup")
-UNNEEDED = ("dask", "distributed", "meshio", "pyamg", "scipy.fft", "scipy.io", "scipy.ndimage")
+DASK = ("dask", "distributed")
+SCIPY = tuple(f"scipy.{part}" for part in ("fft", "io", "linalg", "ndimage", "sparse", "spatial", "special"))
+UNNEEDED = ("meshio", "numpy.testing", "pyamg", "zarr", *SCIPY)
 
 
 def find_imported(names: tuple[str, ...], modules: tuple[str, ...]) -> list[str]:
@@ -24,21 +27,46 @@ def find_imported(names: tuple[str, ...], modules: tuple[str, ...]) -> list[str]
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
 
 
-def test_a_run_in_one_process_imports_what_it_needs_alone() -> None:
-    assert find_imported(UNNEEDED, ("tiler.run", "tiler.terminal")) == []
+def test_a_run_imports_what_it_needs_alone() -> None:
+    assert find_imported(UNNEEDED, ("tiler.run", "tiler.terminal", "tiler.preload")) == []
 
 
-def test_what_only_sends_tasks_to_workers_does_not_wait_for_zarr() -> None:
-    assert find_imported(("zarr",), DRIVER) == []
+def test_what_all_tasks_need_has_all_that_numba_knows_with_blas() -> None:
+    code = """
+import sys, tiler.preload
+from numba.np import arraymath, linalg
+from numba.core.registry import cpu_target
+before = len(sys.modules)
+cpu_target.target_context.refresh()
+print(len(sys.modules) - before, arraymath._HAVE_BLAS, linalg.ensure_blas.__name__)
+"""
+    assert tell_in_fresh_process(code) == "0 True ensure_blas"
 
 
-def test_workers_are_born_with_what_tasks_import_as_they_run() -> None:
-    assert find_imported(("distributed", "zarr"), ("tiler.preload",)) == ["zarr"]
-    assert find_imported(("distributed", "zarr"), ("tiler.preload_dask",)) == ["distributed", "zarr"]
+def test_a_kernel_of_the_user_calls_blas_in_a_process_that_runs_tasks() -> None:
+    code = """
+import sys, tiler.preload, numpy, numba
+product = numba.njit(lambda a, b: numpy.dot(a, b))(numpy.eye(2), numpy.full((2, 2), 3.0))
+print(product.sum(), "scipy.linalg" in sys.modules)
+"""
+    assert tell_in_fresh_process(code) == "12.0 True"
+
+
+def test_the_tasks_of_a_run_import_nothing_more(tmp_path: Path) -> None:
+    city = write_city(tmp_path / "city", size=300, buildings=15, density=1.0)
+    words = ["run", *map(str, city.clouds), "--footprints", str(city.footprints), "--out", str(tmp_path / "out")]
+    code = f"""
+import sys
+from tiler.cli import main
+main({[*words, "--workers", "0", "--tile-size", "150", "--quiet"]})
+print([name for name in {(*DASK, *UNNEEDED)} if name in sys.modules])
+"""
+    assert tell_in_fresh_process(code).splitlines()[-1] == "[]"
+    assert (tmp_path / "out" / "run.json").exists()
 
 
 def test_a_run_with_workers_imports_no_dask() -> None:
-    assert find_imported(("dask", "distributed"), ("tiler.run", "tiler.terminal", "tiler.preload")) == []
+    assert find_imported(DASK, ("tiler.run", "tiler.terminal", "tiler.preload")) == []
 
 
 def test_the_memory_of_this_machine_is_what_dask_finds() -> None:

@@ -11,7 +11,7 @@ from zarr.codecs import BloscCodec
 
 from tiler.packing import shorten_chunk
 from tiler.store import Store
-from tiler.zarr_files import DECODER, GROUP, ChunkForm, describe_group
+from tiler.zarr_files import DECODER, GROUP, NUMBERS, ChunkForm, describe_group
 
 RNG = np.random.default_rng(5)
 ARRAYS: dict[str, tuple[NDArray[Any], tuple[int, ...]]] = {
@@ -24,6 +24,15 @@ ARRAYS: dict[str, tuple[NDArray[Any], tuple[int, ...]]] = {
     "small integers": (RNG.integers(-99, 99, (300, 2, 2)).astype(np.int16), (100, 2, 2)),
     "negative zero, infinity, no number": (np.array([-0.0, np.inf, np.nan, 1.0]), (3,)),
 }
+
+
+@pytest.mark.parametrize("dtype", [*sorted(NUMBERS), "<c16", "<M8[s]"])
+def test_all_types_are_described_as_zarr_does(dtype: str, tmp_path: Path) -> None:
+    codec = BloscCodec(cname="lz4", clevel=5, shuffle="shuffle")
+    zarr.create_array(
+        str(tmp_path), shape=(70, 50), chunks=(32, 16), dtype=dtype, compressors=codec, zarr_format=3
+    )
+    assert ChunkForm(np.dtype(dtype), (70, 50), (32, 16)).describe() == (tmp_path / GROUP).read_bytes()
 
 
 @pytest.mark.parametrize("kind", ARRAYS)

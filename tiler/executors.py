@@ -8,6 +8,7 @@ from typing import Protocol
 
 from tiler.crew import WEIGH, Crew, Function, Given
 from tiler.limits import Limits, share_memory, tell_memory
+from tiler.numba_registry import look_up
 from tiler.task import Failure, Record, Task, run_task
 
 WINDOW, LEAST_WINDOW = 4, 8  # tasks in hand for each worker, and at least
@@ -107,6 +108,7 @@ class Processes:
 @contextmanager
 def serial() -> Iterator[Executor]:
     """Run tasks in this process."""
+    look_up()
     yield Serial()
 
 
