@@ -2,6 +2,7 @@
 
 import errno
 import os
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +60,12 @@ def test_the_record_and_the_manifest_wait_for_the_disk(
 ) -> None:
     """In this order: the bytes, the name, the folder's names."""
     done: list[str] = []
+    meanwhile: list[str] = []
     sync, move = os.fsync, os.replace
 
     def fsync(file: int) -> None:
-        done.append(f"sync {Path(os.readlink(f'/proc/self/fd/{file}')).name}")
+        listed = done if threading.current_thread() is threading.main_thread() else meanwhile
+        listed.append(f"sync {Path(os.readlink(f'/proc/self/fd/{file}')).name}")
         sync(file)
 
     def replace(source: Any, target: Any) -> None:
@@ -78,6 +81,12 @@ def test_the_record_and_the_manifest_wait_for_the_disk(
         assert done[last - 1].startswith(f"sync .{Path(name).stem}.")
         assert done[last + 1] == f"sync {folder}"
     assert not any(what.startswith("sync .progress") for what in done)
+    # In a new folder nothing can belie the first record: the disk takes it while the run goes on.
+    assert meanwhile == ["sync run.json", "sync out"]
+    assert done.count("sync out") == 1
+    run(town.config(out))
+    assert meanwhile == ["sync run.json", "sync out"]
+    assert done.count("sync out") == 3
 
 
 def test_a_disk_that_does_not_take_it_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

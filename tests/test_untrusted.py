@@ -16,6 +16,7 @@ import pyproj
 import pytest
 import shapely
 
+from pipeline.errors import ConfigError
 from tests.bad_input import (
     BOUNDS,
     HOUSE,
@@ -31,6 +32,7 @@ from tests.bad_input import (
     write_parquet,
 )
 from tiler import ingest
+from tiler.out_folder import refuse_inputs_within
 from tiler.seal import seal
 from tiler.store import Store
 
@@ -542,6 +544,16 @@ def test_inputs_among_the_results_are_not_removed(city: Path, capsys: Capture) -
         assert found.code == 2
         assert f"{inside}: an input lies among the results" in found.err
         inside.rename(city / name)
+
+
+def test_inputs_are_found_among_the_results_whichever_way_both_are_named(tmp_path: Path) -> None:
+    far, near = tmp_path / "far", tmp_path / "near"
+    far.mkdir()
+    near.symlink_to(far)
+    for out, given in ((near, far), (far, near)):
+        with pytest.raises(ConfigError, match="lies among the results"):
+            refuse_inputs_within(out / "out", [tmp_path / "cloud.laz", given / "out" / "mesh" / "cloud.laz"])
+        refuse_inputs_within(out / "out", [given / "cloud.laz", given / "out" / "cloud.laz"])
 
 
 # Results of someone else

@@ -3,9 +3,10 @@
 import os
 import shutil
 import tempfile
+import threading
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pipeline.errors import OutputError
@@ -49,6 +50,20 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
         ) from error
+
+
+def sync_meanwhile(path: Path) -> None:
+    """Let the disk take a file and its name, and go on: it may take a second where much else was written.
+
+    Nobody is told if it cannot: for a file that is written again, and waited for, in the end.
+    """
+
+    def sync() -> None:
+        with suppress(OSError):
+            _sync(path)
+            _sync(path.parent)
+
+    threading.Thread(target=sync, name="sync", daemon=True).start()
 
 
 def _sync(path: Path) -> None:

@@ -184,23 +184,31 @@ def refuse_inputs_within(out: Path, inputs: Iterable[Path]) -> None:
     ConfigError
         With the first such input.
     """
+    results = _find_results(out)
     for path in inputs:
-        if _is_result(out, path):
+        if _is_within(path, results):
             raise ConfigError(f"{path}: an input lies among the results in {out}; move it, or give another --out")
 
 
 def refuse_result(out: Path, log: Path) -> None:
     """Refuse a file for `--log-json` that a run writes or removes itself; ConfigError with its name."""
-    if _is_result(out, log):
+    if _is_within(log, _find_results(out)):
         raise ConfigError(f"--log-json {log}: lies among the results in {out}; give another file")
 
 
-def _is_result(out: Path, path: Path) -> bool:
-    if in_bucket(out) or in_bucket(path):
-        both = in_bucket(out) and in_bucket(path)
-        return both and any(path.is_relative_to(out / name) for name in RESULTS)
-    real = Path(os.path.realpath(path))
-    return any(real.is_relative_to(os.path.realpath(out / name)) for name in RESULTS)
+def _find_results(out: Path) -> list[Path]:
+    """Where the results of a run go, links followed."""
+    return [_follow(out / name) for name in RESULTS]
+
+
+def _is_within(path: Path, results: Sequence[Path]) -> bool:
+    real = _follow(path)
+    return any(in_bucket(real) == in_bucket(result) and real.is_relative_to(result) for result in results)
+
+
+def _follow(path: Path) -> Path:
+    remote = in_bucket(path)
+    return path if remote else Path(os.path.realpath(path))
 
 
 def _is_ours(out: Path) -> bool:

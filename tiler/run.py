@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.errors import CityError, OutputError
 from tiler.addresses import ANYWHERE
-from tiler.atomic import replacing
+from tiler.atomic import replacing, sync_meanwhile
 from tiler.audit import Audit
 from tiler.config import Config
 from tiler.dashboard.server import read_address, watched
@@ -200,7 +200,7 @@ def _run(
     failed = True
     try:
         # Nothing of an earlier run is touched before the inputs are known to be there; then, before anything else
-        # changes, its record no longer says that it is done.
+        # changes, its record no longer says that it is done, whatever happens to the power.
         plan = make_plan(config, say)
         vectors = [place(config.footprints)] if config.footprints else []
         for warning in _foresee(plan, config):
@@ -208,7 +208,9 @@ def _run(
             say(warning)
         refuse_inputs_within(out, [*(header.path for header in plan.headers), *vectors])
         untouched = False
-        _write_record(out, record)
+        _write_record(out, record, durable=bool(earlier))
+        if not earlier and not in_bucket(out):
+            sync_meanwhile(out / RUN_RECORD)  # nothing is there yet that a loss of power could make it lie about
         clear_folder(out, earlier, overwrite=config.overwrite)
         if not in_bucket(out):
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
@@ -379,6 +381,6 @@ def tell_error(error: BaseException) -> str:
     return str(error) if isinstance(error, CityError) else f"{type(error).__name__}: {error}"
 
 
-def _write_record(out: Path, record: dict[str, Any]) -> None:
-    with replacing(out / RUN_RECORD, durable=True) as part:
+def _write_record(out: Path, record: dict[str, Any], *, durable: bool = True) -> None:
+    with replacing(out / RUN_RECORD, durable=durable) as part:
         part.write_bytes(seal(json.dumps(record, indent=1, default=str).encode() + b"\n"))

@@ -146,7 +146,8 @@ def list_refs(items: Items, source: str, reach: Items, listed: Mapping[str, Sequ
 
 
 def _make_refs(source: str, pairs: NDArray[np.int64], n_items: int, n_source: int) -> Refs:
-    flat = np.unique(pairs[0] * max(n_source, 1) + pairs[1])
+    flat = np.sort(pairs[0] * max(n_source, 1) + pairs[1])
+    flat = flat[np.diff(flat, prepend=-1) > 0]  # np.unique imports masked arrays: 0.03 s before the first task
     reader, index = flat // max(n_source, 1), flat % max(n_source, 1)
     start = np.searchsorted(reader, np.arange(n_items + 1)).astype(np.int64)
     return Refs(source, start, index.astype(np.int32))
