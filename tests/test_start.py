@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 from distributed.system import memory_limit
+from numba.np import linalg
 
 from tiler.importing import uncollected
 from tiler.kept_memory import GARBAGE
 from tiler.limits import machine_memory
+from tiler.numba_registry import look_up
 from tiler.synth import write_city
 
 DASK = ("dask", "distributed")
@@ -41,6 +43,13 @@ cpu_target.target_context.refresh()
 print(len(sys.modules) - before, arraymath._HAVE_BLAS, linalg.ensure_blas.__name__)
 """
     assert tell_in_fresh_process(code) == "0 True ensure_blas"
+
+
+def test_a_numba_that_looks_for_blas_otherwise_has_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    look_up()  # else numba's own modules would miss what is taken away
+    monkeypatch.delattr(linalg, "ensure_blas")
+    look_up()
+    assert not hasattr(linalg, "ensure_blas")
 
 
 def test_a_kernel_of_the_user_calls_blas_in_a_process_that_runs_tasks() -> None:
