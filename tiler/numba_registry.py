@@ -9,7 +9,7 @@ def look_up() -> None:
 
     Notes
     -----
-    To see whether scipy has BLAS, numba would import `scipy.linalg` then: 0.25 s. It is among what we depend on,
+    To see whether scipy has BLAS, numba would import `scipy.linalg` then: 0.12 s. It is among what we depend on,
     and a kernel that calls BLAS imports it when it is compiled or loaded.
     """
     from numba.core.registry import cpu_target
