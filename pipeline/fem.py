@@ -77,7 +77,7 @@ def solve_laplace(
     SolverError
         If the residual is not finite or above its bound.
     """
-    import pyamg  # here, as both take 0.3 s and hardly a run needs them
+    import pyamg  # here, as hardly a run needs either
     from scipy.sparse.linalg import cg
 
     matrix = stiffness_matrix(mesh)

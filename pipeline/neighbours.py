@@ -45,12 +45,13 @@ def join_equal_roofs(
     Returns
     -------
     int32, (b,)
-        A group for each building, named by the smallest index in it.
+        A group for each building.
     """
     equal = pairs[roof[pairs[:, 0]] == roof[pairs[:, 1]]]
     _, first, member = np.unique(group, return_index=True, return_inverse=True)
     links = np.concatenate((equal, np.column_stack((first[member], np.arange(len(roof))))))
-    return join_pairs(len(roof), links).astype(np.int32)
+    joined: NDArray[np.int32] = np.unique(join_pairs(len(roof), links), return_inverse=True)[1].astype(np.int32)
+    return joined
 
 
 def part_neighbours(

@@ -338,7 +338,7 @@ def test_roofs_that_meet_rise_one_layer_each_and_equal_ones_share_theirs() -> No
     own = np.arange(5, dtype=np.int32)
     pairs = adjacent_houses(city.polygons)
     group = join_equal_roofs(pairs, city.roof, own)
-    assert group.tolist() == [0, 1, 1, 3, 4]
+    assert group.tolist() == [0, 1, 1, 2, 3]
     alone = np.array([1, 1, 1, 2, 4], np.int32)
     removed, parted = part_neighbours(pairs, city.roof, group, alone, city.polygons, n_layers=8)
     assert (removed.tolist(), parted) == ([1, 2, 2, 3, 4], 2)

@@ -33,6 +33,15 @@ def test_a_run_imports_what_it_needs_alone() -> None:
     assert find_imported(UNNEEDED, ("tiler.run", "tiler.terminal", "tiler.preload")) == []
 
 
+def test_what_only_sends_tasks_to_workers_does_not_wait_for_zarr() -> None:
+    assert find_imported(("zarr",), ("tiler.terminal", "tiler.run", "tiler.worker_setup")) == []
+
+
+def test_workers_of_dask_are_born_with_dask_alone() -> None:
+    assert find_imported(("distributed", "zarr"), ("tiler.preload",)) == []
+    assert find_imported(("distributed", "zarr"), ("tiler.preload_dask",)) == ["distributed"]
+
+
 def test_what_all_tasks_need_has_all_that_numba_knows_with_blas() -> None:
     code = """
 import sys, tiler.preload

@@ -1,4 +1,4 @@
-"""What numba knows of, looked up before the first kernel: 0.15 s, which workers are spared as they are forked."""
+"""What numba knows of, looked up before the first kernel: 0.2 s, which workers are spared as they are forked."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
