@@ -242,9 +242,29 @@ def test_offsets_that_are_kept_are_those_of_the_file(tmp_path: Path, city: TinyC
         data = read_with_vtk(vtkXMLUnstructuredGridReader(), tmp_path / f"{k}.vtu")
         assert_same(rows_of(data.GetCells(), 4).astype(np.int32), mesh.cells.astype(np.int32))
     for k, mesh in enumerate(meshes):
-        vtk_files._compress_ends.cache_clear()
+        vtk_files._kept_ends.cache_clear()
         write_vtu(tmp_path / "alone.vtu", mesh)
         assert (tmp_path / "alone.vtu").read_bytes() == (tmp_path / f"{k}.vtu").read_bytes()
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_offsets_of_the_first_cells_are_compressed_once(
+    tmp_path: Path, city: TinyCity, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a piece that is larger than what is kept, too; the last block alone is the piece's own."""
+    step = vtk_xml.BLOCK_BYTES // 4
+    monkeypatch.setattr(vtk_files, "KEPT_ROWS", 3 * step)
+    vtk_files._kept_ends.cache_clear()
+    compressed: list[int] = []
+
+    def note(items: NDArray[Any], dtype: np.dtype[Any], *, level: int) -> bytes:
+        compressed.append(int(items[0]) // 4 // step)
+        return vtk_xml.compress_block(items, dtype, level=level)
+
+    monkeypatch.setattr(vtk_files, "compress_block", note)
+    for n_cells in (5 * step, 3 * step, 2 * step + 1):
+        write_vtu(tmp_path / "m.vtu", TetMesh(city.mesh.points, city.mesh.cells[:n_cells]))
+    assert compressed == [0, 1, 2, 3, 4, 2, 2]
 
 
 def test_same_input_same_bytes_and_the_input_is_left_alone(tmp_path: Path, city: TinyCity) -> None:

@@ -223,7 +223,7 @@ class Config:
         0.0,
         "run",
         "side of a tile, at least 14 mesh sizes; tiles are aligned to multiples of it in the CRS; 0 takes 1250 m, "
-        "and less for meshes finer than 10 m (520 m for 5 m, 220 m for 2.5 m), which have more cells",
+        "and less for meshes finer than 10 m (660 m for 5 m, 350 m for 2.5 m), which have more cells",
         unit="m",
         least=0,
     )

@@ -31,6 +31,7 @@ from tiler.vtk_xml import (
 )
 
 TETRA = 10  # VTK_TETRA
+KEPT_ROWS = 1 << 24  # whose offsets are kept once they are compressed: 20 MB where a piece has so many cells
 Arrays = Mapping[str, NDArray[Any]]
 NO_ARRAYS: Arrays = {}
 
@@ -387,12 +388,20 @@ def _items(rows: Rows) -> Callable[[int, int], NDArray[Any]]:
 def stream_offsets(n_rows: int, width: int) -> Stream:
     """Make the stream that tells where rows of so many numbers end in the connectivity."""
     dtype = np.dtype(np.int32 if n_rows * width < 2**31 else np.int64)
-    return Stream("offsets", dtype, 1, n_rows, partial(_compress_ends, width, dtype))
+    return Stream("offsets", dtype, 1, n_rows, partial(_give_ends, width, dtype, n_rows))
 
 
-@lru_cache(maxsize=64)  # of 77 kB at most, enough for 4 million cells: a fifth of the time to compress a piece
+def _give_ends(width: int, dtype: np.dtype[Any], n_rows: int, i: int, j: int) -> bytes:
+    """Give a block of offsets: all but the last are the same in every piece, and the first of these are kept."""
+    kept = j < n_rows and j <= KEPT_ROWS
+    return _kept_ends(width, dtype, i, j) if kept else _compress_ends(width, dtype, i, j)
+
+
 def _compress_ends(width: int, dtype: np.dtype[Any], i: int, j: int) -> bytes:
     return compress_block(np.arange(i + 1, j + 1, dtype=np.int64) * width, dtype, level=THOROUGH)
+
+
+_kept_ends = lru_cache(maxsize=None)(_compress_ends)
 
 
 def stream_types(n_cells: int) -> Stream:
