@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.mesh import TetMesh
 
+AT_ONCE = 248  # cells measured together: 24 kB of corners, whose rows do not share the places of a cache
 PERCENTILES = (0.0, 0.1, 1.0, 5.0, 50.0, 95.0, 99.0, 99.9, 100.0)
 
 
@@ -22,7 +23,7 @@ class Quality:
     min_dihedral : float32, (m,)
         Smallest of the six dihedral angles (degrees): 70.5 at best.
     aspect_ratio : float32, (m,)
-        Longest edge over 2 sqrt(6) inscribed radii: 1 at best.
+        Longest edge over 2 sqrt(6) inscribed radii: 1 at best, infinite for a flat one.
     """
 
     radius_ratio: NDArray[np.float32]
@@ -57,42 +58,51 @@ def quality_percentiles(quality: Quality) -> dict[str, dict[str, float]]:
 
 @numba.njit(cache=True, nogil=True)
 def _measure(points: NDArray[np.float64], cells: NDArray[np.int32], result: NDArray[np.float32]) -> None:
-    # Twice the area vector of the faces opposite to corners 0, 1, 2, 3, outwards or inwards alike.
-    nx, ny, nz = np.empty(4), np.empty(4), np.empty(4)
-    size = np.empty(4)
-    for c in range(len(cells)):
-        p = points[cells[c, 0]]
-        ux, uy, uz = points[cells[c, 1], 0] - p[0], points[cells[c, 1], 1] - p[1], points[cells[c, 1], 2] - p[2]
-        vx, vy, vz = points[cells[c, 2], 0] - p[0], points[cells[c, 2], 1] - p[1], points[cells[c, 2], 2] - p[2]
-        wx, wy, wz = points[cells[c, 3], 0] - p[0], points[cells[c, 3], 1] - p[1], points[cells[c, 3], 2] - p[2]
-        nx[1], ny[1], nz[1] = vy * wz - vz * wy, vz * wx - vx * wz, vx * wy - vy * wx
-        nx[2], ny[2], nz[2] = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
-        nx[3], ny[3], nz[3] = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        nx[0], ny[0], nz[0] = -nx[1] - nx[2] - nx[3], -ny[1] - ny[2] - ny[3], -nz[1] - nz[2] - nz[3]
-        surface = 0.0
-        for k in range(4):
-            size[k] = np.sqrt(nx[k] * nx[k] + ny[k] * ny[k] + nz[k] * nz[k])
-            surface += size[k]
-        volume = abs(ux * nx[1] + uy * ny[1] + uz * nz[1])
-        inner = volume / surface
+    """Measure cells, some at a time: their corners lie by coordinate, so that one instruction takes several."""
+    corner, found = np.empty((12, AT_ONCE)), np.empty((3, AT_ONCE))
+    for start in range(0, len(cells), AT_ONCE):
+        end = min(start + AT_ONCE, len(cells))
+        for c in range(start, end):
+            for k in range(4):
+                for axis in range(3):
+                    corner[3 * k + axis, c - start] = points[cells[c, k], axis]
+        _measure_some(corner, end - start, found)
+        for c in range(start, end):
+            result[0, c], result[2, c] = found[0, c - start], found[2, c - start]
+            result[1, c] = np.degrees(np.arccos(min(found[1, c - start], 1.0)))
+
+
+# By numpy's rules, for division by zero: a flat cell has a ratio of 0, or NaN if its corners are on a circle.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _measure_some(corner: NDArray[np.float64], n: int, found: NDArray[np.float64]) -> None:
+    """Measure n cells by their corners: radius ratio, cosine of the least dihedral angle, aspect ratio."""
+    for c in range(n):
+        ux, uy, uz = corner[3, c] - corner[0, c], corner[4, c] - corner[1, c], corner[5, c] - corner[2, c]
+        vx, vy, vz = corner[6, c] - corner[0, c], corner[7, c] - corner[1, c], corner[8, c] - corner[2, c]
+        wx, wy, wz = corner[9, c] - corner[0, c], corner[10, c] - corner[1, c], corner[11, c] - corner[2, c]
+        # Twice the area vectors of the faces opposite to corners 1, 2, 3 and 0, outwards or inwards alike.
+        ax, ay, az = vy * wz - vz * wy, vz * wx - vx * wz, vx * wy - vy * wx
+        bx, by, bz = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
+        cx, cy, cz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        ox, oy, oz = -ax - bx - cx, -ay - by - cy, -az - bz - cz
+        o, a = np.sqrt(ox * ox + oy * oy + oz * oz), np.sqrt(ax * ax + ay * ay + az * az)
+        b, d = np.sqrt(bx * bx + by * by + bz * bz), np.sqrt(cx * cx + cy * cy + cz * cz)
+        volume = abs(ux * ax + uy * ay + uz * az)
+        inner = volume / (o + a + b + d)
         uu, vv, ww = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, wx * wx + wy * wy + wz * wz
-        sx = uu * nx[1] + vv * nx[2] + ww * nx[3]
-        sy = uu * ny[1] + vv * ny[2] + ww * ny[3]
-        sz = uu * nz[1] + vv * nz[2] + ww * nz[3]
+        sx, sy, sz = uu * ax + vv * bx + ww * cx, uu * ay + vv * by + ww * cy, uu * az + vv * bz + ww * cz
         outer = np.sqrt(sx * sx + sy * sy + sz * sz) / (2 * volume)
-        sharpest = -1.0
-        for i in range(4):
-            for j in range(i):
-                cosine = -(nx[i] * nx[j] + ny[i] * ny[j] + nz[i] * nz[j]) / (size[i] * size[j])
-                sharpest = max(sharpest, cosine)
-        longest = max(
-            uu,
-            vv,
-            ww,
-            (ux - vx) ** 2 + (uy - vy) ** 2 + (uz - vz) ** 2,
-            (vx - wx) ** 2 + (vy - wy) ** 2 + (vz - wz) ** 2,
-            (wx - ux) ** 2 + (wy - uy) ** 2 + (wz - uz) ** 2,
+        found[1, c] = max(
+            -(ax * ox + ay * oy + az * oz) / (a * o),
+            -(bx * ox + by * oy + bz * oz) / (b * o),
+            -(cx * ox + cy * oy + cz * oz) / (d * o),
+            -(bx * ax + by * ay + bz * az) / (b * a),
+            -(cx * ax + cy * ay + cz * az) / (d * a),
+            -(cx * bx + cy * by + cz * bz) / (d * b),
         )
-        result[0, c] = 3 * inner / outer
-        result[1, c] = np.degrees(np.arccos(min(sharpest, 1.0)))
-        result[2, c] = np.sqrt(longest) / (2 * np.sqrt(6.0) * inner)
+        uv = (ux - vx) ** 2 + (uy - vy) ** 2 + (uz - vz) ** 2
+        vw = (vx - wx) ** 2 + (vy - wy) ** 2 + (vz - wz) ** 2
+        wu = (wx - ux) ** 2 + (wy - uy) ** 2 + (wz - uz) ** 2
+        longest = max(uu, vv, ww, uv, vw, wu)
+        found[0, c] = 3 * inner / outer
+        found[2, c] = np.sqrt(longest) / (2 * np.sqrt(6.0) * inner)

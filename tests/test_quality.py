@@ -8,7 +8,7 @@ from vtkmodules.vtkCommonDataModel import VTK_TETRA, vtkUnstructuredGrid
 from vtkmodules.vtkFiltersVerdict import vtkMeshQuality
 
 from pipeline.mesh import TetMesh
-from pipeline.quality import measure_cells, quality_percentiles
+from pipeline.quality import AT_ONCE, measure_cells, quality_percentiles
 
 
 def tet(*corners: tuple[float, float, float]) -> TetMesh:
@@ -63,6 +63,23 @@ def test_measures_are_those_of_vtk() -> None:
     angles = [least_dihedral(points[cell]) for cell in cells]
     np.testing.assert_allclose(quality.min_dihedral, angles, rtol=1e-5)
     np.testing.assert_allclose(quality.aspect_ratio, by_vtk("AspectRatio"), rtol=1e-4)
+
+
+@pytest.mark.parametrize("n_cells", [1, AT_ONCE - 1, AT_ONCE, 2 * AT_ONCE + 7])
+def test_a_cell_is_measured_alike_beside_any_number_of_others(n_cells: int) -> None:
+    rng = np.random.default_rng(n_cells)
+    points = rng.normal(size=(50, 3))
+    cells = np.array([rng.permutation(50)[:4] for _ in range(n_cells)], np.int32)
+    together = measure_cells(TetMesh(points, cells))
+    alone = [measure_cells(TetMesh(points, cell[None])) for cell in cells]
+    for name in ("radius_ratio", "min_dihedral", "aspect_ratio"):
+        wanted = np.concatenate([getattr(quality, name) for quality in alone])
+        np.testing.assert_array_equal(getattr(together, name), wanted)
+
+
+def test_a_flat_cell_has_no_ratio() -> None:
+    quality = measure_cells(tet((0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 3, 0)))
+    assert (quality.radius_ratio[0], quality.min_dihedral[0], quality.aspect_ratio[0]) == (0.0, 0.0, np.inf)
 
 
 def test_percentiles_have_minimum_and_maximum() -> None:
