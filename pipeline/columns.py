@@ -59,7 +59,8 @@ def merge_columns(mesh: ColumnMesh, part: slice, clockwise: NDArray[np.bool_], n
     Returns
     -------
     int32, (n_cells, 4)
-        Levels of `ColumnMesh.z`, triangle by triangle.
+        Levels of `ColumnMesh.z`, triangle by triangle. The first and the last corner of a cell are the ends of its
+        upright edge, so that rows repeat what is above them: files of them are smaller, and packed sooner.
     """
     cells = np.empty((n_cells, 4), np.int32)
     triangles, by_height = mesh.plane.triangles[part], mesh.order == "heights"
@@ -324,7 +325,15 @@ def _merge_columns(
 ) -> None:
     cell = 0
     for t in range(len(triangles)):
-        cell = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, cell)
+        first = cell
+        cell = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, first)
+        for k in range(first, cell):
+            a, b, c = cells[k, 0], cells[k, 1], cells[k, 2]
+            below = cells[k, 3] - 1
+            if b == below:
+                cells[k, 0], cells[k, 1], cells[k, 2] = b, c, a
+            elif c == below:
+                cells[k, 0], cells[k, 1], cells[k, 2] = c, a, b
 
 
 @numba.njit(cache=True, nogil=True)

@@ -67,7 +67,7 @@ def piece_stages() -> list[Stage]:
     return [
         Stage("numbers", Scope.REGION, number_parts, meshed, version=3),
         # Of the tiles around it a piece asks only which of them there are.
-        Stage("pieces", Scope.TILE, write_piece, beside, version=3),
+        Stage("pieces", Scope.TILE, write_piece, beside, version=4),
         Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces", beside=True, optional=True),)),
         Stage("report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True))),
     ]
