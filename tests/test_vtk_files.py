@@ -257,8 +257,9 @@ def test_offsets_of_the_first_cells_are_compressed_once(
     vtk_files._kept_ends.cache_clear()
     compressed: list[int] = []
 
-    def note(items: NDArray[Any], dtype: np.dtype[Any], *, level: int) -> bytes:
-        compressed.append(int(items[0]) // 4 // step)
+    def note(items: NDArray[Any], dtype: np.dtype[Any], *, level: int = vtk_xml.LEVEL) -> bytes:
+        if dtype == np.int32:  # not the types
+            compressed.append(int(items[0]) // 4 // step)
         return vtk_xml.compress_block(items, dtype, level=level)
 
     monkeypatch.setattr(vtk_files, "compress_block", note)

@@ -406,7 +406,12 @@ _kept_ends = lru_cache(maxsize=None)(_compress_ends)
 
 def stream_types(n_cells: int) -> Stream:
     """Make the stream of the types of tetrahedra."""
-    return stream_items("types", np.dtype(np.uint8), 1, n_cells, lambda i, j: np.full(j - i, TETRA, np.uint8))
+    return Stream("types", np.dtype(np.uint8), 1, n_cells, lambda i, j: _compress_types(j - i))
+
+
+@lru_cache(maxsize=2)  # a full block, and the last one
+def _compress_types(n_cells: int) -> bytes:
+    return compress_block(np.full(n_cells, TETRA, np.uint8), np.dtype(np.uint8))
 
 
 def _rows_of(arrays: Arrays, n_rows: int) -> RowArrays:
