@@ -300,10 +300,11 @@ def test_the_pods_commands_run_and_give_the_bytes_of_a_serial_run(tmp_path: Path
 
     def adapt(command: list[str], health: int) -> list[str]:
         swaps = {"tcp://citystitch-scheduler:8786": address, "8786": str(port), "/tmp": str(tmp_path)}
-        found = [sys.executable, "-m", "dask", *command[1:]]
+        found = command[1:]
         for old, new in swaps.items():
             found = [word.replace(old, new) for word in found]
-        return [re.sub(r"^(--dashboard-address=):\d+$", rf"\g<1>127.0.0.1:{health}", word) for word in found]
+        found = [re.sub(r"^(--dashboard-address=):\d+$", rf"\g<1>127.0.0.1:{health}", word) for word in found]
+        return [sys.executable, "-m", "dask", *found]
 
     with ExitStack() as stack:
         scheduler = adapt(commands["scheduler"], http)
