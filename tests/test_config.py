@@ -115,7 +115,7 @@ def test_tiles_follow_the_mesh_size_alone_where_no_side_is_given(tmp_path: Path)
     assert (sides >= LEAST_TILE * sizes).all()
     fine = sizes <= 10
     triangles = (sides / sizes)[fine] ** 2  # but for a factor
-    assert (np.diff(triangles) >= 0).all()  # neither more seams in a tile as meshes get finer
+    assert (np.diff(triangles) >= 0).all()  # no more seams for its area as meshes get finer
     assert (np.diff(triangles * sizes[fine] ** 0.4) <= 0).all()  # nor many more columns
     assert make_config({"mesh_size": 2.5, "open_size": 40.0}).tile_size_or_default == LEAST_TILE * 40.0
 
