@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.group_order import sort_values
 from pipeline.inside import are_inside, find_inside
+from pipeline.kernel import kernel
 from pipeline.pointcloud import (
     BUILDING,
     GROUND,
@@ -154,7 +154,7 @@ def remove_outliers(
     return np.concatenate(([0], np.cumsum(kept))), z[keep]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _select_close(
     start: NDArray[np.int64], z: NDArray[np.float64], deviations: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
@@ -244,7 +244,7 @@ def _regroup(
     return new_start, sort_values(new_start, _deal_out(start, z, owner, new_start))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _deal_out(
     start: NDArray[np.int64], z: NDArray[np.float64], owner: NDArray[np.int64], new_start: NDArray[np.int64]
 ) -> NDArray[np.float64]:

@@ -7,12 +7,12 @@ what a tile takes; next come 24 bytes for each point.
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.columns import count_by_triangle, merge_columns
 from pipeline.histograms import QUALITY_BINS, Histogram, merge_histograms, no_values, quality_histograms
+from pipeline.kernel import kernel
 from pipeline.mesh import ColumnMesh, TetMesh
 from pipeline.plane import signed_areas
 from pipeline.quality import measure_cells
@@ -90,7 +90,7 @@ class UsedPoints:
         return points
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _place(
     xy: NDArray[np.float64],
     column: NDArray[np.int32],

@@ -6,11 +6,11 @@ order compares two columns by what these two are, so the faces over an edge are 
 triangles: the mesh conforms.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.edges import plane_edges
+from pipeline.kernel import kernel
 from pipeline.mesh import Boundary, ColumnMesh, Marker, SeamEdges, TetMesh
 from pipeline.plane import signed_areas
 
@@ -261,7 +261,7 @@ def _side_marker(start: NDArray[np.float64], end: NDArray[np.float64], bounds: B
     return np.select(sides, [Marker.WEST, Marker.EAST, Marker.SOUTH, Marker.NORTH], 0)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _comes_first(z: NDArray[np.float64], by_height: bool, i: int, end_i: int, j: int, end_j: int) -> bool:
     """Whether a column's segment over level i is merged before the one over j of a later vertex's column."""
     if i == end_i or j == end_j:
@@ -271,7 +271,7 @@ def _comes_first(z: NDArray[np.float64], by_height: bool, i: int, end_i: int, j:
     return end_i - i > end_j - j
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def merge_triangle(
     triangle: NDArray[np.int32],
     bottom: NDArray[np.int32],
@@ -313,7 +313,7 @@ def merge_triangle(
     return cell
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _merge_columns(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
@@ -336,7 +336,7 @@ def _merge_columns(
                 cells[k, 0], cells[k, 1], cells[k, 2] = c, a, b
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _merge_edges(
     low: NDArray[np.int64],
     high: NDArray[np.int64],
@@ -389,7 +389,7 @@ def _merge_edges(
         count[e] = facet - begin
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _edge_sides(
     of_triangle: NDArray[np.int32], bottom: NDArray[np.int32], n_edges: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

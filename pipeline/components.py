@@ -1,8 +1,9 @@
 """Connected components: things that belong together by chains of pairs."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.kernel import kernel
 
 
 def join_pairs(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -29,7 +30,7 @@ def join_pairs(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
     return name
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _unite(parent: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.int64]:
     """Unite sets that are trees, with path halving; a parent is never above its child."""
     for k in range(len(pairs)):

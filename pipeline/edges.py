@@ -1,8 +1,9 @@
 """Edges of a plane mesh: which there are, and which triangles lie beside them."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.kernel import kernel
 
 
 def plane_edges(triangles: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -60,7 +61,7 @@ def sort_triangles(triangles: NDArray[np.int32]) -> NDArray[np.int64]:
     return order
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _number_edges(triangles: NDArray[np.int32], n: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Put the edges at their lower vertices, and sort those of each by the higher one."""
     m = len(triangles)
@@ -95,7 +96,7 @@ def _number_edges(triangles: NDArray[np.int32], n: int) -> tuple[NDArray[np.int3
     return edges[:e].copy(), of_triangle
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _pair_triangles(of_triangle: NDArray[np.int32], n_edges: int) -> NDArray[np.int32]:
     neighbour = np.full(of_triangle.shape, -1, np.int32)
     earlier = np.full(n_edges, -1, np.int32)
@@ -109,7 +110,7 @@ def _pair_triangles(of_triangle: NDArray[np.int32], n_edges: int) -> NDArray[np.
     return neighbour
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sort_rows(triangles: NDArray[np.int32], n: int) -> NDArray[np.int64]:
     start = np.zeros(n + 1, np.int64)
     for t in range(len(triangles)):

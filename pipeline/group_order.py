@@ -1,10 +1,12 @@
 """Values and points put in order within groups that lie one after the other (steps 1.5 and 2.0)."""
 
 from itertools import pairwise
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.kernel import kernel
 
 FEW = 24  # points that are sorted one by one
 
@@ -23,7 +25,7 @@ def sort_values(start: NDArray[np.int64], values: NDArray[np.float64]) -> NDArra
     return ordered
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def sort_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sort the points of each group by height, then y, then x.
 
@@ -49,7 +51,7 @@ def sort_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> NDArray[n
     return ordered
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def sort_group(xyz: NDArray[np.float64]) -> None:
     """Sort the points of one group, (n, 3), in place, as `sort_points` does; for kernels."""
     bins = _deal_out(xyz)
@@ -57,7 +59,7 @@ def sort_group(xyz: NDArray[np.float64]) -> None:
         _sort(xyz[bins[k] : bins[k + 1]])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def order_values(values: NDArray[np.float64]) -> NDArray[np.int64]:
     """Rows of values, (n,), in ascending order, those of equal ones as they come; for kernels."""
     n = len(values)
@@ -70,7 +72,7 @@ def order_values(values: NDArray[np.float64]) -> NDArray[np.int64]:
     return order
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _deal_out(xyz: NDArray[np.float64]) -> NDArray[np.int64]:
     """Put points in order of as many bins of equal height; give where each bin starts."""
     n = len(xyz)
@@ -96,7 +98,7 @@ def _deal_out(xyz: NDArray[np.float64]) -> NDArray[np.int64]:
     return start
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sort(xyz: NDArray[np.float64]) -> None:
     """Sort points in place: a few at a time, and what is sorted is merged."""
     n = len(xyz)
@@ -104,14 +106,15 @@ def _sort(xyz: NDArray[np.float64]) -> None:
         _insert(xyz[first : min(first + FEW, n)])
     if n <= FEW:
         return
-    room, width = np.empty((n, 3)), np.int64(FEW)  # for a constant, numba would compile `_merge` once more
+    room = np.empty((n, 3))
+    width: Any = np.int64(FEW)  # for a constant, numba would compile `_merge` once more
     while width < n:
         for first in range(0, n - width, 2 * width):
             _merge(xyz[first : min(first + 2 * width, n)], width, room)
         width *= 2
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _merge(xyz: NDArray[np.float64], middle: int, room: NDArray[np.float64]) -> None:
     """Merge the sorted points before the middle with those after it, in place."""
     for k in range(middle):
@@ -128,7 +131,7 @@ def _merge(xyz: NDArray[np.float64], middle: int, room: NDArray[np.float64]) -> 
         to += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _insert(xyz: NDArray[np.float64]) -> None:
     """Sort a few points in place."""
     for k in range(1, len(xyz)):
@@ -140,7 +143,7 @@ def _insert(xyz: NDArray[np.float64]) -> None:
         xyz[m, 0], xyz[m, 1], xyz[m, 2] = x, y, z
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _is_before(x: float, y: float, z: float, x2: float, y2: float, z2: float) -> bool:
     if z != z2:
         return z < z2

@@ -7,9 +7,10 @@ taken, so that the result is the same on every machine.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.kernel import kernel
 
 # Levels where steps have half of their full height may move; the second one above the ground is the first.
 MOVABLE_STEP = 0.5
@@ -106,7 +107,7 @@ def layer_levels(height: float, spacing: float, growth: Growth) -> NDArray[np.fl
     return np.array([*levels, height])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def count_steps(height: float, spacing: float, first: float, ratio: float) -> float:
     """Number of steps from the ground up to a height (m), the last one in part."""
     steps, step = 0.0, min(first, spacing)
@@ -117,7 +118,7 @@ def count_steps(height: float, spacing: float, first: float, ratio: float) -> fl
     return steps + height / step
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def height_of_steps(steps: float, spacing: float, first: float, ratio: float) -> float:
     """Height above the ground (m) that a number of steps leads to: the inverse of `count_steps`."""
     height, step = 0.0, min(first, spacing)
@@ -128,7 +129,7 @@ def height_of_steps(steps: float, spacing: float, first: float, ratio: float) ->
     return height + steps * step
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def stagger_weight(height: float, spacing: float, first: float, ratio: float) -> float:
     """Part of its shift that a level keeps: nothing in the first layer, all of it where steps are full."""
     if first >= spacing:

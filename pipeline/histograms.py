@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from pipeline.quality import PERCENTILES, Quality
 
 # Range and number of bins of each measure of quality: steps of 0.0005, 0.01 degrees and 0.01. The last of the
@@ -76,7 +76,7 @@ def no_values(limits: tuple[float, float], bins: int) -> Histogram:
     return count_values(np.empty(0, np.float32), limits, bins)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _count(
     values: NDArray[np.floating], low: float, high: float, counts: NDArray[np.int64]
 ) -> tuple[float, float, int]:

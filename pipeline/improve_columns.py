@@ -6,12 +6,13 @@ cell dominates. Then the columns are merged anew at their new heights.
 """
 
 from dataclasses import replace
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.columns import count_by_triangle, merge_triangle
+from pipeline.kernel import kernel
 from pipeline.mesh import ColumnMesh
 from pipeline.plane import signed_areas
 
@@ -205,7 +206,7 @@ class ColumnSurvey:
         )
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _radius_ratio(
     ax: float, ay: float, az: float, bx: float, by: float, bz: float,
     cx: float, cy: float, cz: float, dx: float, dy: float, dz: float,
@@ -230,7 +231,7 @@ def _radius_ratio(
     return float(6 * volume6 * abs(volume6) / (surface2 * np.sqrt(ex * ex + ey * ey + ez * ez)))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _inverse_power(ratio: float) -> float:
     if ratio <= 0:
         return np.inf
@@ -238,7 +239,7 @@ def _inverse_power(ratio: float) -> float:
     return square * square * square * square
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _columns_of_cell(
     triangle: NDArray[np.int32], clockwise: bool, cell: NDArray[np.int32]
 ) -> tuple[np.int32, np.int32, np.int32, np.int32]:
@@ -248,7 +249,7 @@ def _columns_of_cell(
     return a, b, c, a if above == cell[0] else b if above == cell[1] else c
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _lay_out(
     xy: NDArray[np.float64],
     triangle: NDArray[np.int32],
@@ -266,7 +267,7 @@ def _lay_out(
     at[9, i], at[10, i], at[11, i] = xy[d, 0], xy[d, 1], z[cell[3]]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _measure_block(at: NDArray[np.float64], n: int, ratio: NDArray[np.float64]) -> None:
     """Radius ratio of the first n columns: corners side by side let the machine take several cells at once."""
     for i in range(n):
@@ -276,7 +277,7 @@ def _measure_block(at: NDArray[np.float64], n: int, ratio: NDArray[np.float64]) 
         )  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _survey(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
@@ -295,7 +296,7 @@ def _survey(
 ) -> None:
     """Make and measure the cells over the triangles that are wanted: at most so many over one."""
     cells, at, ratio = np.empty((most, 4), np.int32), np.empty((12, most)), np.empty(most)
-    first = np.int64(0)  # for a constant, numba would compile `merge_triangle` once more
+    first: Any = np.int64(0)  # for a constant, numba would compile `merge_triangle` once more
     for t in range(len(triangles)):
         if not wanted[t]:
             continue
@@ -313,7 +314,7 @@ def _survey(
                 bad[a] = bad[b] = bad[c] = bad[d] = True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _find_level(level: NDArray[np.int64], low: int, high: int, p: int) -> int:
     """Place of a level among those from low to high, which ascend; -1 if it is not there."""
     end = high
@@ -326,7 +327,7 @@ def _find_level(level: NDArray[np.int64], low: int, high: int, p: int) -> int:
     return low if low < end and level[low] == p else -1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _gather(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
@@ -362,7 +363,7 @@ def _gather(
     return found, over
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add_costs(ratio: NDArray[np.float64]) -> float:
     total = 0.0
     for i in range(len(ratio)):
@@ -370,7 +371,7 @@ def _add_costs(ratio: NDArray[np.float64]) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cells_of_levels(
     cells: NDArray[np.int32],
     over: NDArray[np.int32],
@@ -401,7 +402,7 @@ def _cells_of_levels(
     return start, of_level
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cost(at: NDArray[np.float64], row: NDArray[np.int64], z: float, n: int, ratio: NDArray[np.float64]) -> float:
     """Cost of the first n cells with one corner of each, whose height is in that row, at z."""
     for i in range(n):
@@ -410,7 +411,7 @@ def _cost(at: NDArray[np.float64], row: NDArray[np.int64], z: float, n: int, rat
     return float(_add_costs(ratio[:n]))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _search(
     xy: NDArray[np.float64],
     triangles: NDArray[np.int32],

@@ -5,11 +5,11 @@ ratio), then flips edges until the mesh is Delaunay between the walls again. An 
 its two sides differ; walls, border edges and their vertices stay as they are, bit for bit.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.edges import triangle_neighbours
+from pipeline.kernel import kernel
 
 SEARCH_SWEEPS = 6  # rounds of the search in each pass
 FIRST_STEP = 0.15  # of the mesh size: the search's first step
@@ -82,7 +82,7 @@ def _frozen_vertices(
     return frozen
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _ring_costs(
     ring: NDArray[np.float64], n: int, x: NDArray[np.float64], y: NDArray[np.float64], cost: NDArray[np.float64]
 ) -> None:
@@ -99,7 +99,7 @@ def _ring_costs(
             cost[d] += square * square if area2 > 0 else np.inf
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _collect_ring(
     xy: NDArray[np.float64],
     triangles: NDArray[np.int32],
@@ -124,7 +124,7 @@ def _collect_ring(
     return 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _move_vertices(
     xy: NDArray[np.float64],
     triangles: NDArray[np.int32],
@@ -158,7 +158,7 @@ def _move_vertices(
             step[v] *= 1.25 if best else 0.5
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _flip_edges(
     xy: NDArray[np.float64], triangles: NDArray[np.int32], neighbour: NDArray[np.int32], label: NDArray[np.int32]
 ) -> None:
@@ -175,12 +175,12 @@ def _flip_edges(
             return
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _side_of(neighbour: NDArray[np.int32], u: int, t: int) -> int:
     return 0 if neighbour[u, 0] == t else (1 if neighbour[u, 1] == t else 2)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _wants_flip(
     xy: NDArray[np.float64], triangles: NDArray[np.int32], neighbour: NDArray[np.int32], t: int, k: int, u: int
 ) -> bool:
@@ -195,7 +195,7 @@ def _wants_flip(
     return bool(sin_a * cos_b + cos_a * sin_b < -FLIP_TOLERANCE * scale)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _flip(triangles: NDArray[np.int32], neighbour: NDArray[np.int32], t: int, k: int, u: int) -> None:
     """Turn triangles a-p-q and b-q-p into a-p-b and a-b-q."""
     j = _side_of(neighbour, u, t)

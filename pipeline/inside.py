@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+
+from pipeline.kernel import kernel
 
 INDEX_CELL = 2.0  # m, side of a cell of the point index; a power of two, so that borders of cells are exact
 BLOCK = 1 << 13  # points that room is made for at a time
@@ -81,7 +82,7 @@ def edges_of_rings(rings: Rings) -> Edges:
     return Edges(*_edges_of_rings(rings.start, rings.xy, rings.ring))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _edges_of_rings(start: Index, xy: Array, ring: Index) -> tuple[Index, Array, Array]:
     n = 0
     for v in range(1, len(xy)):
@@ -210,7 +211,7 @@ def cover_polygons(polygons: NDArray[np.object_]) -> Cover:
     return Cover(i0, j0, marked if marked.size else np.zeros((1, 1), np.bool_))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def is_covered(x: float, y: float, i0: int, j0: int, marked: NDArray[np.bool_]) -> bool:
     """Tell for kernels whether a place lies in a cell of the cover with these attributes."""
     i, j = int(np.floor(x / INDEX_CELL)) - i0, int(np.floor(y / INDEX_CELL)) - j0
@@ -218,7 +219,7 @@ def is_covered(x: float, y: float, i0: int, j0: int, marked: NDArray[np.bool_]) 
     return bool(there & marked[j * there, i * there])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _look_up(xy: Array, i0: int, j0: int, marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
     found = np.zeros(len(xy), np.bool_)
     for k in range(len(xy)):
@@ -302,7 +303,7 @@ def _settle(
     return inside
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _cross(x: float, y: float, xa: float, ya: float, xb: float, yb: float) -> int:
     """Whether the ray from a point towards greater x crosses an edge; `UNSURE` where the point may be on it."""
     if (ya > y) == (yb > y):
@@ -318,7 +319,7 @@ def _cross(x: float, y: float, xa: float, ya: float, xb: float, yb: float) -> in
     return 1 if (ahead > across) == (yb > ya) else 0
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def side_of(x: float, y: float, first: int, last: int, a: Array, b: Array) -> int:
     """Tell for kernels the side of a place from the rings of some edges; where it is `UNSURE`, GEOS knows."""
     side = OUTSIDE
@@ -330,7 +331,7 @@ def side_of(x: float, y: float, first: int, last: int, a: Array, b: Array) -> in
     return side
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _may_meet(
     xa: float, ya: float, xb: float, yb: float, left: float, under: float, right: float, over: float
 ) -> bool:
@@ -347,7 +348,7 @@ def _may_meet(
     return n_ahead < 4 and n_behind < 4
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _side_of_cell(left: float, under: float, near: Index, a: Array, b: Array) -> int:
     """Side of a cell from the rings of the edges that meet its row; `UNSURE` where it may have both."""
     right, over = left + INDEX_CELL, under + INDEX_CELL
@@ -362,7 +363,7 @@ def _side_of_cell(left: float, under: float, near: Index, a: Array, b: Array) ->
     return side
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _box_of(xy: Array, among: NDArray[np.bool_]) -> Box:
     """Box of some points; inside out where there are none."""
     low_x = low_y = np.inf
@@ -374,7 +375,7 @@ def _box_of(xy: Array, among: NDArray[np.bool_]) -> Box:
     return low_x, low_y, high_x, high_y
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _find_cells(box: Box, a: Array, b: Array) -> tuple[int, int, int, int]:
     """Column and row of the first cell that both the box and edges are around, number of columns and rows."""
     low_x = low_y = np.inf
@@ -389,7 +390,7 @@ def _find_cells(box: Box, a: Array, b: Array) -> tuple[int, int, int, int]:
     return i0, j0, int(np.floor(high_x / INDEX_CELL)) - i0 + 1, int(np.floor(high_y / INDEX_CELL)) - j0 + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _put_into_cells(
     cells: tuple[int, int, int, int], edge_start: Index, a: Array, b: Array
 ) -> tuple[Index, NDArray[np.int32], Index, Array, Array]:
@@ -442,7 +443,7 @@ def _put_into_cells(
     return start, ordered, edges, _take(a, near[:n_near]), _take(b, near[:n_near])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _take(xy: Array, rows: Index) -> Array:
     """Rows of an array (n, 2); quicker to compile than an index."""
     taken = np.empty((len(rows), 2))
@@ -451,7 +452,7 @@ def _take(xy: Array, rows: Index) -> Array:
     return taken
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _lengthen(values: NDArray[Any]) -> NDArray[Any]:
     """Twice the room, with the values in its first half."""
     room = np.empty(2 * len(values), values.dtype)
@@ -460,7 +461,7 @@ def _lengthen(values: NDArray[Any]) -> NDArray[Any]:
     return room
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _group(group: NDArray[np.integer], n: int) -> tuple[Index, Index]:
     """Where each of n groups starts, and the rows by group, in their old order within each."""
     start = np.zeros(n + 1, np.int64)
@@ -476,7 +477,7 @@ def _group(group: NDArray[np.integer], n: int) -> tuple[Index, Index]:
     return start, order
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _find(
     xy: Array,
     among: NDArray[np.bool_],
@@ -493,7 +494,7 @@ def _find(
     for cell in range(len(cell_start) - 1):
         most = max(most, cell_start[cell + 1] - cell_start[cell])
     owner, found = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int64)
-    n = np.int64(0)  # for a constant, numba would compile what it is given to once more
+    n: Any = np.int64(0)  # for a constant, numba would compile what it is given to once more
     for first in range(0, len(xy) if most else 0, BLOCK):
         last = min(first + BLOCK, len(xy))
         while n + (last - first) * most > len(found):
@@ -506,7 +507,7 @@ def _find(
     return start, ordered
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _find_some(
     xy: Array,
     among: NDArray[np.bool_],
@@ -541,7 +542,7 @@ def _find_some(
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _locate(
     xy: NDArray[np.float64],
     polygon: NDArray[np.int64],
@@ -555,7 +556,7 @@ def _locate(
         sides[k] = side_of(xy[k, 0], xy[k, 1], edge_start[p], edge_start[p + 1], a, b)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _find_owners(
     xy: NDArray[np.float64],
     edge_start: NDArray[np.int64],

@@ -1,10 +1,10 @@
 """The levels between the nodes of a column: evenly spaced, shifted against the neighbours (our steps 3.2-3.4)."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.growth import Growth, count_steps, height_of_steps, stagger_weight
+from pipeline.kernel import kernel
 from pipeline.nodes import TOP_SURFACE, Levels, Nodes, SeamColumns
 
 N_PHASES = 3
@@ -94,7 +94,7 @@ def stagger_columns(n: int, edges: NDArray[np.int32]) -> NDArray[np.float64]:
     return shift
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _count_levels(
     node_start: NDArray[np.int64],
     node_z: NDArray[np.float64],
@@ -126,7 +126,7 @@ def _count_levels(
     return steps, start
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill(
     node_start: NDArray[np.int64],
     node_surface: NDArray[np.float64],
@@ -180,7 +180,7 @@ def _fill(
         surface[at] = TOP_SURFACE
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _repel_phases(
     start: NDArray[np.int64], neighbour: NDArray[np.int32], phase: NDArray[np.int8], sweeps: int
 ) -> None:

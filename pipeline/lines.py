@@ -3,11 +3,11 @@
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.group_order import order_values, sort_group
+from pipeline.kernel import kernel
 
 MAX_DIRECTIONS = 4  # directions of walls along which lines are tried, those with most wall first
 SAME_DIRECTION = 0.0872  # sine of 5 degrees; walls that differ by less count as one direction
@@ -63,7 +63,7 @@ def rank_lines(a: Array, b: Array, xyz: Array, *, clearance: float, min_points: 
     ]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _rank_lines(a: Array, b: Array, xyz: Array, clearance: float, min_points: int) -> Array:
     """Rank lines as `rank_lines` does; gives direction and offset of each, (k, 3)."""
     n = len(xyz)
@@ -96,7 +96,7 @@ def _rank_lines(a: Array, b: Array, xyz: Array, clearance: float, min_points: in
     return lines[:n_lines].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _directions(a: Array, b: Array) -> Array:
     """Unit vectors of the directions with most wall, each that of its longest wall."""
     n = len(a)
@@ -113,7 +113,7 @@ def _directions(a: Array, b: Array) -> Array:
     return most
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _group_directions(along: Array, length: Array, left: NDArray[np.int64]) -> tuple[Array, Array]:
     """Group walls of about the same direction, in the order that is given; gives directions and length of all.
 
@@ -139,7 +139,7 @@ def _group_directions(along: Array, length: Array, left: NDArray[np.int64]) -> t
     return found[:n_found], total[:n_found]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def sum_squares(z: Array) -> float:
     """Sum the squares of heights around their mean (m²)."""
     n = len(z)
@@ -150,7 +150,7 @@ def sum_squares(z: Array) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sum_pairwise(values: Array) -> float:
     """Sum as numpy does: eight sums side by side, halves apart above 128 values."""
     n = len(values)
@@ -171,7 +171,7 @@ def _sum_pairwise(values: Array) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _best_lines(
     across: Array, z: Array, vertex: Array, total: float, clearance: float, min_points: int
 ) -> tuple[Array, Array]:

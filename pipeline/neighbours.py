@@ -4,12 +4,12 @@ In the layered mesh a roof is one layer of each of its columns. Where roofs of d
 lie on different layers, in the order of their heights; roofs of equal height must share one.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.components import join_pairs
 from pipeline.errors import GeometryError
+from pipeline.kernel import kernel
 
 
 def check_groups(roof: NDArray[np.float64], group: NDArray[np.int32]) -> None:
@@ -129,13 +129,13 @@ def _order_pairs(
     return ends[:, 0], ends[:, 1]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _raise_layers(layer: NDArray[np.int64], lower: NDArray[np.int64], higher: NDArray[np.int64]) -> None:
     for k in range(len(lower)):
         layer[higher[k]] = max(layer[higher[k]], layer[lower[k]] + 1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _lower_layers(layer: NDArray[np.int64], lower: NDArray[np.int64], higher: NDArray[np.int64]) -> None:
     for k in range(len(lower)):
         layer[lower[k]] = min(layer[lower[k]], layer[higher[k]] - 1)

@@ -7,10 +7,10 @@ height. A column has a node for every surface that its vertex touches, and its t
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from pipeline.mesh import PlaneMesh
 
 GROUND_SURFACE = -np.inf
@@ -163,7 +163,7 @@ def place_nodes(
     return Nodes(start, node_surface, z, index[: len(own)].reshape(-1, 3)), z - wanted
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _part_nodes(start: NDArray[np.int64], least_gap: NDArray[np.float64], z: NDArray[np.float64]) -> None:
     for i in range(len(start) - 1):
         for k in range(start[i] + 1, start[i + 1]):

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.inside import Rings, edges_of_rings, find_owner, read_rings
+from pipeline.kernel import kernel
 from pipeline.segments import insert_corners
 
 Array = NDArray[np.float64]
@@ -94,7 +94,7 @@ def deal_out(pieces: NDArray[np.object_], xyz: Array) -> Iterator[tuple[Outline,
         yield Outline(rings.xy[begin:end], rings.ring[begin:end], piece), dealt[first[k] : first[k + 1]]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _area(xy: Array, ring: Index) -> float:
     """Area of the shell less those of the holes."""
     area = twice = 0.0
@@ -110,7 +110,7 @@ def _area(xy: Array, ring: Index) -> float:
     return area
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _deal_out(xyz: Array, owner: Index, n: int) -> tuple[Array, Index]:
     """Put points in the order of their owners, those of none left out; gives where each owner's begin."""
     start = np.zeros(n + 2, np.int64)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from pipeline.inside import (
     list_edges,
     side_of,
 )
+from pipeline.kernel import kernel
 from pipeline.pointcloud import GROUND, WATER, PointCloud
 from pipeline.raster import Dtm, measure_over
 from pipeline.residuals import Residuals, ResidualSums, conclude, merge_residuals, sum_residuals, summarise
@@ -271,7 +271,7 @@ def _mark(n: int, index: NDArray[np.int64]) -> NDArray[np.bool_]:
     return marked
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _measure_each(
     start: NDArray[np.int64],
     xyz: NDArray[np.float64],

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from pipeline.mesh import TetMesh
 
 AT_ONCE = 248  # cells measured together: 24 kB of corners, whose rows do not share the places of a cache
@@ -56,7 +56,7 @@ def quality_percentiles(quality: Quality) -> dict[str, dict[str, float]]:
     return table
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _measure(points: NDArray[np.float64], cells: NDArray[np.int32], result: NDArray[np.float32]) -> None:
     """Measure cells, some at a time: their corners lie by coordinate, so that one instruction takes several."""
     corner, found = np.empty((12, AT_ONCE)), np.empty((3, AT_ONCE))
@@ -73,7 +73,7 @@ def _measure(points: NDArray[np.float64], cells: NDArray[np.int32], result: NDAr
 
 
 # By numpy's rules, for division by zero: a flat cell has a ratio of 0, or NaN if its corners are on a circle.
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _measure_some(corner: NDArray[np.float64], n: int, found: NDArray[np.float64]) -> None:
     """Measure n cells by their corners: radius ratio, cosine of the least dihedral angle, aspect ratio."""
     for c in range(n):

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.kernel import kernel
 
 # Heights are summed as whole numbers of this unit, 0.12 mm, so that a mean does not depend on the order of what
 # is summed: sums of whole numbers below 2**53 are exact in float64. The terrain's own are rounded to it: the last
@@ -55,7 +56,7 @@ class NodeWindow:
     ny: int
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def round_height(z: float) -> float:
     """Round a height of the terrain (m) for kernels, to the closest whole number of `HEIGHT_UNIT`; NaN stays."""
     return float(np.rint(z / HEIGHT_UNIT) * HEIGHT_UNIT)
@@ -253,7 +254,7 @@ def measure_over(dtm: Dtm, xyz: NDArray[np.float64], among: NDArray[np.bool_]) -
     return np.asarray(_measure_over(dtm.z, dtm.i0, dtm.j0, dtm.spacing, xyz, among))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sample(
     z: NDArray[np.float64],
     i0: int,
@@ -266,7 +267,7 @@ def _sample(
         height[k] = _height_at(z, i0, j0, spacing, xy[k, 0], xy[k, 1])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sample_grid(
     z: NDArray[np.float64],
     i0: int,
@@ -281,7 +282,7 @@ def _sample_grid(
             height[row, column] = _height_at(z, i0, j0, spacing, x[column], y[row])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _measure_over(
     z: NDArray[np.float64],
     i0: int,
@@ -299,7 +300,7 @@ def _measure_over(
     return over
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _height_at(z: NDArray[np.float64], i0: int, j0: int, spacing: float, x: float, y: float) -> float:
     ny, nx = z.shape
     u = min(max(x / spacing, float(i0)), float(i0 + nx - 1))

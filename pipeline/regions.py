@@ -3,11 +3,11 @@
 import math
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.group_order import order_values, sort_group
+from pipeline.kernel import kernel
 from pipeline.outlines import Outline
 from pipeline.segments import heights_beside
 
@@ -65,7 +65,7 @@ def join_cells(
     return region, within
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _find_borders(start: Index, xy: Array, ring: Index, xyz: Array, first: Index) -> tuple[Index, Array, Index]:
     """Find the edges that two cells share, and the heights of the points beside them.
 
@@ -108,7 +108,7 @@ def _find_borders(start: Index, xy: Array, ring: Index, xyz: Array, first: Index
     return border[:n].copy(), near[: near_start[2 * n]].copy(), near_start
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _number_edges(start: Index, xy: Array, ring: Index) -> Index:
     """List the edges of all cells in order: both vertices, the lesser first, cell, and row where it begins."""
     n = len(xy)
@@ -139,7 +139,7 @@ def _number_edges(start: Index, xy: Array, ring: Index) -> Index:
     return ordered
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _join(
     border: Index,
     near: Array,
@@ -203,7 +203,7 @@ def _join(
     return region, _squares_within(region, z, cell)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _find_best(why: Index, difference: Array, border: Index, region: Index) -> int:
     """Find the border that is opened first; -1 if none is."""
     best = -1
@@ -214,21 +214,21 @@ def _find_best(why: Index, difference: Array, border: Index, region: Index) -> i
     return best
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sides(border: Index, k: int, region: Index) -> tuple[int, int]:
     """Regions on both sides of a border, the lesser first."""
     one, two = region[border[k, 0]], region[border[k, 1]]
     return min(one, two), max(one, two)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _is_between(border: Index, k: int, region: Index, one: int, two: int) -> bool:
     """Whether a border lies between two regions."""
     first, second = region[border[k, 0]], region[border[k, 1]]
     return bool((first == one and second == two) or (first == two and second == one))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _goes_before(k: int, other: int, why: Index, difference: Array, border: Index, region: Index) -> bool:
     """Whether a border is opened before another one."""
     if why[k] != why[other]:
@@ -240,7 +240,7 @@ def _goes_before(k: int, other: int, why: Index, difference: Array, border: Inde
     return bool(one < other_one or (one == other_one and two < other_two))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _median_of(wanted: int, region: Index, z: Array, cell: Index) -> tuple[int, float]:
     """Number and median height of the points of a region; NaN without points."""
     n = 0
@@ -259,7 +259,7 @@ def _median_of(wanted: int, region: Index, z: Array, cell: Index) -> tuple[int, 
     return n, (low + high) / 2
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _step_at(
     one: int,
     two: int,
@@ -280,7 +280,7 @@ def _step_at(
     return step
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _median_beside(
     wanted: int, other: int, border: Index, near: Array, near_start: Index, region: Index
 ) -> tuple[int, float]:
@@ -299,7 +299,7 @@ def _median_beside(
     return n, (found[order[(n - 1) // 2]] + found[order[n // 2]]) / 2
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _squares_within(region: Index, z: Array, cell: Index) -> float:
     """Squares of the heights around the means of their regions (m²)."""
     total, count, squares = np.zeros(len(region)), np.zeros(len(region)), 0.0

@@ -1,11 +1,11 @@
 """Step 3.5, the fast way: Laplace's equation on columns, matrix in a stencil, solved by sweeps over it."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.edges import plane_edges
 from pipeline.errors import SolverError
+from pipeline.kernel import kernel
 from pipeline.mesh import PlaneMesh
 from pipeline.stencil import assemble_stencil, multiply_stencil
 from pipeline.sweeps import scale_stencil, solve_sweeps
@@ -93,7 +93,7 @@ def guess_displacement(fixed: NDArray[np.bool_], displacement: NDArray[np.float6
     return guess
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _interpolate_columns(fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> None:
     fading = 0.5  # a level's share of the displacement below it
     n, levels = u.shape

@@ -4,11 +4,11 @@ A cell is inverted exactly where a column does not ascend. The repair looks at o
 its result does not depend on tiles; levels that are given (ground, roofs) stay.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import GeometryError
+from pipeline.kernel import kernel
 
 
 def repair_columns(
@@ -50,7 +50,7 @@ def repair_columns(
     return result, moved
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _repair(
     z: NDArray[np.float64], kept: NDArray[np.int32], fixed: NDArray[np.bool_], min_gap: float
 ) -> tuple[int, int]:

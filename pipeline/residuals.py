@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.histograms import Histogram, count_values, merge_histograms, percentile
+from pipeline.kernel import kernel
 
 UNIT = 1e-4  # m; residuals are summed as whole numbers of it, so that the order does not matter
 HISTOGRAM_LIMITS = (0.0, 50.0)  # m, of absolute residuals
@@ -73,7 +73,7 @@ def sum_residuals(residual: NDArray[np.float64]) -> ResidualSums:
     return ResidualSums(len(residual), int(total), (int(upper) << 32) + int(lower), absolute)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sum_units(residual: NDArray[np.float64]) -> tuple[int, int, int]:
     """Sum of residuals in `UNIT`, and of their squares in two halves, neither of which can overflow 64 bits."""
     total = upper = lower = 0

@@ -2,12 +2,12 @@
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.group_order import order_values
 from pipeline.inside import INSIDE, side_of
+from pipeline.kernel import kernel
 
 BLUNT = 0.866  # cosine of 30 degrees, the least angle between a new wall and another
 ON_EDGE = 1e-6  # m; a corner of a neighbour this close to an edge lies on it
@@ -15,7 +15,7 @@ ON_EDGE = 1e-6  # m; a corner of a neighbour this close to an edge lies on it
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def add_places(places: Array, more: Array) -> Array:
     """Add places, float64 (k, 2), to others that are sorted by x, then y, without repetitions, and stay so."""
     united = np.empty((len(places) + len(more), 2))
@@ -36,7 +36,7 @@ def add_places(places: Array, more: Array) -> Array:
     return united[:n].copy()
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
     """Distance of a place to a segment; NaN for one of no length."""
     dx, dy, x, y = bx - ax, by - ay, x - ax, y - ay
@@ -47,7 +47,7 @@ def _distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) ->
     return math.hypot(x - t * dx, y - t * dy)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def distances_to_segments(xy: Array, a: Array, b: Array) -> Array:
     """Distances (m), float64 (k, n), of ``n`` places to the ``k`` segments from `a` to `b`."""
     far = np.empty((len(a), len(xy)))
@@ -57,7 +57,7 @@ def distances_to_segments(xy: Array, a: Array, b: Array) -> Array:
     return far
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def heights_beside(xyz: Array, a: Array, b: Array, reach: float) -> Array:
     """Heights of the points (n, 3) within a reach (m) of the segment from `a` to `b`, float64 (2,)."""
     z = np.empty(len(xyz))
@@ -69,7 +69,7 @@ def heights_beside(xyz: Array, a: Array, b: Array, reach: float) -> Array:
     return z[:n].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def find_nodes(
     a: Array, b: Array, side_a: Array, side_b: Array, clearance: float
 ) -> tuple[Array, NDArray[np.int64]]:
@@ -111,7 +111,7 @@ def find_nodes(
     return nodes[:n], edge[:n]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def are_clear(start: Array, end: Array, a: Array, b: Array, clearance: float) -> NDArray[np.bool_]:
     """Tell which walls are long enough, clear of the edges and vertices that they do not end at, and end bluntly.
 
@@ -149,7 +149,7 @@ def are_clear(start: Array, end: Array, a: Array, b: Array, clearance: float) ->
     return clear
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _is_blunt(start: Array, end: Array, a: Array, b: Array) -> bool:
     """Whether a wall leaves the outline at `start` at no sharp angle."""
     dx, dy = end[0] - start[0], end[1] - start[1]
@@ -165,7 +165,7 @@ def _is_blunt(start: Array, end: Array, a: Array, b: Array) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def place_walls(
     a: Array, b: Array, along: Array, offset: float, clearance: float
 ) -> tuple[Array, NDArray[np.int64]]:
@@ -218,7 +218,7 @@ def place_walls(
     return ends[:n].copy(), divided[:n].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def divide_edges(a: Array, b: Array, ends: Array, edge: NDArray[np.int64]) -> Array:
     """Divide the edges of an outline where walls end on them.
 
@@ -259,14 +259,14 @@ def divide_edges(a: Array, b: Array, ends: Array, edge: NDArray[np.int64]) -> Ar
     return segments
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _put(segments: Array, row: int, start: Array, end: Array) -> None:
     """Write a segment number by number: assigning rows brings numpy's errors, and strings, into a kernel."""
     segments[row, 0, 0], segments[row, 0, 1] = start[0], start[1]
     segments[row, 1, 0], segments[row, 1, 1] = end[0], end[1]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def insert_corners(xy: Array, ring: NDArray[np.int64], corners: Array) -> tuple[Array, NDArray[np.int64]]:
     """Insert the corners that lie on edges of rings, and at neither of their ends.
 
@@ -311,7 +311,7 @@ def insert_corners(xy: Array, ring: NDArray[np.int64], corners: Array) -> tuple[
     return new_xy[:n].copy(), new_ring[:n].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _take_near(xy: Array, corners: Array) -> Array:
     """Take the corners that lie in the box around some vertices, or on its sides."""
     near = np.empty((len(corners), 2))

@@ -11,11 +11,11 @@ tile is as good as the region: `slab_window` for a mesh, `lift_places` for place
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import scipy  # what is asked of it is imported then
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from pipeline.raster import node_window
 from pipeline.terrain import Dtm, cut_terrain, sample_dtm, sample_grid
 
@@ -335,7 +335,7 @@ def _sum_modes(
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sum_damped(
     spectrum: NDArray[np.float64],
     damping: NDArray[np.float64],
@@ -349,7 +349,7 @@ def _sum_damped(
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add_modes(
     spectrum: NDArray[np.float64],
     rows: NDArray[np.float64],

@@ -5,11 +5,11 @@ Both are functions of a place and its neighbourhood alone, so that a tile gets t
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.edges import plane_edges
+from pipeline.kernel import kernel
 from pipeline.mesh import PlaneMesh
 from pipeline.terrain import HEIGHT_UNIT, Dtm, sample_dtm
 
@@ -115,7 +115,7 @@ def domain_top(dtm: Dtm, xy: NDArray[np.float64], *, domain_height: float) -> ND
     return domain_height + sample_dtm(smooth, xy)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _average(units: NDArray[np.float64], half: int) -> NDArray[np.float64]:
     """Moving average of whole numbers over a square of side ``2 half + 1``, less at the border.
 

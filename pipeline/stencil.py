@@ -7,10 +7,10 @@ and from level k of i to level k + 1 of j.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from pipeline.mesh import PlaneMesh
 
 
@@ -79,7 +79,7 @@ def multiply_stencil(stencil: Stencil, edges: NDArray[np.int32], x: NDArray[np.f
     return product
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _assemble(
     xy: NDArray[np.float64],
     triangles: NDArray[np.int32],
@@ -104,7 +104,7 @@ def _assemble(
             _add_cell(grad, area2, z, v, e, 0, k, k + 1, k + 1, diagonal, up, level, slant)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _gradients(xy: NDArray[np.float64], v: NDArray[np.int32], grad: NDArray[np.float64]) -> float:
     """Gradients of the triangle's barycentric coordinates; returns twice its area."""
     x0, y0 = xy[v[0], 0], xy[v[0], 1]
@@ -117,7 +117,7 @@ def _gradients(xy: NDArray[np.float64], v: NDArray[np.int32], grad: NDArray[np.f
     return float(abs(det))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _add_cell(
     grad: NDArray[np.float64],
     area2: float,
@@ -174,7 +174,7 @@ def _add_cell(
         slant[e[p + q - 1], kp] += value
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _multiply(
     edges: NDArray[np.int32],
     diagonal: NDArray[np.float64],

@@ -1,9 +1,9 @@
 """Points over the lower surface of a mesh: which triangle is below each, and how high the surface is there."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from pipeline.mesh import ColumnMesh
 
 CELL = 4.0  # m, side of a cell of the index of points
@@ -49,7 +49,7 @@ def measure_surface(mesh: ColumnMesh, xyz: NDArray[np.float64]) -> tuple[NDArray
     return triangle, residual
 
 
-@numba.njit(cache=True)
+@kernel
 def _locate(
     corners: NDArray[np.float64],
     xyz: NDArray[np.float64],

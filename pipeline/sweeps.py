@@ -7,10 +7,10 @@ inverses around the matrix, which take one sweep down and one up: the matrix its
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from pipeline.stencil import Stencil
 
 RELAXATION = 1.6  # omega; 1.3 to 1.7 take about the same iterations, the smooth error is least at the upper end
@@ -112,7 +112,7 @@ def solve_sweeps(
     return x.astype(np.float64) * sweeps.scale, iterations
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _scale(
     edges: NDArray[np.int32],
     up: NDArray[np.float64],
@@ -135,7 +135,7 @@ def _scale(
         scaled_level[e, last] = level[e, last] * scale[i, last] * scale[j, last]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _conjugate_gradients(
     edges: NDArray[np.int32],
     start: NDArray[np.int64],
@@ -170,7 +170,7 @@ def _conjugate_gradients(
     return iteration
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sweep_down(
     edges: NDArray[np.int32],
     start: NDArray[np.int64],
@@ -201,7 +201,7 @@ def _sweep_down(
             t[i, k] = above
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sweep_up(
     edges: NDArray[np.int32],
     start: NDArray[np.int64],
@@ -228,7 +228,7 @@ def _sweep_up(
     return energy
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _solve_lower(
     edges: NDArray[np.int32],
     start: NDArray[np.int64],
@@ -245,7 +245,7 @@ def _solve_lower(
             r[i, k] = column[k]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _finish_column(
     edges: NDArray[np.int32],
     start: NDArray[np.int64],
@@ -270,7 +270,7 @@ def _finish_column(
             q[j, k] -= level[e, k] * column[k] + slant[e, k - 1] * column[k - 1]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _step(
     alpha: np.float32,
     scale: NDArray[np.float32],
@@ -292,7 +292,7 @@ def _step(
     return rho, float(largest)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _largest_residual(
     edges: NDArray[np.int32],
     start: NDArray[np.int64],

@@ -7,10 +7,10 @@ A region in one piece takes `compute_dtm`. Tiles take the same steps one by one:
 
 from collections.abc import Iterable, Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from pipeline.las_points import Box, Triple, UnitPoints, is_within
 from pipeline.pointcloud import GROUND, WATER, PointCloud
 from pipeline.raster import (
@@ -107,7 +107,7 @@ def bin_units(parts: Iterable[UnitPoints], box: Box, window: NodeWindow, *, spac
     return Dtm(_average_bins(total, count), window.i0, window.j0, spacing)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sum_bins(
     xyz: NDArray[np.float64],
     classification: NDArray[np.uint8],
@@ -123,7 +123,7 @@ def _sum_bins(
             _add_point(xyz[k, 0], xyz[k, 1], xyz[k, 2], spacing, i0, j0, total, count)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sum_units(
     units: NDArray[np.int32],
     scale: Triple,
@@ -144,7 +144,7 @@ def _sum_units(
                 _add_point(x, y, units[k, 2] * scale[2] + offset[2], spacing, i0, j0, total, count)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _add_point(
     x: float,
     y: float,
@@ -161,7 +161,7 @@ def _add_point(
         count[j, i] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _average_bins(total: NDArray[np.float64], count: NDArray[np.int32]) -> NDArray[np.float64]:
     """Turn sums of heights, in `HEIGHT_UNIT`, into means (m), NaN where nothing is counted."""
     mean = np.empty(total.shape)

@@ -7,11 +7,11 @@ of a region share.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from pipeline.kernel import kernel
 from pipeline.raster import HEIGHT_UNIT, Dtm, NodeWindow, cut_nodes, hull_windows, round_height, window_of
 
 FILL_RINGS = 64  # rings that are flooded; also how many nodes beyond its own a tile must read
@@ -262,7 +262,7 @@ def _sum_up(
     return unique, sums[0], sums[1]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _flood(
     raw: NDArray[np.float64], z: NDArray[np.float64], ring: NDArray[np.integer], limit: int, deeper: int
 ) -> None:
@@ -296,7 +296,7 @@ def _flood(
         r += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_first(raw: NDArray[np.float64], z: NDArray[np.float64], ring: NDArray[np.integer], deeper: int) -> None:
     """Fill the first ring, which most empty nodes are in: its means take nothing but `raw`.
 
@@ -320,7 +320,7 @@ def _fill_first(raw: NDArray[np.float64], z: NDArray[np.float64], ring: NDArray[
             _fill_first_at_border(raw, z, ring, deeper, j, i)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill_first_at_border(
     raw: NDArray[np.float64], z: NDArray[np.float64], ring: NDArray[np.integer], deeper: int, j: int, i: int
 ) -> None:
@@ -337,7 +337,7 @@ def _fill_first_at_border(
         z[j, i] = round_height(total / count)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _touches_first(ring: NDArray[np.integer], j: int, i: int) -> bool:
     for q in range(max(j - 1, 0), min(j + 2, ring.shape[0])):
         for p in range(max(i - 1, 0), min(i + 2, ring.shape[1])):
@@ -346,7 +346,7 @@ def _touches_first(ring: NDArray[np.integer], j: int, i: int) -> bool:
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _blend(
     z: NDArray[np.float64],
     ring: NDArray[np.uint8],

@@ -6,10 +6,10 @@ boundary, and faces that another piece must have.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from stitch.conformity import FACES, group_rows
 
 NO_MATE, CROWDED = -1, -2
@@ -112,7 +112,7 @@ def _find_facets(outer: NDArray[np.int32], facets: NDArray[np.int32]) -> NDArray
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sorted_face(cells, face):  # type: ignore[no-untyped-def]  # pragma: no cover
     i, k = face // 4, face % 4
     a, b, c = cells[i, FACES[k, 0]], cells[i, FACES[k, 1]], cells[i, FACES[k, 2]]
@@ -120,7 +120,7 @@ def _sorted_face(cells, face):  # type: ignore[no-untyped-def]  # pragma: no cov
     return low, np.int64(a) + np.int64(b) + np.int64(c) - low - high, high
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _pair(cells, n_points):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Find for each of the 4 m faces the other that has the same vertices, `NO_MATE` or `CROWDED`."""
     n_faces = 4 * len(cells)

@@ -6,9 +6,10 @@ in a face when they list its vertices in opposite orders.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.kernel import kernel
 
 # The faces of a cell of positive volume, counter-clockwise seen from outside.
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int8)
@@ -318,7 +319,7 @@ def _is_even(facets: NDArray[np.int32]) -> NDArray[np.bool_]:
     return even
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _ordered_face(cells, i, k):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the vertices of a face in ascending order, and 1 if a rotation suffices for that."""
     a, b, c = cells[i, FACES[k, 0]], cells[i, FACES[k, 1]], cells[i, FACES[k, 2]]
@@ -328,7 +329,7 @@ def _ordered_face(cells, i, k):  # type: ignore[no-untyped-def]  # pragma: no co
     return low, middle, high, np.int64(even)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _face_states(cells, n_points):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Mark each of the 4 m faces as interior, exterior, same-side or shared."""
     n_faces = 4 * len(cells)
@@ -370,7 +371,7 @@ def _face_states(cells, n_points):  # type: ignore[no-untyped-def]  # pragma: no
     return state
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cell_volumes(points, cells, flat_below):  # type: ignore[no-untyped-def]  # pragma: no cover
     volume = np.empty(len(cells))
     flat = np.empty(len(cells), np.bool_)

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.inside import find_inside
+from pipeline.kernel import kernel
 from pipeline.sizes import SizeField, local_sizes, wall_distances
 from stitch.grid import (
     CORNER_SHARE,
@@ -133,7 +133,7 @@ def _walls_around(walls: NDArray[np.float64], xy: NDArray[np.float64], reach: fl
     return around
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _find_best(
     walls: NDArray[np.float64], xy: NDArray[np.float64], share: NDArray[np.float64], reach: float, margin: float
 ) -> NDArray[np.int64]:

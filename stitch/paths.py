@@ -1,11 +1,11 @@
 """A seam's way: the shortest path along the edges of a strip (before step 3.1, ours)."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.edges import triangle_neighbours
 from pipeline.errors import GeometryError
+from pipeline.kernel import kernel
 from stitch.corners import Corner
 from stitch.grid import SeamKey, TileGrid, band_width
 from stitch.shortest import find_shortest
@@ -90,7 +90,7 @@ def _costs(
     return edges, cost, on_wall | built
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _look_at_vertices(
     xy: NDArray[np.float64],
     triangles: NDArray[np.int32],
@@ -121,7 +121,7 @@ def _look_at_vertices(
     return worst, on_wall, built
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cost_edges(
     xy: NDArray[np.float64],
     triangles: NDArray[np.int32],

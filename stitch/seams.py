@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kernel import kernel
 from pipeline.mesh import PlaneMesh
 from pipeline.plane import order_plane
 from pipeline.sizes import SizeField, largest_size, local_sizes
@@ -153,7 +153,7 @@ def _are_near(
     return near
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _leave_near(
     centre: NDArray[np.float64],
     line: NDArray[np.float64],

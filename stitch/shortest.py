@@ -2,9 +2,10 @@
 
 import heapq
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.kernel import kernel
 
 
 def find_shortest(
@@ -49,7 +50,7 @@ def find_shortest(
     return np.array(path[::-1])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _search(
     edges: NDArray[np.int64], cost: NDArray[np.float64], n: int, start: int, end: int
 ) -> NDArray[np.int64]:
@@ -72,7 +73,7 @@ def _search(
     return before
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _index_edges(
     edges: NDArray[np.int64], cost: NDArray[np.float64], n: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:

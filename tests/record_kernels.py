@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from numba.core import event, types
-from numba.core.dispatcher import Dispatcher
 
+from pipeline.kernel import Kernel
 from tiler.cli import main
 from tiler.kernels import LIST, Kernels, read_list
 
@@ -68,8 +68,8 @@ class _Compiled(event.Listener):  # type: ignore[misc]  # numba has no types
 def _called() -> Kernels:
     called: Kernels = {}
     for module, name, kernel in _kernels():
-        if kernel.signatures:
-            called.setdefault(module, {})[name] = sorted(map(spell, kernel.signatures))
+        if kernel.dispatcher.signatures:
+            called.setdefault(module, {})[name] = sorted(map(spell, kernel.dispatcher.signatures))
     return called
 
 
@@ -98,10 +98,10 @@ def _spell(kind: types.Type) -> str:
     return "boolean" if kind == types.boolean else repr(kind)
 
 
-def _kernels() -> Iterator[tuple[str, str, Dispatcher]]:
+def _kernels() -> Iterator[tuple[str, str, Kernel]]:
     for module in sorted(name for name in sys.modules if name.split(".")[0] in PACKAGES):
         for name, kernel in sorted(vars(sys.modules[module]).items()):
-            if isinstance(kernel, Dispatcher) and kernel.py_func.__module__ == module:
+            if isinstance(kernel, Kernel) and kernel.py_func.__module__ == module:
                 yield module, name, kernel
 
 

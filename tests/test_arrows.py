@@ -26,6 +26,7 @@ HOMES = {
     "meshio": ("tiler/",),
     "rich": ("tiler/",),
     "triangle": ("pipeline/plane.py",),
+    "numba": ("pipeline/kernel.py", "pipeline/kernel_library.py", "tiler/kernels.py", "tiler/numba_registry.py"),
 }
 
 

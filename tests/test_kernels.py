@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from numba.core.dispatcher import Dispatcher
 from numba.core.sigutils import normalize_signature
 
 from pipeline.errors import ConfigError
+from pipeline.kernel import Kernel
 from tests.record_kernels import record_apart
 from tests.sparse_city import SparseCity, make_city
 from tiler import kernels
@@ -35,7 +35,8 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> SparseCity:
 class Deadly:
     """What a process does not survive, in the place of a kernel."""
 
-    def compile(self, arguments: Any) -> None:
+    @property
+    def dispatcher(self) -> Any:
         """Die."""
         os._exit(9)
 
@@ -48,14 +49,14 @@ def listed(monkeypatch: pytest.MonkeyPatch, folder: Path, **parts: kernels.Kerne
     path = folder / "kernels.json"
     path.write_text(json.dumps({part: parts.get(part, {}) for part in PARTS}))
     monkeypatch.setattr(kernels, "LIST", path)
-    monkeypatch.setattr(kernels, "find_folder", lambda: folder)
+    monkeypatch.setattr(kernels, "stamp_folder", lambda: folder)
 
 
 def test_all_that_is_listed_is_a_kernel() -> None:
     assert tuple(read_list()) == PARTS
     for module, names in (entry for part in read_list().values() for entry in part.items()):
         for name, signatures in names.items():
-            assert isinstance(kernels._kernel(module, name), Dispatcher)
+            assert isinstance(kernels._kernel(module, name), Kernel)
             assert all(normalize_signature(signature)[0] for signature in signatures)
 
 
@@ -73,7 +74,9 @@ def test_no_kernel_is_for_kernels_and_gives_arrays_to_python() -> None:
             for alias in node.names
         }
         for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef) and "njit" in "".join(map(ast.unparse, node.decorator_list)):
+            if isinstance(node, ast.FunctionDef) and any(
+                ast.unparse(one).split("(")[0] == "kernel" for one in node.decorator_list
+            ):
                 jitted[module, node.name] = node
                 names = {inner.id for inner in ast.walk(node) if isinstance(inner, ast.Name)} - {node.name}
                 used |= {places.get(name, (module, name)) for name in names}
@@ -82,6 +85,10 @@ def test_no_kernel_is_for_kernels_and_gives_arrays_to_python() -> None:
     assert len(used & jitted.keys()) > 20
     result = {place: ast.unparse(jitted[place].returns or ast.Pass()) for place in called & used}
     assert [place for place, kind in result.items() if kind not in ("None", "bool", "int", "float")] == []
+
+
+def _name(decorator: ast.expr) -> str:
+    return ast.unparse(decorator.func if isinstance(decorator, ast.Call) else decorator)
 
 
 @pytest.mark.parametrize("processes", [1, 2])
@@ -100,6 +107,27 @@ def test_what_is_compiled_is_not_compiled_again(
     assert are_compiled()
     listed(monkeypatch, tmp_path, run=GROWTH, other=GROWTH)  # other code
     assert not are_compiled((RUN,))
+
+
+def test_what_is_compiled_is_noted_where_it_can_be_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    told, code, user = (tmp_path / name for name in ("told", "code", "user"))
+    monkeypatch.setattr(kernels, "ROOT", code)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(user))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    assert kernels.stamp_folder() == user / "citystitch"
+    beside = code / "pipeline" / "__pycache__"
+    beside.mkdir(parents=True)
+    assert kernels.stamp_folder() == beside
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(told))
+    assert kernels.stamp_folder() == told
+    listed_ = kernels.stamp_folder
+    listed(monkeypatch, tmp_path, run=GROWTH)
+    monkeypatch.setattr(kernels, "stamp_folder", listed_)
+    assert compile_kernels(1, (RUN,)) == []
+    assert are_compiled((RUN,))
+    assert [path.name.endswith("-run") for path in told.glob("citystitch-*")] == [True]
 
 
 def test_what_cannot_be_compiled_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -71,16 +71,26 @@ print(product.sum(), "scipy.linalg" in sys.modules)
 
 
 def test_the_tasks_of_a_run_import_nothing_more(tmp_path: Path) -> None:
+    assert find_imported_by_a_run(tmp_path, (*DASK, *UNNEEDED), workers=0) == []
+
+
+def test_the_driver_of_workers_imports_no_numba(tmp_path: Path) -> None:
+    assert find_imported_by_a_run(tmp_path, ("numba", *DASK, *UNNEEDED), workers=1) == []
+
+
+def find_imported_by_a_run(tmp_path: Path, names: tuple[str, ...], workers: int) -> list[str]:
+    """Which of the names the process of a command has imported when its run is done."""
     city = write_city(tmp_path / "city", size=300, buildings=15, density=1.0)
     words = ["run", *map(str, city.clouds), "--footprints", str(city.footprints), "--out", str(tmp_path / "out")]
     code = f"""
 import sys
 from tiler.cli import main
-main({[*words, "--workers", "0", "--tile-size", "150", "--quiet"]})
-print([name for name in {(*DASK, *UNNEEDED)} if name in sys.modules])
+main({[*words, "--workers", str(workers), "--tile-size", "150", "--quiet"]})
+print(*[name for name in {names} if name in sys.modules])
 """
-    assert tell_in_fresh_process(code).splitlines()[-1] == "[]"
+    told = tell_in_fresh_process(code + "print(0)").splitlines()
     assert (tmp_path / "out" / "run.json").exists()
+    return told[-2].split()
 
 
 def test_a_run_with_workers_imports_no_dask() -> None:

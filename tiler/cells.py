@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.kernel import kernel
 
 Box = tuple[float, float, float, float]
 Pair = tuple[float, float]
@@ -103,7 +104,7 @@ def find_places(
     return place, cell, np.concatenate([[0], np.cumsum(count)])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _number_cells(
     x: NDArray[Any], y: NDArray[Any], scale: Pair, offset: Pair, among: NDArray[np.bool_], size: float
 ) -> tuple[NDArray[np.int64], int, int, int, int]:
@@ -189,7 +190,7 @@ def _put_in_order(place: NDArray[np.int64], n: int) -> tuple[NDArray[np.int64], 
     return key, count[key]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _take_places(place: NDArray[np.int64], free: NDArray[np.int64]) -> None:
     """Give each key its next free place."""
     for k in range(len(place)):

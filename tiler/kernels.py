@@ -1,7 +1,7 @@
 """Kernels: compiled for this machine before they are needed, side by side, once.
 
 numba compiles a kernel when it is first called, and keeps it on disk. Left to that, workers that begin together
-compile the same ones, each for itself.
+compile the same ones, each for itself. Whether it was done is told without numba, which a driver does not need.
 """
 
 import hashlib
@@ -12,17 +12,16 @@ import platform
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
-import llvmlite
-import llvmlite.binding
-import numba
-from numba.core.sigutils import normalize_signature
+from llvmlite import binding
 
 from tiler import fork_server
 
+ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).with_name("kernels.json")  # written by tests/record_kernels.py
 RUN, OTHER = PARTS = ("run", "other")  # of the list: what runs need by default; what other ways and commands do
 MOST = 8  # processes that compile side by side: each module is one process's affair, and some take much longer
@@ -63,7 +62,7 @@ def prepare(processes: int, say: Callable[[str], None]) -> None:
 
 def are_compiled(parts: Collection[str] = PARTS) -> bool:
     """Tell whether `compile_kernels` has done its work with this code, on a machine like this one."""
-    if numba.config.DISABLE_JIT:
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
         return True
     state = _state()
     with suppress(OSError):
@@ -94,6 +93,7 @@ def compile_kernels(processes: int, parts: Collection[str] = PARTS) -> list[str]
             failed += _share_out(pipes[:1], modules)
     if not failed:
         with suppress(OSError):  # they are looked at again the next time
+            stamp_folder().mkdir(parents=True, exist_ok=True)
             for part in parts:
                 _stamp(part).write_text(_state())
     return failed
@@ -103,14 +103,10 @@ def describe_kernels() -> str:
     """Say what there is to compile, for what, and where it is kept."""
     kernels = {(module, name) for part in read_list().values() for module, names in part.items() for name in names}
     machine, processor, _ = _target()
-    kept = numba.config.CACHE_DIR or f"{find_folder()} and the like"
+    module, names = next(iter(read_list()[RUN].items()))
+    folder = _kernel(module, next(iter(names))).dispatcher.stats.cache_path
+    kept = os.environ.get("NUMBA_CACHE_DIR") or f"{folder} and the like"
     return f"{len(kernels)} kernels for {machine} {processor}, kept in {kept}"
-
-
-def find_folder() -> Path:
-    """Folder in which numba keeps what it compiles of our first package."""
-    module, kernels = next(iter(read_list()[RUN].items()))
-    return Path(_kernel(module, next(iter(kernels))).stats.cache_path)
 
 
 def _share_out(pipes: list[Any], modules: list[tuple[str, Signatures]]) -> list[str]:
@@ -162,12 +158,14 @@ def _work(pipe: Any) -> None:
 
 def _compile(module: str, kernels: Signatures) -> list[str]:
     """Compile kernels of a module, or load them; gives what failed."""
+    from numba.core.sigutils import normalize_signature
+
     failed = []
     for name, signatures in kernels.items():
         for signature in signatures:
             try:
                 arguments, _ = normalize_signature(signature)  # it is found again by these, not by their words
-                _kernel(module, name).compile(arguments)
+                _kernel(module, name).dispatcher.compile(arguments)
             except Exception as error:
                 reason = (str(error) or type(error).__name__).splitlines()[0]
                 failed.append(f"{module}.{name}{signature}: {reason}")
@@ -180,24 +178,33 @@ def _kernel(module: str, name: str) -> Any:
 
 def _stamp(part: str) -> Path:
     """File that says with what a part was compiled: one for each kind of processor, as they may share a folder."""
-    digest = hashlib.blake2b(" ".join(_target()).encode(), digest_size=8).hexdigest()
-    return find_folder() / f"citystitch-{digest}-{part}"
+    digest = hashlib.blake2b(" ".join([*_target(), str(ROOT)]).encode(), digest_size=8).hexdigest()
+    return stamp_folder() / f"citystitch-{digest}-{part}"
+
+
+def stamp_folder() -> Path:
+    """Folder that numba was told; else one beside the code, or the user's where that is read-only."""
+    if told := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(told)
+    beside = ROOT / "pipeline" / "__pycache__"
+    if os.access(beside, os.W_OK):
+        return beside
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "citystitch"
 
 
 def _target() -> tuple[str, str, str]:
     """What is compiled for, by this machine or as numba was told: kind of machine, processor and its features."""
-    features = numba.config.CPU_FEATURES
+    features = os.environ.get("NUMBA_CPU_FEATURES")
     if features is None:
-        features = llvmlite.binding.get_host_cpu_features().flatten()
-    return platform.machine(), numba.config.CPU_NAME or llvmlite.binding.get_host_cpu_name(), features
+        features = binding.get_host_cpu_features().flatten()
+    return platform.machine(), os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name(), features
 
 
 def _state() -> str:
     """Digest of what compiled kernels depend on: versions, the list, and the files of its modules."""
-    lines = [platform.python_version(), numba.__version__, llvmlite.__version__, LIST.read_text()]
-    root = Path(__file__).parents[1]
+    lines = [platform.python_version(), version("numba"), version("llvmlite"), LIST.read_text()]
     for module in sorted({module for part in read_list().values() for module in part}):
         with suppress(OSError):  # compiling says so
-            file = root.joinpath(*module.split(".")).with_suffix(".py").stat()
+            file = ROOT.joinpath(*module.split(".")).with_suffix(".py").stat()
             lines.append(f"{module} {file.st_mtime_ns} {file.st_size}")
     return hashlib.blake2b("\n".join(lines).encode(), digest_size=16).hexdigest()

@@ -6,11 +6,11 @@ Pictures are the same bytes every time, on every machine that has the same numbe
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.inside import list_edges
+from pipeline.kernel import kernel
 
 Floats = NDArray[np.float64]
 Colours = NDArray[np.uint8]
@@ -179,11 +179,9 @@ def paint(
     edges = np.linalg.norm(plane - np.roll(plane, 1, axis=1), axis=2).mean(axis=1) / SAMPLES
     strength = np.where(scene.lined, np.clip((edges - edge_pixels) / (3 * edge_pixels), 0, 1) * 0.45, 0.0)
     image = _gradient(sky, (height, width))
-    _shade(
-        *(image, near, facet, rim, scene.rgb.astype(np.float64), normal, strength),
-        *(np.ascontiguousarray(frame), view.position, scale),
-        *(light.lights, light.frames, light.sides, light.maps),
-    )
+    rgb, frame = scene.rgb.astype(np.float64), np.ascontiguousarray(frame)
+    lit_by = light.lights, light.frames, light.sides, light.maps
+    _shade(image, near, facet, rim, rgb, normal, strength, frame, view.position, scale, *lit_by)
     small = sum(image[i::SAMPLES, j::SAMPLES] for i, j in np.ndindex(SAMPLES, SAMPLES)) / SAMPLES**2
     found: Colours = np.rint(small).astype(np.uint8)
     return found
@@ -216,7 +214,7 @@ def _cast(corners: Floats, light: Floats, pixels: int, near: NDArray[np.float32]
     scale = (pixels - 4) / max(float((high - low)[:2].max()), 1e-9)
     seen *= np.array([[scale], [scale], [1.0]])
     seen += np.array([[2 - low[0] * scale], [2 - low[1] * scale], [1 - low[2]]])
-    _depth(*seen, near[:pixels, :pixels])
+    _depth(seen[0], seen[1], seen[2], near[:pixels, :pixels])
     return np.vstack([frame * [[scale], [scale], [1.0]], [*(2 - low[:2] * scale), 1.0 - low[2]]])
 
 
@@ -227,7 +225,7 @@ def _gradient(sky: tuple[str, str], size: tuple[int, int]) -> NDArray[np.float32
     return image
 
 
-@numba.njit(cache=True)
+@kernel
 def _fill(image: NDArray[np.uint8], start: NDArray[np.int64], a: Floats, b: Floats) -> None:
     """Fill polygons line by line, between crossings with their edges; pixel centres are whole numbers."""
     rows, columns = image.shape
@@ -252,7 +250,7 @@ def _fill(image: NDArray[np.uint8], start: NDArray[np.int64], a: Floats, b: Floa
                     image[row, column] = 1
 
 
-@numba.njit(cache=True)
+@kernel
 def _raster(
     plane: Floats, nearness: Floats, near: Floats, facet: NDArray[np.int32], rim: NDArray[np.float32]
 ) -> None:
@@ -289,7 +287,7 @@ def _raster(
                     rim[y, x] = min(u * high, v * high_q, w * high_r)
 
 
-@numba.njit(cache=True)
+@kernel
 def _turn(points: Floats, frame: Floats) -> Floats:
     """Give points (n, 3) in the axes that are a frame's rows, (3, n)."""
     found = np.empty((3, len(points)))
@@ -299,7 +297,7 @@ def _turn(points: Floats, frame: Floats) -> Floats:
     return found
 
 
-@numba.njit(cache=True)
+@kernel
 def _depth(x: Floats, y: Floats, z: Floats, near: NDArray[np.float32]) -> None:
     """Draw the heights of triangles, three rows each, on pixels whose centres are whole numbers."""
     rows, columns = near.shape
@@ -321,7 +319,7 @@ def _depth(x: Floats, y: Floats, z: Floats, near: NDArray[np.float32]) -> None:
                 v += v_x
 
 
-@numba.njit(cache=True)
+@kernel
 def _shade(
     image: NDArray[np.float32],
     near: Floats,
