@@ -6,6 +6,7 @@ are written from that: `python -m tests.benchmarks.bench cells` measures one stu
 `--large` adds the city of 10 km to those of area and workers (17 and 33 minutes in all).
 """
 
+import argparse
 import json
 import os
 import re
@@ -391,10 +392,13 @@ STUDIES: Mapping[str, Study] = {
 
 def main() -> None:
     """Measure the studies that are named, or all; write what is known."""
-    names = [word for word in sys.argv[1:] if not word.startswith("-")] or list(STUDIES)
-    unknown = sorted(set(names) - STUDIES.keys())
-    if unknown:
-        raise SystemExit(f"no study {unknown[0]!r}; there are {', '.join(STUDIES)}")
+    told = "Measure studies anew, and write docs/benchmarks.md of all that is known."
+    parser = argparse.ArgumentParser("python -m tests.benchmarks.bench", description=told, allow_abbrev=False)
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"{', '.join(STUDIES)}; all by default")
+    parser.add_argument("--large", action="store_true", help="have the city of 10 km in area and workers, too")
+    names = parser.parse_args().studies or list(STUDIES)
+    if unknown := sorted(set(names) - STUDIES.keys()):
+        parser.error(f"no study {unknown[0]!r}; there are {', '.join(STUDIES)}")
     kept: dict[str, Any] = json.loads(KEPT.read_text()) if KEPT.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
         cities, out = Cities(Path(folder)), Path(folder) / "out"
