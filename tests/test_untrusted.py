@@ -735,7 +735,7 @@ def test_nothing_that_is_read_is_run_or_unpickled() -> None:
     # file of the package, which numba evaluates.
     assert found == {
         "pickle.loads(pickle.dumps(error))", "pickle.loads(sent)", "pickle.loads(message)", "loads(told)",
-        "_kernel(module, name).compile(arguments)",
+        "_kernel(module, name).dispatcher.compile(arguments)",
     }  # fmt: skip
 
 
