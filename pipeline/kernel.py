@@ -43,6 +43,7 @@ class Kernel:
 
     @property
     def _numba_type_(self) -> Any:
+        """What numba takes it for where another kernel calls it."""
         return self.dispatcher._numba_type_
 
 
