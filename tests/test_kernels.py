@@ -122,12 +122,19 @@ def test_what_is_compiled_is_noted_where_it_can_be_written(
     assert kernels.stamp_folder() == beside
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(told))
     assert kernels.stamp_folder() == told
-    listed_ = kernels.stamp_folder
+    folder = kernels.stamp_folder
     listed(monkeypatch, tmp_path, run=GROWTH)
-    monkeypatch.setattr(kernels, "stamp_folder", listed_)
+    monkeypatch.setattr(kernels, "stamp_folder", folder)
     assert compile_kernels(1, (RUN,)) == []
     assert are_compiled((RUN,))
     assert [path.name.endswith("-run") for path in told.glob("citystitch-*")] == [True]
+
+
+def test_without_a_compiler_nothing_is_to_be_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    listed(monkeypatch, tmp_path, run=GROWTH)
+    for value, compiled in (("1", True), ("0", False), ("", False)):
+        monkeypatch.setenv("NUMBA_DISABLE_JIT", value)
+        assert are_compiled() is compiled
 
 
 def test_what_cannot_be_compiled_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

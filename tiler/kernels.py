@@ -12,7 +12,6 @@ import platform
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from typing import Any
 from llvmlite import binding
 
 from tiler import fork_server
+from tiler.keys import version_of
 
 ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).with_name("kernels.json")  # written by tests/record_kernels.py
@@ -62,7 +62,7 @@ def prepare(processes: int, say: Callable[[str], None]) -> None:
 
 def are_compiled(parts: Collection[str] = PARTS) -> bool:
     """Tell whether `compile_kernels` has done its work with this code, on a machine like this one."""
-    if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
+    if (os.environ.get("NUMBA_DISABLE_JIT") or "0") != "0":
         return True
     state = _state()
     with suppress(OSError):
@@ -202,7 +202,7 @@ def _target() -> tuple[str, str, str]:
 
 def _state() -> str:
     """Digest of what compiled kernels depend on: versions, the list, and the files of its modules."""
-    lines = [platform.python_version(), version("numba"), version("llvmlite"), LIST.read_text()]
+    lines = [platform.python_version(), version_of("numba"), version_of("llvmlite"), LIST.read_text()]
     for module in sorted({module for part in read_list().values() for module in part}):
         with suppress(OSError):  # compiling says so
             file = ROOT.joinpath(*module.split(".")).with_suffix(".py").stat()

@@ -113,10 +113,11 @@ def file_identity(layout: Layout, scope: Scope, name: str) -> tuple[str, str]:
 @cache
 def code_versions() -> tuple[tuple[str, str], ...]:
     """Names and versions of this package and of those that it computes with, ``"unknown"`` for one without."""
-    return tuple((name, _version(name)) for name in CODE)
+    return tuple((name, version_of(name)) for name in CODE)
 
 
-def _version(name: str) -> str:
+def version_of(name: str) -> str:
+    """Version of an installed package, ``"unknown"`` for one without."""
     try:
         return version(name)
     except PackageNotFoundError:
