@@ -30,10 +30,8 @@ class Footprints:
 
 
 @dataclass(frozen=True, eq=False)
-class CityModel:
-    """Buildings, or parts of them, as prisms ``polygon x [ground, roof]`` (paper, section 4.2).
-
-    A house of several heights has a row for each part; all others have one row.
+class Prisms:
+    """Buildings, or parts of them, as prisms ``polygon x [ground, roof]``: what a mesh is made around.
 
     Attributes
     ----------
@@ -45,10 +43,6 @@ class CityModel:
         The same ids as numbers below 2**53, for formats without strings; see `number_ids`.
     ground, roof : float64, (n,)
         Absolute ground and roof height (m).
-    members : tuple of n tuples of str
-        Ids of the input footprints that each building was made of, ascending, itself included.
-    house : str, (n,)
-        Id of the building that the row is a part of; the row's own id where it is the whole.
     """
 
     polygons: NDArray[np.object_]
@@ -56,11 +50,29 @@ class CityModel:
     numbers: NDArray[np.int64]
     ground: NDArray[np.float64]
     roof: NDArray[np.float64]
-    members: tuple[tuple[str, ...], ...]
-    house: NDArray[np.str_]
 
     def __len__(self) -> int:
         return len(self.polygons)
+
+
+@dataclass(frozen=True, eq=False)
+class CityModel(Prisms):
+    """Buildings with what they were made of (paper, section 4.2).
+
+    A house of several heights has a row for each part; all others have one row.
+
+    Attributes
+    ----------
+    polygons, ids, numbers, ground, roof
+        As of `Prisms`.
+    members : tuple of n tuples of str
+        Ids of the input footprints that each building was made of, ascending, itself included.
+    house : str, (n,)
+        Id of the building that the row is a part of; the row's own id where it is the whole.
+    """
+
+    members: tuple[tuple[str, ...], ...]
+    house: NDArray[np.str_]
 
 
 def number_ids(ids: NDArray[np.str_]) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.citymodel import CityModel
+from pipeline.citymodel import Prisms
 from pipeline.columns import expand_cells
 from pipeline.fem import solve_laplace
 from pipeline.given import GivenLevels, find_given_levels, take_used_levels
@@ -222,7 +222,7 @@ def layer_mesh(
 def mesh_layers(
     plane: PlaneMesh,
     dtm: Dtm,
-    city: CityModel,
+    city: Prisms,
     wall_ground: NDArray[np.float64],
     bounds: Bounds,
     options: LayeredOptions,
@@ -239,7 +239,7 @@ def mesh_layers(
         Plane mesh.
     dtm : Dtm
         Terrain, as far beyond the plane mesh as `terrain_reach` says.
-    city : CityModel
+    city : Prisms
         Buildings, row by row those of `PlaneMesh.building`.
     wall_ground : float64, (b,)
         Highest terrain at the walls of each building (m); of no use if `removed` is given.

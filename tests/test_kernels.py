@@ -130,6 +130,15 @@ def test_what_is_compiled_is_noted_where_it_can_be_written(
     assert [path.name.endswith("-run") for path in told.glob("citystitch-*")] == [True]
 
 
+def test_where_numba_cannot_write_is_not_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    told = tmp_path / "told"
+    told.write_text("a file")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(told))
+    assert kernels.stamp_folder() != told
+    command = [sys.executable, "-c", "from tiler.kernels import describe_kernels; print(describe_kernels())"]
+    assert str(told) not in subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
 def test_without_a_compiler_nothing_is_to_be_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     listed(monkeypatch, tmp_path, run=GROWTH)
     for value, compiled in (("1", True), ("0", False), ("", False)):

@@ -7,7 +7,21 @@ import shapely
 from pipeline.building_points import BuildingPoints
 from pipeline.house_levels import HouseParts
 from pipeline.houses import Houses, join_houses, take_houses
-from tiler.tables import ARRAYS_TO_RAISE, ARRAYS_TO_SHAPE, pack_houses, unpack_houses
+from pipeline.point_fidelity import HouseFidelity
+from tests.cities import city_of, crowded_blocks
+from tiler.tables import (
+    ARRAYS_TO_RAISE,
+    ARRAYS_TO_SHAPE,
+    NEAR_ARRAYS,
+    Buildings,
+    join_near,
+    no_buildings,
+    pack_houses,
+    pack_model,
+    take_buildings,
+    take_near,
+    unpack_houses,
+)
 
 
 def make_houses() -> Houses:
@@ -50,3 +64,54 @@ def test_houses_are_taken_and_joined_without_what_was_not_read(names: tuple[str,
         assert (found.polygons == houses.polygons[[1, 0]]).all()
         assert found.points.roof_z.tolist() == [2.0, 3.0, 4.0, 0.0, 1.0]
         assert set(found.parts.polygons.tolist()) == {None}
+
+
+def make_town() -> Buildings:
+    """Turned blocks, many of whose boxes reach farther than they do, in groups of two."""
+    blocks = crowded_blocks((0.0, 0.0, 300.0, 300.0), 60, seed=8)
+    rows = np.arange(len(blocks))
+    heights = rows.astype(np.float64)
+    return Buildings(
+        city_of(blocks, (10.0 + rows).tolist()),
+        np.zeros(len(rows), np.int8),
+        0.5 + heights,
+        0.25 * heights,
+        rows // 2,
+        rows.astype(np.int32),
+        HouseFidelity(rows, *np.zeros((3, len(rows)))),
+    )
+
+
+def test_buildings_near_a_box_are_those_that_meet_it() -> None:
+    town = make_town()
+    order = np.random.default_rng(2).permutation(len(town))
+    tiles = [pack_model(take_buildings(town, rows)) for rows in (order[:25], order[25:], order[:0])]
+    read = [{name: arrays[name] for name in NEAR_ARRAYS} for arrays in tiles]
+    boxes_only = 0
+    for x, y in np.random.default_rng(3).uniform(0, 290, (200, 2)):
+        box = shapely.box(x, y, x + 5, y + 20)
+        shapely.prepare(box)
+        near = join_near([take_near(arrays, box) for arrays in read])
+        meet = shapely.intersects(town.model.polygons, box)
+        expected = take_buildings(town, np.flatnonzero(meet)[np.argsort(town.model.ids[meet], kind="stable")])
+        assert near.model.ids.tolist() == expected.model.ids.tolist()
+        assert (near.model.polygons == expected.model.polygons).all()
+        for name in ("numbers", "ground", "roof"):
+            assert getattr(near.model, name).tolist() == getattr(expected.model, name).tolist()
+        assert near.wall_ground.tolist() == expected.wall_ground.tolist()
+        assert near.layers.tolist() == expected.layers.tolist()
+        boxes_only += int(shapely.intersects(shapely.envelope(town.model.polygons), box).sum() - meet.sum())
+    assert boxes_only > 10, "a box that meets says nothing of the building"
+
+
+def test_groups_of_tiles_stay_apart_and_layers_may_come_later() -> None:
+    packed, everywhere = pack_model(make_town()), shapely.box(0, 0, 300, 300)
+    near = join_near([take_near(packed, everywhere, np.full(len(make_town()), 7, np.int32))] * 2)
+    assert set(near.layers.tolist()) == {7}
+    _, size = np.unique(near.group, return_counts=True)
+    assert size.tolist() == np.bincount(make_town().group).tolist() * 2
+
+
+def test_no_buildings_are_near_where_there_are_none() -> None:
+    assert len(join_near([take_near(pack_model(no_buildings()), shapely.box(0, 0, 9, 9))])) == 0
+    assert len(join_near([])) == 0

@@ -104,8 +104,9 @@ def describe_kernels() -> str:
     kernels = {(module, name) for part in read_list().values() for module, names in part.items() for name in names}
     machine, processor, _ = _target()
     module, names = next(iter(read_list()[RUN].items()))
-    folder = _kernel(module, next(iter(names))).dispatcher.stats.cache_path
-    kept = os.environ.get("NUMBA_CACHE_DIR") or f"{folder} and the like"
+    folder = Path(_kernel(module, next(iter(names))).dispatcher.stats.cache_path)
+    told = os.environ.get("NUMBA_CACHE_DIR")  # where it cannot be written, numba keeps them elsewhere
+    kept = told if told and folder.is_relative_to(told) else f"{folder} and the like"
     return f"{len(kernels)} kernels for {machine} {processor}, kept in {kept}"
 
 
@@ -183,9 +184,12 @@ def _stamp(part: str) -> Path:
 
 
 def stamp_folder() -> Path:
-    """Folder that numba was told; else one beside the code, or the user's where that is read-only."""
+    """Folder that numba was told; where that cannot be written one beside the code, or else the user's."""
     if told := os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(told)
+        with suppress(OSError):
+            Path(told).mkdir(parents=True, exist_ok=True)
+            if os.access(told, os.W_OK):
+                return Path(told)
     beside = ROOT / "pipeline" / "__pycache__"
     if os.access(beside, os.W_OK):
         return beside

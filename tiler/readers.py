@@ -29,7 +29,7 @@ from tiler.footprint_index import FootprintRows, join_footprints, select_footpri
 from tiler.ingest import CELL
 from tiler.packing import CHUNK_BYTES
 from tiler.stage import Box
-from tiler.tables import Buildings, join_buildings, take_buildings, unpack_buildings
+from tiler.tables import NEAR_ARRAYS, NearBuildings, join_near, take_near
 from tiler.task import Task
 
 CHUNK_ROWS = CHUNK_BYTES // 12  # of coordinates in the store, three units of 4 bytes each
@@ -243,21 +243,18 @@ def _cut_ranges(ends: NDArray[np.int64], ranges: Ranges) -> tuple[Ranges, NDArra
     return spans, np.cumsum(np.concatenate(sizes))
 
 
-def read_buildings(task: Task, box: Box) -> Buildings:
+def read_buildings(task: Task, box: Box) -> NearBuildings:
     """Read the buildings of the simplified city model that meet a box, by ascending id.
 
     Their layers are those of the stage ``layers``, where the task reads it.
     """
-    near, here = [], shapely.box(*box)
+    here = shapely.box(*box)
     shapely.prepare(here)
     later = task.read("layers") if "layers" in task.refs else iter(())
     layers = {result.name: result.arrays["layers"] for result in later}
-    for result in task.read("model"):
-        buildings = unpack_buildings(result.arrays)
-        buildings = replace(buildings, layers=layers.get(result.name, buildings.layers))
-        rows = np.flatnonzero(shapely.intersects(here, buildings.model.polygons))
-        near.append(take_buildings(buildings, rows))
-    return join_buildings(near)
+    return join_near(
+        [take_near(result.arrays, here, layers.get(result.name)) for result in task.read("model", NEAR_ARRAYS)]
+    )
 
 
 @dataclass(frozen=True, eq=False)

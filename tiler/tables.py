@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.building_points import BuildingPoints
 from pipeline.city import City
-from pipeline.citymodel import CityModel
+from pipeline.citymodel import CityModel, Prisms
 from pipeline.house_levels import HouseParts
 from pipeline.houses import Houses
 from pipeline.point_fidelity import HouseFidelity
@@ -53,6 +53,27 @@ class Buildings:
         return len(self.model)
 
 
+@dataclass(frozen=True, eq=False)
+class NearBuildings:
+    """Buildings of a city model around a box, as meshing and measuring need them, ``n`` of them by ascending id.
+
+    Attributes
+    ----------
+    model : Prisms
+        The buildings.
+    wall_ground, group, layers
+        As of `Buildings`.
+    """
+
+    model: Prisms
+    wall_ground: NDArray[np.float64]
+    group: NDArray[np.int64]
+    layers: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.model)
+
+
 def pack_polygons(polygons: NDArray[np.object_], name: str) -> Arrays:
     """Write polygons as well-known binary: bytes one after the other, and where each starts."""
     blobs = shapely.to_wkb(polygons, byte_order=1)
@@ -60,11 +81,14 @@ def pack_polygons(polygons: NDArray[np.object_], name: str) -> Arrays:
     return {name: np.frombuffer(b"".join(blobs), np.uint8), f"{name}_start": start}
 
 
-def unpack_polygons(arrays: Arrays, name: str) -> NDArray[np.object_]:
-    """Read what `pack_polygons` wrote."""
-    data, start = arrays[name].tobytes(), arrays[f"{name}_start"].tolist()
-    blobs = np.empty(len(start) - 1, object)
-    blobs[:] = [data[a:b] for a, b in pairwise(start)]
+def unpack_polygons(
+    arrays: Arrays, name: str, rows: NDArray[np.integer[Any]] | None = None
+) -> NDArray[np.object_]:
+    """Read what `pack_polygons` wrote, or some rows of it."""
+    data, start = arrays[name].tobytes(), arrays[f"{name}_start"]
+    rows = np.arange(len(start) - 1) if rows is None else rows
+    blobs = np.empty(len(rows), object)
+    blobs[:] = [data[a:b] for a, b in zip(start[rows].tolist(), start[rows + 1].tolist(), strict=True)]
     polygons: NDArray[np.object_] = shapely.from_wkb(blobs)
     return polygons
 
@@ -175,6 +199,68 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
         arrays["group"],
         arrays["layers"],
         fidelity,
+    )
+
+
+NEAR_ARRAYS = (
+    *("polygon", "polygon_start", "extents", "id", "number", "ground", "roof"),
+    *("wall_ground", "group", "layers"),
+)
+
+
+def pack_model(buildings: Buildings) -> Arrays:
+    """Write the buildings of the stage ``model`` as arrays, with the boxes by which `take_near` finds some."""
+    return pack_buildings(buildings) | {"extents": shapely.bounds(buildings.model.polygons)}
+
+
+def take_near(arrays: Arrays, box: shapely.Polygon, layers: NDArray[np.int32] | None = None) -> NearBuildings:
+    """Read the buildings that meet a box from `NEAR_ARRAYS` of the stage ``model``.
+
+    Parameters
+    ----------
+    arrays : dict of str to array
+        The arrays.
+    box : Polygon
+        A box, prepared.
+    layers : int32, (n,), optional
+        Layers of all of them, where these were chosen later; by default those of the arrays.
+    """
+    x0, y0, x1, y1 = box.bounds
+    west, south, east, north = arrays["extents"].T
+    rows = np.flatnonzero((west <= x1) & (east >= x0) & (south <= y1) & (north >= y0))
+    polygons = unpack_polygons(arrays, "polygon", rows)
+    meet = shapely.intersects(box, polygons)
+    rows, polygons = rows[meet], polygons[meet]
+    columns = (arrays[name][rows] for name in ("id", "number", "ground", "roof"))
+    layers = arrays["layers"] if layers is None else layers
+    return NearBuildings(
+        Prisms(polygons, *columns), arrays["wall_ground"][rows], arrays["group"][rows], layers[rows]
+    )
+
+
+def join_near(several: Sequence[NearBuildings]) -> NearBuildings:
+    """Put the buildings of several tiles together, by ascending id; groups stay apart.
+
+    Parameters
+    ----------
+    several : sequence of NearBuildings
+        Buildings of different tiles; none gives none.
+    """
+    none = no_buildings()
+    several = [NearBuildings(none.model, none.wall_ground, none.group, none.layers), *several]
+    first = np.cumsum([0, *(int(each.group.max(initial=-1)) + 1 for each in several)])
+    group = np.concatenate([each.group + begin for each, begin in zip(several, first, strict=False)])
+    order = np.argsort(np.concatenate([each.model.ids for each in several]), kind="stable")
+
+    def join(parts: Sequence[NDArray[Any]]) -> Any:
+        return np.concatenate(parts)[order]
+
+    names = ("polygons", "ids", "numbers", "ground", "roof")
+    return NearBuildings(
+        Prisms(*(join([getattr(each.model, name) for each in several]) for name in names)),
+        join([each.wall_ground for each in several]),
+        group[order],
+        join([each.layers for each in several]),
     )
 
 

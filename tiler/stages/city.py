@@ -38,6 +38,7 @@ from tiler.tables import (
     make_buildings,
     pack_buildings,
     pack_houses,
+    pack_model,
     pack_polygons,
     unpack_houses,
     unpack_polygons,
@@ -121,7 +122,7 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    version = 5 if layered else 3
+    version = 6 if layered else 4
     return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=version)
 
 
@@ -298,7 +299,7 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
         roofs = locate_roof_points(cloud, city.model.polygons, building_class=True)
         del cloud
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
-    task.put(**pack_buildings(make_buildings(city, fidelity, layers)))
+    task.put(**pack_model(make_buildings(city, fidelity, layers)))
     counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
     counts |= {"roofs on another layer": parted} if parted else {}
     return {"n": len(model), "extent": extent, "counts": counts, "outline": city.outline}

@@ -48,7 +48,7 @@ from tiler.stages.city import chooses_layers_later
 from tiler.stages.seam_tables import pack_columns, pack_seam, unpack_levels, unpack_pinched, unpack_seam
 from tiler.stages.soil import lay_soil, unpack_pinched_soil, unpack_soil
 from tiler.stages.surroundings import find_sizes, halos, read_surroundings, terrain_around, terrain_halo
-from tiler.tables import Buildings
+from tiler.tables import NearBuildings
 from tiler.task import Task
 
 
@@ -225,7 +225,7 @@ def _fill_corner(
     corner: Corner,
     key: Key,
     dtm: Dtm,
-    buildings: Buildings,
+    buildings: NearBuildings,
     walls: NDArray[np.float64],
     sizes: SizeField | None,
     task: Task,
@@ -247,7 +247,7 @@ def _fill(
     seam: Seam,
     ends: tuple[Levels, Levels],
     dtm: Dtm,
-    buildings: Buildings,
+    buildings: NearBuildings,
     sizes: SizeField | None,
     task: Task,
 ) -> Levels:
@@ -263,7 +263,7 @@ def _fill_pinched(
     key: SeamKey,
     ends: tuple[Corner, Corner],
     dtm: Dtm,
-    buildings: Buildings,
+    buildings: NearBuildings,
     walls: NDArray[np.float64],
     sizes: SizeField | None,
     soil: SoilOptions | None,
@@ -286,7 +286,7 @@ def _fill_pinched(
 def _mesh(
     plane: PlaneMesh,
     dtm: Dtm,
-    buildings: Buildings,
+    buildings: NearBuildings,
     options: Any,
     seam: Any,
     sizes: SizeField | None,

@@ -16,7 +16,7 @@ from stitch.tiles import sizes_halo, tile_halo
 from tiler.domain import Domain
 from tiler.options import mesh_options, size_rule
 from tiler.readers import grow, read_buildings, read_known_terrain, region_window
-from tiler.tables import Buildings
+from tiler.tables import NearBuildings
 from tiler.task import Task
 
 
@@ -53,7 +53,7 @@ def find_sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
     return size_field(walls, rule) if given.open_size else size_field_around(given.core_bounds, rule)
 
 
-def read_surroundings(task: Task) -> tuple[Buildings, Dtm]:
+def read_surroundings(task: Task) -> tuple[NearBuildings, Dtm]:
     """Read what counts for a tile or a seam; the terrain is NaN at nodes of tiles that are absent."""
     given = task.parameters
     halo, see = _halos_of(task)
