@@ -1,9 +1,9 @@
 """Houses and city models as plain arrays for the store, and back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
+from dataclasses import dataclass, fields, is_dataclass, replace
+from itertools import chain, pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 import shapely
@@ -72,6 +72,9 @@ class NearBuildings:
 
     def __len__(self) -> int:
         return len(self.model)
+
+
+Rows = TypeVar("Rows", Buildings, NearBuildings)
 
 
 def pack_polygons(polygons: NDArray[np.object_], name: str) -> Arrays:
@@ -239,51 +242,16 @@ def take_near(arrays: Arrays, box: shapely.Polygon, layers: NDArray[np.int32] | 
 
 
 def join_near(several: Sequence[NearBuildings]) -> NearBuildings:
-    """Put the buildings of several tiles together, by ascending id; groups stay apart.
-
-    Parameters
-    ----------
-    several : sequence of NearBuildings
-        Buildings of different tiles; none gives none.
-    """
+    """Put what `take_near` gives of several tiles together, as `join_buildings` does."""
     none = no_buildings()
-    several = [NearBuildings(none.model, none.wall_ground, none.group, none.layers), *several]
-    first = np.cumsum([0, *(int(each.group.max(initial=-1)) + 1 for each in several)])
-    group = np.concatenate([each.group + begin for each, begin in zip(several, first, strict=False)])
-    order = np.argsort(np.concatenate([each.model.ids for each in several]), kind="stable")
-
-    def join(parts: Sequence[NDArray[Any]]) -> Any:
-        return np.concatenate(parts)[order]
-
-    names = ("polygons", "ids", "numbers", "ground", "roof")
-    return NearBuildings(
-        Prisms(*(join([getattr(each.model, name) for each in several]) for name in names)),
-        join([each.wall_ground for each in several]),
-        group[order],
-        join([each.layers for each in several]),
-    )
+    model = Prisms(*(getattr(none.model, name) for name in _columns(Prisms)))
+    return _join_by_id([NearBuildings(model, none.wall_ground, none.group, none.layers), *several])
 
 
-def take_buildings(buildings: Buildings, rows: NDArray[np.integer[Any]]) -> Buildings:
+def take_buildings(buildings: Rows, rows: NDArray[np.integer[Any]]) -> Rows:
     """Take some buildings, in the order of `rows`."""
-    model, fidelity = buildings.model, buildings.fidelity
-    return Buildings(
-        CityModel(
-            model.polygons[rows],
-            model.ids[rows],
-            model.numbers[rows],
-            model.ground[rows],
-            model.roof[rows],
-            tuple(model.members[row] for row in rows.tolist()),
-            model.house[rows],
-        ),
-        buildings.roof_source[rows],
-        buildings.measured_roof[rows],
-        buildings.wall_ground[rows],
-        buildings.group[rows],
-        buildings.layers[rows],
-        HouseFidelity(fidelity.n_points[rows], fidelity.rmse[rows], fidelity.bias[rows], fidelity.coverage[rows]),
-    )
+    taken: Rows = _take(buildings, rows)
+    return taken
 
 
 def no_buildings() -> Buildings:
@@ -303,30 +271,31 @@ def join_buildings(several: Sequence[Buildings]) -> Buildings:
     several : sequence of Buildings
         Buildings of different tiles; none gives none.
     """
-    several = [no_buildings(), *several]
-    models = [each.model for each in several]
+    return _join_by_id([no_buildings(), *several])
+
+
+def _join_by_id(several: Sequence[Rows]) -> Rows:
     first = np.cumsum([0, *(int(each.group.max(initial=-1)) + 1 for each in several)])
-    ids = np.concatenate([model.ids for model in models])
-    joined = Buildings(
-        CityModel(
-            np.concatenate([model.polygons for model in models]),
-            ids,
-            np.concatenate([model.numbers for model in models]),
-            np.concatenate([model.ground for model in models]),
-            np.concatenate([model.roof for model in models]),
-            tuple(names for model in models for names in model.members),
-            np.concatenate([model.house for model in models]),
-        ),
-        np.concatenate([each.roof_source for each in several]),
-        np.concatenate([each.measured_roof for each in several]),
-        np.concatenate([each.wall_ground for each in several]),
-        np.concatenate([each.group + begin for each, begin in zip(several, first, strict=False)]),
-        np.concatenate([each.layers for each in several]),
-        HouseFidelity(
-            *(
-                np.concatenate([getattr(each.fidelity, name) for each in several])
-                for name in ("n_points", "rmse", "bias", "coverage")
-            )
-        ),
-    )
-    return take_buildings(joined, np.argsort(ids, kind="stable"))
+    apart = [replace(each, group=each.group + begin) for each, begin in zip(several, first, strict=False)]
+    joined: Rows = _join(apart)
+    return take_buildings(joined, np.argsort(joined.model.ids, kind="stable"))
+
+
+def _join(several: Sequence[Any]) -> Any:
+    """Put rows one after the other: of arrays, of tuples, or of dataclasses made of them."""
+    one = several[0]
+    if columns := _columns(one):
+        return type(one)(*(_join([getattr(each, name) for each in several]) for name in columns))
+    return tuple(chain.from_iterable(several)) if isinstance(one, tuple) else np.concatenate(several)
+
+
+def _take(table: Any, rows: NDArray[np.integer[Any]]) -> Any:
+    """Take rows of an array, of a tuple, or of a dataclass made of them."""
+    if columns := _columns(table):
+        return type(table)(*(_take(getattr(table, name), rows) for name in columns))
+    return tuple(table[row] for row in rows.tolist()) if isinstance(table, tuple) else table[rows]
+
+
+def _columns(table: Any) -> list[str]:
+    """Names of what a dataclass is made of; none for anything else."""
+    return [field.name for field in fields(table)] if is_dataclass(table) else []
