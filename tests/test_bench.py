@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from tests.benchmarks.bench import inner_seconds
+from tests.benchmarks.bench import count_samples, inner_seconds
 
 
 def test_inner_items_have_others_all_around_and_count_by_their_median(tmp_path: Path) -> None:
@@ -17,3 +17,24 @@ def test_inner_items_have_others_all_around_and_count_by_their_median(tmp_path: 
     (tmp_path / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
 
     assert inner_seconds(tmp_path) == {"columns": (8.05 + 9.04) / 2, "seams": 9.0}
+
+
+def test_compiled_code_counts_for_the_function_that_calls_it() -> None:
+    task = "thread (1): MainThread;_run (/home/site/tiler/run.py:221);run_task (/home/site/tiler/task.py:293)"
+    cut = f"{task};make_seam (/home/site/tiler/stages/mesh.py:9);cut_walls (/home/site/stitch/walls.py:97)"
+    call = f"{cut};Kernel.__call__ (/home/site/pipeline/kernel.py:29)"
+    lines = [
+        f"{cut} 2",
+        f"{call} 30",
+        f"{call};Kernel.dispatcher (/home/site/pipeline/kernel.py:40) 4",
+        f"{task};make_seam (/home/site/tiler/stages/mesh.py:9);_amin (numpy/_core/_methods.py:45) 500",
+        "thread (1): MainThread;_run (/home/site/tiler/run.py:221) 6000",
+        f"thread (2): {cut.replace('MainThread', 'zarr_io')} 70000",
+    ]
+
+    assert count_samples(lines) == {
+        "stitch/walls.py: cut_walls": 32,
+        "pipeline/kernel.py: Kernel.dispatcher": 4,
+        "tiler/stages/mesh.py: make_seam": 500,
+        "driver: outside of tasks": 6000,
+    }
