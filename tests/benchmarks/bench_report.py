@@ -355,7 +355,7 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
         "profile",
         "Where the time goes",
-        "Serial run of the city of 2.5 km, 100 samples a second (py-spy): our innermost function, with what it "
+        "Serial run of the city of 2.5 km, 250 samples a second (py-spy): our innermost function, with what it "
         "calls of others.",
         _profile,
     ),
