@@ -13,6 +13,7 @@ from pipeline.kernel import kernel
 from stitch.conformity import FACES, group_rows
 
 NO_MATE, CROWDED = -1, -2
+MOST_CELLS = 2**29 - 1  # four faces each have numbers of 32 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +57,12 @@ def find_cell_faces(cells: NDArray[np.int32], facets: NDArray[np.int32], n_point
     Raises
     ------
     ValueError
-        If more than two cells have a face, or a facet is no exterior face or is there twice.
+        If more than two cells have a face, a facet is no exterior face or is there twice, or there are more than
+        `MOST_CELLS` cells.
 
     Notes
     -----
-    Linear in the cells; some 80 bytes a cell.
+    Linear in the cells; some 60 bytes a cell, of which 40 are the result.
 
     Examples
     --------
@@ -72,22 +74,22 @@ def find_cell_faces(cells: NDArray[np.int32], facets: NDArray[np.int32], n_point
     >>> faces.inner.tolist(), faces.facet_cell.tolist(), faces.shared.tolist()
     ([[1, 2, 3]], [0, 0, 0, 1, 1], [[2, 3, 4]])
     """
-    mate = _pair(np.ascontiguousarray(cells), n_points)
+    if len(cells) > MOST_CELLS:
+        raise ValueError(f"{len(cells)} cells in one piece, at most {MOST_CELLS} can be paired")
+    cells = np.ascontiguousarray(cells)
+    mate = _pair(cells, n_points)
     crowded = np.flatnonzero(mate == CROWDED)
     if len(crowded):
         raise ValueError(f"more than two cells have the face {_corners(cells, crowded[:1])[0].tolist()}")
-    first = np.flatnonzero(mate > np.arange(len(mate)))
-    owner, neighbour = first // 4, mate[first] // 4
-    order = np.argsort(owner * len(cells) + neighbour)
-    first = first[order]
     outer = np.flatnonzero(mate == NO_MATE)
     facet = _find_facets(_corners(cells, outer), facets)
     is_shared = np.ones(len(outer), np.bool_)
     is_shared[facet] = False
+    owner, neighbour, inner = _take_inner(cells, mate, (len(mate) - len(outer)) // 2)
     return CellFaces(
-        owner[order].astype(np.int32),
-        neighbour[order].astype(np.int32),
-        _corners(cells, first),
+        owner,
+        neighbour,
+        inner,
         (outer[facet] // 4).astype(np.int32),
         (outer[is_shared] // 4).astype(np.int32),
         _corners(cells, outer[is_shared]),
@@ -124,10 +126,10 @@ def _sorted_face(cells, face):  # type: ignore[no-untyped-def]  # pragma: no cov
 def _pair(cells, n_points):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Find for each of the 4 m faces the other that has the same vertices, `NO_MATE` or `CROWDED`."""
     n_faces = 4 * len(cells)
-    mate = np.full(n_faces, NO_MATE, np.int64)
+    mate = np.full(n_faces, NO_MATE, np.int32)
     # Faces by their smallest vertex, as linked lists: few faces have the same one.
-    last = np.full(n_points, -1, np.int64)
-    before = np.empty(n_faces, np.int64)
+    last = np.full(n_points, -1, np.int32)
+    before = np.empty(n_faces, np.int32)
     for face in range(n_faces):
         low, middle, high = _sorted_face(cells, face)
         other = last[low]
@@ -144,3 +146,28 @@ def _pair(cells, n_points):  # type: ignore[no-untyped-def]  # pragma: no cover
         else:
             mate[face] = CROWDED
     return mate
+
+
+@kernel
+def _take_inner(cells, mate, n):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Give both cells and the vertices of the `n` faces with two cells, sorted by the lower, then the other."""
+    owner, neighbour, inner = np.empty(n, np.int32), np.empty(n, np.int32), np.empty((n, 3), np.int32)
+    end = 0
+    for cell in range(len(cells)):
+        first = end
+        for k in range(4):
+            other = mate[4 * cell + k]
+            if other <= 4 * cell + k:
+                continue
+            row, beyond = end, other // 4
+            while row > first and neighbour[row - 1] > beyond:
+                neighbour[row] = neighbour[row - 1]
+                for j in range(3):
+                    inner[row, j] = inner[row - 1, j]
+                row -= 1
+            neighbour[row] = beyond
+            for j in range(3):
+                inner[row, j] = cells[cell, FACES[k, j]]
+            owner[end] = cell
+            end += 1
+    return owner, neighbour, inner

@@ -25,12 +25,14 @@ from tiler.formats.pieces import Pieces
 from tiler.formats.region_faces import (
     FacetSets,
     Ints,
+    OwnFaces,
     RegionFaces,
     faces_of_piece,
     find_ground,
     find_outer,
     lowest_first,
     own_faces,
+    wrong_ground,
 )
 from tiler.mesh_pieces import MeshPiece
 
@@ -246,28 +248,42 @@ class _PartWriter:
 
     def _add_inner(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> None:
         """Write the faces whose lower cell is in the piece and whose other cell is in the part."""
+        region = self._plan.region
+        ground, face = [], int(region.face_start[k])
+        for own in own_faces(region, k, piece, faces):
+            is_ground = find_ground(region, k, piece, own)
+            inside = self._add_block(k, own, face, local)
+            ground.append(self._row + np.cumsum(inside)[is_ground] - 1)
+            self._row += int(inside.sum())
+            face += len(inside)
+        if self._places is not None:
+            self._across.append(self._find_turned(k, piece, faces, local))
+        if piece.region is None:
+            return
+        rows = np.concatenate(ground)
+        if len(rows) != int((~find_outer(piece)).sum()):
+            raise wrong_ground(piece)
+        if self._zones is not None and len(rows):
+            self._zones.write(k, np.full(len(rows), GROUND_ZONE), rows)
+
+    def _add_block(self, k: int, own: OwnFaces, face: int, local: Ints) -> NDArray[np.bool_]:
+        """Write faces of piece `k` from number `face` of the region on; tells which are inside the part."""
         region, part, start = self._plan.region, self._plan.part, self.numbers.start
-        own = own_faces(region, k, piece, faces)
         beyond = region.piece_of(own.neighbour)
         other = part[beyond]
         owner, corners = own.owner - region.cell_start[k] + start[k], local[own.corners]
-        inside = other == self.numbers.number
+        inside: NDArray[np.bool_] = other == self.numbers.number
         self._faces.write(self._row, corners[inside])
         self._owner.write(self._row, owner[inside])
         within = beyond[inside]
         self._neighbour.write(self._row, own.neighbour[inside] - region.cell_start[within] + start[within])
         if self._places is not None:
-            face = region.face_start[k] + np.arange(len(inside))
-            self._face_to.write(self._row, face[inside] + 1)
+            number = face + np.arange(len(inside))
+            self._face_to.write(self._row, number[inside] + 1)
             out = ~inside
             turned = np.zeros(int(out.sum()), np.bool_)
-            self._across.append(_Across(other[out], face[out], turned, owner[out], corners[out]))
-            self._across.append(self._find_turned(k, piece, faces, local))
-        ground = np.flatnonzero(find_ground(region, k, piece, own))
-        if self._zones is not None and len(ground):
-            number = self._row + np.cumsum(inside)[ground] - 1
-            self._zones.write(k, np.full(len(ground), GROUND_ZONE), number)
-        self._row += int(inside.sum())
+            self._across.append(_Across(other[out], number[out], turned, owner[out], corners[out]))
+        return inside
 
     def _find_turned(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> _Across:
         """Find the faces of a piece whose lower cell is in another part."""

@@ -7,7 +7,7 @@ first of them to the second; what is known of it then stands in files.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from tiler.mesh_pieces import MeshPiece
 Ints = NDArray[np.int64]
 # Given a piece, the key of a set of facets, or of cells, for each of them; several sets may have one.
 SetsOf = Callable[[MeshPiece], Ints]
+BLOCK_CELLS = 2**17  # whose faces are put in order together
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +102,7 @@ class RegionFaces:
 
 @dataclass(frozen=True, eq=False)
 class OwnFaces:
-    """The faces of a piece that have two cells and whose lower cell is in it, in the region's order.
+    """Faces with two cells, whose lower cell is in a piece: some of its, in the region's order.
 
     Attributes
     ----------
@@ -207,13 +208,37 @@ def find_outer(piece: MeshPiece) -> NDArray[np.bool_]:
     return outer
 
 
-def find_ground(region: RegionFaces, k: int, piece: MeshPiece, own: "OwnFaces") -> NDArray[np.bool_]:
-    """Tell which of the faces that piece `k` has of the region's list are the ground between air and soil.
+def own_faces(region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces) -> Iterator[OwnFaces]:
+    """Take the faces that piece `k` has of the region's list: rows ``face_start[k]`` to ``face_start[k + 1]``.
+
+    Yields
+    ------
+    OwnFaces
+        Those of `BLOCK_CELLS` cells after the other: memory does not go with the piece.
+    """
+    rows = slice(int(region.shared_start[k]), int(region.shared_start[k + 1]))
+    start = int(region.cell_start[k])
+    cell, other = np.asarray(region.cell[rows]), np.asarray(region.cell[np.asarray(region.mate[rows])])
+    later = np.flatnonzero(other > cell)
+    cell, other = cell[later], other[later]
+    for first in range(0, len(piece.cells), BLOCK_CELLS):
+        ends = first, first + BLOCK_CELLS
+        inner = slice(*np.searchsorted(faces.owner, ends).tolist())
+        beyond = slice(*np.searchsorted(cell - start, ends).tolist())
+        owner = np.concatenate([faces.owner[inner].astype(np.int64) + start, cell[beyond]])
+        neighbour = np.concatenate([faces.neighbour[inner].astype(np.int64) + start, other[beyond]])
+        order = np.lexsort((neighbour, owner))
+        corners = np.concatenate([faces.inner[inner], faces.shared[later[beyond]]])[order]
+        yield OwnFaces(owner[order], neighbour[order], lowest_first(corners, piece.ids))
+
+
+def find_ground(region: RegionFaces, k: int, piece: MeshPiece, own: OwnFaces) -> NDArray[np.bool_]:
+    """Tell which faces of a block of piece `k` are the ground between air and soil.
 
     Raises
     ------
     InputError
-        If these are not as many as the piece marks, or the normal of one points up.
+        If the normal of one points up.
     """
     ground = np.zeros(len(own.owner), np.bool_)
     if piece.region is None:
@@ -221,26 +246,18 @@ def find_ground(region: RegionFaces, k: int, piece: MeshPiece, own: "OwnFaces") 
     owner, neighbour = own.owner - region.cell_start[k], own.neighbour - region.cell_start[k]
     within = np.flatnonzero(neighbour < len(piece.cells))
     pair = piece.region[owner[within]], piece.region[neighbour[within]]
+    if (pair[0] > pair[1]).any():
+        raise wrong_ground(piece)
     ground[within] = (pair[0] == Region.AIR) & (pair[1] == Region.SOIL)
-    if ground.sum() != (~find_outer(piece)).sum() or (pair[0] > pair[1]).any():
-        raise InputError(
-            f"tile {piece.name}: its ground is not what air and soil share, the air's cells first; run citystitch "
-            "check"
-        )
     return ground
 
 
-def own_faces(region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces) -> OwnFaces:
-    """Take the faces that piece `k` has of the region's list: rows ``face_start[k]`` to ``face_start[k + 1]``."""
-    rows = slice(int(region.shared_start[k]), int(region.shared_start[k + 1]))
-    cell, other = np.asarray(region.cell[rows]), np.asarray(region.cell[np.asarray(region.mate[rows])])
-    later = np.flatnonzero(other > cell)
-    start = int(region.cell_start[k])
-    owner = np.concatenate([faces.owner.astype(np.int64) + start, cell[later]])
-    neighbour = np.concatenate([faces.neighbour.astype(np.int64) + start, other[later]])
-    order = np.lexsort((neighbour, owner))
-    corners = np.concatenate([faces.inner, faces.shared[later]])[order]
-    return OwnFaces(owner[order], neighbour[order], lowest_first(corners, piece.ids))
+def wrong_ground(piece: MeshPiece) -> InputError:
+    """Make the error of a piece whose ground is not where it marks it."""
+    return InputError(
+        f"tile {piece.name}: its ground is not what air and soil share, the air's cells first; run "
+        "citystitch check"
+    )
 
 
 def lowest_first(corners: NDArray[np.int32], ids: Ints) -> NDArray[np.int32]:
