@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError, InputError, OutputError
 from pipeline.mesh import Marker
+from stitch import cell_faces
 from stitch.cell_faces import find_cell_faces
 from tests.foam_reader import (
     PolyMesh,
@@ -27,7 +28,7 @@ from tests.programs import mesh_is_ok, read_check, run_foam
 from tiler.atomic import replacing_folder
 from tiler.cli import main
 from tiler.export import export_run
-from tiler.formats import openfoam
+from tiler.formats import openfoam, region_faces
 from tiler.formats.foam_patches import PATCHES
 from tiler.formats.openfoam import write_openfoam
 from tiler.formats.partition import split_pieces
@@ -289,8 +290,32 @@ def test_faces_of_cells_are_found_whatever_their_order() -> None:
         (piece.facets, faces.facet_cell),
     ):
         assert (corners[:, :, None] == piece.cells[cell][:, None, :]).any(axis=2).all()
+    key = faces.owner.astype(np.int64) * len(piece.cells) + faces.neighbour
+    assert (np.diff(key) > 0).all()
+    assert (faces.owner < faces.neighbour).all()
     with pytest.raises(ValueError, match="a facet is there twice"):
         find_cell_faces(piece.cells, piece.facets[[0, 0]], len(piece.points))
+
+
+def test_more_cells_than_their_faces_have_numbers_for_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    piece = box_pieces((1, 1)).read(0)
+    monkeypatch.setattr(cell_faces, "MOST_CELLS", len(piece.cells))
+    find_cell_faces(piece.cells, piece.facets, len(piece.points))
+    monkeypatch.setattr(cell_faces, "MOST_CELLS", len(piece.cells) - 1)
+    with pytest.raises(ValueError, match=f"{len(piece.cells)} cells in one piece, at most {len(piece.cells) - 1}"):
+        find_cell_faces(piece.cells, piece.facets, len(piece.points))
+
+
+@pytest.mark.parametrize("parts", [None, 3])
+def test_the_size_of_blocks_changes_no_byte(
+    box: HandPieces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parts: int | None
+) -> None:
+    at_once = write(tmp_path / "at_once", box, parts=parts)
+    monkeypatch.setattr(region_faces, "BLOCK_CELLS", 7)
+    by_seven = write(tmp_path / "by_seven", box, parts=parts)
+    files = sorted(path.relative_to(at_once) for path in at_once.rglob("*") if path.is_file())
+    assert files == sorted(path.relative_to(by_seven) for path in by_seven.rglob("*") if path.is_file())
+    assert [path for path in files if (at_once / path).read_bytes() != (by_seven / path).read_bytes()] == []
 
 
 def test_parts_are_even_and_compact() -> None:

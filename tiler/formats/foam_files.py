@@ -7,12 +7,11 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.formats.rows import blocks_of
+from tiler.formats.rows import blocks_of, slices
 
 BANNER = "// Written by citystitch.\n"
 LABEL_LIMIT = 2**31 - 1  # numbers that a 32 bit label can hold
 COUNT_WIDTH = 20  # characters of a count that is known when its list is whole
-ROWS = 1 << 20  # rows that are made at once
 
 
 def foam_header(
@@ -125,8 +124,8 @@ class FoamFaces:
         self._file: BinaryIO = path.open("wb")
         header = foam_header("faces", "faceCompactList", location=location, binary=True, label=label)
         self._file.write(f"{header}{n + 1}\n(".encode())
-        for i in range(0, n + 1, ROWS):
-            self._file.write((3 * np.arange(i, min(i + ROWS, n + 1))).astype(self._dtype).data)
+        for some in slices(n + 1):
+            self._file.write((3 * np.arange(some.start, some.stop)).astype(self._dtype).data)
         self._file.write(f")\n{3 * n}\n(".encode())
         self._start, self._n = self._file.tell(), n
 

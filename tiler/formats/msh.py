@@ -16,7 +16,7 @@ from pipeline.mesh import Marker, Region
 from tiler.atomic import replacing
 from tiler.formats.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
 from tiler.formats.pieces import Pieces
-from tiler.formats.rows import blocks_of
+from tiler.formats.rows import blocks_of, slices
 from tiler.mesh_pieces import MeshPiece, open_pieces
 
 # No marker has one of these numbers: some programs know groups by number alone.
@@ -27,7 +27,6 @@ NAMES = {number: region.name.lower() for region, number in VOLUMES.items()}
 OF_AIR = (Marker.WALL, Marker.ROOF, Marker.TOP)
 OF_SOIL = (Marker.BOTTOM, Marker.FOUNDATION)
 TRIANGLE, TETRAHEDRON = 2, 4  # Gmsh's types of elements
-ROWS = 1 << 18  # rows that are made at once
 TEXT_FLOAT = "%24.16e"  # 17 digits, enough for any float64; each has the same width
 
 _Box = NDArray[np.float64]
@@ -108,11 +107,12 @@ def export_msh(output: Path, directory: Path, *, buildings: str | None = None) -
             patches += [(group, piece.cells[volumes == group]) for group in survey.cells]
             for group, rows_of_group in patches:
                 place, first = elements[group]
-                corners = piece.ids[rows_of_group]
-                tags = first + seen[group] + np.arange(len(corners))
-                file.seek(place + 8 * (1 + corners.shape[1]) * seen[group])
-                file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
-                seen[group] += len(corners)
+                file.seek(place + 8 * (1 + rows_of_group.shape[1]) * seen[group])
+                for some in slices(len(rows_of_group)):
+                    corners = piece.ids[rows_of_group[some]]
+                    tags = first + seen[group] + np.arange(len(corners))
+                    file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
+                    seen[group] += len(corners)
 
 
 def export_msh2(output: Path, directory: Path, *, buildings: str | None = None) -> None:
@@ -134,12 +134,12 @@ def export_msh2(output: Path, directory: Path, *, buildings: str | None = None) 
             piece = pieces.read(k)
             found = patch_keys(piece.marker, piece.building, by_building=by_building)
             groups = numbers[np.searchsorted(keys, found)]
-            facets = _numbered(tag, piece.ids[piece.facets] + 1, TRIANGLE, groups)
-            tag += len(facets)
-            cells = _numbered(tag, piece.ids[piece.cells] + 1, TETRAHEDRON, _groups(piece))
-            tag += len(cells)
-            for rows in (facets, cells):
-                _write_lines(file, " ".join(["%d"] * rows.shape[1]) + "\n", rows)
+            kinds = ((TRIANGLE, piece.facets, groups), (TETRAHEDRON, piece.cells, _groups(piece)))
+            for kind, rows, groups_of_rows in kinds:
+                for some in slices(len(rows)):
+                    lines = _numbered(tag, piece.ids[rows[some]] + 1, kind, groups_of_rows[some])
+                    _write_lines(file, " ".join(["%d"] * lines.shape[1]) + "\n", lines)
+                    tag += len(lines)
             end = file.tell()
             line = f"%{digits}d {TEXT_FLOAT} {TEXT_FLOAT} {TEXT_FLOAT}\n"
             for start, chosen in blocks_of(piece.ids):
@@ -162,7 +162,9 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
         parts += [(facets, key, piece.facets[rows]) for key, rows in keys]
         for counts, group, corners in parts:
             counts[group] = counts.get(group, 0) + len(corners)
-            boxes[group] = _grown(boxes.get(group, _no_box()), piece.points[corners.ravel()])
+            used = np.zeros(len(piece.points), np.bool_)
+            used[corners] = True
+            boxes[group] = _grown(boxes.get(group, _no_box()), piece.points[used])
     return _Survey(pieces.n_points, dict(sorted(cells.items())), dict(sorted(facets.items())), boxes)
 
 
@@ -208,8 +210,8 @@ def _bounds(key: int, group: int) -> bool:
 def _begin_nodes(file: BinaryIO, n: int) -> int:
     """Write all of the section but coordinates; returns where they begin."""
     file.write(b"$Nodes\n" + _packed("u8", [1, n, 1, n]) + _packed("i4", [3, AIR, 0]) + _packed("u8", [n]))
-    for i in range(0, n, ROWS):
-        file.write(_packed("u8", np.arange(i + 1, min(i + ROWS, n) + 1)))
+    for some in slices(n):
+        file.write(_packed("u8", np.arange(some.start + 1, some.stop + 1)))
     start = file.tell()
     file.seek(start + 24 * n)
     file.write(b"\n$EndNodes\n")
@@ -244,6 +246,6 @@ def _numbered(tag: int, nodes: NDArray[np.int64], kind: int, group: NDArray[np.i
 
 
 def _write_lines(file: BinaryIO, line: str, rows: NDArray[Any]) -> None:
-    for i in range(0, len(rows), ROWS):
-        some = rows[i : i + ROWS]
-        file.write((line * len(some) % tuple(some.ravel().tolist())).encode())
+    for some in slices(len(rows)):
+        numbers = rows[some].ravel().tolist()
+        file.write((line * (some.stop - some.start) % tuple(numbers)).encode())

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from tiler.atomic import replacing
 from tiler.formats.foam_patches import facets_by_key, patch_of_key
-from tiler.formats.surface import Surface, keys_asked, open_surface, place_vertices, slices, survey_surface
+from tiler.formats.rows import slices
+from tiler.formats.surface import Surface, keys_asked, open_surface, place_vertices, survey_surface
 
 VERTEX = "v" + " %24.16e" * 3 + "\n"
 VERTEX_BYTES = len(VERTEX % ((0.0,) * 3))

@@ -113,7 +113,7 @@ def write_openfoam(
 
     Notes
     -----
-    Memory: one piece with its faces (some 300 bytes a cell), the faces between one part and the others (some
+    Memory: one piece with its faces (some 80 bytes a cell), the faces between one part and the others (some
     60 bytes each), and what `survey_faces` holds. Files beside the result, gone at the end: 40 bytes a face
     between two tiles; for parts also 8 bytes a point. Each piece is read twice.
     """

@@ -1,9 +1,11 @@
-"""Rows of a long array that belong to a piece, in as few blocks as there are."""
+"""Rows of long arrays: those that follow each other, and so many at a time."""
 
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+
+ROWS = 1 << 16  # rows that are made at once
 
 
 def blocks_of(place: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
@@ -31,3 +33,15 @@ def blocks_of(place: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]
     for rows in np.split(order, breaks):
         if len(rows):
             yield int(place[rows[0]]), rows
+
+
+def slices(n: int) -> Iterator[slice]:
+    """Cut n rows into slices of `ROWS`, and what is left.
+
+    Examples
+    --------
+    >>> list(slices(70_000))
+    [slice(0, 65536, None), slice(65536, 70000, None)]
+    """
+    for start in range(0, n, ROWS):
+        yield slice(start, min(start + ROWS, n))

@@ -1,6 +1,6 @@
 """The boundary of a finished run for surface formats: facets piece by piece, vertices numbered from 0 on."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -15,7 +15,6 @@ from tiler.merged import VERTEX_ID, number_piece
 from tiler.mesh_pieces import MeshPieces, open_pieces
 from tiler.vtk_files import read_vtp
 
-ROWS = 1 << 16  # rows that are made at once
 WORD = 64  # points in a word of `VertexSet`
 
 
@@ -238,12 +237,6 @@ def place_vertices(
     places = vertices.places(piece.ids[used])
     runs = [(start, piece.points[used[rows]]) for start, rows in blocks_of(places)]
     return runs, places[local.reshape(-1, 3)]
-
-
-def slices(n: int) -> Iterator[slice]:
-    """Cut n rows into slices of `ROWS`."""
-    for start in range(0, n, ROWS):
-        yield slice(start, start + ROWS)
 
 
 def _bit(ids: NDArray[np.int64]) -> NDArray[np.uint64]:
