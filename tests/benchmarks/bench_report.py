@@ -111,7 +111,10 @@ def _growth(rows: Rows, name: str, key: str) -> list[str]:
         "|---|---|---|",
     ]
     half = len(rows) // 2
-    for step, seconds in {**series, "all steps": whole}.items():
+    told_too = {"all steps": whole}
+    if key != "cells":
+        told_too["the number of cells"] = [float(row["cells"]) for row in rows]
+    for step, seconds in {**series, **told_too}.items():
         told = [fit_exponent(sizes, seconds), fit_exponent(sizes[half:], seconds[half:])]
         lines.append(f"| {step} | " + " | ".join("-" if e is None else f"{e:.2f}" for e in told) + " |")
     return [*lines, "", f"![Seconds of each step against {key}](study-{name}.png)"]
