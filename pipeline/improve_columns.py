@@ -134,7 +134,8 @@ class ColumnSurvey:
         m = len(mesh.plane.triangles)
         self._mesh, self._free, self._flat_cells = mesh, free, flat_cells
         self._clockwise = signed_areas(mesh.plane) < 0
-        self._most = int(count_by_triangle(mesh).max(initial=0))
+        self._n_cells = count_by_triangle(mesh)
+        self._most = int(self._n_cells.max(initial=0))
         self._z = mesh.z
         self.of_cells, self.least = np.empty(m), np.empty(m)
         self._measure(np.ones(m, np.bool_))
@@ -156,13 +157,17 @@ class ColumnSurvey:
         level = np.flatnonzero(self.bad & self._free)
         column = self._columns_of(level)
         count = np.bincount(column, minlength=len(xy))
+        place = np.full(len(z), -1, np.int32)  # of each level among those that are searched together
         for columns in split_columns(xy, count, MOST_LEVELS):
             here = np.zeros(len(xy), np.bool_)
             here[columns] = True
             part = here[column]
-            searched, first = level[part], np.concatenate([[0], np.cumsum(np.where(here, count, 0))])
-            cells, over = _gather(*self._merged(), self._touch(here), self._most, self._clockwise, searched, first)
-            around = _cells_of_levels(cells, over, triangles, self._clockwise, searched, first)
+            searched, wanted = level[part], self._touch(here)
+            place[searched] = np.arange(len(searched))
+            room = int(self._n_cells[wanted].sum())
+            cells, over = _gather(*self._merged(), wanted, self._most, self._clockwise, place, room)
+            around = _cells_of_levels(cells, place, len(searched))
+            place[searched] = -1
             step = first_step[column[part]]
             n_moved += _search(xy, triangles, self._clockwise, z, cells, over, searched, *around, step)
         return z, n_moved
@@ -315,19 +320,6 @@ def _survey(
 
 
 @kernel
-def _find_level(level: NDArray[np.int64], low: int, high: int, p: int) -> int:
-    """Place of a level among those from low to high, which ascend; -1 if it is not there."""
-    end = high
-    while low < high:
-        middle = (low + high) // 2
-        if level[middle] < p:
-            low = middle + 1
-        else:
-            high = middle
-    return low if low < end and level[low] == p else -1
-
-
-@kernel
 def _gather(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
@@ -337,30 +329,27 @@ def _gather(
     wanted: NDArray[np.bool_],
     most: int,
     clockwise: NDArray[np.bool_],
-    level: NDArray[np.int64],
-    first: NDArray[np.int64],
+    place: NDArray[np.int32],
+    room: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Cells with one of some levels, over the triangles that are wanted, in their order; and those triangles."""
+    """Cells over wanted triangles that have a level with a place, and those triangles, in their order.
+
+    All cells over these triangles have room.
+    """
     cells = np.empty((most, 4), np.int32)
-    found, over = np.empty((0, 4), np.int32), np.empty(0, np.int32)
-    for _ in range(2):  # count them, then write them
-        row = 0
-        for t in range(len(triangles)):
-            if not wanted[t]:
-                continue
-            n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, 0)
-            for i in range(n):
-                has_one, columns = False, _columns_of_cell(triangles[t], clockwise[t], cells[i])
-                for k in range(4):
-                    has_one |= _find_level(level, first[columns[k]], first[columns[k] + 1], cells[i, k]) >= 0
-                if has_one:
-                    if row < len(found):
-                        found[row] = cells[i]
-                        over[row] = t
-                    row += 1
-        if len(found) == 0:
-            found, over = np.empty((row, 4), np.int32), np.empty(row, np.int32)
-    return found, over
+    found, over = np.empty((room, 4), np.int32), np.empty(room, np.int32)
+    row = 0
+    for t in range(len(triangles)):
+        if not wanted[t]:
+            continue
+        n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, 0)
+        for i in range(n):
+            a, b, c, d = cells[i]
+            if place[a] >= 0 or place[b] >= 0 or place[c] >= 0 or place[d] >= 0:
+                found[row] = cells[i]
+                over[row] = t
+                row += 1
+    return found[:row], over[:row]
 
 
 @kernel
@@ -373,32 +362,25 @@ def _add_costs(ratio: NDArray[np.float64]) -> float:
 
 @kernel
 def _cells_of_levels(
-    cells: NDArray[np.int32],
-    over: NDArray[np.int32],
-    triangles: NDArray[np.int32],
-    clockwise: NDArray[np.bool_],
-    level: NDArray[np.int64],
-    first: NDArray[np.int64],
+    cells: NDArray[np.int32], place: NDArray[np.int32], n: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Cells around each of some levels: those of the k-th are ``of_level[start[k]:start[k + 1]]``."""
-    start = np.zeros(len(level) + 1, np.int64)
+    """Cells around each of n levels with a place: those of the k-th are ``of_level[start[k]:start[k + 1]]``."""
+    start = np.zeros(n + 1, np.int64)
     for i in range(len(cells)):
-        columns = _columns_of_cell(triangles[over[i]], clockwise[over[i]], cells[i])
         for k in range(4):
-            p = _find_level(level, first[columns[k]], first[columns[k] + 1], cells[i, k])
+            p = place[cells[i, k]]
             if p >= 0:
                 start[p + 1] += 1
-    for p in range(len(level)):
+    for p in range(n):
         start[p + 1] += start[p]
-    place = start[:-1].copy()
+    end = start[:-1].copy()
     of_level = np.empty(start[-1], np.int32)
     for i in range(len(cells)):
-        columns = _columns_of_cell(triangles[over[i]], clockwise[over[i]], cells[i])
         for k in range(4):
-            p = _find_level(level, first[columns[k]], first[columns[k] + 1], cells[i, k])
+            p = place[cells[i, k]]
             if p >= 0:
-                of_level[place[p]] = i
-                place[p] += 1
+                of_level[end[p]] = i
+                end[p] += 1
     return start, of_level
 
 
