@@ -3,7 +3,7 @@
 The first two are the paper's studies (its section 2.2): (a) cost against the number of cells, (b) against that of
 buildings. What is measured is kept in docs/benchmarks.json, a study each, and docs/benchmarks.md and its pictures
 are written from that: `python -m tests.benchmarks.bench cells` measures one study anew and leaves the others, and
-`--large` adds the city of 10 km to those of area and workers (17 and 33 minutes in all).
+`--large` adds the city of 10 km to those of area and workers (11 and 36 minutes in all).
 """
 
 import argparse
