@@ -249,7 +249,7 @@ class _PartWriter:
     def _add_inner(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> None:
         """Write the faces whose lower cell is in the piece and whose other cell is in the part."""
         region = self._plan.region
-        ground, face = [], int(region.face_start[k])
+        ground, face = [np.empty(0, np.int64)], int(region.face_start[k])
         for own in own_faces(region, k, piece, faces):
             is_ground = find_ground(region, k, piece, own)
             inside = self._add_block(k, own, face, local)

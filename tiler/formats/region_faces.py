@@ -222,7 +222,7 @@ def own_faces(region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces) -
     later = np.flatnonzero(other > cell)
     cell, other = cell[later], other[later]
     for first in range(0, len(piece.cells), BLOCK_CELLS):
-        ends = first, first + BLOCK_CELLS
+        ends = np.array([first, first + BLOCK_CELLS], np.int32)  # as in the faces, which are so searched in place
         inner = slice(*np.searchsorted(faces.owner, ends).tolist())
         beyond = slice(*np.searchsorted(cell - start, ends).tolist())
         owner = np.concatenate([faces.owner[inner].astype(np.int64) + start, cell[beyond]])
