@@ -4,6 +4,7 @@ import io
 import os
 import pty
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -436,8 +437,13 @@ def test_ctrl_c_on_the_keyboard_stops_and_leaves_a_whole_terminal(town: Town, tm
     os.close(theirs)
     seen, pressed = b"", False
     try:
-        while data := os.read(ours, 65536):
-            seen += data
+        while True:
+            # The screen is written now and then: a run of few tiles may be done before it is again.
+            if select.select([ours], [], [], 0.002)[0]:
+                data = os.read(ours, 65536)
+                if not data:
+                    break
+                seen += data
             if not pressed and list((out / "store.zarr" / "ground").glob("[!.]*")):
                 os.write(ours, b"\x03")
                 pressed = True
