@@ -218,14 +218,13 @@ def own_faces(region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces) -
     """
     rows = slice(int(region.shared_start[k]), int(region.shared_start[k + 1]))
     start = int(region.cell_start[k])
-    cell, other = np.asarray(region.cell[rows]), np.asarray(region.cell[np.asarray(region.mate[rows])])
-    later = np.flatnonzero(other > cell)
-    cell, other = cell[later], other[later]
+    other = np.asarray(region.cell[np.asarray(region.mate[rows])])
+    later = np.flatnonzero(other > np.asarray(region.cell[rows]))
+    cell, other = faces.shared_cell[later], other[later]
     for first in range(0, len(piece.cells), BLOCK_CELLS):
         ends = np.array([first, first + BLOCK_CELLS], np.int32)  # as in the faces, which are so searched in place
-        inner = slice(*np.searchsorted(faces.owner, ends).tolist())
-        beyond = slice(*np.searchsorted(cell - start, ends).tolist())
-        owner = np.concatenate([faces.owner[inner].astype(np.int64) + start, cell[beyond]])
+        inner, beyond = (slice(*np.searchsorted(some, ends).tolist()) for some in (faces.owner, cell))
+        owner = np.concatenate([faces.owner[inner], cell[beyond]]).astype(np.int64) + start
         neighbour = np.concatenate([faces.neighbour[inner].astype(np.int64) + start, other[beyond]])
         order = np.lexsort((neighbour, owner))
         corners = np.concatenate([faces.inner[inner], faces.shared[later[beyond]]])[order]
