@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions
 from pipeline.building_points import reach_of_points
+from pipeline.city import find_places
 from pipeline.citymodel import Footprints
 from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leave_out, shape_clusters
 from pipeline.components import join_pairs
@@ -20,10 +21,11 @@ from pipeline.notes import Note
 from pipeline.point_fidelity import measure_houses
 from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
 from pipeline.raster import Dtm, window_of
-from pipeline.roof_points import keep_roof_points, locate_roof_points
+from pipeline.roof_points import RoofPoints, add_roof_points, keep_roof_points, locate_roof_points
 from pipeline.simplify import raise_buildings
 from pipeline.terrain import cut_terrain
 from pipeline.tile import measure_city, prepare_footprints
+from pipeline.unmarked_roofs import MAY_BE_ROOF, are_roofs, find_bare, locate_unmarked
 from stitch.grid import Key
 from tiler.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.config import Config
@@ -55,7 +57,7 @@ def house_stage(config: Config) -> Stage:
         Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
-    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN), version=3)
+    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN), version=4)
 
 
 def first_round(config: Config) -> list[Stage]:
@@ -122,7 +124,7 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    version = 6 if layered else 4
+    version = 7 if layered else 5
     return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=version)
 
 
@@ -152,21 +154,26 @@ def make_houses(task: Task) -> Facts:
     terrain = cut_terrain(dtm, window_of(dtm))
     with task.step("1.5 extract building points"):
         roofs = locate_roof_points(cloud, own.polygons, building_class=True)
+        bare = np.flatnonzero(find_bare(roofs, own.polygons))
+        found = _locate_unmarked(task, own.polygons[bare], terrain)
+        there = are_roofs(found, own.polygons[bare], cloud)
+        unmarked, found = bare[there], keep_roof_points(found, there)
+        task.notes(_note_unmarked(own, unmarked, np.diff(roofs.start)[unmarked], found))
+        roofs = add_roof_points(roofs, unmarked, found)
     city = measure_city(cloud, own, terrain, options, building_class=True, roofs=roofs, trace=task.step)
     task.notes(city.notes)
     roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
+    others = np.isin(city.model.ids, own.ids[unmarked])
     with task.step("2.0 split levels"):
-        houses = divide_houses(city, cloud, options, building_class=True, roofs=roofs)
+        houses = divide_houses(city, cloud, options, building_class=True, roofs=roofs, unmarked=others)
     del cloud  # large, and no longer needed
     with task.step("1.7 fit of roofs"):
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
         full = make_buildings(city, fidelity, np.zeros(len(city.model), np.int32))
-    task.put(**pack_houses(houses), **pack_buildings(full, "full_"))
-    return {
-        "n": len(houses),
-        "extent": _extent(houses.polygons),
-        "counts": {"buildings before merging": len(houses), **_count_parts(houses)},
-    }
+    task.put(**pack_houses(houses), **pack_buildings(full, "full_"), unmarked=others)
+    counts = {"buildings before merging": len(houses), **_count_parts(houses)}
+    counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
+    return {"n": len(houses), "extent": _extent(houses.polygons), "counts": counts}
 
 
 def find_near_houses(task: Task) -> Facts:
@@ -298,6 +305,8 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     with task.step("2.4 fit of roofs"):
         roofs = locate_roof_points(cloud, city.model.polygons, building_class=True)
         del cloud
+        rows = _find_unmarked(city.model.members, gathered)
+        roofs = add_roof_points(roofs, rows, _locate_unmarked(task, city.model.polygons[rows], terrain))
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
     task.put(**pack_model(make_buildings(city, fidelity, layers)))
     counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
@@ -350,6 +359,32 @@ def _points_near(
         )
 
 
+def _locate_unmarked(task: Task, polygons: NDArray[np.object_], terrain: Dtm) -> RoofPoints:
+    """Points of other classes in some houses that may be of their roofs."""
+    others = _points_near(task, _extent(polygons), 0.0, polygons, MAY_BE_ROOF)
+    return locate_unmarked(others, polygons, terrain)
+
+
+def _note_unmarked(
+    footprints: Footprints, rows: NDArray[np.int64], n_marked: NDArray[np.int64], found: RoofPoints
+) -> list[Note]:
+    """Tell of the houses whose roofs are of other classes."""
+    chosen = np.zeros(len(footprints.ids), np.bool_)
+    chosen[rows] = True
+    places = (place for _, place in find_places(footprints, chosen))
+    numbers = zip(places, n_marked.tolist(), np.diff(found.start).tolist(), strict=True)
+    return [
+        Note("footprint-roof-from-other-classes", *place, f"{n} points of class {BUILDING}, {other} of others")
+        for place, n, other in numbers
+    ]
+
+
+def _find_unmarked(members: Sequence[tuple[str, ...]], gathered: "_Gathered") -> NDArray[np.int64]:
+    """Rows of the buildings whose houses are all unmarked."""
+    unmarked = set(gathered.houses.ids[gathered.unmarked].tolist())
+    return np.array([k for k, names in enumerate(members) if unmarked.issuperset(names)], np.int64)
+
+
 def _terrain_around(task: Task, extent: Box | None, reach: float) -> Dtm:
     """Terrain around an extent, NaN at nodes of tiles that are absent; any where there is no extent."""
     spacing = task.parameters.dtm_spacing
@@ -378,11 +413,12 @@ def _members(task: Task) -> Result:
 def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
     """Read some arrays of the houses of the tile's clusters, by ascending id."""
     house, cluster, changed = (members.arrays[name] for name in ("house", "cluster", "changed"))
-    several, order = [], []
-    for result in task.read("houses", arrays):
+    several, order, other = [], [], [np.empty(0, np.bool_)]
+    for result in task.read("houses", (*arrays, "unmarked")):
         mine = np.flatnonzero((house[:, :2] == tile_key(result.name)).all(axis=1))
         several.append(take_houses(unpack_houses(result.arrays), house[mine, 2]))
         order.append(mine)
+        other.append(result.arrays["unmarked"][house[mine, 2]])
     rows = np.concatenate([np.empty(0, np.int64), *order])
     joined = join_houses(several)
     by_id = np.argsort(joined.ids, kind="stable")
@@ -390,16 +426,20 @@ def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
     of_part = houses.parts.house
     number = np.arange(len(of_part)) - np.searchsorted(of_part, of_part)
     place = np.column_stack((house[rows].reshape(-1, 3)[of_part], number)).astype(np.int64)
-    return _Gathered(houses, cluster[rows], changed[rows], place.reshape(-1, 4))
+    return _Gathered(houses, cluster[rows], changed[rows], np.concatenate(other)[by_id], place.reshape(-1, 4))
 
 
 @dataclass(frozen=True, eq=False)
 class _Gathered:
-    """Houses of a tile's clusters; ``place`` (p, 4) tells of each part its house's tile, row there, and number."""
+    """Houses of a tile's clusters, and whether roofs are of other classes than that of buildings.
+
+    ``place`` (p, 4) tells of each part its house's tile, row there, and number.
+    """
 
     houses: Houses
     cluster: NDArray[np.int64]
     changed: NDArray[np.bool_]
+    unmarked: NDArray[np.bool_]
     place: NDArray[np.int64]
 
 

@@ -9,7 +9,7 @@ import shapely
 
 from pipeline.errors import InputError
 from pipeline.notes import Note
-from pipeline.pointcloud import BUILDING, GROUND, WATER
+from pipeline.pointcloud import GROUND, WATER, rename_classes
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
 from pipeline.terrain import bin_nodes, bin_units
 from pipeline.terrain_fill import (
@@ -41,7 +41,9 @@ def input_stages(config: Config) -> list[Stage]:
     spacing = config.dtm_spacing
     ground = ("dtm_spacing", "ground_filter")
     return [
-        Stage("points", Scope.FILE, read_point_file, parameters=("skip_unreadable",), version=2),
+        Stage(
+            "points", Scope.FILE, read_point_file, parameters=("skip_unreadable", "building_classes"), version=3
+        ),
         Stage(
             "footprints",
             Scope.REGION,
@@ -93,13 +95,14 @@ def read_point_file(task: Task) -> Facts:
     """Read a point cloud file and deal its points out to cells (step 1.1)."""
     counts: Counter[str] = Counter()
     classes: set[int] = set()
+    become = rename_classes(task.parameters.building_classes)
     row = n_cells = 0
     blocks = [0]
     try:
         for block in read_cells(task.file, task.context.bounds):
             task.append(
                 units=block.units,
-                classification=block.classification,
+                classification=become[block.classification],
                 cell=block.cell,
                 cell_row=block.start[:-1] + row,
             )
@@ -118,7 +121,7 @@ def read_point_file(task: Task) -> Facts:
     return {
         "counts": dict(counts),
         "classes": sorted(classes),
-        "marks_buildings": BUILDING in classes,
+        "marks_buildings": bool(classes & set(task.parameters.building_classes)),
         "unreadable": None,
         **scaling,
     }

@@ -1,0 +1,202 @@
+"""Roofs that a cloud leaves in other classes than that of buildings (step 1.5, ours)."""
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.building_points import NEVER_ROOF
+from pipeline.inside import find_inside
+from pipeline.pointcloud import BUILDING, GROUND, N_CLASSES, WATER, PointCloud
+from pipeline.raster import Dtm, sample_dtm
+from pipeline.roof_points import RoofPoints, make_roof_points
+
+# Classes in which the roof of a house may be that has too few points of class 6.
+MAY_BE_ROOF = tuple(number for number in range(N_CLASSES) if number not in (BUILDING, *NEVER_ROOF))
+MARK_CELL = 1.0  # m, side of the cells that points of class 6 cover
+MARKED_SHARE = 0.2  # of a footprint; a neighbour's roof and stray points cover less of it, a roof of its own more
+DENSE = 4.0  # points of class 6 a square metre of footprint, above which a roof is marked without a closer look
+LEAST_HEIGHT = 2.0  # m above the terrain; cars, hedges and grass are below
+LEAST_POINTS = 10
+LEAST_COVER = 0.5  # of a footprint that its roof covers
+CELL_POINTS = 8  # that a cell has on average in which points are held against a plane
+CELL_SIDES = (1.0, 4.0)  # m, least and greatest side of such a cell
+FIT_POINTS = 4  # that tell how far they are from a plane
+NEARLY_ALL = 0.8  # share of smooth points of a house from which cells of fewer points are believed too
+# Root mean square distance from the plane of a cell up to which it is one of a roof: so much, and so much for each
+# metre of its side. A ridge of 45 degrees has 0.14 a metre, points anywhere in 3 m of a tree's crown have 0.87 m.
+SMOOTH, SMOOTH_SLOPE = 0.15, 0.1
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def find_bare(points: RoofPoints, polygons: NDArray[np.object_]) -> Mask:
+    """Tell which houses have no points of class 6, or so few that these are strays or of the house next door.
+
+    Parameters
+    ----------
+    points : RoofPoints
+        Points of class 6 inside each house, as from `locate_roof_points`.
+    polygons : object, (n,)
+        Houses.
+
+    Returns
+    -------
+    bool, (n,)
+        True where they lie in less than a fifth of its square metres.
+    """
+    count, area = np.diff(points.start), shapely.area(polygons)
+    bare: Mask = count == 0
+    thin = ~bare & (count < DENSE * area)
+    rows = np.flatnonzero(np.repeat(thin, count))
+    if len(rows) == 0:
+        return bare
+    house = np.repeat(np.arange(len(polygons)), count)[rows]
+    group, order = _group_by_cell(points.xyz[rows], house, np.full(len(polygons), MARK_CELL))
+    cells = np.bincount(house[order[_first_of(group)]], minlength=len(polygons))
+    return bare | (thin & (cells * MARK_CELL**2 < MARKED_SHARE * area))
+
+
+def locate_unmarked(others: PointCloud, polygons: NDArray[np.object_], dtm: Dtm) -> RoofPoints:
+    """Take the points of other classes inside each house that lie on smooth surfaces above the terrain.
+
+    Parameters
+    ----------
+    others : PointCloud
+        Points of the classes `MAY_BE_ROOF`.
+    polygons : object, (n,)
+        Valid shapely Polygons.
+    dtm : Dtm
+        Terrain without empty nodes.
+
+    Notes
+    -----
+    Points are held against the plane that fits best in cells of some eight points. A cell that is not smooth is
+    cut once at its largest gap in height: a crown above a roof, two roofs. What a house gets depends on its own
+    points alone, in whatever order they come.
+    """
+    high = others.xyz[:, 2] >= sample_dtm(dtm, others.xyz[:, :2]) + LEAST_HEIGHT
+    house, point = find_inside(others.xyz, polygons, among=high)
+    xyz = others.xyz[point]
+    smooth = _are_smooth(xyz, house, _cell_sides(house, polygons))
+    house, xyz = house[smooth], xyz[smooth]
+    start = np.concatenate(([0], np.cumsum(np.bincount(house, minlength=len(polygons)))))
+    return make_roof_points(start, xyz)
+
+
+def are_roofs(found: RoofPoints, polygons: NDArray[np.object_], cloud: PointCloud) -> Mask:
+    """Tell which houses have a roof of such points.
+
+    Parameters
+    ----------
+    found : RoofPoints
+        Result of `locate_unmarked`.
+    polygons : object, (n,)
+        The same houses.
+    cloud : PointCloud
+        Points that include those of ground and water inside the houses.
+
+    Returns
+    -------
+    bool, (n,)
+        True where they are ten at least, as many as those of ground inside, and cover half of the house.
+    """
+    ground = (cloud.classification == GROUND) | (cloud.classification == WATER)
+    inside, _ = find_inside(cloud.xyz, polygons, among=ground)
+    count = np.diff(found.start)
+    enough: Mask = (count >= LEAST_POINTS) & (count >= np.bincount(inside, minlength=len(polygons)))
+    house = np.repeat(np.arange(len(polygons)), count)
+    rows = enough[house]
+    side = _cell_sides(house, polygons)
+    group, order = _group_by_cell(found.xyz[rows], house[rows], side)
+    first = order[_first_of(group)]
+    owner, xy = house[rows][first], found.xyz[rows][first, :2]
+    low = np.floor(xy / side[owner, None]) * side[owner, None]
+    boxes = shapely.box(*low.T, *(low + side[owner, None]).T)
+    covered = np.bincount(owner, shapely.area(shapely.intersection(boxes, polygons[owner])), len(polygons))
+    return enough & (covered >= LEAST_COVER * shapely.area(polygons))
+
+
+def _cell_sides(house: Index, polygons: NDArray[np.object_]) -> Array:
+    """Side (m) of the cells of each house, for the points that are told to be in it."""
+    count = np.bincount(house, minlength=len(polygons))
+    return np.clip(np.sqrt(CELL_POINTS * shapely.area(polygons) / np.maximum(count, 1)), *CELL_SIDES)
+
+
+def _group_by_cell(xyz: Array, house: Index, side: Array) -> tuple[Index, Index]:
+    """Group points by house and cell; the groups (k,), ascending, and the rows that they belong to.
+
+    Within a group, points ascend by height, y and x.
+    """
+    cell = np.floor(xyz[:, :2] / side[house, None]).astype(np.int64)
+    order = np.lexsort((xyz[:, 0], xyz[:, 1], xyz[:, 2], cell[:, 0], cell[:, 1], house))
+    key = np.column_stack((house, cell))[order]
+    new = np.ones(len(key), np.bool_)
+    new[1:] = (key[1:] != key[:-1]).any(axis=1)
+    return np.cumsum(new) - 1, order
+
+
+def _first_of(group: Index) -> Index:
+    """Position of the first of each group."""
+    return np.unique(group, return_index=True)[1]
+
+
+def _are_smooth(xyz: Array, house: Index, side: Array) -> Mask:
+    """Tell which points lie on a plane together with others of their cell."""
+    smooth = np.zeros(len(xyz), np.bool_)
+    if len(xyz) == 0:
+        return smooth
+    group, order = _group_by_cell(xyz, house, side)
+    points, owner = xyz[order], house[order]
+    limit = (SMOOTH + SMOOTH_SLOPE * side)[owner]
+    flat = _distance_from_planes(points, group)[group] <= limit
+    halves = _cut_at_gaps(points[:, 2], group)
+    flat |= _distance_from_planes(points, halves)[halves] <= limit
+    few = np.bincount(halves)[halves] < FIT_POINTS
+    few &= ~flat
+    smooth[order] = flat | (few & _are_among(points[:, 2], owner, flat, few))
+    return smooth
+
+
+def _are_among(z: Array, owner: Index, flat: Mask, few: Mask) -> Mask:
+    """Tell which points are within the heights of the smooth ones of their house, where nearly all are smooth."""
+    n = int(owner[-1]) + 1
+    judged = np.bincount(owner, ~few, n)
+    share = np.bincount(owner, flat, n) / np.maximum(judged, 1)
+    low, high = np.full(n, np.inf), np.full(n, -np.inf)
+    np.minimum.at(low, owner[flat], z[flat])
+    np.maximum.at(high, owner[flat], z[flat])
+    among: Mask = (share[owner] >= NEARLY_ALL) & (low[owner] <= z) & (z <= high[owner])
+    return among
+
+
+def _cut_at_gaps(z: Array, group: Index) -> Index:
+    """Cut each group of ascending heights in two where its largest gap is; groups of the halves, ascending."""
+    gap = np.zeros(len(z))
+    inner = group[1:] == group[:-1]
+    gap[1:][inner] = np.diff(z)[inner]
+    largest = np.zeros(group[-1] + 1)
+    np.maximum.at(largest, group, gap)
+    cut = np.zeros(len(z), np.bool_)
+    begins = np.flatnonzero((gap == largest[group]) & (gap > 0))
+    cut[begins[_first_of(group[begins])]] = True  # the lowest of equal gaps
+    first = np.ones(len(z), np.bool_)
+    first[1:] = ~inner
+    halves: Index = np.cumsum(first | cut) - 1
+    return halves
+
+
+def _distance_from_planes(xyz: Array, group: Index) -> Array:
+    """Root mean square distance in height (m) of each group from its best plane; infinite for too few points."""
+    n = np.bincount(group)
+    centre = np.column_stack([np.bincount(group, column) / n for column in xyz.T])
+    x, y, z = (xyz - centre[group]).T
+    xx, xy, yy = (np.bincount(group, product) for product in (x * x, x * y, y * y))
+    xz, yz, zz = (np.bincount(group, product) for product in (x * z, y * z, z * z))
+    least = 1e-6 * n  # points on a line have no slope across it
+    xx, yy = xx + least, yy + least
+    determinant = xx * yy - xy * xy
+    explained = (yy * xz * xz - 2 * xy * xz * yz + xx * yz * yz) / determinant
+    squares = np.maximum(zz - explained, 0.0)
+    return np.where(n >= FIT_POINTS, np.sqrt(squares / np.maximum(n - 3, 1)), np.inf)
