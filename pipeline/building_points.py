@@ -17,7 +17,6 @@ from pipeline.pointcloud import (
     GROUND,
     HIGH_NOISE,
     HIGH_VEGETATION,
-    IGNORED_GROUND,
     KEY_POINT,
     LOW_NOISE,
     LOW_VEGETATION,
@@ -25,7 +24,7 @@ from pipeline.pointcloud import (
     OVERHEAD,
     RAIL,
     ROAD,
-    SNOW,
+    SEA,
     TRANSMISSION_TOWER,
     WATER,
     WIRE_CONDUCTOR,
@@ -34,11 +33,12 @@ from pipeline.pointcloud import (
     PointCloud,
 )
 
-# Where a cloud has no building class, a point of any class but these may lie on a roof.
+# Where a cloud has no building class, a point of any class but these may lie on a roof. Class 20 is ignored ground
+# to LAS 1.4, but all that is not ground, buildings above all, to North Rhine-Westphalia.
 NEVER_ROOF = (
     *(GROUND, LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION, LOW_NOISE, KEY_POINT, WATER, RAIL, ROAD),
     *(WIRE_GUARD, WIRE_CONDUCTOR, TRANSMISSION_TOWER, WIRE_CONNECTOR, BRIDGE_DECK, HIGH_NOISE, OVERHEAD),
-    *(IGNORED_GROUND, SNOW),
+    *SEA,
 )
 OUTLIER_DEVIATIONS = 2.0  # paper, step 1.5
 FINE_OUTLINE = 2000  # vertices; only the largest of real houses have so many

@@ -25,8 +25,7 @@ WIRE_CONNECTOR = 16
 BRIDGE_DECK = 17
 HIGH_NOISE = 18
 OVERHEAD = 19  # conveyors, gantries of signs
-IGNORED_GROUND = 20
-SNOW = 21
+SEA = (40, 41, 42, 43, 44, 45)  # bottom, surface and what is between; ASPRS topo-bathy domain profile
 N_CLASSES = 256  # that a point may have
 
 

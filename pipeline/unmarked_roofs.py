@@ -6,21 +6,33 @@ from numpy.typing import NDArray
 
 from pipeline.building_points import NEVER_ROOF
 from pipeline.inside import find_inside
-from pipeline.pointcloud import BUILDING, GROUND, N_CLASSES, WATER, PointCloud
+from pipeline.pointcloud import (
+    BUILDING,
+    GROUND,
+    HIGH_VEGETATION,
+    LOW_VEGETATION,
+    MEDIUM_VEGETATION,
+    N_CLASSES,
+    WATER,
+    PointCloud,
+)
 from pipeline.raster import Dtm, sample_dtm
 from pipeline.roof_points import RoofPoints, make_roof_points
 
 # Classes in which the roof of a house may be that has too few points of class 6.
 MAY_BE_ROOF = tuple(number for number in range(N_CLASSES) if number not in (BUILDING, *NEVER_ROOF))
+PLANTS = (LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION)
 MARK_CELL = 1.0  # m, side of the cells that points of class 6 cover
 MARKED_SHARE = 0.2  # of a footprint; a neighbour's roof and stray points cover less of it, a roof of its own more
 DENSE = 4.0  # points of class 6 a square metre of footprint, above which a roof is marked without a closer look
 LEAST_HEIGHT = 2.0  # m above the terrain; cars, hedges and grass are below
 LEAST_POINTS = 10
 LEAST_COVER = 0.5  # of a footprint that its roof covers
-CELL_POINTS = 8  # that a cell has on average in which points are held against a plane
+CELL_POINTS = 10  # that a cell has on average in which points are held against a plane
 CELL_SIDES = (1.0, 4.0)  # m, least and greatest side of such a cell
-FIT_POINTS = 4  # that tell how far they are from a plane
+FIT_POINTS = 5  # that tell how far they are from a plane
+LEAST_HALF = 0.3  # of the points of a cell that is cut in two: fewer are close to a plane by chance
+LEAST_SMOOTH = 0.4  # of the points of a house that are higher than `LEAST_HEIGHT`
 NEARLY_ALL = 0.8  # share of smooth points of a house from which cells of fewer points are believed too
 # Root mean square distance from the plane of a cell up to which it is one of a roof: so much, and so much for each
 # metre of its side. A ridge of 45 degrees has 0.14 a metre, points anywhere in 3 m of a tree's crown have 0.87 m.
@@ -64,7 +76,7 @@ def locate_unmarked(others: PointCloud, polygons: NDArray[np.object_], dtm: Dtm)
     Parameters
     ----------
     others : PointCloud
-        Points of the classes `MAY_BE_ROOF`.
+        Points of the classes that may be a roof.
     polygons : object, (n,)
         Valid shapely Polygons.
     dtm : Dtm
@@ -72,14 +84,17 @@ def locate_unmarked(others: PointCloud, polygons: NDArray[np.object_], dtm: Dtm)
 
     Notes
     -----
-    Points are held against the plane that fits best in cells of some eight points. A cell that is not smooth is
-    cut once at its largest gap in height: a crown above a roof, two roofs. What a house gets depends on its own
-    points alone, in whatever order they come.
+    Points are held against the plane that fits best in cells of some ten points. A cell that is not smooth is cut
+    once at its largest gap in height: a crown above a roof, two roofs. Where less than two fifths of a house's
+    points are smooth, it gets none: trees. What a house gets depends on its own points alone, in whatever order
+    they come.
     """
     high = others.xyz[:, 2] >= sample_dtm(dtm, others.xyz[:, :2]) + LEAST_HEIGHT
     house, point = find_inside(others.xyz, polygons, among=high)
     xyz = others.xyz[point]
     smooth = _are_smooth(xyz, house, _cell_sides(house, polygons))
+    n = len(polygons)
+    smooth &= (np.bincount(house[smooth], minlength=n) >= LEAST_SMOOTH * np.bincount(house, minlength=n))[house]
     house, xyz = house[smooth], xyz[smooth]
     start = np.concatenate(([0], np.cumsum(np.bincount(house, minlength=len(polygons)))))
     return make_roof_points(start, xyz)
@@ -152,8 +167,10 @@ def _are_smooth(xyz: Array, house: Index, side: Array) -> Mask:
     limit = (SMOOTH + SMOOTH_SLOPE * side)[owner]
     flat = _distance_from_planes(points, group)[group] <= limit
     halves = _cut_at_gaps(points[:, 2], group)
-    flat |= _distance_from_planes(points, halves)[halves] <= limit
-    few = np.bincount(halves)[halves] < FIT_POINTS
+    count = np.bincount(halves)[halves]
+    half_flat = _distance_from_planes(points, halves)[halves] <= limit
+    flat |= half_flat & (count >= LEAST_HALF * np.bincount(group)[group])
+    few = count < FIT_POINTS
     few &= ~flat
     smooth[order] = flat | (few & _are_among(points[:, 2], owner, flat, few))
     return smooth

@@ -9,30 +9,29 @@ from numpy.typing import NDArray
 
 from pipeline.adaptive import AdaptiveOptions
 from pipeline.building_points import reach_of_points
-from pipeline.city import find_places
 from pipeline.citymodel import Footprints
 from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leave_out, shape_clusters
 from pipeline.components import join_pairs
 from pipeline.groups import adjacent_houses
 from pipeline.houses import Houses, divide_houses, join_houses, take_houses
-from pipeline.inside import cover_polygons
 from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
 from pipeline.point_fidelity import measure_houses
-from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
+from pipeline.pointcloud import BUILDING, GROUND, WATER
 from pipeline.raster import Dtm, window_of
-from pipeline.roof_points import RoofPoints, add_roof_points, keep_roof_points, locate_roof_points
+from pipeline.roof_points import add_roof_points, keep_roof_points, locate_roof_points
 from pipeline.simplify import raise_buildings
 from pipeline.terrain import cut_terrain
 from pipeline.tile import measure_city, prepare_footprints
-from pipeline.unmarked_roofs import MAY_BE_ROOF, are_roofs, find_bare, locate_unmarked
+from pipeline.unmarked_roofs import MAY_BE_ROOF
 from stitch.grid import Key
 from tiler.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.config import Config
 from tiler.context import find_owned, region_around, tile_key
 from tiler.options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
-from tiler.readers import grow, read_cloud, read_known_terrain
+from tiler.readers import grow, read_known_terrain
 from tiler.stage import Box, Facts, Read, Scope, Stage
+from tiler.stages.house_points import add_unmarked, extent_of, find_surfaces, points_near
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import (
     ARRAYS_TO_RAISE,
@@ -147,19 +146,14 @@ def make_houses(task: Task) -> Facts:
         own = _owned(task, inner)
     places = np.array([(note.x, note.y) for note in notes]).reshape(-1, 2)
     task.notes(note for note, mine in zip(notes, find_owned(task.box, bounds, places), strict=True) if mine)
-    extent = _extent(own.polygons)
+    extent = extent_of(own.polygons)
     near = reach_of_points(own.polygons, options.ground_margin)
     dtm = _terrain_around(task, extent, 2 * spacing)
-    cloud = _points_near(task, extent, options.ground_margin, near, (BUILDING, GROUND, WATER))
+    cloud = points_near(task, extent, options.ground_margin, near, (BUILDING, GROUND, WATER))
     terrain = cut_terrain(dtm, window_of(dtm))
     with task.step("1.5 extract building points"):
         roofs = locate_roof_points(cloud, own.polygons, building_class=True)
-        bare = np.flatnonzero(find_bare(roofs, own.polygons))
-        found = _locate_unmarked(task, own.polygons[bare], terrain)
-        there = are_roofs(found, own.polygons[bare], cloud)
-        unmarked, found = bare[there], keep_roof_points(found, there)
-        task.notes(_note_unmarked(own, unmarked, np.diff(roofs.start)[unmarked], found))
-        roofs = add_roof_points(roofs, unmarked, found)
+        roofs, unmarked = add_unmarked(task, own, roofs, cloud, terrain)
     city = measure_city(cloud, own, terrain, options, building_class=True, roofs=roofs, trace=task.step)
     task.notes(city.notes)
     roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
@@ -173,7 +167,7 @@ def make_houses(task: Task) -> Facts:
     task.put(**pack_houses(houses), **pack_buildings(full, "full_"), unmarked=others)
     counts = {"buildings before merging": len(houses), **_count_parts(houses)}
     counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
-    return {"n": len(houses), "extent": _extent(houses.polygons), "counts": counts}
+    return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts}
 
 
 def find_near_houses(task: Task) -> Facts:
@@ -267,7 +261,7 @@ def shape_members(task: Task) -> Facts:
         closed=gathered.place[shapes.closed[:, 0]],
         closed_cluster=shapes.closed[:, 1],
     )
-    return {"n": len(shapes), "extent": _extent(shapes.polygons), "counts": dict(sorted(counts.items()))}
+    return {"n": len(shapes), "extent": extent_of(shapes.polygons), "counts": dict(sorted(counts.items()))}
 
 
 def make_model(task: Task) -> Facts:
@@ -287,7 +281,7 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     shapes = _earlier_shapes(task, replace(gathered, changed=np.zeros(len(gathered.houses), np.bool_)))
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0
     shapes = _keep_within(task, shapes, gathered.houses)
-    extent = _extent(shapes.polygons)
+    extent = extent_of(shapes.polygons)
     dtm = _terrain_around(task, extent, reach + 2 * given.dtm_spacing)
     reserved = {name for result in task.read("reserved", ()) for name in result.facts["names"]}
     terrain = cut_terrain(dtm, window_of(dtm))
@@ -301,12 +295,12 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
             layers, parted = choose_layers(
                 model.polygons, model.roof, city.wall_ground, city.group, pairs, dtm, bounds, mesh
             )
-    cloud = _points_near(task, extent, options.ground_margin, shapes.polygons, (BUILDING,))
+    cloud = points_near(task, extent, options.ground_margin, shapes.polygons, (BUILDING,))
     with task.step("2.4 fit of roofs"):
         roofs = locate_roof_points(cloud, city.model.polygons, building_class=True)
         del cloud
         rows = _find_unmarked(city.model.members, gathered)
-        roofs = add_roof_points(roofs, rows, _locate_unmarked(task, city.model.polygons[rows], terrain))
+        roofs = add_roof_points(roofs, rows, find_surfaces(task, city.model.polygons[rows], terrain, MAY_BE_ROOF))
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
     task.put(**pack_model(make_buildings(city, fidelity, layers)))
     counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
@@ -316,7 +310,7 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
 
 def _keep_within(task: Task, shapes: Shapes, houses: Houses) -> Shapes:
     """Leave out the buildings that leave the region: where its border turns inwards, a hull of several may."""
-    extent = _extent(shapes.polygons)
+    extent = extent_of(shapes.polygons)
     if extent is None:
         return shapes
     region = region_around(task.context.grid, extent)
@@ -341,42 +335,6 @@ def _owned(task: Task, footprints: Footprints) -> Footprints:
     xy = shapely.get_coordinates(shapely.point_on_surface(footprints.polygons))
     mine = find_owned(task.box, task.context.bounds, xy.reshape(-1, 2))
     return Footprints(footprints.polygons[mine], footprints.ids[mine], footprints.given_height[mine])
-
-
-def _points_near(
-    task: Task, extent: Box | None, margin: float, areas: NDArray[np.object_], classes: Sequence[int]
-) -> PointCloud:
-    """Points of some classes in areas, and some near them, as far as a margin around an extent, if any."""
-    if extent is None:
-        return PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
-    with task.step("1.1 points of houses"):
-        return read_cloud(
-            task,
-            grow(extent, margin),
-            classes=classes,
-            ground_filter=task.parameters.ground_filter,
-            cover=cover_polygons(areas),
-        )
-
-
-def _locate_unmarked(task: Task, polygons: NDArray[np.object_], terrain: Dtm) -> RoofPoints:
-    """Points of other classes in some houses that may be of their roofs."""
-    others = _points_near(task, _extent(polygons), 0.0, polygons, MAY_BE_ROOF)
-    return locate_unmarked(others, polygons, terrain)
-
-
-def _note_unmarked(
-    footprints: Footprints, rows: NDArray[np.int64], n_marked: NDArray[np.int64], found: RoofPoints
-) -> list[Note]:
-    """Tell of the houses whose roofs are of other classes."""
-    chosen = np.zeros(len(footprints.ids), np.bool_)
-    chosen[rows] = True
-    places = (place for _, place in find_places(footprints, chosen))
-    numbers = zip(places, n_marked.tolist(), np.diff(found.start).tolist(), strict=True)
-    return [
-        Note("footprint-roof-from-other-classes", *place, f"{n} points of class {BUILDING}, {other} of others")
-        for place, n, other in numbers
-    ]
 
 
 def _find_unmarked(members: Sequence[tuple[str, ...]], gathered: "_Gathered") -> NDArray[np.int64]:
@@ -472,13 +430,6 @@ def _find_rows(among: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.
     position[index[: len(among)]] = np.arange(len(among))
     found: NDArray[np.int64] = position[index[len(among) :]]
     return found
-
-
-def _extent(polygons: NDArray[np.object_]) -> Box | None:
-    if len(polygons) == 0:
-        return None
-    xmin, ymin, xmax, ymax = shapely.total_bounds(polygons).tolist()
-    return xmin, ymin, xmax, ymax
 
 
 def _hull(one: Box, other: Box) -> Box:

@@ -1,13 +1,16 @@
 """Stages 1.1 to 1.3: points of each file, footprints, and the terrain of each tile."""
 
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyproj
 import shapely
+from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from pipeline.ground_check import LEAST_STEP, compare_ground, is_upside_down
 from pipeline.notes import Note
 from pipeline.pointcloud import GROUND, WATER, rename_classes
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
@@ -28,7 +31,7 @@ from stitch.grid import Key, has_tile
 from tiler.config import Config
 from tiler.context import tile_key
 from tiler.footprint_index import scan_footprints
-from tiler.ingest import read_cells
+from tiler.ingest import CELL, read_cells
 from tiler.places import place
 from tiler.readers import clip, grow, join_rasters, read_bands, read_outlines, read_units
 from tiler.stage import Box, Facts, Read, Scope, Stage
@@ -42,7 +45,11 @@ def input_stages(config: Config) -> list[Stage]:
     ground = ("dtm_spacing", "ground_filter")
     return [
         Stage(
-            "points", Scope.FILE, read_point_file, parameters=("skip_unreadable", "building_classes"), version=3
+            "points",
+            Scope.FILE,
+            read_point_file,
+            parameters=("skip_unreadable", "building_classes", "ground_filter"),
+            version=3,
         ),
         Stage(
             "footprints",
@@ -98,6 +105,7 @@ def read_point_file(task: Task) -> Facts:
     become = rename_classes(task.parameters.building_classes)
     row = n_cells = 0
     blocks = [0]
+    steps = [np.empty(0)]
     try:
         for block in read_cells(task.file, task.context.bounds):
             task.append(
@@ -112,6 +120,10 @@ def read_point_file(task: Task) -> Facts:
             n_cells += len(block.cell)
             blocks.append(n_cells)
             scaling = {"scale": block.scale, "offset": block.offset}
+            z = block.units[:, 2] * block.scale[2] + block.offset[2]
+            steps.append(compare_ground(z, block.classification, block.start))
+        if not task.parameters.ground_filter:
+            _check_ground(task.file, np.concatenate(steps))
     except InputError as error:
         if not task.parameters.skip_unreadable:
             raise
@@ -125,6 +137,18 @@ def read_point_file(task: Task) -> Facts:
         "unreadable": None,
         **scaling,
     }
+
+
+def _check_ground(file: Path, steps: NDArray[np.float64]) -> None:
+    """Refuse a cloud whose class 2 lies above what has no class."""
+    if is_upside_down(steps):
+        high = steps[steps > LEAST_STEP]
+        raise InputError(
+            f"{file}: class {GROUND} lies {np.median(high):.1f} m above classes 0 and 1 in {len(high)} of "
+            f"{len(steps)} squares of {CELL:g} m, so it is not ground here: the cloud numbers its classes otherwise; "
+            "renumber them to those of ASPRS (pdal translate, filters.assign), or find ground anew with "
+            "--ground-filter"
+        )
 
 
 def read_footprint_file(task: Task) -> Facts:
