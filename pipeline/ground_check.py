@@ -11,7 +11,7 @@ LEAST_STEP = 1.0  # m that class 2 is higher on average; what has no class is hi
 LEAST_ROUGHNESS = (
     0.5  # m that class 2 is rougher, as standard deviation; a quay is smoother than what is on its water
 )
-LEAST_CELLS = 3
+LEAST_CELLS = 2
 
 
 def compare_ground(
@@ -61,7 +61,7 @@ def is_upside_down(steps: NDArray[np.float64]) -> bool:
 
     Examples
     --------
-    >>> is_upside_down(np.array([9.0, 8.0, 7.0, -1.0])), is_upside_down(np.array([9.0, -3.0, -3.0]))
+    >>> is_upside_down(np.array([9.0, 8.0, -1.0])), is_upside_down(np.array([9.0, -3.0, -3.0]))
     (True, False)
     """
     high = int((steps > LEAST_STEP).sum())

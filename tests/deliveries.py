@@ -37,6 +37,14 @@ def ground(x: Array, y: Array) -> Array:
     return np.asarray(GROUND_HEIGHT + 0.01 * x + 0.3 * np.sin(y / 25.0), np.float64)
 
 
+def house_of(xyz: Array) -> NDArray[np.int64]:
+    """House in whose outline each point lies, in metres from the town's corner; -1 for none."""
+    house = np.full(len(xyz), -1)
+    for k, (a, b, c, d, _) in enumerate(HOUSES):
+        house[(xyz[:, 0] > a) & (xyz[:, 0] < c) & (xyz[:, 1] > b) & (xyz[:, 1] < d)] = k
+    return house
+
+
 def scan(step: float = 0.8) -> tuple[Array, NDArray[np.str_]]:
     """Points of the town, (n, 3) in metres from its corner, and what each lies on."""
     rng = np.random.default_rng(7)
@@ -130,9 +138,51 @@ def write_delivery(folder: Path, delivery: Delivery) -> dict[str, Any]:
     if delivery.edit is not None:
         delivery.edit(las, what)
     path = folder / f"cloud{delivery.suffix}"
-    las.write(path)
+    if delivery.suffix == ".copc.laz":
+        write_copc(path, las, delivery)
+    else:
+        las.write(path)
     write_footprints(folder / "footprints.gpkg", delivery)
     return {"pointcloud": [str(path)], "footprints": str(folder / "footprints.gpkg"), **delivery.options}
+
+
+def write_copc(path: Path, las: laspy.LasData, delivery: Delivery) -> None:
+    """Write points as COPC, spread over three levels of the octree."""
+    import copclib as copc
+
+    xyz, classes, withheld = np.asarray(las.xyz), np.asarray(las.classification), np.asarray(las.withheld)
+    side, levels = 256.0, 3
+    corner = np.floor(xyz.min(axis=0)) - (1.0, 1.0, 0.0)
+    scale = copc.Vector3(*[delivery.scale] * 3)
+    wkt = pyproj.CRS(delivery.crs).to_wkt("WKT1_GDAL")
+    writer = copc.FileWriter(str(path), copc.CopcConfigWriter(6, scale, copc.Vector3(*corner), wkt))
+    info = writer.copc_config.copc_info
+    info.halfsize, info.spacing = side / 2, 10.0
+    info.center_x, info.center_y, info.center_z = (corner + side / 2).tolist()
+    level = np.arange(len(xyz)) % levels
+    rows = np.column_stack((level, np.floor((xyz - corner) / (side / 2.0 ** level[:, None])))).astype(int)
+    for node in np.unique(rows, axis=0):
+        points = copc.Points(writer.copc_config.las_header)
+        for row in np.flatnonzero((rows == node).all(axis=1)).tolist():
+            point = points.CreatePoint()
+            point.x, point.y, point.z = xyz[row].tolist()
+            point.classification, point.withheld = int(classes[row]), bool(withheld[row])
+            point.return_number = point.number_of_returns = 1
+            points.AddPoint(point)
+        writer.AddNode(copc.VoxelKey(*node.tolist()), points)
+    header = writer.copc_config.las_header
+    header.min, header.max = copc.Vector3(*xyz.min(axis=0)), copc.Vector3(*xyz.max(axis=0))
+    writer.Close()
+
+
+def forget_chunk_size(path: Path) -> None:
+    """Write 0 as chunk size into the LASzip record of a COPC file, where "variable" is 2^32 - 1."""
+    data = bytearray(path.read_bytes())
+    place = data.find(b"laszip encoded") - 2 + 54 + 12
+    if struct.unpack_from("<I", data, place)[0] != 2**32 - 1:
+        raise ValueError(f"{path}: no variable chunks")
+    struct.pack_into("<I", data, place, 0)
+    path.write_bytes(data)
 
 
 def add_record(header: laspy.LasHeader, delivery: Delivery) -> None:

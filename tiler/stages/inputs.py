@@ -145,7 +145,7 @@ def _check_ground(file: Path, steps: NDArray[np.float64]) -> None:
         high = steps[steps > LEAST_STEP]
         raise InputError(
             f"{file}: class {GROUND} lies {np.median(high):.1f} m above classes 0 and 1 in {len(high)} of "
-            f"{len(steps)} squares of {CELL:g} m, so it is not ground here: the cloud numbers its classes otherwise; "
+            f"{len(steps)} squares of {CELL:g} m, so it is not ground here: this cloud has classes of its own; "
             "renumber them to those of ASPRS (pdal translate, filters.assign), or find ground anew with "
             "--ground-filter"
         )
