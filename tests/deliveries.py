@@ -151,7 +151,7 @@ def write_copc(path: Path, las: laspy.LasData, delivery: Delivery) -> None:
     import copclib as copc
 
     xyz, classes, withheld = np.asarray(las.xyz), np.asarray(las.classification), np.asarray(las.withheld)
-    side, levels = 256.0, 3
+    side, levels = 512.0, 3
     corner = np.floor(xyz.min(axis=0)) - (1.0, 1.0, 0.0)
     scale = copc.Vector3(*[delivery.scale] * 3)
     wkt = pyproj.CRS(delivery.crs).to_wkt("WKT1_GDAL")
