@@ -12,6 +12,7 @@ LEAST_ROUGHNESS = (
     0.5  # m that class 2 is rougher, as standard deviation; a quay is smoother than what is on its water
 )
 LEAST_CELLS = 2
+SAMPLE = 100_000  # points that are compared at most
 
 
 def compare_ground(
@@ -41,7 +42,9 @@ def compare_ground(
     array([7.])
     """
     n_cells = len(start) - 1
-    cell = np.repeat(np.arange(n_cells), np.diff(start))
+    chosen = np.arange(0, len(z), max(len(z) // SAMPLE, 1))
+    cell = np.searchsorted(start, chosen, side="right") - 1
+    z, classification = z[chosen], classification[chosen]
     ground, other = classification == GROUND, classification <= UNCLASSIFIED
     n_ground, n_other = (np.bincount(cell[rows], minlength=n_cells) for rows in (ground, other))
     enough = (n_ground >= LEAST_POINTS) & (n_other >= np.maximum(LEAST_POINTS, LEAST_SHARE * n_ground))

@@ -67,7 +67,8 @@ def find_bare(points: RoofPoints, polygons: NDArray[np.object_]) -> Mask:
     house = np.repeat(np.arange(len(polygons)), count)[rows]
     group, order = _group_by_cell(points.xyz[rows], house, np.full(len(polygons), MARK_CELL))
     cells = np.bincount(house[order[_first_of(group)]], minlength=len(polygons))
-    return bare | (thin & (cells * MARK_CELL**2 < MARKED_SHARE * area))
+    bare |= thin & (cells * MARK_CELL**2 < MARKED_SHARE * area)
+    return bare
 
 
 def locate_unmarked(others: PointCloud, polygons: NDArray[np.object_], dtm: Dtm) -> RoofPoints:
@@ -130,13 +131,15 @@ def are_roofs(found: RoofPoints, polygons: NDArray[np.object_], cloud: PointClou
     low = np.floor(xy / side[owner, None]) * side[owner, None]
     boxes = shapely.box(*low.T, *(low + side[owner, None]).T)
     covered = np.bincount(owner, shapely.area(shapely.intersection(boxes, polygons[owner])), len(polygons))
-    return enough & (covered >= LEAST_COVER * shapely.area(polygons))
+    enough &= covered >= LEAST_COVER * shapely.area(polygons)
+    return enough
 
 
 def _cell_sides(house: Index, polygons: NDArray[np.object_]) -> Array:
     """Side (m) of the cells of each house, for the points that are told to be in it."""
     count = np.bincount(house, minlength=len(polygons))
-    return np.clip(np.sqrt(CELL_POINTS * shapely.area(polygons) / np.maximum(count, 1)), *CELL_SIDES)
+    sides: Array = np.clip(np.sqrt(CELL_POINTS * shapely.area(polygons) / np.maximum(count, 1)), *CELL_SIDES)
+    return sides
 
 
 def _group_by_cell(xyz: Array, house: Index, side: Array) -> tuple[Index, Index]:

@@ -72,7 +72,8 @@ def test_withheld_points_are_left_out_in_every_format(point_format: int, suffix:
 @pytest.mark.parametrize("flag", ["synthetic", "key_point", "overlap"])
 def test_other_flags_change_nothing(flag: str, tmp_path: Path) -> None:
     path = tmp_path / "cloud.laz"
-    assert_same(path, write(path, 6, n=2000, **{flag: np.arange(2000) % 2}))
+    fields: dict[str, Any] = {flag: np.arange(2000) % 2}
+    assert_same(path, write(path, 6, n=2000, **fields))
 
 
 @pytest.mark.parametrize("byte", [0x20, 0x40, 0x60])

@@ -1,7 +1,6 @@
 """Stages 1.1 to 1.3: points of each file, footprints, and the terrain of each tile."""
 
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -120,7 +119,7 @@ def read_point_file(task: Task) -> Facts:
             n_cells += len(block.cell)
             blocks.append(n_cells)
             scaling = {"scale": block.scale, "offset": block.offset}
-            z = block.units[:, 2] * block.scale[2] + block.offset[2]
+            z = np.asarray(block.units[:, 2] * block.scale[2] + block.offset[2], np.float64)
             steps.append(compare_ground(z, block.classification, block.start))
         if not task.parameters.ground_filter:
             _check_ground(task.file, np.concatenate(steps))
@@ -139,7 +138,7 @@ def read_point_file(task: Task) -> Facts:
     }
 
 
-def _check_ground(file: Path, steps: NDArray[np.float64]) -> None:
+def _check_ground(file: str, steps: NDArray[np.float64]) -> None:
     """Refuse a cloud whose class 2 lies above what has no class."""
     if is_upside_down(steps):
         high = steps[steps > LEAST_STEP]
