@@ -5,7 +5,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.building_points import NEVER_ROOF
-from pipeline.inside import find_inside
+from pipeline.inside import are_inside, find_inside
 from pipeline.pointcloud import (
     BUILDING,
     GROUND,
@@ -37,6 +37,10 @@ NEARLY_ALL = 0.8  # share of smooth points of a house from which cells of fewer 
 # Root mean square distance from the plane of a cell up to which it is one of a roof: so much, and so much for each
 # metre of its side. A ridge of 45 degrees has 0.14 a metre, points anywhere in 3 m of a tree's crown have 0.87 m.
 SMOOTH, SMOOTH_SLOPE = 0.15, 0.1
+SPOTS = (
+    np.indices((3, 3)).reshape(2, 9).T + 0.5
+) / 3  # of a cell of side 1, that tell how much of it is in a house
+PART = 500_000  # points that are looked at together; a house is not divided
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -65,8 +69,8 @@ def find_bare(points: RoofPoints, polygons: NDArray[np.object_]) -> Mask:
     if len(rows) == 0:
         return bare
     house = np.repeat(np.arange(len(polygons)), count)[rows]
-    group, order = _group_by_cell(points.xyz[rows], house, np.full(len(polygons), MARK_CELL))
-    cells = np.bincount(house[order[_first_of(group)]], minlength=len(polygons))
+    keys = _cell_keys(points.xyz[rows], house, np.full(len(polygons), MARK_CELL))
+    cells = np.bincount(house[np.unique(keys, return_index=True)[1]], minlength=len(polygons))
     bare |= thin & (cells * MARK_CELL**2 < MARKED_SHARE * area)
     return bare
 
@@ -119,18 +123,19 @@ def are_roofs(found: RoofPoints, polygons: NDArray[np.object_], cloud: PointClou
         True where they are ten at least, as many as those of ground inside, and cover half of the house.
     """
     ground = (cloud.classification == GROUND) | (cloud.classification == WATER)
-    inside, _ = find_inside(cloud.xyz, polygons, among=ground)
+    below, _ = find_inside(cloud.xyz, polygons, among=ground)
     count = np.diff(found.start)
-    enough: Mask = (count >= LEAST_POINTS) & (count >= np.bincount(inside, minlength=len(polygons)))
+    enough: Mask = (count >= LEAST_POINTS) & (count >= np.bincount(below, minlength=len(polygons)))
     house = np.repeat(np.arange(len(polygons)), count)
     rows = enough[house]
     side = _cell_sides(house, polygons)
-    group, order = _group_by_cell(found.xyz[rows], house[rows], side)
-    first = order[_first_of(group)]
+    first = np.unique(_cell_keys(found.xyz[rows], house[rows], side), return_index=True)[1]
     owner, xy = house[rows][first], found.xyz[rows][first, :2]
     low = np.floor(xy / side[owner, None]) * side[owner, None]
-    boxes = shapely.box(*low.T, *(low + side[owner, None]).T)
-    covered = np.bincount(owner, shapely.area(shapely.intersection(boxes, polygons[owner])), len(polygons))
+    places = (low[:, None] + side[owner, None, None] * SPOTS).reshape(-1, 2)
+    spots = np.repeat(owner, len(SPOTS))
+    inside = are_inside(polygons, spots, places, closed=True)
+    covered = np.bincount(spots[inside], minlength=len(polygons)) * side**2 / len(SPOTS)
     enough &= covered >= LEAST_COVER * shapely.area(polygons)
     return enough
 
@@ -142,30 +147,33 @@ def _cell_sides(house: Index, polygons: NDArray[np.object_]) -> Array:
     return sides
 
 
-def _group_by_cell(xyz: Array, house: Index, side: Array) -> tuple[Index, Index]:
-    """Group points by house and cell; the groups (k,), ascending, and the rows that they belong to.
-
-    Within a group, points ascend by height, y and x.
-    """
+def _cell_keys(xyz: Array, house: Index, side: Array) -> Index:
+    """Give the points of one house and cell one number: by house, then by cell."""
     cell = np.floor(xyz[:, :2] / side[house, None]).astype(np.int64)
-    order = np.lexsort((xyz[:, 0], xyz[:, 1], xyz[:, 2], cell[:, 0], cell[:, 1], house))
-    key = np.column_stack((house, cell))[order]
-    new = np.ones(len(key), np.bool_)
-    new[1:] = (key[1:] != key[:-1]).any(axis=1)
-    return np.cumsum(new) - 1, order
-
-
-def _first_of(group: Index) -> Index:
-    """Position of the first of each group."""
-    return np.unique(group, return_index=True)[1]
+    if len(cell) == 0:
+        return house
+    column, row = (cell - cell.min(axis=0)).T
+    keys: Index = (house * (row.max() + 1) + row) * (column.max() + 1) + column
+    return keys
 
 
 def _are_smooth(xyz: Array, house: Index, side: Array) -> Mask:
-    """Tell which points lie on a plane together with others of their cell."""
+    """Tell which points lie on a plane together with others of their cell; `house` ascends."""
     smooth = np.zeros(len(xyz), np.bool_)
-    if len(xyz) == 0:
-        return smooth
-    group, order = _group_by_cell(xyz, house, side)
+    first = 0
+    while first < len(xyz):
+        last = int(np.searchsorted(house, house[min(first + PART, len(xyz) - 1)], side="right"))
+        smooth[first:last] = _are_smooth_together(xyz[first:last], house[first:last], side)
+        first = last
+    return smooth
+
+
+def _are_smooth_together(xyz: Array, house: Index, side: Array) -> Mask:
+    """As `_are_smooth`, all at once; at least one point."""
+    smooth = np.zeros(len(xyz), np.bool_)
+    keys = _cell_keys(xyz, house, side)
+    order = np.lexsort((xyz[:, 0], xyz[:, 1], xyz[:, 2], keys))
+    group = np.cumsum(np.diff(keys[order], prepend=-1) != 0) - 1
     points, owner = xyz[order], house[order]
     limit = (SMOOTH + SMOOTH_SLOPE * side)[owner]
     flat = _distance_from_planes(points, group)[group] <= limit
@@ -200,7 +208,7 @@ def _cut_at_gaps(z: Array, group: Index) -> Index:
     np.maximum.at(largest, group, gap)
     cut = np.zeros(len(z), np.bool_)
     begins = np.flatnonzero((gap == largest[group]) & (gap > 0))
-    cut[begins[_first_of(group[begins])]] = True  # the lowest of equal gaps
+    cut[begins[np.unique(group[begins], return_index=True)[1]]] = True  # the lowest of equal gaps
     first = np.ones(len(z), np.bool_)
     first[1:] = ~inner
     halves: Index = np.cumsum(first | cut) - 1
