@@ -11,6 +11,7 @@ LEAST_STEP = 1.0  # m that class 2 is higher on average; what has no class is hi
 LEAST_ROUGHNESS = (
     0.5  # m that class 2 is rougher, as standard deviation; a quay is smoother than what is on its water
 )
+HIGHER_THAN_QUAYS = 5.0  # m from which class 2 may be as smooth as a flat roof
 LEAST_CELLS = 2
 SAMPLE = 100_000  # points that are compared at most
 
@@ -32,8 +33,8 @@ def compare_ground(
     Returns
     -------
     float64, (k,)
-        How much higher class 2 is on average (m), for the cells that have enough of both; 0 where it is not
-        rougher.
+        How much higher class 2 is on average (m), for the cells that have enough of both; 0 where it is smooth and
+        less than 5 m higher, as a quay.
 
     Examples
     --------
@@ -54,8 +55,8 @@ def compare_ground(
         squares = np.bincount(cell[rows], (z[rows] - centre[cell[rows]]) ** 2, n_cells) / np.maximum(n, 1)
         mean.append(centre[enough])
         deviation.append(np.sqrt(squares[enough]))
-    rough = deviation[0] > deviation[1] + LEAST_ROUGHNESS
-    steps: NDArray[np.float64] = np.where(rough, mean[0] - mean[1], 0.0)
+    steps = mean[0] - mean[1]
+    steps[(steps < HIGHER_THAN_QUAYS) & (deviation[0] <= deviation[1] + LEAST_ROUGHNESS)] = 0.0
     return steps
 
 
