@@ -1,5 +1,7 @@
 """Roofs that a cloud leaves in other classes than that of buildings (step 1.5, ours)."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -35,8 +37,10 @@ LEAST_HALF = 0.3  # of the points of a cell that is cut in two: fewer are close 
 LEAST_SMOOTH = 0.4  # of the points of a house that are higher than `LEAST_HEIGHT`
 NEARLY_ALL = 0.8  # share of smooth points of a house from which cells of fewer points are believed too
 # Root mean square distance from the plane of a cell up to which it is one of a roof: so much, and so much for each
-# metre of its side. A ridge of 45 degrees has 0.14 a metre, points anywhere in 3 m of a tree's crown have 0.87 m.
-SMOOTH, SMOOTH_SLOPE = 0.15, 0.1
+# metre of its side, at most. A ridge of 45 degrees has 0.14 a metre, points anywhere in 3 m of a crown 0.87 m.
+# With class 6 called class 1, 1,002 of 1,042 houses of Amsterdam (3.5 points a square metre) have a roof by this
+# rule, whose median is within 0.05, 0.4 and 0.6 m of that of class 6 in 50, 90 and 95 % of them.
+SMOOTH, SMOOTH_SLOPE, MOST_SMOOTH = 0.15, 0.2, 0.6
 SPOTS = (
     np.indices((3, 3)).reshape(2, 9).T + 0.5
 ) / 3  # of a cell of side 1, that tell how much of it is in a house
@@ -75,8 +79,24 @@ def find_bare(points: RoofPoints, polygons: NDArray[np.object_]) -> Mask:
     return bare
 
 
-def locate_unmarked(others: PointCloud, polygons: NDArray[np.object_], dtm: Dtm) -> RoofPoints:
-    """Take the points of other classes inside each house that lie on smooth surfaces above the terrain.
+@dataclass(frozen=True, eq=False)
+class UnmarkedRoofs:
+    """What may be the roofs of houses, of points of other classes.
+
+    Attributes
+    ----------
+    smooth : RoofPoints
+        Points on smooth surfaces above the terrain.
+    points : RoofPoints
+        These, and those between the lowest and the highest of them: dormers, ridges and steep gables are rough.
+    """
+
+    smooth: RoofPoints
+    points: RoofPoints
+
+
+def locate_unmarked(others: PointCloud, polygons: NDArray[np.object_], dtm: Dtm) -> UnmarkedRoofs:
+    """Look for smooth surfaces above the terrain in each house, among points of other classes.
 
     Parameters
     ----------
@@ -97,15 +117,19 @@ def locate_unmarked(others: PointCloud, polygons: NDArray[np.object_], dtm: Dtm)
     high = others.xyz[:, 2] >= sample_dtm(dtm, others.xyz[:, :2]) + LEAST_HEIGHT
     house, point = find_inside(others.xyz, polygons, among=high)
     xyz = others.xyz[point]
-    smooth = _are_smooth(xyz, house, _cell_sides(house, polygons))
     n = len(polygons)
+    smooth = _are_smooth(xyz, house, _cell_sides(house, polygons))
     smooth &= (np.bincount(house[smooth], minlength=n) >= LEAST_SMOOTH * np.bincount(house, minlength=n))[house]
-    house, xyz = house[smooth], xyz[smooth]
-    start = np.concatenate(([0], np.cumsum(np.bincount(house, minlength=len(polygons)))))
+    within = _are_between(xyz[:, 2], house, smooth)
+    return UnmarkedRoofs(*(_by_house(xyz[rows], house[rows], n) for rows in (smooth, within)))
+
+
+def _by_house(xyz: Array, house: Index, n: int) -> RoofPoints:
+    start = np.concatenate(([0], np.cumsum(np.bincount(house, minlength=n))))
     return make_roof_points(start, xyz)
 
 
-def are_roofs(found: RoofPoints, polygons: NDArray[np.object_], cloud: PointCloud) -> Mask:
+def are_roofs(found: UnmarkedRoofs, polygons: NDArray[np.object_], cloud: PointCloud) -> Mask:
     """Tell which houses have a roof of such points.
 
     Parameters
@@ -120,18 +144,18 @@ def are_roofs(found: RoofPoints, polygons: NDArray[np.object_], cloud: PointClou
     Returns
     -------
     bool, (n,)
-        True where they are ten at least, as many as those of ground inside, and cover half of the house.
+        True where the smooth ones are ten at least, as many as those of ground inside, and cover half of a house.
     """
     ground = (cloud.classification == GROUND) | (cloud.classification == WATER)
     below, _ = find_inside(cloud.xyz, polygons, among=ground)
-    count = np.diff(found.start)
+    xyz, count = found.smooth.xyz, np.diff(found.smooth.start)
     enough: Mask = (count >= LEAST_POINTS) & (count >= np.bincount(below, minlength=len(polygons)))
     house = np.repeat(np.arange(len(polygons)), count)
     rows = enough[house]
     side = _cell_sides(house, polygons)
-    first = np.unique(_cell_keys(found.xyz[rows], house[rows], side), return_index=True)[1]
-    owner, xy = house[rows][first], found.xyz[rows][first, :2]
-    low = np.floor(xy / side[owner, None]) * side[owner, None]
+    first = np.unique(_cell_keys(xyz[rows], house[rows], side), return_index=True)[1]
+    owner, corner = house[rows][first], xyz[rows][first, :2]
+    low = np.floor(corner / side[owner, None]) * side[owner, None]
     places = (low[:, None] + side[owner, None, None] * SPOTS).reshape(-1, 2)
     spots = np.repeat(owner, len(SPOTS))
     inside = are_inside(polygons, spots, places, closed=True)
@@ -175,7 +199,7 @@ def _are_smooth_together(xyz: Array, house: Index, side: Array) -> Mask:
     order = np.lexsort((xyz[:, 0], xyz[:, 1], xyz[:, 2], keys))
     group = np.cumsum(np.diff(keys[order], prepend=-1) != 0) - 1
     points, owner = xyz[order], house[order]
-    limit = (SMOOTH + SMOOTH_SLOPE * side)[owner]
+    limit = np.minimum(SMOOTH + SMOOTH_SLOPE * side, MOST_SMOOTH)[owner]
     flat = _distance_from_planes(points, group)[group] <= limit
     halves = _cut_at_gaps(points[:, 2], group)
     count = np.bincount(halves)[halves]
@@ -190,13 +214,18 @@ def _are_smooth_together(xyz: Array, house: Index, side: Array) -> Mask:
 def _are_among(z: Array, owner: Index, flat: Mask, few: Mask) -> Mask:
     """Tell which points are within the heights of the smooth ones of their house, where nearly all are smooth."""
     n = int(owner[-1]) + 1
-    judged = np.bincount(owner, ~few, n)
-    share = np.bincount(owner, flat, n) / np.maximum(judged, 1)
+    share = np.bincount(owner, flat, n) / np.maximum(np.bincount(owner, ~few, n), 1)
+    return (share >= NEARLY_ALL)[owner] & _are_between(z, owner, flat)
+
+
+def _are_between(z: Array, owner: Index, some: Mask) -> Mask:
+    """Tell which heights are between the least and the greatest of some of their owner, if any."""
+    n = int(owner.max(initial=-1)) + 1
     low, high = np.full(n, np.inf), np.full(n, -np.inf)
-    np.minimum.at(low, owner[flat], z[flat])
-    np.maximum.at(high, owner[flat], z[flat])
-    among: Mask = (share[owner] >= NEARLY_ALL) & (low[owner] <= z) & (z <= high[owner])
-    return among
+    np.minimum.at(low, owner[some], z[some])
+    np.maximum.at(high, owner[some], z[some])
+    between: Mask = (low[owner] <= z) & (z <= high[owner])
+    return between
 
 
 def _cut_at_gaps(z: Array, group: Index) -> Index:

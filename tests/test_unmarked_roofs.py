@@ -1,14 +1,18 @@
 """Step 1.5: roofs that a cloud leaves in other classes, house by house."""
 
 from collections.abc import Callable
+from pathlib import Path
 
+import laspy
 import numpy as np
+import pyogrio
 import pytest
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.pointcloud import BUILDING, GROUND, UNCLASSIFIED, PointCloud, rename_classes
 from pipeline.roof_points import RoofPoints, locate_roof_points
+from pipeline.terrain import compute_dtm
 from pipeline.unmarked_roofs import MAY_BE_ROOF, are_roofs, find_bare, locate_unmarked
 from tests.cities import tilted_dtm
 
@@ -62,7 +66,7 @@ def ground(*several: Array) -> PointCloud:
 def found_roof(others: PointCloud, soil: PointCloud | None = None) -> tuple[bool, RoofPoints]:
     found = locate_unmarked(others, ONE, DTM)
     (there,) = are_roofs(found, ONE, ground() if soil is None else soil)
-    return bool(there), found
+    return bool(there), found.points
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)
@@ -77,6 +81,15 @@ def test_a_gable_is_a_roof(spacing: float) -> None:
     there, found = found_roof(unclassified(scan(HOUSE, gable, spacing=spacing)))
     assert there
     assert np.median(found.z) == pytest.approx(2 + 6.5, abs=0.3)
+
+
+@pytest.mark.parametrize("spacing", SPACINGS[:2])
+def test_a_steep_roof_of_a_narrow_house_is_a_roof(spacing: float) -> None:
+    house = np.array([shapely.box(10, 10, 15.5, 22)], object)
+    points = scan(house[0], lambda x, _: 14 - 1.7 * np.abs(x - 12.75), spacing=spacing)  # 60 degrees
+    found = locate_unmarked(unclassified(points), house, DTM)
+    assert are_roofs(found, house, ground()).all()
+    assert np.median(found.points.z) == pytest.approx(2 + 14 - 1.7 * 1.375, abs=0.3)
 
 
 def test_two_levels_are_one_roof_with_all_its_points() -> None:
@@ -125,7 +138,7 @@ def test_the_order_of_points_and_other_houses_change_nothing() -> None:
     houses = np.array([HOUSE, shapely.box(22, 10, 35, 20)], object)
     others = unclassified(scan(shapely.union_all(houses), gable), crown(20, 15, n=200))
     order = np.random.default_rng(2).permutation(len(others.xyz))
-    both = locate_unmarked(PointCloud(others.xyz[order], others.classification), houses, DTM)
+    both = locate_unmarked(PointCloud(others.xyz[order], others.classification), houses, DTM).points
     _, alone = found_roof(others)
     np.testing.assert_array_equal(both.z[: both.start[1]], alone.z)
 
@@ -152,3 +165,27 @@ def test_classes_that_mark_buildings_take_the_place_of_6() -> None:
     assert rename_classes([6]).tolist() == list(range(256))
     assert rename_classes([6, 67])[[6, 67, 1]].tolist() == [6, 6, 1]
     assert rename_classes([67])[[6, 67, 1]].tolist() == [1, 6, 1]
+
+
+@pytest.mark.long
+def test_houses_of_amsterdam_have_their_roofs_without_class_6(shared_data: Path) -> None:
+    parts = [laspy.read(path) for path in sorted((shared_data / "amsterdam" / "tiles").glob("*.laz"))]
+    xyz = np.concatenate([np.asarray(part.xyz) for part in parts])
+    cloud = PointCloud(xyz, np.concatenate([np.asarray(part.classification, np.uint8) for part in parts]))
+    bounds = (*np.floor(xyz[:, :2].min(axis=0)).tolist(), *np.ceil(xyz[:, :2].max(axis=0)).tolist())
+    houses = shapely.from_wkb(pyogrio.raw.read(shared_data / "amsterdam" / "footprints.shp")[2])
+    houses = houses[shapely.is_valid(houses) & (shapely.get_type_id(houses) == 3) & (shapely.area(houses) > 5)]
+    houses = houses[shapely.contains(shapely.box(*bounds), houses)]
+    marked = locate_roof_points(cloud, houses, building_class=True)
+    assert find_bare(marked, houses).sum() <= 5
+    others = np.isin(cloud.classification, (*MAY_BE_ROOF, BUILDING))
+    unmarked = PointCloud(xyz[others], cloud.classification[others])
+    found = locate_unmarked(unmarked, houses, compute_dtm(cloud, bounds))
+    there = np.flatnonzero(are_roofs(found, houses, cloud) & (np.diff(marked.start) > 0))
+    assert len(there) > 0.95 * len(houses)
+    medians = [
+        [np.median(points.z[points.start[k] : points.start[k + 1]]) for k in there.tolist()]
+        for points in (marked, found.points)
+    ]
+    error = np.percentile(np.abs(np.subtract(*medians)), [50, 90, 95])
+    assert (error < (0.1, 0.5, 0.8)).all()

@@ -300,7 +300,8 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
         roofs = locate_roof_points(cloud, city.model.polygons, building_class=True)
         del cloud
         rows = _find_unmarked(city.model.members, gathered)
-        roofs = add_roof_points(roofs, rows, find_surfaces(task, city.model.polygons[rows], terrain, MAY_BE_ROOF))
+        others = find_surfaces(task, city.model.polygons[rows], terrain, MAY_BE_ROOF)
+        roofs = add_roof_points(roofs, rows, others.points)
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
     task.put(**pack_model(make_buildings(city, fidelity, layers)))
     counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}

@@ -13,7 +13,7 @@ from pipeline.notes import Note
 from pipeline.pointcloud import BUILDING, PointCloud
 from pipeline.raster import Dtm
 from pipeline.roof_points import RoofPoints, add_roof_points, keep_roof_points
-from pipeline.unmarked_roofs import MAY_BE_ROOF, PLANTS, are_roofs, find_bare, locate_unmarked
+from pipeline.unmarked_roofs import MAY_BE_ROOF, PLANTS, UnmarkedRoofs, are_roofs, find_bare, locate_unmarked
 from tiler.readers import grow, read_cloud
 from tiler.stage import Box
 from tiler.task import Task
@@ -95,7 +95,9 @@ def add_unmarked(
     return add_roof_points(roofs, rows, found), rows
 
 
-def find_surfaces(task: Task, polygons: NDArray[np.object_], terrain: Dtm, classes: Sequence[int]) -> RoofPoints:
+def find_surfaces(
+    task: Task, polygons: NDArray[np.object_], terrain: Dtm, classes: Sequence[int]
+) -> UnmarkedRoofs:
     """Read the points of some classes in some houses that may be of their roofs, as `locate_unmarked`."""
     others = points_near(task, extent_of(polygons), 0.0, polygons, classes)
     return locate_unmarked(others, polygons, terrain)
@@ -107,7 +109,7 @@ def _find_roofs(
     """Find which of some houses have a roof in some classes, and its points."""
     found = find_surfaces(task, polygons[rows], terrain, classes)
     there = are_roofs(found, polygons[rows], cloud)
-    return rows[there], keep_roof_points(found, there)
+    return rows[there], keep_roof_points(found.points, there)
 
 
 def _note_each(kind: str, footprints: Footprints, rows: Rows, details: Sequence[str]) -> list[Note]:
