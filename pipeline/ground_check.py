@@ -55,7 +55,7 @@ def compare_ground(
         squares = np.bincount(cell[rows], (z[rows] - centre[cell[rows]]) ** 2, n_cells) / np.maximum(n, 1)
         mean.append(centre[enough])
         deviation.append(np.sqrt(squares[enough]))
-    steps = mean[0] - mean[1]
+    steps: NDArray[np.float64] = mean[0] - mean[1]
     steps[(steps < HIGHER_THAN_QUAYS) & (deviation[0] <= deviation[1] + LEAST_ROUGHNESS)] = 0.0
     return steps
 

@@ -187,5 +187,5 @@ def test_houses_of_amsterdam_have_their_roofs_without_class_6(shared_data: Path)
         [np.median(points.z[points.start[k] : points.start[k + 1]]) for k in there.tolist()]
         for points in (marked, found.points)
     ]
-    error = np.percentile(np.abs(np.subtract(*medians)), [50, 90, 95])
+    error = np.percentile(np.abs(np.array(medians[0]) - np.array(medians[1])), [50, 90, 95])
     assert (error < (0.1, 0.5, 0.8)).all()
