@@ -246,6 +246,28 @@ def test_ground_plants_water_and_bridges_make_no_roof(number: int, tmp_path: Pat
     assert [item["subject"] for item in record["notes"]["footprint-roof-from-default"]["items"]] == ["h09"]
 
 
+def overlap(las: laspy.LasData, what: NDArray[np.str_]) -> None:
+    """Every second point is of the overlap of two strips, class 12 up to LAS 1.3, whatever it lies on."""
+    las.classification[1::2][what[1::2] != "noise"] = 12
+
+
+@pytest.mark.parametrize("name", ["pnoa", "lantmateriet"])
+def test_points_in_the_overlap_of_strips_do_no_harm(name: str, tmp_path: Path) -> None:
+    record = run_delivery(replace(DELIVERIES[name], edit=overlap), tmp_path)
+    assert not other_roofs(record)
+    assert_right(tmp_path)
+
+
+def test_strays_of_the_next_house_do_not_mark_a_roof(tmp_path: Path) -> None:
+    def edit(las: laspy.LasData, what: NDArray[np.str_]) -> None:
+        roofs_of((9,), 1)(las, what)
+        place = np.asarray(las.xyz) - np.floor(np.asarray(las.xyz).min(axis=0))
+        las.classification[(house_of(place) == 9) & (place[:, 0] < HOUSES[9][0] + 0.8)] = 6
+
+    assert other_roofs(run_delivery(replace(DELIVERIES["linz"], edit=edit), tmp_path)) == ["h09"]
+    assert_right(tmp_path)
+
+
 def test_other_classes_may_mark_buildings(tmp_path: Path) -> None:
     delivery = replace(DELIVERIES["linz"], edit=roofs_of((2, 9), 67))
     record = run_delivery(delivery, tmp_path, building_classes=(6, 67))

@@ -18,6 +18,7 @@ from tests.test_clouds import EVERYWHERE, ORIGIN
 from tests.test_deliveries import DELIVERIES
 from tiler.cli import main
 from tiler.clouds import find_clouds, read_header, read_points
+from tiler.config import load_config, make_config, write_config
 from tiler.ingest import read_cells
 from tiler.quarantine import command_alone
 
@@ -161,3 +162,13 @@ def test_tiles_west_and_south_of_the_origin_are_named_on_the_command_line(
 def test_classes_that_mark_no_buildings_are_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "cloud.laz", "--building-classes", words]) == 2
     assert "building_classes" in capsys.readouterr().err
+
+
+def test_classes_that_mark_buildings_are_given_with_commas_or_as_a_list(tmp_path: Path) -> None:
+    for given in ("6,67", "6, 67", [6, 67], (6, 67)):
+        config = make_config({"building_classes": given})
+        assert config.building_classes == (6, 67)
+    (tmp_path / "config.toml").write_text(write_config(config))
+    assert make_config(load_config(tmp_path / "config.toml")).building_classes == (6, 67)
+    assert make_config({"building_classes": 67}).building_classes == (67,)
+    assert make_config({}).building_classes == (6,)

@@ -81,7 +81,7 @@ class Config:
         (), "input", "region as xmin ymin xmax ymax; empty: whole metres within the point clouds", unit="m"
     )
     building_classes: tuple[int, ...] = _parameter(
-        (BUILDING,), "input", "classes of points that mark buildings, as 6,67; class 6 alone by default",
+        (BUILDING,), "input", "classes of points that mark buildings, as 6,67",
         source="ASPRS LAS 1.4", least=0, most=255,
     )  # fmt: skip
     skip_unreadable: bool = _parameter(
