@@ -1,5 +1,6 @@
 """Inputs are read once: points dealt out to cells, footprints to a grid, both found again by box."""
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,6 +35,7 @@ from tiler.footprint_index import (
     select_footprints,
     take_rows,
 )
+from tiler.georeference.frame import AS_IT_IS
 from tiler.ingest import CELL, PointBlock, read_cells
 from tiler.lasheader import read_promise
 from tiler.layers import describe_layer, scan_layer
@@ -370,7 +372,14 @@ def test_a_tile_reads_the_rows_of_its_cells_alone(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(inputs, "scan_footprints", partial(scan_footprints, batch=150))
     tiles = {f"{i}_{j}": (X + 900.0 * i, Y + 900.0 * j, X + 900.0 * (i + 1), Y + 900.0 * (j + 1)) for i, j in NEAR}
     parameters = SimpleNamespace(
-        footprints=str(path), footprints_identity="", layer="", id_attribute="", height_attribute="h"
+        footprints=str(path),
+        footprints_identity="",
+        footprints_frame=dataclasses.astuple(AS_IT_IS),
+        footprints_shift=(0.0, 0.0),
+        align=False,
+        layer="",
+        id_attribute="",
+        height_attribute="h",
     )
     context = SimpleNamespace(crs=RD.to_wkt(), bounds=REGION)
     layout = Layout(tiles=tiles, bounds=REGION)

@@ -61,7 +61,7 @@ def plan_run(
         if path is not None and not path.parent.is_dir():
             raise ConfigError(f"{path}: there is no folder {path.parent}; make it, or choose another")
     survey = survey_inputs(config, say_nothing)
-    sample = sample_footprints(config, survey.region)
+    sample = sample_footprints(config, survey.region, frame=survey.georeference.footprints)
     memory = None if config.on_cluster else machine_memory()
     forecast = forecast_run(survey, sample, config, memory=memory)
     plan = describe_plan(survey, sample, forecast, config, memory)
@@ -92,6 +92,7 @@ def describe_plan(
             "area": float(loads.area.sum()),
         }
         | ({"core": list(survey.region.bounds)} if config.padded else {}),
+        "georeference": survey.georeference.record,
         "tiles": {
             "size": config.tile_size_or_default,
             "present": len(loads),
