@@ -185,6 +185,10 @@ def test_axes_to_the_west_and_south_are_turned() -> None:
     plain = establish(cloud("EPSG:5513", bounds=(-742800.0, -1042700.0, -742600.0, -1042500.0, 0.0, 9.0)))
     assert plain.clouds[0].frame == AS_IT_IS
     assert "the coordinates grow to the east and north" in plain.messages[0]
+    # northing before easting
+    swapped = establish(cloud("EPSG:28992", bounds=(485900.0, 120600.0, 486500.0, 121200.0, 0.0, 9.0)))
+    assert swapped.clouds[0].bounds[:4] == AMSTERDAM[:4]
+    assert "the northing comes first" in swapped.messages[0]
     with pytest.raises(InputError, match="axes to the north and west"):
         establish(cloud("EPSG:2296"))
 

@@ -35,7 +35,7 @@ from tiler.footprint_index import (
     select_footprints,
     take_rows,
 )
-from tiler.georeference.frame import AS_IT_IS
+from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.ingest import CELL, PointBlock, read_cells
 from tiler.lasheader import read_promise
 from tiler.layers import describe_layer, scan_layer
@@ -243,6 +243,18 @@ def test_copc_by_query_is_copc_from_end_to_end(copc_file: Path, monkeypatch: pyt
     (same,) = read_cells(copc_file, box)
     assert once.units.tobytes() == same.units.tobytes()  # in the same order, too
     assert set(same.classes) == {1, 2, 6, 7}
+
+
+def test_copc_in_feet_is_queried_by_the_box_of_the_region(copc_file: Path) -> None:
+    x, y, _ = ORIGIN
+    foot, box = 0.3048, (x - 100, y - 300, x + 30.5, y - 128)
+    feet = Frame((0, foot), (1, foot), foot)
+    plain = list(read_cells(copc_file, box))
+    xmin, ymin, xmax, ymax = (value * foot for value in box)
+    metric = list(read_cells(copc_file, (xmin, ymin, xmax, ymax), frame=feet))
+    assert total(metric) == total(plain)
+    np.testing.assert_allclose(sorted_rows(whole(metric)), sorted_rows(whole(plain)) * (foot, foot, foot, 1))
+    assert metric[0].scale == tuple(value * foot for value in plain[0].scale)
 
 
 def test_copc_is_queried_only_where_that_saves_half(copc_file: Path) -> None:

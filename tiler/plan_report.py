@@ -220,8 +220,8 @@ def _describe_coordinates(found: dict[str, Any]) -> str:
     heights = " and ".join(sorted(unit_name(unit) for unit in units))
     taken = ", ".join(dict.fromkeys(cloud["taken as"] for cloud in found["clouds"]))
     return (
-        f"coordinates of {taken}, heights in {heights}{'' if stated else ' (not stated)'}; a metre on the ground is "
-        f"{found['scale of the projection']:.4f} m in plan"
+        f"coordinates of {taken}, heights in {heights}{'' if stated else ' (not stated)'}; a metre on the ground "
+        f"is {found['scale of the projection']:.4f} m in plan"
     )
 
 

@@ -215,19 +215,28 @@ def _with_unit(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, told: Told
             f"{unit_name(unit)}; coordinates are taken in {unit_name(unit if taken is keyed else sizes[0])}",
         )
         return taken
-    if metric.east[1] < 0 or metric.north[1] < 0:
-        plain = MetricCrs(metric.crs, (0, sizes[0]), (1, sizes[1]))
-        if not is_on_its_place(metric_box(group, metric), metric.crs) and is_on_its_place(
-            metric_box(group, plain), plain.crs
-        ):
+    return _with_axes(group, crs, metric, told)
+
+
+def _with_axes(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, told: Told) -> MetricCrs:
+    """Take the axes that the coordinates show, where those of the CRS put them off its area of use."""
+    if is_on_its_place(metric_box(group, metric), metric.crs):
+        return metric
+    sizes = abs(metric.east[1]), abs(metric.north[1])
+    others = {
+        f"{crs_name(crs)} has axes to the {directions_of(crs)}, but the coordinates grow to the east and north": (
+            MetricCrs(metric.crs, (0, sizes[0]), (1, sizes[1]))
+        ),
+        f"the northing comes first, before the easting of {crs_name(crs)}": (
+            MetricCrs(metric.crs, (1, sizes[0]), (0, sizes[1]))
+        ),
+    }
+    for words, other in others.items():
+        if other != metric and is_on_its_place(metric_box(group, other), other.crs):
             told.say(
-                "cloud-axes",
-                group.first.path.name,
-                f"{group.label}: {crs_name(crs)} has axes to the {directions_of(crs)}, but the coordinates grow "
-                "to the "
-                f"east and north; taken as {crs_name(metric.crs)}",
+                "cloud-axes", group.first.path.name, f"{group.label}: {words}; taken as {crs_name(metric.crs)}"
             )
-            return plain
+            return other
     return metric
 
 
