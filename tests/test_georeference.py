@@ -288,6 +288,11 @@ def test_footprints_without_a_crs_are_where_the_cloud_is() -> None:
     assert establish(cloud("EPSG:2263+6360", bounds=NEW_YORK_FEET), extent=metric).footprints == AS_IT_IS
 
 
+def test_a_crs_that_proj_cannot_transform_is_refused() -> None:
+    with pytest.raises(InputError, match=r"ESRI:102470, or PROJ has no transformation of it"):
+        establish(cloud("ESRI:102470", bounds=(100000.0, -2500000.0, 100100.0, -2499900.0, 0.0, 9.0)))
+
+
 def test_a_cloud_off_its_crs_is_told() -> None:
     far = cloud(None, bounds=(318000.0, 6399000.0, 319000.0, 6400000.0, 0.0, 9.0))
     assert len(establish(far, crs="EPSG:3006").messages) == 1

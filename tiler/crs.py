@@ -165,7 +165,8 @@ def scale_of(bounds: Sequence[float], crs: pyproj.CRS) -> float:
     Returns
     -------
     float
-        Of the directions along both axes that which is farther from 1; NaN if the box is not on Earth.
+        Of the directions along both axes that which is farther from 1; NaN if the box is not on Earth, or PROJ has
+        no transformation of the CRS.
 
     Examples
     --------
@@ -179,7 +180,10 @@ def scale_of(bounds: Sequence[float], crs: pyproj.CRS) -> float:
         return math.nan
     x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
     ends = np.array([(x - reach, y), (x + reach, y), (x, y - reach), (x, y + reach)])
-    lon, lat = pyproj.Transformer.from_crs(crs, base, always_xy=True).transform(*ends.T)
+    try:
+        lon, lat = pyproj.Transformer.from_crs(crs, base, always_xy=True).transform(*ends.T)
+    except pyproj.exceptions.ProjError:  # some entries of the Esri register lack a parameter
+        return math.nan
     if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
         return math.nan
     geod = base.get_geod()

@@ -1,5 +1,6 @@
 """Where a region lies: its CRS, and how coordinates of each cloud and of the footprints become those of it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -235,7 +236,12 @@ def _check_scale(crs: pyproj.CRS, clouds: Sequence[CloudHeader], asked: Asked) -
     """Refuse a projection whose lengths are not those on the ground."""
     box = box_around([cloud.bounds for cloud in clouds])
     scale = scale_of(box, crs)
-    if not abs(scale - 1) > LARGEST_SCALE:  # NaN: off the Earth, which is told otherwise
+    if math.isnan(scale):
+        raise InputError(
+            f"{clouds[0].path}: coordinates such as ({box[0]:.10g}, {box[1]:.10g}) have no place on Earth in "
+            f"{crs_name(crs)}, or PROJ has no transformation of it; give the right CRS with --crs"
+        )
+    if abs(scale - 1) <= LARGEST_SCALE:
         return scale
     if not is_on_its_place(box, crs):
         area = crs.area_of_use.name if crs.area_of_use else ""
