@@ -200,10 +200,6 @@ def test_no_points_claimed_but_many_held(tmp_path: Path, xyz: np.ndarray) -> Non
         (147, "d", float("inf"), "z scale inf"),
         (155, "d", 2e8, "x offset 2e\\+08"),
         (163, "d", float("nan"), "y offset nan"),
-        (179, "d", 1e9, "bounds x .* 1e\\+09"),
-        (187, "d", float("nan"), "bounds x nan"),
-        (203, "d", 500000.0, "bounds y from 500000 to"),
-        (211, "d", float("inf"), "bounds z .* inf"),
         (94, "H", 60000, "header of 60000 bytes"),
         (96, "I", 2**31, "points from byte 2147483648"),
         (100, "I", 2**31, "2147483648 records"),
@@ -216,6 +212,29 @@ def test_absurd_headers_are_refused(laz: Path, place: int, form: str, value: flo
     with pytest.raises(InputError, match=message) as caught:
         read_header(patch(laz, place, form, value))
     assert str(laz) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "ends",
+    [
+        {179: 1e9},
+        {187: float("nan")},
+        {203: 500000.0},
+        {211: float("inf")},
+        {187: 0.0, 203: 0.0, 219: 0.0},  # the low ends were never written
+        dict.fromkeys((179, 187, 195, 203, 211, 219), 0.0),
+        {179: -1.7e308, 187: 1.7e308, 195: -1.7e308, 203: 1.7e308, 211: -1.7e308, 219: 1.7e308},
+    ],
+)
+def test_a_void_box_of_the_header_is_that_of_the_points(laz: Path, ends: dict[int, float]) -> None:
+    sound = read_header(laz)
+    assert not sound.box_of_points
+    for place, value in ends.items():
+        patch(laz, place, "d", value)
+    header = read_header(laz)
+    assert header.box_of_points
+    np.testing.assert_allclose(header.bounds, sound.bounds, atol=0.011)
+    assert len(read_points(laz, EVERYWHERE)[0].xyz) == 5000
 
 
 def test_a_chunk_table_beyond_the_file_is_refused(laz: Path) -> None:

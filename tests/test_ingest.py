@@ -1,5 +1,6 @@
 """Inputs are read once: points dealt out to cells, footprints to a grid, both found again by box."""
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,6 +35,7 @@ from tiler.footprint_index import (
     select_footprints,
     take_rows,
 )
+from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.ingest import CELL, PointBlock, read_cells
 from tiler.lasheader import read_promise
 from tiler.layers import describe_layer, scan_layer
@@ -243,6 +245,18 @@ def test_copc_by_query_is_copc_from_end_to_end(copc_file: Path, monkeypatch: pyt
     assert set(same.classes) == {1, 2, 6, 7}
 
 
+def test_copc_in_feet_is_queried_by_the_box_of_the_region(copc_file: Path) -> None:
+    x, y, _ = ORIGIN
+    foot, box = 0.3048, (x - 100, y - 300, x + 30.5, y - 128)
+    feet = Frame((0, foot), (1, foot), foot)
+    plain = list(read_cells(copc_file, box))
+    xmin, ymin, xmax, ymax = (value * foot for value in box)
+    metric = list(read_cells(copc_file, (xmin, ymin, xmax, ymax), frame=feet))
+    assert total(metric) == total(plain)
+    np.testing.assert_allclose(sorted_rows(whole(metric)), sorted_rows(whole(plain)) * (foot, foot, foot, 1))
+    assert metric[0].scale == tuple(value * foot for value in plain[0].scale)
+
+
 def test_copc_is_queried_only_where_that_saves_half(copc_file: Path) -> None:
     x, y, _ = ORIGIN
     skipped = [
@@ -370,7 +384,14 @@ def test_a_tile_reads_the_rows_of_its_cells_alone(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(inputs, "scan_footprints", partial(scan_footprints, batch=150))
     tiles = {f"{i}_{j}": (X + 900.0 * i, Y + 900.0 * j, X + 900.0 * (i + 1), Y + 900.0 * (j + 1)) for i, j in NEAR}
     parameters = SimpleNamespace(
-        footprints=str(path), footprints_identity="", layer="", id_attribute="", height_attribute="h"
+        footprints=str(path),
+        footprints_identity="",
+        footprints_frame=dataclasses.astuple(AS_IT_IS),
+        footprints_shift=(0.0, 0.0),
+        align=False,
+        layer="",
+        id_attribute="",
+        height_attribute="h",
     )
     context = SimpleNamespace(crs=RD.to_wkt(), bounds=REGION)
     layout = Layout(tiles=tiles, bounds=REGION)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 import shapely
 from PIL import Image
@@ -21,6 +22,8 @@ from tiler.config import Config, make_config
 from tiler.context import absent_tiles, choose_tiles, make_layout, seam_name, tile_name
 from tiler.footprint_sample import FootprintSample, measure_detail, sample_footprints
 from tiler.forecast import Forecast, forecast_run, spread_points, warn_of_memory
+from tiler.georeference.establish import Georeference
+from tiler.georeference.frame import AS_IT_IS
 from tiler.plan_picture import ABSENT, HATCH, HOUSE, PRESENT, draw_plan
 from tiler.plan_report import describe_plan, plan_run
 from tiler.planning import Survey, survey_inputs
@@ -53,6 +56,9 @@ def forecast_of(config: Config, **words: Any) -> Forecast:
     return forecast_run(survey, sample_footprints(config, survey.region), config, **words)
 
 
+ESTABLISHED = Georeference(pyproj.CRS(CRS), [], AS_IT_IS, {}, [], [], {})
+
+
 def ignore(_: str) -> None:
     """Say nothing."""
 
@@ -74,7 +80,7 @@ def country(n: int, size: float = 1000.0) -> Survey:
         if not n // 3 <= 5 * i < 2 * n // 3 or not n // 3 <= 5 * j < 2 * n // 3
     ]
     grid = choose_tiles(make_grid(bounds, tile_size=size, mesh_size=5.0), [cloud.bounds[:4] for cloud in clouds])
-    return Survey(Region(bounds, CRS, size), clouds, clouds, [], {}, grid, grid)
+    return Survey(Region(bounds, CRS, size), clouds, clouds, [], {}, grid, ESTABLISHED, grid)
 
 
 def test_cells_points_disk_and_memory_are_as_a_run_has_them(city: Config, record: dict[str, Any]) -> None:

@@ -16,7 +16,8 @@ import shapely
 from pipeline.errors import ConfigError
 from pipeline.synthetic import ORIGIN, SyntheticCity, city_points, make_city, terrain_height
 from tiler.clouds import find_clouds, read_header, read_points
-from tiler.crs import resolve_crs
+from tiler.georeference.cloud_crs import Asked
+from tiler.georeference.establish import establish_georeference
 from tiler.synth import SynthFiles, write_city
 from tiler.vectors import read_footprint_crs, read_footprints
 
@@ -71,7 +72,8 @@ def test_the_readers_get_back_what_was_made(written: tuple[Path, SynthFiles]) ->
         f"{x}_{y}.laz" for x in (318000, 318400) for y in (6399000, 6399400)
     ]
     headers = [read_header(path) for path in files.clouds]
-    assert resolve_crs(None, headers, read_footprint_crs(files.footprints)) == (SWEREF, [])
+    found = establish_georeference(Asked(), headers, read_footprint_crs(files.footprints), None)
+    assert (found.crs, found.messages) == (SWEREF, [])
     bounds = box(800)
     for path in (files.footprints, files.shapefile):
         footprints, notes = read_footprints(path, crs=SWEREF, bounds=bounds)

@@ -17,6 +17,7 @@ from tiler.planning import check_sources, make_plan
 from tiler.quarantine import config_alone
 from tiler.sequence import make_engine, run_city_stages
 from tiler.settling import domain_of_run, take_domain
+from tiler.stages.alignment import shift_of_run
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
 
@@ -47,6 +48,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
     refuse_bucket(config.out, "--only")
     whole = make_plan(config, say_nothing)
     domain, tallest = domain_of_run(config)
+    shift = shift_of_run(config) if config.align and config.footprints else None
     pad, store = None, None
     if config.padded:
         alone, pad, store = plan_alone(config, whole, tile, tallest)
@@ -60,7 +62,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
             (out / folder).mkdir(exist_ok=True)
         with serial() as executor:
             engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
-            run_city_stages(engine, alone)
+            run_city_stages(engine, alone, shift=shift)
             seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
             take_domain(engine, alone, domain, pad, store)
             engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})

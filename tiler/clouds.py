@@ -1,11 +1,9 @@
 """Point cloud files: find them, read their headers, read their points within a box (step 1.1)."""
 
 import logging
-import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import laspy
@@ -17,19 +15,21 @@ from pipeline.errors import InputError, OutputError
 from pipeline.las_points import KEPT, REASONS, count_values, judge_points
 from pipeline.pointcloud import PointCloud
 from tiler.copc import NODE_SLACK, CopcIndex, read_index, read_nodes
-from tiler.las_chunks import FIELDS, classes_of, coordinates_of, ends_of, scaling_of, units_of
+from tiler.georeference.frame import AS_IT_IS, Frame, box_to_file, box_to_region
+from tiler.georeference.las_crs import read_las_crs
+from tiler.las_chunks import FIELDS, PointChunk, coordinates_of, ends_of, place_chunk, take_chunk
 from tiler.lasheader import AGAIN, RECORD_BYTES, LasPromise, read_promise
 from tiler.places import as_place, is_url, place, source_of
 
 CHUNK_POINTS = 1_000_000
 CHUNK_BYTES = 64_000_000  # wins over CHUNK_POINTS where a point has many extra bytes
 HEADER_SLACK = 1.0  # m that a point may lie outside the header's bounds
+COUNTED = ("read", "outside", "withheld", "noise", "absurd", "kept")
+KEY_POINTS = "key points"
 QUERY_SHARE = 0.5  # a COPC file is read by its octree where less than this share of its box is wanted
 
 Box = tuple[float, float, float, float]
 
-# What laspy and pyproj raise on records of a CRS that make no sense.
-_NO_CRS = (pyproj.exceptions.CRSError, ValueError, TypeError, LookupError, OverflowError, struct.error)
 _SUFFIXES = {".las", ".laz"}
 _GLOB_SIGNS = set("*?[")
 
@@ -48,15 +48,29 @@ class CloudHeader:
     n_points : int
         Number of points.
     bounds : tuple of 6 floats
-        xmin, ymin, xmax, ymax, zmin, zmax in the file's CRS; all NaN if there are no points.
+        xmin, ymin, xmax, ymax, zmin, zmax in the file's CRS, or in the region's where that is established; all NaN
+        if there are no points.
     crs : pyproj.CRS or None
         As stated, compound CRSs included; None if the file states none or one that nobody can parse.
+    plan_unit, height_unit : float or None
+        Metres of a unit in plan and of height, where a record states them beside the CRS (see `LasCrs`).
+    unread : str
+        What a record of the CRS holds that is not understood.
+    box_of_points : bool
+        Whether the box in the header is void, and the points were read for `bounds`.
+    frame : Frame
+        How coordinates of the file become those of the region.
     """
 
     path: Path
     n_points: int
     bounds: tuple[float, float, float, float, float, float]
     crs: pyproj.CRS | None
+    plan_unit: float | None = None
+    height_unit: float | None = None
+    unread: str = ""
+    box_of_points: bool = False
+    frame: Frame = AS_IT_IS
 
 
 def find_clouds(sources: Sequence[str | Path]) -> list[Path]:
@@ -106,17 +120,29 @@ def read_header(path: str | Path) -> CloudHeader:
 
     Notes
     -----
-    A CRS that cannot be parsed counts as none: the user must then state it, and is told so.
+    A CRS that cannot be parsed counts as none: the user must then state it, and is told so. Where the box in the
+    header is void, all points are read once for their box.
     """
     path = as_place(path)
     promise = read_promise(path)
     evlrs = promise.extended <= RECORD_BYTES
     with _laspy_as_input_error(path, promise, [0]), laspy.open(source_of(path), read_evlrs=evlrs) as reader:
-        header = reader.header
-    return CloudHeader(path, promise.n_points, promise.bounds, _parse_crs(header))
+        stated = read_las_crs(reader.header)
+    bounds = _box_of_points(path, promise) if promise.has_void_box else promise.bounds
+    differs = not np.allclose(bounds, promise.bounds, rtol=0.0, atol=HEADER_SLACK)
+    return CloudHeader(
+        path,
+        promise.n_points,
+        bounds,
+        stated.crs,
+        stated.plan_unit,
+        stated.height_unit,
+        stated.unread,
+        promise.n_points > 0 and differs,
+    )
 
 
-def read_points(path: str | Path, bounds: Box) -> tuple[PointCloud, dict[str, int]]:
+def read_points(path: str | Path, bounds: Box, *, frame: Frame = AS_IT_IS) -> tuple[PointCloud, dict[str, int]]:
     """Read the usable points of a file within a box (step 1.1).
 
     Dropped are, in this order: points outside the box, withheld points, the noise classes 7 and 18, and
@@ -127,7 +153,9 @@ def read_points(path: str | Path, bounds: Box) -> tuple[PointCloud, dict[str, in
     path : str or Path
         LAS, LAZ or COPC file.
     bounds : tuple of 4 floats
-        xmin, ymin, xmax, ymax in the file's CRS; the borders belong to the box.
+        xmin, ymin, xmax, ymax in the region's CRS (m); the borders belong to the box.
+    frame : Frame
+        How coordinates of the file become those of the region.
 
     Returns
     -------
@@ -135,6 +163,7 @@ def read_points(path: str | Path, bounds: Box) -> tuple[PointCloud, dict[str, in
         The kept points in the order of the file; possibly none.
     dict of str to int
         ``read`` = ``outside`` + ``withheld`` + ``noise`` + ``absurd`` + ``kept``; each point counts once.
+        Where there are any, ``key points`` are those of ``read`` with the class of model key points: ground.
 
     Raises
     ------
@@ -148,16 +177,16 @@ def read_points(path: str | Path, bounds: Box) -> tuple[PointCloud, dict[str, in
     """
     path = as_place(path)
     promise = read_promise(path)
-    counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
+    counts = dict.fromkeys(COUNTED, 0)
     places, classes = [np.empty((0, 3))], [np.empty(0, np.uint8)]
-    for chunk in _chunks(path, promise):
+    for chunk in _place(path, promise, _chunks(path, promise), frame):
         kept = select_usable(chunk, bounds, counts)
         places.append(coordinates_of(chunk)[kept])
-        classes.append(classes_of(chunk)[kept])
+        classes.append(chunk.classification[kept])
     return PointCloud(np.concatenate(places), np.concatenate(classes)), counts
 
 
-def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePointRecord, int]]:
+def read_chunks(path: Path, bounds: Box, *, frame: Frame = AS_IT_IS) -> Iterator[tuple[PointChunk, int]]:
     """Read a file by chunks, without those parts of a COPC file that are away from a box.
 
     Parameters
@@ -165,12 +194,15 @@ def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePoint
     path : Path
         LAS, LAZ or COPC file.
     bounds : tuple of 4 floats
-        xmin, ymin, xmax, ymax in the file's CRS (m).
+        xmin, ymin, xmax, ymax in the region's CRS (m).
+    frame : Frame
+        How coordinates of the file become those of the region.
 
     Yields
     ------
-    laspy.ScaleAwarePointRecord
-        Some million points, in the order of the file; the first chunk may be empty, others are not.
+    PointChunk
+        Some million points in the region's CRS, in the order of the file; the first chunk may be empty, others are
+        not.
     int
         Points that are not read, all of them outside the box; not 0 in the first chunk only.
 
@@ -184,31 +216,34 @@ def read_chunks(path: Path, bounds: Box) -> Iterator[tuple[laspy.ScaleAwarePoint
     A COPC file is read by its octree where the box covers less than half of the box in its header.
     """
     promise = read_promise(path)
-    index = read_index(path, promise) if _share(promise, bounds) < QUERY_SHARE else None
     n_skipped, chunks = 0, _chunks(path, promise)
-    if index is not None:
-        near = _near(index.box, bounds)
-        n_skipped, chunks = int(index.count[~near].sum()), _query(path, promise, index, near)
-    first = next(chunks, None)
+    if promise.n_points and not promise.has_void_box:
+        near = box_to_file(frame, bounds)
+        index = read_index(path, promise) if _share(promise, near) < QUERY_SHARE else None
+        if index is not None:
+            wanted = _near(index.box, near)
+            n_skipped, chunks = int(index.count[~wanted].sum()), _query(path, promise, index, wanted)
+    placed = _place(path, promise, chunks, frame)
+    first = next(placed, None)
     if first is None:
         with _laspy_as_input_error(path, promise, [0]), laspy.open(source_of(path), read_evlrs=False) as reader:
-            empty = laspy.ScaleAwarePointRecord.zeros(0, header=reader.header)
+            empty = take_chunk(laspy.ScaleAwarePointRecord.zeros(0, header=reader.header))
         yield empty, n_skipped
         return
     yield first, n_skipped
-    for chunk in chunks:
+    for chunk in placed:
         yield chunk, 0
 
 
-def select_usable(chunk: laspy.ScaleAwarePointRecord, bounds: Box, counts: dict[str, int]) -> NDArray[np.bool_]:
+def select_usable(chunk: PointChunk, bounds: Box, counts: dict[str, int]) -> NDArray[np.bool_]:
     """Select the usable points of a chunk, and count what became of each.
 
     Parameters
     ----------
-    chunk : laspy.ScaleAwarePointRecord
-        Points of a file, n of them.
+    chunk : PointChunk
+        Points of a file in the region's CRS, n of them.
     bounds : tuple of 4 floats
-        xmin, ymin, xmax, ymax; the borders belong to the box.
+        xmin, ymin, xmax, ymax (m); the borders belong to the box.
     counts : dict of str to int
         The counts of `read_points`; this chunk's are added.
 
@@ -218,12 +253,37 @@ def select_usable(chunk: laspy.ScaleAwarePointRecord, bounds: Box, counts: dict[
         Which points to keep.
     """
     verdict = judge_points(
-        *units_of(chunk), *scaling_of(chunk), classes_of(chunk), np.asarray(chunk.withheld) != 0, bounds
+        chunk.x, chunk.y, chunk.z, chunk.scale, chunk.offset, chunk.classification, chunk.withheld, bounds
     )
     for reason, number in zip(REASONS, count_values(verdict)[: len(REASONS)].tolist(), strict=True):
         counts[reason] += number
     counts["read"] += len(chunk)
+    if chunk.n_key_points:
+        counts[KEY_POINTS] = counts.get(KEY_POINTS, 0) + chunk.n_key_points
     return np.asarray(verdict == KEPT)
+
+
+def _place(path: Path, promise: LasPromise, chunks: Iterator[PointChunk], frame: Frame) -> Iterator[PointChunk]:
+    """Give chunks in the region's CRS."""
+    if frame == AS_IT_IS:
+        yield from chunks
+        return
+    box = promise.bounds[:4]
+    if frame.source and promise.has_void_box:
+        box = _box_of_points(path, promise)[:4]
+    middle = (0.0, 0.0)
+    if frame.source and promise.n_points:
+        xmin, ymin, xmax, ymax = box_to_region(frame, box)
+        middle = (xmin + xmax) / 2, (ymin + ymax) / 2
+    for chunk in chunks:
+        yield place_chunk(chunk, frame, middle)
+
+
+def _box_of_points(path: Path, promise: LasPromise) -> tuple[float, float, float, float, float, float]:
+    """Read all points of a file for their box, in the file's CRS."""
+    ends = np.concatenate([ends_of(chunk) for chunk in _chunks(path, promise)])
+    (xmin, ymin, zmin), (xmax, ymax, zmax) = ends.min(axis=0).tolist(), ends.max(axis=0).tolist()
+    return xmin, ymin, xmax, ymax, zmin, zmax
 
 
 def _expand(source: Path) -> list[Path]:
@@ -281,7 +341,7 @@ def _glob(pattern: Path) -> list[Path]:
     return [path for path in found if not any(part.startswith(".") for part in path.relative_to(base).parts)]
 
 
-def _chunks(path: Path, promise: LasPromise) -> Iterator[laspy.ScaleAwarePointRecord]:
+def _chunks(path: Path, promise: LasPromise) -> Iterator[PointChunk]:
     """Yield the points by chunks; fail if there are fewer than the header claims."""
     step = _step(promise)
     n_read = [0]
@@ -292,10 +352,11 @@ def _chunks(path: Path, promise: LasPromise) -> Iterator[laspy.ScaleAwarePointRe
         ) as reader,
     ):
         while n_read[0] < promise.n_points:
-            chunk = reader.read_points(step)
-            if len(chunk) == 0:
+            record = reader.read_points(step)
+            if len(record) == 0:
                 break
-            n_read[0] += len(chunk)
+            n_read[0] += len(record)
+            chunk = take_chunk(record)
             _check_within_header(path, promise, chunk)
             yield chunk
     if n_read[0] != promise.n_points:
@@ -318,9 +379,7 @@ def _near(box: NDArray[np.float64], bounds: Box) -> NDArray[np.bool_]:
     return near
 
 
-def _query(
-    path: Path, promise: LasPromise, index: CopcIndex, near: NDArray[np.bool_]
-) -> Iterator[laspy.ScaleAwarePointRecord]:
+def _query(path: Path, promise: LasPromise, index: CopcIndex, near: NDArray[np.bool_]) -> Iterator[PointChunk]:
     n_read = [0]
     with _laspy_as_input_error(path, promise, n_read):
         for chunk in read_nodes(path, index, near, step=_step(promise)):
@@ -333,7 +392,9 @@ def _step(promise: LasPromise) -> int:
     return max(1, min(CHUNK_POINTS, CHUNK_BYTES // promise.point_size))
 
 
-def _check_within_header(path: Path, promise: LasPromise, chunk: laspy.ScaleAwarePointRecord) -> None:
+def _check_within_header(path: Path, promise: LasPromise, chunk: PointChunk) -> None:
+    if promise.has_void_box:
+        return
     low = np.array(promise.bounds[:2]) - HEADER_SLACK
     high = np.array(promise.bounds[2:4]) + HEADER_SLACK
     ends = ends_of(chunk)[:, :2]
@@ -347,20 +408,6 @@ def _check_within_header(path: Path, promise: LasPromise, chunk: laspy.ScaleAwar
         f"the bounds in its header, the first at ({x:.2f}, {y:.2f}): the points or the header are "
         f"damaged; {AGAIN}, or rewrite it: pdal translate {path.name} mended.laz"
     )
-
-
-def _parse_crs(header: laspy.LasHeader) -> pyproj.CRS | None:
-    try:
-        crs: pyproj.CRS | None = header.parse_crs()
-    except _NO_CRS:
-        return None
-    return None if crs is None else _one_crs(crs.srs)
-
-
-@lru_cache(maxsize=64)
-def _one_crs(text: str) -> pyproj.CRS:
-    """Give the one CRS of a text: a country's files state the same, and each takes some 30 kB."""
-    return pyproj.CRS.from_user_input(text)
 
 
 @contextmanager

@@ -77,6 +77,18 @@ class Config:
     crs: str = _parameter(
         UNSET, "input", "CRS of the region, as EPSG:NNNN; empty: that of the data, where it states one"
     )
+    reproject: bool = _parameter(
+        False, "input", "reproject point clouds that are in another CRS than the region's, in degrees, or in a "
+        "projection without true lengths (Web Mercator): to crs, or to their UTM zone",
+    )  # fmt: skip
+    align: bool = _parameter(
+        False, "input", "move the footprints by the shift that fits the roofs in the point cloud best, as measured"
+    )
+    height_unit: str = _parameter(
+        UNSET, "input", "unit of heights of the point clouds, whatever they state: m, ft, or ftUS (US survey "
+        "feet); empty: what they state, else metres, or feet where plan is in feet",
+        choices=(UNSET, "m", "ft", "ftUS"),
+    )  # fmt: skip
     bounds: tuple[float, ...] = _parameter(
         (), "input", "region as xmin ymin xmax ymax; empty: whole metres within the point clouds", unit="m"
     )

@@ -13,7 +13,7 @@ from laspy.vlrs.known import LasZipVlr
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from tiler.las_chunks import coordinates_of
+from tiler.las_chunks import PointChunk, coordinates_of, take_chunk
 from tiler.lasheader import AGAIN, LasPromise
 
 # m that a point may lie outside its node, or a node's box outside the octree's cube.
@@ -99,9 +99,7 @@ def read_index(path: Path, promise: LasPromise) -> CopcIndex | None:
     return index if _fits(index, nodes, promise, n_bytes, (x, y, half)) else None
 
 
-def read_nodes(
-    path: Path, index: CopcIndex, wanted: NDArray[np.bool_], *, step: int
-) -> Iterator[laspy.ScaleAwarePointRecord]:
+def read_nodes(path: Path, index: CopcIndex, wanted: NDArray[np.bool_], *, step: int) -> Iterator[PointChunk]:
     """Read the points of some nodes.
 
     Parameters
@@ -117,8 +115,8 @@ def read_nodes(
 
     Yields
     ------
-    laspy.ScaleAwarePointRecord
-        Points in the order of the file.
+    PointChunk
+        Points in the order of the file, in its CRS.
 
     Raises
     ------
@@ -136,7 +134,9 @@ def read_nodes(
             raw = np.zeros(int(index.count[part].sum()) * header.point_format.size, np.uint8)
             lazrs.decompress_points_with_chunk_table(b"".join(blobs), zipped, raw, table)
             record = laspy.PackedPointRecord.from_buffer(raw, header.point_format)
-            chunk = laspy.ScaleAwarePointRecord(record.array, header.point_format, header.scales, header.offsets)
+            chunk = take_chunk(
+                laspy.ScaleAwarePointRecord(record.array, header.point_format, header.scales, header.offsets)
+            )
             _check_within_nodes(path, coordinates_of(chunk), np.repeat(index.box[part], index.count[part], axis=0))
             yield chunk
 

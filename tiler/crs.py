@@ -1,15 +1,16 @@
-"""Which coordinate reference system the region has, and why it may be refused (steps 1.1 and 1.2)."""
+"""Coordinate reference systems: read, named, compared, and where on Earth they have a place (steps 1.1, 1.2)."""
 
 import math
 from collections.abc import Sequence
 from functools import lru_cache
 
+import numpy as np
 import pyproj
 
-from pipeline.errors import ConfigError, InputError
-from tiler.clouds import CloudHeader
+from pipeline.errors import ConfigError
 
 _ALIKE = 20  # confidence (%) above which PROJ names a candidate, which is then compared in full
+SAME_PLACE = 0.1  # m; CRSs between which a region moves by less are one
 _PLACE_SLACK = 1.0  # degrees that a cloud may lie outside the area that a CRS is meant for
 
 
@@ -100,65 +101,6 @@ def same_crs(one: pyproj.CRS, other: pyproj.CRS) -> bool:
     return bool(_east_first(a).equals(_east_first(b), ignore_axis_order=True))
 
 
-def resolve_crs(
-    asked: str | None, clouds: Sequence[CloudHeader], footprints: pyproj.CRS | None
-) -> tuple[pyproj.CRS, list[str]]:
-    """Decide the region's CRS: what was asked for, else the clouds', else the footprints'.
-
-    Parameters
-    ----------
-    asked : str or None
-        Value of ``--crs``.
-    clouds : sequence of CloudHeader
-        Headers of all point clouds; those without points have no say.
-    footprints : pyproj.CRS or None
-        CRS that the footprint file states.
-
-    Returns
-    -------
-    pyproj.CRS
-        Projected, horizontal, in metres.
-    list of str
-        Sentences that the user must be told: what was assumed.
-
-    Raises
-    ------
-    ConfigError
-        If `asked` cannot be parsed.
-    InputError
-        If clouds contradict each other or `asked`, if nobody states a CRS, or if the CRS or its heights do
-        not count in metres: with the command that mends it.
-
-    Notes
-    -----
-    Footprints in another CRS than the clouds' are fine: they are reprojected as they are read.
-    """
-    filled = [cloud for cloud in clouds if cloud.n_points > 0]
-    # Headers share the CRS of a text: PROJ takes milliseconds to compare two, a country has 100,000 files.
-    some = {id(cloud.crs): cloud.crs for cloud in filled}
-    flat = {key: horizontal_crs(crs) for key, crs in some.items()}
-    stated = [(cloud, crs) for cloud in filled if (crs := flat[id(cloud.crs)]) is not None]
-    one_each = list({id(crs): (cloud, crs) for cloud, crs in reversed(stated)}.values())[::-1]
-    full = None if asked is None else parse_crs(asked)
-    wish = horizontal_crs(full)
-    for cloud, crs in one_each:
-        _check_metric_cloud(cloud, crs, wish)
-    _check_agreement(one_each, wish)
-    if full is not None:
-        if wish is None:
-            raise ConfigError(f"--crs {asked!r} has no place on Earth; give a projected CRS in metres")
-        _check_metric(full, filled, "--crs")
-        crs, source = wish, "--crs"
-    elif stated:
-        crs, source = stated[0][1], stated[0][0].path.name
-    elif (crs_of_footprints := horizontal_crs(footprints)) is not None:
-        crs, source = crs_of_footprints, "the footprints"
-        _check_metric(crs, filled, source)
-    else:
-        raise InputError("neither point clouds nor footprints state a CRS; give --crs, as in --crs EPSG:28992")
-    return crs, _sentences(crs, source, filled, len(stated), footprints)
-
-
 def utm_crs(bounds: Sequence[float], crs: pyproj.CRS) -> str | None:
     """Name the UTM zone (WGS 84) in which the middle of a box lies.
 
@@ -189,6 +131,108 @@ def utm_crs(bounds: Sequence[float], crs: pyproj.CRS) -> str | None:
     return f"EPSG:{(32600 if lat >= 0 else 32700) + zone}"
 
 
+def crs_text(crs: pyproj.CRS) -> str:
+    """Write a CRS so that it can be parsed anywhere: EPSG:NNNN where it is of that register, else WKT.
+
+    Examples
+    --------
+    >>> crs_text(pyproj.CRS("EPSG:28992"))
+    'EPSG:28992'
+    """
+    code = crs.to_epsg()
+    return f"EPSG:{code}" if code else str(crs.to_wkt())
+
+
+def geographic_box(bounds: Sequence[float], crs: pyproj.CRS) -> tuple[float, float, float, float] | None:
+    """Give west, south, east and north (degrees) of the middle of a box, a tenth of a degree around it."""
+    place = _lon_lat(bounds, crs)
+    if place is None:
+        return None
+    lon, lat = place
+    return max(lon - 0.05, -180.0), max(lat - 0.05, -90.0), min(lon + 0.05, 180.0), min(lat + 0.05, 90.0)
+
+
+def scale_of(bounds: Sequence[float], crs: pyproj.CRS) -> float:
+    """Give how long a metre on the ground is in a projected, metric CRS, at the middle of a box.
+
+    Parameters
+    ----------
+    bounds : sequence of at least 4 floats
+        xmin, ymin, xmax, ymax, easting first (m).
+    crs : pyproj.CRS
+        Projected.
+
+    Returns
+    -------
+    float
+        Of the directions along both axes that which is farther from 1; NaN if the box is not on Earth, or PROJ has
+        no transformation of the CRS.
+
+    Examples
+    --------
+    >>> round(scale_of((120000, 487000, 121000, 488000), pyproj.CRS("EPSG:28992")), 4)
+    0.9999
+    >>> round(scale_of((545000, 6867000, 545100, 6867100), pyproj.CRS("EPSG:3857")), 2)
+    1.64
+    """
+    base, reach = crs.geodetic_crs, 500.0
+    if base is None:
+        return math.nan
+    x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
+    ends = np.array([(x - reach, y), (x + reach, y), (x, y - reach), (x, y + reach)])
+    try:
+        lon, lat = pyproj.Transformer.from_crs(crs, base, always_xy=True).transform(*ends.T)
+    except pyproj.exceptions.ProjError:  # some entries of the Esri register lack a parameter
+        return math.nan
+    if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
+        return math.nan
+    geod = base.get_geod()
+    if geod is None:
+        return math.nan
+    _, _, length = geod.inv(lon[::2], lat[::2], lon[1::2], lat[1::2])
+    scales = 2 * reach / np.asarray(length)
+    return float(scales[np.argmax(np.abs(scales - 1))])
+
+
+def move_between(one: pyproj.CRS, other: pyproj.CRS, bounds: Sequence[float]) -> float:
+    """Give how far coordinates move where those of one CRS become those of another (units of the CRSs).
+
+    Parameters
+    ----------
+    one, other : pyproj.CRS
+        Projected, or both geographic.
+    bounds : sequence of at least 4 floats
+        xmin, ymin, xmax, ymax, easting first: the corners and the middle are tried.
+
+    Returns
+    -------
+    float
+        The farthest; infinite where a place is lost, or the CRSs are of different kinds.
+
+    Examples
+    --------
+    >>> zones = pyproj.CRS("EPSG:25832"), pyproj.CRS("EPSG:32632")
+    >>> move_between(*zones, (565000, 5934000, 566000, 5935000)) < 0.001
+    True
+    """
+    if one.is_geographic != other.is_geographic:
+        return math.inf
+    xmin, ymin, xmax, ymax = bounds[:4]
+    x = np.array([xmin, xmax, xmin, xmax, (xmin + xmax) / 2])
+    y = np.array([ymin, ymin, ymax, ymax, (ymin + ymax) / 2])
+    try:
+        to_x, to_y = pyproj.Transformer.from_crs(one, other, always_xy=True).transform(x, y)
+    except pyproj.exceptions.ProjError:
+        return math.inf
+    moved = np.hypot(np.asarray(to_x) - x, np.asarray(to_y) - y)
+    return float(moved.max()) if np.isfinite(moved).all() else math.inf
+
+
+def is_one(one: pyproj.CRS, other: pyproj.CRS, bounds: Sequence[float]) -> bool:
+    """Whether two CRSs are one: written alike, or a box moves by less than `SAME_PLACE` between them."""
+    return same_crs(one, other) or move_between(one, other, bounds) < SAME_PLACE
+
+
 def _east_first(crs: pyproj.CRS) -> pyproj.CRS:
     """Write a projected CRS with its easting first: PROJ compares regardless of axis order only degrees."""
     if not crs.is_projected or [axis.direction for axis in crs.axis_info] != ["north", "east"]:
@@ -199,128 +243,15 @@ def _east_first(crs: pyproj.CRS) -> pyproj.CRS:
     return pyproj.CRS.from_json_dict(fields)
 
 
-def _fault(crs: pyproj.CRS) -> str:
-    """Say in words why a CRS is no metric one; "" if it is. Heights count too."""
-    for part in crs.sub_crs_list or [crs]:
-        core = part.source_crs if part.is_bound and part.source_crs is not None else part
-        if core.is_geographic:
-            return "is geographic (degrees)"
-        if not (core.is_projected or core.is_vertical):
-            return f"is no projected CRS ({core.type_name})"
-        for axis in core.axis_info:
-            if axis.unit_conversion_factor != 1.0:
-                return f"counts {axis.name.lower()} in {axis.unit_name}, not in metres"
-    return ""
+def is_on_its_place(bounds: Sequence[float], crs: pyproj.CRS) -> bool:
+    """Whether the middle of a box lies where a CRS is meant for, or within a degree of it.
 
-
-def _check_metric_cloud(cloud: CloudHeader, crs: pyproj.CRS, wish: pyproj.CRS | None) -> None:
-    """Refuse a cloud whose own CRS is not metric, with the command that reprojects it."""
-    if cloud.crs is None or not (fault := _fault(cloud.crs)):
-        return
-    target = crs_name(wish) if wish is not None and not _fault(wish) else utm_crs(cloud.bounds, crs)
-    raise InputError(
-        f"{cloud.path}: its CRS, {crs_name(cloud.crs)}, {fault}; reproject this and every cloud like it: "
-        f"{_pdal(cloud, cloud.crs, target)}"
-    )
-
-
-def _check_metric(crs: pyproj.CRS, clouds: Sequence[CloudHeader], source: str) -> None:
-    """Refuse a CRS that is not metric, from ``--crs`` or the footprints, where the clouds state none."""
-    flat = horizontal_crs(crs)
-    if flat is None or not (fault := _fault(crs)):
-        return
-    name = crs_name(crs)
-    words = [f"{source}: the CRS {name} {fault}"]
-    if source == "--crs":
-        words.append("give the projected CRS of the clouds")
-    else:
-        words.append(
-            "the point clouds state none: if theirs is another, give it with --crs, or reproject the "
-            "footprints to it: ogr2ogr -t_srs EPSG:<code of the clouds> metric.gpkg <footprints>"
-        )
-    target = utm_crs(clouds[0].bounds, flat) if clouds else None
-    if target is not None:
-        words.append(f"clouds in {name} must be reprojected: {_pdal(clouds[0], crs, target)}")
-    raise InputError("; ".join(words))
-
-
-def _pdal(cloud: CloudHeader, crs: pyproj.CRS, target: str | None) -> str:
-    """Give the command that makes a cloud metric.
-
-    Both CRSs are named without heights, so that PDAL leaves z alone; heights are scaled on their own.
+    Examples
+    --------
+    >>> rd = pyproj.CRS("EPSG:28992")
+    >>> is_on_its_place((120000, 487000, 121000, 488000), rd), is_on_its_place((4.8, 52.3, 4.9, 52.4), rd)
+    (True, False)
     """
-    flat, factor = horizontal_crs(crs), _height_factor(crs)
-    filters, options = [], []
-    if flat is not None and not _fault(flat):
-        target = crs_name(flat)
-    else:
-        target = target or "EPSG:<a projected CRS in metres>"
-        filters.append("reprojection")
-        if flat is not None and flat.to_authority():
-            options.append(f"--filters.reprojection.in_srs={crs_name(flat)}")
-        options.append(f"--filters.reprojection.out_srs={target}")
-    if factor != 1.0:
-        filters.append("assign")
-        options.append(f'--filters.assign.value="Z = Z * {factor!r}"')
-    options.append(f"--writers.las.a_srs={target}")
-    return f"pdal translate {_paths(cloud, 'metric')} {' '.join(filters + options)}"
-
-
-def _height_factor(crs: pyproj.CRS) -> float:
-    """Give the metres of one unit of height."""
-    for part in crs.sub_crs_list:
-        if part.is_vertical:
-            return float(part.axis_info[0].unit_conversion_factor)
-    return float(crs.axis_info[2].unit_conversion_factor) if len(crs.axis_info) > 2 else 1.0
-
-
-def _check_agreement(stated: Sequence[tuple[CloudHeader, pyproj.CRS]], wish: pyproj.CRS | None) -> None:
-    for cloud, crs in stated:
-        if wish is not None and not same_crs(crs, wish):
-            raise InputError(
-                f"{cloud.path}: states {crs_name(crs)}, but --crs asks for {crs_name(wish)}; leave out "
-                f"--crs, or reproject the cloud: {_reproject(cloud, crs_name(wish))}"
-            )
-        first, common = stated[0]
-        if not same_crs(crs, common):
-            raise InputError(
-                f"{cloud.path}: states {crs_name(crs)}, but {first.path} states {crs_name(common)}; leave "
-                f"one out, or reproject it: {_reproject(cloud, crs_name(common))}"
-            )
-
-
-def _reproject(cloud: CloudHeader, target: str) -> str:
-    return f"pdal translate {_paths(cloud, 'reprojected')} reprojection --filters.reprojection.out_srs={target}"
-
-
-def _paths(cloud: CloudHeader, suffix: str) -> str:
-    name = cloud.path.name.split(".")[0]
-    return f'"{cloud.path}" "{cloud.path.with_name(f"{name}_{suffix}.laz")}"'
-
-
-def _sentences(
-    crs: pyproj.CRS, source: str, filled: Sequence[CloudHeader], n_stated: int, footprints: pyproj.CRS | None
-) -> list[str]:
-    words = []
-    if filled and n_stated == 0:
-        words.append(f"the point cloud states no CRS; using {crs_name(crs)} of {source}")
-    elif n_stated < len(filled):
-        silent = f"{len(filled) - n_stated} of {len(filled)}"
-        words.append(f"{silent} point clouds state no CRS; taken as {crs_name(crs)} of {source}")
-    ours = horizontal_crs(footprints)
-    if ours is not None and not same_crs(ours, crs):
-        words.append(f"the footprints are reprojected from {crs_name(ours)} to {crs_name(crs)}")
-    stray = [cloud for cloud in filled if not _on_its_place(cloud.bounds, crs)]
-    if stray:
-        more = f" and {len(stray) - 1} more point clouds lie" if len(stray) > 1 else " lies"
-        words.append(
-            f"{stray[0].path.name}{more} outside the area of use of "
-            f"{crs_name(crs)} ({crs.area_of_use.name if crs.area_of_use else ''}); is it the right CRS?"
-        )
-    return words
-
-
-def _on_its_place(bounds: Sequence[float], crs: pyproj.CRS) -> bool:
     area = crs.area_of_use
     if area is None:
         return True
@@ -338,7 +269,10 @@ def _on_its_place(bounds: Sequence[float], crs: pyproj.CRS) -> bool:
 def _lon_lat(bounds: Sequence[float], crs: pyproj.CRS) -> tuple[float, float] | None:
     """Give the longitude and latitude (WGS 84, degrees) of the middle of a box, None if it has none."""
     xmin, ymin, xmax, ymax = bounds[:4]
-    lon, lat = _to_degrees(crs).transform((xmin + xmax) / 2, (ymin + ymax) / 2)
+    try:
+        lon, lat = _to_degrees(crs).transform((xmin + xmax) / 2, (ymin + ymax) / 2)
+    except pyproj.exceptions.ProjError:
+        return None
     on_earth = math.isfinite(lon) and math.isfinite(lat) and abs(lon) <= 180 and abs(lat) <= 90
     return (lon, lat) if on_earth else None
 

@@ -435,7 +435,7 @@ class _Run:
             engine.blocked[stage.name, name] = lacking[0]
             self._lose(ticket, name, f"not run: {' '.join(lacking[0])} is not there", lacking[0])
             return
-        path, identity = file_identity(engine.layout, stage.scope, name)
+        path, identity, frame = file_identity(engine.layout, stage.scope, name)
         xmin, ymin, xmax, ymax = planned.items.boxes[item].tolist()
         box = (xmin, ymin, xmax, ymax)
         digest = engine.records.digest
@@ -450,7 +450,7 @@ class _Run:
         key = item_key(planned.digest, name, box, identity, found, engine._find_gaps(stage.scope, box, held))
         parameters, context, store = planned.parameters, engine.context, engine.store
         self.tasks[ticket] = Task(
-            stage.name, name, stage.scope, box, parameters, context, path, store, refs, key, engine._folder
+            stage.name, name, stage.scope, box, parameters, context, path, store, refs, key, engine._folder, frame
         )
         self._submit(ticket)
         if engine._watch is not None:

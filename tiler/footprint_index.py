@@ -13,6 +13,7 @@ from pipeline.citymodel import Footprints
 from pipeline.notes import Note
 from tiler.cells import order_by_cell, row_ranges
 from tiler.footprint_source import FootprintSource, make_footprints, open_source
+from tiler.georeference.frame import Frame
 from tiler.layers import BATCH, Box, Features, scan_layer
 from tiler.places import as_place
 from tiler.repeated_ids import find_repeated_ids
@@ -83,13 +84,14 @@ def scan_footprints(
     layer: str = "",
     id_attribute: str = "",
     height_attribute: str = "",
+    frame: Frame | None = None,
     batch: int = BATCH,
 ) -> Iterator[FootprintBlock]:
     """Read the footprints that meet a box, once and by batches (step 1.2).
 
     Parameters
     ----------
-    path, crs, bounds, layer, id_attribute, height_attribute
+    path, crs, bounds, layer, id_attribute, height_attribute, frame
         As `read_footprints` has them.
     batch : int
         Features in memory at once.
@@ -118,6 +120,7 @@ def scan_footprints(
         layer=layer,
         id_attribute=id_attribute,
         height_attribute=height_attribute,
+        frame=frame,
     )
     repeated = find_repeated_ids(source.layer, source.id_name, batch=batch)
     columns = [name for name in (source.id_name, source.height_name) if name]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tiler.config import Config
 from tiler.footprint_source import FootprintSource, make_footprints, open_source
+from tiler.georeference.frame import Frame, box_to_region
 from tiler.layers import BATCH, scan_layer
 from tiler.places import place
 from tiler.region import Region
@@ -52,7 +53,9 @@ class FootprintSample:
         return len(self.polygons)
 
 
-def sample_footprints(config: Config, region: Region, *, limit: int = SAMPLE_FEATURES) -> FootprintSample | None:
+def sample_footprints(
+    config: Config, region: Region, *, frame: Frame | None = None, limit: int = SAMPLE_FEATURES
+) -> FootprintSample | None:
     """Read the footprints of a region, or enough of them to know the rest.
 
     Parameters
@@ -61,6 +64,8 @@ def sample_footprints(config: Config, region: Region, *, limit: int = SAMPLE_FEA
         Parameters of the run.
     region : Region
         The region.
+    frame : Frame, optional
+        How coordinates of the footprints become those of the region; by default as the CRSs have it.
     limit : int
         Reading stops after this many features.
 
@@ -88,6 +93,7 @@ def sample_footprints(config: Config, region: Region, *, limit: int = SAMPLE_FEA
         bounds=region.bounds,
         layer=config.layer,
         id_attribute=config.id_attribute,
+        frame=frame,
         height_attribute=config.height_attribute,
     )
     columns = [name for name in (source.id_name, source.height_name) if name]
@@ -138,8 +144,8 @@ def _number_within(source: FootprintSource, region: Region, crs: pyproj.CRS) -> 
     extent, n = source.layer.extent, source.layer.n_features
     if extent is None or n < 0:
         return 0
-    if source.forward is not None:
-        extent = source.forward.transform_bounds(*extent)
+    if source.frame.changes_plan:
+        extent = box_to_region(source.frame, extent)
     sides = [max(0.0, min(extent[k + 2], region.bounds[k + 2]) - max(extent[k], region.bounds[k])) for k in (0, 1)]
     area = (extent[2] - extent[0]) * (extent[3] - extent[1])
     return round(n * sides[0] * sides[1] / area) if area > 0 else n

@@ -2,6 +2,7 @@
 
 from collections.abc import Set
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from numpy.typing import NDArray
 from pipeline.citymodel import Footprints, make_ids
 from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note
-from tiler.crs import crs_name, horizontal_crs, same_crs
+from tiler.crs import crs_name, horizontal_crs
+from tiler.georeference.footprints import footprint_frame
+from tiler.georeference.frame import Frame, box_to_file, to_region
 from tiler.lasheader import COORDINATE_LIMIT
 from tiler.layers import Box, Features, Layer, describe_layer, list_some
 from tiler.plain_text import ID_LENGTH, printable, shorten
@@ -26,7 +29,6 @@ ID_ATTRIBUTES = (
     *("building_id", "buildingid", "bldg_id", "id", "gid", "fid", "objectid"),
 )
 
-_BOX_MARGIN = 0.01  # share of the box's size added after reprojection, whose straight edges bend
 # Vertices of one footprint: the largest of a national register have some thousands. Up to this many take less than
 # a minute however they lie, beyond it the time of geometric predicates grows with the square.
 MAX_VERTICES = 100_000
@@ -43,8 +45,8 @@ class FootprintSource:
         The layer.
     id_name, height_name : str
         Attributes with the id and with the height above ground, ``""`` for none.
-    forward : pyproj.Transformer or None
-        From the file's CRS to the region's; None where they are the same.
+    frame : Frame
+        How coordinates of the file become those of the region.
     bounds : tuple of 4 floats
         The region (m), in its own CRS.
     box : tuple of 4 floats
@@ -56,20 +58,27 @@ class FootprintSource:
     layer: Layer
     id_name: str
     height_name: str
-    forward: pyproj.Transformer | None
+    frame: Frame
     bounds: Box
     box: Box
     notes: tuple[Note, ...]
 
 
 def open_source(
-    path: Path, *, crs: pyproj.CRS, bounds: Box, layer: str, id_attribute: str, height_attribute: str
+    path: Path,
+    *,
+    crs: pyproj.CRS,
+    bounds: Box,
+    layer: str,
+    id_attribute: str,
+    height_attribute: str,
+    frame: Frame | None = None,
 ) -> FootprintSource:
     """Decide how footprints are read from a file.
 
     Parameters
     ----------
-    path, crs, bounds, layer, id_attribute, height_attribute
+    path, crs, bounds, layer, id_attribute, height_attribute, frame
         As `read_footprints` has them.
 
     Returns
@@ -86,14 +95,13 @@ def open_source(
     info = describe_layer(path, layer)
     id_name, height_name = _id_attribute(info, id_attribute), _attribute(info, height_attribute)
     own = horizontal_crs(info.crs)
-    notes = tuple(_crs_notes(info, own, crs))
-    source = crs if own is None or same_crs(own, crs) else own
-    _check_extent(info, source)
-    if source is crs:
-        return FootprintSource(info, id_name, height_name, None, bounds, bounds, notes)
-    forward = pyproj.Transformer.from_crs(source, crs, always_xy=True)
-    box = _reproject_box(info, source, crs, bounds)
-    return FootprintSource(info, id_name, height_name, forward, bounds, box, notes)
+    _check_extent(info, own or crs)
+    if frame is None:
+        frame = Frame() if own is None else footprint_frame(own, crs, bounds)[0]
+    box = box_to_file(frame, bounds) if frame.changes_plan else bounds
+    return FootprintSource(
+        info, id_name, height_name, frame, bounds, box, tuple(_crs_notes(info, own, crs, frame))
+    )
 
 
 def make_footprints(
@@ -118,8 +126,8 @@ def make_footprints(
         As `read_footprints` gives them.
     """
     geometry, rows, notes = parse_polygons(features.wkb)
-    if source.forward is not None:
-        geometry = shapely.transform(geometry, source.forward.transform, interleaved=False)
+    if source.frame.changes_plan:
+        geometry = shapely.transform(geometry, partial(to_region, source.frame))
     keep, found = _finite_within(geometry, source.bounds)
     notes += found
     geometry, rows = geometry[keep], rows[keep]
@@ -146,11 +154,13 @@ def _id_attribute(info: Layer, asked: str) -> str:
     return next((lower[name] for name in ID_ATTRIBUTES if name in lower), "")
 
 
-def _crs_notes(info: Layer, own: pyproj.CRS | None, crs: pyproj.CRS) -> list[Note]:
+def _crs_notes(info: Layer, own: pyproj.CRS | None, crs: pyproj.CRS, frame: Frame) -> list[Note]:
     name = info.path.name
-    if own is None:
+    if own is None and not frame.changes_plan:
         return [Note("footprints-without-crs", name, detail=f"taken as {crs_name(crs)}, the region's CRS")]
-    if not same_crs(own, crs):
+    if own is None:
+        return [Note("footprints-without-crs", name, detail="taken in the CRS and units of the point clouds")]
+    if frame.changes_plan:
         return [Note("footprints-reprojected", name, detail=f"from {crs_name(own)} to {crs_name(crs)}")]
     return []
 
@@ -163,19 +173,6 @@ def _check_extent(info: Layer, crs: pyproj.CRS) -> None:
             f"{max(info.extent, key=abs):g}; GeoJSON without a CRS means degrees: state the true one, "
             f'ogr2ogr -a_srs EPSG:<code> mended.gpkg "{info.path}"'
         )
-
-
-def _reproject_box(info: Layer, source: pyproj.CRS, crs: pyproj.CRS, bounds: Box) -> Box:
-    transformer = pyproj.Transformer.from_crs(crs, source, always_xy=True)
-    xmin, ymin, xmax, ymax = transformer.transform_bounds(*bounds, densify_pts=21)
-    margin = _BOX_MARGIN * max(xmax - xmin, ymax - ymin)
-    box = (xmin - margin, ymin - margin, xmax + margin, ymax + margin)
-    if not np.isfinite(box).all() or xmin > xmax:
-        raise InputError(
-            f"{info.path}: the region {bounds} of {crs_name(crs)} has no place in {crs_name(source)}, "
-            "the CRS of the footprints; check --crs and --bounds"
-        )
-    return box
 
 
 def parse_polygons(wkb: NDArray[np.object_]) -> tuple[NDArray[np.object_], NDArray[np.int64], list[Note]]:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.las_points import Triple, count_values, put_units
 from tiler.cells import Box, find_places
-from tiler.clouds import read_chunks, select_usable
-from tiler.las_chunks import classes_of, scaling_of, units_of
+from tiler.clouds import COUNTED, read_chunks, select_usable
+from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.places import as_place
 
 # Side of a cell (m). A box of 250 m reads 1.25, 1.54 and 2.14 times its points in cells of 32, 64 and 128 m, in
@@ -30,7 +30,8 @@ class PointBlock:
     Attributes
     ----------
     units : int32, (n, 3)
-        Coordinates in the file's CRS and units, by ascending cell (j, then i); in a cell in the order of the file.
+        Coordinates in the region's CRS in units of the file, by ascending cell (j, then i); in a cell in the
+        order of the file.
     scale, offset : tuple of 3 floats
         Size of a unit along each axis, and place of unit 0 (m).
     classification : uint8, (n,)
@@ -55,7 +56,9 @@ class PointBlock:
     counts: dict[str, int]
 
 
-def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator[PointBlock]:
+def read_cells(
+    path: str | Path, bounds: Box, *, size: float = CELL, frame: Frame = AS_IT_IS
+) -> Iterator[PointBlock]:
     """Read the usable points of a file within a box, dealt out to cells (step 1.1).
 
     Parameters
@@ -63,9 +66,11 @@ def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator
     path : str or Path
         LAS, LAZ or COPC file.
     bounds : tuple of 4 floats
-        xmin, ymin, xmax, ymax in the file's CRS (m); the borders belong to the box.
+        xmin, ymin, xmax, ymax in the region's CRS (m); the borders belong to the box.
     size : float
         Side of a cell (m); cells have their corners at multiples of it.
+    frame : Frame
+        How coordinates of the file become those of the region.
 
     Yields
     ------
@@ -91,19 +96,17 @@ def read_cells(path: str | Path, bounds: Box, *, size: float = CELL) -> Iterator
     if not size > 0:
         raise ValueError(f"size of cells {size} m must be positive")
     total: Counter[tuple[int, int]] = Counter()
-    for chunk, n_skipped in read_chunks(as_place(path), bounds):
-        counts = dict.fromkeys(("read", "outside", "withheld", "noise", "absurd", "kept"), 0)
+    for chunk, n_skipped in read_chunks(as_place(path), bounds, frame=frame):
+        counts = dict.fromkeys(COUNTED, 0)
         kept = select_usable(chunk, bounds, counts)
         counts["read"] += n_skipped
         counts["outside"] += n_skipped
-        (x, y, z), (scale, offset) = units_of(chunk), scaling_of(chunk)
-        place, cell, start = find_places(x, y, scale[:2], offset[:2], kept, float(size))
+        place, cell, start = find_places(chunk.x, chunk.y, chunk.scale[:2], chunk.offset[:2], kept, float(size))
         total.update(dict(zip(map(tuple, cell.tolist()), np.diff(start).tolist(), strict=True)))
         _check_density(as_place(path), total, size)
-        all_classes = classes_of(chunk)
-        units, classes = put_units(x, y, z, all_classes, place, int(start[-1]))
-        there = np.flatnonzero(count_values(all_classes)).astype(np.uint8)
-        yield PointBlock(units, scale, offset, classes, cell, start, there, counts)
+        units, classes = put_units(chunk.x, chunk.y, chunk.z, chunk.classification, place, int(start[-1]))
+        there = np.flatnonzero(count_values(chunk.classification)).astype(np.uint8)
+        yield PointBlock(units, chunk.scale, chunk.offset, classes, cell, start, there, counts)
 
 
 def _check_density(path: Path, total: Counter[tuple[int, int]], size: float) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.stage import Box, Layout, Scope, Stage
 
 # What computes results: a change of one of their versions redoes everything.
@@ -103,11 +104,16 @@ def declared_values(stage: Stage, parameters: Any) -> dict[str, Any]:
     return {name: getattr(parameters, name) for name in sorted(stage.parameters)}
 
 
-def file_identity(layout: Layout, scope: Scope, name: str) -> tuple[str, str]:
-    """Give path and identity of a file item; empty for other scopes."""
+def file_identity(layout: Layout, scope: Scope, name: str) -> tuple[str, str, Frame]:
+    """Give path, identity and frame of a file item; those of none for other scopes.
+
+    The frame is part of the identity, unless coordinates are taken as they are.
+    """
     if scope is not Scope.FILE:
-        return "", ""
-    return layout.files[name].path, layout.files[name].identity
+        return "", "", AS_IT_IS
+    item = layout.files[name]
+    framed = item.identity if item.frame == AS_IT_IS else f"{item.identity} {item.frame}"
+    return item.path, framed, item.frame
 
 
 @cache

@@ -47,6 +47,9 @@ class LasPromise:
         xmin, ymin, xmax, ymax, zmin, zmax in the file's CRS; all NaN if there are no points.
     extended : int
         Bytes of the records behind the points.
+    has_void_box : bool
+        Whether `bounds` cannot be the box of the points: an end is exactly 0, as writers leave what they did not
+        know, or the ends are no interval. The points tell then.
     """
 
     n_points: int
@@ -54,6 +57,7 @@ class LasPromise:
     compressed: bool
     bounds: tuple[float, float, float, float, float, float]
     extended: int = 0
+    has_void_box: bool = False
 
 
 def read_promise(path: Path) -> LasPromise:
@@ -158,29 +162,28 @@ def _parse(path: Path, head: bytes, extended: int) -> LasPromise:
             f"{path}: the header gives a point {point_size} bytes, the least point size is {_RETURN_BYTES}; "
             f"{AGAIN}"
         )
-    return LasPromise(n_points, point_size, point_format >= _COMPRESSED, _bounds(path, head, n_points), extended)
+    bounds, void = _bounds(path, head, n_points)
+    return LasPromise(n_points, point_size, point_format >= _COMPRESSED, bounds, extended, void)
 
 
-def _bounds(path: Path, head: bytes, n_points: int) -> tuple[float, float, float, float, float, float]:
+def _bounds(
+    path: Path, head: bytes, n_points: int
+) -> tuple[tuple[float, float, float, float, float, float], bool]:
+    """Give the box, and whether it is void."""
     scales = struct.unpack_from("<3d", head, 131)
     offsets = struct.unpack_from("<3d", head, 155)
     xmax, xmin, ymax, ymin, zmax, zmin = struct.unpack_from("<6d", head, 179)
     if n_points == 0:
-        return (float("nan"),) * 6
+        return (float("nan"),) * 6, False
     for axis, scale, offset in zip("xyz", scales, offsets, strict=True):
         if not 0 < scale <= SCALE_LIMIT:  # NaN fails too
             raise InputError(f"{path}: {axis} scale {scale:g} is not within 0 to {SCALE_LIMIT:g}; {AGAIN}")
         if not abs(offset) <= COORDINATE_LIMIT:
             raise InputError(f"{path}: {axis} offset {offset:g} is not within ±{COORDINATE_LIMIT:g} m; {AGAIN}")
-    for axis, low, high in (("x", xmin, xmax), ("y", ymin, ymax)):
-        if not (abs(low) <= COORDINATE_LIMIT and abs(high) <= COORDINATE_LIMIT):
-            raise InputError(
-                f"{path}: header bounds {axis} {low:g} to {high:g} are not within ±{COORDINATE_LIMIT:g} m; {AGAIN}"
-            )
-    for axis, low, high in (("x", xmin, xmax), ("y", ymin, ymax), ("z", zmin, zmax)):
-        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-            raise InputError(f"{path}: header bounds {axis} from {low:g} to {high:g} are no interval; {AGAIN}")
-    return xmin, ymin, xmax, ymax, zmin, zmax
+    ends = (xmin, xmax), (ymin, ymax), (zmin, zmax)
+    void = any(not low <= high or not math.isfinite(high - low) for low, high in ends)  # NaN too
+    void |= any(value == 0 or abs(value) > COORDINATE_LIMIT for value in (xmin, xmax, ymin, ymax))
+    return (xmin, ymin, xmax, ymax, zmin, zmax), void
 
 
 def _check_finished(path: Path, promise: LasPromise, n_bytes: int) -> None:

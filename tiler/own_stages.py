@@ -11,6 +11,7 @@ from tiler.engine import Engine
 from tiler.options import derived_parameters
 from tiler.padding import CORE_STAGE
 from tiler.stage import Stage
+from tiler.stages.alignment import alignment_stages
 from tiler.stages.approach import approach_stages
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
@@ -42,6 +43,7 @@ def list_stages(config: Config) -> list[Stage]:
     stages += [*later_round(config, 1), model_stage(config, 0), *domain_stages(config)]
     stages += [*approach_stages(config), *layer_stages(config, Domain(config.expected_height, None))]
     stages += [*city_model_stages(), fit_stage(config)]
+    stages += alignment_stages(config) if config.footprints else []
     return [*stages, *mesh_stages(config), *piece_stages()]
 
 
@@ -67,6 +69,7 @@ def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, 
     if taken:
         raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")
     given = {*dataclasses.asdict(config), *derived_parameters(config), "footprints_identity", "top_elevation"}
+    given |= {"footprints_frame", "footprints_shift"}
     given |= {"core_bounds", "rim_store", "rim_digest"}
     clash = sorted(own.parameters.keys() & given)
     if clash:

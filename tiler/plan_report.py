@@ -17,6 +17,7 @@ from tiler.atomic import replacing
 from tiler.config import Config
 from tiler.footprint_sample import FootprintSample, sample_footprints
 from tiler.forecast import CELLS_A_POINT, Forecast, forecast_run
+from tiler.georeference.units import unit_name
 from tiler.limits import machine_memory
 from tiler.plain_text import say_nothing
 from tiler.planning import Survey, check_sources, survey_inputs
@@ -61,7 +62,7 @@ def plan_run(
         if path is not None and not path.parent.is_dir():
             raise ConfigError(f"{path}: there is no folder {path.parent}; make it, or choose another")
     survey = survey_inputs(config, say_nothing)
-    sample = sample_footprints(config, survey.region)
+    sample = sample_footprints(config, survey.region, frame=survey.georeference.footprints)
     memory = None if config.on_cluster else machine_memory()
     forecast = forecast_run(survey, sample, config, memory=memory)
     plan = describe_plan(survey, sample, forecast, config, memory)
@@ -92,6 +93,7 @@ def describe_plan(
             "area": float(loads.area.sum()),
         }
         | ({"core": list(survey.region.bounds)} if config.padded else {}),
+        "georeference": survey.georeference.record,
         "tiles": {
             "size": config.tile_size_or_default,
             "present": len(loads),
@@ -162,6 +164,7 @@ def _print_plan(plan: dict[str, Any], console: Console) -> None:
     rows = [
         ("region", f"{_km(xmax - xmin)} x {_km(ymax - ymin)}, {xmin:.0f} {ymin:.0f} {xmax:.0f} {ymax:.0f}, {crs}")
     ]
+    rows.append(("", _describe_coordinates(plan["georeference"])))
     if "core" in region:
         xmin, ymin, xmax, ymax = region["core"]
         rows.append(("", f"of these {_km(xmax - xmin)} x {_km(ymax - ymin)} without the pad"))
@@ -208,6 +211,18 @@ def _print_plan(plan: dict[str, Any], console: Console) -> None:
     for label, text in rows:
         table.add_row(label, plain(text))
     console.print(table)
+
+
+def _describe_coordinates(found: dict[str, Any]) -> str:
+    """Say in which CRS and unit coordinates are, what they had in the files, and how true lengths are."""
+    units = {cloud["unit of heights (m)"] for cloud in found["clouds"]}
+    stated = all(cloud["unit of heights stated"] for cloud in found["clouds"])
+    heights = " and ".join(sorted(unit_name(unit) for unit in units))
+    taken = ", ".join(dict.fromkeys(cloud["taken as"] for cloud in found["clouds"]))
+    return (
+        f"coordinates of {taken}, heights in {heights}{'' if stated else ' (not stated)'}; a metre on the ground "
+        f"is {found['scale of the projection']:.4f} m in plan"
+    )
 
 
 def _task_rows(tasks: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:

@@ -8,15 +8,21 @@ from itertools import count
 from pathlib import Path
 
 from pipeline.errors import ConfigError, InputError
+from pipeline.notes import Note
 from stitch.grid import TileGrid, make_grid, tiles_present
 from tiler.clouds import CloudHeader, find_clouds, read_header
 from tiler.config import Config, idle_parameters
 from tiler.context import choose_tiles, make_layout, tile_key
-from tiler.crs import resolve_crs
+from tiler.crs import crs_text
+from tiler.georeference.cloud_crs import Asked
+from tiler.georeference.establish import FOOTPRINTS, Georeference, establish_georeference, find_inexact
+from tiler.georeference.operation import Operation
+from tiler.layers import describe_layer
 from tiler.objects.requests import WAITS
 from tiler.places import in_bucket, place
 from tiler.region import (
     Region,
+    check_points,
     check_region,
     check_sizes,
     choose_bounds,
@@ -25,7 +31,6 @@ from tiler.region import (
     foresee_pad,
 )
 from tiler.stage import FileItem, Layout
-from tiler.vectors import read_footprint_crs
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,11 @@ class Plan:
     layout: Layout
     survey: "Survey"
 
+    @property
+    def georeference(self) -> Georeference:
+        """Where the region lies."""
+        return self.survey.georeference
+
 
 @dataclass(frozen=True)
 class Survey:
@@ -77,6 +87,8 @@ class Survey:
         Files left out, with the reason.
     grid : TileGrid
         Tiles, those without any point cloud left out.
+    georeference : Georeference
+        Where the region lies, and how coordinates of its input get there.
     meshed : TileGrid
         The same, and those of the pad where there is one; where its width follows from the tallest building, that
         of an expected one counts.
@@ -88,6 +100,7 @@ class Survey:
     messages: list[str]
     unreadable: dict[str, str]
     grid: TileGrid
+    georeference: Georeference
     meshed: TileGrid
 
 
@@ -138,14 +151,9 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     """
     paths = find_clouds(config.pointcloud)
     headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
-    footprint_crs = read_footprint_crs(place(config.footprints), config.layer) if config.footprints else None
-    crs, messages = resolve_crs(config.crs or None, headers, footprint_crs)
-    code = crs.to_epsg()
-    region = Region(
-        choose_bounds(config.bounds, headers),
-        f"EPSG:{code}" if code else crs.to_wkt(),
-        config.tile_size_or_default,
-    )
+    found = find_georeference(config, headers)
+    headers, messages = found.clouds, list(found.messages)
+    region = Region(choose_bounds(config.bounds, headers), crs_text(found.crs), config.tile_size_or_default)
     check_region(region, config.largest_size, headers, kind="open" if config.open_size else "mesh")
     check_sizes(region, config)
     clouds = [header for header in headers if header.n_points and _meets(header, region)]
@@ -172,7 +180,33 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
         messages.append("no footprints given: the mesh has terrain only")
     for message in messages:
         say(message)
-    return Survey(region, headers, clouds, messages, unreadable, grid, foresee_pad(grid, config))
+    return Survey(region, headers, clouds, messages, unreadable, grid, found, foresee_pad(grid, config))
+
+
+def find_georeference(config: Config, headers: Sequence[CloudHeader]) -> Georeference:
+    """Establish where the region lies, of headers of clouds and of the footprints' layer."""
+    check_points(headers)
+    asked = Asked(config.crs, config.reproject, config.height_unit)
+    layer = describe_layer(place(config.footprints), config.layer) if config.footprints else None
+    crs, extent = (None, None) if layer is None else (layer.crs, layer.extent)
+    found = establish_georeference(asked, headers, crs, extent)
+    inexact = find_inexact(found, config.clearance)
+    words = [_describe_inexact(found.operations[note.subject], note.subject, config) for note in inexact]
+    void = [
+        Note("cloud-void-header-box", header.path.name, detail="the box in the header is void; that of the points")
+        for header in headers
+        if header.box_of_points
+    ]
+    if void:
+        words.append(f"{len(void)} point clouds have no sound box in their header; their points were read for it")
+    notes = [*found.notes, *void, *inexact]
+    return replace(found, messages=[*found.messages, *words], notes=notes)
+
+
+def _describe_inexact(operation: Operation, subject: str, config: Config) -> str:
+    aligned = config.align and subject == FOOTPRINTS
+    end = "--align moves them by what the points show" if aligned else "the run ends with exit code 3"
+    return f"{subject}: {operation.exact}, worse than the clearance of {config.clearance:g} m; {end}"
 
 
 def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:
@@ -181,7 +215,7 @@ def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:
     for header in clouds:
         stem = re.sub(r"[^\w-]", "_", header.path.stem)
         name = next(name for k in count(1) if (name := f"{stem}-{k}" if k > 1 else stem) not in items)
-        items[name] = FileItem(str(header.path), header.bounds[:4], identify(header.path))
+        items[name] = FileItem(str(header.path), header.bounds[:4], identify(header.path), header.frame)
     return items
 
 

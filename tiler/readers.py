@@ -197,13 +197,24 @@ def region_window(box: Box, spacing: float, bounds: Bounds) -> NodeWindow:
     return grow_window(node_window(box, spacing), 0, within=node_window(bounds, spacing))
 
 
-def read_outlines(task: Task) -> Footprints:
-    """Read the footprints that meet the task's box, from the stage ``footprints``: the rows of its cells alone."""
+def read_outlines(task: Task, *, shift: tuple[float, float] = (0.0, 0.0)) -> Footprints:
+    """Read the footprints that meet the task's box, from the stage ``footprints``: the rows of its cells alone.
+
+    They are moved by a shift (m) before.
+    """
+    if any(shift):
+        xmin, ymin, xmax, ymax = task.box
+        found = _read_outlines(task, (xmin - shift[0], ymin - shift[1], xmax - shift[0], ymax - shift[1]))
+        return replace(found, polygons=shapely.transform(found.polygons, lambda xy: xy + shift))
+    return _read_outlines(task, task.box)
+
+
+def _read_outlines(task: Task, box: Box) -> Footprints:
     (found,) = task.read("footprints", ())
     if found.facts["n"] == 0:
-        return join_footprints([], task.box)
+        return join_footprints([], box)
     arrays, _ = task.store.read("footprints", found.name, names=("cell_box", "cell_start", "end"))
-    ranges = select_footprints(arrays["cell_box"], np.append(arrays["cell_start"], arrays["end"]), task.box)
+    ranges = select_footprints(arrays["cell_box"], np.append(arrays["cell_start"], arrays["end"]), box)
 
     def read(ranges: Ranges, *names: str) -> dict[str, NDArray[Any]]:
         return task.read_ranges("footprints", found.name, names, ranges)
@@ -215,7 +226,7 @@ def read_outlines(task: Task) -> Footprints:
     wkb, text = read(wkb_ranges, "wkb")["wkb"], read(id_ranges, "id")["id"].tobytes()
     ids = np.array([text[first:last].decode() for first, last in pairwise(letter.tolist())], np.str_)
     rest = read(ranges, "given_height", "box")
-    return join_footprints([FootprintRows(wkb, byte, ids, rest["given_height"], rest["box"])], task.box)
+    return join_footprints([FootprintRows(wkb, byte, ids, rest["given_height"], rest["box"])], box)
 
 
 def _cut_ranges(ends: NDArray[np.int64], ranges: Ranges) -> tuple[Ranges, NDArray[np.int64]]:

@@ -44,6 +44,14 @@ class Region:
     tile_size: float
 
 
+def check_points(clouds: Sequence[CloudHeader]) -> None:
+    """Raise InputError if no cloud has a point."""
+    if not any(cloud.n_points > 0 for cloud in clouds):
+        raise InputError(
+            f"point cloud: {len(clouds)} files hold no point at all; nothing can be meshed without ground points"
+        )
+
+
 def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Bounds:
     """Take the bounds asked for, else the whole metres inside the extent of all clouds with points.
 
@@ -53,10 +61,7 @@ def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Boun
         If no cloud has a point, or none meets the bounds.
     """
     extents = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
-    if not extents:
-        raise InputError(
-            f"point cloud: {len(clouds)} files hold no point at all; nothing can be meshed without ground points"
-        )
+    check_points(clouds)
     xmin, ymin = min(e[0] for e in extents), min(e[1] for e in extents)
     xmax, ymax = max(e[2] for e in extents), max(e[3] for e in extents)
     if not asked:

@@ -22,6 +22,7 @@ from tiler.quarantine import (
 )
 from tiler.settling import settle_domain
 from tiler.stage import REGION_ITEM
+from tiler.stages.alignment import alignment_stages, shift_of
 from tiler.stages.city import first_round, house_stage, later_round, member_stage, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.inputs import fill_stage, input_stages, lake_stage
@@ -43,6 +44,8 @@ def run_stages(engine: Engine, config: Config) -> int:
     domain = settle_domain(engine, config)
     # Nothing waits for these: first in a call, so last of what may run, they fill the time in which others wait.
     of_model = [fit_stage(config), *city_model_stages()]
+    if config.footprints and not config.align:
+        of_model = [*alignment_stages(config), *of_model]
     meshed = [*mesh_stages(config, domain), *piece_stages()]
     if config.padded:
         engine.tell_layout()
@@ -61,14 +64,20 @@ def run_stages(engine: Engine, config: Config) -> int:
     return rounds
 
 
-def run_city_stages(engine: Engine, config: Config) -> int:
+def run_city_stages(engine: Engine, config: Config, *, shift: tuple[float, float] | None = None) -> int:
     """Run the stages up to the simplified city model; parameters and result as for `run_stages`.
+
+    A shift of the footprints (m) that is known is taken, and not measured.
 
     Raises
     ------
     HolesError
         If an item was set aside.
     """
+    if shift is not None:
+        engine.add_parameters(footprints_shift=shift)
+    elif config.align and config.footprints:
+        _align(engine, config)
     engine.run(*input_stages(config))
     stop_at_holes(engine)
     deep = engine.records["coarse", REGION_ITEM].facts["deep"]
@@ -94,6 +103,15 @@ def run_city_stages(engine: Engine, config: Config) -> int:
     engine.run(model_stage(config, last))
     stop_at_holes(engine)
     return last + 1
+
+
+def _align(engine: Engine, config: Config) -> None:
+    """Measure the shift between footprints and roofs before footprints are used, and take it from now on."""
+    wanted = {"points", "footprints"}
+    before = [stage for stage in input_stages(config) if stage.name in wanted]
+    engine.run(*before, *alignment_stages(config))
+    stop_at_holes(engine)
+    engine.add_parameters(footprints_shift=shift_of(engine.records["shift", REGION_ITEM].facts))
 
 
 def make_engine(
@@ -122,6 +140,8 @@ def make_engine(
         **own.parameters,
         **derived_parameters(config),
         footprints_identity=identify(footprints) if footprints else "",
+        footprints_frame=dataclasses.astuple(plan.georeference.footprints),
+        footprints_shift=(0.0, 0.0),
     )
     return Engine(
         out / STORE,

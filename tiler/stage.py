@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
+from tiler.georeference.frame import AS_IT_IS, Frame
+
 if TYPE_CHECKING:
     from tiler.task import Task
 
@@ -115,11 +117,14 @@ class FileItem:
         xmin, ymin, xmax, ymax of its content (m).
     identity : str
         Changes when the content does: path, size and time of change, say.
+    frame : Frame
+        How its coordinates become those of the region.
     """
 
     path: str
     box: Box
     identity: str
+    frame: Frame = AS_IT_IS
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,13 @@ from tiler.config import Config
 from tiler.context import absent_tiles, tile_name
 from tiler.domain import settle
 from tiler.engine import Engine
+from tiler.georeference.establish import FOOTPRINTS
 from tiler.padding import CORE_STAGE
 from tiler.places import place
 from tiler.planning import Plan
 from tiler.quarantine import Missing, describe_missing
 from tiler.stage import REGION_ITEM, Facts
+from tiler.stages.alignment import describe_alignment
 from tiler.stages.approach import RIM
 from tiler.stages.domain import LOW_DOMAIN
 from tiler.task import read_notes
@@ -23,7 +25,7 @@ from tiler.task import read_notes
 EXIT_DONE, EXIT_INCOMPLETE = 0, 3
 # Notes of these kinds say that something is missing which the input has: the exit code tells.
 INCOMPLETE = {
-    *("building-beyond-region", "building-lost", "building-points-without-footprints"),
+    *("crs-accuracy", "building-beyond-region", "building-lost", "building-points-without-footprints"),
     "footprint-too-many-vertices",
 }
 DAMAGED = "damaged-artefact"  # kind of the notes on what was damaged or missing, and made anew
@@ -52,12 +54,20 @@ def summarise_run(
     """
     records = engine.records
     clouds = {record.name: record.facts for record in records.of("points")}
-    notes = [*_collect_notes(engine), *_notes_of_clouds(engine, config, list(clouds.values()))]
+    notes = [
+        *plan.georeference.notes,
+        *_collect_notes(engine),
+        *_notes_of_clouds(engine, config, list(clouds.values())),
+    ]
     notes += [Note(DAMAGED, path, detail=f"{what}; made anew") for path, what in sorted(damage.items())]
     unreadable = dict(plan.unreadable)
     unreadable |= {
         plan.layout.files[name].path: facts["unreadable"] for name, facts in clouds.items() if facts["unreadable"]
     }
+    alignment, misaligned, words = describe_alignment(records, config)
+    notes += misaligned
+    if alignment.get("applied"):
+        notes = [note for note in notes if (note.kind, note.subject) != ("crs-accuracy", FOOTPRINTS)]
     report = records["report", REGION_ITEM].facts
     found = records["domain", REGION_ITEM].facts
     domain = settle(config.domain_height, config.top, found)
@@ -74,6 +84,7 @@ def summarise_run(
         }
         | ({} if domain.top is None else {"top": domain.top})
         | (_describe_pad(engine) if config.padded else {}),
+        "georeference": plan.georeference.record | ({"alignment": alignment} if alignment else {}),
         "domain": {"height (m)": domain.height, "tallest building (m)": found["tallest"]},
         "tiles": {
             name: {
@@ -93,7 +104,7 @@ def summarise_run(
         "ran": records.count_ran(),
         "seconds": {name: round(seconds, 3) for name, seconds in sorted(records.seconds.items())},
         "peak_memory_bytes": records.peak_memory,
-        "messages": [*plan.messages, *_tell_damage(damage), *_tell_low_domain(notes)],
+        "messages": [*plan.messages, *words, *_tell_damage(damage), *_tell_low_domain(notes)],
         "unreadable": unreadable,
         "notes": group_notes(notes),
     }

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import CityError
 from pipeline.notes import Note, count_notes
+from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.objects.requests import WAITS
 from tiler.places import in_bucket
 from tiler.result_writer import Writer, plain_json
@@ -158,6 +159,8 @@ class Task:
         Key of all that the result depends on.
     folder : Path
         Where the files are that results state as the fact ``"files"``.
+    frame : Frame
+        How coordinates of the file become those of the region, for the scope FILE.
     """
 
     stage: str
@@ -171,6 +174,7 @@ class Task:
     refs: dict[str, tuple[str, ...]]
     key: str
     folder: Path
+    frame: Frame = AS_IT_IS
     _writer: Writer | None = None
     _notes: list[Note] = field(default_factory=list)
     _seconds: dict[str, float] = field(default_factory=dict)

@@ -8,6 +8,7 @@ from pipeline.citymodel import Footprints
 from pipeline.notes import Note
 from tiler.crs import horizontal_crs
 from tiler.footprint_index import join_footprints, scan_footprints
+from tiler.georeference.frame import Frame
 from tiler.layers import Box, describe_layer
 from tiler.places import as_place
 
@@ -46,6 +47,7 @@ def read_footprints(
     layer: str = "",
     id_attribute: str = "",
     height_attribute: str = "",
+    frame: Frame | None = None,
 ) -> tuple[Footprints, tuple[Note, ...]]:
     """Read the footprints that meet a box (step 1.2).
 
@@ -63,6 +65,8 @@ def read_footprints(
         Attribute with the building's id; ``""`` for the first of `ID_ATTRIBUTES` that the layer has.
     height_attribute : str
         Attribute with the height above ground (m); ``""`` for none.
+    frame : Frame, optional
+        How coordinates of the file become those of the region; by default as the CRSs have it.
 
     Returns
     -------
@@ -96,6 +100,7 @@ def read_footprints(
             layer=layer,
             id_attribute=id_attribute,
             height_attribute=height_attribute,
+            frame=frame,
         )
     )
     notes = tuple(note for block in blocks for note in block.notes)

@@ -8,6 +8,7 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.alignment import REACH
 from pipeline.errors import InputError
 from pipeline.ground_check import LEAST_STEP, compare_ground, is_upside_down
 from pipeline.notes import Note
@@ -30,6 +31,7 @@ from stitch.grid import Key, has_tile
 from tiler.config import Config
 from tiler.context import tile_key
 from tiler.footprint_index import scan_footprints
+from tiler.georeference.frame import Frame
 from tiler.ingest import CELL, read_cells
 from tiler.places import place
 from tiler.readers import clip, grow, join_rasters, read_bands, read_outlines, read_units
@@ -48,17 +50,20 @@ def input_stages(config: Config) -> list[Stage]:
             Scope.FILE,
             read_point_file,
             parameters=("skip_unreadable", "building_classes", "ground_filter"),
-            version=3,
+            version=4,
         ),
         Stage(
             "footprints",
             Scope.REGION,
             read_footprint_file,
-            parameters=("footprints", "footprints_identity", "layer", "id_attribute", "height_attribute"),
+            parameters=(
+                *("footprints", "footprints_identity", "footprints_frame", "align"),
+                *("layer", "id_attribute", "height_attribute"),
+            ),
             version=2,
         ),
         # What a tile needs of the footprints: it does not run again when others change.
-        Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),), version=2),
+        Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),), ("footprints_shift",), version=3),
         Stage("reserved", Scope.REGION, list_reserved, (Read("footprints"),)),
         Stage(
             "ground", Scope.TILE, bin_tile, (Read("points", halo_of_points(config, spacing)),), ground, version=2
@@ -106,7 +111,7 @@ def read_point_file(task: Task) -> Facts:
     blocks = [0]
     steps = [np.empty(0)]
     try:
-        for block in read_cells(task.file, task.context.bounds):
+        for block in read_cells(task.file, task.context.bounds, frame=task.frame):
             task.append(
                 units=block.units,
                 classification=become[block.classification],
@@ -160,7 +165,8 @@ def read_footprint_file(task: Task) -> Facts:
     for block in scan_footprints(
         place(given.footprints),
         crs=pyproj.CRS.from_user_input(task.context.crs),
-        bounds=task.context.bounds,
+        bounds=grow(task.context.bounds, REACH) if given.align else task.context.bounds,
+        frame=Frame(*given.footprints_frame),
         layer=given.layer,
         id_attribute=given.id_attribute,
         height_attribute=given.height_attribute,
@@ -192,7 +198,7 @@ def read_footprint_file(task: Task) -> Facts:
 
 def take_outlines(task: Task) -> Facts:
     """Take the footprints that meet a tile (step 1.2)."""
-    footprints = read_outlines(task)
+    footprints = read_outlines(task, shift=task.parameters.footprints_shift)
     task.put(
         **pack_polygons(footprints.polygons, "outline"),
         ids=footprints.ids,

@@ -1,0 +1,360 @@
+"""Which CRS and units the coordinates of each cloud have: what files state, held against what the user says."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pyproj
+
+from pipeline.errors import ConfigError, InputError
+from pipeline.notes import Note
+from tiler.clouds import CloudHeader
+from tiler.crs import crs_name, horizontal_crs, is_on_its_place, is_one, parse_crs, utm_crs
+from tiler.georeference.frame import Frame, box_to_region
+from tiler.georeference.las_crs import height_unit_of
+from tiler.georeference.metric import MetricCrs, find_metric
+from tiler.georeference.units import UNITS, same_unit, unit_name
+from tiler.georeference.words import box_words, directions_of, fault_of, like_degrees, pdal_command
+
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the user says of the CRS.
+
+    Attributes
+    ----------
+    crs : str
+        Value of ``--crs``, ``""`` for none.
+    reproject : bool
+        Whether clouds in another CRS are reprojected.
+    height_unit : str
+        Unit of heights, one of `UNITS`; ``""`` for what the files state.
+    """
+
+    crs: str = ""
+    reproject: bool = False
+    height_unit: str = ""
+
+
+@dataclass(frozen=True)
+class CloudGroup:
+    """Clouds that state the same of their coordinates."""
+
+    clouds: list[CloudHeader]
+    stated: pyproj.CRS | None  # horizontal
+
+    @property
+    def first(self) -> CloudHeader:
+        return self.clouds[0]
+
+    @property
+    def box(self) -> Box:
+        boxes = [cloud.bounds for cloud in self.clouds]
+        return (
+            min(box[0] for box in boxes),
+            min(box[1] for box in boxes),
+            max(box[2] for box in boxes),
+            max(box[3] for box in boxes),
+        )
+
+    @property
+    def label(self) -> str:
+        n = len(self.clouds)
+        return self.first.path.name if n == 1 else f"{n} point clouds ({self.first.path.name} and others)"
+
+
+@dataclass(frozen=True)
+class PlanCrs:
+    """Which metric CRS a group's coordinates in plan have, and from where."""
+
+    source: pyproj.CRS
+    metric: MetricCrs
+    degrees: bool = False
+
+
+@dataclass(frozen=True)
+class Told:
+    messages: list[str]
+    notes: list[Note]
+
+    def say(self, kind: str, subject: str, text: str) -> None:
+        self.messages.append(text)
+        self.notes.append(Note(kind, subject, detail=text))
+
+
+def group_clouds(clouds: Sequence[CloudHeader]) -> list[CloudGroup]:
+    """Group clouds with points by what they state, in the order of their first."""
+    groups: dict[Any, list[CloudHeader]] = {}
+    for cloud in clouds:
+        if cloud.n_points > 0:
+            groups.setdefault((id(cloud.crs), cloud.plan_unit, cloud.height_unit), []).append(cloud)
+    return [CloudGroup(members, horizontal_crs(members[0].crs)) for members in groups.values()]
+
+
+def read_wish(asked: Asked, groups: Sequence[CloudGroup]) -> tuple[pyproj.CRS, MetricCrs] | None:
+    """Parse ``--crs``, and find its metric form."""
+    if not asked.crs:
+        return None
+    full = parse_crs(asked.crs)
+    flat = horizontal_crs(full)
+    if flat is None:
+        raise ConfigError(f"--crs {asked.crs!r} has no place on Earth; give a projected CRS in metres")
+    if not flat.is_projected:
+        zone = next((zone for group in groups if (zone := utm_crs(group.box, flat))), None)
+        move = f"--crs {zone} --reproject" if zone else "the projected CRS of the clouds"
+        raise InputError(
+            f"--crs {crs_name(flat)} {fault_of(flat)}, and cells need metres; give {move} (the region's CRS)"
+        )
+    metric = find_metric(flat)
+    if metric is None:
+        raise InputError(
+            f"--crs {crs_name(flat)} has axes to the {directions_of(flat)}, and no register has it with axes "
+            "east and "
+            "north; give such a CRS, a UTM zone for example, with --reproject"
+        )
+    return flat, metric
+
+
+def choose_plan(
+    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Asked, told: Told
+) -> PlanCrs | None:
+    """Decide which CRS a group's coordinates have; None where neither file nor user says."""
+    stated = group.stated
+    if stated is None:
+        unread = f": {group.first.unread}" if group.first.unread else ""
+        if wish is None:
+            return None
+        told.say(
+            "cloud-without-crs",
+            group.first.path.name,
+            f"{group.label} {states_of(group)} no CRS that is understood{unread}; taken as {crs_name(wish[0])} "
+            "of --crs",
+        )
+        return PlanCrs(wish[0], _with_unit(group, wish[0], wish[1], told))
+    if stated.is_geographic:
+        return _choose_for_degrees(group, stated, wish, asked, told)
+    if not stated.is_projected:
+        raise InputError(
+            f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}; reproject the cloud to a "
+            "projected "
+            f"CRS: {pdal_command(group.first, stated, None)}"
+        )
+    metric = find_metric(stated)
+    if metric is None:
+        zone = utm_crs(group.box, stated) or "EPSG:<a projected CRS in metres>"
+        raise InputError(
+            f"{group.first.path}: its CRS, {crs_name(stated)}, has axes to the {directions_of(stated)}, and no "
+            "register "
+            f"has it with axes east and north; reproject the cloud: {pdal_command(group.first, stated, zone)}"
+        )
+    if wish is None or asked.reproject or is_one(metric.crs, wish[1].crs, metric_box(group, metric)):
+        return PlanCrs(stated, _with_unit(group, stated, metric, told))
+    return _overrule(group, stated, wish, told)
+
+
+def _overrule(group: CloudGroup, stated: pyproj.CRS, wish: tuple[pyproj.CRS, MetricCrs], told: Told) -> PlanCrs:
+    """Take ``--crs`` for what a file states, where its coordinates are plausible for that."""
+    flat, metric = wish
+    if not is_on_its_place(metric_box(group, metric), metric.crs):
+        raise InputError(
+            f"{group.first.path}: states {crs_name(stated)}, but --crs asks for {crs_name(flat)}, where "
+            "coordinates "
+            f"such as ({group.box[0]:.10g}, {group.box[1]:.10g}) have no place; add --reproject to reproject "
+            "the cloud, "
+            f"or leave out --crs"
+        )
+    told.say(
+        "cloud-crs-overruled",
+        group.first.path.name,
+        f"{group.label} {states_of(group)} {crs_name(stated)}; taken as {crs_name(flat)} of --crs (--reproject "
+        "would "
+        "reproject instead)",
+    )
+    return PlanCrs(flat, metric)
+
+
+def _choose_for_degrees(
+    group: CloudGroup,
+    stated: pyproj.CRS,
+    wish: tuple[pyproj.CRS, MetricCrs] | None,
+    asked: Asked,
+    told: Told,
+) -> PlanCrs:
+    if asked.reproject and is_on_its_place(group.box, stated):
+        return PlanCrs(stated, MetricCrs(stated, (0, 1.0), (1, 1.0)), degrees=True)
+    if wish is not None and not like_degrees(group.box):
+        return _overrule(group, stated, wish, told)
+    target = crs_name(wish[0]) if wish is not None else utm_crs(group.box, stated)
+    raise InputError(
+        f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}, and cells need metres; give "
+        "--reproject"
+        f"{f' --crs {target}' if target else ''}, or reproject this and every cloud like it: "
+        f"{pdal_command(group.first, stated, target)}"
+    )
+
+
+def _with_unit(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, told: Told) -> MetricCrs:
+    """Take the unit that a key states beside a CRS, and the axes that the coordinates show."""
+    unit = group.first.plan_unit
+    sizes = abs(metric.east[1]), abs(metric.north[1])
+    if unit is not None and any(not same_unit(unit, size) for size in sizes):
+        keyed = MetricCrs(
+            metric.crs,
+            (metric.east[0], math.copysign(unit, metric.east[1])),
+            (metric.north[0], math.copysign(unit, metric.north[1])),
+        )
+        by_key, by_crs = (is_on_its_place(metric_box(group, one), one.crs) for one in (keyed, metric))
+        taken = keyed if by_key or not by_crs else metric
+        told.say(
+            "cloud-unit-of-key",
+            group.first.path.name,
+            f"{group.label}: {crs_name(crs)} is in {unit_name(sizes[0])}, but GeoTIFF key 3076 says "
+            f"{unit_name(unit)}; coordinates are taken in {unit_name(unit if taken is keyed else sizes[0])}",
+        )
+        return taken
+    return _with_axes(group, crs, metric, told)
+
+
+def _with_axes(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, told: Told) -> MetricCrs:
+    """Take the axes that the coordinates show, where those of the CRS put them off its area of use."""
+    if is_on_its_place(metric_box(group, metric), metric.crs):
+        return metric
+    sizes = abs(metric.east[1]), abs(metric.north[1])
+    others = {
+        f"{crs_name(crs)} has axes to the {directions_of(crs)}, but the coordinates grow to the east and north": (
+            MetricCrs(metric.crs, (0, sizes[0]), (1, sizes[1]))
+        ),
+        f"the northing comes first, before the easting of {crs_name(crs)}": (
+            MetricCrs(metric.crs, (1, sizes[0]), (0, sizes[1]))
+        ),
+    }
+    for words, other in others.items():
+        if other != metric and is_on_its_place(metric_box(group, other), other.crs):
+            told.say(
+                "cloud-axes", group.first.path.name, f"{group.label}: {words}; taken as {crs_name(metric.crs)}"
+            )
+            return other
+    return metric
+
+
+def choose_fallback(
+    groups: Sequence[CloudGroup],
+    plans: Sequence[PlanCrs | None],
+    wish: tuple[pyproj.CRS, MetricCrs] | None,
+    footprints: pyproj.CRS | None,
+    asked: Asked,
+    told: Told,
+) -> PlanCrs:
+    """What is taken for clouds that state nothing: what the others state, else the footprints' CRS."""
+    silent = [group for group, plan in zip(groups, plans, strict=True) if plan is None]
+    known = [(group, plan) for group, plan in zip(groups, plans, strict=True) if plan is not None]
+    if not silent:
+        return known[0][1]
+    n_silent, n_all = sum(len(group.clouds) for group in silent), sum(len(group.clouds) for group in groups)
+    unread = next((f" ({group.first.unread})" for group in silent if group.first.unread), "")
+    if known:
+        group, plan = known[0]
+        told.say(
+            "cloud-without-crs",
+            silent[0].first.path.name,
+            f"{n_silent} of {n_all} point clouds state no CRS{unread}; taken as {crs_name(plan.source)} of "
+            f"{group.first.path.name}",
+        )
+        return plan
+    first = silent[0]
+    if like_degrees(first.box):
+        return _assume_degrees(first, asked, told)
+    flat = horizontal_crs(footprints)
+    if flat is None:
+        raise InputError(
+            f"neither point clouds nor footprints state a CRS{unread}; give --crs, as in --crs EPSG:28992"
+        )
+    metric = find_metric(flat) if flat.is_projected else None
+    if metric is None:
+        raise InputError(
+            f"the point clouds state no CRS{unread}, and that of the footprints, {crs_name(flat)}, "
+            f"{fault_of(flat) or f'has axes to the {directions_of(flat)}'}; give the CRS of the clouds with --crs"
+        )
+    told.say(
+        "cloud-without-crs",
+        first.first.path.name,
+        f"the point cloud states no CRS{unread}; using {crs_name(flat)} of the footprints",
+    )
+    return PlanCrs(flat, _with_unit(first, flat, metric, told))
+
+
+def _assume_degrees(group: CloudGroup, asked: Asked, told: Told) -> PlanCrs:
+    wgs84 = pyproj.CRS("EPSG:4326")
+    if asked.reproject:
+        told.say(
+            "cloud-without-crs",
+            group.first.path.name,
+            f"{group.label} {states_of(group)} no CRS, and the coordinates look like degrees; taken as "
+            "EPSG:4326 (WGS 84)",
+        )
+        return PlanCrs(wgs84, MetricCrs(wgs84, (0, 1.0), (1, 1.0)), degrees=True)
+    zone = utm_crs(group.box, wgs84)
+    raise InputError(
+        f"{group.first.path}: states no CRS, and its coordinates, {box_words(group.box)}, look like degrees, "
+        "where "
+        f"cells need metres; give --reproject{f' --crs {zone}' if zone else ''} if they are WGS 84, or "
+        "reproject it: "
+        f"{pdal_command(group.first, wgs84, zone)}"
+    )
+
+
+def choose_height_unit(group: CloudGroup, plan: PlanCrs, asked: Asked, told: Told) -> float:
+    """Metres of a unit of height: asked for, stated, or that of plan."""
+    stated, name = group.first.height_unit, group.first.path.name
+    if asked.height_unit:
+        unit = UNITS[asked.height_unit]
+        if stated is not None and not same_unit(stated, unit):
+            told.say(
+                "cloud-height-unit",
+                name,
+                f"{group.label}: states heights in {unit_name(stated)}; taken in {unit_name(unit)} by "
+                "--height-unit",
+            )
+    elif stated is not None:
+        unit = stated
+    elif asked.crs and (by_crs := height_unit_of(parse_crs(asked.crs))) is not None:
+        unit = by_crs
+    else:
+        unit = 1.0 if plan.degrees else abs(plan.metric.east[1])
+        if unit != 1.0:
+            told.say(
+                "cloud-height-unit",
+                name,
+                f"{group.label}: no record states the unit of heights; taken in {unit_name(unit)} as plan is, "
+                "--height-unit m says otherwise",
+            )
+    if unit != 1.0:
+        told.say(
+            "cloud-height-converted", name, f"{group.label}: heights in {unit_name(unit)} converted to metres"
+        )
+    return unit
+
+
+def metric_box(group: CloudGroup, metric: MetricCrs) -> Box:
+    return box_to_region(Frame(metric.east, metric.north), group.box)
+
+
+def group_box(group: CloudGroup, plan: PlanCrs) -> Box:
+    """Give the box of a group in its metric CRS, or in degrees."""
+    return group.box if plan.degrees else metric_box(group, plan.metric)
+
+
+def box_around(boxes: Sequence[Sequence[float]]) -> Box:
+    return (
+        min(box[0] for box in boxes),
+        min(box[1] for box in boxes),
+        max(box[2] for box in boxes),
+        max(box[3] for box in boxes),
+    )
+
+
+def states_of(group: CloudGroup) -> str:
+    return "states" if len(group.clouds) == 1 else "state"

@@ -1,0 +1,65 @@
+"""How coordinates of the footprints become those of the region (step 1.2)."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pyproj
+
+from pipeline.errors import InputError
+from tiler.crs import crs_name, crs_text, is_one
+from tiler.georeference.frame import Frame
+from tiler.georeference.metric import MetricCrs, find_metric
+from tiler.georeference.operation import Operation, find_operation
+from tiler.georeference.words import directions_of
+
+Box = tuple[float, float, float, float]
+
+
+def footprint_frame(
+    stated: pyproj.CRS, crs: pyproj.CRS, box: Box, say: Callable[[str, str, str], None] | None = None
+) -> tuple[Frame, Operation | None]:
+    """Say how coordinates of footprints become those of a region.
+
+    Parameters
+    ----------
+    stated : pyproj.CRS
+        CRS of the footprints, horizontal.
+    crs : pyproj.CRS
+        The region's.
+    box : tuple of 4 floats
+        The region (m).
+    say : callable, optional
+        Told the kind, the subject and the text of what the user must know.
+
+    Returns
+    -------
+    Frame
+    Operation or None
+        None where nothing is reprojected.
+
+    Raises
+    ------
+    InputError
+        If the axes of the CRS point elsewhere, and no register has it with axes east and north.
+    """
+    metric = MetricCrs(stated, (0, 1.0), (1, 1.0)) if stated.is_geographic else find_metric(stated)
+    if metric is None:
+        raise InputError(
+            f"the footprints: {crs_name(stated)} has axes to the {directions_of(stated)}, and no register has "
+            "it with "
+            f"axes east and north; reproject them: ogr2ogr -t_srs {crs_name(crs)} metric.gpkg <footprints>"
+        )
+    plain = Frame(metric.east, metric.north)
+    if not stated.is_geographic and is_one(metric.crs, crs, box):
+        if say is not None and plain.changes_plan:
+            say(
+                "footprints-converted",
+                "footprints",
+                f"the footprints: {crs_name(stated)} converted to {crs_name(crs)}",
+            )
+        return plain, None
+    frame = replace(plain, source=crs_text(metric.crs), target=crs_text(crs))
+    operation = find_operation(metric.crs, crs, box)
+    if say is not None:
+        say("footprints-operation", "footprints", f"the footprints are reprojected {operation.describe()}")
+    return frame, operation
