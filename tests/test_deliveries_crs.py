@@ -109,7 +109,7 @@ def test_web_mercator_is_never_meshed_as_metres(tmp_path: Path) -> None:
 
 
 def test_web_mercator_is_taken_to_the_utm_zone_that_is_asked_for(tmp_path: Path) -> None:
-    record = run_delivery(EPT, tmp_path, crs="EPSG:26918")
+    record = run_delivery(EPT, tmp_path, crs="EPSG:26918", reproject=True)
     assert_right(tmp_path)
     xmin, _, xmax, _ = record["region"]["bounds"]
     assert xmax - xmin == pytest.approx(120, abs=5)
