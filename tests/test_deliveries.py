@@ -342,12 +342,25 @@ def test_class_2_that_is_no_ground_is_refused(delivery: Delivery, tmp_path: Path
         run_delivery(delivery, tmp_path)
 
 
-@pytest.mark.parametrize(("delivery", "marks"), [(FLANDERS_1, (6,)), (DALES, (8,)), (UNCLASSIFIED, (6,))])
+@pytest.mark.parametrize(
+    ("delivery", "marks"),
+    [
+        (FLANDERS_1, (6,)),
+        (DALES, (6,)),
+        (replace(DALES, point_format=6, version="1.4"), (8,)),
+        (UNCLASSIFIED, (6,)),
+    ],
+)
 def test_ground_is_found_anew_where_classes_are_of_its_own(
     delivery: Delivery, marks: tuple[int, ...], tmp_path: Path
 ) -> None:
     run_delivery(delivery, tmp_path, ground_filter=True, building_classes=marks)
     assert_right(tmp_path)
+
+
+def test_key_points_of_old_formats_mark_no_buildings(tmp_path: Path) -> None:
+    with pytest.raises(CityError, match=r"--building-classes names 8, .* key points .* --ground-filter"):
+        run_delivery(DALES, tmp_path, ground_filter=True, building_classes=(6, 8))
 
 
 def test_a_cloud_without_any_class_names_the_filter(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from pipeline.alignment import REACH
 from pipeline.errors import InputError
 from pipeline.ground_check import LEAST_STEP, compare_ground, is_upside_down
 from pipeline.notes import Note
-from pipeline.pointcloud import GROUND, WATER, rename_classes
+from pipeline.pointcloud import GROUND, KEY_POINT, WATER, rename_classes
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
 from pipeline.terrain import bin_nodes, bin_units
 from pipeline.terrain_fill import (
@@ -28,6 +28,7 @@ from pipeline.terrain_fill import (
     merge_coarse,
 )
 from stitch.grid import Key, has_tile
+from tiler.clouds import KEY_POINTS
 from tiler.config import Config
 from tiler.context import tile_key
 from tiler.footprint_index import scan_footprints
@@ -126,8 +127,7 @@ def read_point_file(task: Task) -> Facts:
             scaling = {"scale": block.scale, "offset": block.offset}
             z = np.asarray(block.units[:, 2] * block.scale[2] + block.offset[2], np.float64)
             steps.append(compare_ground(z, block.classification, block.start))
-        if not task.parameters.ground_filter:
-            _check_ground(task.file, np.concatenate(steps))
+        _check_classes(task, np.concatenate(steps), counts[KEY_POINTS])
     except InputError as error:
         if not task.parameters.skip_unreadable:
             raise
@@ -143,15 +143,22 @@ def read_point_file(task: Task) -> Facts:
     }
 
 
-def _check_ground(file: str, steps: NDArray[np.float64]) -> None:
-    """Refuse a cloud whose class 2 lies above what has no class."""
-    if is_upside_down(steps):
+def _check_classes(task: Task, steps: NDArray[np.float64], n_key_points: int) -> None:
+    """Refuse a cloud whose class 2 lies above what has no class, or whose key points are to be buildings."""
+    given, file = task.parameters, task.file
+    if not given.ground_filter and is_upside_down(steps):
         high = steps[steps > LEAST_STEP]
         raise InputError(
             f"{file}: class {GROUND} lies {np.median(high):.1f} m above classes 0 and 1 in {len(high)} of "
             f"{len(steps)} squares of {CELL:g} m, so it is not ground here: this cloud has classes of its own; "
             "renumber them to those of ASPRS (pdal translate, filters.assign), or find ground anew with "
             "--ground-filter"
+        )
+    if KEY_POINT in given.building_classes and n_key_points:
+        raise InputError(
+            f"{file}: --building-classes names {KEY_POINT}, the class of key points of the ground in its point "
+            f"format (0 to 5), and {n_key_points} points have it; leave {KEY_POINT} out, and find ground anew with "
+            "--ground-filter if they are buildings"
         )
 
 
