@@ -157,8 +157,8 @@ def _check_classes(task: Task, steps: NDArray[np.float64], n_key_points: int) ->
     if KEY_POINT in given.building_classes and n_key_points:
         raise InputError(
             f"{file}: --building-classes names {KEY_POINT}, the class of key points of the ground in its point "
-            f"format (0 to 5), and {n_key_points} points have it; leave {KEY_POINT} out, and find ground anew with "
-            "--ground-filter if they are buildings"
+            f"format (0 to 5), and {n_key_points} points have it; leave {KEY_POINT} out, and find ground anew if "
+            "they are buildings: --ground-filter"
         )
 
 
