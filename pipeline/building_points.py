@@ -12,19 +12,34 @@ from pipeline.group_order import sort_values
 from pipeline.inside import are_inside, find_inside
 from pipeline.kernel import kernel
 from pipeline.pointcloud import (
+    BRIDGE_DECK,
     BUILDING,
     GROUND,
     HIGH_NOISE,
     HIGH_VEGETATION,
+    KEY_POINT,
     LOW_NOISE,
     LOW_VEGETATION,
     MEDIUM_VEGETATION,
+    OVERHEAD,
+    RAIL,
+    ROAD,
+    SEA,
+    TRANSMISSION_TOWER,
     WATER,
+    WIRE_CONDUCTOR,
+    WIRE_CONNECTOR,
+    WIRE_GUARD,
     PointCloud,
 )
 
-# Where a cloud has no building class, a point of any class but these may lie on a roof.
-NEVER_ROOF = (GROUND, LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION, LOW_NOISE, WATER, HIGH_NOISE)
+# Where a cloud has no building class, a point of any class but these may lie on a roof. Class 20 is ignored ground
+# to LAS 1.4, but all that is not ground, buildings above all, to North Rhine-Westphalia.
+NEVER_ROOF = (
+    *(GROUND, LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION, LOW_NOISE, KEY_POINT, WATER, RAIL, ROAD),
+    *(WIRE_GUARD, WIRE_CONDUCTOR, TRANSMISSION_TOWER, WIRE_CONNECTOR, BRIDGE_DECK, HIGH_NOISE, OVERHEAD),
+    *SEA,
+)
 OUTLIER_DEVIATIONS = 2.0  # paper, step 1.5
 FINE_OUTLINE = 2000  # vertices; only the largest of real houses have so many
 
@@ -72,7 +87,7 @@ def extract_building_points(
         Ground points (classes 2 and 9) lie outside the footprint within this distance (m).
     building_class : bool
         True: roof points are those of class 6 inside. False, for a cloud without that class: those inside
-        that are neither ground, water, vegetation nor noise.
+        that are neither ground, water, vegetation nor noise, and no rail, road, wire or bridge deck.
     roof : (start, z), optional
         The roof points of each polygon, where they are known: int64 (n + 1,), and heights (m), ascending in each.
 

@@ -15,8 +15,15 @@ from pipeline.building_points import (
 )
 from pipeline.city import City, CityOptions
 from pipeline.house_levels import HouseParts, LevelOptions, split_levels
+from pipeline.inside import find_inside
 from pipeline.pointcloud import PointCloud
-from pipeline.roof_points import RoofPoints, locate_roof_points
+from pipeline.roof_points import (
+    RoofPoints,
+    add_roof_points,
+    locate_roof_points,
+    make_roof_points,
+    no_roof_points,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +61,7 @@ def divide_houses(
     *,
     building_class: bool | None = None,
     roofs: RoofPoints | None = None,
+    unmarked: NDArray[np.bool_] | None = None,
 ) -> Houses:
     """Divide houses where their roofs step (step 2.0, ours); with other options, take each as one part.
 
@@ -69,6 +77,8 @@ def divide_houses(
         Whether the cloud marks buildings; by default, whether it has a point of that class.
     roofs : RoofPoints, optional
         Roof points of the houses, where they are known.
+    unmarked : bool, (h,), optional
+        Houses whose roof points are those of `roofs` alone, whatever class they have in the cloud.
     """
     model = city.model
     marks = has_building_class(cloud) if building_class is None else building_class
@@ -78,13 +88,33 @@ def divide_houses(
             roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
         parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
         divided = np.flatnonzero(np.bincount(parts.house)[parts.house] > 1)
+        roof = None
+        if unmarked is not None and unmarked.any():
+            roof = _deal_out_roofs(
+                cloud, HouseParts(parts.polygons[divided], parts.house[divided]), roofs, unmarked
+            )
         found = extract_building_points(
-            cloud, parts.polygons[divided], margin=options.ground_margin, building_class=marks
+            cloud, parts.polygons[divided], margin=options.ground_margin, building_class=marks, roof=roof
         )
         rows = parts.house.copy()  # a house that is not divided keeps its points
         rows[divided] = len(model) + np.arange(len(divided))
         points = take_building_points(join_building_points([points, found]), rows)
     return Houses(model.ids, model.polygons, city.given_height, parts, points)
+
+
+def _deal_out_roofs(
+    cloud: PointCloud, parts: HouseParts, roofs: RoofPoints, unmarked: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Roof points of parts: of class 6 inside, and for unmarked houses those of the house inside."""
+    mine = unmarked[parts.house]
+    marked = locate_roof_points(cloud, parts.polygons[~mine], building_class=True)
+    owner = np.repeat(np.arange(len(unmarked)), np.diff(roofs.start))
+    part, point = find_inside(roofs.xyz, parts.polygons[mine], among=unmarked[owner])
+    own = parts.house[mine][part] == owner[point]
+    start = np.concatenate(([0], np.cumsum(np.bincount(part[own], minlength=int(mine.sum())))))
+    found = add_roof_points(no_roof_points(len(mine)), np.flatnonzero(~mine), marked)
+    found = add_roof_points(found, np.flatnonzero(mine), make_roof_points(start, roofs.xyz[point[own]]))
+    return found.start, found.z
 
 
 def take_houses(houses: Houses, rows: NDArray[np.int64]) -> Houses:

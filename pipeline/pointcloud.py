@@ -1,5 +1,6 @@
 """The point cloud as arrays, and the ASPRS classes that the steps use."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +14,19 @@ MEDIUM_VEGETATION = 4
 HIGH_VEGETATION = 5
 BUILDING = 6
 LOW_NOISE = 7
+KEY_POINT = 8  # of ground, up to LAS 1.3; 1.4 reserves the number
 WATER = 9
+RAIL = 10
+ROAD = 11
+WIRE_GUARD = 13
+WIRE_CONDUCTOR = 14
+TRANSMISSION_TOWER = 15
+WIRE_CONNECTOR = 16
+BRIDGE_DECK = 17
 HIGH_NOISE = 18
+OVERHEAD = 19  # conveyors, gantries of signs
+SEA = (40, 41, 42, 43, 44, 45)  # bottom, surface and what is between; ASPRS topo-bathy domain profile
+N_CLASSES = 256  # that a point may have
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,3 +48,27 @@ class PointCloud:
         n = len(self.xyz)
         if self.xyz.shape != (n, 3) or self.classification.shape != (n,):
             raise ValueError(f"xyz {self.xyz.shape} and classification {self.classification.shape} do not match")
+
+
+def rename_classes(marks: Collection[int]) -> NDArray[np.uint8]:
+    """Give each class the number that it has here, where others than `BUILDING` may mark buildings.
+
+    Parameters
+    ----------
+    marks : collection of int
+        Classes that mark buildings in the files.
+
+    Returns
+    -------
+    uint8, (256,)
+        `BUILDING` for these; `UNCLASSIFIED` for `BUILDING` where it is not among them; the others as they are.
+
+    Examples
+    --------
+    >>> rename_classes([8, 67])[[2, 6, 8, 67]].tolist()
+    [2, 1, 6, 6]
+    """
+    become = np.arange(N_CLASSES, dtype=np.uint8)
+    become[BUILDING] = UNCLASSIFIED
+    become[list(marks)] = BUILDING
+    return become

@@ -41,13 +41,18 @@ def make_roof_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> Roof
     return RoofPoints(start, xyz, sort_values(start, xyz[:, 2]))
 
 
+def no_roof_points(n: int) -> RoofPoints:
+    """Give n buildings no point."""
+    return RoofPoints(np.zeros(n + 1, np.int64), np.empty((0, 3)), np.empty(0))
+
+
 def select_roof(cloud: PointCloud, *, building_class: bool) -> NDArray[np.bool_]:
     """Tell which points may lie on a roof, by the rule of `extract_building_points`.
 
     Returns
     -------
     bool, (n,)
-        True for class 6; without that class, for all but ground, water, vegetation and noise.
+        True for class 6; without that class, for all but `NEVER_ROOF`.
     """
     if building_class:
         return np.asarray(cloud.classification == BUILDING)
@@ -93,3 +98,30 @@ def keep_roof_points(points: RoofPoints, kept: NDArray[np.bool_]) -> RoofPoints:
     count = np.diff(points.start)
     rows = np.repeat(kept, count)
     return RoofPoints(np.concatenate(([0], np.cumsum(count[kept]))), points.xyz[rows], points.z[rows])
+
+
+def add_roof_points(points: RoofPoints, rows: NDArray[np.int64], more: RoofPoints) -> RoofPoints:
+    """Give some buildings further points.
+
+    Parameters
+    ----------
+    points : RoofPoints
+        Points of n buildings.
+    rows : int64, (m,)
+        Which of them get some.
+    more : RoofPoints
+        The points of these m.
+
+    Examples
+    --------
+    >>> points = make_roof_points(np.array([0, 1, 2]), np.array([[0.0, 0, 9], [1, 0, 5]]))
+    >>> more = make_roof_points(np.array([0, 1]), np.array([[2.0, 0, 4]]))
+    >>> found = add_roof_points(points, np.array([1]), more)
+    >>> found.start.tolist(), found.z.tolist()
+    ([0, 1, 3], [9.0, 4.0, 5.0])
+    """
+    old, new = np.diff(points.start), np.diff(more.start)
+    owner = np.concatenate((np.repeat(np.arange(len(old)), old), np.repeat(rows, new)))
+    order = np.argsort(owner, kind="stable")
+    start = np.concatenate(([0], np.cumsum(np.bincount(owner, minlength=len(old)))))
+    return make_roof_points(start, np.concatenate((points.xyz, more.xyz))[order])

@@ -21,6 +21,7 @@ from tiler.export import FORMATS
 from tiler.importing import uncollected
 from tiler.jobs.commands import describe_job, find_run, job_line
 from tiler.kept_memory import keep_memory, look_seldom
+from tiler.negative import mark_values
 from tiler.parser import Handler, build_parser
 from tiler.places import place, refuse_bucket
 from tiler.plain_text import printable
@@ -47,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         _silence_libraries()
     parser = make_parser()
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(mark_values(sys.argv[1:] if arguments is None else arguments))
     handler: Handler = options.handler
     try:
         return handler(options)

@@ -301,7 +301,7 @@ def _expand_url(source: str) -> list[Path]:
         if path.suffix.lower() in _SUFFIXES:
             path.stat()
             return [path]
-        found = [one for one in path.iterdir() if one.suffix.lower() in _SUFFIXES and one.is_file()]
+        found = [one for one in path.iterdir() if _is_cloud(one) and one.is_file()]
     except OSError as error:
         raise InputError(f"{source}: cannot be read ({error.strerror}); check the URL") from error
     if not found:
@@ -309,9 +309,14 @@ def _expand_url(source: str) -> list[Path]:
     return found
 
 
+def _is_cloud(path: Path) -> bool:
+    """Whether a file of a folder is meant: hidden ones are not, such as the ``._x.laz`` of macOS archives."""
+    return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
+
+
 def _find(source: Path) -> list[Path]:
     if source.is_dir():
-        found = [path for path in source.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file()]
+        found = [path for path in source.iterdir() if _is_cloud(path) and path.is_file()]
         if not found:
             raise InputError(f"{source}: the folder holds no .las or .laz file; name the folder of the tiles")
         return found

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import ConfigError
+from pipeline.pointcloud import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
 from stitch.least import LEAST_TILE
 from tiler.domain import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
 from tiler.pad_widths import check_widths
@@ -24,6 +25,7 @@ MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
 MAX_INT = 2**53
 UNSET = ""
 PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is given for the open
+NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
 
@@ -90,6 +92,10 @@ class Config:
     bounds: tuple[float, ...] = _parameter(
         (), "input", "region as xmin ymin xmax ymax; empty: whole metres within the point clouds", unit="m"
     )
+    building_classes: tuple[int, ...] = _parameter(
+        (BUILDING,), "input", "classes of points that mark buildings, as 6,67",
+        source="ASPRS LAS 1.4", least=0, most=255,
+    )  # fmt: skip
     skip_unreadable: bool = _parameter(
         False, "input", "leave out point-cloud files that cannot be read, list them, and end with exit code 3"
     )
@@ -522,6 +528,8 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         converted = _convert(name, value, wanted)
         return read_height(converted, name)
     if get_origin(wanted) is tuple:
+        if get_args(wanted)[0] is int and isinstance(value, str):
+            value = _split_numbers(name, value)
         if isinstance(value, str) or not isinstance(value, (list, tuple)):
             value = [value]
         return tuple(_convert(name, item, get_args(wanted)[0]) for item in value)
@@ -536,6 +544,14 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         if name in ("pointcloud", "footprints", "out"):
             check_url(value)
     return value
+
+
+def _split_numbers(name: str, text: str) -> list[int]:
+    """Read whole numbers with commas between them, as the command line gives them."""
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"{name} = {_shown(text)}: whole numbers with commas expected, as 6,67") from None
 
 
 def _check_text(name: str, text: str) -> None:
@@ -556,6 +572,9 @@ def _shown(value: Any) -> str:
 def _check_bounds(name: str, value: Any, data: Mapping[str, Any]) -> None:
     if data["choices"] and value not in data["choices"]:
         raise ConfigError(f"{name} = {_shown(value)}: must be one of {', '.join(data['choices'])}")
+    if isinstance(value, tuple) and data["least"] is not None:
+        for item in value:
+            _check_bounds(name, item, data)
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return
     unit = f" {data['unit']}" if data["unit"] else ""
@@ -580,6 +599,7 @@ def _check_together(config: Config) -> None:
                 f"bounds = {list(config.bounds)}: {xmax - xmin:g} x {ymax - ymin:g} m is smaller than one cell "
                 f"of {config.mesh_size:g} m; give xmin ymin xmax ymax"
             )
+    _check_classes(config.building_classes)
     if config.clearance_floor > config.clearance:
         raise ConfigError(
             f"clearance_floor = {config.clearance_floor:g} m: must be at most clearance = {config.clearance:g} m"
@@ -616,6 +636,19 @@ def _check_together(config: Config) -> None:
     _check_way(config)
     if not isinstance(config.domain_height, str):
         check_height(config, config.domain_height)
+
+
+def _check_classes(classes: tuple[int, ...]) -> None:
+    if not classes:
+        raise ConfigError(
+            f"building_classes is empty; give at least one, {BUILDING} in most clouds: where a file has none of "
+            "them, roofs are found without"
+        )
+    for number in sorted(set(classes) & set(NO_BUILDINGS)):
+        raise ConfigError(
+            f"building_classes = {_shown(classes)}: {number} is ground (2), water (9) or noise (7, 18) and marks "
+            "no buildings; leave it out"
+        )
 
 
 def _check_way(config: Config) -> None:

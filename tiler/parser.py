@@ -166,6 +166,8 @@ def _add_parameters(parser: argparse.ArgumentParser) -> None:
             words["action"] = argparse.BooleanOptionalAction
         elif get_origin(wanted) is tuple and get_args(wanted)[0] == Height:
             words |= {"type": str, "nargs": "+", "metavar": "M|nH"}
+        elif get_origin(wanted) is tuple and get_args(wanted)[0] is int:
+            words |= {"type": str, "metavar": "N,N"}
         elif get_origin(wanted) is tuple:
             words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
         elif wanted == Height:

@@ -41,6 +41,11 @@ MEANINGS: dict[str, tuple[str, str]] = {
     "footprint-id-missing": (DEFAULTED, "no id: named by its geometry"),
     "footprint-roof-from-attribute": (DEFAULTED, "no roof points: height of the footprint's attribute"),
     "footprint-roof-from-default": (DEFAULTED, "no roof points: --default-height"),
+    "footprint-roof-from-other-classes": (
+        DEFAULTED,
+        "no roof of the building class: smooth points of other classes",
+    ),
+    "footprint-roof-like-plants": (OTHER, "no roof points, but points of plants as smooth as a roof, not used"),
     "footprints-without-crs": (DEFAULTED, "file without a CRS: taken as the region's"),
     "ground-filter": (DEFAULTED, "ground found by our own filter"),
     "building-points-without-footprints": (OTHER, "points of buildings, but no footprints in the region"),

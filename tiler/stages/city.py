@@ -14,23 +14,24 @@ from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leav
 from pipeline.components import join_pairs
 from pipeline.groups import adjacent_houses
 from pipeline.houses import Houses, divide_houses, join_houses, take_houses
-from pipeline.inside import cover_polygons
 from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
 from pipeline.point_fidelity import measure_houses
-from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
+from pipeline.pointcloud import BUILDING, GROUND, WATER
 from pipeline.raster import Dtm, window_of
-from pipeline.roof_points import keep_roof_points, locate_roof_points
+from pipeline.roof_points import add_roof_points, keep_roof_points, locate_roof_points
 from pipeline.simplify import raise_buildings
 from pipeline.terrain import cut_terrain
 from pipeline.tile import measure_city, prepare_footprints
+from pipeline.unmarked_roofs import MAY_BE_ROOF
 from stitch.grid import Key
 from tiler.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.config import Config
 from tiler.context import find_owned, region_around, tile_key
 from tiler.options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
-from tiler.readers import grow, read_cloud, read_known_terrain
+from tiler.readers import grow, read_known_terrain
 from tiler.stage import Box, Facts, Read, Scope, Stage
+from tiler.stages.house_points import add_unmarked, extent_of, find_surfaces, points_near
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import (
     ARRAYS_TO_RAISE,
@@ -55,7 +56,7 @@ def house_stage(config: Config) -> Stage:
         Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
-    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN), version=3)
+    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN), version=4)
 
 
 def first_round(config: Config) -> list[Stage]:
@@ -122,7 +123,7 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    version = 6 if layered else 4
+    version = 7 if layered else 5
     return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=version)
 
 
@@ -145,28 +146,28 @@ def make_houses(task: Task) -> Facts:
         own = _owned(task, inner)
     places = np.array([(note.x, note.y) for note in notes]).reshape(-1, 2)
     task.notes(note for note, mine in zip(notes, find_owned(task.box, bounds, places), strict=True) if mine)
-    extent = _extent(own.polygons)
+    extent = extent_of(own.polygons)
     near = reach_of_points(own.polygons, options.ground_margin)
     dtm = _terrain_around(task, extent, 2 * spacing)
-    cloud = _points_near(task, extent, options.ground_margin, near, (BUILDING, GROUND, WATER))
+    cloud = points_near(task, extent, options.ground_margin, near, (BUILDING, GROUND, WATER))
     terrain = cut_terrain(dtm, window_of(dtm))
     with task.step("1.5 extract building points"):
         roofs = locate_roof_points(cloud, own.polygons, building_class=True)
+        roofs, unmarked = add_unmarked(task, own, roofs, cloud, terrain)
     city = measure_city(cloud, own, terrain, options, building_class=True, roofs=roofs, trace=task.step)
     task.notes(city.notes)
     roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
+    others = np.isin(city.model.ids, own.ids[unmarked])
     with task.step("2.0 split levels"):
-        houses = divide_houses(city, cloud, options, building_class=True, roofs=roofs)
+        houses = divide_houses(city, cloud, options, building_class=True, roofs=roofs, unmarked=others)
     del cloud  # large, and no longer needed
     with task.step("1.7 fit of roofs"):
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
         full = make_buildings(city, fidelity, np.zeros(len(city.model), np.int32))
-    task.put(**pack_houses(houses), **pack_buildings(full, "full_"))
-    return {
-        "n": len(houses),
-        "extent": _extent(houses.polygons),
-        "counts": {"buildings before merging": len(houses), **_count_parts(houses)},
-    }
+    task.put(**pack_houses(houses), **pack_buildings(full, "full_"), unmarked=others)
+    counts = {"buildings before merging": len(houses), **_count_parts(houses)}
+    counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
+    return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts}
 
 
 def find_near_houses(task: Task) -> Facts:
@@ -260,7 +261,7 @@ def shape_members(task: Task) -> Facts:
         closed=gathered.place[shapes.closed[:, 0]],
         closed_cluster=shapes.closed[:, 1],
     )
-    return {"n": len(shapes), "extent": _extent(shapes.polygons), "counts": dict(sorted(counts.items()))}
+    return {"n": len(shapes), "extent": extent_of(shapes.polygons), "counts": dict(sorted(counts.items()))}
 
 
 def make_model(task: Task) -> Facts:
@@ -280,7 +281,7 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     shapes = _earlier_shapes(task, replace(gathered, changed=np.zeros(len(gathered.houses), np.bool_)))
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0
     shapes = _keep_within(task, shapes, gathered.houses)
-    extent = _extent(shapes.polygons)
+    extent = extent_of(shapes.polygons)
     dtm = _terrain_around(task, extent, reach + 2 * given.dtm_spacing)
     reserved = {name for result in task.read("reserved", ()) for name in result.facts["names"]}
     terrain = cut_terrain(dtm, window_of(dtm))
@@ -294,10 +295,13 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
             layers, parted = choose_layers(
                 model.polygons, model.roof, city.wall_ground, city.group, pairs, dtm, bounds, mesh
             )
-    cloud = _points_near(task, extent, options.ground_margin, shapes.polygons, (BUILDING,))
+    cloud = points_near(task, extent, options.ground_margin, shapes.polygons, (BUILDING,))
     with task.step("2.4 fit of roofs"):
         roofs = locate_roof_points(cloud, city.model.polygons, building_class=True)
         del cloud
+        rows = _find_unmarked(city.model.members, gathered)
+        others = find_surfaces(task, city.model.polygons[rows], terrain, MAY_BE_ROOF)
+        roofs = add_roof_points(roofs, rows, others.points)
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
     task.put(**pack_model(make_buildings(city, fidelity, layers)))
     counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
@@ -307,7 +311,7 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
 
 def _keep_within(task: Task, shapes: Shapes, houses: Houses) -> Shapes:
     """Leave out the buildings that leave the region: where its border turns inwards, a hull of several may."""
-    extent = _extent(shapes.polygons)
+    extent = extent_of(shapes.polygons)
     if extent is None:
         return shapes
     region = region_around(task.context.grid, extent)
@@ -334,20 +338,10 @@ def _owned(task: Task, footprints: Footprints) -> Footprints:
     return Footprints(footprints.polygons[mine], footprints.ids[mine], footprints.given_height[mine])
 
 
-def _points_near(
-    task: Task, extent: Box | None, margin: float, areas: NDArray[np.object_], classes: Sequence[int]
-) -> PointCloud:
-    """Points of some classes in areas, and some near them, as far as a margin around an extent, if any."""
-    if extent is None:
-        return PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
-    with task.step("1.1 points of houses"):
-        return read_cloud(
-            task,
-            grow(extent, margin),
-            classes=classes,
-            ground_filter=task.parameters.ground_filter,
-            cover=cover_polygons(areas),
-        )
+def _find_unmarked(members: Sequence[tuple[str, ...]], gathered: "_Gathered") -> NDArray[np.int64]:
+    """Rows of the buildings whose houses are all unmarked."""
+    unmarked = set(gathered.houses.ids[gathered.unmarked].tolist())
+    return np.array([k for k, names in enumerate(members) if unmarked.issuperset(names)], np.int64)
 
 
 def _terrain_around(task: Task, extent: Box | None, reach: float) -> Dtm:
@@ -378,11 +372,12 @@ def _members(task: Task) -> Result:
 def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
     """Read some arrays of the houses of the tile's clusters, by ascending id."""
     house, cluster, changed = (members.arrays[name] for name in ("house", "cluster", "changed"))
-    several, order = [], []
-    for result in task.read("houses", arrays):
+    several, order, other = [], [], [np.empty(0, np.bool_)]
+    for result in task.read("houses", (*arrays, "unmarked")):
         mine = np.flatnonzero((house[:, :2] == tile_key(result.name)).all(axis=1))
         several.append(take_houses(unpack_houses(result.arrays), house[mine, 2]))
         order.append(mine)
+        other.append(result.arrays["unmarked"][house[mine, 2]])
     rows = np.concatenate([np.empty(0, np.int64), *order])
     joined = join_houses(several)
     by_id = np.argsort(joined.ids, kind="stable")
@@ -390,16 +385,20 @@ def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
     of_part = houses.parts.house
     number = np.arange(len(of_part)) - np.searchsorted(of_part, of_part)
     place = np.column_stack((house[rows].reshape(-1, 3)[of_part], number)).astype(np.int64)
-    return _Gathered(houses, cluster[rows], changed[rows], place.reshape(-1, 4))
+    return _Gathered(houses, cluster[rows], changed[rows], np.concatenate(other)[by_id], place.reshape(-1, 4))
 
 
 @dataclass(frozen=True, eq=False)
 class _Gathered:
-    """Houses of a tile's clusters; ``place`` (p, 4) tells of each part its house's tile, row there, and number."""
+    """Houses of a tile's clusters, and whether roofs are of other classes than that of buildings.
+
+    ``place`` (p, 4) tells of each part its house's tile, row there, and number.
+    """
 
     houses: Houses
     cluster: NDArray[np.int64]
     changed: NDArray[np.bool_]
+    unmarked: NDArray[np.bool_]
     place: NDArray[np.int64]
 
 
@@ -432,13 +431,6 @@ def _find_rows(among: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.
     position[index[: len(among)]] = np.arange(len(among))
     found: NDArray[np.int64] = position[index[len(among) :]]
     return found
-
-
-def _extent(polygons: NDArray[np.object_]) -> Box | None:
-    if len(polygons) == 0:
-        return None
-    xmin, ymin, xmax, ymax = shapely.total_bounds(polygons).tolist()
-    return xmin, ymin, xmax, ymax
 
 
 def _hull(one: Box, other: Box) -> Box:

@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 import pyproj
 import shapely
+from numpy.typing import NDArray
 
 from pipeline.alignment import REACH
 from pipeline.errors import InputError
+from pipeline.ground_check import LEAST_STEP, compare_ground, is_upside_down
 from pipeline.notes import Note
-from pipeline.pointcloud import BUILDING, GROUND, WATER
+from pipeline.pointcloud import GROUND, KEY_POINT, WATER, rename_classes
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
 from pipeline.terrain import bin_nodes, bin_units
 from pipeline.terrain_fill import (
@@ -26,11 +28,12 @@ from pipeline.terrain_fill import (
     merge_coarse,
 )
 from stitch.grid import Key, has_tile
+from tiler.clouds import KEY_POINTS
 from tiler.config import Config
 from tiler.context import tile_key
 from tiler.footprint_index import scan_footprints
 from tiler.georeference.frame import Frame
-from tiler.ingest import read_cells
+from tiler.ingest import CELL, read_cells
 from tiler.places import place
 from tiler.readers import clip, grow, join_rasters, read_bands, read_outlines, read_units
 from tiler.stage import Box, Facts, Read, Scope, Stage
@@ -43,7 +46,13 @@ def input_stages(config: Config) -> list[Stage]:
     spacing = config.dtm_spacing
     ground = ("dtm_spacing", "ground_filter")
     return [
-        Stage("points", Scope.FILE, read_point_file, parameters=("skip_unreadable",), version=3),
+        Stage(
+            "points",
+            Scope.FILE,
+            read_point_file,
+            parameters=("skip_unreadable", "building_classes", "ground_filter"),
+            version=4,
+        ),
         Stage(
             "footprints",
             Scope.REGION,
@@ -98,13 +107,15 @@ def read_point_file(task: Task) -> Facts:
     """Read a point cloud file and deal its points out to cells (step 1.1)."""
     counts: Counter[str] = Counter()
     classes: set[int] = set()
+    become = rename_classes(task.parameters.building_classes)
     row = n_cells = 0
     blocks = [0]
+    steps = [np.empty(0)]
     try:
         for block in read_cells(task.file, task.context.bounds, frame=task.frame):
             task.append(
                 units=block.units,
-                classification=block.classification,
+                classification=become[block.classification],
                 cell=block.cell,
                 cell_row=block.start[:-1] + row,
             )
@@ -114,6 +125,9 @@ def read_point_file(task: Task) -> Facts:
             n_cells += len(block.cell)
             blocks.append(n_cells)
             scaling = {"scale": block.scale, "offset": block.offset}
+            z = np.asarray(block.units[:, 2] * block.scale[2] + block.offset[2], np.float64)
+            steps.append(compare_ground(z, block.classification, block.start))
+        _check_classes(task, np.concatenate(steps), counts[KEY_POINTS])
     except InputError as error:
         if not task.parameters.skip_unreadable:
             raise
@@ -123,10 +137,29 @@ def read_point_file(task: Task) -> Facts:
     return {
         "counts": dict(counts),
         "classes": sorted(classes),
-        "marks_buildings": BUILDING in classes,
+        "marks_buildings": bool(classes & set(task.parameters.building_classes)),
         "unreadable": None,
         **scaling,
     }
+
+
+def _check_classes(task: Task, steps: NDArray[np.float64], n_key_points: int) -> None:
+    """Refuse a cloud whose class 2 lies above what has no class, or whose key points are to be buildings."""
+    given, file = task.parameters, task.file
+    if not given.ground_filter and is_upside_down(steps):
+        high = steps[steps > LEAST_STEP]
+        raise InputError(
+            f"{file}: class {GROUND} lies {np.median(high):.1f} m above classes 0 and 1 in {len(high)} of "
+            f"{len(steps)} squares of {CELL:g} m, so it is not ground here: this cloud has classes of its own; "
+            "renumber them to those of ASPRS (pdal translate, filters.assign), or find ground anew with "
+            "--ground-filter"
+        )
+    if KEY_POINT in given.building_classes and n_key_points:
+        raise InputError(
+            f"{file}: --building-classes names {KEY_POINT}, the class of key points of the ground in its point "
+            f"format (0 to 5), and {n_key_points} points have it; leave {KEY_POINT} out, and find ground anew if "
+            "they are buildings: --ground-filter"
+        )
 
 
 def read_footprint_file(task: Task) -> Facts:
