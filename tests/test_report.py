@@ -16,15 +16,16 @@ from pipeline.errors import InputError
 from pipeline.heights import ROOF_SOURCES
 from tests.tiles import hash_files
 from tiler.cli import main
+from tiler.note_words import GROUPS, WORDS, group_of, say_notes
 from tiler.report import write_report
 from tiler.report.charts import Series, draw_gantt, draw_histogram
 from tiler.report.maps import draw_map, encode_png, gather_tiles, shade
-from tiler.report.meanings import GROUPS, MEANINGS, explain
 from tiler.report.record import SHOWN, read_run_facts
 from tiler.report.timeline import BINS, read_timeline
 from tiler.stages.domain import LOW_DOMAIN
 
 ROOT = Path(__file__).resolve().parents[1]
+SAME_FOR_ALL: set[str] = set()
 VOID = {"meta", "link", "img"}
 
 
@@ -137,7 +138,7 @@ def test_long_lists_are_cut_and_say_so(copy: Path) -> None:
     change_record(copy, notes={"footprint-sliver": {"count": 12_345, "items": items}})
     page = read(write_report(copy))
     assert sum(bool(re.fullmatch(r"B\d+", words)) for words in page.words) == SHOWN
-    assert f"The first {SHOWN} of 12,345 footprint-sliver; run.json has more" in page.words
+    assert f"The first {SHOWN} of 12,345 notes; run.json has more" in page.words
 
 
 def test_a_failed_run_has_a_report_of_what_is_known(tmp_path: Path) -> None:
@@ -225,11 +226,22 @@ def test_every_kind_of_note_is_explained() -> None:
     )
     found = set(re.findall(r'(?:Note|note|_notes|_note)\(\s*"([a-z]+-[a-z-]+)"', sources))
     assert len(found) > 30
-    assert found <= set(MEANINGS)
+    assert found <= set(WORDS)
     for source in ROOF_SOURCES[1:-1]:
-        assert explain(f"footprint-roof-from-{source}")[0] == "defaulted"
-    assert explain(LOW_DOMAIN)[1]
-    assert {group for group, _ in MEANINGS.values()} == set(GROUPS)
+        assert group_of(f"footprint-roof-from-{source}") == "defaulted"
+    assert LOW_DOMAIN in WORDS
+    assert {words.group for words in WORDS.values()} == set(GROUPS)
+
+
+@pytest.mark.parametrize("kind", WORDS)
+def test_notes_have_grammar(kind: str) -> None:
+    """One and many are sentences of their own, without a sign of how they are made."""
+    one, many = say_notes(kind, 1), say_notes(kind, 5200)
+    assert not re.search(r"[\[\]{}|]", one + many)
+    if "{n}" in WORDS[kind].sentence:
+        assert one.count("1 ") >= 1
+        assert "5,200 " in many
+        assert one.replace("1 ", "") != many.replace("5,200 ", "") or kind in SAME_FOR_ALL
 
 
 def test_events_make_a_gantt_chart(tmp_path: Path) -> None:

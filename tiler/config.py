@@ -117,8 +117,8 @@ class Config:
         above=0,
     )  # fmt: skip
     border: str = _parameter(
-        "drop", "buildings", "buildings on the region's border are dropped, or clipped to it less the clearance",
-        choices=("drop", "clip"),
+        "clip", "buildings", "buildings on the region's border are clipped to it less the clearance, or dropped",
+        choices=("clip", "drop"),
     )  # fmt: skip
     simplify: str = _parameter(
         "clearance", "simplify", "clearance: one planar graph of walls that keeps every house; paper: merging",
@@ -261,6 +261,9 @@ class Config:
         UNSET,
         "run",
         "TOML file that describes a cluster, whose batch system starts the workers; instead of workers",
+    )
+    allow_empty: bool = _parameter(
+        False, "run", "accept a mesh without buildings although footprints were given; else the run fails"
     )
     out: str = _parameter("out", "run", "folder for the results, or s3://BUCKET/NAME")
     overwrite: bool = _parameter(

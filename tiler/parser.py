@@ -212,12 +212,16 @@ def _add_export(export: argparse.ArgumentParser) -> None:
             "choices": ("patches", "zones"),
             "help": "one patch a building instead of walls and roofs; zones: one face zone beside them (openfoam)",
         },
+        "largest_part": {
+            "action": "store_true",
+            "help": "of a mesh in parts that share no face, the one of the most cells alone",
+        },
         "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
     }
     for option, words in given.items():
         takers = ", ".join(name for name, kind in FORMATS.items() if option in kind.options)
         words |= {"default": argparse.SUPPRESS, "help": f"{takers}: {words['help']}"}
-        export.add_argument(f"--{option}", **words)
+        export.add_argument(f"--{option.replace('_', '-')}", **words)
     width = max(map(len, FORMATS))
     rows = [f"  {name:<{width}}  {kind.description}" for name, kind in FORMATS.items()]
     export.formatter_class = argparse.RawDescriptionHelpFormatter

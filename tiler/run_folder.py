@@ -18,11 +18,20 @@ from pipeline.mesh import Region, TetMesh
 from tiler.json_stream import JsonStream, NoJsonError
 
 SCHEMA = 1  # of run.json
-RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters")
+RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")
 TILES = "tiles"
 REGION = "region"  # cell array of a piece with soil
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
+
+
+@dataclass(frozen=True)
+class MeshPart:
+    """A part of a mesh that shares no face with others: cells, tiles, and those that have other cells too."""
+
+    cells: int
+    tiles: tuple[str, ...] = ()
+    divided: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -47,6 +56,9 @@ class RunRecord:
         The region without its pad (m); None without a pad.
     rim : float
         Height of the ground along the outer sides of the pad (m), NaN without one.
+    parts : tuple of MeshPart
+        Parts of the mesh, that of the most cells first; of many those beyond the first are empty. None at all
+        where the record does not tell.
     """
 
     status: str
@@ -57,6 +69,7 @@ class RunRecord:
     depth: float = 0.0
     core: tuple[float, float, float, float] | None = None
     rim: float = math.nan
+    parts: tuple[MeshPart, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +123,7 @@ def read_run_record(path: Path) -> RunRecord:
         status = str(record["status"])
         depth = float(record.get("parameters", {}).get("underground", 0.0))
         core, rim = _read_pad(record["region"])
+        parts = _read_parts(record.get("parts") or {}, counts["cells"])
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
     if not (west < east and south < north and math.isfinite(west + south + east + north)):
@@ -117,7 +131,16 @@ def read_run_record(path: Path) -> RunRecord:
     if not 0 <= depth < math.inf:
         raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
     tiles = record.get(TILES) or {}
-    return RunRecord(status, (west, south, east, north), top, counts, tiles, depth, core, rim)
+    return RunRecord(status, (west, south, east, north), top, counts, tiles, depth, core, rim, parts)
+
+
+def _read_parts(found: Mapping[str, Any], n_cells: int) -> tuple[MeshPart, ...]:
+    n = min(int(found.get("n", 0)), n_cells)
+    listed = [
+        MeshPart(int(part["cells"]), tuple(map(str, part["tiles"])), tuple(map(str, part["divided"])))
+        for part in found.get("largest", ())
+    ]
+    return (*listed, *[MeshPart(0)] * max(n - len(listed), 0))[: max(n, 0)]
 
 
 def _read_pad(region: Mapping[str, Any]) -> tuple[tuple[float, float, float, float] | None, float]:

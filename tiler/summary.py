@@ -10,7 +10,10 @@ from pipeline.notes import Note, count_notes
 from tiler.config import Config
 from tiler.context import absent_tiles, tile_name
 from tiler.domain import settle
+from tiler.empty import explain_empty, is_empty
 from tiler.engine import Engine
+from tiler.left_out import describe_left_out, tell_left_out
+from tiler.mesh_parts import MESH_IN_PARTS, describe_parts, note_parts
 from tiler.padding import CORE_STAGE
 from tiler.places import place
 from tiler.planning import Plan
@@ -59,10 +62,14 @@ def summarise_run(
         plan.layout.files[name].path: facts["unreadable"] for name, facts in clouds.items() if facts["unreadable"]
     }
     report = records["report", REGION_ITEM].facts
+    notes += note_parts(report["parts"])
     found = records["domain", REGION_ITEM].facts
     domain = settle(config.domain_height, config.top, found)
     outline = _join_outlines([record.facts["outline"] for record in records.of("model")])
+    left_out = describe_left_out(engine, notes)
     incomplete = unreadable or missing.tiles or missing.others or INCOMPLETE & {note.kind for note in notes}
+    counts = _join_counts(engine, plan, rounds) | {"tiles missing": len(missing.tiles)}
+    empty = {"empty": explain_empty(config, plan.region, counts, notes)} if is_empty(config, counts) else {}
     absent = {tile_name(key) for key in absent_tiles(plan.grid)} - missing.tiles.keys()
     return {
         "exit_code": EXIT_INCOMPLETE if incomplete else EXIT_DONE,
@@ -74,7 +81,11 @@ def summarise_run(
         }
         | ({} if domain.top is None else {"top": domain.top})
         | (_describe_pad(engine) if config.padded else {}),
-        "domain": {"height (m)": domain.height, "tallest building (m)": found["tallest"]},
+        "domain": {
+            "height (m)": domain.height,
+            "tallest building (m)": found["tallest"],
+            "tallest building in the mesh (m)": found["tallest_meshed"],
+        },
         "tiles": {
             name: {
                 "status": "done",
@@ -85,15 +96,18 @@ def summarise_run(
             for name in sorted(plan.layout.tiles.keys() - missing.tiles.keys())
         },
         **describe_missing(missing, place(config.out)),
-        "counts": _join_counts(engine, plan, rounds) | {"tiles missing": len(missing.tiles)},
+        "counts": counts,
+        **empty,
+        "parts": describe_parts(report["parts"]),
         "quality": report["quality"],
         "fidelity": report["fidelity"] | ({"outline": outline} if outline else {}),
+        "left_out": left_out,
         "tasks": {"all": len(records), "ran": len(records) - sum(records.count_reused().values())},
         "reused": records.count_reused(),
         "ran": records.count_ran(),
         "seconds": {name: round(seconds, 3) for name, seconds in sorted(records.seconds.items())},
         "peak_memory_bytes": records.peak_memory,
-        "messages": [*plan.messages, *_tell_damage(damage), *_tell_low_domain(notes)],
+        "messages": [*plan.messages, *_tell_damage(damage), *_tell_notes(notes), *tell_left_out(left_out)],
         "unreadable": unreadable,
         "notes": group_notes(notes),
     }
@@ -122,8 +136,9 @@ def _tell_damage(damage: Mapping[str, str]) -> list[str]:
     return [f"{len(damage)} damaged or missing artefacts of an earlier run were made anew: {DAMAGED} in the notes"]
 
 
-def _tell_low_domain(notes: Sequence[Note]) -> list[str]:
-    return [f"{LOW_DOMAIN}: {note.detail}" for note in notes if note.kind == LOW_DOMAIN]
+def _tell_notes(notes: Sequence[Note]) -> list[str]:
+    """Notes that a user should read whatever else there is."""
+    return [note.detail for note in notes if note.kind in (MESH_IN_PARTS, LOW_DOMAIN)]
 
 
 def _collect_notes(engine: Engine) -> list[Note]:

@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tiler.live_view import LiveView
+from tiler.note_words import say_notes
 from tiler.places import in_bucket
 from tiler.plain_text import printable
 from tiler.plain_view import PlainView, QuietView
@@ -68,9 +69,9 @@ def print_summary(record: dict[str, Any], out: Path, *, console: Console | None 
     if kinds:
         console.print("dropped, repaired or defaulted, or worth a look:")
     for kind, group in kinds[:LISTED_NOTES]:
-        console.print(f"{group['count']:7,}  {plain(kind.replace('-', ' '))}")
+        console.print(f"  {plain(say_notes(kind, group['count']))}", soft_wrap=True)
     if len(kinds) > LISTED_NOTES:
-        console.print(f"         and {len(kinds) - LISTED_NOTES} more kinds")
+        console.print(f"  and {len(kinds) - LISTED_NOTES} more kinds")
     console.print(f"all of it with places: {plain(str(out / 'run.json'))}", soft_wrap=True)
     for k, words in enumerate(next_commands(out)):
         console.print(f"{'     ' if k else 'next:'} {plain(shlex.join(words))}", soft_wrap=True)

@@ -11,26 +11,6 @@ from tiler.dashboard.codes import Codes, State, combine
 GROWTH = 1024  # items that are made room for at least
 MOST_FACTS = 64  # kinds of values that are kept; a stage of the user's own may tell anything
 
-# Notes that say of something in the input that it is not in the mesh.
-DROPPED = frozenset(
-    {
-        *("building-lost", "building-covered-by-others", "building-beyond-region", "footprint-empty"),
-        *("footprint-not-finite", "footprint-too-small", "footprint-sliver", "footprint-duplicate"),
-        *("footprint-too-many-vertices", "footprint-lost"),
-    }
-)
-
-
-def is_drop(kind: str) -> bool:
-    """Tell whether a kind of note says that something in the input is not in the mesh.
-
-    Examples
-    --------
-    >>> is_drop("footprint-on-border-dropped"), is_drop("building-lost"), is_drop("courtyard-filled")
-    (True, True, False)
-    """
-    return kind in DROPPED or kind.endswith("-dropped")
-
 
 class Column:
     """One number an item, with room for more items.

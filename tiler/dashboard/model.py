@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from tiler.dashboard.codes import State
-from tiler.dashboard.items import Items, is_drop
+from tiler.dashboard.items import Items
 from tiler.dashboard.series import Series
+from tiler.note_words import is_drop
 
 TILE, SEAM = "tile", "seam"
 KEPT_FAILURES, KEPT_MESSAGES = 1000, 50

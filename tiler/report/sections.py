@@ -13,11 +13,11 @@ from pipeline.residuals import ResidualSums, conclude
 from stitch.grid import make_grid, tile_box
 from tiler.config import Config
 from tiler.context import tile_key
+from tiler.note_words import GROUPS, group_of, say_notes
 from tiler.progress import command_line
 from tiler.report.charts import Series, draw_bars, draw_gantt, draw_histogram, rebin
 from tiler.report.collect import Bins, Numbers
 from tiler.report.maps import draw_map, gather_tiles
-from tiler.report.meanings import GROUPS, explain
 from tiler.report.page import figure, figures, folded, heading, number, paragraph, table, text
 from tiler.report.record import SHOWN, NoteGroup, RunFacts
 from tiler.report.samples import NEAR, Samples
@@ -272,7 +272,7 @@ def tell_notes(facts: RunFacts) -> Iterator[str]:
         return
     yield paragraph(f"Ids and places of up to {SHOWN} of each kind; run.json has the first 10,000, the store all.")
     for group in GROUPS:
-        kinds = [notes for notes in facts.notes if explain(notes.kind)[0] == group]
+        kinds = [notes for notes in facts.notes if group_of(notes.kind) == group]
         if not kinds:
             continue
         yield heading(f"{group.capitalize()}: {sum(notes.count for notes in kinds):,}")
@@ -342,14 +342,12 @@ def _coarsen(bins: Bins) -> tuple[float, float, NDArray[np.float64]]:
 
 
 def _list_notes(notes: NoteGroup) -> str:
-    meaning = explain(notes.kind)[1]
     rows = [
         [item.get("subject", ""), number(item.get("x"), 1), number(item.get("y"), 1), item.get("detail", "")]
         for item in notes.items
     ]
     head = ("id or file", "x (m)", "y (m)", "detail")
-    words = f"{notes.count:,} {notes.kind.replace('-', ' ')}" + (f": {meaning}" if meaning else "")
-    return folded(words, table(_first_of(notes.kind, notes.count), head, rows))
+    return folded(say_notes(notes.kind, notes.count), table(_first_of("notes", notes.count), head, rows))
 
 
 def _first_of(what: str, count: int) -> str:
