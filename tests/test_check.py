@@ -73,7 +73,7 @@ def test_a_sound_folder_is_proved(tmp_path: Path, city: TinyCity, n_pieces: int)
     assert report.facts["cells"] == len(city.mesh.cells)
     assert report.facts["points"] == len(city.mesh.points)
     assert report.facts["facets"] == len(city.boundary.facets)
-    assert report.facts["buildings"] == len(HOUSES)
+    assert report.facts["building parts"] == len(HOUSES)
     # The two houses that touch in a corner, up to the lower roof: two levels of it.
     assert report.facts["non_manifold_edges"] == 2
     assert any("touch in a corner only: (" in line for line in report.lines())
@@ -309,7 +309,7 @@ def counts_of(city: TinyCity) -> dict[str, int]:
         "cells": len(city.mesh.cells),
         "points": len(city.mesh.points),
         "facets": len(city.boundary.facets),
-        "buildings": len(city.model),
+        "building parts": len(city.model),
     }
 
 

@@ -161,7 +161,7 @@ def test_blocks_stand_on_the_terrain(small_run: Path, monkeypatch: pytest.Monkey
     record = json.loads((small_run / "run.json").read_text())
     bounds = tuple(record["region"]["bounds"])
     found = block_scene(small_run, (bounds[0], bounds[1], bounds[2], bounds[3]))
-    assert (found.n_buildings, found.n_shown) == (record["counts"]["buildings"],) * 2
+    assert (found.n_buildings, found.n_shown) == (record["counts"]["building parts"],) * 2
     corners = found.scene.corners
     assert np.isfinite(corners).all()
     assert np.abs(corners[..., :2]).max() <= (bounds[2] - bounds[0]) / 2 + 1e-6

@@ -197,11 +197,20 @@ def test_a_run_ends_with_its_report_if_asked(
     before = hash_files(out)
     page = read(out / "report.html")
     assert [a["id"] for tag, a in page.elements if tag == "section"][:3] == ["summary", "pictures", "map"]
-    assert "When each stage worked; the darker the more of its tasks at a time." in page.words
+    assert "When each step worked; the darker the more of its tasks at a time." in page.words
     assert main(words) == 0
     assert f"citystitch report {out}" in capsys.readouterr().out
-    assert not (out / "report.html").exists()  # it told of an earlier run
+    kept = (out / "report.html").read_text()  # nothing has changed
+    assert "This report is old" not in kept
     assert hash_files(out) == before
+    for _ in range(2):
+        assert main([*words, "--roof-group", "1.0"]) == 0  # other roofs
+        old = (out / "report.html").read_text()
+        assert old.count("This report is old: it tells of an earlier run") == 1
+        assert not list(out.glob(".report*"))
+    assert main(words) == 0
+    assert main(["report", str(out)]) == 0
+    assert "This report is old" not in (out / "report.html").read_text()
     assert main(["check", str(out), "--store"]) == 0
     monkeypatch.setattr("tiler.report.write.collect_numbers", _fail)
     capsys.readouterr()
@@ -257,7 +266,7 @@ def test_events_make_a_gantt_chart(tmp_path: Path) -> None:
     path.write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"t": 106, "event": "do')
     found = read_timeline(path, frozenset({"0_0", "0_1"}))
     assert found is not None
-    assert (found.duration, found.stages) == (5.0, ("points", "columns"))
+    assert (found.duration, found.stages) == (5.0, ("points", "mesh"))
     assert (found.tasks.tolist(), found.reused.tolist(), found.failed.tolist()) == ([1, 2], [0, 1], [0, 1])
     assert found.by_tile == {"0_0": 2.0, "0_1": 3.0}
     per_bin = 5.0 / BINS

@@ -18,7 +18,7 @@ from tiler.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
 from tiler.mesh_parts import tell_parts
 from tiler.out_folder import RUN_RECORD, STORE
 from tiler.proofs import Dtm, Fault, Finding, Proof, Vertices
-from tiler.run_folder import RunRecord, read_run_record
+from tiler.run_folder import PARTS, RunRecord, read_run_record
 from tiler.stages.citymodel import CITY_MODEL
 from tiler.vtk_files import read_piece_paths
 
@@ -39,7 +39,7 @@ class CheckReport:
     remarks : tuple of str
         What is no fault, but must be known before a solver runs.
     facts : mapping of str to float
-        Numbers read on the way: ``cells``, ``points``, ``facets``, ``buildings``, ``non_manifold_edges``,
+        Numbers read on the way: ``cells``, ``points``, ``facets``, ``building parts``, ``non_manifold_edges``,
         ``volume`` and ``smallest_cell`` (m³), ``seam_faces``, ``missing_facets``, ``parts`` of the air that
         share no face.
     """
@@ -135,7 +135,7 @@ class _Sums:
     @classmethod
     def start(cls, n_buildings: int) -> "_Sums":
         built = city_proofs.start_built(n_buildings)
-        counts = {"cells": 0, "points": 0, "facets": 0, "buildings": n_buildings}
+        counts = {"cells": 0, "points": 0, "facets": 0, PARTS: n_buildings}
         pairs, part = np.empty((0, 2), np.int64), (np.empty(0, np.int64), np.empty(0, np.bool_))
         return cls({}, built, counts, np.inf, (), np.empty((0, 2)), pairs, *part, pairs)
 

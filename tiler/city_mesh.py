@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pipeline.errors import CityError, ConfigError
 from tiler.atomic import replacing
 from tiler.export import RUN_RECORD, export_run, find_files
+from tiler.run_folder import PARTS
 
 if TYPE_CHECKING:
     import meshio
@@ -350,7 +351,11 @@ class CityMesh:
     def _facts(self) -> list[tuple[str, str]]:
         """Names and numbers of what there is."""
         counts = self.record["counts"]
-        return [(name, f"{counts[name]:,}") for name in ("cells", "points", "buildings", "tiles")]
+        return [
+            (name, f"{counts[name]:,}")
+            for name in ("cells", "points", "buildings", PARTS, "tiles")
+            if name in counts
+        ]
 
     def _told(self) -> list[tuple[str, str]]:
         """Rows of the table."""

@@ -11,7 +11,7 @@ from tiler.config import Config
 from tiler.layers import Box, Layer, describe_layer
 from tiler.note_words import is_drop, say_notes
 from tiler.places import place
-from tiler.plain_text import printable
+from tiler.plain_text import printable, tell_box
 from tiler.region import Region
 
 DEGREES = "EPSG:4326"
@@ -124,18 +124,6 @@ def _meets(extent: Box, crs: pyproj.CRS, region: Region) -> bool:
         return False
     bounds = region.bounds
     return west <= bounds[2] and east >= bounds[0] and south <= bounds[3] and north >= bounds[1]
-
-
-def tell_box(box: Sequence[float]) -> str:
-    """Write a box as its ranges of x and y, without a comma within a number.
-
-    Examples
-    --------
-    >>> tell_box((120000.0, 487200.5, 120624.0, 487786.0))
-    '120000 to 120624, 487200.5 to 487786'
-    """
-    west, south, east, north = (f"{value:.10g}" for value in box)
-    return f"{west} to {east}, {south} to {north}"
 
 
 def _short(crs: str) -> str:

@@ -182,8 +182,8 @@ def describe_parts(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"n": len(parts)} | ({"largest": list(parts[:LISTED_PARTS])} if len(parts) > 1 else {})
 
 
-def tell_parts(cells: Sequence[int]) -> str:
-    """Write in how many parts a mesh is, given the cells of each, largest first.
+def tell_parts(cells: Sequence[int], n: int | None = None) -> str:
+    """Write in how many parts a mesh is, given the cells of the largest, and their number where there are more.
 
     Examples
     --------
@@ -192,10 +192,11 @@ def tell_parts(cells: Sequence[int]) -> str:
     >>> tell_parts([2000, 700, 10])
     'the mesh is 3 parts that share no face: of 2,000, 700 and 10 cells'
     """
-    if len(cells) <= 1:
+    n = len(cells) if n is None else n
+    if n <= 1:
         return "the mesh is one part: all cells hang together by faces"
-    shown = [f"{n:,}" for n in cells[:3]] if len(cells) <= 3 else [f"{n:,}" for n in cells[:3]] + ["fewer"]
-    return f"the mesh is {len(cells):,} parts that share no face: of {', '.join(shown[:-1])} and {shown[-1]} cells"
+    shown = [f"{n:,}" for n in cells[:3]] if n <= 3 else [f"{n:,}" for n in cells[:3]] + ["fewer"]
+    return f"the mesh is {n:,} parts that share no face: of {', '.join(shown[:-1])} and {shown[-1]} cells"
 
 
 def note_parts(parts: Sequence[Mapping[str, Any]]) -> list[Note]:

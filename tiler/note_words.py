@@ -163,8 +163,8 @@ def say_notes(kind: str, n: int) -> str:
     ("1 footprint on the region's border was clipped", "5,200 footprints on the region's border were clipped")
     >>> say_notes("plane-refinement-stopped", 2)
     '2 plane meshes reached the limit on added vertices; angles may be small'
-    >>> say_notes("my-own-rule", 3)
-    '3 notes: my own rule'
+    >>> say_notes("odd", 3)
+    '3 notes: odd'
     """
     known = WORDS.get(kind)
     sentence = known.sentence if known is not None else f"{{n}} note[s]: {kind.replace('-', ' ')}"

@@ -8,9 +8,9 @@ import pyproj
 
 from pipeline.errors import CityError, ConfigError
 from tiler.crs import same_crs
-from tiler.empty import tell_box
 from tiler.out_folder import RUN_RECORD
 from tiler.places import absolute, in_bucket
+from tiler.plain_text import tell_box
 from tiler.region import Region
 from tiler.run_folder import WRONG_FIELD, opened_json
 from tiler.stage import Box

@@ -26,6 +26,7 @@ from tiler.forecast import warn_of_memory
 from tiler.jobs.table import read_cluster
 from tiler.joining.lease import LostFolderError
 from tiler.joining.spool import SPOOL
+from tiler.kept_report import give_back_report
 from tiler.kernels import prepare
 from tiler.keys import code_versions
 from tiler.limits import TASKS, Limits, limit_workers, machine_memory
@@ -224,6 +225,7 @@ def _run(
         for message in record["messages"][len(plan.messages) :]:
             say(message)
         _refuse_empty(config, record)
+        give_back_report(out, changed=bool(record["tasks"]["ran"]))
         record["status"] = "done"
         say(describe_tasks(record["tasks"]))
         if in_bucket(out):

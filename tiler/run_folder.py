@@ -20,6 +20,7 @@ from tiler.json_stream import JsonStream, NoJsonError
 SCHEMA = 1  # of run.json
 RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")
 TILES = "tiles"
+PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
 REGION = "region"  # cell array of a piece with soil
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
@@ -47,7 +48,7 @@ class RunRecord:
     top : float
         Absolute height of the top (m) where the mesher makes it flat, NaN where it does not.
     counts : mapping of str to int
-        ``cells``, ``points``, ``facets`` and ``buildings``.
+        ``cells``, ``points``, ``facets`` and ``building parts``.
     tiles : mapping of str to tuple of 4 floats or None
         Boxes of the tiles by name (m), as far as they are stated.
     depth : float
@@ -118,8 +119,9 @@ def read_run_record(path: Path) -> RunRecord:
             raise InputError(f"{path}: the run is {record['status']} and has no mesh yet; wait, or run again")
         west, south, east, north = (float(value) for value in record["region"]["bounds"])
         top = float(record["region"].get("top", math.nan))
-        names = ("cells", "points", "facets", "buildings")
-        counts = {name: int(record["counts"][name]) for name in names}
+        counts = {name: int(record["counts"][name]) for name in ("cells", "points", "facets")}
+        # A record of an earlier version counts parts as buildings.
+        counts[PARTS] = int(record["counts"].get(PARTS, record["counts"]["buildings"]))
         status = str(record["status"])
         depth = float(record.get("parameters", {}).get("underground", 0.0))
         core, rim = _read_pad(record["region"])

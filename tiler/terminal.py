@@ -1,7 +1,7 @@
 """What a run shows while it is at work, and at its end: what was made, how good it is, what next."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ from tiler.note_words import say_notes
 from tiler.places import in_bucket
 from tiler.plain_text import printable
 from tiler.plain_view import PlainView, QuietView
+from tiler.run_folder import PARTS
+from tiler.stage_groups import title_of_stage
 from tiler.tally import Tally
 from tiler.watching import Watcher
 
@@ -60,7 +62,7 @@ def print_summary(record: dict[str, Any], out: Path, *, console: Console | None 
     console = console or Console(highlight=False)
     counts = record["counts"]
     console.print(
-        f"[bold]{counts['cells']:,}[/] cells, {counts['points']:,} points, {counts['buildings']:,} buildings "
+        f"[bold]{counts['cells']:,}[/] cells, {counts['points']:,} points, {tell_buildings(counts)} "
         f"in {record['seconds_total']:.1f} s, peak memory {record['peak_memory_bytes'] / 2**20:.0f} MiB"
     )
     _print_quality(record, console)
@@ -75,6 +77,19 @@ def print_summary(record: dict[str, Any], out: Path, *, console: Console | None 
     console.print(f"all of it with places: {plain(str(out / 'run.json'))}", soft_wrap=True)
     for k, words in enumerate(next_commands(out)):
         console.print(f"{'     ' if k else 'next:'} {plain(shlex.join(words))}", soft_wrap=True)
+
+
+def tell_buildings(counts: Mapping[str, int]) -> str:
+    """Write how many buildings a mesh has, and their parts where these are more.
+
+    Examples
+    --------
+    >>> tell_buildings({"buildings": 1036, "building parts": 1531}), tell_buildings({"buildings": 1})
+    ('1,036 buildings (1,531 parts)', '1 building')
+    """
+    n, parts = counts["buildings"], counts.get(PARTS, counts["buildings"])
+    words = "1 building" if n == 1 else f"{n:,} buildings"
+    return words if parts == n else f"{words} ({parts:,} parts)"
 
 
 def next_commands(out: Path) -> Sequence[Sequence[str]]:
@@ -112,11 +127,12 @@ def _print_missing(record: dict[str, Any], console: Console) -> None:
     for tile, found in missing[:LISTED_MISSING]:
         reason = plain(found["reason"])
         console.print(
-            f"[red]missing[/] tile {tile}: stage {found['stage']} {found['name']}: {reason}", soft_wrap=True
+            f"[red]missing[/] tile {tile}: {title_of_stage(found['stage'])} {found['name']}: {reason}",
+            soft_wrap=True,
         )
         console.print(f"        alone: {plain(found['command'])}", soft_wrap=True)
     for found in failed[:LISTED_MISSING]:
-        why = f"stage {found['stage']} {found['name']}: {plain(found['reason'])}"
+        why = f"{title_of_stage(found['stage'])} {found['name']}: {plain(found['reason'])}"
         console.print(f"[red]failed[/] {why}", soft_wrap=True)
     more = sum(max(len(lost) - LISTED_MISSING, 0) for lost in (missing, failed))
     if more:

@@ -26,7 +26,7 @@ class Question:
     Attributes
     ----------
     stage : str
-        States and values of this stage alone; of all where it is empty.
+        States and values of this step or stage alone; of all where it is empty.
     value : str
         Value to colour by, as of `Items.values`; none where it is empty.
     view : (xmin, ymin, xmax, ymax) or None
@@ -106,7 +106,7 @@ def tell_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
 def _tell_seams(seams: Items, question: Question, since: int, *, whole: bool) -> dict[str, Any]:
     boxes = seams.boxes()
     inside = _find_inside(boxes, question.view)
-    if question.stage and question.stage not in seams.stages:
+    if question.stage and not seams.members(question.stage):
         return {"seams": [], "seam_boxes": [], "seam_names": []} if whole else {"seams": []}
     values = seams.values(question.value, question.stage)[inside]
     told: dict[str, Any] = {

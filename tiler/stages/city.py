@@ -30,6 +30,7 @@ from tiler.config import Config
 from tiler.context import find_owned, region_around, tile_key
 from tiler.options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
 from tiler.readers import grow, read_cloud, read_known_terrain
+from tiler.run_folder import PARTS
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
 from tiler.tables import (
@@ -122,7 +123,7 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    version = 6 if layered else 4
+    version = 7 if layered else 5
     return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=version)
 
 
@@ -300,7 +301,8 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
         del cloud
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
     task.put(**pack_model(make_buildings(city, fidelity, layers)))
-    counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
+    counts = {"buildings": len(np.unique(model.house)), PARTS: len(model)}
+    counts |= {name: n for name, n in city.counts.items() if name not in shapes.counts}
     counts |= {"roofs on another layer": parted} if parted else {}
     return {"n": len(model), "extent": extent, "counts": counts, "outline": city.outline}
 
