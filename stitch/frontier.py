@@ -261,12 +261,12 @@ def _settle(
     matched = opposite & (n_boundary == 0)
     # Rows of one face stand together, so its two pieces are neighbours in this order.
     rows = np.flatnonzero(matched)
-    rows = rows[np.argsort(group[rows], kind="stable")].reshape(-1, 2)
+    two = rows[np.argsort(group[rows], kind="stable")].reshape(-1, 2)
     open_lines, crowded_lines = _settle_lines(lines)
     return Settled(
-        n_matched=len(rows),
-        seams=np.unique(np.sort(piece[rows], axis=1), axis=0),
-        joined=np.unique(np.sort(part[rows], axis=1), axis=0),
+        n_matched=len(two),
+        seams=np.unique(np.sort(piece[two], axis=1), axis=0),
+        joined=np.unique(np.sort(part[two], axis=1), axis=0),
         open=faces[(count == 1) & ~is_boundary],
         extra=faces[opposite & is_boundary],
         same_side=faces[(count == 2) & ~opposite],

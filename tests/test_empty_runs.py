@@ -29,7 +29,8 @@ def to_degrees(xy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def far(xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    return xy + np.array([50_000.0, 0.0])
+    moved: NDArray[np.float64] = xy + np.array([50_000.0, 0.0])
+    return moved
 
 
 WAYS = {
@@ -68,11 +69,20 @@ def write_moved(path: Path, way: str) -> Path:
 def test_footprints_elsewhere_end_the_run_with_one(tmp_path: Path, capsys: Capture, way: str) -> None:
     city = write_city(tmp_path / "city")
     moved = write_moved(city / "moved.gpkg", way)
-    command = ["run", city / "cloud.laz", "--footprints", moved, "--out", city / "out", "-q", *QUICK]
+    command: list[str | Path] = [
+        "run",
+        city / "cloud.laz",
+        "--footprints",
+        moved,
+        "--out",
+        city / "out",
+        "-q",
+        *QUICK,
+    ]
     found = call(capsys, *command)
     assert found.code == 1
     assert found.err.startswith("citystitch: no building was meshed. ")
-    assert "has 1 features, none of them in the region" in found.err
+    assert "has 1 feature, none of them in the region" in found.err
     assert WAYS[way][2] in found.err
     assert "--allow-empty" in found.err
     assert found.err.count("\n") == 1
@@ -84,7 +94,15 @@ def test_footprints_elsewhere_end_the_run_with_one(tmp_path: Path, capsys: Captu
 
 def test_what_was_dropped_is_told(tmp_path: Path, capsys: Capture) -> None:
     city = write_city(tmp_path / "city")
-    command = ["run", city / "cloud.laz", "--footprints", city / "house.gpkg", "--out", city / "out", *QUICK]
+    command: list[str | Path] = [
+        "run",
+        city / "cloud.laz",
+        "--footprints",
+        city / "house.gpkg",
+        "--out",
+        city / "out",
+        *QUICK,
+    ]
     found = call(capsys, *command, "--min-building-area", "100000")
     assert found.code == 1
     assert "1 of them in the region" in found.err
@@ -95,7 +113,15 @@ def test_what_was_dropped_is_told(tmp_path: Path, capsys: Capture) -> None:
 
 def test_an_empty_mesh_is_taken_where_it_is_allowed(tmp_path: Path, capsys: Capture) -> None:
     city = write_city(tmp_path / "city")
-    command = ["run", city / "cloud.laz", "--out", city / "out", *QUICK, "--min-building-area", "100000"]
+    command: list[str | Path] = [
+        "run",
+        city / "cloud.laz",
+        "--out",
+        city / "out",
+        *QUICK,
+        "--min-building-area",
+        "100000",
+    ]
     assert call(capsys, *command, "--footprints", city / "house.gpkg", "--allow-empty").code in (0, 3)
     assert call(capsys, *command).code == 0  # without footprints it is terrain, and meant to be
 

@@ -168,7 +168,7 @@ def test_blocks_stand_on_the_terrain(small_run: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("tiler.scenes.MOST_BLOCKS", 5)
     image, words = paint_blocks(small_run, (160, 100))
     assert image.shape == (100, 160, 3)
-    assert words == f"the largest 5 of {found.n_buildings} buildings are drawn"
+    assert words == f"the largest 5 of {found.n_buildings} building parts are drawn"
 
 
 def test_a_cut_shows_cells_of_air(small_run: Path) -> None:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pipeline.errors import CityError, ConfigError
 from tiler.atomic import replacing
 from tiler.export import RUN_RECORD, export_run, find_files
-from tiler.run_folder import PARTS
 
 if TYPE_CHECKING:
     import meshio
@@ -351,11 +350,7 @@ class CityMesh:
     def _facts(self) -> list[tuple[str, str]]:
         """Names and numbers of what there is."""
         counts = self.record["counts"]
-        return [
-            (name, f"{counts[name]:,}")
-            for name in ("cells", "points", "buildings", PARTS, "tiles")
-            if name in counts
-        ]
+        return [(name, f"{counts[name]:,}") for name in ("cells", "points", "buildings", "tiles")]
 
     def _told(self) -> list[tuple[str, str]]:
         """Rows of the table."""

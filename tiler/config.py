@@ -13,6 +13,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.errors import ConfigError
 from stitch.least import LEAST_TILE
+from tiler.did_you_mean import suggest
 from tiler.domain import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
 from tiler.pad_widths import check_widths
 from tiler.places import check_url, is_url
@@ -385,11 +386,16 @@ def load_config(path: Path) -> dict[str, Any]:
     sections = {entry.name: entry.metadata["section"] for entry in dataclasses.fields(Config)}
     for section, table in document.items():
         if section not in sections.values() or not isinstance(table, dict):
-            raise ConfigError(f"{path}: unknown section [{shorten(section, 100)}]; `citystitch config` lists all")
+            offer = suggest(section, sections.values())
+            raise ConfigError(
+                f"{path}: unknown section [{shorten(section, 100)}]{offer}; `citystitch config` lists all"
+            )
         for name, value in table.items():
             if sections.get(name) != section:
+                offer = f"; it stands in [{sections[name]}]" if name in sections else suggest(name, sections)
                 raise ConfigError(
-                    f"{path}: unknown parameter {shorten(name, 100)} in [{section}]; `citystitch config` lists all"
+                    f"{path}: unknown parameter {shorten(name, 100)} in [{section}]{offer}; `citystitch config` "
+                    "lists all"
                 )
             values[name] = _relative_to(path.parent, name, value)
     return values

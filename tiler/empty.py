@@ -58,7 +58,9 @@ def explain_empty(config: Config, region: Region, counts: dict[str, int], notes:
 
 
 def _tell_number(layer: Layer | None, within: int, box: str, crs: str) -> str:
-    number = "footprints" if layer is None or layer.n_features < 0 else f"{layer.n_features:,} features"
+    number = "footprints"
+    if layer is not None and layer.n_features >= 0:
+        number = "1 feature" if layer.n_features == 1 else f"{layer.n_features:,} features"
     found = f"{within:,}" if within else "none"
     return f"{number}, {found} of them in the region, {box} ({crs})"
 
@@ -82,6 +84,8 @@ def find_place(layer: Layer, region: Region) -> str:
     crs = "no CRS stated" if layer.crs is None else _short(layer.crs.to_string())
     told = f"They lie in {tell_box(layer.extent)} ({crs})"
     own = layer.crs or pyproj.CRS.from_user_input(region.crs)
+    if _meets(layer.extent, own, region):
+        return f"{told}: none that can be read meets the region"
     for exchanged in (False, True):
         extent = _exchange(layer.extent) if exchanged else layer.extent
         for degrees in (False, True):

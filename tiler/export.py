@@ -268,14 +268,25 @@ def find_files(directory: Path) -> RunFiles:
     from tiler.run_folder import read_run_record
     from tiler.vtk_files import read_piece_paths
 
+    refuse_strangers(directory)
     record = directory / RUN_RECORD
-    if not record.is_file():
-        raise InputError(f"{record}: no such file; run citystitch first, or name its output folder")
     found = read_run_record(record)
     if found.status != "done":
         raise InputError(f"{record}: the run is {found.status!r}, not 'done'; finish it or run again")
     volumes, boundaries = (read_piece_paths(directory / name) for name in (VOLUME_INDEX, BOUNDARY_INDEX))
     return RunFiles(directory, tuple(volumes), tuple(boundaries), found.depth, len(found.parts))
+
+
+def refuse_strangers(directory: Path) -> None:
+    """Raise InputError if a folder is not that of a run: whatever else it may hold."""
+    if not directory.is_dir():
+        what = "is a file" if directory.exists() else "no such folder"
+        raise InputError(f"{directory}: {what}; run citystitch first, or give what --out of a run was")
+    if not (directory / RUN_RECORD).is_file():
+        raise InputError(
+            f"{directory}: is not the folder of a run, it has no {RUN_RECORD}; run citystitch first, or give what "
+            "--out of a run was"
+        )
 
 
 def take_largest_part(files: RunFiles) -> RunFiles:

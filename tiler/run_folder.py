@@ -121,7 +121,7 @@ def read_run_record(path: Path) -> RunRecord:
         top = float(record["region"].get("top", math.nan))
         counts = {name: int(record["counts"][name]) for name in ("cells", "points", "facets")}
         # A record of an earlier version counts parts as buildings.
-        counts[PARTS] = int(record["counts"].get(PARTS, record["counts"]["buildings"]))
+        counts[PARTS] = int(record["counts"][PARTS if PARTS in record["counts"] else "buildings"])
         status = str(record["status"])
         depth = float(record.get("parameters", {}).get("underground", 0.0))
         core, rim = _read_pad(record["region"])

@@ -74,6 +74,8 @@ def tell_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
     tiles = model.items[TILE]
     part = _choose_part(tiles, question.view)
     codes, changed = tiles.codes(question.stage)[part.inside], tiles.changed()[part.inside]
+    if model.status == "done":  # not every tile has work in every step
+        codes[codes == State.BEGUN] = State.DONE
     values = tiles.values(question.value, question.stage)[part.inside]
     # A stage that is new changes the state of tiles that nothing happened to.
     layout = ".".join(f"{items.layout}.{len(items.stages)}" for items in model.items.values())

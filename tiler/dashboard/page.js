@@ -72,7 +72,7 @@ function showHead({ head, read, dask }) {
   const share = 100 * head.share;
   const facts = head.status === "running" ? [`${Math.floor(share)} %`, duration(head.seconds)] : [duration(head.seconds)];
   if (head.status === "running") facts.push(head.left != null ? `~${duration(head.left)} left` : "time left not known yet");
-  if (head.workers) facts.push(`${head.workers} workers`);
+  if (head.workers) facts.push(head.workers === 1 ? "1 worker" : `${head.workers} workers`);
   if (head.crs) facts.push(head.crs.length < 40 ? head.crs : "own CRS");
   if (head.n_notes) facts.push(`${amount(head.n_notes)} notes`);
   if (head.ignored) facts.push(`${amount(head.ignored)} events not understood`);
