@@ -304,7 +304,6 @@ def _demo(options: argparse.Namespace) -> int:
     block = {
         "pointcloud": [str(BLOCK / "cloud.laz")],
         "footprints": str(BLOCK / "footprints.geojson"),
-        "border": "clip",
         "mesh_size": 5.0,
     }
     pictures = {out / "demo.png": "overview", out / "tiles.png": "tiles"}

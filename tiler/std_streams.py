@@ -73,5 +73,5 @@ def _guard(stream: TextIO) -> TextIO:
         return stream
     lines = getattr(stream, "line_buffering", False)
     raw: io.RawIOBase = _PatientWriter(file)
-    buffer = io.BufferedWriter(raw)  # type: ignore[type-var]
+    buffer = io.BufferedWriter(raw)
     return io.TextIOWrapper(buffer, encoding=stream.encoding, errors=PLAIN, newline="\n", line_buffering=lines)
