@@ -110,3 +110,22 @@ def test_the_terminal_tells_what_is_left_out(tmp_path: Path, capsys: pytest.Capt
 
 def test_nothing_is_told_where_all_is_in_the_mesh() -> None:
     assert tell_left_out({"footprints": 0, "area (m2)": 0.0, "building points": 0, "of building points": 9}) == []
+
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "amsterdam"
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no real data at {DATA}")
+def test_central_amsterdam_keeps_its_tallest_tower(tmp_path: Path) -> None:
+    """It stands on the region's border: without it the tallest building would be 30.5 m high."""
+    given = {"pointcloud": [str(DATA / "tiles")], "footprints": str(DATA / "footprints.gpkg"), "mesh_size": 20.0}
+    record = run(make_config(given | {"out": str(tmp_path / "out")}))
+    assert record["domain"]["tallest building in the mesh (m)"] == pytest.approx(53.8, abs=0.1)
+    assert record["left_out"]["area (m2)"] < 100
+    dropped = run(make_config(given | {"out": str(tmp_path / "out"), "border": "drop"}))
+    assert dropped["domain"]["tallest building in the mesh (m)"] == pytest.approx(30.5, abs=0.1)
+    assert dropped["domain"]["tallest building (m)"] > 50
+    found = dropped["left_out"]
+    assert found["building points"] / found["of building points"] == pytest.approx(0.26, abs=0.01)
+    assert found["tallest"]["height (m)"] == pytest.approx(dropped["domain"]["tallest building (m)"], abs=0.01)

@@ -92,6 +92,16 @@ def test_one_region_is_one_part(tmp_path: Path) -> None:
     assert (report.facts["parts"], report.remarks) == (1, ())
 
 
+def test_a_gap_within_one_tile_is_told(tmp_path: Path) -> None:
+    """One part then, whose middle nobody has measured."""
+    given = write_islands(tmp_path / "town", (0, 1), (5, 6)) | {"tile_size": 1000.0, "mesh_size": 10.0}
+    record = run(make_config(given))
+    assert record["parts"] == {"n": 1}
+    (note,) = record["notes"]["terrain-far-from-points"]["items"]
+    assert "more than 32 m from any ground point" in note["detail"]
+    assert note["detail"] in record["messages"]
+
+
 def test_tiles_that_touch_in_a_corner_are_parts_and_soil_joins_none(tmp_path: Path) -> None:
     folder = tmp_path / "town"
     folder.mkdir()

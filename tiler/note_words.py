@@ -148,6 +148,7 @@ WORDS: dict[str, Words] = {
     "footprints-reader-warning": Words(OTHER, "the reader of the footprints gave {n} warning[s]"),
     "footprints-reprojected": Words(OTHER, "the footprints were reprojected to the region's CRS"),
     "mesh-in-parts": Words(OTHER, "the mesh falls apart: parts of it share no face"),
+    "terrain-far-from-points": Words(OTHER, "terrain was interpolated over large areas without ground points"),
     "no-footprints-in-region": Words(OTHER, "no footprint lies in the region: terrain only"),
 }
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from pipeline.clusters import add_counts
 from pipeline.notes import Note, count_notes
+from pipeline.terrain_fill import RIM as FAR_NODES
 from tiler.config import Config
 from tiler.context import absent_tiles, tile_name
 from tiler.domain import settle
@@ -30,6 +31,8 @@ INCOMPLETE = {
     "footprint-too-many-vertices",
 }
 DAMAGED = "damaged-artefact"  # kind of the notes on what was damaged or missing, and made anew
+FAR_TERRAIN = "terrain-far-from-points"  # kind of the note on terrain that is interpolated over large gaps
+FAR_SHARE = 0.01  # of the region from which on it is made
 LISTED = 10_000  # notes of a kind that the record lists; the store has all
 
 
@@ -69,6 +72,7 @@ def summarise_run(
     left_out = describe_left_out(engine, notes)
     incomplete = unreadable or missing.tiles or missing.others or INCOMPLETE & {note.kind for note in notes}
     counts = _join_counts(engine, plan, rounds) | {"tiles missing": len(missing.tiles)}
+    notes += _note_far_terrain(counts, config)
     empty = {"empty": explain_empty(config, plan.region, counts, notes)} if is_empty(config, counts) else {}
     absent = {tile_name(key) for key in absent_tiles(plan.grid)} - missing.tiles.keys()
     return {
@@ -136,9 +140,23 @@ def _tell_damage(damage: Mapping[str, str]) -> list[str]:
     return [f"{len(damage)} damaged or missing artefacts of an earlier run were made anew: {DAMAGED} in the notes"]
 
 
+def _note_far_terrain(counts: Mapping[str, int], config: Config) -> list[Note]:
+    """Make the note on terrain far from all ground points, as between two clouds in one tile, where it is much."""
+    far, nodes = counts.get("terrain nodes from coarse level", 0), counts.get("terrain nodes", 0)
+    if far < FAR_SHARE * nodes or not far:
+        return []
+    reach = FAR_NODES * config.dtm_spacing
+    area = f"{far * config.dtm_spacing**2:,.0f} m² ({100 * far / nodes:.0f} % of the region)"
+    detail = (
+        f"{area} are more than {reach:g} m from any ground point: the terrain there is interpolated, and what "
+        "stands there is unknown; see --bounds, or a smaller --tile-size, which leaves out tiles without points"
+    )
+    return [Note(FAR_TERRAIN, detail=detail)]
+
+
 def _tell_notes(notes: Sequence[Note]) -> list[str]:
     """Notes that a user should read whatever else there is."""
-    return [note.detail for note in notes if note.kind in (MESH_IN_PARTS, LOW_DOMAIN)]
+    return [note.detail for note in notes if note.kind in (MESH_IN_PARTS, FAR_TERRAIN, LOW_DOMAIN)]
 
 
 def _collect_notes(engine: Engine) -> list[Note]:
