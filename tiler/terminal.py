@@ -53,7 +53,8 @@ def print_last_line(record: dict[str, Any], out: Path) -> None:
     """Print the end of a run in one line."""
     counts = record["counts"]
     lost = len(record["missing"]) + len(record["set_aside"]) + len(record["unreadable"])
-    left_out = f"; {lost:,} parts left out, see {out / 'run.json'}" if lost else ""
+    items = "1 item" if lost == 1 else f"{lost:,} items"
+    left_out = f"; {items} left out, see {out / 'run.json'}" if lost else ""
     print(printable(f"{counts['cells']:,} cells in {out}, {record['seconds_total']:.1f} s{left_out}"))
 
 
