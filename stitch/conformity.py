@@ -31,11 +31,18 @@ class FacePairs:
         Faces that occur twice in the same orientation: two cells overlap, or one is inverted.
     shared : int32, (t, 3)
         Faces that occur three times or more, one row for each occurrence.
+    row : int64, (k,)
+        The face of the input, or the cell, that each exterior face is of.
+    part : int32, (m,)
+        Of cells: the part of each, from 0. Cells of one part hang together by faces of two cells. Of loose faces
+        none.
     """
 
     exterior: NDArray[np.int32]
     same_side: NDArray[np.int32]
     shared: NDArray[np.int32]
+    row: NDArray[np.int64]
+    part: NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +111,13 @@ def pair_cell_faces(cells: NDArray[np.int32], n_points: int) -> FacePairs:
     >>> len(pairs.exterior), len(pairs.same_side), len(pairs.shared)
     (6, 0, 0)
     """
-    state = _face_states(np.ascontiguousarray(cells), n_points)
+    state, name = _face_states(np.ascontiguousarray(cells), n_points)
+    first = np.flatnonzero(name == np.arange(len(cells)))
+    number = np.empty(len(cells), np.int32)
+    number[first] = np.arange(len(first))
     chosen = [np.flatnonzero(state == kind) for kind in (EXTERIOR, SAME_SIDE, SHARED)]
     exterior, same_side, shared = (cells[i // 4][np.arange(len(i))[:, None], FACES[i % 4]] for i in chosen)
-    return FacePairs(exterior, same_side, shared)
+    return FacePairs(exterior, same_side, shared, chosen[0] // 4, number[name])
 
 
 def pair_faces(facets: NDArray[np.int32]) -> FacePairs:
@@ -127,7 +137,8 @@ def pair_faces(facets: NDArray[np.int32]) -> FacePairs:
     group, n_groups = group_rows(np.sort(facets, axis=1))
     count = np.bincount(group, minlength=n_groups)[group]
     n_even = np.bincount(group, even, n_groups)[group]
-    return FacePairs(facets[count == 1], facets[(count == 2) & (n_even != 1)], facets[count > 2])
+    same_side, shared = facets[(count == 2) & (n_even != 1)], facets[count > 2]
+    return FacePairs(facets[count == 1], same_side, shared, np.flatnonzero(count == 1), np.empty(0, np.int32))
 
 
 def pair_edges(facets: NDArray[np.int32]) -> EdgePairs:
@@ -330,8 +341,9 @@ def _ordered_face(cells, i, k):  # type: ignore[no-untyped-def]  # pragma: no co
 
 
 @kernel
-def _face_states(cells, n_points):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Mark each of the 4 m faces as interior, exterior, same-side or shared."""
+def _face_states(cells, n_points):  # type: ignore[no-untyped-def]  # noqa: PLR0912  # pragma: no cover
+    """Mark each of the 4 m faces as interior, exterior, same-side or shared; name parts by their first cell."""
+    parent = np.arange(len(cells))
     n_faces = 4 * len(cells)
     start = np.zeros(n_points + 1, np.int64)
     for i in range(len(cells)):
@@ -367,8 +379,19 @@ def _face_states(cells, n_points):  # type: ignore[no-untyped-def]  # pragma: no
                 kind = SAME_SIDE
             for at in range(i, j):
                 state[faces[order[at]]] = kind
+            if j - i == 2:
+                a, b = faces[order[i]] // 4, faces[order[i + 1]] // 4
+                while parent[a] != a:
+                    parent[a] = parent[parent[a]]
+                    a = parent[a]
+                while parent[b] != b:
+                    parent[b] = parent[parent[b]]
+                    b = parent[b]
+                parent[max(a, b)] = min(a, b)
             i = j
-    return state
+    for cell in range(len(cells)):
+        parent[cell] = parent[parent[cell]]
+    return state, parent
 
 
 @kernel

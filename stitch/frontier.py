@@ -30,6 +30,8 @@ class Rim:
         Exterior faces of the piece over these edges, pointing out of it.
     is_boundary : bool, (f,)
         Whether the piece says that a face is the boundary of the whole mesh.
+    part : int64, (f,)
+        Number of the part of the mesh that the cell behind a face belongs to, no two pieces have one in common.
     lines : float64, (l, 2, 3)
         Edges of boundary facets, from start to end, each as often as it occurs, with both ends over the rim.
     points : float64, (p, 4)
@@ -39,6 +41,7 @@ class Rim:
     edges: Vertices
     faces: Vertices
     is_boundary: Mask
+    part: NDArray[np.int64]
     lines: Vertices
     points: Vertices
 
@@ -51,8 +54,8 @@ class Settled:
     ----------
     n_matched : int
         Faces that two pieces have, in opposite orientations.
-    seams : int64, (s, 2)
-        Numbers of the pieces that share them, each pair once.
+    seams, joined : int64, (s, 2)
+        Numbers of the pieces that share them, and of the parts that hang together by them, each pair once.
     open : float64, (k, 3, 3)
         Faces that are not on the boundary and that no other piece has.
     extra : float64, (e, 3, 3)
@@ -66,6 +69,7 @@ class Settled:
 
     n_matched: int
     seams: NDArray[np.int64]
+    joined: NDArray[np.int64]
     open: Vertices
     extra: Vertices
     same_side: Vertices
@@ -88,8 +92,9 @@ class Frontier:
 def start_frontier() -> Frontier:
     """Return the frontier before the first piece."""
     none = np.empty(0, np.bool_)
-    rim = Rim(np.empty((0, 2, 2)), np.empty((0, 3, 3)), none, np.empty((0, 2, 3)), np.empty((0, 4)))
-    return Frontier(rim, np.empty(0, np.int64))
+    number = np.empty(0, np.int64)
+    rim = Rim(np.empty((0, 2, 2)), np.empty((0, 3, 3)), none, number, np.empty((0, 2, 3)), np.empty((0, 4)))
+    return Frontier(rim, number)
 
 
 def find_outline(points: Vertices, facets: NDArray[np.int32]) -> Vertices:
@@ -201,21 +206,25 @@ def add_rim(frontier: Frontier, rim: Rim, piece: int) -> tuple[Frontier, Settled
     faces = np.concatenate((old.faces, rim.faces))
     is_boundary = np.concatenate((old.is_boundary, rim.is_boundary))
     pieces = np.concatenate((frontier.piece, np.full(len(rim.faces), piece)))
+    part = np.concatenate((old.part, rim.part))
     face_done = is_done(old.faces, rim.faces)
     lines = np.concatenate((old.lines, rim.lines))
     line_done = is_done(old.lines, rim.lines)
     fresh = _find_fresh(old.points, rim.points, low, high)
     points = np.concatenate((old.points, rim.points[fresh]))
     point_done = is_done(old.points[:, None], rim.points[fresh][:, None])
-    settled = _settle(faces[face_done], is_boundary[face_done], pieces[face_done], lines[line_done])
-    waiting = Rim(edges, faces[~face_done], is_boundary[~face_done], lines[~line_done], points[~point_done])
-    return Frontier(waiting, pieces[~face_done]), settled, fresh
+    settled = _settle(
+        faces[face_done], is_boundary[face_done], pieces[face_done], part[face_done], lines[line_done]
+    )
+    left = ~face_done
+    waiting = Rim(edges, faces[left], is_boundary[left], part[left], lines[~line_done], points[~point_done])
+    return Frontier(waiting, pieces[left]), settled, fresh
 
 
 def close_frontier(frontier: Frontier) -> Settled:
     """Settle what still waits after the last piece."""
     rim = frontier.rim
-    return _settle(rim.faces, rim.is_boundary, frontier.piece, rim.lines)
+    return _settle(rim.faces, rim.is_boundary, frontier.piece, rim.part, rim.lines)
 
 
 def _pair_edges(edges: Vertices) -> Vertices:
@@ -239,7 +248,9 @@ def _find_fresh(old: Vertices, new: Vertices, low: Vertices, high: Vertices) -> 
     return fresh
 
 
-def _settle(faces: Vertices, is_boundary: Mask, piece: NDArray[np.int64], lines: Vertices) -> Settled:
+def _settle(
+    faces: Vertices, is_boundary: Mask, piece: NDArray[np.int64], part: NDArray[np.int64], lines: Vertices
+) -> Settled:
     corner, _ = group_rows(faces.reshape(-1, 3))
     order = np.argsort(corner.reshape(-1, 3), axis=1)
     group, n_groups = group_rows(np.sort(corner.reshape(-1, 3), axis=1))
@@ -250,11 +261,12 @@ def _settle(faces: Vertices, is_boundary: Mask, piece: NDArray[np.int64], lines:
     matched = opposite & (n_boundary == 0)
     # Rows of one face stand together, so its two pieces are neighbours in this order.
     rows = np.flatnonzero(matched)
-    pairs = piece[rows[np.argsort(group[rows], kind="stable")]].reshape(-1, 2)
+    two = rows[np.argsort(group[rows], kind="stable")].reshape(-1, 2)
     open_lines, crowded_lines = _settle_lines(lines)
     return Settled(
-        n_matched=len(pairs),
-        seams=np.unique(np.sort(pairs, axis=1), axis=0),
+        n_matched=len(two),
+        seams=np.unique(np.sort(piece[two], axis=1), axis=0),
+        joined=np.unique(np.sort(part[two], axis=1), axis=0),
         open=faces[(count == 1) & ~is_boundary],
         extra=faces[opposite & is_boundary],
         same_side=faces[(count == 2) & ~opposite],

@@ -73,7 +73,7 @@ def test_a_sound_folder_is_proved(tmp_path: Path, city: TinyCity, n_pieces: int)
     assert report.facts["cells"] == len(city.mesh.cells)
     assert report.facts["points"] == len(city.mesh.points)
     assert report.facts["facets"] == len(city.boundary.facets)
-    assert report.facts["buildings"] == len(HOUSES)
+    assert report.facts["building parts"] == len(HOUSES)
     # The two houses that touch in a corner, up to the lower roof: two levels of it.
     assert report.facts["non_manifold_edges"] == 2
     assert any("touch in a corner only: (" in line for line in report.lines())
@@ -309,7 +309,7 @@ def counts_of(city: TinyCity) -> dict[str, int]:
         "cells": len(city.mesh.cells),
         "points": len(city.mesh.points),
         "facets": len(city.boundary.facets),
-        "buildings": len(city.model),
+        "building parts": len(city.model),
     }
 
 
@@ -664,7 +664,7 @@ def test_a_seam_that_settles_bit_by_bit_counts_once() -> None:
     sums = _Sums.start(0)
     for pairs in ([[0, 1]], [], [[0, 1], [1, 2]]):
         seams = np.array(pairs, np.int64).reshape(-1, 2)
-        sums.add_settled(Settled(len(pairs), seams, none, none, none, none, lines, lines))
+        sums.add_settled(Settled(len(pairs), seams, seams, none, none, none, none, lines, lines))
     assert sums.seams.tolist() == [[0, 1], [1, 2]]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import InputError
 from tests.simulated_runs import simulate, write_events
-from tiler.dashboard.answer import tell
+from tiler.dashboard.answer import _tell_step, tell
 from tiler.dashboard.codes import STATES, State
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.map_view import MOST_SHOWN, Question, tell_map
@@ -18,6 +18,7 @@ from tiler.dashboard.metrics import families, write_text
 from tiler.dashboard.model import TILE, RunModel
 from tiler.dashboard.series import MOST, Series
 from tiler.out_folder import EVENTS
+from tiler.stage_groups import group_stages
 
 
 def fold(*events: object) -> RunModel:
@@ -221,16 +222,57 @@ def test_a_run_whose_process_is_gone_is_dead(tmp_path: Path) -> None:
     assert tell(Follower(tmp_path, lambda: True), Question())["head"]["status"] == "running"
 
 
-def test_what_is_left_follows_from_measured_times(tmp_path: Path) -> None:
+def test_what_is_left_follows_from_measured_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the terminal tells it: a stage that nobody has measured counts by its usual part of the work."""
+    monkeypatch.setattr("tiler.dashboard.answer.time.time", lambda: 110.0)
     (tmp_path / EVENTS).write_text("")
     follower = Follower(tmp_path, lambda: True)
     follower.advance()
     follower.model = begun(
-        item("done", "houses", "0_0", seconds=4.0, total=2), item("done", "pieces", "0_0", seconds=2.0, total=2)
+        item("submitted", "houses", "0_0") | {"t": 100.0},
+        item("done", "houses", "0_0", seconds=4.0, total=2) | {"t": 104.0},
+        item("done", "pieces", "0_0", seconds=2.0, total=2) | {"t": 106.0},
     )
-    assert tell(follower, Question())["head"]["left"] == (4.0 + 2.0) / 2
-    follower.model.fold({"event": "planned", "stage": "proofs", "scope": "seam", "total": 2})
-    assert tell(follower, Question())["head"]["left"] is None, "a stage that nobody has measured"
+    head = tell(follower, Question())["head"]
+    assert head["left"] == pytest.approx((4.0 + 2.0) * 10.0 / 6.0)  # 6 s of work took 10 s
+    assert head["share"] == pytest.approx(0.5)
+    follower.model.fold({"event": "planned", "stage": "columns", "scope": "tile", "total": 2})
+    more = (4.0 + 2.0) * 2 * 0.13 / (0.13 + 0.10)
+    head = tell(follower, Question())["head"]
+    assert head["left"] == pytest.approx((4.0 + 2.0 + more) * 10.0 / 6.0)
+    assert head["share"] == pytest.approx(6.0 / (12.0 + more), abs=1e-4)
+
+
+def test_what_runs_is_no_more_than_workers_can_run() -> None:
+    """Workers have several tasks in hand; those behind the first wait."""
+    model = RunModel()
+    model.fold({"event": "run", "t": 1.0, "status": "running", "workers": 2})
+    model.fold({"event": "tiles", "tiles": [[f"{k}_0", k, 0, k + 1, 1] for k in range(4)]})
+    model.fold({"event": "planned", "stage": "columns", "scope": "tile", "total": 4})
+    for k in range(4):
+        model.fold(item("submitted", "columns", f"{k}_0") | {"t": 2.0 + k})
+    assert model.stages["columns"].counts[State.RUNNING] == 2
+    assert list(model.queued) == [("columns", "2_0"), ("columns", "3_0")]
+    model.fold(item("done", "columns", "0_0") | {"t": 9.0})
+    assert model.stages["columns"].counts[State.RUNNING] == 2
+    assert model.at_work["columns", "2_0"] == 9.0  # since when it runs
+    model.fold(item("done", "columns", "3_0") | {"t": 9.5})  # of the other worker's own
+    assert (model.stages["columns"].counts[State.RUNNING], list(model.queued)) == (2, [])
+    model.fold(item("failed", "columns", "1_0", reason="wet") | {"t": 10.0})
+    model.fold(item("done", "columns", "2_0") | {"t": 11.0})
+    assert (model.stages["columns"].counts[State.RUNNING], model.at_work) == (0, {})
+
+
+def test_stages_are_told_as_steps() -> None:
+    model = begun(
+        item("done", "near-0", "0_0", seconds=1.0, total=2),
+        item("done", "shapes-0", "0_0", seconds=2.0, total=2),
+        item("done", "canopy", "0_0", seconds=3.0, total=1),
+    )
+    steps = {name: _tell_step(model, name, names) for name, names in group_stages(model.stages).items()}
+    assert {"simplification", "canopy"} <= set(steps)
+    assert not {"near-0", "shapes-0"} & set(steps)
+    assert (steps["simplification"]["done"], steps["simplification"]["seconds"]) == (2, 3.0)
 
 
 def test_intervals_are_bounded_and_lose_nothing() -> None:

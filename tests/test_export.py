@@ -190,7 +190,7 @@ def cut_piece(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (no_record, "run.json: no such file; run citystitch first"),
+        (no_record, "it has no run.json; run citystitch first"),
         (failed, "the run failed (no room)"),
         (running, "the run is running and has no mesh yet"),
         (unfinished, "the run is 'partial', not 'done'"),

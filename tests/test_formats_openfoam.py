@@ -603,7 +603,7 @@ def test_check_mesh_reads_buildings_in_four_parts(small_run: Path, tmp_path: Pat
         assert read_check(text)["cells"] == counts["cells"]
         # Of names alone: checkMesh glues long ones to what follows them.
         found = [int(n) for n in re.findall(r"^    (?:boundary patches|face zones): +(\d+)", text, re.MULTILINE)]
-        plain, n = len(counts_by_patch(small_run)), counts["buildings"]
+        plain, n = len(counts_by_patch(small_run)), counts["building parts"]
         assert found == ([plain - 2 + n, 0] if kind == "patches" else [plain, n])
 
 

@@ -161,14 +161,14 @@ def test_blocks_stand_on_the_terrain(small_run: Path, monkeypatch: pytest.Monkey
     record = json.loads((small_run / "run.json").read_text())
     bounds = tuple(record["region"]["bounds"])
     found = block_scene(small_run, (bounds[0], bounds[1], bounds[2], bounds[3]))
-    assert (found.n_buildings, found.n_shown) == (record["counts"]["buildings"],) * 2
+    assert (found.n_buildings, found.n_shown) == (record["counts"]["building parts"],) * 2
     corners = found.scene.corners
     assert np.isfinite(corners).all()
     assert np.abs(corners[..., :2]).max() <= (bounds[2] - bounds[0]) / 2 + 1e-6
     monkeypatch.setattr("tiler.scenes.MOST_BLOCKS", 5)
     image, words = paint_blocks(small_run, (160, 100))
     assert image.shape == (100, 160, 3)
-    assert words == f"the largest 5 of {found.n_buildings} buildings are drawn"
+    assert words == f"the largest 5 of {found.n_buildings} building parts are drawn"
 
 
 def test_a_cut_shows_cells_of_air(small_run: Path) -> None:

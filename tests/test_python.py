@@ -54,7 +54,7 @@ def test_a_mesh_from_python_is_that_of_the_command(tmp_path: Path, capsys: pytes
     files = tiler.write_city(tmp_path / "city", size=160, buildings=4, density=0.5, seed=3)
     city = tiler.mesh(files.clouds[0].parent / "*.laz", files.footprints, out=tmp_path / "a", domain_height=60)
     said = capsys.readouterr().out
-    assert re.search(r"columns \(1\) +\d", said)
+    assert re.search(r"mesh +1 task +\d", said)
     assert "tasks ran" in said
     words = ["run", str(files.clouds[0]), "--footprints", str(files.footprints), "--domain-height", "60"]
     assert main([*words, "--out", str(tmp_path / "b")]) == 0
@@ -271,8 +271,8 @@ def test_a_notebook_shows_how_far_it_is(tmp_path: Path, output: Display, monkeyp
     assert {*range(n + 1)} == set(done)
     assert re.fullmatch(rf"{n} of {n} tasks, \d+ s - done", lines[-1])
     assert f'<progress value="{n}" max="{n}" aria-label="all tasks">' in output.pages[-1]["text/html"]
-    assert any('aria-label="columns"' in page["text/html"] for page in output.pages)
-    assert 'aria-label="columns"' not in output.pages[-1]["text/html"]
+    assert any('aria-label="mesh"' in page["text/html"] for page in output.pages)
+    assert 'aria-label="mesh"' not in output.pages[-1]["text/html"]
     assert "<li>" in output.pages[-1]["text/html"]  # what was said
 
 
@@ -287,7 +287,7 @@ def test_what_fails_is_shown_and_escaped(output: Display) -> None:
     progress.end("failed", "a < b")
     page = output.pages[-1]
     assert "1 failed - failed: a < b" in page["text/plain"]
-    assert "points &lt;script&gt;: no &amp; no" in page["text/html"]
+    assert "points: point-cloud files &lt;script&gt;: no &amp; no" in page["text/html"]
     assert "<script>" not in page["text/html"]
     assert page["text/html"].count("<li>") == 7
     assert "and 2 before" in page["text/html"]

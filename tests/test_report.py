@@ -16,15 +16,16 @@ from pipeline.errors import InputError
 from pipeline.heights import ROOF_SOURCES
 from tests.tiles import hash_files
 from tiler.cli import main
+from tiler.note_words import GROUPS, WORDS, group_of, say_notes
 from tiler.report import write_report
 from tiler.report.charts import Series, draw_gantt, draw_histogram
 from tiler.report.maps import draw_map, encode_png, gather_tiles, shade
-from tiler.report.meanings import GROUPS, MEANINGS, explain
 from tiler.report.record import SHOWN, read_run_facts
 from tiler.report.timeline import BINS, read_timeline
 from tiler.stages.domain import LOW_DOMAIN
 
 ROOT = Path(__file__).resolve().parents[1]
+SAME_FOR_ALL: set[str] = set()
 VOID = {"meta", "link", "img"}
 
 
@@ -137,7 +138,7 @@ def test_long_lists_are_cut_and_say_so(copy: Path) -> None:
     change_record(copy, notes={"footprint-sliver": {"count": 12_345, "items": items}})
     page = read(write_report(copy))
     assert sum(bool(re.fullmatch(r"B\d+", words)) for words in page.words) == SHOWN
-    assert f"The first {SHOWN} of 12,345 footprint-sliver; run.json has more" in page.words
+    assert f"The first {SHOWN} of 12,345 notes; run.json has more" in page.words
 
 
 def test_a_failed_run_has_a_report_of_what_is_known(tmp_path: Path) -> None:
@@ -196,11 +197,20 @@ def test_a_run_ends_with_its_report_if_asked(
     before = hash_files(out)
     page = read(out / "report.html")
     assert [a["id"] for tag, a in page.elements if tag == "section"][:3] == ["summary", "pictures", "map"]
-    assert "When each stage worked; the darker the more of its tasks at a time." in page.words
+    assert "When each step worked; the darker the more of its tasks at a time." in page.words
     assert main(words) == 0
     assert f"citystitch report {out}" in capsys.readouterr().out
-    assert not (out / "report.html").exists()  # it told of an earlier run
+    kept = (out / "report.html").read_text()  # nothing has changed
+    assert "This report is old" not in kept
     assert hash_files(out) == before
+    for _ in range(2):
+        assert main([*words, "--roof-group", "1.0"]) == 0  # other roofs
+        old = (out / "report.html").read_text()
+        assert old.count("This report is old: it tells of an earlier run") == 1
+        assert not list(out.glob(".report*"))
+    assert main(words) == 0
+    assert main(["report", str(out)]) == 0
+    assert "This report is old" not in (out / "report.html").read_text()
     assert main(["check", str(out), "--store"]) == 0
     monkeypatch.setattr("tiler.report.write.collect_numbers", _fail)
     capsys.readouterr()
@@ -225,11 +235,22 @@ def test_every_kind_of_note_is_explained() -> None:
     )
     found = set(re.findall(r'(?:Note|note|_notes|_note)\(\s*"([a-z]+-[a-z-]+)"', sources))
     assert len(found) > 30
-    assert found <= set(MEANINGS)
+    assert found <= set(WORDS)
     for source in ROOF_SOURCES[1:-1]:
-        assert explain(f"footprint-roof-from-{source}")[0] == "defaulted"
-    assert explain(LOW_DOMAIN)[1]
-    assert {group for group, _ in MEANINGS.values()} == set(GROUPS)
+        assert group_of(f"footprint-roof-from-{source}") == "defaulted"
+    assert LOW_DOMAIN in WORDS
+    assert {words.group for words in WORDS.values()} == set(GROUPS)
+
+
+@pytest.mark.parametrize("kind", WORDS)
+def test_notes_have_grammar(kind: str) -> None:
+    """One and many are sentences of their own, without a sign of how they are made."""
+    one, many = say_notes(kind, 1), say_notes(kind, 5200)
+    assert not re.search(r"[\[\]{}|]", one + many)
+    if "{n}" in WORDS[kind].sentence:
+        assert one.count("1 ") >= 1
+        assert "5,200 " in many
+        assert one.replace("1 ", "") != many.replace("5,200 ", "") or kind in SAME_FOR_ALL
 
 
 def test_events_make_a_gantt_chart(tmp_path: Path) -> None:
@@ -245,7 +266,7 @@ def test_events_make_a_gantt_chart(tmp_path: Path) -> None:
     path.write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"t": 106, "event": "do')
     found = read_timeline(path, frozenset({"0_0", "0_1"}))
     assert found is not None
-    assert (found.duration, found.stages) == (5.0, ("points", "columns"))
+    assert (found.duration, found.stages) == (5.0, ("points", "mesh"))
     assert (found.tasks.tolist(), found.reused.tolist(), found.failed.tolist()) == ([1, 2], [0, 1], [0, 1])
     assert found.by_tile == {"0_0": 2.0, "0_1": 3.0}
     per_bin = 5.0 / BINS

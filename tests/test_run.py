@@ -189,7 +189,7 @@ def test_terrain_without_footprints_is_a_mesh(city: Path, tmp_path: Path) -> Non
 
 def test_footprints_elsewhere_leave_terrain_and_a_note(city: Path, tmp_path: Path) -> None:
     far = write_footprints(tmp_path / "far.gpkg", [shapely.box(0, 0, 9, 9)])
-    record = run(make_config(values(city, tmp_path / "out", footprints=str(far))))
+    record = run(make_config(values(city, tmp_path / "out", footprints=str(far), allow_empty=True)))
     assert record["notes"]["no-footprints-in-region"]["count"] == 1
 
 
@@ -287,7 +287,9 @@ def test_errors_in_workers_are_one_message_too(
 
 def test_buildings_in_the_cloud_without_footprints_end_with_three(city: Path, tmp_path: Path) -> None:
     far = write_footprints(tmp_path / "far.gpkg", [shapely.box(0, 0, 9, 9)])
-    assert main(["run", str(city), "--footprints", str(far), "--out", str(tmp_path / "out")]) == 3
+    command = ["run", str(city), "--footprints", str(far), "--out", str(tmp_path / "out")]
+    assert main(command) == 1
+    assert main([*command, "--allow-empty"]) == 3
 
 
 @pytest.mark.parametrize("size", ["20", "30", "40"])
@@ -388,7 +390,7 @@ CASES: list[tuple[str, Callable[[Path], None], list[str], int, str]] = [
     ("tower over the domain", tall_tower, [], 1, "--domain-height"),
     ("unknown attribute", nothing, ["--id-attribute", "nope"], 2, "nope"),
     ("mesh size 0", nothing, ["--mesh-size", "0"], 2, "must be at least"),
-    ("clearance of a kilometre", nothing, ["--clearance", "1000"], 0, ""),
+    ("clearance of a kilometre", nothing, ["--clearance", "1000", "--allow-empty"], 0, ""),
 ]
 
 

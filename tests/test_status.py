@@ -72,7 +72,7 @@ def test_a_finished_run(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
     assert status["running"] == []
     text = show(town.out, capsys)
     assert ": done, " in text
-    assert row(text, "columns")[:6] == ["4", "4", "0", "0", "0", "0"]
+    assert row(text, "mesh")[:6] == ["4", "4", "0", "0", "0", "0"]
     assert text.splitlines()[-1] == f"next: citystitch check {town.out}"
 
 

@@ -133,7 +133,7 @@ def test_parts_have_their_share_of_the_zones(soil_run: Path, tmp_path: Path) -> 
     assert sum(found) == sum(int((part.marker == Marker.GROUND).sum()) for part in parts_of(soil_run))
     zones = [list(read_zones(folder / "faceZones")) for folder in folders]
     assert zones[0] == zones[1] == zones[2]
-    assert len(zones[0]) == counts_of(soil_run)["buildings"] + 1
+    assert len(zones[0]) == counts_of(soil_run)["building parts"] + 1
 
 
 def test_wind_does_not_blow_through_soil(

@@ -74,7 +74,7 @@ def test_time_left_is_that_of_what_is_measured_and_typical_of_the_rest(tmp_path:
     assert left == pytest.approx({"columns": 10.0, "pieces": 20.0 * 0.10 / 0.13})
     assert tally.time_left() == pytest.approx(10.0 + 20.0 * 0.10 / 0.13)  # 10 s of work took 10 s
     assert tally.share_done() == pytest.approx(10.0 / (20.0 + 20.0 * 0.10 / 0.13))
-    assert tally.rate("columns") == pytest.approx(0.5)
+    assert tally.rate(tally.stages["columns"]) == pytest.approx(0.5)
     do(tally, "columns", range(5, 10), 10, seconds=2.0)
     do(tally, "pieces", range(5), 10, seconds=8.0)
     clock.now += 20.0
@@ -124,11 +124,11 @@ def test_no_row_is_too_wide_and_the_view_is_not_too_high(tmp_path: Path, width: 
     if width >= 80:
         assert rows[0].startswith("  stage_with_a_lon ")
         assert " 1,234,567/3,000,000 " in rows[0]
-        assert "stages at work" in rows[-3] if n == 40 else True
-        assert rows[-2].endswith(f"0 of {n} stages")
+        assert "steps at work" in rows[-3] if n == 40 else True
+        assert rows[-2].endswith(f"0 of {n} steps")
         assert rows[-1].startswith("  0:00:00, 2 workers, ")
         assert f"{n:,} failed" in rows[-1]
-    assert ("building with a fault" in rows[-1]) is (width == 200)
+    assert ("notes: building with a fault" in rows[-1]) is (width == 200)
     assert draw(busy_tally(tmp_path, n), width, height, plain=True).plain.isascii()
 
 
@@ -137,14 +137,14 @@ def test_a_view_by_hand(tmp_path: Path) -> None:
     tally = Tally(clock)
     tally.begin(start_with(tmp_path, columns=10, pieces=10, report=1))
     assert draw(tally, 80, 24).plain.split("\n")[0].rstrip() == (
-        f"  {'all':<16} {'─' * 22}   0%        starting  0 of 3 stages"
+        f"  {'all':<16} {'─' * 22}   0%        starting  0 of 2 steps"
     )
     do(tally, "columns", range(5), 10, seconds=2.0, notes={"odd": 1}, peak_memory=300 * 2**20)
     tally.submitted("columns", "5_0")
     clock.now += 10.0
     assert draw(tally, 80, 24).plain.split("\n") == [
-        f"  {'columns':<16} {'━' * 11}{'─' * 11}          5/10  30.0/min   2.00 s each",
-        f"  {'all':<16} {'━' * 6}{'─' * 16}  28%     ~ 26 s left  0 of 3 stages",
+        f"  {'mesh':<16} {'━' * 11}{'─' * 11}          5/10  30.0/min   2.00 s each",
+        f"  {'all':<16} {'━' * 6}{'─' * 16}  28%     ~ 26 s left  0 of 2 steps",
         "  0:00:10, 2 workers, 1 task in hand, peak 300 MiB, 5 warnings",
     ]
 
@@ -162,8 +162,8 @@ def test_lines_tell_stages_failures_and_what_is_said() -> None:
         lines.failed("columns", f"{k}", "wet")
         lines.failed("pieces", f"{k}", "not run", ("columns", f"{k}"))
     texts = [line.text for line in found]
-    assert texts[:2] == ["  columns (3)                      4.50 s", "so it is"]
-    assert texts[2] == "failed: columns 0: wet"
+    assert texts[:2] == ["  mesh              3 tasks      4.50 s", "so it is"]
+    assert texts[2] == "failed: mesh: columns of cells 0: wet"
     assert len(texts) == 2 + LISTED_FAILURES + 1
     assert "run.json will list all" in texts[-1]
     assert [line.bad for line in found] == [False, False] + [True] * (LISTED_FAILURES + 1)
@@ -175,17 +175,20 @@ def test_each_item_is_told_where_it_is_asked_for() -> None:
     do(lines, "columns", range(1, 2), 2, seconds=0.0, reused=True)
     lines.failed("pieces", "0_0", "not run: columns", ("columns", "0_0"))
     assert [line.text for line in found] == [
-        "    columns 0_0  1.50 s, 2 odd",
-        "    columns 1_0  was there",
-        "  columns (2)                      1.50 s",
-        "failed: pieces 0_0: not run: columns",
+        "    mesh: columns of cells 0_0  1.50 s, 2 notes: odd",
+        "    mesh: columns of cells 1_0  was there",
+        "  mesh              2 tasks      1.50 s",
+        "failed: output: files of the mesh 0_0: not run: columns",
     ]
 
 
 def test_a_long_stage_says_now_and_then_how_far_it_is(capsys: pytest.CaptureFixture[str]) -> None:
     tally = Tally(Clock())
-    for every, expected in ((60.0, ""), (0.0, "  columns 1 of 10\n  columns 2 of 10\n")):
-        do(PlainView(tally, every=every), "columns", range(2), 10)
+    for every, expected in ((60.0, ""), (0.0, "  mesh: 1 of 10 tasks\n  mesh: 2 of 10 tasks\n")):
+        view = PlainView(tally, every=every)
+        for k in range(2):
+            do(tally, "columns", range(k, k + 1), 10)
+            do(view, "columns", range(k, k + 1), 10)
         assert capsys.readouterr().out == expected
 
 
@@ -241,10 +244,10 @@ def test_the_live_view_in_a_terminal(tmp_path: Path) -> None:
     assert text.startswith("before it begins")
     assert text.index(HIDE) < text.index("1 warning") < text.rindex(SHOW)
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
-    assert "  points (1)                       1.00 s" in plain
-    assert re.search(r"  columns +━+─+ +1/2 ", plain)
+    assert "  points            1 task       1.00 s" in plain
+    assert re.search(r"  mesh +━+─+ +1/2 ", plain)
     assert "a sentence with \\x1b[31m signs" in plain
-    assert "failed: columns 1_0: it is [bold]wet[/]" in plain
+    assert "failed: mesh: columns of cells 1_0: it is [bold]wet[/]" in plain
     assert COLOUR.search(text)
     # What stays at the end is the lines: the view is wiped row by row before the last of them.
     assert text.rindex("\x1b[2K") < text.rindex("a sentence with")
@@ -265,9 +268,9 @@ def test_a_dumb_terminal_gets_lines_alone(tmp_path: Path, capsys: pytest.Capture
         assert shown() == ""  # lines go to standard output
     assert capsys.readouterr().out.splitlines() == [
         "before it begins",
-        "  points (1)                       1.00 s",
+        "  points            1 task       1.00 s",
         "a sentence with \\x1b[31m signs",
-        "failed: columns 1_0: it is [bold]wet[/]",
+        "failed: mesh: columns of cells 1_0: it is [bold]wet[/]",
     ]
 
 
@@ -301,8 +304,8 @@ def test_the_options_of_the_command(town: Town, tmp_path: Path, capsys: pytest.C
     out, log = town.copy(tmp_path / "out"), tmp_path / "log.jsonl"
     assert main(run_words(town, out, "--verbose", "--log-json", str(log))) == 0
     text = capsys.readouterr().out
-    assert "    columns 2271_45707  was there\n" in text
-    assert "  columns (4)                      0.00 s\n" in text
+    assert "    mesh: columns of cells 2271_45707  was there\n" in text
+    assert "  mesh              4 tasks      0.00 s\n" in text
     assert "\n0 of " in text, text
     assert [line.strip() for line in text.splitlines()[-4:]] == [
         f"next: citystitch check {out}",
@@ -405,15 +408,13 @@ def test_a_run_in_a_terminal_looks_right(town: Town, tmp_path: Path, width: int)
     assert len(views) > 3, screens[-1]
     bar = min(60, width - 58)
     for rows in views:
-        assert re.fullmatch(rf"  all {{14}}[━─]{{{bar}}} +\d+%.* \d+ of 26 stages", rows[-2])
+        assert re.fullmatch(rf"  all {{14}}[━─]{{{bar}}} +\d+%.* \d+ of 7 steps", rows[-2])
         assert re.fullmatch(r"  0:00:\d\d, 2 workers, \d+ tasks? in hand.*", rows[-1])
         # One view, and above it nothing but finished stages and stages at work: no row was wrapped or left behind.
         assert sum("in hand" in row and "workers" in row for row in rows) == 1
         for row in rows[:-2]:
-            done, at_work = r"  [a-z0-9-]+ \(\d+\) +[\d.]+ s", rf"  [a-z0-9-]+ +[━─]{{{bar}}} +[\d,]+/[\d,]+.*"
-            assert re.fullmatch(f"{done}|{at_work}|  and \\d+ more stages at work|domain-lower-.*|[^ ].*", row), (
-                row
-            )
+            done, at_work = r"  [a-z]+ +\d+ tasks? +[\d.]+ s", rf"  [a-z0-9-]+ +[━─]{{{bar}}} +[\d,]+/[\d,]+.*"
+            assert re.fullmatch(f"{done}|{at_work}|  and \\d+ more steps at work|[^ ].*", row), row
     assert any("━" in rows[0] or "─" in rows[0] for rows in views)
     assert any("~ " in rows[-2] for rows in views) or len(views) < 20
     last = screens[-1].rstrip().split("\n")
@@ -421,7 +422,7 @@ def test_a_run_in_a_terminal_looks_right(town: Town, tmp_path: Path, width: int)
     text = "\n".join(last)
     assert "━" not in text
     assert "─" not in text
-    assert len(re.findall(r"^  [a-z0-9-]+ \(\d+\) +[\d.]+ s$", text, re.MULTILINE)) == 26
+    assert len(re.findall(r"^  [a-z]+ +\d+ tasks? +[\d.]+ s$", text, re.MULTILINE)) == 7
     assert "quality, percentile" in text
     assert " cells, " in text
 

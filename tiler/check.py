@@ -1,11 +1,13 @@
 """`citystitch check`: prove from the written files that a run's mesh is right."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.errors import InputError
 from pipeline.mesh import Marker
@@ -13,9 +15,10 @@ from stitch.frontier import Settled, add_rim, close_frontier, start_frontier
 from tiler import city_proofs, pad_proofs, proofs, soil_proofs
 from tiler.building_index import BuildingIndex, index_buildings
 from tiler.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
+from tiler.mesh_parts import tell_parts
 from tiler.out_folder import RUN_RECORD, STORE
 from tiler.proofs import Dtm, Fault, Finding, Proof, Vertices
-from tiler.run_folder import RunRecord, read_run_record
+from tiler.run_folder import PARTS, RunRecord, read_run_record
 from tiler.stages.citymodel import CITY_MODEL
 from tiler.vtk_files import read_piece_paths
 
@@ -33,14 +36,18 @@ class CheckReport:
         The folder.
     proofs : tuple of Proof
         All claims, in a fixed order, with the faults of each.
+    remarks : tuple of str
+        What is no fault, but must be known before a solver runs.
     facts : mapping of str to float
-        Numbers read on the way: ``cells``, ``points``, ``facets``, ``buildings``, ``non_manifold_edges``,
-        ``volume`` and ``smallest_cell`` (m³), ``seam_faces``, ``missing_facets``.
+        Numbers read on the way: ``cells``, ``points``, ``facets``, ``building parts``, ``non_manifold_edges``,
+        ``volume`` and ``smallest_cell`` (m³), ``seam_faces``, ``missing_facets``, ``parts`` of the air that
+        share no face.
     """
 
     directory: Path
     proofs: tuple[Proof, ...]
     facts: Mapping[str, float]
+    remarks: tuple[str, ...] = ()
 
     @property
     def faults(self) -> tuple[Fault, ...]:
@@ -60,7 +67,9 @@ class CheckReport:
             lines += [f"      {_tell(fault)}" for fault in proof.faults]
         n = len({fault.kind for fault in self.faults})
         verdict = "everything is proved" if self.ok else f"{n} {'kind' if n == 1 else 'kinds'} of fault"
-        return [*lines, f"{self.directory}: {verdict}"]
+        if self.remarks:
+            verdict += f", {'but' if self.ok else 'and'} see the {'note' if len(self.remarks) == 1 else 'notes'}"
+        return [*lines, *(f"NOTE  {remark}" for remark in self.remarks), f"{self.directory}: {verdict}"]
 
 
 def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
@@ -97,11 +106,15 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
         frontier = start_frontier()
         for number, (volume, boundary) in enumerate(files):
             piece = read_piece(directory / volume, directory / boundary, record.bounds, soil=record.depth > 0)
-            frontier, settled, fresh = add_rim(frontier, piece.rim, number)
+            rim = replace(piece.rim, part=piece.rim.part + len(sums.part_cells))
+            frontier, settled, fresh = add_rim(frontier, rim, number)
             sums.add_piece(piece, fresh, record, index, dtm)
             sums.add_settled(settled)
         sums.add_settled(close_frontier(frontier))
-        return CheckReport(directory, *_conclude(sums, len(files), record, index))
+        claims, facts = _conclude(sums, len(files), record, index)
+        parts = sums.count_parts()
+        remarks = (tell_parts(parts),) if len(parts) > 1 else ()
+        return CheckReport(directory, claims, {**facts, "parts": len(parts)}, remarks)
 
 
 @dataclass(eq=False)
@@ -115,12 +128,16 @@ class _Sums:
     faults: tuple[Fault, ...]
     crowded: Vertices  # (c, 2): where edges have more than two facets
     seams: NDArray[np.int64]  # (s, 2): pairs of pieces that share faces
+    part_cells: NDArray[np.int64]  # (p,): cells of each part of a piece
+    part_soil: NDArray[np.bool_]  # (p,): whether it is soil
+    joined: NDArray[np.int64]  # (j, 2): pairs of parts that share faces
 
     @classmethod
     def start(cls, n_buildings: int) -> "_Sums":
         built = city_proofs.start_built(n_buildings)
-        counts = {"cells": 0, "points": 0, "facets": 0, "buildings": n_buildings}
-        return cls({}, built, counts, np.inf, (), np.empty((0, 2)), np.empty((0, 2), np.int64))
+        counts = {"cells": 0, "points": 0, "facets": 0, PARTS: n_buildings}
+        pairs, part = np.empty((0, 2), np.int64), (np.empty(0, np.int64), np.empty(0, np.bool_))
+        return cls({}, built, counts, np.inf, (), np.empty((0, 2)), pairs, *part, pairs)
 
     def add_piece(
         self, piece: Piece, fresh: NDArray[np.bool_], record: RunRecord, index: BuildingIndex, dtm: Dtm
@@ -159,6 +176,8 @@ class _Sums:
         self.smallest = min(self.smallest, piece.smallest)
         self.faults = proofs.merge_faults((*self.faults, *piece.faults))
         self._add_crowded(piece.crowded)
+        self.part_cells = np.concatenate((self.part_cells, piece.part_cells))
+        self.part_soil = np.concatenate((self.part_soil, piece.part_soil))
 
     def add_settled(self, settled: Settled) -> None:
         """Add what is settled between pieces."""
@@ -167,6 +186,16 @@ class _Sums:
         self._add_crowded(settled.crowded_lines)
         if len(settled.seams):
             self.seams = np.unique(np.concatenate((self.seams, settled.seams)), axis=0)
+            self.joined = np.unique(np.concatenate((self.joined, settled.joined)), axis=0)
+
+    def count_parts(self) -> list[int]:
+        """Cells of the parts of the air that share no face, the largest first."""
+        n = len(self.part_cells)
+        pairs = coo_array((np.ones(len(self.joined)), tuple(self.joined.T)), shape=(n, n))
+        n_parts, label = connected_components(pairs, directed=False)
+        air = ~self.part_soil
+        cells = np.bincount(label[air], self.part_cells[air], n_parts).astype(np.int64)
+        return sorted(cells[cells > 0].tolist(), reverse=True)
 
     def _join(self, name: str, finding: Finding) -> None:
         self.found[name] = proofs.join_findings(self.found.get(name, Finding()), finding)

@@ -31,6 +31,8 @@ class Piece:
         Volume of all cells of air, of all cells of soil, and of the smallest (m³).
     surface : Surface
         Its boundary file, on the distinct vertices of this and of the exterior faces.
+    part_cells, part_soil : int64, bool, (p,)
+        Cells of each part, air or soil, that hang together by faces, and whether it is soil.
     outline : float64, (k, 2, 2)
         Edges of its plan.
     rim : Rim
@@ -51,6 +53,8 @@ class Piece:
     soil: float
     smallest: float
     surface: Surface
+    part_cells: NDArray[np.int64]
+    part_soil: Mask
     outline: Vertices
     rim: Rim
     on_rim: Mask
@@ -73,6 +77,7 @@ def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: 
     pairs = conformity.pair_cell_faces(mesh.cells, len(mesh.points))
     volumes, flat = conformity.compute_cell_volumes(mesh.points, mesh.cells)
     between, of_soil = _part_regions(mesh, region, pairs.exterior)
+    label = _label_parts(mesh, region, pairs.part)
     surface, rows = _join(mesh.points[np.concatenate((pairs.exterior, between))], file)
     faces, between = rows[: len(pairs.exterior)], rows[len(pairs.exterior) :]
     # Faces of cells whose vertices are there twice meet where coordinates are equal.
@@ -89,7 +94,8 @@ def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: 
     outline = find_outline(surface.points, _facing_up(surface.points, exterior[of_air]))
     edges = outline[~find_border(outline, bounds, tolerance=proofs.SIDE_TOLERANCE)]
     over = find_edges_below(surface.points[exterior], edges) >= 0
-    rim, on_rim = _find_rim(surface, facets, edges, exterior[over], known[over], faces)
+    part = label[pairs.row[joined.row]]
+    rim, on_rim = _find_rim(surface, facets, edges, (exterior[over], part[over]), known[over], faces)
     open_edges, crowded = _pair_edges(surface.points, facets, on_rim)
     return Piece(
         n_cells=len(mesh.cells),
@@ -98,6 +104,8 @@ def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: 
         soil=float(volumes[region == Region.SOIL].sum()),
         smallest=float(volumes.min(initial=np.inf)),
         surface=surface,
+        part_cells=np.bincount(label),
+        part_soil=np.bincount(label, region == Region.SOIL) > 0,
         outline=outline,
         rim=rim,
         on_rim=on_rim,
@@ -136,6 +144,18 @@ def _part_regions(
     return air[match.extra], of_soil
 
 
+def _label_parts(mesh: TetMesh, region: NDArray[np.int8], part: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Number the parts of the air and those of the soil; `part` is that of each cell without regions."""
+    label = part.astype(np.int64)
+    first = 0
+    for kind in np.unique(region).tolist() if len(np.unique(region)) > 1 else ():
+        rows = np.flatnonzero(region == kind)
+        found = conformity.pair_cell_faces(mesh.cells[rows], len(mesh.points)).part
+        label[rows] = first + found
+        first += int(found.max()) + 1
+    return label
+
+
 def _join(exterior: Vertices, file: BoundaryPiece) -> tuple[Surface, NDArray[np.int32]]:
     """Put the boundary and the exterior faces (k, 3, 3) on common points, equal where coordinates are."""
     corners = file.points[file.boundary.facets]
@@ -157,13 +177,13 @@ def _find_rim(
     surface: Surface,
     facets: NDArray[np.int32],
     edges: Vertices,
-    over: NDArray[np.int32],
+    over: tuple[NDArray[np.int32], NDArray[np.int64]],
     known: Mask,
     faces: NDArray[np.int32],
 ) -> tuple[Rim, Mask]:
-    """Gather what stands over the rim's edges: exterior faces `over` them, some `known` to the boundary file.
+    """Gather what stands over the rim's edges: exterior faces `over` them with their parts, some `known`.
 
-    Of the boundary file, `facets` are those that bound the cells.
+    Those `known` are in the boundary file; of that, `facets` are those that bound the cells.
     """
     boundary, points = surface.boundary, surface.points
     on_rim = np.isin(as_places(points), as_places(edges))
@@ -177,8 +197,9 @@ def _find_rim(
     rows = np.concatenate(chosen)
     rim = Rim(
         edges=edges,
-        faces=points[over],
+        faces=points[over[0]],
         is_boundary=known,
+        part=over[1],
         lines=points[np.stack((start[both], end[both]), axis=1)],
         points=np.column_stack((points[rows], np.repeat((ANY, GROUND, TOP), [len(row) for row in chosen]))),
     )

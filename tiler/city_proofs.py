@@ -198,7 +198,9 @@ def prove_buildings(built: Built, index: BuildingIndex, bounds: Bounds, *, parti
     ]
     total = f"roofs {built.roof_area.sum():.2f} m², footprints {wanted.sum():.2f} m²"
     n_whole = f"{n}" if not partial else f"{np.count_nonzero(whole)} whole and {np.count_nonzero(~whole)} other"
-    return Proof(f"the {n_whole} buildings of the city model have their walls and roofs; {total}", tuple(faults))
+    return Proof(
+        f"the {n_whole} building parts of the city model have their walls and roofs; {total}", tuple(faults)
+    )
 
 
 def _measure_footprints(index: BuildingIndex) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -17,7 +17,7 @@ from pipeline.errors import CityError, ConfigError
 from tiler import fork_server
 from tiler.api import with_file
 from tiler.config import Config, annotated_defaults, make_config
-from tiler.export import FORMATS
+from tiler.export import FORMATS, refuse_strangers
 from tiler.importing import uncollected
 from tiler.jobs.commands import describe_job, find_run, job_line
 from tiler.kept_memory import keep_memory, look_seldom
@@ -25,6 +25,7 @@ from tiler.negative import mark_values
 from tiler.parser import Handler, build_parser
 from tiler.places import place, refuse_bucket
 from tiler.plain_text import printable
+from tiler.std_streams import guard_streams
 
 if TYPE_CHECKING:
     from tiler.synth import SynthFiles
@@ -46,9 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     _find_cache()
     if arguments is None:
+        guard_streams()
         _silence_libraries()
     parser = make_parser()
-    options = parser.parse_args(mark_values(sys.argv[1:] if arguments is None else arguments))
+    options, unknown = parser.parse_known_args(mark_values(sys.argv[1:] if arguments is None else arguments))
+    if unknown:
+        options.parser.refuse_unknown(unknown)
     handler: Handler = options.handler
     try:
         return handler(options)
@@ -199,6 +203,7 @@ def _check(options: argparse.Namespace) -> int:
 
         return 0 if audit_run(options.directory, print) else EXIT_FAILED
     refuse_bucket(options.directory, "check without --store")
+    refuse_strangers(options.directory)
     return _check_folder(options.directory)
 
 
@@ -243,6 +248,7 @@ def _dashboard(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from tiler.report import write_report
 
+    refuse_strangers(options.directory)
     say(str(write_report(options.directory)))
     return 0
 
@@ -299,7 +305,6 @@ def _demo(options: argparse.Namespace) -> int:
     block = {
         "pointcloud": [str(BLOCK / "cloud.laz")],
         "footprints": str(BLOCK / "footprints.geojson"),
-        "border": "clip",
         "mesh_size": 5.0,
     }
     pictures = {out / "demo.png": "overview", out / "tiles.png": "tiles"}
@@ -327,6 +332,7 @@ def _demonstrate(title: str, inputs: dict[str, Any], out: Path, pictures: dict[P
 def _render(options: argparse.Namespace) -> int:
     from tiler.render import render_run
 
+    refuse_strangers(options.directory)
     render_run(options.directory, options.output, what=options.what, say=say)
     say(str(options.output))
     return 0
@@ -335,6 +341,7 @@ def _render(options: argparse.Namespace) -> int:
 def _export(options: argparse.Namespace) -> int:
     from tiler.export import export_run
 
+    refuse_strangers(options.directory)
     given = {name: value for name, value in vars(options).items() if name in EXPORT_OPTIONS}
     export_run(options.directory, options.output, name=options.format, overwrite=options.overwrite, options=given)
     say(str(options.output))

@@ -14,6 +14,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from pipeline.errors import ConfigError
 from pipeline.pointcloud import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
 from stitch.least import LEAST_TILE
+from tiler.did_you_mean import suggest
 from tiler.domain import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
 from tiler.pad_widths import check_widths
 from tiler.places import check_url, is_url
@@ -135,8 +136,8 @@ class Config:
         above=0,
     )  # fmt: skip
     border: str = _parameter(
-        "drop", "buildings", "buildings on the region's border are dropped, or clipped to it less the clearance",
-        choices=("drop", "clip"),
+        "clip", "buildings", "buildings on the region's border are clipped to it less the clearance, or dropped",
+        choices=("clip", "drop"),
     )  # fmt: skip
     simplify: str = _parameter(
         "clearance", "simplify", "clearance: one planar graph of walls that keeps every house; paper: merging",
@@ -280,6 +281,9 @@ class Config:
         "run",
         "TOML file that describes a cluster, whose batch system starts the workers; instead of workers",
     )
+    allow_empty: bool = _parameter(
+        False, "run", "accept a mesh without buildings although footprints were given; else the run fails"
+    )
     out: str = _parameter("out", "run", "folder for the results, or s3://BUCKET/NAME")
     overwrite: bool = _parameter(
         False, "run", "remove the results of an earlier run in that folder, and start anew"
@@ -400,11 +404,16 @@ def load_config(path: Path) -> dict[str, Any]:
     sections = {entry.name: entry.metadata["section"] for entry in dataclasses.fields(Config)}
     for section, table in document.items():
         if section not in sections.values() or not isinstance(table, dict):
-            raise ConfigError(f"{path}: unknown section [{shorten(section, 100)}]; `citystitch config` lists all")
+            offer = suggest(section, sections.values())
+            raise ConfigError(
+                f"{path}: unknown section [{shorten(section, 100)}]{offer}; `citystitch config` lists all"
+            )
         for name, value in table.items():
             if sections.get(name) != section:
+                offer = f"; it stands in [{sections[name]}]" if name in sections else suggest(name, sections)
                 raise ConfigError(
-                    f"{path}: unknown parameter {shorten(name, 100)} in [{section}]; `citystitch config` lists all"
+                    f"{path}: unknown parameter {shorten(name, 100)} in [{section}]{offer}; `citystitch config` "
+                    "lists all"
                 )
             values[name] = _relative_to(path.parent, name, value)
     return values

@@ -6,7 +6,7 @@ its help, so writers import what they need when they are called.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +28,27 @@ class RunFiles:
         VTU and VTP pieces, in the order of the index files: by name of tile.
     depth : float
         Depth of its soil (m), 0 where it has none.
+    parts : int
+        Parts of the mesh that share no face, 0 where its record does not tell.
+    sides : tuple of float or None
+        West, south, east and north side (m) of the part of the mesh that these are the files of; None where they
+        are those of the whole mesh.
     """
 
     directory: Path
     volumes: tuple[Path, ...]
     boundaries: tuple[Path, ...]
     depth: float = 0.0
+    parts: int = 0
+    sides: tuple[float, float, float, float] | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Whether these are the files of the whole mesh."""
+        return self.sides is None
+
+
+RunSource = Path | RunFiles
 
 
 @dataclass(frozen=True)
@@ -82,55 +97,55 @@ def _write_vtp(path: Path, files: RunFiles, **options: Any) -> None:
 def _write_openfoam(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.openfoam import export_openfoam
 
-    export_openfoam(path, files.directory, **options)
+    export_openfoam(path, files, **options)
 
 
 def _write_xdmf(path: Path, files: RunFiles) -> None:
     from tiler.formats.xdmf import export_xdmf
 
-    export_xdmf(path, files.directory)
+    export_xdmf(path, files)
 
 
 def _write_cgns(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.cgns import export_cgns
 
-    export_cgns(path, files.directory, **options)
+    export_cgns(path, files, **options)
 
 
 def _write_msh(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.msh import export_msh
 
-    export_msh(path, files.directory, **options)
+    export_msh(path, files, **options)
 
 
 def _write_msh2(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.msh import export_msh2
 
-    export_msh2(path, files.directory, **options)
+    export_msh2(path, files, **options)
 
 
 def _write_stl(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.stl import export_stl
 
-    export_stl(path, files.directory, **options)
+    export_stl(path, files, **options)
 
 
 def _write_obj(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.obj import export_obj
 
-    export_obj(path, files.directory, **options)
+    export_obj(path, files, **options)
 
 
 def _write_ply(path: Path, files: RunFiles) -> None:
     from tiler.formats.ply import export_ply
 
-    export_ply(path, files.directory)
+    export_ply(path, files)
 
 
 def _write_glb(path: Path, files: RunFiles, **options: Any) -> None:
     from tiler.formats.glb import export_glb
 
-    export_glb(path, files.directory, **options)
+    export_glb(path, files, **options)
 
 
 def _write_cityjsonseq(path: Path, files: RunFiles) -> None:
@@ -145,20 +160,22 @@ def _write_gpkg(path: Path, files: RunFiles) -> None:
     export_gpkg(path, files.directory)
 
 
-PER_BUILDING = ("buildings",)
+LARGEST_PART = "largest_part"  # taken by every format of the mesh, not by those of the city model
+PER_BUILDING = ("buildings", LARGEST_PART)
 FORMATS: Mapping[str, Format] = {
-    "vtu": Format("the volume mesh as one VTK file", _write_vtu, options=("scalars",)),
-    "vtp": Format("the marked boundary as one VTK file", _write_vtp, options=("scalars",)),
+    "vtu": Format("the volume mesh as one VTK file", _write_vtu, options=("scalars", LARGEST_PART)),
+    "vtp": Format("the marked boundary as one VTK file", _write_vtp, options=("scalars", LARGEST_PART)),
     "openfoam": Format(
         "a case folder of OpenFOAM",
         _write_openfoam,
-        options=("parts", "case", "buildings"),
+        options=("parts", "case", "buildings", LARGEST_PART),
         buildings=("patches", "zones"),
         folder=True,
     ),
     "xdmf": Format(
         "mesh and marked facets for FEniCS and ParaView, with a file .h5 beside it",
         _write_xdmf,
+        options=(LARGEST_PART,),
         suffix=".xdmf",
         companion=".h5",
     ),
@@ -171,7 +188,9 @@ FORMATS: Mapping[str, Format] = {
     "obj": Format(
         "the boundary as Wavefront OBJ, one group a patch", _write_obj, options=PER_BUILDING, suffix=".obj"
     ),
-    "ply": Format("the boundary as PLY, binary, with marker and building", _write_ply, suffix=".ply"),
+    "ply": Format(
+        "the boundary as PLY, binary, with marker and building", _write_ply, options=(LARGEST_PART,), suffix=".ply"
+    ),
     "glb": Format(
         "the boundary as glTF 2.0, binary, one material a patch", _write_glb, options=PER_BUILDING, suffix=".glb"
     ),
@@ -218,19 +237,24 @@ def export_run(
     kind = FORMATS[name]
     for option in options:
         if option not in kind.options:
-            taken = ", ".join(f"--{known}" for known in kind.options) or "none"
-            raise ConfigError(f"--{option}: format {name} does not take it; its options: {taken}")
+            taken = ", ".join(f"--{known.replace('_', '-')}" for known in kind.options) or "none"
+            raise ConfigError(
+                f"--{option.replace('_', '-')}: format {name} does not take it; its options: {taken}"
+            )
     asked = options.get("buildings", kind.buildings[0])
     if asked not in kind.buildings:
         raise ConfigError(f"--buildings {asked}: format {name} takes {' or '.join(kind.buildings)}")
     if not output.name.endswith(kind.suffix):
         raise ConfigError(f"{output}: a file of format {name} ends with {kind.suffix}; give another --output")
+    given = dict(options)
     files = find_files(directory)
     for target in (output, output.with_suffix(kind.companion)) if kind.companion else (output,):
         _check_target(target, files, overwrite=overwrite)
     if kind.folder and output.exists() and not (output / EXPORT_RECORD).is_file():
         raise ConfigError(f"{output}: holds no {EXPORT_RECORD}, so it was not exported; give another --output")
-    kind.write(output, files, **options)
+    if given.pop(LARGEST_PART, False):
+        files = take_largest_part(files)
+    kind.write(output, files, **given)
 
 
 def find_files(directory: Path) -> RunFiles:
@@ -244,14 +268,59 @@ def find_files(directory: Path) -> RunFiles:
     from tiler.run_folder import read_run_record
     from tiler.vtk_files import read_piece_paths
 
+    refuse_strangers(directory)
     record = directory / RUN_RECORD
-    if not record.is_file():
-        raise InputError(f"{record}: no such file; run citystitch first, or name its output folder")
     found = read_run_record(record)
     if found.status != "done":
         raise InputError(f"{record}: the run is {found.status!r}, not 'done'; finish it or run again")
     volumes, boundaries = (read_piece_paths(directory / name) for name in (VOLUME_INDEX, BOUNDARY_INDEX))
-    return RunFiles(directory, tuple(volumes), tuple(boundaries), found.depth)
+    return RunFiles(directory, tuple(volumes), tuple(boundaries), found.depth, len(found.parts))
+
+
+def refuse_strangers(directory: Path) -> None:
+    """Raise InputError if a folder is not that of a run: whatever else it may hold."""
+    if not directory.is_dir():
+        what = "is a file" if directory.exists() else "no such folder"
+        raise InputError(f"{directory}: {what}; run citystitch first, or give what --out of a run was")
+    if not (directory / RUN_RECORD).is_file():
+        raise InputError(
+            f"{directory}: is not the folder of a run, it has no {RUN_RECORD}; run citystitch first, or give what "
+            "--out of a run was"
+        )
+
+
+def take_largest_part(files: RunFiles) -> RunFiles:
+    """Take the pieces of the part of a mesh that has the most cells, where parts share no face.
+
+    Raises
+    ------
+    InputError
+        If the record of the run does not tell of parts.
+    ConfigError
+        If a tile has cells of this part and of another one.
+    """
+    from tiler.run_folder import read_run_record
+
+    record = files.directory / RUN_RECORD
+    found = read_run_record(record)
+    parts = found.parts
+    if not parts:
+        raise InputError(f"{record}: does not say which parts the mesh has; run again")
+    if len(parts) == 1:
+        return files
+    if divided := parts[0].divided:
+        raise ConfigError(
+            f"--largest-part: tile {divided[0]} has cells of this part and of another one, and pieces are taken "
+            "whole; mesh again with another --bounds or --tile-size"
+        )
+    wanted = set(parts[0].tiles)
+    kept = [tuple(path for path in paths if path.stem in wanted) for paths in (files.volumes, files.boundaries)]
+    boxes = [box for name in parts[0].tiles if (box := found.tiles.get(name)) is not None]
+    if len(boxes) < len(wanted):
+        raise InputError(f"{record}: does not tell the boxes of all tiles; run again")
+    west, south, east, north = zip(*boxes, strict=True)
+    sides = (min(west), min(south), max(east), max(north))
+    return replace(files, volumes=kept[0], boundaries=kept[1], parts=1, sides=sides)
 
 
 def _check_target(output: Path, files: RunFiles, *, overwrite: bool) -> None:

@@ -9,8 +9,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from tiler.note_words import say_notes
 from tiler.plain_text import printable
 from tiler.plain_view import Line, Lines
+from tiler.stage import Scope
 from tiler.tally import StageTally, Tally, tell_duration
 from tiler.task import Record
 from tiler.watching import Item, RunStart, Watcher
@@ -52,11 +54,16 @@ class LiveView(Watcher):
 
     def begin(self, start: RunStart) -> None:
         """Begin to draw."""
+        self._lines.begin(start)
         self._live.start()
         self._thread.start()
 
+    def planned(self, stage: str, scope: Scope, total: int) -> None:
+        """Take note of how many items a stage has."""
+        self._lines.planned(stage, scope, total)
+
     def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
-        """Tell a finished stage, or each item."""
+        """Tell a finished group of stages, or each item."""
         self._lines(stage, done, total, record)
 
     def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
@@ -117,12 +124,12 @@ def draw(tally: Tally, width: int, height: int, *, plain: bool = False) -> Text:
     Text
         Rows that are shorter than `width`, and fewer than `height`: a terminal must not wrap or scroll them.
     """
-    at_work = [(name, state) for name, state in list(tally.stages.items()) if state.running and state.left]
+    at_work = [(name, state) for name, state in tally.groups().items() if state.running and state.left]
     room = max(min(ROWS, height - REST), 0)
     shown = at_work if len(at_work) <= room else at_work[: max(room - 1, 0)]
     rows = [_draw_stage(tally, name, state, width, plain=plain) for name, state in shown]
     if len(at_work) > len(shown) and room:
-        rows.append(Text(f"  and {len(at_work) - len(shown)} more stages at work"))
+        rows.append(Text(f"  and {len(at_work) - len(shown)} more steps at work"))
     rows += [_draw_all(tally, width, plain=plain), _draw_facts(tally, width)]
     for row in rows:
         row.truncate(width - 1, overflow="ellipsis" if not plain else "crop")
@@ -130,7 +137,7 @@ def draw(tally: Tally, width: int, height: int, *, plain: bool = False) -> Text:
 
 
 def _draw_stage(tally: Tally, name: str, state: StageTally, width: int, *, plain: bool) -> Text:
-    words = f" {f'{state.done:,}/{state.total:,}':>13} {_tell_rate(tally.rate(name)):>9} {_tell_mean(state):>13}"
+    words = f" {f'{state.done:,}/{state.total:,}':>13} {_tell_rate(tally.rate(state)):>9} {_tell_mean(state):>13}"
     more = f"  {state.running:,} in hand" if width >= WIDE else ""
     more += f"  {state.failed:,} failed" if state.failed else ""
     share = state.done / state.total if state.total else 0.0
@@ -140,18 +147,18 @@ def _draw_stage(tally: Tally, name: str, state: StageTally, width: int, *, plain
 
 
 def _draw_all(tally: Tally, width: int, *, plain: bool) -> Text:
-    stages = list(tally.stages.values())
-    finished = sum(not state.left for state in stages)
+    groups = list(tally.groups().values())
+    finished = sum(not state.left for state in groups)
     left, share = tally.time_left(), tally.share_done()
     if not tally.began:
         when = "starting"
-    elif finished == len(stages):
+    elif finished == len(groups):
         when = "writing it down"
     else:
         when = "" if left is None else f"~ {tell_duration(left)} left"
     row = _bar("all", share, width, plain=plain)
     row.stylize("bold", 0, NAME)
-    return row.append(f" {share:4.0%} {when:>15}  {finished:,} of {len(stages):,} stages")
+    return row.append(f" {share:4.0%} {when:>15}  {finished:,} of {len(groups):,} steps")
 
 
 def _draw_facts(tally: Tally, width: int) -> Text:
@@ -169,7 +176,7 @@ def _draw_facts(tally: Tally, width: int) -> Text:
         row.append(f", {_count(number, 'warning')}", "yellow")
         if width >= WIDE:
             kinds = islice(tally.warnings.most_common(), 5)
-            row.append(": " + ", ".join(f"{n:,} {printable(kind.replace('-', ' '))}" for kind, n in kinds))
+            row.append(": " + ", ".join(printable(say_notes(kind, n)) for kind, n in kinds))
     return row
 
 

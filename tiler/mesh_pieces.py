@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.mesh import Region
+from pipeline.mesh import Marker, Region
 from stitch.numbering import Numbering
-from tiler.export import RUN_RECORD, RunFiles, find_files
+from tiler.export import RUN_RECORD, RunFiles, RunSource, find_files
 from tiler.merged import VERTEX_ID, number_piece, read_numbering
 from tiler.run_folder import REGION, read_run_record
 from tiler.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
+
+SIDE = 1e-6  # m; how far from a side of the region a facet on it may be
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,20 +94,43 @@ class MeshPieces:
             volume.mesh.points,
             volume.mesh.cells,
             _facets_in_volume(self.files.boundaries[k], volume, boundary),
-            boundary.boundary.marker,
+            mark_sides(self.files, boundary),
             boundary.boundary.building,
             number_piece(path, volume.point_data.get(VERTEX_ID), self.numbering),
             _regions(path, volume) if self.files.depth else None,
         )
 
 
-def open_pieces(directory: Path) -> MeshPieces:
+def mark_sides(files: RunFiles, piece: BoundaryPiece) -> NDArray[np.int32]:
+    """Give the markers of a boundary piece; the outer sides of a part of a mesh are those of its region.
+
+    A side of the whole mesh that lies towards a tile that is not there is ``missing``; where it is the westernmost
+    of the part that is taken alone, it is its west side, and so on.
+    """
+    marker = piece.boundary.marker
+    if files.sides is None:
+        return marker
+    marker = marker.copy()
+    rows = np.flatnonzero(marker == Marker.MISSING)
+    corners = piece.points[piece.boundary.facets[rows], :2]
+    west, south, east, north = files.sides
+    for axis, side, name in (
+        (0, west, Marker.WEST),
+        (0, east, Marker.EAST),
+        (1, south, Marker.SOUTH),
+        (1, north, Marker.NORTH),
+    ):
+        marker[rows[(np.abs(corners[:, :, axis] - side) <= SIDE).all(axis=1)]] = name
+    return marker
+
+
+def open_pieces(source: RunSource) -> MeshPieces:
     """Open the mesh of a finished run.
 
     Parameters
     ----------
-    directory : Path
-        Folder of the run.
+    source : Path or RunFiles
+        Folder of the run, or the files of it that are wanted.
 
     Raises
     ------
@@ -116,13 +141,14 @@ def open_pieces(directory: Path) -> MeshPieces:
     -----
     The ids of all points are read once, a piece at a time; memory holds some 100 bytes for each tile's parts.
     """
-    files = find_files(directory)
+    files = source if isinstance(source, RunFiles) else find_files(source)
+    directory = files.directory
     names = tuple(path.stem for path in files.volumes)
     if names != tuple(path.stem for path in files.boundaries) or list(names) != sorted(set(names)):
         raise InputError(f"{directory}: the indexes of mesh and boundary name other tiles; run again")
     numbering = read_numbering(files.volumes)
     counted = read_run_record(directory / RUN_RECORD).counts["points"]
-    if numbering.n_points != counted:
+    if files.whole and numbering.n_points != counted:
         raise InputError(
             f"{directory}: its pieces have {numbering.n_points} different {VERTEX_ID}, {RUN_RECORD} says "
             f"{counted} points; run again"

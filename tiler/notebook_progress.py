@@ -1,4 +1,4 @@
-"""How far a run is, shown in a notebook: a bar for all tasks, one for each stage in hand, failures, messages."""
+"""How far a run is, shown in a notebook: a bar for all tasks, one for each step in hand, failures, messages."""
 
 import html
 import sys
@@ -6,11 +6,12 @@ import time
 from typing import Any
 
 from tiler.stage import Scope
+from tiler.stage_groups import group_stages, title_of_stage
 from tiler.task import Record
 from tiler.watching import Item, RunStart, Watcher
 
 EVERY = 0.25  # s between two updates of the output
-LISTED = 5  # stages in hand, failures and messages that are shown
+LISTED = 5  # failures and messages that are shown
 
 
 def in_notebook() -> bool:
@@ -62,7 +63,7 @@ class NotebookProgress(Watcher):
         """Take note of an item that failed."""
         self._running[stage] = max(0, self._running.get(stage, 0) - 1)
         if needs is None:
-            self._failures.append(f"{stage} {name}: {reason}")
+            self._failures.append(f"{title_of_stage(stage)} {name}: {reason}")
         self._draw_sometimes()
 
     def say(self, text: str) -> None:
@@ -97,8 +98,10 @@ class NotebookProgress(Watcher):
     def _page(self) -> str:
         done, total = sum(self._done.values()), sum(self._totals.values())
         rows = [_bar("all tasks", done, total)]
-        in_hand = [stage for stage, n in self._running.items() if n] if not self._end else []
-        rows += [_bar(stage, self._done.get(stage, 0), self._totals.get(stage, 0)) for stage in in_hand[:LISTED]]
+        for group, stages in group_stages(self._totals).items() if not self._end else ():
+            if any(self._running.get(stage) for stage in stages):
+                counts = (sum(numbers.get(stage, 0) for stage in stages) for numbers in (self._done, self._totals))
+                rows.append(_bar(group, *counts))
         lists = [("failed", self._failures), ("", self._said)]
         told = "".join(_list(title, lines) for title, lines in lists if lines)
         return f"<div><table>{''.join(rows)}</table><p>{html.escape(self._line())}</p>{told}</div>"

@@ -20,9 +20,10 @@ PIECES = {"mesh": ".vtu", "boundary": ".vtp"}
 RUN_RECORD, PROGRESS, EVENTS, STORE = "run.json", "progress.json", "events.jsonl", "store.zarr"
 MANIFEST_PATH = f"{STORE}/{MANIFEST}"
 REPORT = "report.html"
+EARLIER_REPORT = ".report.earlier.html"  # set aside while a run is at work: see `tiler.kept_report`
 STALE = (*INDEXES, REPORT)  # what an earlier run said of all of its mesh
 RESULTS = (
-    *(RUN_RECORD, PROGRESS, EVENTS, REPORT, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
+    *(RUN_RECORD, PROGRESS, EVENTS, REPORT, EARLIER_REPORT, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
     *(*INDEXES, *PIECES, STORE, TASKS, "only"),
 )
 # A file on its way to its place, of a writer that was killed: see `tiler.atomic`.
@@ -89,7 +90,7 @@ def _check_earlier(out: Path, earlier: Sequence[str], *, overwrite: bool) -> Non
 
 
 def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
-    """Make the folders of a run; take away indexes and report of an earlier one, whose mesh is about to change.
+    """Make the folders of a run; take away the indexes of an earlier one, and set its report aside.
 
     ``run.json`` stays: it must say before this that a run is at work. Other results are used again.
 
@@ -113,7 +114,10 @@ def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
             path = out / name
             if name == RUN_RECORD or name not in earlier:
                 continue
-            _remove(path)
+            if name == REPORT and not overwrite and not in_bucket(out):
+                path.replace(out / EARLIER_REPORT)
+            else:
+                _remove(path)
         for folder in PIECES:
             (out / folder).mkdir(exist_ok=True)
     except OSError as error:

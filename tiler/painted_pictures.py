@@ -66,7 +66,7 @@ def paint_blocks(directory: Path, size: tuple[int, int]) -> tuple[Image, str]:
     found = block_scene(directory, read_run_record(directory / RUN_RECORD).bounds)
     left_out = ""
     if found.n_shown < found.n_buildings:
-        left_out = f"the largest {found.n_shown:,} of {found.n_buildings:,} buildings are drawn"
+        left_out = f"the largest {found.n_shown:,} of {found.n_buildings:,} building parts are drawn"
     return _paint(found.scene, size), left_out
 
 

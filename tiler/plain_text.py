@@ -2,6 +2,7 @@
 
 import hashlib
 import unicodedata
+from collections.abc import Sequence
 
 # Unicode categories that move a cursor, hide or reorder text, or cannot be written as UTF-8: control, format,
 # surrogate, line and paragraph separators. A terminal obeys the first, a reader is misled by the second.
@@ -60,3 +61,15 @@ def say_nothing(_: str) -> None:
 
 def _escape(sign: str) -> str:
     return sign.encode("unicode_escape", errors="surrogatepass").decode("ascii")
+
+
+def tell_box(box: Sequence[float]) -> str:
+    """Write a box as its ranges of x and y, without a comma within a number.
+
+    Examples
+    --------
+    >>> tell_box((120000.0, 487200.5, 120624.0, 487786.0))
+    '120000 to 120624, 487200.5 to 487786'
+    """
+    west, south, east, north = (f"{value:.10g}" for value in box)
+    return f"{west} to {east}, {south} to {north}"

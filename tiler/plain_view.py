@@ -5,10 +5,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from tiler.note_words import say_notes
 from tiler.plain_text import printable
-from tiler.tally import Tally, tell_duration
+from tiler.stage import Scope
+from tiler.stage_groups import group_of_stage, title_of_stage
+from tiler.tally import StageTally, Tally, tell_duration
 from tiler.task import Record
-from tiler.watching import Item, Watcher
+from tiler.watching import Item, RunStart, Watcher
 
 LISTED_FAILURES = 20  # that are told when they happen; the record has all
 EVERY = 60.0  # s without a line, after which one says how far a stage is
@@ -35,25 +38,41 @@ class Lines(Watcher):
 
     def __init__(self, put: Callable[[Line], None], *, verbose: bool = False) -> None:
         self._put, self._verbose = put, verbose
-        self._seconds: dict[str, float] = {}
+        self._tally = Tally()
+        self._told: set[str] = set()
         self._failures = 0
 
+    def begin(self, start: RunStart) -> None:
+        """Take the stages that are known from the start."""
+        self._tally.begin(start)
+
+    def planned(self, stage: str, scope: Scope, total: int) -> None:
+        """Take note of how many items a stage has."""
+        self._tally.planned(stage, scope, total)
+
     def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
-        """Tell a finished stage, or each item."""
-        seconds = record.seconds.get("all", 0.0)
-        self._seconds[stage] = self._seconds.get(stage, 0.0) + seconds
+        """Tell a finished group of stages, or each item."""
+        self._tally(stage, done, total, record)
         if self._verbose:
-            what = "was there" if record.reused else f"{seconds:.2f} s"
-            notes = "".join(f", {n} {kind}" for kind, n in record.notes.items())
-            self._put(Line(f"    {stage} {record.name}  {what}{notes}"))
+            what = "was there" if record.reused else f"{record.seconds.get('all', 0.0):.2f} s"
+            notes = "".join(f", {say_notes(kind, n)}" for kind, n in record.notes.items())
+            self._put(Line(f"    {title_of_stage(stage)} {record.name}  {what}{notes}"))
         if done == total:
-            self._put(Line(tell_stage(stage, total, self._seconds[stage])))
+            self._tell_group(group_of_stage(stage))
+
+    def _tell_group(self, group: str) -> None:
+        """Tell a group when nothing of it is left."""
+        state = self._tally.groups()[group]
+        if not state.left and group not in self._told:
+            self._told.add(group)
+            self._put(Line(tell_group(group, state)))
 
     def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
         """Tell a failure; an item that is not run because of it only where each item is told."""
+        self._tally.failed(stage, name, reason, needs)
         self._failures += needs is None
         if self._verbose or (needs is None and self._failures <= LISTED_FAILURES):
-            self._put(Line(f"failed: {stage} {name}: {reason}", bad=True))
+            self._put(Line(f"failed: {title_of_stage(stage)} {name}: {reason}", bad=True))
         elif needs is None and self._failures == LISTED_FAILURES + 1:
             self._put(Line("failed: more than that; run.json will list all", bad=True))
 
@@ -80,13 +99,23 @@ class PlainView(Watcher):
         self._lines = Lines(self._print, verbose=verbose)
         self._printed = time.monotonic()
 
+    def begin(self, start: RunStart) -> None:
+        """Take the stages that are known from the start."""
+        self._lines.begin(start)
+
+    def planned(self, stage: str, scope: Scope, total: int) -> None:
+        """Take note of how many items a stage has."""
+        self._lines.planned(stage, scope, total)
+
     def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
         """Print what there is to tell."""
         self._lines(stage, done, total, record)
         if done < total and time.monotonic() - self._printed >= self._every:
             left = self._tally.time_left()
             words = f", ~ {tell_duration(left)} left" if left is not None else ""
-            self._print(Line(f"  {stage} {done:,} of {total:,}{words}"))
+            group = group_of_stage(stage)
+            state = self._tally.groups()[group]
+            self._print(Line(f"  {group}: {state.done:,} of {state.total:,} tasks{words}"))
 
     def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
         """Print a failure."""
@@ -112,12 +141,14 @@ class QuietView(Watcher):
         self._lines.failed(stage, name, reason, needs)
 
 
-def tell_stage(stage: str, total: int, seconds: float) -> str:
-    """Write a finished stage, and the time of all its items.
+def tell_group(group: str, state: StageTally) -> str:
+    """Write a finished group of stages, and number and time of its tasks.
 
     Examples
     --------
-    >>> tell_stage("pieces", 9, 1.5)
-    '  pieces (9)                       1.50 s'
+    >>> tell_group("terrain", StageTally(37, done=37, seconds=1.5)), tell_group("points", StageTally(1, done=1))
+    ('  terrain          37 tasks      1.50 s', '  points            1 task       0.00 s')
     """
-    return f"  {f'{stage} ({total})':<28} {seconds:8.2f} s"
+    tasks = "task " if state.total == 1 else "tasks"
+    failed = f"  {state.failed:,} failed" if state.failed else ""
+    return f"  {group:<14} {state.total:>4,} {tasks}  {state.seconds:8.2f} s{failed}"

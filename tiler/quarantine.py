@@ -131,7 +131,7 @@ def save_config(config: Config, out: Path) -> None:
         overwrite=False,
     )
     with replacing(out / CONFIG) as part:
-        part.write_text(write_config(saved))
+        part.write_text(write_config(saved), encoding="utf-8", errors="surrogateescape")
 
 
 def config_alone(config: Config, plan: Plan, tile: str) -> Config:

@@ -18,6 +18,7 @@ from tiler.atomic import replacing, sync_meanwhile
 from tiler.audit import Audit
 from tiler.config import Config
 from tiler.dashboard.server import read_address, watched
+from tiler.empty import EmptyMeshError, is_empty
 from tiler.engine import StoppedError
 from tiler.executors import Executor, processes, serial
 from tiler.folder_lock import only_run
@@ -25,10 +26,12 @@ from tiler.forecast import warn_of_memory
 from tiler.jobs.table import read_cluster
 from tiler.joining.lease import LostFolderError
 from tiler.joining.spool import SPOOL
+from tiler.kept_report import give_back_report
 from tiler.kernels import prepare
 from tiler.keys import code_versions
 from tiler.limits import TASKS, Limits, limit_workers, machine_memory
 from tiler.manifest import find_remade, write_manifest
+from tiler.other_region import find_missing_folders, refuse_other_region, remove_folders
 from tiler.out_folder import (
     INDEXES,
     MANIFEST_PATH,
@@ -142,7 +145,8 @@ def run(
     Raises
     ------
     CityError
-        If nothing could be made of the input; ``run.json`` then says so.
+        If nothing could be made of the input; once the run has begun, ``run.json`` says so. EmptyMeshError where
+        footprints were given and no building was meshed, unless ``allow_empty``: what was meshed stays.
     ValueError
         If a further stage has the name of one of ours, or a further parameter that of one of `config`.
 
@@ -155,6 +159,7 @@ def run(
     """
     told = Watchers(watchers if say is None else [*watchers, Listener(say)])
     config = spell_out(config)
+    made: list[Path] = []
     try:
         check_sources(config)
         if config.cluster:
@@ -163,6 +168,7 @@ def run(
             read_address(dashboard)
         out = place(config.out, config.store_patience)
         own = check_own(config, stages, parameters)
+        made = find_missing_folders(out)
         check_folder(out, overwrite=config.overwrite)
         with only_run(out, told.say) as check, _beside(out, check, told) as shown:
             earlier = check_folder(out, overwrite=config.overwrite)
@@ -174,6 +180,7 @@ def run(
                 means = _Means(dashboard, shown, executor, cluster, compilers if beforehand else 0)
                 return _run(config, out, earlier, damage, own, announce, told, means)
     except BaseException as error:
+        remove_folders(made)  # those of a run that has begun are not empty
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
             told.end("failed", tell_error(error))
         raise
@@ -190,7 +197,7 @@ def _run(
     means: _Means,
 ) -> dict[str, Any]:
     say = watchers.say
-    start, untouched = time.perf_counter(), bool(earlier)
+    start, untouched = time.perf_counter(), True
     record: dict[str, Any] = {
         "schema": SCHEMA,
         "checksum": "0" * 8,
@@ -201,12 +208,7 @@ def _run(
     try:
         # Nothing of an earlier run is touched before the inputs are known to be there; then, before anything else
         # changes, its record no longer says that it is done, whatever happens to the power.
-        plan = make_plan(config, say)
-        vectors = [place(config.footprints)] if config.footprints else []
-        for warning in _foresee(plan, config):
-            plan.messages.append(warning)
-            say(warning)
-        refuse_inputs_within(out, [*(header.path for header in plan.headers), *vectors])
+        plan = _plan(config, out, say, fresh=config.overwrite or not earlier)
         untouched = False
         _write_record(out, record, durable=bool(earlier))
         if not earlier and not in_bucket(out):
@@ -222,6 +224,8 @@ def _run(
         record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:
             say(message)
+        _refuse_empty(config, record)
+        give_back_report(out, changed=bool(record["tasks"]["ran"]))
         record["status"] = "done"
         say(describe_tasks(record["tasks"]))
         if in_bucket(out):
@@ -249,6 +253,26 @@ def _run(
                 _write_record(out, record)
             watchers.end(record["status"], record.get("error", ""))
     return record
+
+
+def _plan(config: Config, out: Path, say: Callable[[str], None], *, fresh: bool) -> Plan:
+    """Plan a run; refuse inputs among its results and, unless it begins anew, the folder of another region."""
+    plan = make_plan(config, say)
+    footprints = [config.footprints] if config.footprints else []
+    for warning in _foresee(plan, config):
+        plan.messages.append(warning)
+        say(warning)
+    refuse_inputs_within(out, [*(header.path for header in plan.headers), *map(place, footprints)])
+    if not fresh:
+        refuse_other_region(out, plan.region, [*config.pointcloud, *footprints])
+    return plan
+
+
+def _refuse_empty(config: Config, record: dict[str, Any]) -> None:
+    """Raise EmptyMeshError if footprints were given and no building was meshed, unless that is allowed."""
+    if is_empty(config, record["counts"]) and not config.allow_empty:
+        record["exit_code"] = EmptyMeshError.exit_code
+        raise EmptyMeshError(record["empty"])
 
 
 def _mesh_region(

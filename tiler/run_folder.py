@@ -18,11 +18,21 @@ from pipeline.mesh import Region, TetMesh
 from tiler.json_stream import JsonStream, NoJsonError
 
 SCHEMA = 1  # of run.json
-RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters")
+RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")
 TILES = "tiles"
+PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
 REGION = "region"  # cell array of a piece with soil
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
+
+
+@dataclass(frozen=True)
+class MeshPart:
+    """A part of a mesh that shares no face with others: cells, tiles, and those that have other cells too."""
+
+    cells: int
+    tiles: tuple[str, ...] = ()
+    divided: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,7 @@ class RunRecord:
     top : float
         Absolute height of the top (m) where the mesher makes it flat, NaN where it does not.
     counts : mapping of str to int
-        ``cells``, ``points``, ``facets`` and ``buildings``.
+        ``cells``, ``points``, ``facets`` and ``building parts``.
     tiles : mapping of str to tuple of 4 floats or None
         Boxes of the tiles by name (m), as far as they are stated.
     depth : float
@@ -47,6 +57,9 @@ class RunRecord:
         The region without its pad (m); None without a pad.
     rim : float
         Height of the ground along the outer sides of the pad (m), NaN without one.
+    parts : tuple of MeshPart
+        Parts of the mesh, that of the most cells first; of many those beyond the first are empty. None at all
+        where the record does not tell.
     """
 
     status: str
@@ -57,6 +70,7 @@ class RunRecord:
     depth: float = 0.0
     core: tuple[float, float, float, float] | None = None
     rim: float = math.nan
+    parts: tuple[MeshPart, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +119,13 @@ def read_run_record(path: Path) -> RunRecord:
             raise InputError(f"{path}: the run is {record['status']} and has no mesh yet; wait, or run again")
         west, south, east, north = (float(value) for value in record["region"]["bounds"])
         top = float(record["region"].get("top", math.nan))
-        names = ("cells", "points", "facets", "buildings")
-        counts = {name: int(record["counts"][name]) for name in names}
+        counts = {name: int(record["counts"][name]) for name in ("cells", "points", "facets")}
+        # A record of an earlier version counts parts as buildings.
+        counts[PARTS] = int(record["counts"][PARTS if PARTS in record["counts"] else "buildings"])
         status = str(record["status"])
         depth = float(record.get("parameters", {}).get("underground", 0.0))
         core, rim = _read_pad(record["region"])
+        parts = _read_parts(record.get("parts") or {}, counts["cells"])
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
     if not (west < east and south < north and math.isfinite(west + south + east + north)):
@@ -117,7 +133,16 @@ def read_run_record(path: Path) -> RunRecord:
     if not 0 <= depth < math.inf:
         raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
     tiles = record.get(TILES) or {}
-    return RunRecord(status, (west, south, east, north), top, counts, tiles, depth, core, rim)
+    return RunRecord(status, (west, south, east, north), top, counts, tiles, depth, core, rim, parts)
+
+
+def _read_parts(found: Mapping[str, Any], n_cells: int) -> tuple[MeshPart, ...]:
+    n = min(int(found.get("n", 0)), n_cells)
+    listed = [
+        MeshPart(int(part["cells"]), tuple(map(str, part["tiles"])), tuple(map(str, part["divided"])))
+        for part in found.get("largest", ())
+    ]
+    return (*listed, *[MeshPart(0)] * max(n - len(listed), 0))[: max(n, 0)]
 
 
 def _read_pad(region: Mapping[str, Any]) -> tuple[tuple[float, float, float, float] | None, float]:

@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from pipeline.errors import InputError
 from tiler.folder_lock import is_held
+from tiler.note_words import say_notes
 from tiler.out_folder import PROGRESS, RUN_RECORD
 from tiler.places import in_bucket
+from tiler.stage_groups import group_stages, title_of_stage
 
 LISTED_ITEMS = 10  # items in hand that the table lists
 COUNTS = ("total", "done", "reused", "running", "failed")
@@ -69,25 +72,26 @@ def print_status(directory: Path, status: dict[str, Any], console: Console) -> N
     """Print what `read_status` gives: a line on the run, a row for each stage, items in hand, and how to go on."""
     console.print(f"[bold]{directory}[/]: {_headline(status)}", soft_wrap=True)
     table = Table(box=None, pad_edge=False)
-    table.add_column("stage")
+    table.add_column("step")
     for title in ("done", "of", "used again", "running", "failed", "left", "time"):
         table.add_column(title, justify="right")
-    for name, stage in status["stages"].items():
-        done, total, reused, failed = (f"{stage[count]:,}" for count in ("done", "total", "reused", "failed"))
-        seconds = f"{stage['seconds']:.1f} s" if stage["done"] else ""
-        row = (name, done, total, reused, f"{stage['running']:,}", failed, f"{stage['left']:,}", seconds)
-        table.add_row(*row, style="red" if stage["failed"] else "dim" if "finished" in stage else None)
+    for name, stages in group_stages(status["stages"]).items():
+        step = {key: sum(status["stages"][stage][key] for stage in stages) for key in (*COUNTS, "left", "seconds")}
+        done, total, reused, failed = (f"{step[count]:,}" for count in ("done", "total", "reused", "failed"))
+        seconds = f"{step['seconds']:.1f} s" if step["done"] else ""
+        row = (escape(name), done, total, reused, f"{step['running']:,}", failed, f"{step['left']:,}", seconds)
+        table.add_row(*row, style="red" if step["failed"] else None if step["left"] or step["running"] else "dim")
     console.print(table)
     items = status["running"] if status["state"] != "done" else []
     if items:
         console.print("in the workers' hands:" if status["held"] else "in hand when it ended:")
     for item in items[:LISTED_ITEMS]:
-        console.print(f"  {item['stage']} {item['name']}, since {item['since']}")
+        console.print(f"  {title_of_stage(item['stage'])} {item['name']}, since {item['since']}", markup=False)
     if items and status["n_running"] > LISTED_ITEMS:
         console.print(f"  and {status['n_running'] - LISTED_ITEMS} more")
     if status["notes"]:
-        notes = ", ".join(f"{count:,} {kind.replace('-', ' ')}" for kind, count in status["notes"].items())
-        console.print(f"notes so far: {notes}")
+        notes = "; ".join(say_notes(kind, count) for kind, count in status["notes"].items())
+        console.print(f"notes so far: {notes}", markup=False)
     if status["error"]:
         console.print(f"error: {status['error']}", markup=False)
     console.print(_next_move(directory, status), markup=False, soft_wrap=True)

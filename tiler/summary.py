@@ -7,11 +7,15 @@ from typing import Any
 
 from pipeline.clusters import add_counts
 from pipeline.notes import Note, count_notes
+from pipeline.terrain_fill import RIM as FAR_NODES
 from tiler.config import Config
 from tiler.context import absent_tiles, tile_name
 from tiler.domain import settle
+from tiler.empty import explain_empty, is_empty
 from tiler.engine import Engine
 from tiler.georeference.establish import FOOTPRINTS
+from tiler.left_out import describe_left_out, tell_left_out
+from tiler.mesh_parts import MESH_IN_PARTS, describe_parts, note_parts
 from tiler.padding import CORE_STAGE
 from tiler.places import place
 from tiler.planning import Plan
@@ -29,6 +33,8 @@ INCOMPLETE = {
     "footprint-too-many-vertices",
 }
 DAMAGED = "damaged-artefact"  # kind of the notes on what was damaged or missing, and made anew
+FAR_TERRAIN = "terrain-far-from-points"  # kind of the note on terrain that is interpolated over large gaps
+FAR_SHARE = 0.01  # of the region from which on it is made
 LISTED = 10_000  # notes of a kind that the record lists; the store has all
 
 
@@ -69,10 +75,15 @@ def summarise_run(
     if alignment.get("applied"):
         notes = [note for note in notes if (note.kind, note.subject) != ("crs-accuracy", FOOTPRINTS)]
     report = records["report", REGION_ITEM].facts
+    notes += note_parts(report["parts"])
     found = records["domain", REGION_ITEM].facts
     domain = settle(config.domain_height, config.top, found)
     outline = _join_outlines([record.facts["outline"] for record in records.of("model")])
+    left_out = describe_left_out(engine, notes)
     incomplete = unreadable or missing.tiles or missing.others or INCOMPLETE & {note.kind for note in notes}
+    counts = _join_counts(engine, plan, rounds) | {"tiles missing": len(missing.tiles)}
+    notes += _note_far_terrain(counts, config)
+    empty = {"empty": explain_empty(config, plan.region, counts, notes)} if is_empty(config, counts) else {}
     absent = {tile_name(key) for key in absent_tiles(plan.grid)} - missing.tiles.keys()
     return {
         "exit_code": EXIT_INCOMPLETE if incomplete else EXIT_DONE,
@@ -85,7 +96,11 @@ def summarise_run(
         | ({} if domain.top is None else {"top": domain.top})
         | (_describe_pad(engine) if config.padded else {}),
         "georeference": plan.georeference.record | ({"alignment": alignment} if alignment else {}),
-        "domain": {"height (m)": domain.height, "tallest building (m)": found["tallest"]},
+        "domain": {
+            "height (m)": domain.height,
+            "tallest building (m)": found["tallest"],
+            "tallest building in the mesh (m)": found["tallest_meshed"],
+        },
         "tiles": {
             name: {
                 "status": "done",
@@ -96,15 +111,24 @@ def summarise_run(
             for name in sorted(plan.layout.tiles.keys() - missing.tiles.keys())
         },
         **describe_missing(missing, place(config.out)),
-        "counts": _join_counts(engine, plan, rounds) | {"tiles missing": len(missing.tiles)},
+        "counts": counts,
+        **empty,
+        "parts": describe_parts(report["parts"]),
         "quality": report["quality"],
         "fidelity": report["fidelity"] | ({"outline": outline} if outline else {}),
+        "left_out": left_out,
         "tasks": {"all": len(records), "ran": len(records) - sum(records.count_reused().values())},
         "reused": records.count_reused(),
         "ran": records.count_ran(),
         "seconds": {name: round(seconds, 3) for name, seconds in sorted(records.seconds.items())},
         "peak_memory_bytes": records.peak_memory,
-        "messages": [*plan.messages, *words, *_tell_damage(damage), *_tell_low_domain(notes)],
+        "messages": [
+            *plan.messages,
+            *words,
+            *_tell_damage(damage),
+            *_tell_notes(notes),
+            *tell_left_out(left_out),
+        ],
         "unreadable": unreadable,
         "notes": group_notes(notes),
     }
@@ -133,8 +157,23 @@ def _tell_damage(damage: Mapping[str, str]) -> list[str]:
     return [f"{len(damage)} damaged or missing artefacts of an earlier run were made anew: {DAMAGED} in the notes"]
 
 
-def _tell_low_domain(notes: Sequence[Note]) -> list[str]:
-    return [f"{LOW_DOMAIN}: {note.detail}" for note in notes if note.kind == LOW_DOMAIN]
+def _note_far_terrain(counts: Mapping[str, int], config: Config) -> list[Note]:
+    """Make the note on terrain far from all ground points, as between two clouds in one tile, where it is much."""
+    far, nodes = counts.get("terrain nodes from coarse level", 0), counts.get("terrain nodes", 0)
+    if far < FAR_SHARE * nodes or not far:
+        return []
+    reach = FAR_NODES * config.dtm_spacing
+    area = f"{far * config.dtm_spacing**2:,.0f} m² ({100 * far / nodes:.0f} % of the region)"
+    detail = (
+        f"{area} are more than {reach:g} m from any ground point: the terrain there is interpolated, and what "
+        "stands there is unknown; see --bounds, or a smaller --tile-size, which leaves out tiles without points"
+    )
+    return [Note(FAR_TERRAIN, detail=detail)]
+
+
+def _tell_notes(notes: Sequence[Note]) -> list[str]:
+    """Notes that a user should read whatever else there is."""
+    return [note.detail for note in notes if note.kind in (MESH_IN_PARTS, FAR_TERRAIN, LOW_DOMAIN)]
 
 
 def _collect_notes(engine: Engine) -> list[Note]:

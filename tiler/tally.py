@@ -2,10 +2,11 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from tiler.stage import Scope
+from tiler.stage_groups import group_stages
 from tiler.task import Record
 from tiler.watching import Item, RunStart, Watcher
 
@@ -147,51 +148,85 @@ class Tally(Watcher):
         """Items that workers have, or that wait at their side."""
         return sum(state.running for state in list(self.stages.values()))
 
-    def rate(self, stage: str) -> float:
-        """Items of a stage that are done in a second, in the mean since its first; 0 as long as there is none."""
-        state = self.stages[stage]
+    def groups(self) -> dict[str, StageTally]:
+        """How far the groups of stages are that a user sees, in their order (`tiler.stage_groups`)."""
+        known = dict(list(self.stages.items()))
+        return {group: _add_up([known[name] for name in names]) for group, names in group_stages(known).items()}
+
+    def rate(self, state: StageTally) -> float:
+        """Items that are done in a second, in the mean since the first; 0 as long as there is none."""
         spent = self._clock() - state.began
         return state.done / spent if state.began and spent > 0 else 0.0
 
-    def work_left(self) -> dict[str, float]:
-        """Estimate the work that is left, by stage (s of one worker).
+    @property
+    def spent(self) -> float:
+        """Seconds since a worker was given the first item; 0 before that."""
+        return self._clock() - self._first if self._first else 0.0
 
-        Notes
-        -----
-        An item that is left takes as long as those done took in the mean. Of a stage that has none yet, all of it
-        is taken in proportion to `SHARES`.
-        """
-        stages = list(self.stages.items())
-        known = {stage: state.work / state.done for stage, state in stages if state.done and state.work > 0}
-        share = sum(share_of(stage) for stage in known)
-        whole = sum(mean * self.stages[stage].total for stage, mean in known.items())
-        unit = whole / share if share >= LEAST_SHARE else 0.0
-        return {
-            stage: known[stage] * state.left if stage in known else unit * share_of(stage)
-            for stage, state in stages
-            if state.left
-        }
+    def work_left(self) -> dict[str, float]:
+        """Estimate the work that is left, see `estimate_work`."""
+        return estimate_work(dict(list(self.stages.items())))
 
     def time_left(self) -> float | None:
-        """Estimate the time to the end (s); None as long as too little is measured."""
-        spent = self._clock() - self._first
-        done = sum(state.work for state in list(self.stages.values()))
-        share = sum(share_of(stage) for stage, state in list(self.stages.items()) if state.done)
-        if not self._first or spent < LEAST_TIME or share < LEAST_SHARE or not done:
-            return None
-        return sum(self.work_left().values()) * spent / done
+        """Estimate the time to the end, see `estimate_time`."""
+        return estimate_time(dict(list(self.stages.items())), self.spent)
 
     def share_done(self) -> float:
-        """How much of all work is done, as far as known: 0 to 1."""
-        done = sum(state.work for state in list(self.stages.values()))
-        left = sum(self.work_left().values())
-        if self.time_left() is None or not done + left:
-            items = sum(state.total for state in list(self.stages.values()))
-            return sum(state.done for state in list(self.stages.values())) / items if items else 0.0
-        return done / (done + left)
+        """How much of all work is done, see `estimate_share`."""
+        return estimate_share(dict(list(self.stages.items())), self.spent)
 
     def _stage(self, name: str) -> StageTally:
         return self.stages.setdefault(name, StageTally(0))
+
+
+def estimate_work(stages: Mapping[str, StageTally]) -> dict[str, float]:
+    """Estimate the work that is left, by stage (s of one worker).
+
+    Notes
+    -----
+    An item that is left takes as long as those done took in the mean. Of a stage that has none yet, all of it
+    is taken in proportion to `SHARES`.
+    """
+    known = {stage: state.work / state.done for stage, state in stages.items() if state.done and state.work > 0}
+    share = sum(share_of(stage) for stage in known)
+    whole = sum(mean * stages[stage].total for stage, mean in known.items())
+    unit = whole / share if share >= LEAST_SHARE else 0.0
+    return {
+        stage: known[stage] * state.left if stage in known else unit * share_of(stage)
+        for stage, state in stages.items()
+        if state.left
+    }
+
+
+def estimate_time(stages: Mapping[str, StageTally], spent: float) -> float | None:
+    """Estimate the time to the end (s), `spent` seconds after the first item was given to a worker.
+
+    None as long as too little is measured.
+    """
+    done = sum(state.work for state in stages.values())
+    share = sum(share_of(stage) for stage, state in stages.items() if state.done)
+    if spent < LEAST_TIME or share < LEAST_SHARE or not done:
+        return None
+    return sum(estimate_work(stages).values()) * spent / done
+
+
+def estimate_share(stages: Mapping[str, StageTally], spent: float) -> float:
+    """How much of all work is done, as far as known: 0 to 1."""
+    done = sum(state.work for state in stages.values())
+    left = sum(estimate_work(stages).values())
+    if estimate_time(stages, spent) is None or not done + left:
+        items = sum(state.total for state in stages.values())
+        return sum(state.done for state in stages.values()) / items if items else 0.0
+    return done / (done + left)
+
+
+def _add_up(stages: Sequence[StageTally]) -> StageTally:
+    """Add up the stages of a group."""
+    names = ("total", "done", "reused", "failed", "running", "seconds")
+    began = [state.began for state in stages if state.began]
+    return StageTally(
+        **{name: sum(getattr(state, name) for state in stages) for name in names}, began=min(began, default=0.0)
+    )
 
 
 def share_of(stage: str) -> float:

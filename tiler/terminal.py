@@ -1,7 +1,7 @@
 """What a run shows while it is at work, and at its end: what was made, how good it is, what next."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from tiler.live_view import LiveView
+from tiler.note_words import say_notes
 from tiler.places import in_bucket
 from tiler.plain_text import printable
 from tiler.plain_view import PlainView, QuietView
+from tiler.run_folder import PARTS
+from tiler.stage_groups import title_of_stage
 from tiler.tally import Tally
 from tiler.watching import Watcher
 
@@ -50,7 +53,8 @@ def print_last_line(record: dict[str, Any], out: Path) -> None:
     """Print the end of a run in one line."""
     counts = record["counts"]
     lost = len(record["missing"]) + len(record["set_aside"]) + len(record["unreadable"])
-    left_out = f"; {lost:,} parts left out, see {out / 'run.json'}" if lost else ""
+    items = "1 item" if lost == 1 else f"{lost:,} items"
+    left_out = f"; {items} left out, see {out / 'run.json'}" if lost else ""
     print(printable(f"{counts['cells']:,} cells in {out}, {record['seconds_total']:.1f} s{left_out}"))
 
 
@@ -59,7 +63,7 @@ def print_summary(record: dict[str, Any], out: Path, *, console: Console | None 
     console = console or Console(highlight=False)
     counts = record["counts"]
     console.print(
-        f"[bold]{counts['cells']:,}[/] cells, {counts['points']:,} points, {counts['buildings']:,} buildings "
+        f"[bold]{counts['cells']:,}[/] cells, {counts['points']:,} points, {tell_buildings(counts)} "
         f"in {record['seconds_total']:.1f} s, peak memory {record['peak_memory_bytes'] / 2**20:.0f} MiB"
     )
     _print_quality(record, console)
@@ -68,12 +72,25 @@ def print_summary(record: dict[str, Any], out: Path, *, console: Console | None 
     if kinds:
         console.print("dropped, repaired or defaulted, or worth a look:")
     for kind, group in kinds[:LISTED_NOTES]:
-        console.print(f"{group['count']:7,}  {plain(kind.replace('-', ' '))}")
+        console.print(f"  {plain(say_notes(kind, group['count']))}", soft_wrap=True)
     if len(kinds) > LISTED_NOTES:
-        console.print(f"         and {len(kinds) - LISTED_NOTES} more kinds")
+        console.print(f"  and {len(kinds) - LISTED_NOTES} more kinds")
     console.print(f"all of it with places: {plain(str(out / 'run.json'))}", soft_wrap=True)
     for k, words in enumerate(next_commands(out)):
         console.print(f"{'     ' if k else 'next:'} {plain(shlex.join(words))}", soft_wrap=True)
+
+
+def tell_buildings(counts: Mapping[str, int]) -> str:
+    """Write how many buildings a mesh has, and their parts where these are more.
+
+    Examples
+    --------
+    >>> tell_buildings({"buildings": 1036, "building parts": 1531}), tell_buildings({"buildings": 1})
+    ('1,036 buildings (1,531 parts)', '1 building')
+    """
+    n, parts = counts["buildings"], counts.get(PARTS, counts["buildings"])
+    words = "1 building" if n == 1 else f"{n:,} buildings"
+    return words if parts == n else f"{words} ({parts:,} parts)"
 
 
 def next_commands(out: Path) -> Sequence[Sequence[str]]:
@@ -111,11 +128,12 @@ def _print_missing(record: dict[str, Any], console: Console) -> None:
     for tile, found in missing[:LISTED_MISSING]:
         reason = plain(found["reason"])
         console.print(
-            f"[red]missing[/] tile {tile}: stage {found['stage']} {found['name']}: {reason}", soft_wrap=True
+            f"[red]missing[/] tile {tile}: {title_of_stage(found['stage'])} {found['name']}: {reason}",
+            soft_wrap=True,
         )
         console.print(f"        alone: {plain(found['command'])}", soft_wrap=True)
     for found in failed[:LISTED_MISSING]:
-        why = f"stage {found['stage']} {found['name']}: {plain(found['reason'])}"
+        why = f"{title_of_stage(found['stage'])} {found['name']}: {plain(found['reason'])}"
         console.print(f"[red]failed[/] {why}", soft_wrap=True)
     more = sum(max(len(lost) - LISTED_MISSING, 0) for lost in (missing, failed))
     if more:

@@ -182,7 +182,7 @@ def draw_blocks(folder: Path, target: Path) -> None:
     pictures = []
     for mode in BLOCKS:
         out, picture = folder / "block", folder / "block.png"
-        amsterdam("amsterdam", out, bounds=BLOCK, border="clip", **MODES[mode])
+        amsterdam("amsterdam", out, bounds=BLOCK, **MODES[mode])
         render_run(out, picture, size=(1000, 700))
         image = Image.open(picture).convert("RGB").resize((700, 490), Image.Resampling.LANCZOS)
         words = mode.replace("*", "").replace(" (default)", "")

@@ -1,17 +1,21 @@
 """What the page asks for, as plain JSON: head, stages, series, failures, messages and the map."""
 
 import time
+from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
 from tiler.dashboard.codes import State
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.map_view import Question, tell_map
-from tiler.dashboard.model import RunModel, StageState
+from tiler.dashboard.model import SEAM, TILE, RunModel
+from tiler.note_words import say_notes
+from tiler.stage_groups import group_of_stage, group_stages, title_of_stage
+from tiler.tally import StageTally, estimate_share, estimate_time
 
 SHOWN_FAILURES, SHOWN_AT_WORK = 200, 12
 TITLES = {  # of the values that come first; a fact has its name
-    "progress": "% of its stages done",
+    "progress": "% of its tasks done",
     "seconds": "seconds",
     "cells": "cells",
     "worst_ratio": "worst radius ratio",
@@ -41,7 +45,7 @@ def tell(follower: Follower, question: Question) -> dict[str, Any]:
             "version": model.version + 1,
             "read": round(follower.share, 4),
             "head": tell_head(model, alive=alive),
-            "stages": [_tell_stage(name, stage) for name, stage in model.stages.items()],
+            "stages": [_tell_step(model, step, names) for step, names in group_stages(model.stages).items()],
             "at_work": _tell_at_work(model, alive=alive),
             "series": {"width": model.series.width, "rows": model.series.rows()},
             "values": list_values(model),
@@ -60,14 +64,16 @@ def tell_head(model: RunModel, *, alive: bool) -> dict[str, Any]:
     status = model.standing(alive=alive)
     taken = {name: model.head.get(name) for name in ("error", "command", "bounds", "crs", "tile_size", "workers")}
     end = time.time() if status == "running" else model.last
+    stages, spent = _tally(model), end - model.first if model.first else 0.0
     return taken | {
         "status": status,
         "began": round(model.began, 1),
         "last": round(model.last, 1),
         "seconds": round(max(end - model.began, 0.0), 1) if model.began else 0.0,
-        "left": _estimate(model) if status == "running" else None,
+        "left": None if status != "running" else estimate_time(stages, spent),
+        "share": 1.0 if status == "done" else round(estimate_share(stages, spent), 4),
         "memory": model.memory,
-        "notes": dict(model.notes.most_common(20)),
+        "notes": [say_notes(kind, n) for kind, n in model.notes.most_common(20)],
         "n_notes": model.notes.total(),
         "ignored": model.ignored,
     }
@@ -81,47 +87,60 @@ def list_values(model: RunModel) -> list[list[str]]:
     return [[name, TITLES.get(name, name.replace("_", " "))] for name in names]
 
 
-def _estimate(model: RunModel) -> float | None:
-    """Seconds that the rest takes, from the mean time of what was computed, stage by stage, on all workers.
-
-    None as long as a stage of many items has not been measured: it may be the longest one.
-    """
-    work = 0.0
-    for stage in model.stages.values():
-        computed = stage.counts[State.DONE]
-        left = max(stage.total - stage.done - stage.counts[State.FAILED], 0)
-        if computed:
-            work += left * stage.seconds / computed
-        elif left > 1:
-            return None
-    workers = model.head.get("workers") or 1
-    return round(work / max(int(workers), 1), 1)
-
-
-def _tell_stage(name: str, stage: StageState) -> dict[str, Any]:
-    reused, failed, running = (stage.counts[state] for state in (State.REUSED, State.FAILED, State.RUNNING))
+def _tally(model: RunModel) -> dict[str, StageTally]:
+    """How far each stage is, for the estimates of `tiler.tally`."""
     return {
-        "name": name,
-        "scope": stage.scope,
-        "total": max(stage.total, stage.done + failed + running),
-        "done": stage.done,
+        name: StageTally(
+            max(stage.total, stage.done),
+            stage.done,
+            stage.counts[State.REUSED],
+            stage.counts[State.FAILED],
+            stage.counts[State.RUNNING],
+            stage.seconds,
+        )
+        for name, stage in model.stages.items()
+    }
+
+
+def _tell_step(model: RunModel, step: str, names: Iterable[str]) -> dict[str, Any]:
+    """Add up the stages of a step (`tiler.stage_groups`)."""
+    stages = [model.stages[name] for name in names]
+    counts = sum((stage.counts for stage in stages), Counter[int]())
+    reused, failed, running = (counts[state] for state in (State.REUSED, State.FAILED, State.RUNNING))
+    scopes = {stage.scope for stage in stages}
+    return {
+        "name": step,
+        "mapped": bool(scopes & {TILE, SEAM}),
+        "total": sum(
+            max(stage.total, stage.done + stage.counts[State.FAILED] + stage.counts[State.RUNNING])
+            for stage in stages
+        ),
+        "done": sum(stage.done for stage in stages),
         "reused": reused,
         "running": running,
         "failed": failed,
-        "seconds": round(stage.seconds, 2),
+        "seconds": round(sum(stage.seconds for stage in stages), 2),
     }
 
 
 def _tell_at_work(model: RunModel, *, alive: bool) -> list[list[Any]]:
-    """List what workers have had in hand for longest."""
+    """List what runs, longest first."""
     now = time.time() if alive else model.last
-    longest = sorted(model.at_work.items(), key=lambda item: item[1])[:SHOWN_AT_WORK]
-    return [[stage, name, round(max(now - since, 0.0), 1)] for (stage, name), since in longest]
+    running = [(item, since) for item, since in model.at_work.items() if item not in model.queued]
+    longest = sorted(running, key=lambda one: one[1])[:SHOWN_AT_WORK]
+    return [[title_of_stage(stage), name, round(max(now - since, 0.0), 1)] for (stage, name), since in longest]
 
 
 def _tell_failures(model: RunModel) -> list[dict[str, Any]]:
     last: Iterable[Any] = list(model.failures)[-SHOWN_FAILURES:]
     return [
-        {"stage": one.stage, "name": one.name, "reason": one.reason, "command": one.command, "t": round(one.t, 1)}
+        {
+            "step": group_of_stage(one.stage),
+            "title": title_of_stage(one.stage),
+            "name": one.name,
+            "reason": one.reason,
+            "command": one.command,
+            "t": round(one.t, 1),
+        }
         for one in last
     ]

@@ -7,29 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiler.dashboard.codes import Codes, State, combine
+from tiler.stage_groups import group_of_stage
 
 GROWTH = 1024  # items that are made room for at least
 MOST_FACTS = 64  # kinds of values that are kept; a stage of the user's own may tell anything
-
-# Notes that say of something in the input that it is not in the mesh.
-DROPPED = frozenset(
-    {
-        *("building-lost", "building-covered-by-others", "building-beyond-region", "footprint-empty"),
-        *("footprint-not-finite", "footprint-too-small", "footprint-sliver", "footprint-duplicate"),
-        *("footprint-too-many-vertices", "footprint-lost"),
-    }
-)
-
-
-def is_drop(kind: str) -> bool:
-    """Tell whether a kind of note says that something in the input is not in the mesh.
-
-    Examples
-    --------
-    >>> is_drop("footprint-on-border-dropped"), is_drop("building-lost"), is_drop("courtyard-filled")
-    (True, True, False)
-    """
-    return kind in DROPPED or kind.endswith("-dropped")
 
 
 class Column:
@@ -165,14 +146,22 @@ class Items:
         return self._changed.take(len(self))
 
     def codes(self, stage: str) -> Codes:
-        """State of each item, (n,): in one stage, or in all where `stage` is empty."""
+        """State of each item, (n,): in the stages of a step, in one stage, or in all where `stage` is empty."""
         if stage:
-            return (
-                self.stages[stage].codes.take(len(self)) if stage in self.stages else np.zeros(len(self), np.uint8)
-            )
+            names, n = self.members(stage), len(self)
+            if len(names) == 1:
+                return self.stages[names[0]].codes.take(n)
+            several = np.zeros((n, len(State)), np.int64)
+            for name in names:
+                several[np.arange(n), self.stages[name].codes.take(n)] += 1
+            return combine(several)
         counts = self._tally[: len(self)].astype(np.int64)
         counts[:, State.WAITING] += len(self.stages)  # of which those in another state were taken away
         return combine(counts)
+
+    def members(self, stage: str) -> list[str]:
+        """List the stages of this scope that a step has (`tiler.stage_groups`), or the one of that name."""
+        return [name for name in self.stages if stage in (name, group_of_stage(name))]
 
     def values(self, value: str, stage: str) -> NDArray[np.float64]:
         """A value of each item, (n,), NaN where it is not known.
@@ -183,7 +172,7 @@ class Items:
             ``"progress"``, the share of the stages that are done (%); ``"seconds"``, ``"notes"``, ``"dropped"``,
             or the name of a fact.
         stage : str
-            Of this stage alone, or of all where it is empty; facts are of the item, whatever the stage.
+            Of this step or stage alone, or of all where it is empty; facts are of the item, whatever the stage.
         """
         n = len(self)
         if value in self.facts:
@@ -193,7 +182,7 @@ class Items:
         total, known = np.zeros(n), np.zeros(n, np.bool_)
         if value in {"seconds", "notes", "dropped"}:
             for name, columns in self.stages.items():
-                if stage in {"", name}:
+                if stage in ("", name, group_of_stage(name)):
                     codes = columns.codes.take(n)
                     found = getattr(columns, value).take(n).astype(np.float64)
                     finished = codes == State.DONE
@@ -205,7 +194,11 @@ class Items:
 
     def _progress(self, stage: str) -> NDArray[np.float64]:
         if stage:
-            codes = self.codes(stage)
-            return np.where((codes == State.DONE) | (codes == State.REUSED), 100.0, 0.0)
+            names, n = self.members(stage), len(self)
+            finished = np.zeros(n)
+            for name in names:
+                codes = self.stages[name].codes.take(n)
+                finished += (codes == State.DONE) | (codes == State.REUSED)
+            return 100.0 * finished / max(len(names), 1)
         done = self._tally[: len(self), [State.DONE, State.REUSED]].sum(axis=1)
         return np.asarray(100.0 * done / max(len(self.stages), 1))

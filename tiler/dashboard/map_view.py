@@ -26,7 +26,7 @@ class Question:
     Attributes
     ----------
     stage : str
-        States and values of this stage alone; of all where it is empty.
+        States and values of this step or stage alone; of all where it is empty.
     value : str
         Value to colour by, as of `Items.values`; none where it is empty.
     view : (xmin, ymin, xmax, ymax) or None
@@ -74,6 +74,8 @@ def tell_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
     tiles = model.items[TILE]
     part = _choose_part(tiles, question.view)
     codes, changed = tiles.codes(question.stage)[part.inside], tiles.changed()[part.inside]
+    if model.status == "done":  # not every tile has work in every step
+        codes[codes == State.BEGUN] = State.DONE
     values = tiles.values(question.value, question.stage)[part.inside]
     # A stage that is new changes the state of tiles that nothing happened to.
     layout = ".".join(f"{items.layout}.{len(items.stages)}" for items in model.items.values())
@@ -106,7 +108,7 @@ def tell_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
 def _tell_seams(seams: Items, question: Question, since: int, *, whole: bool) -> dict[str, Any]:
     boxes = seams.boxes()
     inside = _find_inside(boxes, question.view)
-    if question.stage and question.stage not in seams.stages:
+    if question.stage and not seams.members(question.stage):
         return {"seams": [], "seam_boxes": [], "seam_names": []} if whole else {"seams": []}
     values = seams.values(question.value, question.stage)[inside]
     told: dict[str, Any] = {

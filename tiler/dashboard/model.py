@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from tiler.dashboard.codes import State
-from tiler.dashboard.items import Items, is_drop
+from tiler.dashboard.items import Items
 from tiler.dashboard.series import Series
+from tiler.note_words import is_drop
 
 TILE, SEAM = "tile", "seam"
 KEPT_FAILURES, KEPT_MESSAGES = 1000, 50
@@ -79,6 +80,10 @@ class RunModel:
         The last `KEPT_FAILURES`; `n_failures` counts all.
     at_work : dict of (str, str) to float
         Stage and name of what workers have in hand, and since when (s since 1970).
+    queued : dict of (str, str) to None
+        What of that waits at the workers' side: they have several items in hand, and run as many as they are.
+    first : float
+        When the first item was given to a worker (s since 1970); 0 before any.
     notes : Counter
         Notes by kind.
     memory : int
@@ -90,13 +95,14 @@ class RunModel:
     def __init__(self) -> None:
         self.version = 0
         self.head: dict[str, Any] = {}
-        self.began = self.last = 0.0
+        self.began = self.last = self.first = 0.0
         self.items = {TILE: Items(), SEAM: Items()}
         self.stages: dict[str, StageState] = {}
         self.failures: deque[FailedItem] = deque(maxlen=KEPT_FAILURES)
         self.n_failures = 0
         self.messages: deque[tuple[float, str, int]] = deque(maxlen=KEPT_MESSAGES)
         self.at_work: dict[tuple[str, str], float] = {}
+        self.queued: dict[tuple[str, str], None] = {}
         self.notes: Counter[str] = Counter()
         self.series = Series()
         self.memory = 0
@@ -137,6 +143,7 @@ class RunModel:
                 if self._code(place) == State.RUNNING:
                     self._set(place, State.WAITING)
             self.at_work.clear()
+            self.queued.clear()
 
     def _tiles(self, event: Mapping[str, Any], _: float) -> None:
         self.items[TILE].add(event["tiles"], self.version)
@@ -154,12 +161,30 @@ class RunModel:
     def _submitted(self, event: Mapping[str, Any], t: float) -> None:
         place = self._find(str(event["stage"]), str(event["name"]))
         self.at_work[place.key] = t
-        if self._code(place) not in FINISHED:
+        self.first = self.first or t
+        workers = int(self.head.get("workers") or 0)
+        if workers and len(self.at_work) - len(self.queued) > workers:
+            self.queued[place.key] = None
+        elif self._code(place) not in FINISHED:
             self._set(place, State.RUNNING)
+
+    def _take_back(self, key: tuple[str, str], t: float) -> None:
+        """Take note that workers have an item no more; the one that waits longest runs now."""
+        if self.at_work.pop(key, None) is None:
+            return
+        if key in self.queued:
+            del self.queued[key]
+        elif self.queued:
+            following = next(iter(self.queued))
+            del self.queued[following]
+            self.at_work[following] = t
+            place = self._find(*following)
+            if self._code(place) not in FINISHED:
+                self._set(place, State.RUNNING)
 
     def _done(self, event: Mapping[str, Any], t: float) -> None:
         place = self._find(str(event["stage"]), str(event["name"]))
-        self.at_work.pop(place.key, None)
+        self._take_back(place.key, t)
         if self._code(place) in FINISHED:
             return  # planned again around a hole, and taken as it was
         reused, seconds, memory = bool(event.get("reused")), _number(event, "seconds"), _number(event, "memory")
@@ -171,13 +196,19 @@ class RunModel:
         self.memory = max(self.memory, int(memory))
         if not reused:
             stage.seconds += seconds
-        self.series.add(t, seconds=seconds, memory=int(memory), running=len(self.at_work), done=0 if reused else 1)
+        self.series.add(
+            t,
+            seconds=seconds,
+            memory=int(memory),
+            running=len(self.at_work) - len(self.queued),
+            done=0 if reused else 1,
+        )
         if place.items is not None:
             self._keep(place.items, place, seconds, notes, event.get("facts") or {})
 
     def _failed(self, event: Mapping[str, Any], t: float) -> None:
         place = self._find(str(event["stage"]), str(event["name"]))
-        self.at_work.pop(place.key, None)
+        self._take_back(place.key, t)
         self._set(place, State.FAILED)
         reason, command = str(event.get("reason", "")), str(event.get("command", ""))
         self.failures.append(FailedItem(*place.key, reason, command, t, self.version))

@@ -4,7 +4,7 @@ import { FAILED, Palette, RegionMap, STATES, drawCross, rampColour } from "./map
 import { amount, duration, element, memory, showCurve, showFailures, showList, showStages } from "./tables.js";
 
 const BUSY = 1000, IDLE = 5000; // ms between two questions, at work and when it is over
-const TITLES = { waiting: "waiting", begun: "some stages done", running: "in hand", done: "done", reused: "used again", failed: "failed" };
+const TITLES = { waiting: "waiting", begun: "some steps done", running: "running", done: "done", reused: "used again", failed: "failed" };
 const $ = (id) => document.getElementById(id);
 const asked = { stage: "", value: "", view: null, since: 0, key: "" };
 let last = null;
@@ -66,15 +66,13 @@ function show(answer) {
   window.citystitch.read = answer.read;
 }
 
-function showHead({ head, stages, read, dask }) {
+function showHead({ head, read, dask }) {
   $("status").textContent = { running: "running", dead: "dead: its process is gone" }[head.status] || head.status;
   $("status").dataset.state = head.status;
-  const total = stages.reduce((sum, stage) => sum + stage.total, 0);
-  const done = stages.reduce((sum, stage) => sum + stage.done, 0);
-  const share = total ? (100 * done) / total : 0;
-  const facts = [duration(head.seconds)];
-  if (head.left != null) facts.push(`~${duration(head.left)} left`);
-  if (head.workers) facts.push(`${head.workers} workers`);
+  const share = 100 * head.share;
+  const facts = head.status === "running" ? [`${Math.floor(share)} %`, duration(head.seconds)] : [duration(head.seconds)];
+  if (head.status === "running") facts.push(head.left != null ? `~${duration(head.left)} left` : "time left not known yet");
+  if (head.workers) facts.push(head.workers === 1 ? "1 worker" : `${head.workers} workers`);
   if (head.crs) facts.push(head.crs.length < 40 ? head.crs : "own CRS");
   if (head.n_notes) facts.push(`${amount(head.n_notes)} notes`);
   if (head.ignored) facts.push(`${amount(head.ignored)} events not understood`);
@@ -97,8 +95,8 @@ function fill(select, options) {
 
 function showChoices({ stages, values }) {
   fill($("value"), [["", "state"], ...values]);
-  const there = stages.filter((stage) => stage.scope === "tile" || stage.scope === "seam");
-  fill($("stage"), [["", "all stages"], ...there.map((stage) => [stage.name, `${stage.name} (${stage.scope}s)`])]);
+  const there = stages.filter((stage) => stage.mapped);
+  fill($("stage"), [["", "all steps"], ...there.map((stage) => [stage.name, stage.name])]);
 }
 
 function choose(stage) {
@@ -154,26 +152,25 @@ function showScale({ range, level }) {
 
 function showTime({ series, head, at_work: atWork }) {
   const seconds = series.width * series.rows.length;
-  showCurve($("rate"), $("c-rate"), "Items a minute", series.rows.map(([done]) => (60 * done) / series.width), { tell: (value) => amount(Math.round(value)), seconds });
+  showCurve($("rate"), $("c-rate"), "Tasks a minute", series.rows.map(([done]) => (60 * done) / series.width), { tell: (value) => amount(Math.round(value)), seconds });
   showCurve($("memory"), $("c-memory"), "Largest worker process", series.rows.map((row) => row[2]), { tell: memory, seconds });
   const lines = atWork.map(([stage, name, since]) => `${stage} ${name}, ${duration(since)}`);
-  $("h-work").textContent = head.status === "dead" ? "In hand when it died" : "In the workers' hands for longest";
+  $("h-work").textContent = head.status === "dead" ? "Running when it died" : "Running now";
   showList($("work"), lines.length ? lines : [head.status === "running" ? "Nothing yet." : "Nothing: the run is over."]);
 }
 
 function showTrouble(answer) {
   if (answer.failures) showFailed();
   if (answer.messages) showList($("messages"), answer.messages.map(([, text]) => text));
-  const notes = Object.entries(answer.head.notes).map(([kind, n]) => `${amount(n)} ${kind.replaceAll("-", " ")}`);
-  showList($("notes"), notes);
+  showList($("notes"), answer.head.notes);
 }
 
 function showFailed() {
-  const chosen = failures.filter((one) => !asked.stage || one.stage === asked.stage);
+  const chosen = failures.filter((one) => !asked.stage || one.step === asked.stage);
   const all = last.n_failures;
   $("h-failures").textContent = all ? `Failures (${amount(all)})` : "Failures";
   $("no-failures").hidden = chosen.length > 0;
-  $("no-failures").textContent = all ? `None in stage ${asked.stage}.` : "None.";
+  $("no-failures").textContent = all ? `None in ${asked.stage}.` : "None.";
   $("failures").hidden = !chosen.length;
   showFailures($("failures").tBodies[0], chosen, (name) => {
     const index = map.tiles.names.indexOf(name);
@@ -192,7 +189,7 @@ function inspect({ layer, index }) {
   } else words.push(`${layer === "tiles" ? "Tile" : "Seam"} ${found.names[index]}`, TITLES[STATES[code]]);
   if (asked.value && found.values[index] != null) words.push(`${amount(found.values[index])} ${$("value").selectedOptions[0].textContent}`);
   const why = failures.find((one) => one.name === found.names[index]);
-  if (why) words.push(`${why.stage}: ${why.reason}`);
+  if (why) words.push(`${why.title}: ${why.reason}`);
   $("inspect").textContent = words.join(" · ");
 }
 

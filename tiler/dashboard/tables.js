@@ -47,7 +47,7 @@ export function showStages(body, stages, chosen, choose) {
     const counts = { done: stage.done - stage.reused, reused: stage.reused, running: stage.running, failed: stage.failed };
     for (const part of bar.firstChild.children) part.hidden = !counts[part.className];
     for (const part of bar.firstChild.children) part.style.width = `${(100 * counts[part.className]) / Math.max(stage.total, 1)}%`;
-    const said = `${stage.done} of ${stage.total} done, ${stage.reused} used again, ${stage.running} in hand, ${stage.failed} failed`;
+    const said = `${stage.done} of ${stage.total} done, ${stage.reused} used again, ${stage.running} running, ${stage.failed} failed`;
     bar.firstChild.title = said;
     bar.firstChild.setAttribute("role", "img");
     bar.firstChild.setAttribute("aria-label", said);
@@ -69,7 +69,7 @@ export function showFailures(body, failures, locate) {
       command.append(element("code", { text: one.command }), " ", copy);
     } else command.textContent = "no command of its own";
     return element("tr", {},
-      element("td", {}, element("button", { type: "button", text: `${one.stage} ${one.name}`, onclick: () => locate(one.name) })),
+      element("td", {}, element("button", { type: "button", text: `${one.title} ${one.name}`, onclick: () => locate(one.name) })),
       element("td", { text: one.reason }), command);
   }));
 }

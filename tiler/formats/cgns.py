@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError
 from tiler.atomic import replacing
-from tiler.export import RUN_RECORD
+from tiler.export import RUN_RECORD, RunFiles, RunSource
 from tiler.formats.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of
@@ -51,14 +51,14 @@ class _Survey:
         return "i4" if max(self.n_points, n_elements, 4 * self.n_cells) <= INT32_LIMIT else "i8"
 
 
-def export_cgns(output: Path, directory: Path, *, buildings: str | None = None) -> None:
+def export_cgns(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
     """Write the mesh of a finished run as CGNS.
 
     Parameters
     ----------
     output : Path
         The file; it appears whole or not at all.
-    directory : Path
+    source : Path or RunFiles
         Folder of the run.
     buildings : {"patches"}, optional
         See `write_cgns`.
@@ -72,8 +72,8 @@ def export_cgns(output: Path, directory: Path, *, buildings: str | None = None) 
     OutputError
         If the file cannot be written.
     """
-    pieces = open_pieces(directory)
-    crs = read_crs(directory / RUN_RECORD)
+    pieces = open_pieces(source)
+    crs = read_crs((source.directory if isinstance(source, RunFiles) else source) / RUN_RECORD)
     with replacing(output) as part, as_output_error(output):
         write_cgns(part, pieces, crs=crs, buildings=buildings)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.mesh import Marker
 from tiler.atomic import replacing
-from tiler.export import RUN_RECORD
+from tiler.export import RUN_RECORD, RunFiles, RunSource
 from tiler.formats.foam_patches import FIRST_BUILDING, PATCHES, building_name, facets_by_key, is_house
 from tiler.formats.surface import (
     Surface,
@@ -43,14 +43,14 @@ COLOURS = {
 SIDE_COLOUR, SIDE_OPACITY = (0.6, 0.75, 0.9), 0.1  # of top and sides, through which the city is seen
 
 
-def export_glb(output: Path, directory: Path, *, buildings: str | None = None) -> None:
+def export_glb(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
     """Write the boundary of a finished run as GLB.
 
     Parameters
     ----------
     output : Path
         The file; it appears whole or not at all.
-    directory : Path
+    source : Path or RunFiles
         Folder of the run.
     buildings : {"patches"}, optional
         Give each building a node of its own.
@@ -63,8 +63,8 @@ def export_glb(output: Path, directory: Path, *, buildings: str | None = None) -
     OutputError
         If the file cannot be written.
     """
-    surface = open_surface(directory)
-    crs = read_crs(directory / RUN_RECORD)
+    surface = open_surface(source)
+    crs = read_crs((source.directory if isinstance(source, RunFiles) else source) / RUN_RECORD)
     with replacing(output) as part:
         write_glb(part, surface, crs=crs, buildings=buildings)
 

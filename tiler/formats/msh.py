@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.mesh import Marker, Region
 from tiler.atomic import replacing
+from tiler.export import RunSource
 from tiler.formats.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of, slices
@@ -62,14 +63,14 @@ class _Survey:
         }
 
 
-def export_msh(output: Path, directory: Path, *, buildings: str | None = None) -> None:
+def export_msh(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
     """Write the mesh of a finished run as MSH 4.1, binary.
 
     Parameters
     ----------
     output : Path
         The file; it appears whole or not at all.
-    directory : Path
+    source : Path or RunFiles
         Folder of the run.
     buildings : {"patches"}, optional
         Give each building, walls and roofs, a physical group of its own instead of the two.
@@ -86,7 +87,7 @@ def export_msh(output: Path, directory: Path, *, buildings: str | None = None) -
     Memory: one piece. Nodes are in the order of their numbers, which begin with 1. Each piece is read twice. All
     nodes belong to the air.
     """
-    pieces = open_pieces(directory)
+    pieces = open_pieces(source)
     by_building = buildings is not None
     survey = _survey(pieces, by_building=by_building)
     with replacing(output) as part, part.open("wb") as file:
@@ -115,9 +116,9 @@ def export_msh(output: Path, directory: Path, *, buildings: str | None = None) -
                     seen[group] += len(corners)
 
 
-def export_msh2(output: Path, directory: Path, *, buildings: str | None = None) -> None:
+def export_msh2(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
     """Write the mesh of a finished run as MSH 2.2, text; see `export_msh`."""
-    pieces = open_pieces(directory)
+    pieces = open_pieces(source)
     by_building = buildings is not None
     survey = _survey(pieces, by_building=by_building)
     keys, numbers = (np.array(list(some), np.int64) for some in (survey.numbers, survey.numbers.values()))

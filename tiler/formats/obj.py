@@ -6,6 +6,7 @@ from typing import Any, BinaryIO
 from numpy.typing import NDArray
 
 from tiler.atomic import replacing
+from tiler.export import RunSource
 from tiler.formats.foam_patches import facets_by_key, patch_of_key
 from tiler.formats.rows import slices
 from tiler.formats.surface import Surface, keys_asked, open_surface, place_vertices, survey_surface
@@ -14,14 +15,14 @@ VERTEX = "v" + " %24.16e" * 3 + "\n"
 VERTEX_BYTES = len(VERTEX % ((0.0,) * 3))
 
 
-def export_obj(output: Path, directory: Path, *, buildings: str | None = None) -> None:
+def export_obj(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
     """Write the boundary of a finished run as OBJ.
 
     Parameters
     ----------
     output : Path
         The file; it appears whole or not at all.
-    directory : Path
+    source : Path or RunFiles
         Folder of the run.
     buildings : {"patches"}, optional
         Give each building, walls and roofs, a group of its own instead of the two.
@@ -33,7 +34,7 @@ def export_obj(output: Path, directory: Path, *, buildings: str | None = None) -
     OutputError
         If the file cannot be written.
     """
-    surface = open_surface(directory)
+    surface = open_surface(source)
     with replacing(output) as part:
         write_obj(part, surface, buildings=buildings)
 

@@ -13,9 +13,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.errors import CityError, ConfigError, InputError
 from tiler.atomic import replacing_folder
-from tiler.export import EXPORT_RECORD
+from tiler.export import EXPORT_RECORD, RunFiles, RunSource
 from tiler.formats.foam_case import INLET, OUTLET, write_system, write_wind_case
 from tiler.formats.foam_files import LABEL_LIMIT
 from tiler.formats.foam_part import FoamPlan, PartCounts, PointPlaces, write_part
@@ -28,7 +28,7 @@ from tiler.mesh_pieces import MeshPiece, open_pieces
 
 def export_openfoam(
     output: Path,
-    directory: Path,
+    source: RunSource,
     *,
     parts: int | None = None,
     case: str | None = None,
@@ -40,7 +40,7 @@ def export_openfoam(
     ----------
     output : Path
         The folder; it appears whole or not at all.
-    directory : Path
+    source : Path or RunFiles
         Folder of the run.
     parts, buildings
         See `write_openfoam`.
@@ -50,18 +50,21 @@ def export_openfoam(
     Raises
     ------
     ConfigError
-        If there are fewer tiles than parts, no side for the wind to come from, or soil where it should blow.
+        If there are fewer tiles than parts, no side for the wind to come from, soil where it should blow, or a
+        mesh of several parts that share no face.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
         If the folder cannot be written.
     """
-    pieces = open_pieces(directory)
+    pieces = open_pieces(source)
     if case is not None and pieces.files.depth:
         raise ConfigError(
             f"--case {case}: the mesh has soil to {pieces.files.depth:g} m below ground, where no wind blows; "
             "leave --case out, or mesh without --underground"
         )
+    if case is not None and pieces.files.parts != 1:
+        raise _refuse_parts(case, pieces.files)
     with replacing_folder(output) as folder:
         counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings)
         write_system(folder, parts=parts, case=case)
@@ -76,6 +79,17 @@ def export_openfoam(
         # ParaView opens a case by an empty file.
         (folder / "case.foam").touch()
         (folder / EXPORT_RECORD).write_text(_record(counts, parts))
+
+
+def _refuse_parts(case: str, files: RunFiles) -> CityError:
+    """Make the error of a mesh in which the wind does not get everywhere."""
+    if not files.parts:
+        return InputError(f"{files.directory}: its record does not say in how many parts the mesh is; run again")
+    return ConfigError(
+        f"--case {case}: the mesh is {files.parts:,} parts that share no face, and no air flows between them; "
+        "give --largest-part for the largest alone, mesh them apart by --bounds, or close the gap between the "
+        "point clouds"
+    )
 
 
 def _record(counts: Sequence[PartCounts], parts: int | None) -> str:

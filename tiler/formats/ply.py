@@ -6,6 +6,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from tiler.atomic import replacing
+from tiler.export import RunSource
 from tiler.formats.foam_patches import patch_of_key
 from tiler.formats.surface import Surface, SurfaceSurvey, open_surface, place_vertices, survey_surface
 
@@ -15,14 +16,14 @@ FACE = np.dtype([("n", "u1"), ("vertex", "<i4", 3), ("marker", "<i4"), ("buildin
 MOST_VERTICES = 2**31
 
 
-def export_ply(output: Path, directory: Path) -> None:
+def export_ply(output: Path, source: RunSource) -> None:
     """Write the boundary of a finished run as PLY, binary.
 
     Parameters
     ----------
     output : Path
         The file; it appears whole or not at all.
-    directory : Path
+    source : Path or RunFiles
         Folder of the run.
 
     Raises
@@ -32,7 +33,7 @@ def export_ply(output: Path, directory: Path) -> None:
     OutputError
         If the file cannot be written.
     """
-    surface = open_surface(directory)
+    surface = open_surface(source)
     with replacing(output) as part:
         write_ply(part, surface)
 

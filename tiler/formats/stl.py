@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiler.atomic import replacing
+from tiler.export import RunSource
 from tiler.formats.foam_patches import facets_by_key, patch_of_key
 from tiler.formats.rows import slices
 from tiler.formats.surface import Surface, keys_asked, open_surface, survey_surface
@@ -21,14 +22,14 @@ FACET = "  facet normal" + " %13.6e" * 3 + "\n    outer loop\n" + _CORNER * 3 + 
 FACET_BYTES = len(FACET % ((0.0,) * 12))
 
 
-def export_stl(output: Path, directory: Path, *, buildings: str | None = None) -> None:
+def export_stl(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
     """Write the boundary of a finished run as STL, text.
 
     Parameters
     ----------
     output : Path
         The file; it appears whole or not at all.
-    directory : Path
+    source : Path or RunFiles
         Folder of the run.
     buildings : {"patches"}, optional
         Give each building, walls and roofs, a solid of its own instead of the two.
@@ -40,7 +41,7 @@ def export_stl(output: Path, directory: Path, *, buildings: str | None = None) -
     OutputError
         If the file cannot be written.
     """
-    surface = open_surface(directory)
+    surface = open_surface(source)
     with replacing(output) as part:
         write_stl(part, surface, buildings=buildings)
 

@@ -2,17 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from tiler.export import RunSource
 from tiler.formats.foam_patches import PATCHES, patch_keys
 from tiler.formats.rows import blocks_of
 from tiler.merged import VERTEX_ID, number_piece
-from tiler.mesh_pieces import MeshPieces, open_pieces
+from tiler.mesh_pieces import MeshPieces, mark_sides, open_pieces
 from tiler.vtk_files import read_vtp
 
 WORD = 64  # points in a word of `VertexSet`
@@ -98,7 +98,7 @@ class RunSurface:
         """
         path = self.pieces.files.boundaries[k]
         piece = read_vtp(path)
-        marks = piece.boundary.marker
+        marks = mark_sides(self.pieces.files, piece)
         if not np.isin(marks, [int(marker) for marker in PATCHES]).all():
             raise InputError(
                 f"{path}: markers {marks.min()}..{marks.max()}, known are 1..{max(PATCHES)}; run the tile again"
@@ -107,7 +107,7 @@ class RunSurface:
         return BoundaryPart(piece.points, piece.boundary.facets, marks, piece.boundary.building, ids)
 
 
-def open_surface(directory: Path) -> RunSurface:
+def open_surface(source: RunSource) -> RunSurface:
     """Open the boundary of a finished run.
 
     Raises
@@ -115,7 +115,7 @@ def open_surface(directory: Path) -> RunSurface:
     InputError
         If the folder holds no finished run, or a file of it is missing or damaged.
     """
-    return RunSurface(open_pieces(directory))
+    return RunSurface(open_pieces(source))
 
 
 class VertexSet:

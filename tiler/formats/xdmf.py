@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import OutputError
 from tiler.atomic import replacing
+from tiler.export import RunSource
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of
 from tiler.mesh_pieces import MeshPieces, open_pieces
@@ -32,14 +33,14 @@ HEAD = '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
 TAIL = "  </Domain>\n</Xdmf>\n"
 
 
-def export_xdmf(output: Path, directory: Path) -> None:
+def export_xdmf(output: Path, source: RunSource) -> None:
     """Write the mesh of a finished run as XDMF.
 
     Parameters
     ----------
     output : Path
         The XML file; the numbers go to the file of the same name with the suffix ``.h5``.
-    directory : Path
+    source : Path or RunFiles
         Folder of the run.
 
     Raises
@@ -54,7 +55,7 @@ def export_xdmf(output: Path, directory: Path) -> None:
     Memory: one piece. Points are in the order of their numbers, cells and facets piece by piece. Each piece is
     read twice. The XML is written last: without it there is no mesh.
     """
-    pieces = open_pieces(directory)
+    pieces = open_pieces(source)
     n_cells, n_facets = count_rows(pieces)
     data = output.with_suffix(DATA)
     with replacing(output) as text_part, replacing(data) as data_part:

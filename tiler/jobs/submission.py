@@ -264,7 +264,9 @@ def _write_files(config: Config, out: Path, script: str) -> None:
             scheduler="",
             out="out",
         )
-        (folder / PARAMETERS).write_text(write_config(given, "the parameters of a submitted run"))
+        (folder / PARAMETERS).write_text(
+            write_config(given, "the parameters of a submitted run"), encoding="utf-8", errors="surrogateescape"
+        )
         (folder / SCRIPT).write_text(script)
         (folder / SCRIPT).chmod(0o755)
     except OSError as error:

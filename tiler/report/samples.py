@@ -47,6 +47,8 @@ class Samples:
     ----------
     tiles, all_tiles : int
         Tiles that were looked at, and all.
+    n_points, all_points : int
+        Points that were looked at, and all that lie on these tiles.
     near : dict of str to Histogram
         Quality of the cells of air whose triangle's centre is within `NEAR` of a seam; empty where there is none.
     points : dict of str to ResidualSums
@@ -55,6 +57,8 @@ class Samples:
 
     tiles: int
     all_tiles: int
+    n_points: int
+    all_points: int
     near: dict[str, Histogram]
     points: dict[str, ResidualSums]
 
@@ -86,6 +90,7 @@ def measure_samples(directory: Path, bounds: Box, *, ground_filter: bool) -> Sam
     files = _find_files(store)
     near: dict[str, Histogram] = {}
     points: dict[str, ResidualSums] = {}
+    n_points = all_points = 0
     for name in chosen:
         arrays, attributes = store.read("columns", name, names=(*COLUMN_ARRAYS, "edge", "edge_missing"))
         mesh, _ = unpack_columns(arrays, attributes["facts"]["order"])
@@ -94,9 +99,11 @@ def measure_samples(directory: Path, bounds: Box, *, ground_filter: bool) -> Sam
         refs: dict[str, tuple[str, ...]] = {"points": ()}
         context = SimpleNamespace(bounds=bounds)
         task = Task("report", name, Scope.TILE, bounds, None, context, "", store, refs, "", directory)
-        for key, sums in _measure_points(mesh, task, files, ground_filter).items():
+        found, taken, there = _measure_points(mesh, task, files, ground_filter)
+        n_points, all_points = n_points + taken, all_points + there
+        for key, sums in found.items():
             points[key] = merge_residuals([points[key], sums]) if key in points else sums
-    return Samples(len(chosen), len(names), near, points)
+    return Samples(len(chosen), len(names), n_points, all_points, near, points)
 
 
 def _measure_near(mesh: ColumnMesh, edges: NDArray[np.int32]) -> dict[str, Histogram]:
@@ -127,8 +134,11 @@ def _find_files(store: Store) -> Mapping[str, Box]:
 
 def _measure_points(
     mesh: ColumnMesh, task: Task, files: Mapping[str, Box], ground_filter: bool
-) -> dict[str, ResidualSums]:
-    """Heights of a tile's lower surface over the points on it; each point is on the mesh of one tile."""
+) -> tuple[dict[str, ResidualSums], int, int]:
+    """Heights of a tile's lower surface over points, the number of these, and of all of which they are chosen.
+
+    Each point is on the mesh of one tile.
+    """
     low, high = mesh.plane.xy.min(axis=0).tolist(), mesh.plane.xy.max(axis=0).tolist()
     box = (low[0], low[1], high[0], high[1])
     task.refs["points"] = tuple(
@@ -146,4 +156,4 @@ def _measure_points(
     for number, word in CLASSES.items():
         for on_roof, surface in ((False, "ground"), (True, "roof")):
             found[f"{word} on {surface}"] = sum_residuals(residual[there & (kind == number) & (built == on_roof)])
-    return found
+    return found, len(xyz), len(cloud.xyz)

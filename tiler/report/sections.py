@@ -13,16 +13,20 @@ from pipeline.residuals import ResidualSums, conclude
 from stitch.grid import make_grid, tile_box
 from tiler.config import Config
 from tiler.context import tile_key
+from tiler.left_out import tell_left_out
+from tiler.mesh_parts import tell_parts
+from tiler.note_words import GROUPS, group_of, say_notes
+from tiler.plain_text import tell_box
 from tiler.progress import command_line
 from tiler.report.charts import Series, draw_bars, draw_gantt, draw_histogram, rebin
 from tiler.report.collect import Bins, Numbers
 from tiler.report.maps import draw_map, gather_tiles
-from tiler.report.meanings import GROUPS, explain
 from tiler.report.page import figure, figures, folded, heading, number, paragraph, table, text
-from tiler.report.record import SHOWN, NoteGroup, RunFacts
+from tiler.report.record import PLACES, SHOWN, NoteGroup, RunFacts
 from tiler.report.samples import NEAR, Samples
 from tiler.report.timeline import Timeline
-from tiler.run_folder import WRONG_FIELD
+from tiler.run_folder import PARTS, WRONG_FIELD
+from tiler.stage_groups import group_stages, title_of_stage
 
 PERCENTILES = (0, 0.1, 1, 5, 50, 95, 100)
 
@@ -72,8 +76,20 @@ def tell_summary(facts: RunFacts) -> Iterator[str]:
     elif members.get("exit_code"):
         yield paragraph("The mesh is whole but for parts that are listed below (exit code 3).", "bad")
     else:
-        yield paragraph("The mesh is whole: nothing that the input has is missing but what is listed below.")
-    pairs = [("cells", "cells"), ("points", "points"), ("facets", "facets"), ("buildings", "buildings")]
+        yield paragraph("The mesh is whole: every tile was meshed.")
+    lost = tell_left_out(members.get("left_out") or {})
+    if members.get("parts", {}).get("n", 1) > 1:
+        yield paragraph(f"{_tell_parts(members['parts'])}: no flow passes between them.", "bad")
+    if lost:
+        yield heading("Buildings that are not in the mesh")
+        yield _bullets(lost)
+    pairs = [
+        ("cells", "cells"),
+        ("points", "points"),
+        ("facets", "facets"),
+        ("buildings", "buildings"),
+        (PARTS, "building parts"),
+    ]
     shown = [(words, number(counts[name])) for words, name in pairs if name in counts]
     if bounds is not None:
         area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) / 1e6
@@ -84,8 +100,8 @@ def tell_summary(facts: RunFacts) -> Iterator[str]:
     if "peak_memory_bytes" in members:
         shown.append(("peak memory of a process", f"{members['peak_memory_bytes'] / 2**20:,.0f} MiB"))
     yield figures(shown)
-    if messages := members.get("messages"):
-        yield '<ul class="messages">' + "".join(f"<li>{text(message)}</li>" for message in messages) + "</ul>"
+    if messages := [message for message in members.get("messages", ()) if message not in lost]:
+        yield _bullets(messages)
 
 
 def tell_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -> Iterator[str]:
@@ -96,7 +112,7 @@ def tell_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -> It
     size = float(region["tile_size"])
     missing = list(_find_missing(facts))
     yield paragraph(
-        f"Region {', '.join(f'{value:,.10g}' for value in bounds)} in {region['crs']}, tiles of {size:g} m: "
+        f"Region {tell_box(bounds)} in {region['crs']}, tiles of {size:g} m: "
         f"{len(tiles.names):,} meshed, {len(region.get('absent', ())):,} absent, "
         f"{facts.lengths.get('missing', 0):,} missing."
     )
@@ -119,7 +135,9 @@ def tell_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -> It
         marks=marks,
     )
     words = "Worst radius ratio of each tile; the darker the worse (lighter on a dark page)."
-    yield figure(worst, f"{words} Dots: where something was dropped, repaired or defaulted.")
+    more = any(group.count > len(group.places) for group in facts.notes)
+    sample = f" (the first {PLACES} of each kind)" if more else ""
+    yield figure(worst, f"{words} Dots: where something was dropped, repaired or defaulted{sample}.")
     others = [("cells", tiles.cells.astype(np.float64), "", "Cells of each tile.")]
     if timeline is not None and timeline.by_tile:
         spent = np.array([timeline.by_tile.get(name, np.nan) for name in tiles.names])
@@ -168,7 +186,7 @@ def tell_heights(facts: RunFacts, numbers: Numbers) -> Iterator[str]:
         yield figures([(names.get(name, name), number(value, 1)) for name, value in domain.items()])
     charts = []
     for bins, title, axis in (
-        (numbers.buildings, "buildings", "height of buildings above their ground (m)"),
+        (numbers.buildings, "building parts", "height of building parts above their ground (m)"),
         (numbers.terrain, "terrain", "height of the terrain (m)"),
     ):
         if not bins.n:
@@ -194,8 +212,9 @@ def tell_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
     head = ["points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "99 % below (m)", "bias (m)"]
     yield heading("The mesh's surface")
     yield paragraph(
-        f"Height of ground and roofs of the mesh over LiDAR points by class{_chosen(samples)}; percentiles are of "
-        "absolute values, outliers count. A roof is one height a part, so slopes and dormers show here."
+        f"Height of ground and roofs of the mesh over LiDAR points by class{_chosen(samples)}{_thinned(samples)}; "
+        "percentiles are of absolute values, outliers count. A roof is one height a part, so slopes and dormers "
+        "show here."
     )
     yield table("Heights of the mesh over LiDAR points", head, rows)
     found = facts.members["fidelity"]
@@ -220,7 +239,8 @@ def tell_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:
     """Show where the time went: by stage, and when each stage worked."""
     members = facts.members
     seconds: dict[str, float] = members.get("seconds", {})
-    stages = {name: value for name, value in seconds.items() if ":" not in name}
+    alone = {name: value for name, value in seconds.items() if ":" not in name}
+    steps = {step: sum(alone[name] for name in names) for step, names in group_stages(alone).items()}
     if timeline is not None:
         tips = [
             f"{name}: {first:.2f} to {last:.2f} s, {n} tasks, {reused} used again, {failed} failed"
@@ -229,39 +249,47 @@ def tell_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:
                 strict=True,
             )
         ]  # fmt: skip
-        chart = draw_gantt("When each stage worked", timeline.duration, timeline.stages, timeline.busy, tips)
+        chart = draw_gantt("When each step worked", timeline.duration, timeline.stages, timeline.busy, tips)
         yield figure(
             f'<div class="narrow">{chart}</div>',
-            "When each stage worked; the darker the more of its tasks at a time.",
+            "When each step worked; the darker the more of its tasks at a time.",
         )
     else:
         yield paragraph("When each task worked is not known: the folder has no events.jsonl.")
-    by_time = sorted(stages.items(), key=lambda stage: (-stage[1], stage[0]))
-    rows = [(name, value, f"{value:,.2f} s") for name, value in by_time if value >= SHORTEST]
-    bars = f'<div class="narrow">{draw_bars("Time of all tasks by stage", rows)}</div>'
-    yield figure(bars, "Time of all tasks of each stage, over all workers.")
+    rows = [(name, value, f"{value:,.2f} s") for name, value in steps.items() if value >= SHORTEST]
+    bars = f'<div class="narrow">{draw_bars("Time of all tasks by step", rows)}</div>'
+    yield figure(bars, "Time of all tasks of each step, over all workers.")
     ran, reused, finished = (members.get(name, {}) for name in ("ran", "reused", "finished"))
-    steps = [
-        [name, number(ran.get(name)), number(reused.get(name)), number(value, 2), number(finished.get(name), 1)]
+    details = [
+        [
+            _tell_step(name),
+            number(ran.get(name)),
+            number(reused.get(name)),
+            number(value, 2),
+            number(finished.get(name), 1),
+        ]
         for name, value in sorted(seconds.items())
     ]
-    head = ("stage, and its steps", "tasks ran", "used again", "time (s)", "done after (s)")
-    yield folded("All stages and steps", table("Stages", head, steps))
+    head = ("step", "tasks ran", "used again", "time (s)", "done after (s)")
+    yield folded("All steps in detail", table("Steps", head, details))
 
 
 def tell_notes(facts: RunFacts) -> Iterator[str]:
     """List what failed, was dropped, repaired or defaulted."""
     members, lengths = facts.members, facts.lengths
     if missing := members.get("missing"):
-        rows = [[name, f["stage"], f["name"], f["reason"], f["command"]] for name, f in _first(missing.items())]
+        rows = [
+            [name, title_of_stage(f["stage"]), f["name"], f["reason"], f["command"]]
+            for name, f in _first(missing.items())
+        ]
         yield heading("Tiles that failed")
         yield table(
-            _first_of("tiles", lengths["missing"]), ("tile", "stage", "item", "reason", "alone"), rows, numbers=9
+            _first_of("tiles", lengths["missing"]), ("tile", "step", "item", "reason", "alone"), rows, numbers=9
         )
     if others := members.get("set_aside"):
-        rows = [[f["name"], f["stage"], f["reason"]] for f in others[:SHOWN]]
+        rows = [[f["name"], title_of_stage(f["stage"]), f["reason"]] for f in others[:SHOWN]]
         yield heading("What else failed")
-        yield table(_first_of("items", lengths["set_aside"]), ("item", "stage", "reason"), rows, numbers=9)
+        yield table(_first_of("items", lengths["set_aside"]), ("item", "step", "reason"), rows, numbers=9)
     if unreadable := members.get("unreadable"):
         yield heading("Files that were left out")
         yield table(
@@ -272,7 +300,7 @@ def tell_notes(facts: RunFacts) -> Iterator[str]:
         return
     yield paragraph(f"Ids and places of up to {SHOWN} of each kind; run.json has the first 10,000, the store all.")
     for group in GROUPS:
-        kinds = [notes for notes in facts.notes if explain(notes.kind)[0] == group]
+        kinds = [notes for notes in facts.notes if group_of(notes.kind) == group]
         if not kinds:
             continue
         yield heading(f"{group.capitalize()}: {sum(notes.count for notes in kinds):,}")
@@ -314,7 +342,10 @@ def _find_missing(facts: RunFacts) -> Iterator[tuple[tuple[float, float, float, 
         open_size=float(given["open_size"]),
     )
     for name, failure in found.items():
-        yield tile_box(grid, tile_key(name)), f"{name} failed: stage {failure['stage']}: {failure['reason']}"
+        yield (
+            tile_box(grid, tile_key(name)),
+            f"{name} failed: {title_of_stage(failure['stage'])}: {failure['reason']}",
+        )
 
 
 def _residuals(sums: ResidualSums) -> list[str]:
@@ -323,10 +354,31 @@ def _residuals(sums: ResidualSums) -> list[str]:
     return [number(value) for value in values]
 
 
+def _tell_step(name: str) -> str:
+    """Name a stage, or a step of one as ``"houses: 2.0 split levels"``, in words of its group."""
+    stage, colon, step = name.partition(":")
+    return f"{title_of_stage(stage)}{colon}{step}"
+
+
 def _chosen(samples: Samples) -> str:
     if samples.tiles == samples.all_tiles:
         return ""
-    return f", of {samples.tiles:,} of {samples.all_tiles:,} tiles, evenly chosen"
+    return f" (a sample: {samples.tiles:,} of {samples.all_tiles:,} tiles, evenly chosen)"
+
+
+def _thinned(samples: Samples) -> str:
+    if samples.n_points == samples.all_points:
+        return ""
+    return f" (a sample: {samples.n_points:,} of the {samples.all_points:,} points there, evenly chosen)"
+
+
+def _tell_parts(parts: dict[str, Any]) -> str:
+    told = tell_parts([part["cells"] for part in parts["largest"]], parts["n"])
+    return told[:1].upper() + told[1:]
+
+
+def _bullets(lines: Sequence[str]) -> str:
+    return '<ul class="messages">' + "".join(f"<li>{text(line)}</li>" for line in lines) + "</ul>"
 
 
 def _percentiles(found: Histogram) -> list[str]:
@@ -342,14 +394,12 @@ def _coarsen(bins: Bins) -> tuple[float, float, NDArray[np.float64]]:
 
 
 def _list_notes(notes: NoteGroup) -> str:
-    meaning = explain(notes.kind)[1]
     rows = [
         [item.get("subject", ""), number(item.get("x"), 1), number(item.get("y"), 1), item.get("detail", "")]
         for item in notes.items
     ]
     head = ("id or file", "x (m)", "y (m)", "detail")
-    words = f"{notes.count:,} {notes.kind.replace('-', ' ')}" + (f": {meaning}" if meaning else "")
-    return folded(words, table(_first_of(notes.kind, notes.count), head, rows))
+    return folded(say_notes(notes.kind, notes.count), table(_first_of("notes", notes.count), head, rows))
 
 
 def _first_of(what: str, count: int) -> str:

@@ -10,20 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiler.events import read_events
+from tiler.stage_groups import group_of_stage
 
 BINS = 240  # columns of the Gantt chart
 
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """How busy each stage was over the time of a run.
+    """How busy each group of stages was over the time of a run (`tiler.stage_groups`).
 
     Attributes
     ----------
     duration : float
         From the first task's beginning to the last one's end (s).
     stages : tuple of str
-        Stages in the order in which they began.
+        Groups in the order in which they began.
     busy : float64, (n_stages, BINS)
         Tasks at work in each slice of time, in the mean.
     first, last : float64, (n_stages,)
@@ -115,7 +116,7 @@ def _tasks(path: Path) -> Iterator[tuple[dict[str, Any], str, float, float]]:
         except (KeyError, TypeError, ValueError):
             continue
         if math.isfinite(end) and 0 <= seconds < math.inf:
-            yield event, str(event.get("stage", "")), end, seconds
+            yield event, group_of_stage(str(event.get("stage", ""))), end, seconds
 
 
 def _add(busy: NDArray[np.float64], start: float, end: float) -> None:

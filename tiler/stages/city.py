@@ -30,6 +30,7 @@ from tiler.config import Config
 from tiler.context import find_owned, region_around, tile_key
 from tiler.options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
 from tiler.readers import grow, read_known_terrain
+from tiler.run_folder import PARTS
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.stages.house_points import add_unmarked, extent_of, find_surfaces, points_near
 from tiler.stages.inputs import halo_of_points
@@ -304,7 +305,8 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
         roofs = add_roof_points(roofs, rows, others.points)
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
     task.put(**pack_model(make_buildings(city, fidelity, layers)))
-    counts = {"buildings": len(model)} | {name: n for name, n in city.counts.items() if name not in shapes.counts}
+    counts = {"buildings": len(np.unique(model.house)), PARTS: len(model)}
+    counts |= {name: n for name, n in city.counts.items() if name not in shapes.counts}
     counts |= {"roofs on another layer": parted} if parted else {}
     return {"n": len(model), "extent": extent, "counts": counts, "outline": city.outline}
 

@@ -15,6 +15,7 @@ from tiler.readers import grow, read_known_terrain
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.approach import terrain_stage
 from tiler.stages.city import chooses_layers_later
+from tiler.stages.left_out import LEFT_OUT, left_out_stage
 from tiler.tables import unpack_buildings, unpack_polygons
 from tiler.task import Task
 
@@ -22,14 +23,14 @@ LOW_DOMAIN = "domain-lower-than-guidelines"
 
 
 def domain_stages(config: Config) -> list[Stage]:
-    """Stages that find the tallest building and, for a flat top, the highest ground of the region."""
-    reads = [Read("model")]
-    stages = []
+    """Stages that find what is left out, the tallest building and, for a flat top, the highest ground."""
+    reads = [Read("model"), Read(LEFT_OUT)]
+    stages = [left_out_stage(config)]
     if config.top == "flat":
-        stages = [Stage("summits", Scope.TILE, find_summit, (Read("terrain", own=True),))]
+        stages += [Stage("summits", Scope.TILE, find_summit, (Read("terrain", own=True),))]
         reads += [Read("summits")]
     parameters = ("domain_height", "top")
-    return [*stages, Stage("domain", Scope.REGION, measure_domain, tuple(reads), parameters)]
+    return [*stages, Stage("domain", Scope.REGION, measure_domain, tuple(reads), parameters, version=2)]
 
 
 def layer_stages(config: Config, domain: Domain) -> list[Stage]:
@@ -55,7 +56,10 @@ def find_summit(task: Task) -> Facts:
 
 
 def measure_domain(task: Task) -> Facts:
-    """Find the tallest building and the highest terrain; note a domain that is too low for the building."""
+    """Find the tallest building and the highest terrain; note a domain that is too low for the building.
+
+    Buildings that were left out count: their neighbours stand in their wind.
+    """
     given = task.parameters
     best: tuple[float, str, str] = (0.0, "", "")
     for result in task.read("model", ("ground", "roof", "id")):
@@ -65,16 +69,37 @@ def measure_domain(task: Task) -> Facts:
             row = np.lexsort((found["id"], -height))[0]
             best = min(best, (-float(height[row]), str(found["id"][row]), result.name))
     tallest, building, tile = abs(best[0]), best[1], best[2]
-    facts: dict[str, Any] = {"tallest": tallest, "building": building}
+    facts: dict[str, Any] = {"tallest": tallest, "tallest_meshed": tallest, "building": building}
+    lost, words = _tallest_left_out(task), "the tallest building's"
+    place: tuple[float, float] | None = None
+    if lost is not None:
+        facts["left_out"] = lost
+        if lost["height"] > tallest:
+            tallest, building, place = lost["height"], lost["id"], (lost["x"], lost["y"])
+            words = f"the height of building {building}, which is left out:"
+            facts |= {"tallest": tallest, "building": building}
     if given.top == "flat":
         facts["highest_ground"] = max(result.facts["highest_ground"] for result in task.read("summits", ()))
     height = height_in_metres(given.domain_height, tallest)
     if is_low(height, tallest):
         wanted = f"guidelines (COST 732, AIJ) ask for {GUIDELINE:g} times: --domain-height {GUIDELINE:g}H"
-        times = f"{height / tallest:.2f} times the tallest building's {tallest:.1f} m"
+        times = f"{height / tallest:.2f} times {words} {tallest:.1f} m"
         detail = f"the domain is {height:.1f} m high, {times}; {wanted}"
-        task.note(Note(LOW_DOMAIN, building, *_place(task, tile, building), detail))
+        task.note(Note(LOW_DOMAIN, building, *(place or _place(task, tile, building)), detail))
     return facts
+
+
+def _tallest_left_out(task: Task) -> dict[str, Any] | None:
+    """Id, height and place of the tallest building that was left out; None where none has a height."""
+    best: dict[str, Any] | None = None
+    for result in task.read(LEFT_OUT, ("id", "height", "place")):
+        found = result.arrays
+        for row in np.flatnonzero(found["height"] > 0).tolist():
+            height, name = float(found["height"][row]), str(found["id"][row])
+            if best is None or (-height, name) < (-best["height"], best["id"]):
+                x, y = found["place"][row].tolist()
+                best = {"id": name, "height": height, "x": x, "y": y}
+    return best
 
 
 def choose_tile_layers(task: Task) -> Facts:

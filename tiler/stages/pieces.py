@@ -1,10 +1,10 @@
 """Stage 3.6: a piece of the mesh and of its boundary a tile, numbers for the whole region, proof of the seams."""
 
 import hashlib
+from collections import Counter
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from pipeline.building_facts import fidelity_table
@@ -34,11 +34,13 @@ from stitch.numbering import corner_part, first_id, make_offsets, number_columns
 from tiler.config import Config
 from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
 from tiler.merged import VERTEX_ID
+from tiler.mesh_parts import find_tile_parts, join_tiles, read_tile_parts
 from tiler.readers import read_bands, read_buildings, read_terrain
 from tiler.results import COLUMN_ARRAYS, unpack_columns
 from tiler.run_folder import REGION
 from tiler.stage import Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
+from tiler.stages.left_out import read_polygons
 from tiler.tables import unpack_polygons
 from tiler.task import Result, Task
 from tiler.vtk_files import Rows, Values, write_vtp_blocks, write_vtu_blocks
@@ -55,9 +57,9 @@ def fit_stage(config: Config) -> Stage:
         Read("points", halo_of_points(config, 0.0)),
         Read("terrain", 2 * config.dtm_spacing),
         Read("model", by_extent=True),
-        Read("houses", by_extent=True),
+        Read("outlines", own=True),
     )
-    return Stage("fit", Scope.TILE, measure_fit, reads, ("dtm_spacing", "ground_filter"))
+    return Stage("fit", Scope.TILE, measure_fit, reads, ("dtm_spacing", "ground_filter"), version=2)
 
 
 def piece_stages() -> list[Stage]:
@@ -67,9 +69,11 @@ def piece_stages() -> list[Stage]:
     return [
         Stage("numbers", Scope.REGION, number_parts, meshed, version=3),
         # Of the tiles around it a piece asks only which of them there are.
-        Stage("pieces", Scope.TILE, write_piece, beside, version=4),
+        Stage("pieces", Scope.TILE, write_piece, beside, version=5),
         Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces", beside=True, optional=True),)),
-        Stage("report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True))),
+        Stage(
+            "report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True)), version=2
+        ),
     ]
 
 
@@ -121,6 +125,10 @@ def write_piece(task: Task) -> Facts:
         cells = CellBlocks([(mesh, None)])
         boundary, shared = split_boundary(mesh, numbers, task.context.bounds, edges)
     seams = _digest_seams(mesh, shared, arrays["edge"], arrays["edge_seam"], key)
+    there = ~edges.missing
+    parts, found = find_tile_parts(mesh, arrays["edge"][there], arrays["edge_seam"][there])
+    if found:
+        task.put(**found)
     points, meter = UsedPoints(mesh, used), QualityMeter()
     lowest = number_columns(mesh, arrays["shared"], arrays["shared_id"], first_id(tile_part(key)))
 
@@ -147,6 +155,7 @@ def write_piece(task: Task) -> Facts:
     return {
         "counts": {"cells": cells.n_cells, "facets": len(boundary.facets), "seam faces": len(shared)},
         "seams": seams,
+        "parts": parts,
         FILES: written,
     }
 
@@ -191,37 +200,47 @@ def measure_fit(task: Task) -> Facts:
     given, bounds = task.parameters, task.context.bounds
     dtm = read_terrain(task, task.box, spacing=given.dtm_spacing, bounds=bounds)
     buildings = read_buildings(task, task.box)
-    outlines = [np.empty(0, object)]
-    for result in task.read("houses", ("outline", "outline_start")):
-        polygons = unpack_polygons(result.arrays, "outline")
-        outlines.append(polygons[shapely.intersects(shapely.box(*task.box), polygons)])
-    footprints = np.concatenate(outlines)
+    (found,) = task.read("outlines", ("outline", "outline_start"))
+    outlines = unpack_polygons(found.arrays, "outline")
+    footprints, _ = read_polygons(outlines, np.arange(len(outlines)))
     model = index_model(buildings.model.polygons, buildings.model.roof, footprints=footprints, box=task.box)
-    parts = [
-        sum_fidelity(cloud, dtm, model, building_class=True, among=find_owned(task.box, bounds, cloud.xyz[:, :2]))
-        for cloud in read_bands(task, task.box, classes=FIT_CLASSES, ground_filter=given.ground_filter)
-    ]
+    parts, n_building = [], 0
+    for cloud in read_bands(task, task.box, classes=FIT_CLASSES, ground_filter=given.ground_filter):
+        mine = find_owned(task.box, bounds, cloud.xyz[:, :2])
+        parts.append(sum_fidelity(cloud, dtm, model, building_class=True, among=mine))
+        n_building += int((mine & (cloud.classification == BUILDING)).sum())
     sums = merge_fidelity(parts)
     facts = {}
     for kind in KINDS:
         residual: ResidualSums = getattr(sums, kind)
         facts[kind] = {"n": residual.n, "total": residual.total, "squares": str(residual.squares)}
         task.put(**{kind: residual.absolute.counts, f"{kind}_range": _range(residual.absolute)})
-    return {"fit": facts}
+    in_mesh, bare = sums.roof.n, sums.missed.n
+    # Where a file marks no buildings, what lies beside all footprints may be anything.
+    marked = all(task.store.attributes("points", name)["facts"]["marks_buildings"] for name in task.refs["points"])
+    stray = max(n_building - in_mesh - bare, 0) if marked else 0
+    return {"fit": facts, "building_points": {"in_mesh": in_mesh, "bare": bare, "stray": stray}}
 
 
 def sum_up(task: Task) -> Facts:
-    """Add up the quality of all cells and the fit of all points, over the whole region."""
+    """Add up the quality of all cells and the fit of all points, and join the parts of tiles, over the region."""
     quality: dict[str, Histogram] = {}
+    tiles = []
     for result in task.read("pieces"):
+        faces = {seam: found["faces"] for seam, found in result.facts["seams"].items()}
+        sides = [seam_name(seam) for seam in seams_of_tile(tile_key(result.name))]
+        tiles.append(read_tile_parts(result.name, result.facts["parts"], faces, result.arrays, sides))
         for name, (limits, _) in QUALITY_BINS.items():
             part = _histogram(result.arrays, name, limits)
             quality[name] = merge_histograms([quality[name], part]) if name in quality else part
     total: FidelitySums | None = None
+    building_points: Counter[str] = Counter()
     for result in task.read("fit"):
+        building_points.update(result.facts["building_points"])
         sums = FidelitySums(**{kind: _residuals(result, kind) for kind in KINDS})
         total = merge_fidelity([total, sums]) if total is not None else sums
-    facts: Facts = {"quality": histogram_percentiles(quality)}
+    facts: Facts = {"quality": histogram_percentiles(quality), "building_points": dict(building_points)}
+    facts["parts"] = join_tiles(tiles)
     return facts | {"fidelity": fidelity_table(conclude_fidelity(total)) if total is not None else {}}
 
 

@@ -1,0 +1,84 @@
+"""Stages in words of the field: the groups that a user sees, and what each stage of a group does."""
+
+from collections.abc import Iterable
+
+POINTS, TERRAIN, BUILDINGS, SIMPLIFICATION = "points", "terrain", "buildings", "simplification"
+SEAMS, MESH, OUTPUT = "seams", "mesh", "output"
+GROUPS = (POINTS, TERRAIN, BUILDINGS, SIMPLIFICATION, SEAMS, MESH, OUTPUT)
+
+# Group and task of each stage; of rounds that are numbered, without the number. The last stage of each group is
+# known when a run begins, so that a group is not done before it.
+STAGES: dict[str, tuple[str, str]] = {
+    "points": (POINTS, "point-cloud files"),
+    "ground": (TERRAIN, "means of ground points"),
+    "flooded": (TERRAIN, "small gaps"),
+    "coarse": (TERRAIN, "coarse grid for large gaps"),
+    "lakes": (TERRAIN, "large gaps"),
+    "terrain": (TERRAIN, "grid"),
+    "footprints": (BUILDINGS, "footprint file"),
+    "outlines": (BUILDINGS, "footprints of tiles"),
+    "reserved": (BUILDINGS, "ids"),
+    "houses": (BUILDINGS, "outlines and heights"),
+    "near-": (SIMPLIFICATION, "close buildings"),
+    "join-": (SIMPLIFICATION, "clusters"),
+    "members-": (SIMPLIFICATION, "clusters of tiles"),
+    "shapes-": (SIMPLIFICATION, "outlines"),
+    "model": (SIMPLIFICATION, "city model"),
+    "left-out": (SIMPLIFICATION, "what is left out"),
+    "summits": (SEAMS, "highest ground"),
+    "domain": (SEAMS, "height of the domain"),
+    "rim": (SEAMS, "ground at the border of the region"),
+    "approach": (SEAMS, "ground of the pad"),
+    "layers": (SEAMS, "layers of roofs"),
+    "seams": (SEAMS, "seams"),
+    "columns": (MESH, "columns of cells"),
+    "pieces": (OUTPUT, "files of the mesh"),
+    "numbers": (OUTPUT, "numbers of points"),
+    "citymodel": (OUTPUT, "file of the city model"),
+    "citymodel-full": (OUTPUT, "file of the full city model"),
+    "fit": (OUTPUT, "distance of points to the model"),
+    "proofs": (OUTPUT, "proof of seams"),
+    "report": (OUTPUT, "quality"),
+}
+
+
+def group_of_stage(stage: str) -> str:
+    """Give the group of a stage; one of the user's own is its own group.
+
+    Examples
+    --------
+    >>> group_of_stage("near-0"), group_of_stage("flooded"), group_of_stage("canopy-2")
+    ('simplification', 'terrain', 'canopy-2')
+    """
+    found = STAGES.get(stage) or STAGES.get(stage.rstrip("0123456789"))
+    return stage if found is None else found[0]
+
+
+def title_of_stage(stage: str) -> str:
+    """Tell what a stage does, in the words of its group; one of the user's own by its name.
+
+    Examples
+    --------
+    >>> title_of_stage("near-1"), title_of_stage("columns"), title_of_stage("canopy")
+    ('simplification: close buildings, round 2', 'mesh: columns of cells', 'canopy')
+    """
+    name = stage.rstrip("0123456789")
+    found = STAGES.get(stage) or STAGES.get(name)
+    if found is None:
+        return stage
+    number = stage[len(name) :]
+    return f"{found[0]}: {found[1]}" + (f", round {int(number) + 1}" if name.endswith("-") and int(number) else "")
+
+
+def group_stages(stages: Iterable[str]) -> dict[str, list[str]]:
+    """Put stages into their groups: ours in the order of `GROUPS`, then the user's own.
+
+    Examples
+    --------
+    >>> group_stages(["footprints", "points", "canopy", "houses"])
+    {'points': ['points'], 'buildings': ['footprints', 'houses'], 'canopy': ['canopy']}
+    """
+    found: dict[str, list[str]] = {group: [] for group in GROUPS}
+    for stage in stages:
+        found.setdefault(group_of_stage(stage), []).append(stage)
+    return {group: names for group, names in found.items() if names}
