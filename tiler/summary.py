@@ -24,7 +24,7 @@ EXIT_DONE, EXIT_INCOMPLETE = 0, 3
 # Notes of these kinds say that something is missing which the input has: the exit code tells.
 INCOMPLETE = {
     *("building-beyond-region", "building-lost", "building-points-without-footprints"),
-    "footprint-too-many-vertices",
+    *("footprint-too-many-vertices", "footprint-unreadable", "footprint-not-finite", "footprint-not-polygon"),
 }
 DAMAGED = "damaged-artefact"  # kind of the notes on what was damaged or missing, and made anew
 LISTED = 10_000  # notes of a kind that the record lists; the store has all

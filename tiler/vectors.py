@@ -7,8 +7,9 @@ import pyproj
 from pipeline.citymodel import Footprints
 from pipeline.notes import Note
 from tiler.crs import horizontal_crs
+from tiler.features import Box
 from tiler.footprint_index import join_footprints, scan_footprints
-from tiler.layers import Box, describe_layer
+from tiler.layers import describe_layer
 from tiler.places import as_place
 
 

@@ -16,7 +16,7 @@ DROPPED = frozenset(
     {
         *("building-lost", "building-covered-by-others", "building-beyond-region", "footprint-empty"),
         *("footprint-not-finite", "footprint-too-small", "footprint-sliver", "footprint-duplicate"),
-        *("footprint-too-many-vertices", "footprint-lost"),
+        *("footprint-too-many-vertices", "footprint-lost", "footprint-unreadable", "footprint-not-polygon"),
     }
 )
 

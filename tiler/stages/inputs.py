@@ -47,7 +47,7 @@ def input_stages(config: Config) -> list[Stage]:
             Scope.REGION,
             read_footprint_file,
             parameters=("footprints", "footprints_identity", "layer", "id_attribute", "height_attribute"),
-            version=2,
+            version=3,
         ),
         # What a tile needs of the footprints: it does not run again when others change.
         Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),), version=2),
