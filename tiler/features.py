@@ -51,19 +51,28 @@ def to_objects(items: list[Any]) -> NDArray[np.object_]:
     return array
 
 
-def decode_text(data: bytes | None) -> str | None:
+def decode_text(data: bytes | None, warned: list[str]) -> str | None:
     """Decode text of a file that states no encoding, or a wrong one: UTF-8, else Windows-1252.
+
+    Parameters
+    ----------
+    data : bytes or None
+        As stored.
+    warned : list of str
+        Gets a line for a text that is no UTF-8.
 
     Examples
     --------
-    >>> [decode_text(text) for text in (b"Stra\\xc3\\x9fe", b"Stra\\xdfe", b"\\x81", None)]
-    ['Straße', 'Straße', '\\x81', None]
+    >>> [decode_text("Straße".encode(name), []) for name in ("utf-8", "cp1252")]
+    ['Straße', 'Straße']
     """
     if data is None:
         return None
-    for encoding in ("utf-8", "cp1252"):
-        try:
-            return data.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-    return data.decode("latin-1")  # five bytes of Windows-1252 have no letter
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        warned.append("text that is no UTF-8 is read as Windows-1252")
+    try:
+        return data.decode("cp1252")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")  # five bytes of Windows-1252 have no letter

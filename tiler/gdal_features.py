@@ -120,7 +120,7 @@ def _stream_slice(
         while True:
             with gdal_as_input_error(layer.path, warned):
                 part = next(reader, None)  # no warning may be caught, and no error be turned, across a yield
-                lists = [] if part is None else [_to_list(column) for column in part.columns]
+                lists = [] if part is None else [_to_list(column, warned) for column in part.columns]
             if part is None:
                 break
             names = [str(name) for name in meta["fields"]]  # in the stream behind the number, before the geometry
@@ -165,7 +165,7 @@ def _read_slice(
         encoding,
         layer.info["encoding"],
     ):  # each byte a letter: what GDAL takes where none is stated
-        values = [to_objects([_decode_again(value) for value in column]) for column in values]
+        values = [to_objects([_decode_again(value, warned) for value in column]) for column in values]
     found = dict(zip((str(name) for name in meta["fields"]), values, strict=True))
     wkb = wkb if geometry else np.full(len(fids), None, np.object_)
     yield Features(wkb, found, tuple(dict.fromkeys(warned)), fids.astype(np.int64), {})
@@ -220,20 +220,20 @@ def _options(layer: GdalLayer) -> dict[str, str]:
     return {} if isinstance(layer.source, bytes) else layer.options
 
 
-def _to_list(column: Any) -> list[Any]:
+def _to_list(column: Any, warned: list[str]) -> list[Any]:
     """Give the values of a column; text is decoded here: that of a file without an encoding comes as it is."""
     import pyarrow as pa
 
     if pa.types.is_string(column.type):
-        return [decode_text(value) for value in column.cast(pa.binary()).to_pylist()]
+        return [decode_text(value, warned) for value in column.cast(pa.binary()).to_pylist()]
     if pa.types.is_large_string(column.type):
-        return [decode_text(value) for value in column.cast(pa.large_binary()).to_pylist()]
+        return [decode_text(value, warned) for value in column.cast(pa.large_binary()).to_pylist()]
     values: list[Any] = column.to_pylist()
     return values
 
 
-def _decode_again(value: Any) -> Any:
-    return decode_text(value.encode("latin-1", errors="replace")) if isinstance(value, str) else value
+def _decode_again(value: Any, warned: list[str]) -> Any:
+    return decode_text(value.encode("latin-1", errors="replace"), warned) if isinstance(value, str) else value
 
 
 def _find_broken(layer: GdalLayer, part: Features) -> Features:

@@ -172,8 +172,8 @@ def _notes(gdal: GdalLayer) -> Iterator[Note]:
     name = gdal.path.name
     if find_osm_tags(gdal.fields) is not None:
         detail = (
-            "building=* and building:part=* are taken; heights, where there are no roof points, by the tag height, "
-            f"else building:levels x {STOREY:g} m"
+            "building=* and building:part=* are taken; heights, where there are no roof points, by the tag "
+            f"height, else building:levels x {STOREY:g} m"
         )
         yield Note("footprints-of-osm", name, detail=detail)
     if gdal.chosen and gdal.driver != "OSM":

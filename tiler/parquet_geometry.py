@@ -99,8 +99,9 @@ def find_geometry(path: Path, table: Any) -> GeometryColumn:
     found = _by_parquet_type(table) or _by_arrow_type(schema) or _by_name(path, table)
     if found is None:
         raise InputError(
-            f"{path}: has no column with geometries: neither metadata of GeoParquet nor a column of type GEOMETRY, "
-            f"nor one with WKB that is named {', '.join(_NAMES)}; write it as GeoParquet, or convert it to GPKG"
+            f"{path}: has no column with geometries: neither metadata of GeoParquet nor a column of type "
+            f"GEOMETRY, nor WKB in a column with a usual name ({', '.join(_NAMES)}); write it as GeoParquet, or "
+            "convert it to GPKG"
         )
     return found
 

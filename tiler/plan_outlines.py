@@ -80,8 +80,8 @@ def outline_all(wkb: NDArray[np.object_], *, metre: float = 1.0) -> Outlines:
     Outlines
         Polygons as they came; arcs made segments within `SAGITTA` (``footprint-curve-linearised``); of surfaces in
         space and collections of polygons the outline of their faces (``footprint-outline-of-surface``); what
-        closed lines enclose (``footprint-from-line``). Left out: ``footprint-not-polygon``, ``footprint-unreadable``,
-        ``footprint-too-many-vertices``.
+        closed lines enclose (``footprint-from-line``). Left out: ``footprint-not-polygon``,
+        ``footprint-not-finite``, ``footprint-unreadable``, ``footprint-too-many-vertices``.
 
     Notes
     -----
