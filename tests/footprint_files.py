@@ -1,8 +1,8 @@
-"""Footprint files in forms that pyogrio does not write: blobs of any kind, tables of Shapefiles, extracts of OSM."""
+"""Footprint files that pyogrio does not write: blobs of any kind, tables of Shapefiles, extracts of OSM."""
 
 import sqlite3
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -143,18 +143,20 @@ class OsmTown:
             return texts.index(text)
 
         def keys(given: dict[str, str]) -> bytes:
+            if not given:
+                return b""
             return _field(2, _packed(index(key) for key in given)) + _field(
                 3, _packed(index(value) for value in given.values())
             )
 
-        group = b""
+        nodes = ways = relations = b""  # a group each: one may not hold different kinds
         for k, (lon, lat) in enumerate(self.nodes):
             place = [_zigzag(k + 1), _zigzag(round(lat * 1e9)), _zigzag(round(lon * 1e9))]
             node = b"\x08" + _varint(place[0]) + b"\x40" + _varint(place[1]) + b"\x48" + _varint(place[2])
-            group += _field(1, node)
+            nodes += _field(1, node)
         for number, refs, given in self.ways:
             steps = np.diff([0, *refs]).tolist()
-            group += _field(3, b"\x08" + _varint(number) + keys(given) + _field(8, _packed(map(_zigzag, steps))))
+            ways += _field(3, b"\x08" + _varint(number) + keys(given) + _field(8, _packed(map(_zigzag, steps))))
         for number, members, given in self.relations:
             steps = np.diff([0, *members]).tolist()
             roles = _field(8, _packed(index("outer") for _ in members))
@@ -162,9 +164,11 @@ class OsmTown:
             body = (
                 b"\x08" + _varint(number) + keys(given) + roles + _field(9, _packed(map(_zigzag, steps))) + kinds
             )
-            group += _field(4, body)
+            relations += _field(4, body)
         table = b"".join(_field(1, text.encode()) for text in texts)
-        block = _field(1, table) + _field(2, group) + b"\x88\x01" + _varint(1)  # granularity of 1e-9 degrees
+        block = (
+            _field(1, table) + _field(2, nodes) + _field(2, ways) + _field(2, relations) + b"\x88\x01" + _varint(1)
+        )  # granularity of 1e-9 degrees
         header = _field(4, b"OsmSchema-V0.6")
         path.write_bytes(_pbf_blob(b"OSMHeader", header) + _pbf_blob(b"OSMData", block))
         return path
@@ -194,6 +198,3 @@ def _pbf_blob(kind: bytes, data: bytes) -> bytes:
     body = _field(1, data) + b"\x10" + _varint(len(data))
     head = _field(1, kind) + b"\x18" + _varint(len(body))
     return struct.pack(">I", len(head)) + head + body
-
-
-Damage = Callable[[bytes], bytes]

@@ -164,7 +164,8 @@ def scan_layer(
         if len(own) < len(columns):
             features.columns[layer.fid_name] = to_objects(features.fids.tolist())
         yield features
-    if box is None and n_read < layer.n_features:
+    # An extract of OSM does not tell its number, and its stream too ends at damage without a word.
+    if (box is None and n_read < layer.n_features) or (geometry and layer.gdal.driver == "OSM"):
         check_readable(layer.gdal)
 
 

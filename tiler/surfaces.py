@@ -86,4 +86,4 @@ def _polygonal(geometry: shapely.Geometry) -> shapely.Geometry:
 
 
 def _count_rings(geometry: shapely.Geometry) -> int:
-    return len(shapely.get_rings(geometry))
+    return len(shapely.get_rings(shapely.get_parts(geometry)))

@@ -79,7 +79,8 @@ def read_shape(blob: bytes, *, tolerance: float, max_vertices: int) -> Shape:
     """
     reader = _Reader(blob, tolerance, max_vertices)
     try:
-        geometry = reader.read(1)
+        with np.errstate(invalid="ignore"):  # GEOS compares NaN coordinates
+            geometry = reader.read(1)
     except (struct.error, shapely.errors.ShapelyError, TypeError) as error:
         raise ValueError(str(error)) from error
     return Shape(geometry, reader.curved, reader.surface)
