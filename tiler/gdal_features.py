@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from tiler.features import Box, Features, decode_text, to_objects
 from tiler.gdal_layer import GdalLayer, ask_gpkg, gdal_as_input_error, quote
-from tiler.shapefile import is_null_shape, is_shapefile
+from tiler.shapefile import find_near_shapes, is_null_shape, is_shapefile
 
 MOST_BROKEN = 100  # features whose reading fails; of a file with more the storage is damaged
 _FEWER = 8  # times smaller a slice is read where one fails
@@ -53,6 +53,30 @@ def scan_features(
     has made segments of 4 degrees.
     """
     filters = _filter(layer, box)
+    if "bbox" in filters and geometry and is_shapefile(layer.path):
+        yield from _scan_shapefile(layer, columns, batch, filters["bbox"])
+        return
+    yield from _scan(layer, columns, geometry, batch, filters)
+
+
+def _scan_shapefile(layer: GdalLayer, columns: Sequence[str], batch: int, box: Box) -> Iterator[Features]:
+    """Read by a box, and then what the file's own boxes have there and GDAL did not give, as it is damaged."""
+    given = [np.empty(0, np.int64)]
+    for part in _scan(layer, columns, True, batch, {"bbox": box}):
+        given.append(part.fids)
+        yield part
+    missing = np.setdiff1d(find_near_shapes(layer.path, box), np.concatenate(given))
+    for row in missing.tolist():
+        try:
+            for part in _read_slice(layer, columns, True, batch, {"fids": [row]}):
+                yield _find_broken(layer, part)
+        except InputError as error:
+            yield _no_feature(columns, row, str(error))
+
+
+def _scan(
+    layer: GdalLayer, columns: Sequence[str], geometry: bool, batch: int, filters: dict[str, Any]
+) -> Iterator[Features]:
     read = _read_slice if find_spec("pyarrow") is None else _stream_slice
     done = 0
     try:
@@ -90,7 +114,8 @@ def _filter(layer: GdalLayer, box: Box | None) -> dict[str, Any]:
         near = f"maxx >= {xmin!r} AND minx <= {xmax!r} AND maxy >= {ymin!r} AND miny <= {ymax!r}"
         unknown = f"NOT EXISTS (SELECT 1 FROM {rows} AS known WHERE known.rowid = {fid})"
         return {"where": f"{fid} IN (SELECT id FROM {table} WHERE {near}) OR {unknown}"}
-    if layer.driver != "GPKG" and layer.info["capabilities"]["fast_spatial_filter"]:
+    by_box = is_shapefile(layer.path) or layer.info["capabilities"]["fast_spatial_filter"]
+    if layer.driver != "GPKG" and by_box:
         return {"bbox": box}
     return {}
 
