@@ -20,7 +20,7 @@ from pipeline.notes import Note, count_notes
 from pipeline.pointcloud import PointCloud
 from tests.test_clouds import EVERYWHERE, ORIGIN, patch, write_cloud
 from tests.test_vectors import RD, square, write, write_parquet
-from tiler import clouds, layers
+from tiler import clouds, gdal_features
 from tiler.cells import Box, select_cells
 from tiler.clouds import find_clouds, read_points
 from tiler.config import Config
@@ -493,7 +493,7 @@ def test_without_pyarrow_the_same_comes_at_once(tmp_path: Path, monkeypatch: pyt
     streamed = {
         name: list(scan_footprints(path, crs=RD, bounds=REGION, id_attribute=name)) for name in ("id", "n")
     }
-    monkeypatch.setattr(layers, "find_spec", lambda _name: None)
+    monkeypatch.setattr(gdal_features, "find_spec", lambda _name: None)
     for name, blocks in streamed.items():
         (block,) = scan_footprints(path, crs=RD, bounds=REGION, id_attribute=name, batch=10)
         assert_same(in_box([block], REGION), in_box(blocks, REGION))
@@ -529,14 +529,14 @@ def test_a_region_around_the_file_asks_for_all_of_it(tmp_path: Path, monkeypatch
     true = pyogrio.raw.open_arrow
 
     def watch(path: Path, **options: Any) -> Any:
-        asked.append(options["bbox"])
+        asked.append(options.get("where", "all"))
         return true(path, **options)
 
     monkeypatch.setattr(pyogrio.raw, "open_arrow", watch)
     layer = describe_layer(write_any(tmp_path / "a.gpkg", *houses(20)))
     for box in (REGION, (X - 9e4, Y - 9e4, X + 9e4, Y + 9e4)):
         list(scan_layer(layer, ["id"], box))
-    assert asked == [REGION, None]
+    assert [where.count("rtree_a_geom") for where in asked] == [2, 0]  # its boxes, and what it does not know
 
 
 def test_a_damaged_page_is_no_end_of_the_file(tmp_path: Path) -> None:

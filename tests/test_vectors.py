@@ -106,9 +106,12 @@ def test_geoparquet_says_nothing_unknown_or_nonsense(tmp_path: Path) -> None:
     unknown = write_parquet(tmp_path / "unknown.parquet", [square(5, 5)], {}, crs=None)
     assert read_footprint_crs(unknown) is None
     assert count_notes(read(unknown)[1]) == {"footprints-without-crs": 1}
-    native = write_parquet(tmp_path / "native.parquet", [square(5, 5)], {}, encoding="polygon")
-    with pytest.raises(InputError, match="encoding: polygon"):
-        read(native)
+    other = write_parquet(tmp_path / "other.parquet", [square(5, 5)], {}, encoding="WKT")
+    with pytest.raises(InputError, match="has geometries as WKT; write them as WKB"):
+        read(other)
+    wrong = write_parquet(tmp_path / "wrong.parquet", [square(5, 5)], {}, encoding="polygon")
+    with pytest.raises(InputError, match="binary is no polygon of GeoArrow"):
+        read(wrong)
     cut = tmp_path / "cut.parquet"
     cut.write_bytes(unknown.read_bytes()[:-20])
     with pytest.raises(InputError, match="cut.parquet: cannot be read as GeoParquet".replace(".", r"\.")):
@@ -168,11 +171,17 @@ def test_only_polygons(tmp_path: Path) -> None:
     shapes = [multi, shapely.Point(X + 1, Y + 2), shapely.LineString([(X, Y), (X + 4, Y + 2)]), None]
     shapes += [shapely.force_3d(square(40, 40), 7.0), shapely.GeometryCollection([square(50, 50)])]
     footprints, notes = read(write(tmp_path / "a.gpkg", shapes, {"id": list("abcdef")}))
-    assert footprints.ids.tolist() == ["a", "e"]
-    assert same_shapes(footprints.polygons, [multi, square(40, 40)])
+    assert footprints.ids.tolist() == ["a", "e", "f"]
+    assert same_shapes(footprints.polygons, [multi, square(40, 40), square(50, 50)])
     assert not shapely.has_z(footprints.polygons).any()
-    assert count_notes(notes) == {"footprint-not-polygon": 3}
-    assert (notes[0].x, notes[0].y, notes[0].detail) == (X + 1, Y + 2, "is a point")
+    assert count_notes(notes) == {
+        "footprint-not-polygon": 2,
+        "footprint-outline-of-surface": 1,
+        "footprints-without-geometry": 1,
+    }
+    assert (notes[0].subject, notes[0].x, notes[0].y) == ("b", X + 1, Y + 2)
+    assert notes[0].detail == "feature 2: is a point"
+    assert notes[1].detail == "feature 3: is an open line: its ends are 4.47 m apart"
 
 
 def test_broken_geometries_are_kept_or_told(tmp_path: Path) -> None:
@@ -242,13 +251,13 @@ def test_repeated_ids_are_told_apart(tmp_path: Path) -> None:
 
 def test_heights_must_be_positive_numbers(tmp_path: Path) -> None:
     shapes = [square(15 * i, 5) for i in range(6)]
-    heights = np.array(["7.5", "8 m", None, "-1", "0", "inf"], object)
+    heights = np.array(["7.5", "8 storeys", None, "-1", "0", "inf"], object)
     path = write(tmp_path / "a.gpkg", shapes, {"id": list("abcdef"), "h": heights})
     footprints, notes = read(path, height_attribute="h")
     np.testing.assert_array_equal(footprints.given_height, [7.5, *[np.nan] * 5])
     assert count_notes(notes) == {"footprint-height-missing": 5}
     assert notes[0].subject == "b"
-    assert "8 m" in notes[0].detail
+    assert "8 storeys" in notes[0].detail
     assert np.isnan(read(path)[0].given_height).all()
 
 

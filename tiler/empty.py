@@ -8,7 +8,8 @@ import pyproj
 from pipeline.errors import CityError, InputError
 from pipeline.notes import Note, count_notes
 from tiler.config import Config
-from tiler.layers import Box, Layer, describe_layer
+from tiler.features import Box
+from tiler.layers import Layer, describe_layer
 from tiler.note_words import is_drop, say_notes
 from tiler.places import place
 from tiler.plain_text import printable, tell_box

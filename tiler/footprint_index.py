@@ -1,5 +1,6 @@
 """Footprints read once, in rows sorted by place, and those of a box found again (step 1.2)."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 from pipeline.citymodel import Footprints
 from pipeline.notes import Note
 from tiler.cells import order_by_cell, row_ranges
-from tiler.footprint_source import FootprintSource, make_footprints, open_source
+from tiler.features import Box, Features
+from tiler.footprint_source import FootprintSource, count_notes_of, make_footprints, open_source
 from tiler.georeference.frame import Frame
-from tiler.layers import BATCH, Box, Features, scan_layer
+from tiler.layers import BATCH, scan_layer
 from tiler.places import as_place
 from tiler.repeated_ids import find_repeated_ids
 
@@ -123,18 +125,20 @@ def scan_footprints(
         frame=frame,
     )
     repeated = find_repeated_ids(source.layer, source.id_name, batch=batch)
-    columns = [name for name in (source.id_name, source.height_name) if name]
-    n_found, notes, warned = 0, list(source.notes), set[str]()
-    for features in scan_layer(source.layer, columns, source.box, batch=batch):
-        footprints, found = make_footprints(source, features, repeated)
+    n_found, notes, warned = 0, [*source.layer.notes, *source.notes], set[str]()
+    counts: Counter[str] = Counter()
+    for features in scan_layer(source.layer, source.columns, source.box, batch=batch):
+        footprints, found = make_footprints(source, features, repeated, counts)
         notes += [*_warnings(source, features, warned), *found]
         n_found += len(footprints.ids)
         if len(footprints.ids) or notes:
             yield _block(footprints, notes)
         notes = []
+    notes += count_notes_of(source, counts)
     if n_found == 0:
-        nothing = Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0))
-        yield _block(nothing, [*notes, *_outside(source)])
+        notes += _outside(source)
+    if n_found == 0 or notes:
+        yield _block(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), notes)
 
 
 def select_footprints(cell_box: NDArray[np.float64], start: NDArray[np.int64], box: Box) -> list[tuple[int, int]]:

@@ -1,5 +1,6 @@
 """A look at the footprints before a run: how many there are, where, and how finely they are drawn."""
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +68,7 @@ def sample_footprints(
     frame : Frame, optional
         How coordinates of the footprints become those of the region; by default as the CRSs have it.
     limit : int
-        Reading stops after this many features.
+        Reading stops after this many footprints.
 
     Returns
     -------
@@ -96,14 +97,13 @@ def sample_footprints(
         frame=frame,
         height_attribute=config.height_attribute,
     )
-    columns = [name for name in (source.id_name, source.height_name) if name]
     parts, n_read, complete = [np.empty(0, np.object_)], 0, True
-    for features in scan_layer(source.layer, columns, source.box, batch=min(BATCH, limit)):
+    for features in scan_layer(source.layer, source.columns, source.box, batch=min(BATCH, limit)):
         if n_read >= limit:
             complete = False
             break
-        n_read += len(features.wkb)
-        parts.append(make_footprints(source, features, frozenset())[0].polygons)
+        parts.append(make_footprints(source, features, frozenset(), Counter())[0].polygons)
+        n_read += len(parts[-1])
     polygons = np.concatenate(parts)
     total = len(polygons) if complete else max(len(polygons), _number_within(source, region, crs))
     detail, octaves = measure_detail(polygons, clearance=config.clearance, mesh_size=config.mesh_size)

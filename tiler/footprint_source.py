@@ -1,10 +1,10 @@
 """A footprint file opened: which attributes, which CRS, and features made footprints (step 1.2)."""
 
+from collections import Counter
 from collections.abc import Set
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyproj
@@ -12,27 +12,27 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.citymodel import Footprints, make_ids
-from pipeline.errors import ConfigError, InputError
+from pipeline.errors import InputError
 from pipeline.notes import Note
 from tiler.crs import crs_name, horizontal_crs
+from tiler.features import Box, Features
+from tiler.footprint_attributes import (
+    explain_repeated,
+    find_attribute,
+    find_id_attribute,
+    height_columns,
+    id_columns,
+    read_heights,
+    read_ids,
+)
 from tiler.georeference.footprints import footprint_frame
 from tiler.georeference.frame import Frame, box_to_file, to_region
 from tiler.lasheader import COORDINATE_LIMIT
-from tiler.layers import Box, Features, Layer, describe_layer, list_some
-from tiler.plain_text import ID_LENGTH, printable, shorten
-from tiler.wkb import parse_wkb
+from tiler.layers import Layer, describe_layer
+from tiler.osm_tags import STOREY, find_osm_tags, is_building
+from tiler.plan_outlines import Finding, outline_all
 
-# Attributes that hold a building's own id, first found first taken, in any case: Dutch BAG (and its
-# ten letters in SHP), INSPIRE and GML, OpenStreetMap, then names in general use.
-ID_ATTRIBUTES = (
-    *("identificatie", "identifica", "gml_id", "inspireid", "localid", "uuid", "osm_id", "@id"),
-    *("building_id", "buildingid", "bldg_id", "id", "gid", "fid", "objectid"),
-)
-
-# Vertices of one footprint: the largest of a national register have some thousands. Up to this many take less than
-# a minute however they lie, beyond it the time of geometric predicates grows with the square.
-MAX_VERTICES = 100_000
-_POLYGONAL = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)
+_NOWHERE = (float("nan"),) * 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +62,12 @@ class FootprintSource:
     bounds: Box
     box: Box
     notes: tuple[Note, ...]
+
+    @property
+    def columns(self) -> list[str]:
+        """Attributes that `make_footprints` needs."""
+        ids = id_columns(self.layer, self.id_name)
+        return list(dict.fromkeys([*ids, *height_columns(self.layer, self.height_name)]))
 
 
 def open_source(
@@ -93,7 +99,7 @@ def open_source(
         If the layer or an attribute does not exist.
     """
     info = describe_layer(path, layer)
-    id_name, height_name = _id_attribute(info, id_attribute), _attribute(info, height_attribute)
+    id_name, height_name = find_id_attribute(info, id_attribute), find_attribute(info, height_attribute)
     own = horizontal_crs(info.crs)
     _check_extent(info, own or crs)
     if frame is None:
@@ -105,7 +111,7 @@ def open_source(
 
 
 def make_footprints(
-    source: FootprintSource, features: Features, repeated: Set[str]
+    source: FootprintSource, features: Features, repeated: Set[str], counts: Counter[str]
 ) -> tuple[Footprints, list[Note]]:
     """Make footprints of features.
 
@@ -114,9 +120,11 @@ def make_footprints(
     source : FootprintSource
         Where they come from.
     features : Features
-        Any of its features, with the attributes of its id and height.
+        Any of its features, with the attributes that `FootprintSource.columns` names.
     repeated : set of str
         Ids that several different geometries of the file carry: they are completed by the geometry.
+    counts : Counter of str
+        Numbers of features, by the kind of the note that a file gets for all of them: see `count_notes_of`.
 
     Returns
     -------
@@ -125,33 +133,46 @@ def make_footprints(
     list of Note
         As `read_footprints` gives them.
     """
-    geometry, rows, notes = parse_polygons(features.wkb)
+    tags = find_osm_tags(source.layer.fields)
+    wanted = np.ones(len(features.wkb), np.bool_) if tags is None else is_building(tags, features.columns)
+    outlines = outline_all(features.wkb, metre=source.layer.metre)
+    counts["footprints-without-geometry"] += sum(blob is None for blob in features.wkb) - len(features.broken)
+    names = read_ids(source.layer, source.id_name, features) if source.id_name else [""] * len(features.wkb)
+    notes = _unreadable(features, names)
+    geometry, rows = outlines.geometry, outlines.rows
     if source.frame.changes_plan:
         geometry = shapely.transform(geometry, partial(to_region, source.frame))
-    keep, found = _finite_within(geometry, source.bounds)
-    notes += found
+    keep, wrong = _finite_within(geometry, source.bounds)
+    counts["footprints-not-buildings"] += int((keep & ~wanted[rows]).sum())
+    keep &= wanted[rows]
+    found = [finding for finding in outlines.findings if wanted[finding.row] and _is_near(finding, source.box)]
+    notes += _tell(found, source, features, names)
+    notes += _tell(
+        [finding for finding in _not_finite(rows[wrong]) if wanted[finding.row]], source, features, names
+    )
     geometry, rows = geometry[keep], rows[keep]
-    ids, found = _ids(geometry, features.columns[source.id_name][rows] if source.id_name else None, repeated)
-    notes += found
-    given = features.columns[source.height_name][rows] if source.height_name else None
-    heights, found = _heights(geometry, ids, given)
-    return Footprints(geometry, ids, heights), notes + found
+    ids, told = _ids(source, geometry, np.array([names[row] for row in rows], np.str_), repeated)
+    notes += told
+    height, by_levels, bad = read_heights(source.layer, source.height_name, features)
+    counts["footprint-heights-by-levels"] += int(by_levels[rows].sum())
+    none = np.array([bool(bad[row]) for row in rows], np.bool_)
+    notes += _notes("footprint-height-missing", geometry[none], [bad[row] for row in rows[none]], ids[none])
+    return Footprints(geometry, ids, height[rows]), notes
 
 
-def _attribute(info: Layer, asked: str) -> str:
-    """Check that an attribute exists; a GeoJSON file without features has none, and needs none."""
-    if asked and asked not in info.fields:
-        if info.n_features == 0:
-            return ""
-        raise ConfigError(f"{info.path}: has no attribute {asked!r}; it has: {list_some(info.fields)}")
-    return asked
-
-
-def _id_attribute(info: Layer, asked: str) -> str:
-    if asked:
-        return _attribute(info, asked)
-    lower = {field.lower(): field for field in info.fields}
-    return next((lower[name] for name in ID_ATTRIBUTES if name in lower), "")
+def count_notes_of(source: FootprintSource, counts: Counter[str]) -> list[Note]:
+    """Make one note a file of each kind that `make_footprints` counts."""
+    details = {
+        "footprints-without-geometry": "{} features have no geometry",
+        "footprints-not-buildings": "{} polygons without building=* or building:part=* are left out",
+        "footprint-heights-by-levels": f"{{}} heights are building:levels x {STOREY:g} m",
+    }
+    name = source.layer.path.name
+    return [
+        Note(kind, name, detail=detail.format(counts[kind]))
+        for kind, detail in details.items()
+        if counts[kind] > 0
+    ]
 
 
 def _crs_notes(info: Layer, own: pyproj.CRS | None, crs: pyproj.CRS, frame: Frame) -> list[Note]:
@@ -175,125 +196,62 @@ def _check_extent(info: Layer, crs: pyproj.CRS) -> None:
         )
 
 
-def parse_polygons(wkb: NDArray[np.object_]) -> tuple[NDArray[np.object_], NDArray[np.int64], list[Note]]:
-    """Parse geometries, and give the polygonal ones with their rows.
-
-    Parameters
-    ----------
-    wkb : object, (n,)
-        Well-known binary, None where there is none.
-
-    Returns
-    -------
-    geometry : object, (m,)
-        Polygons and multipolygons without Z, valid or not.
-    rows : int64, (m,)
-        Their rows.
-    notes : list of Note
-        What cannot be parsed, and what is something else.
-    """
-    with np.errstate(invalid="ignore"):  # GEOS compares NaN coordinates
-        geometry = shapely.force_2d(parse_wkb(wkb))
-    stored = np.array([blob is not None for blob in wkb], bool)
-    kinds = shapely.get_type_id(geometry)
-    polygonal = np.isin(kinds, _POLYGONAL) & ~shapely.is_empty(geometry)
-    other = ~np.isin(kinds, _POLYGONAL) & (kinds >= 0)
-    notes = _notes("footprint-unreadable", geometry[stored & (kinds < 0)], "the geometry cannot be parsed")
-    for kind in np.unique(kinds[other]):
-        notes += _notes("footprint-not-polygon", geometry[kinds == kind], f"is a {_kind_name(kind)}")
-    size = shapely.get_num_coordinates(geometry)
-    large = polygonal & (size > MAX_VERTICES)
-    details = [f"{n} vertices > {MAX_VERTICES}; left out" for n in size[large]]
-    notes += _notes("footprint-too-many-vertices", geometry[large], details)
-    rows = np.flatnonzero(polygonal & ~large)
-    return geometry[rows], rows, notes
-
-
-def _kind_name(kind: int) -> str:
-    try:
-        return str(shapely.GeometryType(kind).name.lower())
-    except ValueError:  # curves, which GEOS knows and shapely has no name for
-        return f"geometry of type {kind}"
-
-
-def _finite_within(geometry: NDArray[np.object_], bounds: Box) -> tuple[NDArray[np.bool_], list[Note]]:
+def _finite_within(geometry: NDArray[np.object_], bounds: Box) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Tell the geometries that meet a box, and list those that are not finite."""
     coordinates, owner = shapely.get_coordinates(geometry, return_index=True)
     finite = np.ones(len(geometry), bool)
     finite[owner[~(np.abs(coordinates) <= COORDINATE_LIMIT).all(axis=1)]] = False  # NaN too
-    detail = f"a coordinate is NaN, infinite, or beyond ±{COORDINATE_LIMIT:g} m"
-    notes = _notes("footprint-not-finite", geometry[~finite], detail)
     keep = finite.copy()
     keep[finite] = shapely.intersects(geometry[finite], shapely.box(*bounds))
-    return keep, notes
+    return keep, np.flatnonzero(~finite)
+
+
+def _not_finite(rows: NDArray[np.int64]) -> list[Finding]:
+    detail = f"a coordinate is NaN, infinite, or beyond ±{COORDINATE_LIMIT:g} m"
+    return [Finding("footprint-not-finite", row, detail, _NOWHERE) for row in rows.tolist()]
+
+
+def _is_near(finding: Finding, box: Box) -> bool:
+    """Whether something was found at a box, or where there is no place."""
+    xmin, ymin, xmax, ymax = finding.box
+    return not (xmin > box[2] or xmax < box[0] or ymin > box[3] or ymax < box[1])
+
+
+def _tell(findings: list[Finding], source: FootprintSource, features: Features, names: list[str]) -> list[Note]:
+    """Make notes of findings, at the middle of the bounding box in the region's CRS."""
+    notes = []
+    for finding in findings:
+        x, y = (finding.box[0] + finding.box[2]) / 2, (finding.box[1] + finding.box[3]) / 2
+        if source.frame.changes_plan and np.isfinite((x, y)).all():
+            x, y = to_region(source.frame, np.array([(x, y)]))[0].tolist()
+        detail = f"feature {features.fids[finding.row]}: {finding.detail}"
+        notes.append(Note(finding.kind, names[finding.row], float(x), float(y), detail))
+    return notes
+
+
+def _unreadable(features: Features, names: list[str]) -> list[Note]:
+    return [
+        Note("footprint-unreadable", names[row], detail=f"feature {features.fids[row]}: {reason}")
+        for row, reason in sorted(features.broken.items())
+    ]
 
 
 def _ids(
-    geometry: NDArray[np.object_], values: NDArray[Any] | None, repeated: Set[str]
+    source: FootprintSource, geometry: NDArray[np.object_], given: NDArray[np.str_], repeated: Set[str]
 ) -> tuple[NDArray[np.str_], list[Note]]:
     """Give each footprint its id, see `read_footprints`."""
-    given = (
-        np.full(len(geometry), "") if values is None else np.array([id_text(value) for value in values], np.str_)
-    )
     missing = given == ""
     again = np.fromiter((name in repeated for name in given.tolist()), bool, len(given)) & ~missing
     made = np.full(len(given), "", dtype="<U14")
     made[missing | again] = make_ids(geometry[missing | again])
     ids = np.where(missing, made, given)
     ids = np.where(again, np.char.add(np.char.add(given, "-"), made), ids)
-    if values is None:
+    if not source.id_name:
         return ids, []
     notes = _notes("footprint-id-missing", geometry[missing], "named by its geometry", made[missing])
-    notes += _notes("footprint-id-repeated", geometry[again], "completed by its geometry", ids[again])
+    reasons = [explain_repeated(source.layer, source.id_name, name) for name in given[again].tolist()]
+    notes += _notes("footprint-id-repeated", geometry[again], reasons, ids[again])
     return ids, notes
-
-
-def id_text(value: Any) -> str:
-    """Write an id as text, whole floats as integers (a column with nulls may be read as float).
-
-    Parameters
-    ----------
-    value : Any
-        As the file has it.
-
-    Returns
-    -------
-    str
-        ``""`` where there is none. Control characters are escaped, and what is longer than `ID_LENGTH` ends in a
-        hash: an id becomes a key of files and part of messages.
-
-    Examples
-    --------
-    >>> id_text(12.0), id_text(" a1 "), id_text(None), id_text(float("nan"))
-    ('12', 'a1', '', '')
-    """
-    return shorten(printable(_plain_id(value)), ID_LENGTH)
-
-
-def _plain_id(value: Any) -> str:
-    if isinstance(value, str):
-        return value.strip()
-    if isinstance(value, float | np.floating):
-        return f"{value:.17g}" if np.isfinite(value) else ""
-    return "" if value is None else str(value).strip()
-
-
-def _heights(
-    geometry: NDArray[np.object_], ids: NDArray[np.str_], values: NDArray[Any] | None
-) -> tuple[NDArray[np.float64], list[Note]]:
-    if values is None:
-        return np.full(len(geometry), np.nan), []
-    heights = np.array([_number(value) for value in values], dtype=np.float64)
-    bad = ~(heights > 0) | ~np.isfinite(heights)
-    heights[bad] = np.nan
-    details = [f"{shorten(repr(value), ID_LENGTH)} is no height above 0 m" for value in values[bad]]
-    return heights, _notes("footprint-height-missing", geometry[bad], details, ids[bad])
-
-
-def _number(value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return float("nan")
 
 
 def _notes(

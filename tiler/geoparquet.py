@@ -1,6 +1,5 @@
 """GeoParquet by pyarrow, as most builds of GDAL have no driver for it (step 1.2)."""
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,10 +11,10 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from tiler.features import Box, Features, to_objects
+from tiler.parquet_geometry import GeometryColumn, find_geometry, read_geometry
 from tiler.places import source_of
 from tiler.wkb import parse_wkb
-
-Box = tuple[float, float, float, float]
 
 BATCH_BYTES = 2**30  # of the values of one column in a batch; 50,000 footprints take some 10 MB
 _SUFFIXES = {".parquet", ".geoparquet", ".pq"}
@@ -37,8 +36,8 @@ def is_parquet(path: Path) -> bool:
     return path.suffix.lower() in _SUFFIXES
 
 
-def describe(path: Path) -> tuple[pyproj.CRS | None, tuple[str, ...], int, Box | None]:
-    """Read the metadata of a GeoParquet file.
+def describe(path: Path) -> tuple[GeometryColumn, tuple[str, ...], int, Box | None]:
+    """Read the metadata of a Parquet file with geometries.
 
     Parameters
     ----------
@@ -47,8 +46,8 @@ def describe(path: Path) -> tuple[pyproj.CRS | None, tuple[str, ...], int, Box |
 
     Returns
     -------
-    pyproj.CRS or None
-        None where the file says that the CRS is unknown; longitude and latitude where it says nothing.
+    GeometryColumn
+        The column with the geometries, and its CRS.
     tuple of str
         Names of the attributes.
     int
@@ -59,29 +58,21 @@ def describe(path: Path) -> tuple[pyproj.CRS | None, tuple[str, ...], int, Box |
     Raises
     ------
     InputError
-        If the file is damaged, is not GeoParquet with geometries as WKB, or if pyarrow is not installed.
-
-    References
-    ----------
-    GeoParquet 1.1, section "Column metadata".
+        If the file is damaged, has no geometries that are known, or if pyarrow is not installed.
     """
     with _arrow_as_input_error(path):
-        table = _open(path)
-        name, column = _geometry(path, table)
-        crs = column.get("crs", "OGC:CRS84")
-        bbox = column.get("bbox")
+        table, column = _open(path)
+        bbox = column.bbox
         return (
-            None if crs is None else pyproj.CRS.from_user_input(crs),
-            tuple(field for field in table.schema_arrow.names if field != name),
+            column,
+            tuple(field for field in table.schema_arrow.names if field != column.name),
             table.metadata.num_rows,
             None if bbox is None else (bbox[0], bbox[1], bbox[len(bbox) // 2], bbox[len(bbox) // 2 + 1]),
         )
 
 
-def scan(
-    path: Path, columns: Sequence[str], box: Box | None, *, geometry: bool, batch: int
-) -> Iterator[tuple[NDArray[np.object_], dict[str, NDArray[Any]]]]:
-    """Read the features whose bounding boxes meet a box, by batches.
+def scan(path: Path, columns: Sequence[str], box: Box | None, *, geometry: bool, batch: int) -> Iterator[Features]:
+    """Read the features whose bounding boxes meet a box, by batches; those without a known one too.
 
     Parameters
     ----------
@@ -98,10 +89,8 @@ def scan(
 
     Yields
     ------
-    object, (n,)
-        Geometries as well-known binary (bytes).
-    dict of str to (n,) arrays
-        Values of the attributes.
+    Features
+        Numbered by their rows in the file, from 0.
 
     Raises
     ------
@@ -118,52 +107,47 @@ def scan(
     if box is not None and not geometry:
         raise ValueError("a box needs the geometries")
     with _arrow_as_input_error(path):
-        table = _open(path, [*columns])
-        name, column = _geometry(path, table)
+        table, column = _open(path, columns)
         groups = [group for group in range(table.num_row_groups) if _near(table, group, column, box)]
-        parts = table.iter_batches(
-            batch, row_groups=groups, columns=[name, *columns] if geometry else list(columns)
-        )
+        read = [column.name, *columns] if geometry else list(columns)
+        parts = table.iter_batches(batch, row_groups=groups, columns=list(dict.fromkeys(read)))
+        rows = _rows_of(table, groups)
     while True:
         with _arrow_as_input_error(path):
             part = next(parts, None)
             if part is None:
                 return
             _check_expanded(path, part)
-            blobs = to_objects(part.column(name).to_pylist() if geometry else [None] * part.num_rows)
+            fids, rows = rows[: part.num_rows], rows[part.num_rows :]
+            stored = (
+                read_geometry(part.column(column.name), column.encoding) if geometry else [None] * part.num_rows
+            )
+            blobs = to_objects(stored)
             if box is not None:
-                hits = np.flatnonzero(_meets(blobs, box))
-                blobs, part = blobs[hits], part.take(hits)
+                hits = np.flatnonzero(_may_meet(blobs, box))
+                blobs, fids, part = blobs[hits], fids[hits], part.take(hits)
             values = {field: to_objects(part.column(field).to_pylist()) for field in columns}
-        yield blobs, values
+        yield Features(blobs, values, (), fids, {})
 
 
-def to_objects(items: list[Any]) -> NDArray[np.object_]:
-    """Put values into an array of objects, each as it is.
-
-    Parameters
-    ----------
-    items : list
-        Anything, lists and None included.
-
-    Returns
-    -------
-    object, (n,)
-    """
-    array = np.empty(len(items), dtype=np.object_)
-    array[:] = items
-    return array
+def _rows_of(table: Any, groups: list[int]) -> NDArray[np.int64]:
+    """List the rows of row groups."""
+    sizes = np.array([table.metadata.row_group(group).num_rows for group in range(table.num_row_groups)], np.int64)
+    first = np.cumsum(sizes) - sizes
+    return np.concatenate([np.empty(0, np.int64), *(first[group] + np.arange(sizes[group]) for group in groups)])
 
 
-def _meets(wkb: NDArray[np.object_], box: Box) -> NDArray[np.bool_]:
-    xmin, ymin, xmax, ymax = shapely.bounds(parse_wkb(wkb)).T
-    meets: NDArray[np.bool_] = (xmin <= box[2]) & (xmax >= box[0]) & (ymin <= box[3]) & (ymax >= box[1])
-    return meets
+def _may_meet(wkb: NDArray[np.object_], box: Box) -> NDArray[np.bool_]:
+    """Whether the bounding boxes of geometries meet a box; True too where one is unknown, or not finite."""
+    xmin, ymin, xmax, ymax = shapely.bounds(parse_wkb(wkb)).reshape(-1, 4).T
+    away: NDArray[np.bool_] = (xmin > box[2]) | (xmax < box[0]) | (ymin > box[3]) | (ymax < box[1])
+    stored = np.array([blob is not None for blob in wkb], np.bool_)
+    return stored & ~away
 
 
-def _near(table: Any, group: int, column: dict[str, Any], box: Box | None) -> bool:
+def _near(table: Any, group: int, column: GeometryColumn, box: Box | None) -> bool:
     """Whether a row group may hold features that meet a box, by the statistics of its bounding box column."""
-    covering = column.get("covering", {}).get("bbox")
+    covering = column.covering
     if box is None or covering is None:
         return True
     rows = table.metadata.row_group(group)
@@ -195,7 +179,7 @@ def _check_expanded(path: Path, part: Any) -> None:
                 )
 
 
-def _open(path: Path, columns: Sequence[str] = ()) -> Any:
+def _open(path: Path, columns: Sequence[str] = ()) -> tuple[Any, GeometryColumn]:
     try:
         import pyarrow.parquet
     except ImportError as error:
@@ -206,21 +190,9 @@ def _open(path: Path, columns: Sequence[str] = ()) -> Any:
     size, n_rows = path.stat().st_size, table.metadata.num_rows
     if n_rows > size:
         raise InputError(f"{path}: claims {n_rows} features in {size} bytes; copy the file again")
-    geometry = _geometry(path, table)[0]
-    return pyarrow.parquet.ParquetFile(source_of(path), read_dictionary=[geometry, *columns])
-
-
-def _geometry(path: Path, table: Any) -> tuple[str, dict[str, Any]]:
-    """Give the name and the metadata of the geometry column."""
-    geo = json.loads((table.schema_arrow.metadata or {}).get(b"geo", b"{}"))
-    name = geo.get("primary_column", "")
-    column = geo.get("columns", {}).get(name)
-    if column is None or column.get("encoding") != "WKB":
-        raise InputError(
-            f"{path}: is no GeoParquet file with geometries as WKB (encoding: "
-            f"{None if column is None else column.get('encoding')}); convert it to GPKG"
-        )
-    return name, column
+    column = find_geometry(path, table)
+    kept = [*columns, *([column.name] if column.encoding == "WKB" else [])]
+    return pyarrow.parquet.ParquetFile(source_of(path), read_dictionary=kept), column
 
 
 @contextmanager

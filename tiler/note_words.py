@@ -58,7 +58,8 @@ WORDS: dict[str, Words] = {
         DROPPED, "{n} footprint[s] with a coordinate that is no number [was|were] dropped"
     ),
     "footprint-not-polygon": Words(
-        DROPPED, "{n} feature[s] of the footprints [is a point or line|are points or lines]"
+        DROPPED,
+        "{n} feature[s] of the footprints [is a point, an open line or a wall|are points, open lines or walls]",
     ),
     "footprint-on-border-dropped": Words(
         DROPPED,
@@ -164,6 +165,21 @@ WORDS: dict[str, Words] = {
     "footprint-roof-from-other-classes": Words(
         DEFAULTED, "{n} footprint[s] without points of the building class took smooth points of other classes"
     ),
+    "footprint-curve-linearised": Words(
+        REPAIRED, "{n} footprint[s] with arcs [was|were] made of segments within 0.01 m"
+    ),
+    "footprint-from-line": Words(
+        REPAIRED, "{n} footprint[s] [is the outline of a closed line|are outlines of closed lines]"
+    ),
+    "footprint-outline-of-surface": Words(
+        REPAIRED, "{n} footprint[s] [is|are] the plan outline of faces in space"
+    ),
+    "footprint-heights-by-levels": Words(DEFAULTED, "heights were taken from numbers of levels, 3 m each"),
+    "footprints-without-metadata": Words(DEFAULTED, "the Parquet file has no metadata of geometries"),
+    "footprints-layer-chosen": Words(OTHER, "the layer of polygons was taken of data of OpenStreetMap"),
+    "footprints-not-buildings": Words(OTHER, "polygons of OpenStreetMap that are no buildings were left out"),
+    "footprints-of-osm": Words(OTHER, "tags of OpenStreetMap say which polygons are buildings, and how high"),
+    "footprints-without-geometry": Words(OTHER, "the footprints have features without a geometry"),
     "footprint-roof-like-plants": Words(
         OTHER, "{n} footprint[s] [has|have] no roof points but points of plants as smooth as a roof, not used"
     ),

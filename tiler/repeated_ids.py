@@ -5,8 +5,9 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.citymodel import make_ids
-from tiler.footprint_source import id_text, parse_polygons
-from tiler.layers import BATCH, Features, Layer, scan_layer
+from tiler.footprint_attributes import id_columns, read_ids
+from tiler.layers import BATCH, Layer, scan_layer
+from tiler.plan_outlines import outline_all
 
 
 def find_repeated_ids(layer: Layer, id_name: str, *, batch: int = BATCH) -> set[str]:
@@ -39,8 +40,10 @@ def find_repeated_ids(layer: Layer, id_name: str, *, batch: int = BATCH) -> set[
     """
     if not id_name:
         return set()
+    columns = id_columns(layer, id_name)
     parts = [
-        _hashes(features, id_name) for features in scan_layer(layer, [id_name], None, geometry=False, batch=batch)
+        _hashes(read_ids(layer, id_name, features))
+        for features in scan_layer(layer, columns, None, geometry=False, batch=batch)
     ]
     hashes = np.sort(np.concatenate([np.empty(0, np.int64), *parts]))
     twice = np.unique(hashes[1:][np.diff(hashes) == 0])
@@ -48,21 +51,21 @@ def find_repeated_ids(layer: Layer, id_name: str, *, batch: int = BATCH) -> set[
     return _different(layer, id_name, twice, batch) if len(twice) else set()
 
 
-def _hashes(features: Features, id_name: str) -> NDArray[np.int64]:
+def _hashes(names: list[str]) -> NDArray[np.int64]:
     """Hash the ids; the hashes differ from run to run, so only their being equal may be used."""
-    values = features.columns[id_name]
-    return np.fromiter((hash(id_text(value)) for value in values), np.int64, len(values))
+    return np.fromiter(map(hash, names), np.int64, len(names))
 
 
 def _different(layer: Layer, id_name: str, twice: NDArray[np.int64], batch: int) -> set[str]:
     shapes: dict[str, str] = {}
     repeated = set()
-    for features in scan_layer(layer, [id_name], None, batch=batch):
-        hits = np.flatnonzero(np.isin(_hashes(features, id_name), twice))
-        geometry, rows, _ = parse_polygons(features.wkb[hits])
-        finite = np.isfinite(shapely.bounds(geometry)).all(axis=1)
-        names = [id_text(value) for value in features.columns[id_name][hits[rows[finite]]]]
-        for name, shape in zip(names, make_ids(geometry[finite]), strict=True):
-            if shapes.setdefault(name, str(shape)) != shape:
-                repeated.add(name)
+    for features in scan_layer(layer, id_columns(layer, id_name), None, batch=batch):
+        names = read_ids(layer, id_name, features)
+        hits = np.flatnonzero(np.isin(_hashes(names), twice))
+        outlines = outline_all(features.wkb[hits], metre=layer.metre)
+        finite = np.isfinite(shapely.bounds(outlines.geometry)).all(axis=1)
+        rows = hits[outlines.rows[finite]].tolist()
+        for row, shape in zip(rows, make_ids(outlines.geometry[finite]), strict=True):
+            if shapes.setdefault(names[row], str(shape)) != shape:
+                repeated.add(names[row])
     return repeated

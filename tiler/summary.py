@@ -30,7 +30,7 @@ EXIT_DONE, EXIT_INCOMPLETE = 0, 3
 # Notes of these kinds say that something is missing which the input has: the exit code tells.
 INCOMPLETE = {
     *("crs-accuracy", "building-beyond-region", "building-lost", "building-points-without-footprints"),
-    "footprint-too-many-vertices",
+    *("footprint-too-many-vertices", "footprint-unreadable", "footprint-not-finite", "footprint-not-polygon"),
 }
 DAMAGED = "damaged-artefact"  # kind of the notes on what was damaged or missing, and made anew
 FAR_TERRAIN = "terrain-far-from-points"  # kind of the note on terrain that is interpolated over large gaps

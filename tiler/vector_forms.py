@@ -5,6 +5,7 @@ few lines makes it read other files, ask servers and databases, or run an algori
 and expand without end. So a file is looked at before GDAL is asked.
 """
 
+import re
 import stat
 from pathlib import Path
 
@@ -22,6 +23,10 @@ _BEGINNINGS = {
     b"{": "GeoJSON",
     b"\x1e": "GeoJSON sequence",
 }
+# The first block of an OSM extract in protocol buffers, behind its length; and the first element of one in XML,
+# with nothing but the declaration and comments before: no entities, which may expand without end.
+_OSM_BLOCK, _OSM_BLOCK_PLACE = b"\x0a\x09OSMHeader", 4
+_OSM_XML = re.compile(rb"(<\?xml[^>]*\?>)?\s*(<!--(?:[^-]|-(?!->))*-->\s*)*<osm[\s>]")
 
 
 def check_form(path: Path) -> None:
@@ -30,8 +35,8 @@ def check_form(path: Path) -> None:
     Parameters
     ----------
     path : Path
-        Shapefile, GeoPackage, GeoJSON (also as a sequence, TopoJSON and Esri JSON) or FlatGeobuf, told by its
-        content; or a folder, such as an Esri geodatabase.
+        Shapefile, GeoPackage, GeoJSON (also as a sequence, TopoJSON and Esri JSON), FlatGeobuf or an extract of
+        OpenStreetMap, told by its content; or a folder, such as an Esri geodatabase.
 
     Raises
     ------
@@ -43,15 +48,30 @@ def check_form(path: Path) -> None:
     head = read_head(path)
     pointer = next((mark for mark in _POINTERS if mark in head.lower()), None)
     start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
-    if pointer is not None or not any(start.startswith(mark) for mark in _BEGINNINGS):
+    known = any(start.startswith(mark) for mark in _BEGINNINGS) or is_osm(head)
+    if pointer is not None or not known:
         what = (
             f"points to other data ({pointer.decode()})"
             if pointer
-            else "is none of SHP, GPKG, GeoJSON, FlatGeobuf"
+            else "is none of SHP, GPKG, GeoJSON, FlatGeobuf, OSM"
         )
         raise InputError(
             f'{path}: cannot be read: it {what}; convert it, if you trust it: ogr2ogr footprints.gpkg "{path}"'
         )
+
+
+def is_osm(head: bytes) -> bool:
+    """Whether a file that begins so is an extract of OpenStreetMap, in XML or protocol buffers.
+
+    Examples
+    --------
+    >>> is_osm(b"<?xml version='1.0'?>\\n<osm version='0.6'>"), is_osm(b"<!DOCTYPE osm []><osm>")
+    (True, False)
+    """
+    return (
+        head.startswith(_OSM_BLOCK, _OSM_BLOCK_PLACE)
+        or _OSM_XML.match(head.removeprefix(b"\xef\xbb\xbf")) is not None
+    )
 
 
 def read_head(path: Path) -> bytes:

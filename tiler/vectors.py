@@ -7,9 +7,10 @@ import pyproj
 from pipeline.citymodel import Footprints
 from pipeline.notes import Note
 from tiler.crs import horizontal_crs
+from tiler.features import Box
 from tiler.footprint_index import join_footprints, scan_footprints
 from tiler.georeference.frame import Frame
-from tiler.layers import Box, describe_layer
+from tiler.layers import describe_layer
 from tiler.places import as_place
 
 
@@ -19,7 +20,7 @@ def read_footprint_crs(path: str | Path, layer: str = "") -> pyproj.CRS | None:
     Parameters
     ----------
     path : str or Path
-        SHP, GPKG, GeoJSON or GeoParquet.
+        SHP, GPKG, GeoJSON, FlatGeobuf, OSM or GeoParquet.
     layer : str
         Name of the layer, ``""`` for the only one.
 
@@ -54,7 +55,7 @@ def read_footprints(
     Parameters
     ----------
     path : str or Path
-        SHP, GPKG, GeoJSON or GeoParquet.
+        SHP, GPKG, GeoJSON, FlatGeobuf, OSM or GeoParquet.
     crs : pyproj.CRS
         The region's CRS, to which footprints in another are reprojected.
     bounds : tuple of 4 floats
@@ -71,10 +72,10 @@ def read_footprints(
     Returns
     -------
     Footprints
-        By ascending id. Polygons and multipolygons as they came, valid or not, without Z.
+        By ascending id. Polygons and multipolygons, valid or not, without Z: see `outline_all`.
     tuple of Note
-        What was left out, assumed or renamed; a note each for ``footprint-not-polygon``,
-        ``footprint-unreadable``, ``footprint-not-finite``, ``footprint-id-missing``,
+        What was converted, left out, assumed or renamed; a note each for what `outline_all` tells,
+        ``footprint-not-finite``, ``footprint-id-missing``,
         ``footprint-id-repeated`` and ``footprint-height-missing``; and one a file for
         ``footprints-without-crs``, ``footprints-reprojected``, ``footprints-outside`` and
         ``footprints-reader-warning``.

@@ -61,7 +61,7 @@ def input_stages(config: Config) -> list[Stage]:
                 *("footprints", "footprints_identity", "footprints_frame", "align"),
                 *("layer", "id_attribute", "height_attribute"),
             ),
-            version=2,
+            version=3,
         ),
         # What a tile needs of the footprints: it does not run again when others change.
         Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),), ("footprints_shift",), version=3),
