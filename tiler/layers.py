@@ -190,11 +190,14 @@ def _holds(box: Box, extent: Box) -> bool:
 
 
 def _stored_crs(path: Path, text: str) -> pyproj.CRS | None:
-    """Parse the definition that a GeoPackage itself has of a CRS: GDAL names codes that PROJ's register may lack."""
+    """Parse the definition that a GeoPackage has of a CRS: GDAL names codes that PROJ's register may lack."""
     authority, _, code = text.partition(":")
     if path.suffix.lower() != ".gpkg" or not code.isdigit():
         return None
-    query = "select definition from gpkg_spatial_ref_sys where organization = ? collate nocase and organization_coordsys_id = ?"
+    query = (
+        "select definition from gpkg_spatial_ref_sys "
+        "where organization = ? collate nocase and organization_coordsys_id = ?"
+    )
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as table:
             (definition,) = table.execute(query, (authority, int(code))).fetchone()
