@@ -8,10 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.group_order import sort_values
-from pipeline.inside import are_inside, find_inside
-from pipeline.kernel import kernel
-from pipeline.pointcloud import (
+from pipeline.classes import (
     BRIDGE_DECK,
     BUILDING,
     GROUND,
@@ -30,8 +27,11 @@ from pipeline.pointcloud import (
     WIRE_CONDUCTOR,
     WIRE_CONNECTOR,
     WIRE_GUARD,
-    PointCloud,
 )
+from pipeline.group_order import sort_values
+from pipeline.inside import are_inside, find_inside
+from pipeline.kernel import kernel
+from pipeline.pointcloud import PointCloud
 
 # Where a cloud has no building class, a point of any class but these may lie on a roof. Class 20 is ignored ground
 # to LAS 1.4, but all that is not ground, buildings above all, to North Rhine-Westphalia.

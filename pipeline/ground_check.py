@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.pointcloud import GROUND, UNCLASSIFIED
+from pipeline.classes import GROUND, UNCLASSIFIED
 
 LEAST_POINTS = 20  # of each class in a cell that is looked at
 LEAST_SHARE = 0.2  # of the points of class 2 in a cell, that those of no class must be: they may be ground

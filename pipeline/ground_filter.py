@@ -12,7 +12,8 @@ import numpy as np
 import scipy  # what is asked of it is imported then
 from numpy.typing import NDArray
 
-from pipeline.pointcloud import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED, PointCloud
+from pipeline.classes import GROUND, HIGH_NOISE, LOW_NOISE, UNCLASSIFIED
+from pipeline.pointcloud import PointCloud
 
 CELL = 1.0  # m, side of a cell of the lowest surface; cells are aligned with the CRS
 WINDOWS = (2, 4, 8, 16, 32)  # m, half-widths of the openings: the last must exceed the widest roof's half

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.classes import HIGH_NOISE, LOW_NOISE
 from pipeline.inside import is_covered
 from pipeline.kernel import kernel
-from pipeline.pointcloud import HIGH_NOISE, LOW_NOISE
 
 KEPT, OUTSIDE, WITHHELD, NOISE, ABSURD = range(5)
 REASONS = ("kept", "outside", "withheld", "noise", "absurd")

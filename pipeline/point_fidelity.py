@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.classes import GROUND, WATER
 from pipeline.inside import (
     EVERYWHERE,
     INSIDE,
@@ -19,7 +20,7 @@ from pipeline.inside import (
     side_of,
 )
 from pipeline.kernel import kernel
-from pipeline.pointcloud import GROUND, WATER, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.raster import Dtm, measure_over
 from pipeline.residuals import Residuals, ResidualSums, conclude, merge_residuals, sum_residuals, summarise
 from pipeline.roof_points import RoofPoints, select_roof

@@ -1,4 +1,4 @@
-"""The point cloud as arrays, and the ASPRS classes that the steps use."""
+"""The point cloud as arrays."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -6,26 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# ASPRS LAS 1.4 R15, tables 9 and 17.
-UNCLASSIFIED = 1
-GROUND = 2
-LOW_VEGETATION = 3
-MEDIUM_VEGETATION = 4
-HIGH_VEGETATION = 5
-BUILDING = 6
-LOW_NOISE = 7
-KEY_POINT = 8  # of ground, up to LAS 1.3; 1.4 reserves the number
-WATER = 9
-RAIL = 10
-ROAD = 11
-WIRE_GUARD = 13
-WIRE_CONDUCTOR = 14
-TRANSMISSION_TOWER = 15
-WIRE_CONNECTOR = 16
-BRIDGE_DECK = 17
-HIGH_NOISE = 18
-OVERHEAD = 19  # conveyors, gantries of signs
-SEA = (40, 41, 42, 43, 44, 45)  # bottom, surface and what is between; ASPRS topo-bathy domain profile
+from pipeline.classes import BUILDING, UNCLASSIFIED
+
 N_CLASSES = 256  # that a point may have
 
 

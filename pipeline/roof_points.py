@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.building_points import NEVER_ROOF
+from pipeline.classes import BUILDING
 from pipeline.group_order import sort_values
 from pipeline.inside import find_inside
-from pipeline.pointcloud import BUILDING, PointCloud
+from pipeline.pointcloud import PointCloud
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,17 +7,9 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeline.classes import BUILDING, GROUND, HIGH_NOISE, HIGH_VEGETATION, LOW_NOISE, UNCLASSIFIED, WATER
 from pipeline.errors import GeometryError
-from pipeline.pointcloud import (
-    BUILDING,
-    GROUND,
-    HIGH_NOISE,
-    HIGH_VEGETATION,
-    LOW_NOISE,
-    UNCLASSIFIED,
-    WATER,
-    PointCloud,
-)
+from pipeline.pointcloud import PointCloud
 
 ORIGIN = (318_000.0, 6_399_000.0)  # lower left corner in EPSG:3006 (m): western Sweden, as in the paper
 

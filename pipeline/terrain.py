@@ -10,9 +10,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.classes import GROUND, WATER
 from pipeline.kernel import kernel
 from pipeline.las_points import Box, Triple, UnitPoints, is_within
-from pipeline.pointcloud import GROUND, WATER, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.raster import (
     HEIGHT_UNIT,
     Dtm,

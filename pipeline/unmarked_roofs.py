@@ -7,17 +7,9 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.building_points import NEVER_ROOF
+from pipeline.classes import BUILDING, GROUND, HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION, WATER
 from pipeline.inside import are_inside, find_inside
-from pipeline.pointcloud import (
-    BUILDING,
-    GROUND,
-    HIGH_VEGETATION,
-    LOW_VEGETATION,
-    MEDIUM_VEGETATION,
-    N_CLASSES,
-    WATER,
-    PointCloud,
-)
+from pipeline.pointcloud import N_CLASSES, PointCloud
 from pipeline.raster import Dtm, sample_dtm
 from pipeline.roof_points import RoofPoints, make_roof_points
 

@@ -6,8 +6,9 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.citymodel import CityModel, number_ids
+from pipeline.classes import BUILDING, GROUND
 from pipeline.heights import highest_wall_ground
-from pipeline.pointcloud import BUILDING, GROUND, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.terrain import Dtm
 
 Bounds = tuple[float, float, float, float]

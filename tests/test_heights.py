@@ -12,6 +12,7 @@ from pipeline.building_points import (
     reach_of_points,
     remove_outliers,
 )
+from pipeline.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from pipeline.heights import (
     ROOF_SOURCES,
     Heights,
@@ -20,7 +21,7 @@ from pipeline.heights import (
     percentile_by_group,
     raise_low_roofs,
 )
-from pipeline.pointcloud import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER, PointCloud
+from pipeline.pointcloud import PointCloud
 from tests.cities import cloud_over, tilted_dtm
 
 HOUSE = shapely.box(10, 10, 20, 20)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.building_facts import fidelity_table
+from pipeline.classes import BUILDING, GROUND, WATER
 from pipeline.histograms import (
     QUALITY_BINS,
     Histogram,
@@ -28,7 +29,7 @@ from pipeline.point_fidelity import (
     merge_fidelity,
     sum_fidelity,
 )
-from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.quality import PERCENTILES, Quality, measure_cells, quality_percentiles
 from pipeline.residuals import Residuals, conclude, merge_residuals, sum_residuals, summarise
 from tests.cities import city_of, random_blocks, tilted_dtm

@@ -13,9 +13,10 @@ from shapely import affinity
 
 from pipeline.building_points import extract_building_points
 from pipeline.citymodel import Footprints
+from pipeline.classes import BUILDING, GROUND
 from pipeline.house_levels import HouseParts, LevelOptions, split_levels
 from pipeline.houses import divide_houses
-from pipeline.pointcloud import BUILDING, GROUND, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.raster import Dtm
 from pipeline.rings import make_canonical
 from pipeline.roof_points import locate_roof_points, make_roof_points

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from pipeline.building_points import extract_building_points
 from pipeline.citymodel import Footprints
+from pipeline.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from pipeline.footprints import clean_footprints
 from pipeline.heights import percentile_by_group
 from pipeline.house_levels import LevelOptions, split_levels
 from pipeline.inside import find_inside
 from pipeline.point_fidelity import Residuals, measure_fidelity, measure_houses, summarise
-from pipeline.pointcloud import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.roof_points import locate_roof_points, make_roof_points
 from tests.cities import tilted_dtm
 from tiler.clouds import find_clouds, read_points

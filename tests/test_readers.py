@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import shapely
 
+from pipeline.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from pipeline.inside import are_covered, cover_polygons
-from pipeline.pointcloud import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from tests.tiles import make_town, run_of, write_town
 from tiler.readers import read_bands, read_cloud
 from tiler.store import Store

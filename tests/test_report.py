@@ -178,7 +178,7 @@ def test_the_command_writes_it_and_refuses_other_folders(
 ) -> None:
     assert main(["report", str(copy)]) == 0
     assert capsys.readouterr().out.strip() == str(copy / "report.html")
-    assert main(["report", str(tmp_path / "none")]) == 2
+    assert main(["report", str(tmp_path / "none")]) == 1
     (tmp_path / "empty").mkdir()
     assert main(["report", str(tmp_path / "empty")]) == 1
     shutil.rmtree(copy / "store.zarr")

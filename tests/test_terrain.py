@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pipeline.classes import BUILDING, GROUND, WATER
 from pipeline.errors import InputError
 from pipeline.las_points import UnitPoints
-from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.raster import (
     HEIGHT_UNIT,
     NodeWindow,

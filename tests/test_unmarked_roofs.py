@@ -10,7 +10,8 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.pointcloud import BUILDING, GROUND, UNCLASSIFIED, PointCloud, rename_classes
+from pipeline.classes import BUILDING, GROUND, UNCLASSIFIED
+from pipeline.pointcloud import PointCloud, rename_classes
 from pipeline.roof_points import RoofPoints, locate_roof_points
 from pipeline.terrain import compute_dtm
 from pipeline.unmarked_roofs import MAY_BE_ROOF, are_roofs, find_bare, locate_unmarked

@@ -17,7 +17,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.pointcloud import BUILDING, GROUND
+from pipeline.classes import BUILDING, GROUND
 from stitch.grid import Bounds
 from tiler.config import Config, make_config
 from tiler.context import RunContext, pack_tiles
@@ -177,6 +177,8 @@ def open_engine(config: Config) -> Iterator[tuple[Engine, Plan]]:
         **dataclasses.asdict(config),
         **derived_parameters(config),
         footprints_identity=identify(Path(config.footprints)),
+        footprints_frame=dataclasses.astuple(plan.georeference.footprints),
+        footprints_shift=(0.0, 0.0),
     )
     with serial() as executor:
         yield (

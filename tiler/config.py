@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
+from pipeline.classes import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
 from pipeline.errors import ConfigError
-from pipeline.pointcloud import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
 from stitch.least import LEAST_TILE
 from tiler.did_you_mean import suggest
 from tiler.domain import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height

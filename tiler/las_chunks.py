@@ -6,8 +6,8 @@ import laspy
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.classes import GROUND
 from pipeline.las_points import Triple, find_coordinates, find_range
-from pipeline.pointcloud import GROUND
 from tiler.georeference.frame import STEP, Frame, origin_of, to_region
 
 _FIELDS = laspy.DecompressionSelection

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from pipeline.building_points import NEVER_ROOF
 from pipeline.citymodel import Footprints
+from pipeline.classes import BUILDING
 from pipeline.ground_filter import FILTER_REACH, classify_above, find_terrain
 from pipeline.inside import Cover, are_covered
 from pipeline.las_points import LEFT_OUT, Triple, UnitPoints, cut_units
-from pipeline.pointcloud import BUILDING, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.raster import (
     Dtm,
     NodeWindow,
@@ -29,7 +30,7 @@ from tiler.footprint_index import FootprintRows, join_footprints, select_footpri
 from tiler.ingest import CELL
 from tiler.packing import CHUNK_BYTES
 from tiler.stage import Box
-from tiler.tables import NEAR_ARRAYS, NearBuildings, join_near, take_near
+from tiler.tables import NEAR_ARRAYS, NearBuildings, join_near, take_near, unpack_polygons
 from tiler.task import Task
 
 CHUNK_ROWS = CHUNK_BYTES // 12  # of coordinates in the store, three units of 4 bytes each
@@ -207,6 +208,12 @@ def read_outlines(task: Task, *, shift: tuple[float, float] = (0.0, 0.0)) -> Foo
         found = _read_outlines(task, (xmin - shift[0], ymin - shift[1], xmax - shift[0], ymax - shift[1]))
         return replace(found, polygons=shapely.transform(found.polygons, lambda xy: xy + shift))
     return _read_outlines(task, task.box)
+
+
+def read_own_outlines(task: Task) -> Footprints:
+    """Take the footprints that meet a tile, from the stage ``outlines`` for the same tile."""
+    (found,) = (result.arrays for result in task.read("outlines"))
+    return Footprints(unpack_polygons(found, "outline"), found["ids"], found["given_height"])
 
 
 def _read_outlines(task: Task, box: Box) -> Footprints:

@@ -10,10 +10,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.classes import BUILDING, GROUND, WATER
 from pipeline.columns import expand_cells
 from pipeline.histograms import Histogram, merge_histograms, quality_histograms
 from pipeline.mesh import ColumnMesh, PlaneMesh
-from pipeline.pointcloud import BUILDING, GROUND, WATER
 from pipeline.quality import measure_cells
 from pipeline.residuals import ResidualSums, merge_residuals, sum_residuals
 from pipeline.surface_points import NOWHERE, measure_surface

@@ -8,14 +8,14 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.alignment import LEAST_HOUSES, REACH, SIDE, STEP, TOLD, best_shift, describe_shift, score_shifts
+from pipeline.classes import BUILDING, GROUND
 from pipeline.errors import InputError
 from pipeline.inside import cover_polygons
 from pipeline.notes import Note
-from pipeline.pointcloud import BUILDING, GROUND
 from tiler.config import Config
 from tiler.context import find_owned
 from tiler.out_folder import STORE
-from tiler.readers import grow, read_cloud, read_outlines
+from tiler.readers import grow, read_cloud, read_outlines, read_own_outlines
 from tiler.records import Records
 from tiler.stage import REGION_ITEM, Box, Facts, Read, Scope, Stage
 from tiler.stages.inputs import halo_of_points
@@ -31,10 +31,11 @@ MISALIGNED = "footprints-misaligned"
 def alignment_stages(config: Config) -> list[Stage]:
     """Stages from points and footprints to the shift of the region."""
     reach = halo_of_points(config, AROUND + REACH + 2 * STEP)
+    # The footprints of a tile do not change when others do; with --align they wait for what is measured here.
+    footprints = Read("footprints") if config.align else Read("outlines", own=True)
+    reads = (footprints, Read("points", reach))
     return [
-        Stage(
-            "alignment", Scope.TILE, score_tile, (Read("footprints"), Read("points", reach)), ("ground_filter",)
-        ),
+        Stage("alignment", Scope.TILE, score_tile, reads, ("ground_filter",), version=2),
         Stage("shift", Scope.REGION, find_shift, (Read("alignment", optional=True),)),
     ]
 
@@ -114,7 +115,7 @@ def describe_alignment(records: Records, config: Config) -> tuple[Facts, list[No
 
 def _sample(task: Task) -> NDArray[np.object_]:
     """Footprints of the tile to measure by: of a common size, whole within the region, chosen by their ids."""
-    found = read_outlines(task)
+    found = read_outlines(task) if "footprints" in task.refs else read_own_outlines(task)
     area, box = shapely.area(found.polygons), shapely.bounds(found.polygons).reshape(-1, 4)
     fit = (area >= LEAST_AREA) & (area <= MOST_AREA) & shapely.is_valid(found.polygons)
     fit &= find_owned(task.box, task.context.bounds, (box[:, :2] + box[:, 2:]) / 2)

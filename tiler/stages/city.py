@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pipeline.adaptive import AdaptiveOptions
 from pipeline.building_points import reach_of_points
 from pipeline.citymodel import Footprints
+from pipeline.classes import BUILDING, GROUND, WATER
 from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leave_out, shape_clusters
 from pipeline.components import join_pairs
 from pipeline.groups import adjacent_houses
@@ -17,7 +18,6 @@ from pipeline.houses import Houses, divide_houses, join_houses, take_houses
 from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
 from pipeline.point_fidelity import measure_houses
-from pipeline.pointcloud import BUILDING, GROUND, WATER
 from pipeline.raster import Dtm, window_of
 from pipeline.roof_points import add_roof_points, keep_roof_points, locate_roof_points
 from pipeline.simplify import raise_buildings
@@ -29,7 +29,7 @@ from tiler.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.config import Config
 from tiler.context import find_owned, region_around, tile_key
 from tiler.options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
-from tiler.readers import grow, read_known_terrain
+from tiler.readers import grow, read_known_terrain, read_own_outlines
 from tiler.run_folder import PARTS
 from tiler.stage import Box, Facts, Read, Scope, Stage
 from tiler.stages.house_points import add_unmarked, extent_of, find_surfaces, points_near
@@ -141,7 +141,7 @@ def make_houses(task: Task) -> Facts:
     options, spacing = city_options(task.parameters), task.parameters.dtm_spacing
     grid, bounds = task.context.grid, task.context.bounds
     with task.step("1.4 clean footprints"):
-        read = _read_outlines(task)
+        read = read_own_outlines(task)
         around = tuple(shapely.total_bounds(read.polygons).tolist()) if len(read.polygons) else task.box
         inner, notes = prepare_footprints(read, region_around(grid, _hull(task.box, around)), options)
         own = _owned(task, inner)
@@ -325,12 +325,6 @@ def _keep_within(task: Task, shapes: Shapes, houses: Houses) -> Shapes:
         x, y = shapely.get_coordinates(shapely.point_on_surface(shapes.polygons[row]))[0].tolist()
         task.note(Note("building-beyond-region", ", ".join(ids), x, y, "its simplified outline leaves the region"))
     return keep_shapes(shapes, within)
-
-
-def _read_outlines(task: Task) -> Footprints:
-    """Footprints that meet the tile."""
-    (found,) = (result.arrays for result in task.read("outlines"))
-    return Footprints(unpack_polygons(found, "outline"), found["ids"], found["given_height"])
 
 
 def _owned(task: Task, footprints: Footprints) -> Footprints:

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from pipeline.city import find_places
 from pipeline.citymodel import Footprints
+from pipeline.classes import BUILDING
 from pipeline.inside import cover_polygons
 from pipeline.notes import Note
-from pipeline.pointcloud import BUILDING, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.raster import Dtm
 from pipeline.roof_points import RoofPoints, add_roof_points, keep_roof_points
 from pipeline.unmarked_roofs import MAY_BE_ROOF, PLANTS, UnmarkedRoofs, are_roofs, find_bare, locate_unmarked

@@ -9,10 +9,11 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.alignment import REACH
+from pipeline.classes import GROUND, KEY_POINT, WATER
 from pipeline.errors import InputError
 from pipeline.ground_check import LEAST_STEP, compare_ground, is_upside_down
 from pipeline.notes import Note
-from pipeline.pointcloud import GROUND, KEY_POINT, WATER, rename_classes
+from pipeline.pointcloud import rename_classes
 from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
 from pipeline.terrain import bin_nodes, bin_units
 from pipeline.terrain_fill import (

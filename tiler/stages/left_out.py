@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 from pipeline.building_points import reach_of_points
 from pipeline.city import City, CityOptions, measure_heights
 from pipeline.citymodel import Footprints
+from pipeline.classes import BUILDING, GROUND, WATER
 from pipeline.footprints import clean_footprints
 from pipeline.houses import divide_houses
 from pipeline.inside import cover_polygons
-from pipeline.pointcloud import BUILDING, GROUND, WATER, PointCloud
+from pipeline.pointcloud import PointCloud
 from pipeline.raster import Dtm, window_of
 from pipeline.roof_points import locate_roof_points
 from pipeline.terrain import cut_terrain

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.building_facts import fidelity_table
 from pipeline.cell_blocks import CellBlocks, QualityMeter, UsedPoints, number_used
+from pipeline.classes import BUILDING, GROUND, WATER
 from pipeline.columns import find_used_points, split_boundary
 from pipeline.errors import GeometryError
 from pipeline.histograms import (
@@ -26,7 +27,6 @@ from pipeline.point_fidelity import (
     merge_fidelity,
     sum_fidelity,
 )
-from pipeline.pointcloud import BUILDING, GROUND, WATER
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
 from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
 from stitch.grid import Key, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
