@@ -16,6 +16,8 @@ from tiler.plain_text import printable, tell_box
 from tiler.region import Region
 
 DEGREES = "EPSG:4326"
+# What was assumed of the coordinates, and may be wrong.
+ASSUMED = ("cloud-crs-overruled", "cloud-without-crs", "cloud-axes", "cloud-off-its-crs")
 UNKNOWN = "check --crs, the CRS that the file states, and --bounds"
 
 
@@ -54,6 +56,7 @@ def explain_empty(config: Config, region: Region, counts: dict[str, int], notes:
         told.append("run.json names each one; see --min-building-area, --default-height and --border")
     elif layer is not None:
         told.append(find_place(layer, region))
+    told += [note.detail for note in notes if note.kind in ASSUMED]
     told.append(f"--allow-empty accepts a mesh without buildings; this one stays in {config.out} for a look")
     return f"no building was meshed. {config.footprints} has {'. '.join(part for part in told if part)}"
 
