@@ -8,6 +8,7 @@ import pyproj
 from pipeline.errors import CityError, InputError
 from pipeline.notes import Note, count_notes
 from tiler.config import Config
+from tiler.crs import is_on_its_place
 from tiler.features import Box
 from tiler.layers import Layer, describe_layer
 from tiler.note_words import is_drop, say_notes
@@ -98,6 +99,12 @@ def find_place(layer: Layer, region: Region) -> str:
                 continue
             if _meets(extent, pyproj.CRS.from_user_input(stated), region):
                 return f"{told}. {_tell_move(exchanged=exchanged, degrees=degrees and not own.is_geographic)}"
+    code = own.to_authority()
+    if code and own.is_projected and _overlap(layer.extent, region.bounds) and is_on_its_place(layer.extent, own):
+        return (
+            f"{told}. The point clouds have such coordinates too, so their CRS may be that of the footprints: "
+            f"--crs {':'.join(code)}"
+        )
     return f"{told}: {UNKNOWN}"
 
 
@@ -130,8 +137,11 @@ def _meets(extent: Box, crs: pyproj.CRS, region: Region) -> bool:
     west, south, east, north = forward.transform_bounds(*extent, densify_pts=21, errcheck=False)
     if not np.isfinite((west, south, east, north)).all():
         return False
-    bounds = region.bounds
-    return west <= bounds[2] and east >= bounds[0] and south <= bounds[3] and north >= bounds[1]
+    return _overlap((west, south, east, north), region.bounds)
+
+
+def _overlap(one: Box, other: Box) -> bool:
+    return one[0] <= other[2] and one[2] >= other[0] and one[1] <= other[3] and one[3] >= other[1]
 
 
 def _short(crs: str) -> str:
