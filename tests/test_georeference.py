@@ -354,6 +354,15 @@ def test_coordinates_like_degrees_are_told_whatever_is_stated_or_asked_for(crs: 
     assert 627_000 < found.clouds[0].bounds[0] < found.clouds[0].bounds[2] < 629_000
 
 
+def test_metres_below_a_geographic_crs_are_no_degrees() -> None:
+    for asked in ({}, {"reproject": True}):
+        with pytest.raises(
+            InputError, match=r"geographic \(degrees\), but .* are none; give the CRS .* with --crs"
+        ):
+            establish(cloud("EPSG:4269", bounds=AMSTERDAM), footprints=RD, **asked)
+    assert establish(cloud("EPSG:4269", bounds=AMSTERDAM), footprints=RD, crs="EPSG:28992").crs == RD
+
+
 def test_one_cloud_in_degrees_among_others_is_told() -> None:
     with pytest.raises(
         InputError, match=r"b\.laz: states no CRS, and its coordinates, 4\.88 .* look like degrees"

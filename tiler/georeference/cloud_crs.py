@@ -189,6 +189,11 @@ def _choose_for_degrees(
         return PlanCrs(stated, MetricCrs(stated, (0, 1.0), (1, 1.0)), degrees=True)
     if wish is not None and not like_degrees(group.box):
         return _overrule(group, stated, wish, told)
+    if not like_degrees(group.box) and not is_on_its_place(group.box, stated):
+        raise InputError(
+            f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}, but its coordinates, "
+            f"{box_words(group.box)}, are none; give the CRS that they are in with --crs"
+        )
     target = crs_name(wish[0]) if wish is not None else utm_crs(group.box, stated)
     raise InputError(
         f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}, and cells need metres; give "
