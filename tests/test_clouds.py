@@ -223,6 +223,7 @@ def test_absurd_headers_are_refused(laz: Path, place: int, form: str, value: flo
         {211: float("inf")},
         {187: 0.0, 203: 0.0, 219: 0.0},  # the low ends were never written
         dict.fromkeys((179, 187, 195, 203, 211, 219), 0.0),
+        dict.fromkeys((179, 187), 120_000.0) | dict.fromkeys((195, 203), 487_000.0),  # one place for 5000 points
         {179: -1.7e308, 187: 1.7e308, 195: -1.7e308, 203: 1.7e308, 211: -1.7e308, 219: 1.7e308},
     ],
 )

@@ -130,3 +130,11 @@ def test_the_place_of_a_layer_without_extent_is_not_known() -> None:
     bounds: Bounds = (0.0, 0.0, 100.0, 100.0)
     layer = Layer(Path("a.parquet"), "", None, (), 3, None)
     assert find_place(layer, Region(bounds, "EPSG:3006", 100.0)).startswith("The file does not say where they lie")
+
+
+def test_footprints_with_the_numbers_of_the_region_in_another_crs_name_that_crs() -> None:
+    layer = Layer(
+        Path("a.gpkg"), "a", pyproj.CRS("EPSG:25831"), (), 3, (629_400.0, 5_803_950.0, 629_500.0, 5_804_000.0)
+    )
+    region = Region((629_353.0, 5_803_892.0, 629_552.0, 5_804_091.0), "EPSG:25832", 500.0)
+    assert find_place(layer, region).endswith("may be that of the footprints: --crs EPSG:25831")

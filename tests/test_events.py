@@ -174,7 +174,7 @@ def test_a_whole_run(town: Town) -> None:
 
 def test_a_run_that_fails_says_so_and_the_next_starts_the_file_anew(town: Town, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with pytest.raises(CityError, match="stage seams") as error:
+    with pytest.raises(CityError, match="seams: seams") as error:
         run(town.config(out, domain_height=17.0))
     found = list(read_events(out / "events.jsonl"))
     assert (found[-1]["status"], found[-1]["error"]) == ("failed", str(error.value))

@@ -159,7 +159,7 @@ def test_a_file_takes_the_tiles_below_it(city: SparseCity, tmp_path: Path, kind:
     n_files = city.record["counts"]["files"]
     with injected({"points": {name: KINDS[kind][0]}}):
         if n_files == 1:
-            with pytest.raises(CityError, match="stage points, file"):
+            with pytest.raises(CityError, match="points: point-cloud files, file"):
                 run(city.config(out, **LIMITS), stages=[OWN])
         else:
             record = run(city.config(out, **LIMITS), stages=[OWN])

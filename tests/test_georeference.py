@@ -342,3 +342,81 @@ def test_boxes_go_there_and_back() -> None:
     with pytest.raises(InputError, match="has no place"):
         box_to_region(Frame(source="EPSG:32631", target="EPSG:28992"), (1e8, 1e8, 2e8, 2e8))
     assert to_region(AS_IT_IS, np.array([[1.0, 2.0]])).tolist() == [[1.0, 2.0]]
+
+
+@pytest.mark.parametrize("crs", [None, "EPSG:28992"])
+def test_coordinates_like_degrees_are_told_whatever_is_stated_or_asked_for(crs: str | None) -> None:
+    for asked in ({"crs": "EPSG:25831"}, {}):
+        with pytest.raises(InputError, match="look like degrees, where cells need metres; give --reproject --crs"):
+            establish(cloud(crs, bounds=DEGREES), footprints=RD, **asked)
+    found = establish(cloud(crs, bounds=DEGREES), footprints=RD, crs="EPSG:25831", reproject=True)
+    assert found.crs == pyproj.CRS("EPSG:25831")
+    assert 627_000 < found.clouds[0].bounds[0] < found.clouds[0].bounds[2] < 629_000
+
+
+def test_metres_below_a_geographic_crs_are_no_degrees() -> None:
+    for asked in ({}, {"reproject": True}):
+        with pytest.raises(
+            InputError, match=r"geographic \(degrees\), but .* are none; give the CRS .* with --crs"
+        ):
+            establish(cloud("EPSG:4269", bounds=AMSTERDAM), footprints=RD, **asked)
+    assert establish(cloud("EPSG:4269", bounds=AMSTERDAM), footprints=RD, crs="EPSG:28992").crs == RD
+
+
+def test_one_cloud_in_degrees_among_others_is_told() -> None:
+    with pytest.raises(
+        InputError, match=r"b\.laz: states no CRS, and its coordinates, 4\.88 .* look like degrees"
+    ):
+        establish(cloud("EPSG:28992"), cloud(None, "b.laz", DEGREES))
+
+
+def test_the_register_is_asked_for_a_crs_of_the_place() -> None:
+    """Zone 35 of ETRS89 in Bulgaria has the parameters of TM35FIN in Finland."""
+    base = (
+        'GEOGCS["EUREF-FIN",DATUM["EUREF-FIN",SPHEROID["GRS 1980",6378137,298.257222101]],'
+        'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]]'
+    )
+    wkt = (
+        f'PROJCS["EUREF-FIN / TM35FIN(E,N)",{base},PROJECTION["Transverse_Mercator"],'
+        'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",27],PARAMETER["scale_factor",0.9996],'
+        'PARAMETER["false_easting",500000],PARAMETER["false_northing",0],UNIT["metre",1],'
+        'AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+    )
+    helsinki = (385_000.0, 6_671_000.0, 386_000.0, 6_672_000.0, 0.0, 60.0)
+    found = establish(cloud(wkt, bounds=helsinki), footprints="EPSG:4326")
+    area = found.crs.area_of_use
+    assert found.crs.to_epsg() is not None
+    assert area is not None
+    assert area.north > 60
+    assert area.west < 25 < area.east
+
+
+@pytest.mark.parametrize(
+    ("crs", "box", "extent", "words"),
+    [
+        # Krovak: a CRS to the south and west, coordinates to the east and north
+        ("EPSG:5513", (-743_000.0, -1_043_000.0, -742_000.0, -1_042_000.0), None, "but the coordinates grow"),
+        # the northing first, in clouds and footprints
+        ("EPSG:3006", (6_651_000.0, 500_000.0, 6_652_000.0, 501_000.0), None, "are those of the point clouds"),
+        # the same, where the clouds are as their CRS says
+        (
+            "EPSG:5513",
+            (1_042_000.0, 742_000.0, 1_043_000.0, 743_000.0),
+            (-743_000.0, -1_043_000.0, -742_000.0, -1_042_000.0),
+            "but the coordinates grow",
+        ),
+    ],
+)
+def test_footprints_too_have_the_axes_that_their_coordinates_show(
+    crs: str, box: tuple[float, ...], extent: tuple[float, ...] | None, words: str
+) -> None:
+    extent = extent or box
+    found = establish(cloud(crs, bounds=(*box, 0.0, 60.0)), footprints=crs, extent=extent)
+    assert words in found.messages[-1]
+    region = found.clouds[0].bounds[:4]
+    assert box_to_region(found.footprints, (extent[0], extent[1], extent[2], extent[3])) == region
+
+
+def test_footprints_alone_with_the_northing_first_are_left_as_they_are() -> None:
+    extent = (485_900.0, 120_600.0, 486_500.0, 121_200.0)
+    assert establish(cloud("EPSG:28992"), footprints=RD, extent=extent).footprints == AS_IT_IS

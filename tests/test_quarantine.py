@@ -157,8 +157,8 @@ def test_a_file_that_cannot_be_read_takes_the_tiles_below_it(tmp_path: Path) -> 
 
 def test_where_nothing_is_left_the_run_has_failed(town: Town, tmp_path: Path) -> None:
     everywhere = dict.fromkeys(town.record["tiles"], raises)
-    for stage in ("ground", "columns"):
-        with pytest.raises(CityError, match=rf"stage {stage}, tile .*ZeroDivisionError: a fault on purpose"):
+    for stage, title in {"ground": "terrain: means of ground points", "columns": "mesh: columns of cells"}.items():
+        with pytest.raises(CityError, match=rf"{title}, tile .*ZeroDivisionError: a fault on purpose"):
             run_with({stage: everywhere}, town, tmp_path / stage)
         assert json.loads((tmp_path / stage / "run.json").read_text())["status"] == "failed"
 

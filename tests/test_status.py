@@ -140,7 +140,7 @@ def test_a_killed_run_is_told_to_be_dead_and_gone_on_with(
 def test_a_failed_run(town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     config = town.config(out, domain_height=17.0)
-    with pytest.raises(CityError, match="stage seams") as error:
+    with pytest.raises(CityError, match="seams: seams") as error:
         run(config)
     status = read_status(out)
     assert (status["state"], status["error"]) == ("failed", str(error.value))

@@ -8,6 +8,7 @@ import pyproj
 from pipeline.errors import CityError, InputError
 from pipeline.notes import Note, count_notes
 from tiler.config import Config
+from tiler.crs import is_on_its_place
 from tiler.features import Box
 from tiler.layers import Layer, describe_layer
 from tiler.note_words import is_drop, say_notes
@@ -16,6 +17,8 @@ from tiler.plain_text import printable, tell_box
 from tiler.region import Region
 
 DEGREES = "EPSG:4326"
+# What was assumed of the coordinates, and may be wrong.
+ASSUMED = ("cloud-crs-overruled", "cloud-without-crs", "cloud-axes", "cloud-off-its-crs")
 UNKNOWN = "check --crs, the CRS that the file states, and --bounds"
 
 
@@ -54,6 +57,7 @@ def explain_empty(config: Config, region: Region, counts: dict[str, int], notes:
         told.append("run.json names each one; see --min-building-area, --default-height and --border")
     elif layer is not None:
         told.append(find_place(layer, region))
+    told += [note.detail for note in notes if note.kind in ASSUMED]
     told.append(f"--allow-empty accepts a mesh without buildings; this one stays in {config.out} for a look")
     return f"no building was meshed. {config.footprints} has {'. '.join(part for part in told if part)}"
 
@@ -95,6 +99,12 @@ def find_place(layer: Layer, region: Region) -> str:
                 continue
             if _meets(extent, pyproj.CRS.from_user_input(stated), region):
                 return f"{told}. {_tell_move(exchanged=exchanged, degrees=degrees and not own.is_geographic)}"
+    code = own.to_authority()
+    if code and own.is_projected and _overlap(layer.extent, region.bounds) and is_on_its_place(layer.extent, own):
+        return (
+            f"{told}. The point clouds have such coordinates too, so their CRS may be that of the footprints: "
+            f"--crs {':'.join(code)}"
+        )
     return f"{told}: {UNKNOWN}"
 
 
@@ -127,8 +137,11 @@ def _meets(extent: Box, crs: pyproj.CRS, region: Region) -> bool:
     west, south, east, north = forward.transform_bounds(*extent, densify_pts=21, errcheck=False)
     if not np.isfinite((west, south, east, north)).all():
         return False
-    bounds = region.bounds
-    return west <= bounds[2] and east >= bounds[0] and south <= bounds[3] and north >= bounds[1]
+    return _overlap((west, south, east, north), region.bounds)
+
+
+def _overlap(one: Box, other: Box) -> bool:
+    return one[0] <= other[2] and one[2] >= other[0] and one[1] <= other[3] and one[3] >= other[1]
 
 
 def _short(crs: str) -> str:

@@ -23,6 +23,7 @@ from tiler.gaps import Gaps
 from tiler.keys import declared_values, file_identity, item_key, stage_digest
 from tiler.records import Records
 from tiler.stage import Box, Layout, Scope, Stage
+from tiler.stage_groups import place_of_item
 from tiler.store import Store
 from tiler.task import Declared, Failure, Record, Task
 from tiler.task_graph import (
@@ -592,7 +593,7 @@ def _among(found: Refs, reach: Items, run: Items, stage: Stage) -> Refs:
 
 def _named(error: Exception, stage: Stage, name: str) -> Exception:
     """Say stage and item in an error: in the message where it is ours, in a note otherwise."""
-    place = f"stage {stage.name}, {stage.scope.value} {name}"
+    place = place_of_item(stage.name, stage.scope.value, name)
     if isinstance(error, CityError):
         return type(error)(f"{place}: {error}")
     error.add_note(place)

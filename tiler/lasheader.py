@@ -182,6 +182,7 @@ def _bounds(
             raise InputError(f"{path}: {axis} offset {offset:g} is not within ±{COORDINATE_LIMIT:g} m; {AGAIN}")
     ends = (xmin, xmax), (ymin, ymax), (zmin, zmax)
     void = any(not low <= high or not math.isfinite(high - low) for low, high in ends)  # NaN too
+    void |= n_points > 1 and (xmin == xmax or ymin == ymax)
     void |= any(value == 0 or abs(value) > COORDINATE_LIMIT for value in (xmin, xmax, ymin, ymax))
     return (xmin, ymin, xmax, ymax, zmin, zmax), void
 

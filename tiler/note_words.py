@@ -158,6 +158,7 @@ WORDS: dict[str, Words] = {
     "cloud-void-header-box": Words(
         REPAIRED, "{n} point cloud[s] without a sound box in the header [was|were] read for it"
     ),
+    "footprints-axes": Words(DEFAULTED, "axes of the footprints are not those of their CRS"),
     "footprints-converted": Words(REPAIRED, "coordinates of the footprints were converted to metres"),
     "footprints-operation": Words(OTHER, "the footprints were reprojected by one operation"),
     "footprints-misaligned": Words(OTHER, "the footprints lie beside the roofs in the point cloud"),

@@ -198,7 +198,12 @@ def find_georeference(config: Config, headers: Sequence[CloudHeader]) -> Georefe
         if header.box_of_points
     ]
     if void:
-        words.append(f"{len(void)} point clouds have no sound box in their header; their points were read for it")
+        have = (
+            "1 point cloud has no sound box in its"
+            if len(void) == 1
+            else f"{len(void)} point clouds have no sound box in their"
+        )
+        words.append(f"{have} header; the points were read for it")
     notes = [*found.notes, *void, *inexact]
     return replace(found, messages=[*found.messages, *words], notes=notes)
 

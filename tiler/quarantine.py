@@ -18,6 +18,7 @@ from tiler.failures import SetAside
 from tiler.places import absolute
 from tiler.planning import Plan, leave_out
 from tiler.stage import Box, Scope
+from tiler.stage_groups import place_of_item
 
 CONFIG = "config.toml"  # in the folder of a run: its parameters
 ONLY = "only"  # folder below a run's, for tiles that are run alone
@@ -98,7 +99,7 @@ def find_missing(plan: Plan, missing: Missing, engine: Engine) -> Missing:
 
 def as_error(failed: SetAside) -> CityError:
     """The error of an item that was set aside."""
-    return CityError(f"stage {failed.stage}, {failed.scope.value} {failed.name}: {failed.reason}")
+    return CityError(f"{place_of_item(failed.stage, failed.scope.value, failed.name)}: {failed.reason}")
 
 
 def describe_missing(missing: Missing, out: Path) -> dict[str, Any]:

@@ -158,6 +158,11 @@ def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]
         With the extent against its bound.
     """
     width, height = region.bounds[2] - region.bounds[0], region.bounds[3] - region.bounds[1]
+    if min(width, height) <= 0:
+        raise ConfigError(
+            f"the point clouds have no whole metre of the region in them, for cells of {mesh_size:g} m: "
+            "a point, a line or degrees; see citystitch plan, or give --bounds"
+        )
     if min(width, height) < mesh_size:
         raise ConfigError(
             f"region {_words(region.bounds)}: {width:g} x {height:g} m is smaller than one cell of "

@@ -70,6 +70,22 @@ def title_of_stage(stage: str) -> str:
     return f"{found[0]}: {found[1]}" + (f", round {int(number) + 1}" if name.endswith("-") and int(number) else "")
 
 
+def place_of_item(stage: str, scope: str, name: str) -> str:
+    """Say in an error where it arose: what the stage does, or the name of one of the user's own, and the item.
+
+    Examples
+    --------
+    >>> place_of_item("points", "file", "a"), place_of_item("coarse", "region", "region")
+    ('points: point-cloud files, file a', 'terrain: coarse grid for large gaps')
+    >>> place_of_item("canopy", "tile", "1_2")
+    'stage canopy, tile 1_2'
+    """
+    title = title_of_stage(stage)
+    if title == stage:
+        return f"stage {stage}, {scope} {name}"
+    return title if name == scope else f"{title}, {scope} {name}"
+
+
 def group_stages(stages: Iterable[str]) -> dict[str, list[str]]:
     """Put stages into their groups: ours in the order of `GROUPS`, then the user's own.
 

@@ -123,6 +123,8 @@ def choose_plan(
 ) -> PlanCrs | None:
     """Decide which CRS a group's coordinates have; None where neither file nor user says."""
     stated = group.stated
+    if like_degrees(group.box) and (stated is None or stated.is_projected):
+        return _assume_degrees(group, wish, asked, told)
     if stated is None:
         unread = f": {group.first.unread}" if group.first.unread else ""
         if wish is None:
@@ -187,6 +189,11 @@ def _choose_for_degrees(
         return PlanCrs(stated, MetricCrs(stated, (0, 1.0), (1, 1.0)), degrees=True)
     if wish is not None and not like_degrees(group.box):
         return _overrule(group, stated, wish, told)
+    if not like_degrees(group.box) and not is_on_its_place(group.box, stated):
+        raise InputError(
+            f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}, but its coordinates, "
+            f"{box_words(group.box)}, are none; give the CRS that they are in with --crs"
+        )
     target = crs_name(wish[0]) if wish is not None else utm_crs(group.box, stated)
     raise InputError(
         f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}, and cells need metres; give "
@@ -243,9 +250,7 @@ def _with_axes(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, told: Told
 def choose_fallback(
     groups: Sequence[CloudGroup],
     plans: Sequence[PlanCrs | None],
-    wish: tuple[pyproj.CRS, MetricCrs] | None,
     footprints: pyproj.CRS | None,
-    asked: Asked,
     told: Told,
 ) -> PlanCrs:
     """What is taken for clouds that state nothing: what the others state, else the footprints' CRS."""
@@ -265,8 +270,6 @@ def choose_fallback(
         )
         return plan
     first = silent[0]
-    if like_degrees(first.box):
-        return _assume_degrees(first, asked, told)
     flat = horizontal_crs(footprints)
     if flat is None:
         raise InputError(
@@ -286,23 +289,24 @@ def choose_fallback(
     return PlanCrs(flat, _with_unit(first, flat, metric, told))
 
 
-def _assume_degrees(group: CloudGroup, asked: Asked, told: Told) -> PlanCrs:
+def _assume_degrees(
+    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Asked, told: Told
+) -> PlanCrs:
+    """Take coordinates that look like degrees for those of WGS 84, where they may be reprojected."""
     wgs84 = pyproj.CRS("EPSG:4326")
+    states = f"{states_of(group)} {'no CRS' if group.stated is None else crs_name(group.stated)}"
     if asked.reproject:
         told.say(
             "cloud-without-crs",
             group.first.path.name,
-            f"{group.label} {states_of(group)} no CRS, and the coordinates look like degrees; taken as "
-            "EPSG:4326 (WGS 84)",
+            f"{group.label} {states}, and the coordinates look like degrees; taken as EPSG:4326 (WGS 84)",
         )
         return PlanCrs(wgs84, MetricCrs(wgs84, (0, 1.0), (1, 1.0)), degrees=True)
-    zone = utm_crs(group.box, wgs84)
+    target = utm_crs(group.box, wgs84) if wish is None else crs_name(wish[1].crs)
     raise InputError(
-        f"{group.first.path}: states no CRS, and its coordinates, {box_words(group.box)}, look like degrees, "
-        "where "
-        f"cells need metres; give --reproject{f' --crs {zone}' if zone else ''} if they are WGS 84, or "
-        "reproject it: "
-        f"{pdal_command(group.first, wgs84, zone)}"
+        f"{group.first.path}: {states}, and its coordinates, {box_words(group.box)}, look like degrees, where "
+        f"cells need metres; give --reproject{f' --crs {target}' if target else ''} if they are WGS 84, or "
+        f"reproject it: {pdal_command(group.first, wgs84, target)}"
     )
 
 

@@ -34,7 +34,7 @@ from tiler.georeference.cloud_crs import (
     group_clouds,
     read_wish,
 )
-from tiler.georeference.footprints import footprint_frame
+from tiler.georeference.footprints import find_shown_axes, footprint_frame
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.georeference.metric import LIKELY, MetricCrs, find_metric
 from tiler.georeference.operation import Operation, find_operation
@@ -116,7 +116,7 @@ def establish_georeference(
     groups = group_clouds(clouds)
     wish = read_wish(asked, groups)
     stated = [choose_plan(group, wish, asked, told) for group in groups]
-    fallback = choose_fallback(groups, stated, wish, footprints, asked, told)
+    fallback = choose_fallback(groups, stated, footprints, told)
     plans = [found or fallback for found in stated]
     crs = _registered(_choose_target(groups, plans, wish, asked), groups, plans, footprints)
     placed: dict[int, CloudHeader] = {}
@@ -187,7 +187,12 @@ def _registered(
         for match in crs.list_authority(auth_name="EPSG", min_confidence=LIKELY)
     ]
     for other in others:
-        if other.is_projected and other.to_epsg() is not None and is_one(crs, other, box):
+        if (
+            other.is_projected
+            and other.to_epsg() is not None
+            and is_on_its_place(box, other)
+            and is_one(crs, other, box)
+        ):
             metric = find_metric(other)
             if metric is not None and metric.crs == other:
                 return other
@@ -285,6 +290,10 @@ def _place_footprints(
             )
             return replace(like, height=1.0), None
         return Frame(), None
+    shown = find_shown_axes(flat, crs, extent, box, [cloud.frame for cloud in placed.values()])
+    if shown is not None:
+        told.say("footprints-axes", "footprints", f"the footprints: {shown[1]}; taken as {crs_name(crs)}")
+        return shown[0], None
     return footprint_frame(flat, crs, box, told.say)
 
 

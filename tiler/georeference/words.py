@@ -49,5 +49,7 @@ def boxes_meet(one: Sequence[float], other: Sequence[float]) -> bool:
 
 
 def axes_words(metric: MetricCrs) -> str:
-    """Say that axes were turned, ``""`` where they were not."""
+    """Say that axes were turned or exchanged, ``""`` where they were not."""
+    if metric.east[0] == 1 and min(metric.east[1], metric.north[1]) > 0:
+        return ", northing before easting,"
     return ", axes to the west and south," if metric.east[1] < 0 or metric.north[1] < 0 else ""
