@@ -9,6 +9,8 @@ from tiler.note_words import reason_of
 from tiler.stage import REGION_ITEM
 from tiler.stages.left_out import LEFT_OUT
 
+WORTH_TELLING = 0.005  # share of the building points beside footprints; below it lie eaves and antennas
+
 
 def describe_left_out(engine: Engine, notes: Sequence[Note]) -> dict[str, Any]:
     """Add up what no building of the mesh stands for.
@@ -86,7 +88,7 @@ def tell_left_out(found: Mapping[str, Any]) -> list[str]:
             f"{words} ({found['area (m2)']:,.0f} m² within the region) {'is' if n == 1 else 'are'} not in the mesh"
         )
     bare, every = found.get("building points", 0), found.get("of building points", 0)
-    if bare:
+    if bare and (n or bare >= WORTH_TELLING * every):
         share = f"{bare:,} of {every:,} building points ({100 * bare / every:.1f} %)"
         told.append(
             f"{share} are over no building of the mesh: "
