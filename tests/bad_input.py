@@ -17,7 +17,7 @@ import shapely
 from numpy.typing import NDArray
 
 from tests.cities import Bounds, cloud_over
-from tiler.cli import main
+from tiler.cli.main import main
 
 BOUNDS: Bounds = (318000.0, 6399000.0, 318060.0, 6399060.0)
 HOUSE = shapely.box(318020, 6399020, 318040, 6399040)
@@ -120,8 +120,8 @@ def call_apart(*arguments: str | Path, megabytes: int, timeout: float = 100) -> 
     """Call the command line in a process of its own, which ends with 99 where it took more memory."""
     text = (
         "import sys\n"
-        "from tiler.cli import main\n"
-        "from tiler.task import peak_memory\n"
+        "from tiler.cli.main import main\n"
+        "from tiler.engine.task import peak_memory\n"
         "code = main(sys.argv[2:])\n"
         "peak = peak_memory() // 2**20\n"
         "print(f'{peak} MB')\n"

@@ -19,10 +19,10 @@ def pytest_configure() -> None:
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile kernels before tests begin, once: the first of those with a time limit would have to."""
-    from tiler.kernels import are_compiled
+    from tiler.executors.kernels import are_compiled
 
     if not hasattr(session.config, "workerinput") and not are_compiled():
-        subprocess.run([sys.executable, "-m", "tiler.cli", "kernels"], check=False, stdout=subprocess.DEVNULL)
+        subprocess.run([sys.executable, "-m", "tiler.cli.main", "kernels"], check=False, stdout=subprocess.DEVNULL)
 
 
 @pytest.fixture(scope="session")
@@ -36,9 +36,9 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Finished run of a synthetic city on four tiles, not to be changed."""
-    from tiler.config import make_config
-    from tiler.run import run
-    from tiler.synth import write_city
+    from tiler.config.config import make_config
+    from tiler.interface.synth import write_city
+    from tiler.workflow.run import run
 
     folder = tmp_path_factory.mktemp("small")
     files = write_city(folder / "city", size=300, buildings=15, density=1.0)
@@ -68,8 +68,8 @@ def amsterdam_blocks_run(shared_data: Path, tmp_path_factory: pytest.TempPathFac
 
 def run_amsterdam(shared_data: Path, out: Path, **given: Any) -> Path:
     """Mesh central Amsterdam; gives the folder of the run."""
-    from tiler.config import make_config
-    from tiler.run import run
+    from tiler.config.config import make_config
+    from tiler.workflow.run import run
 
     data = shared_data / "amsterdam"
     clouds = [str(path) for path in sorted((data / "tiles").iterdir())]

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tiler.engine import Engine
-from tiler.stage import Facts, Stage
-from tiler.task import Task
+from tiler.engine.engine import Engine
+from tiler.engine.stage import Facts, Stage
+from tiler.engine.task import Task
 
 
 def raises(_: Task) -> None:

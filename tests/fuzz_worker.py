@@ -107,7 +107,7 @@ def serve() -> None:
     """Answer calls, one JSON list of arguments a line, until there are no more."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print by themselves is none of the answers
-    from tiler.cli import main
+    from tiler.cli.main import main
 
     print("ready", file=answers, flush=True)
     for line in sys.stdin:

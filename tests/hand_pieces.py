@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.mesh import Marker
-from tiler.mesh_pieces import MeshPiece
+from tiler.mesh_files.mesh_pieces import MeshPiece
 
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 
 
 @dataclass(frozen=True, eq=False)
 class HandPieces:
-    """Pieces in memory: see `tiler.mesh_pieces.MeshPieces`."""
+    """Pieces in memory: see `tiler.mesh_files.mesh_pieces.MeshPieces`."""
 
     names: tuple[str, ...]
     n_points: int

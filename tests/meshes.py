@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.citymodel import CityModel, number_ids
 from pipeline.mesh import Boundary, Marker, TetMesh
-from tiler.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
+from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
 
 Square = tuple[int, int]
 # Squares of the grid that each building stands on, and the level of its roof.

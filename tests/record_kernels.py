@@ -1,4 +1,4 @@
-"""Which kernels Python calls, and with what: ``python -m tests.record_kernels`` writes `tiler.kernels.LIST` anew.
+"""Which kernels Python calls, and with what: ``python -m tests.record_kernels`` writes the list of kernels anew.
 
 Small cities are meshed, checked and drawn in all ways that have kernels of their own, by a process that finds
 everything compiled: so it loads what Python calls, and not what only other kernels do.
@@ -15,8 +15,8 @@ from pathlib import Path
 from numba.core import event, types
 
 from pipeline.kernel import Kernel
-from tiler.cli import main
-from tiler.kernels import LIST, Kernels, read_list
+from tiler.cli.main import main
+from tiler.executors.kernels import LIST, Kernels, read_list
 
 WAYS = (
     (),

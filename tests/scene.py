@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from shapely.affinity import rotate, translate
 
 from pipeline.mesh import Boundary, TetMesh
-from tiler.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
+from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
 
 # Far from zero, as in a national CRS: single precision has steps of 0.03 m here.
 ORIGIN = np.array([121000.0, 487000.0, 0.0])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stitch.grid import Key, SeamKey
-from tiler.context import seam_name, tile_name
+from tiler.planning.context import seam_name, tile_name
 
 TILE_STAGES = ("ground", "terrain", "houses", "model", "columns", "pieces")
 SIDE = 500.0  # m

@@ -13,11 +13,11 @@ from typing import Any
 import psutil
 
 from tests.test_run import hashes
-from tiler import fork_server
-from tiler.config import Config, make_config
-from tiler.own_stages import list_stages
-from tiler.run import run
-from tiler.synth import write_city
+from tiler.config.config import Config, make_config
+from tiler.executors import fork_server
+from tiler.interface.synth import write_city
+from tiler.workflow.own_stages import list_stages
+from tiler.workflow.run import run
 
 ROOT = Path(__file__).resolve().parents[1]
 TILE = 280.0  # m
@@ -53,7 +53,7 @@ class SparseCity:
         words = [
             sys.executable,
             "-m",
-            "tiler.cli",
+            "tiler.cli.main",
             "run",
             *given["pointcloud"],
             "--footprints",

@@ -15,10 +15,10 @@ from pipeline.terrain import cut_terrain
 from stitch.grid import Bounds, Key, ends_of_seam
 from tests.cities import crowded_blocks, hilly_dtm
 from tests.tiles import make_town, run_of, write_town
-from tiler.check import check_run
-from tiler.context import seam_key
-from tiler.results import StoredTerrain
-from tiler.store import Store
+from tiler.check.check import check_run
+from tiler.planning.context import seam_key
+from tiler.store.results import StoredTerrain
+from tiler.store.store import Store
 
 WEST, SOUTH, SIZE = 318_000.0, 6_399_000.0, 560.0  # m
 DIAGONAL = [(0, 1), (1, 0)]

@@ -10,10 +10,10 @@ import pytest
 import shapely
 
 from pipeline.alignment import LEAST_HOUSES, REACH, best_shift, describe_shift, score_shifts
-from tiler.alone import run_alone
-from tiler.config import make_config
-from tiler.run import run
-from tiler.synth import write_city
+from tiler.config.config import make_config
+from tiler.interface.synth import write_city
+from tiler.workflow.run import run
+from tiler.workflow.single_tile import run_alone
 
 HOUSES = [
     shapely.box(x, y, x + 12 + k, y + 9) for k, (x, y) in enumerate([(20, 20), (60, 22), (25, 60), (70, 64)])

@@ -20,7 +20,9 @@ from tests.namespaces import dask_command
 from tests.sparse_city import ROOT, SparseCity, children, count_results, make_city, start
 from tests.test_engine import grid_layout, make, nothing
 from tests.test_run import hashes
-from tiler.config import Config
+from tiler.config.config import Config
+from tiler.engine.stage import Facts, Scope, Stage
+from tiler.engine.task import Task
 from tiler.scheduler import check as cluster_check
 from tiler.scheduler import terms
 from tiler.scheduler.check import (
@@ -33,8 +35,6 @@ from tiler.scheduler.check import (
 from tiler.scheduler.reach import connect, spell_out
 from tiler.scheduler.terms import PROBE, Terms, check_files, offer_terms, own_terms
 from tiler.scheduler.versions import LIBRARIES, MISSING, NATIVE, tell_versions
-from tiler.stage import Facts, Scope, Stage
-from tiler.task import Task
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_all_that_computes_is_told() -> None:
 
 
 def test_every_library_of_the_keys_is_compared() -> None:
-    from tiler.keys import CODE
+    from tiler.engine.keys import CODE
 
     assert set(CODE) <= tell_versions().keys()
 

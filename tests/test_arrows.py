@@ -19,14 +19,19 @@ COMPOSING = {"pipeline.tile", "pipeline.simplify"}
 HOMES = {
     "dask": ("tiler/",),
     "distributed": ("tiler/",),
-    "zarr": ("tiler/zarr_files.py",),
+    "zarr": ("tiler/store/zarr_files.py",),
     "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py"),
     "laspy": ("tiler/",),
     "pyogrio": ("tiler/",),
     "meshio": ("tiler/",),
     "rich": ("tiler/",),
     "triangle": ("pipeline/plane.py",),
-    "numba": ("pipeline/kernel.py", "pipeline/kernel_library.py", "tiler/kernels.py", "tiler/numba_registry.py"),
+    "numba": (
+        "pipeline/kernel.py",
+        "pipeline/kernel_library.py",
+        "tiler/executors/kernels.py",
+        "tiler/executors/numba_registry.py",
+    ),
 }
 
 

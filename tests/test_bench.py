@@ -20,7 +20,8 @@ def test_inner_items_have_others_all_around_and_count_by_their_median(tmp_path: 
 
 
 def test_compiled_code_counts_for_the_function_that_calls_it() -> None:
-    task = "thread (1): MainThread;_run (/home/site/tiler/run.py:221);run_task (/home/site/tiler/task.py:293)"
+    run = "thread (1): MainThread;_run (/home/site/tiler/workflow/run.py:221)"
+    task = f"{run};run_task (/home/site/tiler/engine/task.py:293)"
     cut = f"{task};make_seam (/home/site/tiler/stages/mesh.py:9);cut_walls (/home/site/stitch/walls.py:97)"
     call = f"{cut};Kernel.__call__ (/home/site/pipeline/kernel.py:29)"
     lines = [
@@ -28,7 +29,7 @@ def test_compiled_code_counts_for_the_function_that_calls_it() -> None:
         f"{call} 30",
         f"{call};Kernel.dispatcher (/home/site/pipeline/kernel.py:40) 4",
         f"{task};make_seam (/home/site/tiler/stages/mesh.py:9);_amin (numpy/_core/_methods.py:45) 500",
-        "thread (1): MainThread;_run (/home/site/tiler/run.py:221) 6000",
+        "thread (1): MainThread;_run (/home/site/tiler/workflow/run.py:221) 6000",
         f"thread (2): {cut.replace('MainThread', 'zarr_io')} 70000",
     ]
 

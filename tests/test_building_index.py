@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 
 from pipeline.citymodel import CityModel, number_ids
 from pipeline.errors import InputError
-from tiler import building_index, json_stream
-from tiler.building_index import index_buildings
-from tiler.check import _in_order
-from tiler.cityjson import write_city_blocks
-from tiler.json_stream import JsonStream
-from tiler.run_folder import RunRecord
+from tiler.check.check import _in_order
+from tiler.citymodels import building_index, json_stream
+from tiler.citymodels.building_index import index_buildings
+from tiler.citymodels.cityjson import write_city_blocks
+from tiler.citymodels.json_stream import JsonStream
+from tiler.workflow.run_folder import RunRecord
 
 LEAVES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5)
 DOCUMENTS = st.dictionaries(

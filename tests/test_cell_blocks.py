@@ -22,7 +22,7 @@ from pipeline.plane import mesh_plane
 from pipeline.quality import measure_cells
 from stitch.conformity import compute_cell_volumes
 from tests.cities import city_of
-from tiler.vtk_files import Rows, Values, read_vtu, write_vtu, write_vtu_blocks
+from tiler.mesh_files.vtk_files import Rows, Values, read_vtu, write_vtu, write_vtu_blocks
 
 
 def uneven_columns(order: MergeOrder, seed: int = 5) -> ColumnMesh:

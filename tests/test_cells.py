@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tiler.cells import MOST_CELLS, find_places, order_by_cell
+from tiler.pointclouds.cells import MOST_CELLS, find_places, order_by_cell
 
 
 @settings(max_examples=60, deadline=None)

@@ -33,10 +33,10 @@ from tests.meshes import (
     with_mesh,
     write_run,
 )
-from tiler.check import CheckReport, _Sums, check_run
-from tiler.proofs import Dtm, Fault, merge_faults
-from tiler.vtk_files import write_vtp, write_vtu
-from tiler.vtk_xml import make_stream, write_data_file
+from tiler.check.check import CheckReport, _Sums, check_run
+from tiler.check.proofs import Dtm, Fault, merge_faults
+from tiler.mesh_files.vtk_files import write_vtp, write_vtu
+from tiler.mesh_files.vtk_xml import make_stream, write_data_file
 
 Tamper = Callable[[TinyCity], TinyCity]
 N_PROOFS = 14

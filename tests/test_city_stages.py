@@ -14,15 +14,15 @@ from pipeline.citymodel import CityModel, number_ids
 from pipeline.errors import InputError
 from pipeline.point_fidelity import HouseFidelity
 from tests.cityjson_rules import file_faults, solid_faults
-from tiler import cityjson
-from tiler.cityjson import read_city_model
-from tiler.engine import Engine
-from tiler.executors import Serial
-from tiler.stage import Box, Facts, Layout, Scope, Stage
+from tiler.citymodels import cityjson
+from tiler.citymodels.cityjson import read_city_model
+from tiler.citymodels.tables import Buildings, no_buildings, pack_buildings, take_buildings
+from tiler.engine.engine import Engine
+from tiler.engine.stage import Box, Facts, Layout, Scope, Stage
+from tiler.engine.task import Task
+from tiler.executors.executor import Serial
 from tiler.stages.citymodel import CITY_MODEL, city_model_stages, house_cells
-from tiler.store import Store
-from tiler.tables import Buildings, no_buildings, pack_buildings, take_buildings
-from tiler.task import Task
+from tiler.store.store import Store
 
 SIDE = 5000.0  # m
 BOUNDS: Box = (120_000.0, 486_000.0, 120_000.0 + SIDE, 486_000.0 + SIDE)

@@ -20,8 +20,8 @@ from pipeline.errors import ConfigError, InputError, OutputError
 from pipeline.notes import Note
 from pipeline.solids import build_solids
 from tests.cityjson_rules import area_vector, broken, file_faults, solid_faults, volume
-from tiler import cityjson
-from tiler.cityjson import read_city_model, write_city_blocks, write_city_model
+from tiler.citymodels import cityjson
+from tiler.citymodels.cityjson import read_city_model, write_city_blocks, write_city_model
 
 BOUNDS = (120999.5, 486999.5, -2.5, 121200.0, 487200.0, 100.0)
 HOUSE = shapely.box(121000, 487000, 121010, 487008)

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 from pipeline.errors import InputError
-from tiler import clouds
-from tiler.clouds import find_clouds, read_header, read_points
+from tiler.pointclouds import clouds
+from tiler.pointclouds.clouds import find_clouds, read_header, read_points
 
 EVERYWHERE = (-1e9, -1e9, 1e9, 1e9)
 ORIGIN = np.array([120000.0, 486000.0, 0.0])

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from stitch.grid import Key
-from tiler.clusters import pack_clusters, place_in_grid, unpack_clusters
-from tiler.packing import rows_per_chunk
-from tiler.stage import Scope
+from tiler.citymodels.clusters import pack_clusters, place_in_grid, unpack_clusters
+from tiler.engine.stage import Scope
+from tiler.engine.task import Declared, Failure, Record, Task, run_task
 from tiler.stages.city import list_members
-from tiler.store import Store
-from tiler.task import Declared, Failure, Record, Task, run_task
+from tiler.store.packing import rows_per_chunk
+from tiler.store.store import Store
 
 # Two tiles; the second house of each is in a cluster with the first house of the first tile.
 HOUSE = np.array([[4, -1, 0], [4, -1, 1], [5, 2, 0], [5, 2, 1]])

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from tests.bad_input import QUICK, call, write_city
-from tiler.cli import main
-from tiler.std_streams import _PatientWriter
+from tiler.cli.main import main
+from tiler.words.std_streams import _PatientWriter
 
 Capture = pytest.CaptureFixture[str]
-PROGRAM = [sys.executable, "-m", "tiler.cli"]
+PROGRAM = [sys.executable, "-m", "tiler.cli.main"]
 
 
 def test_the_version_is_told(capsys: Capture) -> None:

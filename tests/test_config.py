@@ -9,11 +9,11 @@ import pytest
 
 from pipeline.errors import ConfigError
 from stitch.least import LEAST_TILE
-from tiler.api import with_file
-from tiler.cli import make_parser
-from tiler.config import Config, annotated_defaults, load_config, make_config
-from tiler.planning import survey_inputs
-from tiler.synth import write_city
+from tiler.cli.main import make_parser
+from tiler.config.config import Config, annotated_defaults, load_config, make_config
+from tiler.interface.api import with_file
+from tiler.interface.synth import write_city
+from tiler.planning.plan import survey_inputs
 
 
 def test_the_annotated_defaults_are_the_defaults() -> None:

@@ -7,7 +7,7 @@ import pyproj
 import pytest
 
 from pipeline.errors import ConfigError
-from tiler.crs import (
+from tiler.georeference.crs import (
     crs_name,
     horizontal_crs,
     is_on_its_place,

@@ -17,13 +17,13 @@ import pytest
 
 from pipeline.errors import ConfigError
 from tests.simulated_runs import simulate, write_events
-from tiler.cli import main
-from tiler.config import make_config
+from tiler.cli.main import main
+from tiler.config.config import make_config
 from tiler.dashboard.codes import State
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.server import read_address, serve
-from tiler.run import run
-from tiler.synth import write_city
+from tiler.interface.synth import write_city
+from tiler.workflow.run import run
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_the_command_refuses_a_folder_of_nothing(tmp_path: Path, capsys: pytest.
 
 
 def test_the_command_serves_until_it_is_interrupted(folder: Path) -> None:
-    words = [sys.executable, "-m", "tiler.cli", "dashboard", str(folder)]
+    words = [sys.executable, "-m", "tiler.cli.main", "dashboard", str(folder)]
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}
     ) as job:

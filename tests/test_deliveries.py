@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import CityError, InputError
 from tests.deliveries import HOUSES, Delivery, forget_chunk_size, ground, house_of, write_delivery
-from tiler.config import make_config
-from tiler.run import run
+from tiler.config.config import make_config
+from tiler.workflow.run import run
 
 Edit = Callable[[laspy.LasData, NDArray[np.str_]], None]
 ASPRS = {"ground": 2, "roof": 6, "tree": 5, "water": 9, "noise": 7}

@@ -22,11 +22,11 @@ from packaging.requirements import Requirement
 from tests.loopback import free_ports
 from tests.sparse_city import ROOT, make_city
 from tests.test_run import hashes
-from tiler import fork_server
-from tiler.cli import make_parser
-from tiler.config import Config, check_reach, load_config
-from tiler.dask_settings import BOTH, SCHEDULER, WORKER, as_variables
-from tiler.places import is_url
+from tiler.cli.main import make_parser
+from tiler.config.config import Config, check_reach, load_config
+from tiler.executors import fork_server
+from tiler.executors.dask_settings import BOTH, SCHEDULER, WORKER, as_variables
+from tiler.objects.places import is_url
 from tiler.scheduler.reach import PATIENCE
 
 DEPLOY = ROOT / "deploy"
@@ -324,7 +324,7 @@ def test_the_pods_commands_run_and_give_the_bytes_of_a_serial_run(tmp_path: Path
             text, run = text.replace(f'"{old}"', f'"{new}"'), run.replace(old, new)
         (tmp_path / "run.toml").write_text(text)
         sizes = city.command(tmp_path)[7:-2]
-        job = [sys.executable, "-m", "tiler.cli", "run", *run.split(), *sizes]
+        job = [sys.executable, "-m", "tiler.cli.main", "run", *run.split(), *sizes]
         done = subprocess.run(job, capture_output=True, text=True, cwd=tmp_path, env=environment(), check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert hashes(tmp_path / "out") == city.hashes

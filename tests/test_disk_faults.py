@@ -16,8 +16,8 @@ import pytest
 
 from tests.sparse_city import SparseCity, make_city, start
 from tests.test_run import hashes
-from tiler.cli import main
-from tiler.run import run
+from tiler.cli.main import main
+from tiler.workflow.run import run
 
 ERRORS = (errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.EIO)
 CALLS = ("open", "mkdir", "replace")  # what a run writes with: each is counted

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import tiler
-from tiler.cli import main, make_parser
+from tiler.cli.main import main, make_parser
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -152,15 +152,17 @@ def test_a_broken_link_or_name_ends_the_build(tmp_path: Path) -> None:
     source = tmp_path / "source"
     source.mkdir()
     (source / "index.md").write_text("# A page\n\nSee [elsewhere](nowhere.md).\n\n```{toctree}\nnames\n```\n")
-    (source / "names.rst").write_text("Names\n=====\n\nSee `tiler.run.run` and `tiler.run.walk`.\n")
+    (source / "names.rst").write_text(
+        "Names\n=====\n\nSee `tiler.workflow.run.run` and `tiler.workflow.run.walk`.\n"
+    )
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-c", str(SITE), str(source)]
     done = subprocess.run(
         [*command, str(tmp_path / "html")], capture_output=True, text=True, env=environment(), check=False
     )
     assert done.returncode == 1
     assert re.search(r"index\.md.*nowhere\.md", done.stderr)
-    assert "there is no tiler.run.walk" in done.stderr
-    assert "tiler.run.run" not in done.stderr
+    assert "there is no tiler.workflow.run.walk" in done.stderr
+    assert "tiler.workflow.run.run" not in done.stderr
 
 
 def test_examples_of_the_build_hold() -> None:

@@ -16,16 +16,16 @@ from stitch.grid import Bounds
 from tests.cities import crowded_blocks
 from tests.test_tiles import SIZE, TILE, around, prove, prove_local
 from tests.tiles import Town, hash_files, make_town, write_town
-from tiler.alone import run_alone
-from tiler.cli import main
-from tiler.config import Config, idle_parameters, load_config, make_config
-from tiler.domain import Domain, read_height, settle
-from tiler.options import expected_levels
-from tiler.run import run
+from tiler.cli.main import main
+from tiler.config.config import Config, idle_parameters, load_config, make_config
+from tiler.config.domain_height import Domain, read_height, settle
+from tiler.config.step_options import expected_levels
+from tiler.mesh_files.vtk_files import read_vtu
 from tiler.stages.domain import LOW_DOMAIN, layer_stages
 from tiler.stages.mesh import mesh_stages
-from tiler.store import Store
-from tiler.vtk_files import read_vtu
+from tiler.store.store import Store
+from tiler.workflow.run import run
+from tiler.workflow.single_tile import run_alone
 
 NEW = {"first_layer", "layer_growth", "top_elevation"}
 CFD = {"first_layer": 0.5, "layer_growth": 1.25, "top": "flat"}

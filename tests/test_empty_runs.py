@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from tests.bad_input import HOUSE, QUICK, call, write_city
 from tests.cities import Bounds
-from tiler.empty import find_place
-from tiler.layers import Layer
-from tiler.region import Region
+from tiler.planning.region import Region
+from tiler.vectors.layers import Layer
+from tiler.workflow.empty_run import find_place
 
 Capture = pytest.CaptureFixture[str]
 TO_DEGREES = pyproj.Transformer.from_crs("EPSG:3006", "EPSG:4326", always_xy=True)

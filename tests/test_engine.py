@@ -18,16 +18,16 @@ import pytest
 
 from pipeline.errors import CityError, GeometryError, InputError
 from pipeline.notes import Note
-from tiler.engine import Engine
-from tiler.executors import Executor, Serial, processes
-from tiler.keys import item_key, stage_digest
-from tiler.limits import Limits
+from tiler.engine.engine import Engine
+from tiler.engine.keys import item_key, stage_digest
+from tiler.engine.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
+from tiler.engine.task import Failure, Record, Task
+from tiler.engine.task_limits import Limits
+from tiler.executors.executor import Executor, Serial, processes
 from tiler.scheduler.executor import local
 from tiler.scheduler.reach import connect
-from tiler.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
-from tiler.store import Store
-from tiler.task import Failure, Record, Task
-from tiler.written import state_files
+from tiler.store.stated_files import state_files
+from tiler.store.store import Store
 
 ROOT = Path(__file__).resolve().parents[1]
 

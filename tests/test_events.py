@@ -15,14 +15,14 @@ import pytest
 
 from pipeline.errors import CityError, ConfigError, InputError, OutputError
 from tests.towns import Town, make_town
-from tiler.api import with_file
-from tiler.cli import make_parser
-from tiler.config import make_config
-from tiler.events import EventLog, begin_file, numbers, open_log, read_events
-from tiler.run import run
-from tiler.stage import Facts, Scope
-from tiler.task import Record
-from tiler.watching import RunStart, Watcher, Watchers, tell_command
+from tiler.cli.main import make_parser
+from tiler.config.config import make_config
+from tiler.engine.stage import Facts, Scope
+from tiler.engine.task import Record
+from tiler.interface.api import with_file
+from tiler.monitoring.events import EventLog, begin_file, numbers, open_log, read_events
+from tiler.monitoring.watchers import RunStart, Watcher, Watchers, tell_command
+from tiler.workflow.run import run
 
 BOX = (0.0, 0.0, 10.0, 10.0)
 ROOT = Path(__file__).resolve().parents[1]
@@ -30,7 +30,7 @@ KILLED = """
 import os, signal, sys, time
 from itertools import count
 from pathlib import Path
-from tiler.events import EventLog, begin_file
+from tiler.monitoring.events import EventLog, begin_file
 path = Path(sys.argv[1])
 log = EventLog(path, begin_file(path), every=0.05)
 log.say("first")

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from pipeline.errors import OutputError
-from tiler.cli import main
-from tiler.config import make_config
-from tiler.export import FORMATS, export_run
-from tiler.run import run
-from tiler.synth import write_city
-from tiler.vtk_files import read_vtp, read_vtu
+from tiler.cli.main import main
+from tiler.config.config import make_config
+from tiler.formats.export import FORMATS, export_run
+from tiler.interface.synth import write_city
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu
+from tiler.workflow.run import run
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,13 @@ from distributed import Client
 from pipeline.errors import GeometryError, OutputError
 from tests.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
 from tests.test_engine import contents, grid_layout, make, nothing, seen, told
-from tiler.engine import Engine, StoppedError
-from tiler.executors import Executor, Serial, processes
-from tiler.failures import Policy
-from tiler.limits import TASKS, Limits
+from tiler.engine.engine import Engine, StoppedError
+from tiler.engine.failures import Policy
+from tiler.engine.stage import Facts, Read, Scope, Stage
+from tiler.engine.task import Record, Task
+from tiler.engine.task_limits import TASKS, Limits
+from tiler.executors.executor import Executor, Serial, processes
 from tiler.scheduler.executor import Dask, local
-from tiler.stage import Facts, Read, Scope, Stage
-from tiler.task import Record, Task
 
 A = Stage("a", Scope.TILE, nothing)
 B = Stage("b", Scope.TILE, seen, (Read("a", 1.0),))

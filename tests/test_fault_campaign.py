@@ -20,13 +20,13 @@ from tests.campaigns import keep_outcome, rounds
 from tests.faults import hangs, hangs_in_c, injected, is_killed, raises, segfaults, swallows_memory
 from tests.sparse_city import SparseCity, make_city
 from tests.test_run import hashes
-from tiler.check import check_run
-from tiler.context import seam_key, tile_name
-from tiler.results import StoredTerrain
-from tiler.run import run
-from tiler.stage import Facts, Read, Scope, Stage
-from tiler.store import Store
-from tiler.task import Task
+from tiler.check.check import check_run
+from tiler.engine.stage import Facts, Read, Scope, Stage
+from tiler.engine.task import Task
+from tiler.planning.context import seam_key, tile_name
+from tiler.store.results import StoredTerrain
+from tiler.store.store import Store
+from tiler.workflow.run import run
 
 Fault = Callable[[Task], None]
 KINDS: dict[str, tuple[Fault, str]] = {

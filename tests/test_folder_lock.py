@@ -18,8 +18,8 @@ from typing import Any
 import pytest
 
 from pipeline.errors import ConfigError, InputError, OutputError
-from tiler import folder_lock
-from tiler.folder_lock import LOCK, Owner, is_held, only_run
+from tiler.store import folder_lock
+from tiler.store.folder_lock import LOCK, Owner, is_held, only_run
 
 ROOT = Path(__file__).resolve().parents[1]
 NO_LOCKS = """
@@ -31,7 +31,7 @@ fcntl.flock = refuse
 HOLDER = """
 import sys, time
 from pathlib import Path
-from tiler.folder_lock import only_run
+from tiler.store.folder_lock import only_run
 with only_run(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)

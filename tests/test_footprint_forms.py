@@ -20,9 +20,9 @@ from pipeline.citymodel import Footprints, make_ids
 from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note, count_notes
 from tests.footprint_files import BOX, RD, OsmTown, X, Y, blob, chain, face, square, write_gpkg, write_table
-from tiler import gdal_features
-from tiler.summary import INCOMPLETE
-from tiler.vectors import read_footprints
+from tiler.footprints.footprint_reader import read_footprints
+from tiler.vectors import gdal_features
+from tiler.workflow.summary import INCOMPLETE
 
 SMALL = (X, Y + 1, X + 35, Y + 99)  # not all of the files here: they are asked for by their index
 

@@ -14,12 +14,12 @@ from distributed import get_worker
 from tests.sparse_city import make_city, start, wait_until_gone, workers
 from tests.test_engine import ROOT, grid_layout, make, wait_until
 from tests.test_run import hashes
-from tiler import fork_server
-from tiler.executors import processes
-from tiler.limits import TRIM_AT, Limits, resident_memory
+from tiler.engine.stage import Facts, Scope, Stage
+from tiler.engine.task import Task
+from tiler.engine.task_limits import TRIM_AT, Limits, resident_memory
+from tiler.executors import fork_server
+from tiler.executors.executor import processes
 from tiler.scheduler.executor import local
-from tiler.stage import Facts, Scope, Stage
-from tiler.task import Task
 
 pytestmark = pytest.mark.skipif(fork_server.METHOD != "forkserver", reason="workers are forked on Linux alone")
 
@@ -91,9 +91,9 @@ import os, signal, sys, time
 from pathlib import Path
 from tests.faults import hangs_in_c
 from tests.test_join import give_one, make_task
-from tiler import fork_server
-from tiler.crew import Crew, Given
-from tiler.limits import Limits, trace_file
+from tiler.executors import fork_server
+from tiler.executors.worker_processes import Crew, Given
+from tiler.engine.task_limits import Limits, trace_file
 fork_server.has_one_thread = lambda: True  # but for one of pyarrow's memory
 fork_server.begin(forked=True)
 crew = Crew(2, Limits())

@@ -16,11 +16,11 @@ from tests.programs import mesh_is_ok, run_foam
 from tests.test_formats_cgns import corners_of, read_with_vtk
 from tests.test_formats_glb import read_document, turned, validate
 from tests.test_formats_msh import check_with_gmsh
-from tiler.cli import main
-from tiler.export import FORMATS, export_run
+from tiler.cli.main import main
+from tiler.formats.export import FORMATS, export_run
 from tiler.formats.foam_patches import HOUSE, building_name
-from tiler.mesh_pieces import open_pieces
-from tiler.vtk_files import read_vtp
+from tiler.mesh_files.mesh_pieces import open_pieces
+from tiler.mesh_files.vtk_files import read_vtp
 
 Corners = NDArray[np.float64]
 PER_PATCH = ["stl", "obj", "glb", "msh", "msh2", "cgns"]

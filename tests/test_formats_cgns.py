@@ -15,12 +15,12 @@ from pipeline.errors import OutputError
 from pipeline.mesh import Marker
 from tests.hand_pieces import box_pieces
 from tests.programs import run_program
-from tiler.cli import main
-from tiler.export import export_run
+from tiler.cli.main import main
 from tiler.formats import cgns
 from tiler.formats.cgns import write_cgns
+from tiler.formats.export import export_run
 from tiler.formats.foam_patches import HOUSE, PATCHES, building_name
-from tiler.mesh_pieces import open_pieces
+from tiler.mesh_files.mesh_pieces import open_pieces
 
 Corners = NDArray[np.float64]
 

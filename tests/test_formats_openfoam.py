@@ -25,15 +25,15 @@ from tests.foam_reader import (
 )
 from tests.hand_pieces import HandPieces, box_pieces
 from tests.programs import mesh_is_ok, read_check, run_foam
-from tiler.atomic import replacing_folder
-from tiler.cli import main
-from tiler.export import export_run
+from tiler.cli.main import main
 from tiler.formats import openfoam, region_faces
+from tiler.formats.export import export_run
 from tiler.formats.foam_patches import PATCHES
 from tiler.formats.openfoam import write_openfoam
 from tiler.formats.partition import split_pieces
 from tiler.formats.pieces import Pieces
-from tiler.vtk_files import read_vtp, read_vtu
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu
+from tiler.store.atomic import replacing_folder
 
 MESH = "constant/polyMesh"
 Corners = NDArray[np.float64]

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import OutputError
 from tests.programs import MPI, PACKAGES, run_program
-from tiler.cli import main
-from tiler.export import export_run
-from tiler.mesh_pieces import open_pieces
+from tiler.cli.main import main
+from tiler.formats.export import export_run
+from tiler.mesh_files.mesh_pieces import open_pieces
 
 POISSON = Path(__file__).with_name("poisson_dolfinx.py")
 GRADIENT = np.array([0.3, -0.2, 1.0])

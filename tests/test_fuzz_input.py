@@ -25,7 +25,7 @@ from tests.bad_input import BOUNDS, CODES, HOUSE, QUICK, write_city, write_house
 from tests.campaigns import ALL_ROUNDS, FOLDER
 from tests.fuzz_worker import HUNG, Worker
 from tests.test_ingest import write_copc
-from tiler.config import Config
+from tiler.config.config import Config
 
 LIMIT = 30.0  # s a call may take on a busy machine; most take half a second
 FEW, MANY = 10, 60 if ALL_ROUNDS else 25  # cases of a family in the everyday tests and in the campaign

@@ -10,13 +10,13 @@ import pyproj
 import pytest
 
 from pipeline.errors import ConfigError, InputError
-from tiler.clouds import CloudHeader
 from tiler.georeference import cloud_crs
 from tiler.georeference.cloud_crs import Asked
 from tiler.georeference.establish import FOOTPRINTS, Georeference, establish_georeference, find_inexact
 from tiler.georeference.frame import AS_IT_IS, Frame, box_to_file, box_to_region, to_region
 from tiler.georeference.metric import find_metric
 from tiler.georeference.operation import find_operation
+from tiler.pointclouds.clouds import CloudHeader
 
 RD = pyproj.CRS("EPSG:28992")
 AMSTERDAM = (120600.0, 485900.0, 121200.0, 486500.0, -5.0, 60.0)

@@ -36,15 +36,15 @@ from tests.stitching import (
     select_houses,
 )
 from tests.tiles import column_arrays, hash_files, make_town, run_of, write_town
-from tiler.check import check_run
-from tiler.config import Config, idle_parameters, make_config
-from tiler.footprint_sample import sample_footprints
-from tiler.forecast import forecast_run
-from tiler.picture_data import City
-from tiler.planning import survey_inputs
-from tiler.results import StoredTerrain
-from tiler.sizes_picture import draw_sizes, plan_edges
+from tiler.check.check import check_run
+from tiler.config.config import Config, idle_parameters, make_config
+from tiler.footprints.footprint_sample import sample_footprints
+from tiler.pictures.picture_data import City
+from tiler.pictures.sizes_picture import draw_sizes, plan_edges
+from tiler.planning.forecast import forecast_run
+from tiler.planning.plan import survey_inputs
 from tiler.stages.mesh import mesh_stages
+from tiler.store.results import StoredTerrain
 
 RULE = SizeRule(mesh_size=10.0, open_size=25.0, grading=0.2)
 SIZE = 350.0  # m; side of a tile, 14 open sizes

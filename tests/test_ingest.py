@@ -20,14 +20,12 @@ from pipeline.notes import Note, count_notes
 from pipeline.pointcloud import PointCloud
 from tests.test_clouds import EVERYWHERE, ORIGIN, patch, write_cloud
 from tests.test_vectors import RD, square, write, write_parquet
-from tiler import clouds, gdal_features
-from tiler.cells import Box, select_cells
-from tiler.clouds import find_clouds, read_points
-from tiler.config import Config
-from tiler.copc import read_index
-from tiler.engine import Engine
-from tiler.executors import Serial
-from tiler.footprint_index import (
+from tiler.citymodels.tables import unpack_polygons
+from tiler.config.config import Config
+from tiler.engine.engine import Engine
+from tiler.engine.stage import Layout
+from tiler.executors.executor import Serial
+from tiler.footprints.footprint_index import (
     FOOTPRINT_CELL,
     FootprintBlock,
     join_footprints,
@@ -35,17 +33,20 @@ from tiler.footprint_index import (
     select_footprints,
     take_rows,
 )
+from tiler.footprints.footprint_reader import read_footprints
+from tiler.footprints.repeated_ids import find_repeated_ids
 from tiler.georeference.frame import AS_IT_IS, Frame
-from tiler.ingest import CELL, PointBlock, read_cells
-from tiler.lasheader import read_promise
-from tiler.layers import describe_layer, scan_layer
-from tiler.repeated_ids import find_repeated_ids
-from tiler.stage import Layout
+from tiler.pointclouds import clouds
+from tiler.pointclouds.cells import Box, select_cells
+from tiler.pointclouds.clouds import find_clouds, read_points
+from tiler.pointclouds.copc import read_index
+from tiler.pointclouds.ingest import CELL, PointBlock, read_cells
+from tiler.pointclouds.las_header import read_promise
 from tiler.stages import inputs
 from tiler.stages.inputs import input_stages
-from tiler.store import Store
-from tiler.tables import unpack_polygons
-from tiler.vectors import read_footprints
+from tiler.store.store import Store
+from tiler.vectors import gdal_features
+from tiler.vectors.layers import describe_layer, scan_layer
 
 SIDE = 1000.0
 NEAR = [(-2, -2), (-1, 0), (0, 0), (1, 1), (4, 4)]  # tiles, the last one empty

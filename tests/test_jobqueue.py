@@ -13,14 +13,14 @@ import pytest
 
 from pipeline.errors import CityError
 from tests.test_engine import make
-from tiler import fork_server
+from tiler.engine.stage import Facts, Scope, Stage
+from tiler.engine.task import Task
+from tiler.engine.task_limits import Limits
+from tiler.executors import fork_server
 from tiler.jobs.jobqueue import LOSSES, SETTINGS, UNBORN, QueuedDask, _Jobs, read_worker_jobs
 from tiler.jobs.queues import QueueError
 from tiler.jobs.table import Cluster
-from tiler.limits import Limits
 from tiler.scheduler.executor import ClusterError
-from tiler.stage import Facts, Scope, Stage
-from tiler.task import Task
 
 HERE: dict[str, Any] = {  # workers that begin quickly, and again as often as they end
     "distributed.deploy.lost-worker-timeout": "3650 days",

@@ -17,15 +17,15 @@ import pytest
 from pipeline.errors import ConfigError, InputError
 from tests.sparse_city import ROOT
 from tests.test_deploy import program
-from tiler.cli import main
-from tiler.config import make_config
+from tiler.cli.main import main
+from tiler.config.config import make_config
+from tiler.interface.synth import write_city
 from tiler.jobs import controller
 from tiler.jobs import submission as jobs
 from tiler.jobs.jobqueue import worker_script
 from tiler.jobs.queues import QUEUES
 from tiler.jobs.submission import JobRecord, array_script, controller_script, read_record, write_record
 from tiler.jobs.table import TYPES, Cluster, read_cluster
-from tiler.synth import write_city
 
 TEMPLATES = ROOT / "deploy" / "slurm"
 FULL = """
@@ -169,7 +169,7 @@ def test_an_array_runs_members_that_are_told_before_their_time(tmp_path: Path) -
     assert "#SBATCH --output=/out/job/logs/member-%A-%a.log" in lines
     assert "#SBATCH --signal=B:TERM@60" in lines
     assert "#SBATCH --mem=3272M" in lines
-    assert lines[-1].endswith("tiler.cli join /out/job/run.toml --out /out --workers 2 --memory-limit 1.5")
+    assert lines[-1].endswith("tiler.cli.main join /out/job/run.toml --out /out --workers 2 --memory-limit 1.5")
     assert "#PBS -J 0-3" in array_script(full(tmp_path, "pbs"), Path("/out"), 4)
     assert "#$ -t 1-4" in array_script(full(tmp_path, "sge"), Path("/out"), 4)
     assert '#BSUB -J "citystitch[1-4]"' in array_script(full(tmp_path, "lsf"), Path("/out"), 4)
@@ -416,7 +416,7 @@ def test_submit_keeps_what_jobs_run_and_refuses_a_second_one(
 
 
 def jobs_values(out: Path) -> dict[str, Any]:
-    from tiler.config import load_config
+    from tiler.config.config import load_config
 
     return load_config(out / "job" / "run.toml")
 

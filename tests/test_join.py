@@ -18,11 +18,13 @@ import pytest
 from pipeline.errors import CityError, ConfigError, InputError
 from tests.sparse_city import SparseCity, children, make_city, start, wait_for_results, wait_until_gone
 from tests.test_run import hashes
-from tiler.config import make_config
-from tiler.crew import Crew, Given
-from tiler.engine import Engine
-from tiler.executors import LEAST_WINDOW, WINDOW
-from tiler.folder_lock import is_held, only_run
+from tiler.config.config import make_config
+from tiler.engine.engine import Engine
+from tiler.engine.stage import Facts, Layout, Scope
+from tiler.engine.task import Declared, Failure, Record, Task
+from tiler.engine.task_limits import Limits, trace_file
+from tiler.executors.executor import LEAST_WINDOW, WINDOW
+from tiler.executors.worker_processes import Crew, Given
 from tiler.joining import lease as leases
 from tiler.joining import mailbox
 from tiler.joining.join import ARRAY_INDEX, describe_member, join, name_member
@@ -40,19 +42,17 @@ from tiler.joining.lease import (
 from tiler.joining.mailbox import GoneError, MailReader, MailWriter
 from tiler.joining.member import Ended, Left, _Service
 from tiler.joining.spool import HOLDER, INBOX, OUTBOX, SPOOL, Spool
-from tiler.limits import Limits, trace_file
-from tiler.stage import Facts, Layout, Scope
-from tiler.store import Store
-from tiler.task import Declared, Failure, Record, Task
+from tiler.store.folder_lock import is_held, only_run
+from tiler.store.store import Store
 
 END = 240.0  # s that members may take
 # What a member does first: imports, which take long on a busy machine, and a wait for a file; it is slow, too.
 MEMBER = """
 import sys, time
 from pathlib import Path
-from tiler import crew
+from tiler.executors import worker_processes as crew
 from tiler.joining import join
-from tiler.cli import main
+from tiler.cli.main import main
 give = crew.Crew.give
 def give_slowly(self, given):
     time.sleep(0.25)
@@ -67,12 +67,12 @@ import errno, fcntl, os
 def refuse(*_):
     raise OSError(errno.ENOLCK, "No locks available")
 fcntl.flock = refuse
-from tiler import folder_lock
+from tiler.store import folder_lock
 from tiler.joining import lease
 folder_lock._place = lambda: f"machine {os.getpid()}"
 folder_lock.BEAT, folder_lock.SILENCE, lease.BEAT, lease.SILENCE = 0.3, 4.0, 0.3, 4.0
 """
-SAY = "import time; from tiler.cli import say; say('works as a'); time.sleep(600)"
+SAY = "import time; from tiler.cli.main import say; say('works as a'); time.sleep(600)"
 MAIN = "sys.exit(main(sys.argv[2:]))"
 
 

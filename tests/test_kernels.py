@@ -16,12 +16,21 @@ from pipeline.errors import ConfigError
 from pipeline.kernel import Kernel
 from tests.record_kernels import record_apart
 from tests.sparse_city import SparseCity, make_city
-from tiler import kernels
-from tiler.cli import main
-from tiler.engine import StoppedError
+from tiler.cli.main import main
+from tiler.engine.engine import StoppedError
+from tiler.executors import kernels
+from tiler.executors.kernels import (
+    OTHER,
+    PARTS,
+    RUN,
+    are_compiled,
+    compile_kernels,
+    count_cores,
+    prepare,
+    read_list,
+)
 from tiler.joining.join import join
-from tiler.kernels import OTHER, PARTS, RUN, are_compiled, compile_kernels, count_cores, prepare, read_list
-from tiler.run import run
+from tiler.workflow.run import run
 
 ROOT = Path(__file__).parents[1]
 GROWTH = {"pipeline.growth": read_list()[OTHER]["pipeline.growth"]}  # compiled in no time
@@ -135,7 +144,11 @@ def test_where_numba_cannot_write_is_not_named(monkeypatch: pytest.MonkeyPatch, 
     told.write_text("a file")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(told))
     assert kernels.stamp_folder() != told
-    command = [sys.executable, "-c", "from tiler.kernels import describe_kernels; print(describe_kernels())"]
+    command = [
+        sys.executable,
+        "-c",
+        "from tiler.executors.kernels import describe_kernels; print(describe_kernels())",
+    ]
     assert str(told) not in subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
@@ -176,7 +189,7 @@ def test_a_run_compiles_with_as_many_processes_as_it_has_workers(
     city: SparseCity, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     asked: list[int] = []
-    monkeypatch.setattr("tiler.run.prepare", lambda processes, say: asked.append(processes))
+    monkeypatch.setattr("tiler.workflow.run.prepare", lambda processes, say: asked.append(processes))
     for number, (workers, compilers) in enumerate(((0, None), (0, 3), (1, None), (1, 0))):
         run(city.config(tmp_path / str(number), workers=workers), compilers=compilers)
     assert asked == [3, 1]
@@ -186,7 +199,7 @@ def test_the_same_run_again_compiles_nothing_beforehand(
     city: SparseCity, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     asked: list[str] = []
-    monkeypatch.setattr("tiler.run.prepare", lambda processes, say: asked.append("run"))
+    monkeypatch.setattr("tiler.workflow.run.prepare", lambda processes, say: asked.append("run"))
     monkeypatch.setattr("tiler.joining.join.prepare", lambda processes, say: asked.append("join"))
     config = city.config(tmp_path / "out", workers=1)
     for _ in range(2):
@@ -210,7 +223,7 @@ def test_ctrl_c_while_kernels_are_compiled_stops_a_run(
     def interrupted(processes: int, say: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tiler.run.prepare", interrupted)
+    monkeypatch.setattr("tiler.workflow.run.prepare", interrupted)
     out = tmp_path / "out"
     with pytest.raises(StoppedError, match="stopped before the first task"):
         run(city.config(out, workers=1))
@@ -229,7 +242,7 @@ def test_no_more_processes_than_cores_compile() -> None:
 @pytest.mark.long
 def test_after_the_command_nothing_is_compiled(tmp_path: Path) -> None:
     kept = {"NUMBA_CACHE_DIR": str(tmp_path / "numba")}
-    command = [sys.executable, "-m", "tiler.cli", "kernels"]
+    command = [sys.executable, "-m", "tiler.cli.main", "kernels"]
     done = subprocess.run(command, env=os.environ | kept, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.rstrip().endswith(f"kept in {tmp_path / 'numba'}")

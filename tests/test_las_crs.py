@@ -11,7 +11,7 @@ from laspy.vlrs.known import GeoDoubleParamsVlr, GeoKeyDirectoryVlr, WktCoordina
 
 from tiler.georeference.frame import Frame
 from tiler.georeference.las_crs import LasCrs, read_las_crs
-from tiler.las_chunks import PointChunk, coordinates_of, place_chunk, take_chunk
+from tiler.pointclouds.las_chunks import PointChunk, coordinates_of, place_chunk, take_chunk
 
 FOOT = 1200 / 3937
 

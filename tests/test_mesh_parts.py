@@ -15,15 +15,15 @@ from pipeline.mesh import Marker
 from stitch.conformity import pair_cell_faces
 from tests.bad_input import call, write_cloud, write_houses
 from tests.cities import cloud_over
-from tiler.check import check_run
-from tiler.config import make_config
-from tiler.export import export_run, find_files, take_largest_part
-from tiler.mesh_parts import TileParts, join_tiles, label_triangles, tell_parts
-from tiler.mesh_pieces import open_pieces
+from tiler.check.check import check_run
+from tiler.config.config import make_config
+from tiler.formats.export import export_run, find_files, take_largest_part
+from tiler.mesh_files.mesh_parts import TileParts, join_tiles, label_triangles, tell_parts
+from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.report import write_report
-from tiler.results import StoredTerrain
-from tiler.run import run
-from tiler.run_folder import read_run_record
+from tiler.store.results import StoredTerrain
+from tiler.workflow.run import run
+from tiler.workflow.run_folder import read_run_record
 
 Capture = pytest.CaptureFixture[str]
 WEST, SOUTH, TILE = 318_000.0, 6_399_000.0, 60.0

@@ -11,11 +11,11 @@ import pytest
 from pipeline.errors import InputError
 from pipeline.mesh import Marker
 from stitch.conformity import pair_cell_faces
-from tiler.config import make_config
-from tiler.mesh_pieces import open_pieces
-from tiler.run import run
-from tiler.synth import write_city
-from tiler.vtk_files import read_vtp, read_vtu, write_vtu
+from tiler.config.config import make_config
+from tiler.interface.synth import write_city
+from tiler.mesh_files.mesh_pieces import open_pieces
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_vtu
+from tiler.workflow.run import run
 
 
 @pytest.fixture(scope="module")

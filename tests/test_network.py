@@ -16,11 +16,11 @@ from pipeline.errors import CityError, ConfigError
 from tests.namespaces import Host, certificates, dask_command, hosts
 from tests.sparse_city import ROOT, SparseCity, children, count_results, make_city, start
 from tests.test_run import hashes
-from tiler.config import idle_parameters, make_config
-from tiler.quarantine import save_config
+from tiler.config.config import idle_parameters, make_config
 from tiler.scheduler import transport
 from tiler.scheduler.reach import connect
 from tiler.scheduler.transport import TlsFiles, check_answer, make_security
+from tiler.workflow.failed_tiles import save_config
 
 CUT = 30.0  # s
 LOST = "the connection to the Dask scheduler is lost; all that was done is kept"

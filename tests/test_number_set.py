@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tiler.number_set import NumberSet
+from tiler.citymodels.number_set import NumberSet
 
 BLOCKS = st.lists(st.lists(st.integers(-(2**63), 2**63 - 1) | st.integers(-5, 5), max_size=40), max_size=30)
 

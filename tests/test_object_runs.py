@@ -14,7 +14,7 @@ from tests.flaky_proxy import FlakyProxy, flaky_proxy
 from tests.object_servers import BUCKET, SECRET, S3Server, environment, s3_server
 from tests.test_run import hashes
 from tests.towns import TILE, Town, make_town
-from tiler.places import place
+from tiler.objects.places import place
 
 pytest.importorskip("obstore")
 pytest.importorskip("moto")
@@ -42,7 +42,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
 
 
 def words(town: Town, url: str, *more: str) -> list[str]:
-    command = [sys.executable, "-m", "tiler.cli", "run", str(town.folder / "tiles"), "--footprints"]
+    command = [sys.executable, "-m", "tiler.cli.main", "run", str(town.folder / "tiles"), "--footprints"]
     command += [str(town.folder / "footprints.gpkg"), "--tile-size", f"{TILE:g}", "--domain-height", "70"]
     return [*command, "--out", url, "--store-patience", str(PATIENCE), "--no-dashboard", *more]
 
@@ -55,7 +55,7 @@ def run_to_end(town: Town, url: str, *more: str) -> str:
 
 
 def fetch(url: str, folder: Path) -> dict[str, str]:
-    command = [sys.executable, "-m", "tiler.cli", "fetch", url, str(folder)]
+    command = [sys.executable, "-m", "tiler.cli.main", "fetch", url, str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
     return hashes(folder)
@@ -146,7 +146,7 @@ def test_inputs_in_a_bucket_give_the_bytes_of_those_on_a_disk(
     for path in (*(town.folder / "tiles").iterdir(), town.folder / "footprints.gpkg"):
         name = f"{path.parent.name}/{path.name}" if path.suffix == ".laz" else path.name
         (place(f"s3://{BUCKET}/inputs") / name).write_bytes(path.read_bytes())
-    command = [sys.executable, "-m", "tiler.cli", "run", f"s3://{BUCKET}/inputs/tiles", "--footprints"]
+    command = [sys.executable, "-m", "tiler.cli.main", "run", f"s3://{BUCKET}/inputs/tiles", "--footprints"]
     command += [f"s3://{BUCKET}/inputs/footprints.gpkg", "--tile-size", f"{TILE:g}", "--domain-height", "70", "-q"]
     done = subprocess.run(
         [*command, "--out", str(tmp_path / "out")], capture_output=True, text=True, check=False, timeout=280

@@ -13,18 +13,18 @@ import pytest
 from pipeline.errors import ConfigError, InputError, OutputError
 from tests.test_run import hashes
 from tests.towns import Town, make_town
-from tiler import folder_lock
-from tiler.cli import main
-from tiler.config import load_config, make_config
+from tiler.cli.main import main
+from tiler.config.config import load_config, make_config
+from tiler.engine.stage import Scope
 from tiler.objects import range_file
 from tiler.objects import requests as object_requests
 from tiler.objects.fetch import fetch_run
 from tiler.objects.path import ObjectPath
+from tiler.objects.places import StoreUnreachableError, absolute, place
 from tiler.objects.range_file import RangeFile
-from tiler.places import StoreUnreachableError, absolute, place
-from tiler.run import run
-from tiler.stage import Scope
-from tiler.store import Store
+from tiler.store import folder_lock
+from tiler.store.store import Store
+from tiler.workflow.run import run
 
 obstore = pytest.importorskip("obstore")
 
@@ -397,7 +397,7 @@ def test_an_address_that_never_answered_is_given_up_soon(
 def test_who_does_tasks_waits(
     memory: Memory, hasty: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from tiler import task as tasks
+    from tiler.engine import task as tasks
 
     monkeypatch.setattr(tasks, "WAITS", object_requests.WAITS)
     assert not object_requests.WAITS.working

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from tiler.check import check_run
-from tiler.config import make_config
-from tiler.results import StoredTerrain
-from tiler.run import run
-from tiler.synth import write_city
+from tiler.check.check import check_run
+from tiler.config.config import make_config
+from tiler.interface.synth import write_city
+from tiler.store.results import StoredTerrain
+from tiler.workflow.run import run
 
 
 @pytest.mark.long

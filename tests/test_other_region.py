@@ -9,8 +9,8 @@ from pipeline.errors import ConfigError
 from tests.bad_input import QUICK, call, write_city, write_cloud
 from tests.cities import cloud_over
 from tests.tiles import hash_files
-from tiler.other_region import refuse_other_region
-from tiler.region import Region
+from tiler.planning.region import Region
+from tiler.workflow.other_region import refuse_other_region
 
 Capture = pytest.CaptureFixture[str]
 BOX = (318_000.0, 6_399_000.0, 318_060.0, 6_399_060.0)

@@ -12,14 +12,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from tiler.config import Config, make_config
-from tiler.own_stages import check_own
-from tiler.results import StoredTerrain
-from tiler.run import run
-from tiler.stage import Scope, Stage
-from tiler.status import read_status
-from tiler.store import Store
-from tiler.synth import write_city
+from tiler.config.config import Config, make_config
+from tiler.engine.stage import Scope, Stage
+from tiler.interface.synth import write_city
+from tiler.monitoring.status import read_status
+from tiler.store.results import StoredTerrain
+from tiler.store.store import Store
+from tiler.workflow.own_stages import check_own
+from tiler.workflow.run import run
 
 ROOT = Path(__file__).resolve().parents[1]
 CELL = 2.0

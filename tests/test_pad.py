@@ -20,24 +20,24 @@ from tests.cities import crowded_blocks
 from tests.faults import injected, raises
 from tests.programs import mesh_is_ok, read_check, run_foam
 from tests.tiles import hash_files, make_town, run_of, write_footprints, write_town
-from tiler.alone import run_alone
-from tiler.check import check_run
-from tiler.cli import main
-from tiler.config import Config, check_height, load_config, make_config
-from tiler.context import absent_tiles, choose_tiles
-from tiler.export import export_run
-from tiler.own_stages import list_stages
-from tiler.pad import pad_bounds, pad_grid
-from tiler.pad_widths import widths_in_metres
-from tiler.plan_report import plan_run
-from tiler.region import find_pad
-from tiler.results import StoredTerrain
-from tiler.run import run
-from tiler.stage import Facts, Read, Scope, Stage
+from tiler.check.check import check_run
+from tiler.cli.main import main
+from tiler.config.config import Config, check_height, load_config, make_config
+from tiler.config.pad_widths import widths_in_metres
+from tiler.engine.stage import Facts, Read, Scope, Stage
+from tiler.engine.task import Task
+from tiler.formats.export import export_run
+from tiler.mesh_files.vtk_files import read_vtu
+from tiler.planning.context import absent_tiles, choose_tiles
+from tiler.planning.pad import pad_bounds, pad_grid
+from tiler.planning.plan_report import plan_run
+from tiler.planning.region import find_pad
 from tiler.stages.surroundings import find_sizes
-from tiler.store import Store
-from tiler.task import Task
-from tiler.vtk_files import read_vtu
+from tiler.store.results import StoredTerrain
+from tiler.store.store import Store
+from tiler.workflow.own_stages import list_stages
+from tiler.workflow.run import run
+from tiler.workflow.single_tile import run_alone
 
 CORE = (318_090.0, 6_399_130.0, 318_330.0, 6_399_350.0)
 TILE = 160.0  # m

@@ -15,15 +15,15 @@ from pipeline.errors import InputError
 from pipeline.mesh import Boundary, Marker
 from pipeline.quality import measure_cells
 from tests.scene import PIECES, write_scene
-from tiler.cli import main
-from tiler.coarsening import Facets, coarsen, join_facets
-from tiler.facet_quality import measure_facets
-from tiler.paint import SUN, Scene, View, fill_polygons, paint
-from tiler.painted_pictures import paint_blocks, paint_cut
-from tiler.picture_data import find_middle, load_city
-from tiler.render import render_run
-from tiler.scenes import QUALITY_COLOURS, block_scene, quality_colours
-from tiler.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
+from tiler.cli.main import main
+from tiler.mesh_files.facet_quality import measure_facets
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
+from tiler.pictures.coarsening import Facets, coarsen, join_facets
+from tiler.pictures.paint import SUN, Scene, View, fill_polygons, paint
+from tiler.pictures.painted_pictures import paint_blocks, paint_cut
+from tiler.pictures.picture_data import find_middle, load_city
+from tiler.pictures.render import render_run
+from tiler.pictures.scenes import QUALITY_COLOURS, block_scene, quality_colours
 
 SKY = ("#ffffff", "#ffffff")
 DOWN = View(np.array([0.0, -0.01, 100.0]), np.zeros(3), 30.0, (100, 80))
@@ -165,7 +165,7 @@ def test_blocks_stand_on_the_terrain(small_run: Path, monkeypatch: pytest.Monkey
     corners = found.scene.corners
     assert np.isfinite(corners).all()
     assert np.abs(corners[..., :2]).max() <= (bounds[2] - bounds[0]) / 2 + 1e-6
-    monkeypatch.setattr("tiler.scenes.MOST_BLOCKS", 5)
+    monkeypatch.setattr("tiler.pictures.scenes.MOST_BLOCKS", 5)
     image, words = paint_blocks(small_run, (160, 100))
     assert image.shape == (100, 160, 3)
     assert words == f"the largest 5 of {found.n_buildings} building parts are drawn"
@@ -189,7 +189,7 @@ def test_what_reaches_behind_the_camera_is_left_out() -> None:
 def test_render_paints_quality_and_the_city_model(
     small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(__import__("tiler.render").render.SIZES, "quality", (320, 240))
+    monkeypatch.setitem(__import__("tiler.pictures.render").render.SIZES, "quality", (320, 240))
     for what, size in (("quality", (320, 240)), ("citymodel", (1600, 1000))):
         files = [tmp_path / f"{what}{k}.png" for k in range(2)]
         for file in files:

@@ -50,9 +50,9 @@ from tests.tiled_runs import (
     write_numbered,
     write_tiled_run,
 )
-from tiler.check import CheckReport, check_run
-from tiler.merged import VERTEX_ID, write_merged_boundary, write_merged_volume
-from tiler.vtk_files import read_vtp, read_vtu, write_vtu
+from tiler.check.check import CheckReport, check_run
+from tiler.mesh_files.merged import VERTEX_ID, write_merged_boundary, write_merged_volume
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_vtu
 
 SQUARE: Bounds = (0.0, 0.0, 420.0, 420.0)
 FOUR = make_grid(SQUARE, tile_size=210.0, mesh_size=10.0)

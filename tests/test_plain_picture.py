@@ -10,8 +10,8 @@ import pyvista
 from PIL import Image
 
 from tests.scene import write_scene
-from tiler import plain_picture, render
-from tiler.plain_picture import PlainPlotter, has_graphics
+from tiler.pictures import plain_picture, render
+from tiler.pictures.plain_picture import PlainPlotter, has_graphics
 
 
 def paint(*squares: tuple[float, str]) -> np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]:
@@ -68,5 +68,5 @@ def test_a_run_is_drawn_without_graphics(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_importing_the_room_needs_no_graphics() -> None:
-    code = "import sys, tiler.plain_picture; sys.exit('pyvista' in sys.modules)"
+    code = "import sys, tiler.pictures.plain_picture; sys.exit('pyvista' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -16,20 +16,20 @@ from rich.console import Console
 
 from pipeline.errors import ConfigError
 from stitch.grid import TileGrid, has_tile, make_grid, seam_keys, seam_line, tile_box, tile_keys, tiles_of_seam
-from tiler import cli
-from tiler.clouds import CloudHeader
-from tiler.config import Config, make_config
-from tiler.context import absent_tiles, choose_tiles, make_layout, seam_name, tile_name
-from tiler.footprint_sample import FootprintSample, measure_detail, sample_footprints
-from tiler.forecast import Forecast, forecast_run, spread_points, warn_of_memory
+from tiler.cli import main as cli
+from tiler.config.config import Config, make_config
+from tiler.footprints.footprint_sample import FootprintSample, measure_detail, sample_footprints
 from tiler.georeference.establish import Georeference
 from tiler.georeference.frame import AS_IT_IS
-from tiler.plan_picture import ABSENT, HATCH, HOUSE, PRESENT, draw_plan
-from tiler.plan_report import describe_plan, plan_run
-from tiler.planning import Survey, survey_inputs
-from tiler.region import Region, check_region
-from tiler.run import run
-from tiler.synth import write_city
+from tiler.interface.synth import write_city
+from tiler.pictures.plan_picture import ABSENT, HATCH, HOUSE, PRESENT, draw_plan
+from tiler.planning.context import absent_tiles, choose_tiles, make_layout, seam_name, tile_name
+from tiler.planning.forecast import Forecast, forecast_run, spread_points, warn_of_memory
+from tiler.planning.plan import Survey, survey_inputs
+from tiler.planning.plan_report import describe_plan, plan_run
+from tiler.planning.region import Region, check_region
+from tiler.pointclouds.clouds import CloudHeader
+from tiler.workflow.run import run
 
 CRS = "EPSG:3006"
 
@@ -46,7 +46,7 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> Config:
 def record(city: Config) -> dict[str, Any]:
     """What a run of the city really took, in a process of its own."""
     words = [*city.pointcloud, "--footprints", city.footprints, "--tile-size", "150", "--out", city.out]
-    subprocess.run([sys.executable, "-m", "tiler.cli", "run", *words], check=True, capture_output=True)
+    subprocess.run([sys.executable, "-m", "tiler.cli.main", "run", *words], check=True, capture_output=True)
     found: dict[str, Any] = json.loads((Path(city.out) / "run.json").read_text())
     return found
 
@@ -349,7 +349,7 @@ def test_a_run_says_before_it_starts_which_tiles_may_not_fit(
 ) -> None:
     write_city(tmp_path / "city", size=200.0, buildings=4, density=0.5, relief=2, seed=1)
     for memory in (4.0, 0.3):
-        monkeypatch.setattr("tiler.run.machine_memory", lambda memory=memory: memory * 2**30)
+        monkeypatch.setattr("tiler.workflow.run.machine_memory", lambda memory=memory: memory * 2**30)
         said: list[str] = []
         values = {"pointcloud": [str(tmp_path / "city" / "tiles")], "out": str(tmp_path / str(memory))}
         record = run(make_config(values | {"tile_size": 100.0, "mesh_size": 5.0}), say=said.append)

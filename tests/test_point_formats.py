@@ -16,11 +16,11 @@ from laspy.vlrs.vlrlist import VLRList
 from tests.deliveries import write_delivery
 from tests.test_clouds import EVERYWHERE, ORIGIN
 from tests.test_deliveries import DELIVERIES
-from tiler.cli import main
-from tiler.clouds import find_clouds, read_header, read_points
-from tiler.config import load_config, make_config, write_config
-from tiler.ingest import read_cells
-from tiler.quarantine import command_alone
+from tiler.cli.main import main
+from tiler.config.config import load_config, make_config, write_config
+from tiler.pointclouds.clouds import find_clouds, read_header, read_points
+from tiler.pointclouds.ingest import read_cells
+from tiler.workflow.failed_tiles import command_alone
 
 N = 130_000  # more than two chunks of LAZ, which have 50,000 points
 VERSIONS = dict.fromkeys((0, 1), "1.1") | dict.fromkeys((2, 3), "1.2") | dict.fromkeys((4, 5), "1.3")

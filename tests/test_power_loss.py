@@ -13,9 +13,9 @@ from pipeline.errors import OutputError
 from tests.campaigns import keep_outcome, rounds
 from tests.test_run import hashes
 from tests.towns import Town, make_town
-from tiler.atomic import replacing
-from tiler.out_folder import MANIFEST_PATH, RUN_RECORD
-from tiler.run import run
+from tiler.store.atomic import replacing
+from tiler.workflow.out_folder import MANIFEST_PATH, RUN_RECORD
+from tiler.workflow.run import run
 
 SYNCED = {RUN_RECORD, MANIFEST_PATH}  # these the disk has before anything goes on
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in rounds(range(1, 4), range(4, 10)))]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tiler.cli import BLOCK
+from tiler.cli.main import BLOCK
 
 # Instructions that numpy looks for when it is imported.
 CHOSEN = importlib.import_module("numpy._core._multiarray_umath").__cpu_dispatch__
@@ -18,7 +18,7 @@ OLD = {"OPENBLAS_CORETYPE": "Prescott", "NPY_DISABLE_CPU_FEATURES": " ".join(CHO
 RUN = """
 import sys
 from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
-from tiler.cli import main
+from tiler.cli.main import main
 
 print("found:", *(name for name in __cpu_dispatch__ if __cpu_features__[name]))
 sys.exit(main(sys.argv[1:]))

@@ -13,11 +13,11 @@ import shapely
 
 import tiler
 from pipeline.errors import ConfigError, InputError
-from tiler.building_index import index_buildings
-from tiler.city_mesh import CityMesh
-from tiler.cli import main
-from tiler.notebook_progress import NotebookProgress, in_notebook
-from tiler.render import render_run
+from tiler.citymodels.building_index import index_buildings
+from tiler.cli.main import main
+from tiler.interface.city_mesh import CityMesh
+from tiler.interface.notebook_progress import NotebookProgress, in_notebook
+from tiler.pictures.render import render_run
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("numpy", "dask", "distributed", "shapely", "zarr", "numba", "rich", "IPython", "pyvista")
@@ -30,7 +30,11 @@ def city(small_run: Path) -> CityMesh:
 
 @pytest.mark.parametrize(
     "command",
-    ["import tiler; tiler.CityError", "import tiler.api", "from tiler.cli import make_parser; make_parser()"],
+    [
+        "import tiler; tiler.CityError",
+        "import tiler.interface.api",
+        "from tiler.cli.main import make_parser; make_parser()",
+    ],
 )
 def test_the_import_is_light(command: str) -> None:
     code = f"{command}; import sys; print(*(name for name in {HEAVY} if name in sys.modules))"
@@ -151,7 +155,7 @@ def test_it_shows_itself(city: CityMesh, monkeypatch: pytest.MonkeyPatch) -> Non
         drawn.append(options)
         render_run(directory, output, **options | {"size": (64, 40)})
 
-    monkeypatch.setattr("tiler.render.render_run", draw)
+    monkeypatch.setattr("tiler.pictures.render.render_run", draw)
     cells = f"{city.record['counts']['cells']:,} cells"
     assert repr(city) == (
         f"CityMesh({str(city.folder)!r}): {cells}, {city.record['counts']['points']:,} points, "
@@ -173,7 +177,7 @@ def test_it_says_why_there_is_no_picture(city: CityMesh, monkeypatch: pytest.Mon
     assert "<p>No picture: pictures need pyvista: pip install citystitch[pictures]</p>" in page
     assert "<img" not in page
     assert "radius ratio" in page
-    monkeypatch.setattr("tiler.city_mesh.MOST_SHOWN", 10)
+    monkeypatch.setattr("tiler.interface.city_mesh.MOST_SHOWN", 10)
     assert "facets &gt; 10 that are drawn unasked" in tiler.open(city.folder)._repr_html_()
 
 
@@ -256,12 +260,12 @@ class Display:
 def output(monkeypatch: pytest.MonkeyPatch) -> Display:
     output = Display()
     monkeypatch.setattr("IPython.display.display", output)
-    monkeypatch.setattr("tiler.notebook_progress.EVERY", 0.0)
+    monkeypatch.setattr("tiler.interface.notebook_progress.EVERY", 0.0)
     return output
 
 
 def test_a_notebook_shows_how_far_it_is(tmp_path: Path, output: Display, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tiler.notebook_progress.in_notebook", lambda: True)
+    monkeypatch.setattr("tiler.interface.notebook_progress.in_notebook", lambda: True)
     files = tiler.write_city(tmp_path / "city", size=160, buildings=4, density=0.5, seed=3)
     city = tiler.mesh(files.clouds, files.footprints, out=tmp_path / "out", domain_height=60)
     n = city.record["tasks"]["all"]

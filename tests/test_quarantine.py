@@ -15,15 +15,15 @@ from pipeline.mesh import Marker
 from tests.faults import Faults, injected, raises, segfaults
 from tests.test_resume import Town
 from tests.test_run import hashes
-from tiler.alone import run_alone
-from tiler.check import check_run
-from tiler.cli import main
-from tiler.config import make_config
-from tiler.results import StoredTerrain
-from tiler.run import run
-from tiler.synth import write_city
-from tiler.task import Task
-from tiler.vtk_files import read_vtp, read_vtu
+from tiler.check.check import check_run
+from tiler.cli.main import main
+from tiler.config.config import make_config
+from tiler.engine.task import Task
+from tiler.interface.synth import write_city
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu
+from tiler.store.results import StoredTerrain
+from tiler.workflow.run import run
+from tiler.workflow.single_tile import run_alone
 
 SIZE, TILE = 420.0, 140.0  # m: 9 tiles
 
@@ -195,7 +195,7 @@ def test_a_tile_alone_must_be_one_of_the_region(town: Town, tmp_path: Path) -> N
 
 
 def test_the_configuration_of_a_run_is_kept(town: Town) -> None:
-    from tiler.config import load_config
+    from tiler.config.config import load_config
 
     assert make_config(load_config(town.out / "config.toml")) == town.config(town.out)
 

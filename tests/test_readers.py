@@ -11,8 +11,8 @@ import shapely
 from pipeline.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from pipeline.inside import are_covered, cover_polygons
 from tests.tiles import make_town, run_of, write_town
-from tiler.readers import read_bands, read_cloud
-from tiler.store import Store
+from tiler.stages.readers import read_bands, read_cloud
+from tiler.store.store import Store
 
 Rows = list[tuple[int, int, int, int]]  # x, y, z in centimetres, and class
 
@@ -95,8 +95,8 @@ def test_bands_have_all_points_in_order_and_no_more_rows_than_they_may(
 
     task.read_ranges = watch
     for chunk, most in ((4, 12), (7, 7), (3, 100), (1, 2)):
-        monkeypatch.setattr("tiler.readers.CHUNK_ROWS", chunk)
-        monkeypatch.setattr("tiler.readers.BAND", most)
+        monkeypatch.setattr("tiler.stages.readers.CHUNK_ROWS", chunk)
+        monkeypatch.setattr("tiler.stages.readers.BAND", most)
         bands = list(read_bands(task, box, **options))
         assert len(bands) >= 107 / most
         assert np.concatenate([band.xyz for band in bands]).tobytes() == whole.xyz.tobytes()
@@ -133,8 +133,8 @@ def test_stages_give_the_same_whatever_the_bands(monkeypatch: pytest.MonkeyPatch
     values = write_town(tmp_path / "city", town, files=(2, 1)) | {"domain_height": 40.0, "bounds": region}
     found = []
     for rows in (1 << 20, 100):
-        monkeypatch.setattr("tiler.readers.CHUNK_ROWS", rows)
-        monkeypatch.setattr("tiler.readers.BAND", 3 * rows)
+        monkeypatch.setattr("tiler.stages.readers.CHUNK_ROWS", rows)
+        monkeypatch.setattr("tiler.stages.readers.BAND", 3 * rows)
         store = run_store(values, tmp_path / str(rows))
         stages = ("ground", "houses", "model", "fit")
         found.append([store.describe(stage, name) for stage in stages for name in store.names(stage)])

@@ -21,16 +21,16 @@ from pipeline.errors import ConfigError
 from stitch.grid import tiles_of_seam
 from tests.campaigns import keep_outcome
 from tests.test_run import hashes
-from tiler import run as run_module
-from tiler.check import check_run
-from tiler.config import Config, make_config
-from tiler.context import seam_key, tile_key
-from tiler.folder_lock import only_run
-from tiler.results import StoredTerrain
-from tiler.run import run
-from tiler.store import Store
-from tiler.summary import describe_tasks
-from tiler.synth import write_city
+from tiler.check.check import check_run
+from tiler.config.config import Config, make_config
+from tiler.interface.synth import write_city
+from tiler.planning.context import seam_key, tile_key
+from tiler.store.folder_lock import only_run
+from tiler.store.results import StoredTerrain
+from tiler.store.store import Store
+from tiler.workflow import run as run_module
+from tiler.workflow.run import run
+from tiler.workflow.summary import describe_tasks
 
 TILE = 140.0  # m
 CORNER = "2271_45707"  # the first tile

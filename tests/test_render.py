@@ -17,9 +17,10 @@ from PIL import Image
 from pipeline.errors import ConfigError, InputError, OutputError
 from pipeline.mesh import Boundary, Marker
 from tests.scene import PIECES, write_scene
-from tiler.camera import fit_camera
-from tiler.picture_data import City, load_air, load_city
-from tiler.picture_parts import (
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
+from tiler.pictures.camera import fit_camera
+from tiler.pictures.picture_data import City, load_air, load_city
+from tiler.pictures.picture_parts import (
     TILE_COLOURS,
     _edge_style,
     _skirt,
@@ -28,8 +29,7 @@ from tiler.picture_parts import (
     heights_above_ground,
     tile_colours,
 )
-from tiler.render import SIZES, render_run
-from tiler.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
+from tiler.pictures.render import SIZES, render_run
 
 SIDE = 240.0
 SIZE = (400, 250)

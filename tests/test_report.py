@@ -15,14 +15,14 @@ import pytest
 from pipeline.errors import InputError
 from pipeline.heights import ROOF_SOURCES
 from tests.tiles import hash_files
-from tiler.cli import main
-from tiler.note_words import GROUPS, WORDS, group_of, say_notes
+from tiler.cli.main import main
 from tiler.report import write_report
 from tiler.report.charts import Series, draw_gantt, draw_histogram
 from tiler.report.maps import draw_map, encode_png, gather_tiles, shade
 from tiler.report.record import SHOWN, read_run_facts
 from tiler.report.timeline import BINS, read_timeline
 from tiler.stages.domain import LOW_DOMAIN
+from tiler.words.note_words import GROUPS, WORDS, group_of, say_notes
 
 ROOT = Path(__file__).resolve().parents[1]
 SAME_FOR_ALL: set[str] = set()

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tiler.cli import main
+from tiler.cli.main import main
 
 pytestmark = pytest.mark.long
 SCRIPT = Path(__file__).with_name("open_report.js")

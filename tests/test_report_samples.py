@@ -16,8 +16,8 @@ from pipeline.residuals import conclude
 from pipeline.surface_points import measure_surface
 from tiler.report import samples
 from tiler.report.samples import NEAR, Samples, measure_samples
-from tiler.results import read_columns
-from tiler.store import Store
+from tiler.store.results import read_columns
+from tiler.store.store import Store
 
 
 def ramp() -> ColumnMesh:

@@ -14,13 +14,13 @@ from shapely import affinity
 
 from pipeline.errors import ConfigError
 from tests.test_run import hashes
-from tiler.check import check_run
-from tiler.config import Config, make_config
-from tiler.folder_lock import only_run
-from tiler.results import StoredTerrain
-from tiler.run import run
-from tiler.store import Store
-from tiler.synth import write_city
+from tiler.check.check import check_run
+from tiler.config.config import Config, make_config
+from tiler.interface.synth import write_city
+from tiler.store.folder_lock import only_run
+from tiler.store.results import StoredTerrain
+from tiler.store.store import Store
+from tiler.workflow.run import run
 
 SIZE, TILE = 560.0, 140.0  # m: 16 tiles
 

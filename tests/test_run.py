@@ -20,14 +20,14 @@ from pipeline.columns import expand_cells
 from pipeline.errors import CityError
 from tests.campaigns import keep_outcome, rounds
 from tests.cities import Bounds, cloud_over
-from tiler.check import check_run
-from tiler.cli import main
-from tiler.config import make_config
-from tiler.render import SIZES
-from tiler.results import StoredTerrain, read_columns
-from tiler.run import run
-from tiler.store import Store
-from tiler.synth import write_city
+from tiler.check.check import check_run
+from tiler.cli.main import main
+from tiler.config.config import make_config
+from tiler.interface.synth import write_city
+from tiler.pictures.render import SIZES
+from tiler.store.results import StoredTerrain, read_columns
+from tiler.store.store import Store
+from tiler.workflow.run import run
 
 BOUNDS: Bounds = (318000.0, 6399000.0, 318100.0, 6399100.0)
 HOUSE = shapely.box(318020, 6399020, 318040, 6399045)

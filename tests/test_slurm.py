@@ -46,7 +46,7 @@ LONG = {
 # A worker imports this before its first task, and maybe twice; results that are there already take no time.
 SLOW = """
 import time
-from tiler import limits
+from tiler.engine import task_limits as limits
 
 def slow(function, task, original=limits.run_task):
     def late(task):
@@ -82,7 +82,7 @@ def village(tmp_path_factory: pytest.TempPathFactory) -> SparseCity:
 
 def call(slurm: Slurm, *words: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "tiler.cli", *words],
+        [sys.executable, "-m", "tiler.cli.main", *words],
         env=slurm.environment, cwd=ROOT, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr

@@ -9,11 +9,11 @@ import pytest
 from distributed.system import memory_limit
 from numba.np import linalg
 
-from tiler.importing import uncollected
-from tiler.kept_memory import GARBAGE
-from tiler.limits import machine_memory
-from tiler.numba_registry import look_up
-from tiler.synth import write_city
+from tiler.engine.task_limits import machine_memory
+from tiler.executors.importing import uncollected
+from tiler.executors.kept_memory import GARBAGE
+from tiler.executors.numba_registry import look_up
+from tiler.interface.synth import write_city
 
 DASK = ("dask", "distributed")
 SCIPY = tuple(f"scipy.{part}" for part in ("fft", "io", "linalg", "ndimage", "sparse", "spatial", "special"))
@@ -23,28 +23,37 @@ UNNEEDED = ("meshio", "numpy.testing", "pyamg", "zarr", *SCIPY)
 def find_imported(names: tuple[str, ...], modules: tuple[str, ...]) -> list[str]:
     """Which of the names there are in a fresh process that has imported some modules, and looked at its memory."""
     code = (
-        f"import sys, {', '.join(modules)}; from tiler.limits import machine_memory; machine_memory(); "
+        f"import sys, {', '.join(modules)}; from tiler.engine.task_limits import machine_memory; "
+        "machine_memory(); "
         f"print(*(name for name in {names} if name in sys.modules))"
     )
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
 
 
 def test_a_run_imports_what_it_needs_alone() -> None:
-    assert find_imported(UNNEEDED, ("tiler.run", "tiler.terminal", "tiler.preload")) == []
+    assert (
+        find_imported(UNNEEDED, ("tiler.workflow.run", "tiler.monitoring.terminal", "tiler.executors.preload"))
+        == []
+    )
 
 
 def test_what_only_sends_tasks_to_workers_does_not_wait_for_zarr() -> None:
-    assert find_imported(("zarr",), ("tiler.terminal", "tiler.run", "tiler.worker_setup")) == []
+    assert (
+        find_imported(
+            ("zarr",), ("tiler.monitoring.terminal", "tiler.workflow.run", "tiler.executors.worker_setup")
+        )
+        == []
+    )
 
 
 def test_workers_of_dask_are_born_with_dask_alone() -> None:
-    assert find_imported(("distributed", "zarr"), ("tiler.preload",)) == []
-    assert find_imported(("distributed", "zarr"), ("tiler.preload_dask",)) == ["distributed"]
+    assert find_imported(("distributed", "zarr"), ("tiler.executors.preload",)) == []
+    assert find_imported(("distributed", "zarr"), ("tiler.executors.preload_dask",)) == ["distributed"]
 
 
 def test_what_all_tasks_need_has_all_that_numba_knows_with_blas() -> None:
     code = """
-import sys, tiler.preload
+import sys, tiler.executors.preload
 from numba.np import arraymath, linalg
 from numba.core.registry import cpu_target
 before = len(sys.modules)
@@ -63,7 +72,7 @@ def test_a_numba_that_looks_for_blas_otherwise_has_its_way(monkeypatch: pytest.M
 
 def test_a_kernel_of_the_user_calls_blas_in_a_process_that_runs_tasks() -> None:
     code = """
-import sys, tiler.preload, numpy, numba
+import sys, tiler.executors.preload, numpy, numba
 product = numba.njit(lambda a, b: numpy.dot(a, b))(numpy.eye(2), numpy.full((2, 2), 3.0))
 print(product.sum(), "scipy.linalg" in sys.modules)
 """
@@ -84,7 +93,7 @@ def find_imported_by_a_run(tmp_path: Path, names: tuple[str, ...], workers: int)
     words = ["run", *map(str, city.clouds), "--footprints", str(city.footprints), "--out", str(tmp_path / "out")]
     code = f"""
 import sys
-from tiler.cli import main
+from tiler.cli.main import main
 main({[*words, "--workers", str(workers), "--tile-size", "150", "--quiet"]})
 print("imported:", *(name for name in {names} if name in sys.modules))
 """
@@ -94,7 +103,9 @@ print("imported:", *(name for name in {names} if name in sys.modules))
 
 
 def test_a_run_with_workers_imports_no_dask() -> None:
-    assert find_imported(DASK, ("tiler.run", "tiler.terminal", "tiler.preload")) == []
+    assert (
+        find_imported(DASK, ("tiler.workflow.run", "tiler.monitoring.terminal", "tiler.executors.preload")) == []
+    )
 
 
 def test_the_memory_of_this_machine_is_what_dask_finds() -> None:
@@ -117,9 +128,11 @@ def tell_in_fresh_process(code: str) -> str:
 
 
 def test_workers_and_a_run_in_one_process_look_for_garbage_seldom() -> None:
-    assert tell_in_fresh_process("import gc, tiler.preload; print(gc.get_threshold()[0])") == str(GARBAGE)
+    assert tell_in_fresh_process("import gc, tiler.executors.preload; print(gc.get_threshold()[0])") == str(
+        GARBAGE
+    )
     nowhere = "main(['run', 'no/such.laz', '--workers', '0'])"
-    told = f"import gc; from tiler.cli import main; {nowhere}; print(gc.get_threshold()[0])"
+    told = f"import gc; from tiler.cli.main import main; {nowhere}; print(gc.get_threshold()[0])"
     assert tell_in_fresh_process(told) == str(GARBAGE)
 
 
@@ -127,7 +140,7 @@ def test_workers_and_a_run_in_one_process_look_for_garbage_seldom() -> None:
 def test_a_run_in_one_process_keeps_the_memory_that_it_freed() -> None:
     code = """
 import resource
-from tiler.cli import main
+from tiler.cli.main import main
 main(["run", "no/such.laz", "--workers", "0"])
 def take(): return [bytearray(30_000_000) for _ in range(4)]
 take()

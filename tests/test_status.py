@@ -21,22 +21,22 @@ import pytest
 from pipeline.errors import CityError, ConfigError, InputError
 from tests.test_run import hashes
 from tests.towns import Town, make_town
-from tiler.api import with_file
-from tiler.cli import main, make_parser
-from tiler.config import make_config
-from tiler.folder_lock import LOCK, is_held, only_run
-from tiler.progress import RunProgress, command_line
-from tiler.run import run
-from tiler.status import read_status
-from tiler.task import Record
+from tiler.cli.main import main, make_parser
+from tiler.config.config import make_config
+from tiler.engine.task import Record
+from tiler.interface.api import with_file
+from tiler.monitoring.progress import RunProgress, command_line
+from tiler.monitoring.status import read_status
+from tiler.store.folder_lock import LOCK, is_held, only_run
+from tiler.workflow.run import run
 
 ROOT = Path(__file__).resolve().parents[1]
 KILLED = """
 import os, signal, sys
-import tiler.progress
-from tiler.config import make_config
-from tiler.run import run
-tiler.progress.EVERY = 0.0
+import tiler.monitoring.progress
+from tiler.config.config import make_config
+from tiler.workflow.run import run
+tiler.monitoring.progress.EVERY = 0.0
 def stop(stage, seconds):
     if stage.startswith("columns"):
         os.kill(os.getpid(), signal.SIGKILL)
@@ -84,7 +84,7 @@ def test_json_is_all_of_it(town: Town, capsys: pytest.CaptureFixture[str]) -> No
 def test_a_run_at_work(
     town: Town, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("tiler.progress.EVERY", 0.0)
+    monkeypatch.setattr("tiler.monitoring.progress.EVERY", 0.0)
     out = tmp_path / "out"
     seen: dict[str, Any] = {}
 
@@ -194,7 +194,7 @@ def test_the_command_has_all_parameters(tmp_path: Path, others: dict[str, Any]) 
 
 def test_stages_of_the_users_own_have_no_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     RunProgress(tmp_path, make_config({"pointcloud": ["a.laz"]}), {}, command="")
-    assert "call tiler.run.run again as before" in show(tmp_path, capsys)
+    assert "call tiler.workflow.run.run again as before" in show(tmp_path, capsys)
 
 
 def test_what_is_no_run_and_what_is_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,8 +12,8 @@ import pytest
 
 from tests.test_resume import Town
 from tests.test_run import hashes
-from tiler.run import run
-from tiler.synth import write_city
+from tiler.interface.synth import write_city
+from tiler.workflow.run import run
 
 STOPPED = 130
 
@@ -28,7 +28,15 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
 
 def start(town: Town, out: Path, workers: int, *, dask: bool = False) -> "subprocess.Popen[str]":
     config = town.config(out)
-    command = [sys.executable, "-m", "tiler.cli", "run", *config.pointcloud, "--footprints", config.footprints]
+    command = [
+        sys.executable,
+        "-m",
+        "tiler.cli.main",
+        "run",
+        *config.pointcloud,
+        "--footprints",
+        config.footprints,
+    ]
     command += ["--out", str(out), "--tile-size", str(config.tile_size), "--domain-height", "70"]
     command += ["--workers", str(workers), *(["--dask"] if dask else [])]
     return subprocess.Popen(
@@ -79,7 +87,7 @@ def test_a_ctrl_c_when_all_is_said_changes_nothing() -> None:
 import atexit, os, signal, sys
 atexit.register(os.kill, os.getpid(), signal.SIGINT)
 sys.argv[1:] = ["run", "no/such.laz"]
-from tiler.cli import main
+from tiler.cli.main import main
 sys.exit(main())
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError, OutputError
-from tiler.packing import CHUNK_BYTES, CHUNK_HEAD, INLINE_BYTES, PACKED_BYTES, SQUARE, verified_chunks
-from tiler.store import Store
+from tiler.store.packing import CHUNK_BYTES, CHUNK_HEAD, INLINE_BYTES, PACKED_BYTES, SQUARE, verified_chunks
+from tiler.store.store import Store
 
 RNG = np.random.default_rng(7)
 N_CHUNK = CHUNK_BYTES // 24  # rows of three float64 in a chunk
@@ -147,7 +147,7 @@ def test_ranges_are_read_at_once_and_chunks_once(
         checked.extend(expected)
         return verified_chunks(rows, chunk, expected)
 
-    monkeypatch.setattr("tiler.result_reader.verified_chunks", watch)
+    monkeypatch.setattr("tiler.store.result_reader.verified_chunks", watch)
     found = store.read_ranges("s", "n", ["numbers", "big"], ranges)
     assert list(found) == ["big", "numbers"]
     assert found["big"].tobytes() == BIG[rows].tobytes()

@@ -13,13 +13,13 @@ from pipeline.errors import ConfigError, InputError
 from tests.campaigns import keep_outcome, rounds
 from tests.test_run import hashes
 from tests.towns import Town, make_town
-from tiler.audit import audit_run
-from tiler.cli import main
-from tiler.folder_lock import only_run
-from tiler.manifest import Entry, read_manifest
-from tiler.run import run
-from tiler.seal import seal
-from tiler.store import Store
+from tiler.cli.main import main
+from tiler.store.audit import audit_run
+from tiler.store.checksums import seal
+from tiler.store.folder_lock import only_run
+from tiler.store.manifest import Entry, read_manifest
+from tiler.store.store import Store
+from tiler.workflow.run import run
 
 SEEDS = [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in rounds(range(2, 6), range(6, 20)))]
 NOTE = "damaged-artefact"

@@ -9,7 +9,7 @@ from pipeline.house_levels import HouseParts
 from pipeline.houses import Houses, join_houses, take_houses
 from pipeline.point_fidelity import HouseFidelity
 from tests.cities import city_of, crowded_blocks
-from tiler.tables import (
+from tiler.citymodels.tables import (
     ARRAYS_TO_RAISE,
     ARRAYS_TO_SHAPE,
     NEAR_ARRAYS,

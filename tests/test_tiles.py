@@ -27,12 +27,12 @@ from tests.tiles import (
     terraces,
     write_town,
 )
-from tiler.check import CheckReport, check_run
-from tiler.config import make_config
-from tiler.mesh_pieces import open_pieces
-from tiler.results import StoredTerrain
+from tiler.check.check import CheckReport, check_run
+from tiler.config.config import make_config
+from tiler.mesh_files.mesh_pieces import open_pieces
+from tiler.mesh_files.vtk_files import read_vtp
 from tiler.stages.surroundings import terrain_halo
-from tiler.vtk_files import read_vtp
+from tiler.store.results import StoredTerrain
 
 X, Y = 318_000.0, 6_399_000.0
 SIZE = 140.0  # least tile for cells of 10 m
@@ -176,7 +176,7 @@ def test_any_order_of_files_and_tasks_leaves_the_same_files(
 ) -> None:
     values, hashes = city
     order = AnyOrder(1)
-    monkeypatch.setattr("tiler.engine.heapq", order)
+    monkeypatch.setattr("tiler.engine.engine.heapq", order)
     files = sorted(Path(values["pointcloud"][0]).iterdir(), reverse=True)
     run_of(values | {"pointcloud": [str(path) for path in files]}, tmp_path)
     assert hash_files(tmp_path) == hashes

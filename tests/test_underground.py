@@ -34,12 +34,12 @@ from stitch.conformity import compute_cell_volumes, pair_cell_faces
 from tests.cities import Bounds, crowded_blocks
 from tests.test_tiles import prove_local, put_beside
 from tests.tiles import hash_files, make_town, run_of, write_town
-from tiler.check import CheckReport, check_run
-from tiler.config import Config, idle_parameters, make_config
-from tiler.export import export_run
-from tiler.results import StoredTerrain
-from tiler.store import Store
-from tiler.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu, write_vtp, write_vtu
+from tiler.check.check import CheckReport, check_run
+from tiler.config.config import Config, idle_parameters, make_config
+from tiler.formats.export import export_run
+from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu, write_vtp, write_vtu
+from tiler.store.results import StoredTerrain
+from tiler.store.store import Store
 
 SIZE = 140.0  # m: side of a tile
 DEPTH = 25.0

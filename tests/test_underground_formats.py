@@ -20,15 +20,15 @@ from tests.foam_reader import PolyMesh, read_poly_mesh, read_zones
 from tests.hand_pieces import HandPieces
 from tests.programs import mesh_is_ok, read_check, run_foam, run_program
 from tests.test_formats_openfoam import MESH, assert_in_order, volumes_of
-from tiler.cli import main
-from tiler.config import make_config
-from tiler.export import FORMATS, export_run
+from tiler.cli.main import main
+from tiler.config.config import make_config
+from tiler.formats.export import FORMATS, export_run
 from tiler.formats.foam_patches import PATCHES
 from tiler.formats.openfoam import write_openfoam
-from tiler.mesh_pieces import MeshPiece, open_pieces
-from tiler.run import run
-from tiler.synth import write_city
-from tiler.vtk_files import read_vtu, write_vtu
+from tiler.interface.synth import write_city
+from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
+from tiler.mesh_files.vtk_files import read_vtu, write_vtu
+from tiler.workflow.run import run
 
 DEPTH = 20.0
 

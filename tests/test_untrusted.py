@@ -31,10 +31,10 @@ from tests.bad_input import (
     write_houses,
     write_parquet,
 )
-from tiler import ingest
-from tiler.out_folder import refuse_inputs_within
-from tiler.seal import seal
-from tiler.store import Store
+from tiler.pointclouds import ingest
+from tiler.store.checksums import seal
+from tiler.store.store import Store
+from tiler.workflow.out_folder import refuse_inputs_within
 
 Capture = pytest.CaptureFixture[str]
 Damage = Callable[[Path], None]

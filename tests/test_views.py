@@ -21,14 +21,14 @@ from rich.console import Console
 from tests.programs import run_program
 from tests.test_events import kinds, record_of, start_of
 from tests.towns import Town, make_town
-from tiler.cli import main
-from tiler.events import read_events
-from tiler.live_view import LiveView, draw
-from tiler.plain_view import LISTED_FAILURES, Line, Lines, PlainView
-from tiler.stage import Scope
-from tiler.tally import Tally
-from tiler.terminal import make_views
-from tiler.watching import RunStart, Watchers
+from tiler.cli.main import main
+from tiler.engine.stage import Scope
+from tiler.monitoring.events import read_events
+from tiler.monitoring.live_view import LiveView, draw
+from tiler.monitoring.plain_view import LISTED_FAILURES, Line, Lines, PlainView
+from tiler.monitoring.tally import Tally
+from tiler.monitoring.terminal import make_views
+from tiler.monitoring.watchers import RunStart, Watchers
 
 ROOT = Path(__file__).resolve().parents[1]
 HIDE, SHOW = "\x1b[?25l", "\x1b[?25h"
@@ -353,7 +353,7 @@ def test_a_run_that_cannot_begin_is_in_the_log(tmp_path: Path, capsys: pytest.Ca
 
 def test_libraries_are_silent(tmp_path: Path) -> None:
     """Warnings of libraries are not for the user, in the driver or in workers; -W brings them back."""
-    code = "import warnings, sys; from tiler.cli import main; sys.argv = ['citystitch', 'config']; main();"
+    code = "import warnings, sys; from tiler.cli.main import main; sys.argv = ['citystitch', 'config']; main();"
     code += 'import os; os.system(f"{sys.executable} -c \'import warnings; warnings.warn(\\"child\\")\'");'
     code += "warnings.warn('driver')"
     for options, seen in (([], False), (["-W", "default"], True)):
@@ -366,7 +366,7 @@ def test_libraries_are_silent(tmp_path: Path) -> None:
 
 def test_logs_of_libraries_are_silent() -> None:
     """Dask tells of closed connections after its cluster has let go of its logs; others are as open."""
-    code = "import logging, sys; from tiler.cli import main; sys.argv = ['citystitch', 'config']; main();"
+    code = "import logging, sys; from tiler.cli.main import main; sys.argv = ['citystitch', 'config']; main();"
     code += "import distributed; names = ['distributed.batched', 'distributed.client', 'tornado', 'asyncio'];"
     code += "[logging.getLogger(name).critical('said by %s', name) for name in names]"
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -403,7 +403,7 @@ def in_tmux(words: list[str], width: int, folder: Path) -> Iterator[str]:
 @pytest.mark.parametrize("width", [80, 200])
 def test_a_run_in_a_terminal_looks_right(town: Town, tmp_path: Path, width: int) -> None:
     words = run_words(town, tmp_path / "out", "--workers", "2", "--mesh-size", "1.5")  # takes some seconds
-    screens = list(in_tmux([sys.executable, "-m", "tiler.cli", *words], width, tmp_path))
+    screens = list(in_tmux([sys.executable, "-m", "tiler.cli.main", *words], width, tmp_path))
     views = [rows for screen in screens[:-1] if "in hand" in screen for rows in [screen.rstrip().split("\n")]]
     assert len(views) > 3, screens[-1]
     bar = min(60, width - 58)
@@ -431,7 +431,7 @@ def test_a_run_in_a_terminal_looks_right(town: Town, tmp_path: Path, width: int)
 def test_ctrl_c_on_the_keyboard_stops_and_leaves_a_whole_terminal(town: Town, tmp_path: Path) -> None:
     out = tmp_path / "out"
     ours, theirs = pty.openpty()
-    words = [sys.executable, "-m", "tiler.cli", *run_words(town, out, "--workers", "2")]
+    words = [sys.executable, "-m", "tiler.cli.main", *run_words(town, out, "--workers", "2")]
     process = subprocess.Popen(
         ["setsid", "-c", *words], stdin=theirs, stdout=theirs, stderr=theirs, env={**os.environ, "TERM": "xterm"}
     )

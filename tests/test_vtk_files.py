@@ -21,8 +21,8 @@ from vtkmodules.vtkIOXML import (
 from pipeline.errors import InputError, OutputError
 from pipeline.mesh import Boundary, TetMesh
 from tests.meshes import TinyCity, make_city, split_city
-from tiler import vtk_files, vtk_xml
-from tiler.vtk_files import (
+from tiler.mesh_files import vtk_files, vtk_xml
+from tiler.mesh_files.vtk_files import (
     read_piece_paths,
     read_vtp,
     read_vtu,
@@ -31,7 +31,7 @@ from tiler.vtk_files import (
     write_vtp,
     write_vtu,
 )
-from tiler.vtk_xml import make_stream, write_data_file
+from tiler.mesh_files.vtk_xml import make_stream, write_data_file
 
 
 @pytest.fixture(scope="module")

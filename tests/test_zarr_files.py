@@ -9,9 +9,9 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec
 
-from tiler.packing import shorten_chunk
-from tiler.store import Store
-from tiler.zarr_files import DECODER, GROUP, NUMBERS, ChunkForm, describe_group
+from tiler.store.packing import shorten_chunk
+from tiler.store.store import Store
+from tiler.store.zarr_files import DECODER, GROUP, NUMBERS, ChunkForm, describe_group
 
 RNG = np.random.default_rng(5)
 ARRAYS: dict[str, tuple[NDArray[Any], tuple[int, ...]]] = {

@@ -29,9 +29,9 @@ from stitch.numbering import (
 from stitch.seam_columns import tile_columns
 from stitch.seams import find_vertices
 from tests.stitching import OPTIONS, Scene, Tile, clip_scene, mesh_all
-from tiler.cityjson import write_city_model
-from tiler.merged import VERTEX_ID
-from tiler.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
+from tiler.citymodels.cityjson import write_city_model
+from tiler.mesh_files.merged import VERTEX_ID
+from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
 
 Split = tuple[ColumnMesh, Boundary, NDArray[np.int32]]
 Pieces = dict[Key, tuple[TetMesh, Boundary]]

@@ -19,18 +19,18 @@ from shapely import affinity
 
 from pipeline.classes import BUILDING, GROUND
 from stitch.grid import Bounds
-from tiler.config import Config, make_config
-from tiler.context import RunContext, pack_tiles
-from tiler.engine import Engine
-from tiler.executors import serial
-from tiler.options import derived_parameters
-from tiler.planning import Plan, identify, make_plan
-from tiler.run import run
-from tiler.sequence import run_city_stages
-from tiler.settling import settle_domain
-from tiler.stage import REGION_ITEM
+from tiler.config.config import Config, make_config
+from tiler.config.step_options import derived_parameters
+from tiler.engine.engine import Engine
+from tiler.engine.stage import REGION_ITEM
+from tiler.executors.executor import serial
+from tiler.planning.context import RunContext, pack_tiles
+from tiler.planning.plan import Plan, identify, make_plan
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.mesh import mesh_stages
+from tiler.workflow.run import run
+from tiler.workflow.settled_domain import settle_domain
+from tiler.workflow.stage_sequence import run_city_stages
 
 CRS = "EPSG:3006"
 ROAD = 14.0  # m between two terraces, back to back ones are closer

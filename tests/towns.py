@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tiler.config import Config, make_config
-from tiler.run import run
-from tiler.synth import write_city
+from tiler.config.config import Config, make_config
+from tiler.interface.synth import write_city
+from tiler.workflow.run import run
 
 SIZE, TILE = 280.0, 140.0  # m: 4 tiles
 

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pipeline.errors import CityError
-    from tiler.api import mesh, plan, write_city
-    from tiler.api import open_folder as open
-    from tiler.city_mesh import Building, CityMesh, Picture
-    from tiler.mesh_pieces import MeshPiece
-    from tiler.plan_view import RunPlan
+    from tiler.interface.api import mesh, plan, write_city
+    from tiler.interface.api import open_folder as open
+    from tiler.interface.city_mesh import Building, CityMesh, Picture
+    from tiler.interface.plan_view import RunPlan
+    from tiler.mesh_files.mesh_pieces import MeshPiece
 
 __all__ = [
     "Building",
@@ -34,16 +34,16 @@ __all__ = [
 # Where each name is, and what it is called there. None may be that of a module of this package: importing the
 # module would take its place.
 _PLACES = {
-    "Building": ("tiler.city_mesh", "Building"),
+    "Building": ("tiler.interface.city_mesh", "Building"),
     "CityError": ("pipeline.errors", "CityError"),
-    "CityMesh": ("tiler.city_mesh", "CityMesh"),
-    "MeshPiece": ("tiler.mesh_pieces", "MeshPiece"),
-    "Picture": ("tiler.city_mesh", "Picture"),
-    "RunPlan": ("tiler.plan_view", "RunPlan"),
-    "mesh": ("tiler.api", "mesh"),
-    "open": ("tiler.api", "open_folder"),
-    "plan": ("tiler.api", "plan"),
-    "write_city": ("tiler.api", "write_city"),
+    "CityMesh": ("tiler.interface.city_mesh", "CityMesh"),
+    "MeshPiece": ("tiler.mesh_files.mesh_pieces", "MeshPiece"),
+    "Picture": ("tiler.interface.city_mesh", "Picture"),
+    "RunPlan": ("tiler.interface.plan_view", "RunPlan"),
+    "mesh": ("tiler.interface.api", "mesh"),
+    "open": ("tiler.interface.api", "open_folder"),
+    "plan": ("tiler.interface.api", "plan"),
+    "write_city": ("tiler.interface.api", "write_city"),
 }
 
 

@@ -17,7 +17,7 @@ def exists(name: str) -> bool:
 
     Examples
     --------
-    >>> exists("tiler.run.run"), exists("tiler.run.walk")
+    >>> exists("tiler.workflow.run.run"), exists("tiler.workflow.run.walk")
     (True, False)
     """
     parts = name.split(".")

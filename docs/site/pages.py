@@ -20,7 +20,7 @@ COLUMNS = "100"  # of the help of a command
 
 def describe_parameters() -> str:
     """Tell every parameter of a run: default, unit, choices, meaning, source."""
-    from tiler.config import Config
+    from tiler.config.config import Config
 
     lines = [
         "# Parameters",
@@ -45,7 +45,7 @@ def describe_parameters() -> str:
 
 def describe_commands() -> str:
     """Give the help of every command."""
-    from tiler.cli import make_parser
+    from tiler.cli.main import make_parser
 
     os.environ["COLUMNS"] = COLUMNS
     parser = make_parser()

@@ -35,7 +35,7 @@ from tests.benchmarks.bench_report import (
     write_report,
 )
 from tests.benchmarks.runs import COMMAND, citystitch, record_of, set_aside
-from tiler.events import read_events
+from tiler.monitoring.events import read_events
 
 KEPT = DOCS / "benchmarks.json"
 MESH_SIZES = (20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)
@@ -357,7 +357,7 @@ def study_limits(cities: Cities, out: Path) -> list[dict[str, Any]]:
     """What the machine does at best: LAZ decompression alone, a copy in memory, a file written and flushed."""
     import laspy
 
-    from tiler.las_chunks import FIELDS
+    from tiler.pointclouds.las_chunks import FIELDS
 
     files = sorted((cities.make(2500, 3000) / "tiles").glob("*.laz"))
     start, n_points = time.perf_counter(), 0

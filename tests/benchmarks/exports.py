@@ -18,7 +18,7 @@ from typing import Any
 from tests.benchmarks.bench_report import REPORT
 from tests.benchmarks.reliability import replace_between
 from tests.benchmarks.runs import citystitch, record_of
-from tiler.export import FORMATS, export_run
+from tiler.formats.export import FORMATS, export_run
 
 BOUND = 2**30  # bytes of memory that no export may exceed: all of them stream
 ALONE = "--alone"  # the process that exports once, and says what it took

@@ -11,9 +11,9 @@ from statistics import median
 from numba.core import codegen
 from numba.core.sigutils import normalize_signature
 
-from tiler.kernels import RUN, _kernel, read_list
-from tiler.limits import resident_memory
-from tiler.numba_registry import look_up
+from tiler.engine.task_limits import resident_memory
+from tiler.executors.kernels import RUN, _kernel, read_list
+from tiler.executors.numba_registry import look_up
 
 ROUNDS = 7
 WAYS = OURS, NUMBAS = "ours", "numba's"

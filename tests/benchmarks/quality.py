@@ -11,11 +11,11 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw
 
-from tiler.cityjson import read_city_model
-from tiler.config import make_config
-from tiler.render import render_run
-from tiler.run import run
-from tiler.synth import write_city
+from tiler.citymodels.cityjson import read_city_model
+from tiler.config.config import make_config
+from tiler.interface.synth import write_city
+from tiler.pictures.render import render_run
+from tiler.workflow.run import run
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from stitch.grid import Key
-from tiler.config import Config
-from tiler.context import tile_key, tile_name
-from tiler.engine import Engine
-from tiler.executors import serial
-from tiler.own_stages import OwnStages
-from tiler.planning import make_plan
-from tiler.sequence import make_engine, run_stages
-from tiler.stage import Box, Facts, Scope
-from tiler.store import Store
-from tiler.task import Record
+from tiler.config.config import Config
+from tiler.engine.engine import Engine
+from tiler.engine.stage import Box, Facts, Scope
+from tiler.engine.task import Record
+from tiler.executors.executor import serial
+from tiler.planning.context import tile_key, tile_name
+from tiler.planning.plan import make_plan
+from tiler.store.store import Store
+from tiler.workflow.own_stages import OwnStages
+from tiler.workflow.stage_sequence import make_engine, run_stages
 
 PATH = Path(__file__).with_name("recorded.json")
 KEPT = 6  # tasks of each stage that are kept, evenly among all by their time

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-COMMAND = [sys.executable, "-m", "tiler.cli"]
+COMMAND = [sys.executable, "-m", "tiler.cli.main"]
 
 
 def citystitch(*arguments: str, cores: int = 2) -> None:

@@ -18,20 +18,20 @@ from tests.benchmarks.countries import COUNTRIES, sheets, write_sheets
 from tests.benchmarks.recorded import PATH as RECORDED
 from tests.benchmarks.recorded import record
 from tests.benchmarks.virtual import StandInStore, VirtualWorkers, instant
-from tiler.config import Config, make_config
-from tiler.engine import Engine, StoppedError
-from tiler.executors import Executor
-from tiler.manifest import find_remade, write_manifest
-from tiler.out_folder import MANIFEST_PATH, STORE
-from tiler.own_stages import OwnStages, list_stages
-from tiler.planning import Plan, make_plan
-from tiler.progress import RunProgress
-from tiler.quarantine import HolesError, Missing, find_missing, leave_holes
-from tiler.records import Records
+from tiler.config.config import Config, make_config
+from tiler.engine.engine import Engine, StoppedError
+from tiler.engine.records import Records
+from tiler.engine.task import Record
+from tiler.executors.executor import Executor
+from tiler.monitoring.progress import RunProgress
+from tiler.planning.plan import Plan, make_plan
 from tiler.scheduler.executor import local
-from tiler.sequence import make_engine, run_stages
-from tiler.summary import summarise_run
-from tiler.task import Record
+from tiler.store.manifest import find_remade, write_manifest
+from tiler.workflow.failed_tiles import HolesError, Missing, find_missing, leave_holes
+from tiler.workflow.out_folder import MANIFEST_PATH, STORE
+from tiler.workflow.own_stages import OwnStages, list_stages
+from tiler.workflow.stage_sequence import make_engine, run_stages
+from tiler.workflow.summary import summarise_run
 
 SAMPLED = 10_000  # tasks between two looks at memory
 SETTLE = 3.0  # s after which a cluster is quiet
@@ -92,7 +92,7 @@ def drive(
     stand_in: StandInStore | None = None,
     stop_after: int = 0,
 ) -> dict[str, Any]:
-    """Run all stages of a region and what follows them, as `tiler.run` does, but for the index files."""
+    """Run all stages of a region and what follows them, as `tiler.workflow.run` does, but for the index files."""
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
     meter = Meter(out, config, plan, stop_after=stop_after)

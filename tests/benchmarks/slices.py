@@ -12,9 +12,9 @@ from typing import Any
 import pyvista as pv
 from PIL import Image
 
-from tiler.config import make_config
-from tiler.run import run
-from tiler.synth import write_city
+from tiler.config.config import make_config
+from tiler.interface.synth import write_city
+from tiler.workflow.run import run
 
 SIZE, TILE, HEIGHT = 300.0, 150.0, 60.0  # m
 ROW = 0.3  # of the region's depth: where it is cut

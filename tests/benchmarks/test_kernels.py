@@ -24,7 +24,7 @@ from pipeline.slab import lift_places, smooth_slab
 from pipeline.spacing import SpacingLimits
 from pipeline.terrain import Dtm
 from tests.cities import Bounds, random_city
-from tiler.vtk_xml import compress_block
+from tiler.mesh_files.vtk_xml import compress_block
 
 BOUNDS: Bounds = (0.0, 0.0, 600.0, 600.0)
 BUILDINGS, MESH_SIZE, HEIGHT, POINTS = 170, 5.0, 100.0, 1_000_000

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pipeline.columns import expand_cells
 from pipeline.quality import Quality, measure_cells
 from tests.benchmarks.runs import citystitch
-from tiler.results import read_columns
-from tiler.store import Store
+from tiler.store.results import read_columns
+from tiler.store.store import Store
 
 SIZE = 1200
 BUILDINGS = 1000

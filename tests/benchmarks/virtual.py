@@ -12,11 +12,11 @@ import numpy as np
 
 from pipeline.errors import CityError
 from tests.benchmarks.recorded import choose, draw, make_facts
-from tiler.crew import Function
-from tiler.executors import LEAST_WINDOW, WINDOW
-from tiler.stage import Box, Facts, Layout, Scope
-from tiler.store import Store
-from tiler.task import Failure, Record, Task, run_task
+from tiler.engine.stage import Box, Facts, Layout, Scope
+from tiler.engine.task import Failure, Record, Task, run_task
+from tiler.executors.executor import LEAST_WINDOW, WINDOW
+from tiler.executors.worker_processes import Function
+from tiler.store.store import Store
 
 VERIFIED = 1e9  # bytes/s; how fast an earlier result is held against its checksums
 LATENCY = 1e-3  # s; for an earlier result besides
@@ -189,7 +189,7 @@ class VirtualWorkers:
 
 
 def instant(function: Function, task: Task, seconds: float) -> Record:
-    """Stand for `tiler.limits.run_guarded`: the record of a task at once, and nothing in the store."""
+    """Stand for `tiler.engine.task_limits.run_guarded`: the record of a task at once, and nothing in the store."""
     chosen = choose(task.context.tile_size, task.stage, task.name)
     facts = make_facts(chosen, task.scope, task.name, task.box)
     notes = {"simulated": chosen.notes} if chosen.notes else {}

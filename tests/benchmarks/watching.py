@@ -22,15 +22,15 @@ from unittest.mock import patch
 
 from rich.console import Console
 
-from tiler.config import Config, make_config
-from tiler.events import EventLog, begin_file
-from tiler.live_view import LiveView
-from tiler.run import run
-from tiler.stage import Scope
-from tiler.synth import write_city
-from tiler.task import Record
-from tiler.terminal import make_views
-from tiler.watching import RunStart, Watcher, Watchers
+from tiler.config.config import Config, make_config
+from tiler.engine.stage import Scope
+from tiler.engine.task import Record
+from tiler.interface.synth import write_city
+from tiler.monitoring.events import EventLog, begin_file
+from tiler.monitoring.live_view import LiveView
+from tiler.monitoring.terminal import make_views
+from tiler.monitoring.watchers import RunStart, Watcher, Watchers
+from tiler.workflow.run import run
 
 SIZE, BUILDINGS, TILE = 600.0, 220, 150.0  # m, number, m: 16 tiles
 PAIRS = 12
@@ -48,7 +48,7 @@ def seconds_of(config: Config, watchers: Sequence[Watcher], *, files: bool) -> f
     if files:
         run(config, watchers=watchers)
     else:
-        with patch("tiler.run_watchers.EventLog", lambda *_: Watcher()):
+        with patch("tiler.workflow.run_watchers.EventLog", lambda *_: Watcher()):
             run(config, watchers=watchers)
     return time.process_time() - began
 

@@ -53,7 +53,7 @@ def run_once(words: Sequence[str], *, watched: bool) -> tuple[float, int]:
 
 def cost_of_answer(out: Path, asked: int = 300) -> float:
     """Processor time (s) that the server of a run's folder takes to answer a page that is open."""
-    words = [sys.executable, "-m", "tiler.cli", "dashboard", str(out)]
+    words = [sys.executable, "-m", "tiler.cli.main", "dashboard", str(out)]
     place = os.environ | {"PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=place) as job:
         assert job.stdout is not None
@@ -114,7 +114,7 @@ def main() -> None:
     parser.add_argument("--buildings", type=int, default=500)
     parser.add_argument("--tile-size", type=float, default=250.0)
     given = parser.parse_args()
-    python = [sys.executable, "-m", "tiler.cli"]
+    python = [sys.executable, "-m", "tiler.cli.main"]
     with tempfile.TemporaryDirectory() as folder:
         city, out = Path(folder, "city"), Path(folder, "out")
         size = ["--size", str(given.size), "--buildings", str(given.buildings)]

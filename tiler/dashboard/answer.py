@@ -9,9 +9,9 @@ from tiler.dashboard.codes import State
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.map_view import Question, tell_map
 from tiler.dashboard.model import SEAM, TILE, RunModel
-from tiler.note_words import say_notes
-from tiler.stage_groups import group_of_stage, group_stages, title_of_stage
-from tiler.tally import StageTally, estimate_share, estimate_time
+from tiler.monitoring.tally import StageTally, estimate_share, estimate_time
+from tiler.words.note_words import say_notes
+from tiler.words.stage_groups import group_of_stage, group_stages, title_of_stage
 
 SHOWN_FAILURES, SHOWN_AT_WORK = 200, 12
 TITLES = {  # of the values that come first; a fact has its name
@@ -88,7 +88,7 @@ def list_values(model: RunModel) -> list[list[str]]:
 
 
 def _tally(model: RunModel) -> dict[str, StageTally]:
-    """How far each stage is, for the estimates of `tiler.tally`."""
+    """How far each stage is, for the estimates of `tiler.monitoring.tally`."""
     return {
         name: StageTally(
             max(stage.total, stage.done),
@@ -103,7 +103,7 @@ def _tally(model: RunModel) -> dict[str, StageTally]:
 
 
 def _tell_step(model: RunModel, step: str, names: Iterable[str]) -> dict[str, Any]:
-    """Add up the stages of a step (`tiler.stage_groups`)."""
+    """Add up the stages of a step (`tiler.words.stage_groups`)."""
     stages = [model.stages[name] for name in names]
     counts = sum((stage.counts for stage in stages), Counter[int]())
     reused, failed, running = (counts[state] for state in (State.REUSED, State.FAILED, State.RUNNING))

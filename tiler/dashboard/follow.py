@@ -10,8 +10,8 @@ from typing import Any
 
 from pipeline.errors import CityError, InputError
 from tiler.dashboard.model import RunModel
-from tiler.folder_lock import is_held
-from tiler.out_folder import EVENTS, RUN_RECORD
+from tiler.store.folder_lock import is_held
+from tiler.workflow.out_folder import EVENTS, RUN_RECORD
 
 CHUNK = 2**20  # bytes that are read at once
 LONGEST = 2**24  # bytes of a line; a longer one is no event

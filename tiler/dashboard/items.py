@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiler.dashboard.codes import Codes, State, combine
-from tiler.stage_groups import group_of_stage
+from tiler.words.stage_groups import group_of_stage
 
 GROWTH = 1024  # items that are made room for at least
 MOST_FACTS = 64  # kinds of values that are kept; a stage of the user's own may tell anything
@@ -160,7 +160,7 @@ class Items:
         return combine(counts)
 
     def members(self, stage: str) -> list[str]:
-        """List the stages of this scope that a step has (`tiler.stage_groups`), or the one of that name."""
+        """List the stages of this scope that a step has (`tiler.words.stage_groups`), or the one of that name."""
         return [name for name in self.stages if stage in (name, group_of_stage(name))]
 
     def values(self, value: str, stage: str) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The state of a run, folded from the events of its driver (`tiler.events`) one after the other."""
+"""The state of a run, folded from the events of its driver (`tiler.monitoring.events`) one after the other."""
 
 import math
 from collections import Counter, deque
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from tiler.dashboard.codes import State
 from tiler.dashboard.items import Items
 from tiler.dashboard.series import Series
-from tiler.note_words import is_drop
+from tiler.words.note_words import is_drop
 
 TILE, SEAM = "tile", "seam"
 KEPT_FAILURES, KEPT_MESSAGES = 1000, 50

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError
-from tiler.atomic import replacing
-from tiler.export import RUN_RECORD, RunFiles, RunSource
+from tiler.formats.export import RUN_RECORD, RunFiles, RunSource
 from tiler.formats.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of
 from tiler.formats.xdmf import as_output_error
-from tiler.mesh_pieces import open_pieces
-from tiler.run_folder import read_crs
+from tiler.mesh_files.mesh_pieces import open_pieces
+from tiler.store.atomic import replacing
+from tiler.workflow.run_folder import read_crs
 
 VERSION = 3.3  # of CGNS, the first in which all that is written has today's meaning
 TRIANGLE, TETRAHEDRON = 5, 10  # TRI_3 and TETRA_4 among CGNS's types of elements

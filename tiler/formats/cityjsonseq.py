@@ -9,9 +9,9 @@ from typing import IO, Any
 import numpy as np
 
 from pipeline.errors import InputError
-from tiler.atomic import replacing
-from tiler.building_index import Vertices, has_parts, read_objects, spool_vertices
-from tiler.run_folder import WRONG_FIELD, broken_field
+from tiler.citymodels.building_index import Vertices, has_parts, read_objects, spool_vertices
+from tiler.store.atomic import replacing
+from tiler.workflow.run_folder import WRONG_FIELD, broken_field
 
 CITY_MODEL = "citymodel.city.json"  # of a run: the one that was meshed
 

@@ -34,7 +34,7 @@ from tiler.formats.region_faces import (
     own_faces,
     wrong_ground,
 )
-from tiler.mesh_pieces import MeshPiece
+from tiler.mesh_files.mesh_pieces import MeshPiece
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.mesh import Marker
-from tiler.atomic import replacing
-from tiler.export import RUN_RECORD, RunFiles, RunSource
+from tiler.formats.export import RUN_RECORD, RunFiles, RunSource
 from tiler.formats.foam_patches import FIRST_BUILDING, PATCHES, building_name, facets_by_key, is_house
 from tiler.formats.surface import (
     Surface,
@@ -25,7 +24,8 @@ from tiler.formats.surface import (
     place_vertices,
     survey_surface,
 )
-from tiler.run_folder import read_crs
+from tiler.store.atomic import replacing
+from tiler.workflow.run_folder import read_crs
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 VERTICES, INDICES = 34962, 34963  # targets of buffer views

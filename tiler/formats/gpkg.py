@@ -14,11 +14,11 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.errors import OutputError
-from tiler.atomic import replacing
-from tiler.building_index import has_parts, read_building, read_objects, spool_vertices
-from tiler.export import RUN_RECORD
+from tiler.citymodels.building_index import has_parts, read_building, read_objects, spool_vertices
 from tiler.formats.cityjsonseq import CITY_MODEL
-from tiler.run_folder import read_crs
+from tiler.formats.export import RUN_RECORD
+from tiler.store.atomic import replacing
+from tiler.workflow.run_folder import read_crs
 
 LAYER = "buildings"
 BATCH = 5000  # rows that are written at once

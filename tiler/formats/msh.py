@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.mesh import Marker, Region
-from tiler.atomic import replacing
-from tiler.export import RunSource
+from tiler.formats.export import RunSource
 from tiler.formats.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of, slices
-from tiler.mesh_pieces import MeshPiece, open_pieces
+from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
+from tiler.store.atomic import replacing
 
 # No marker has one of these numbers: some programs know groups by number alone.
 VOLUMES = {Region.AIR: 10, Region.SOIL: 20}

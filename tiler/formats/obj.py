@@ -5,11 +5,11 @@ from typing import Any, BinaryIO
 
 from numpy.typing import NDArray
 
-from tiler.atomic import replacing
-from tiler.export import RunSource
+from tiler.formats.export import RunSource
 from tiler.formats.foam_patches import facets_by_key, patch_of_key
 from tiler.formats.rows import slices
 from tiler.formats.surface import Surface, keys_asked, open_surface, place_vertices, survey_surface
+from tiler.store.atomic import replacing
 
 VERTEX = "v" + " %24.16e" * 3 + "\n"
 VERTEX_BYTES = len(VERTEX % ((0.0,) * 3))

@@ -14,8 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from pipeline.errors import CityError, ConfigError, InputError
-from tiler.atomic import replacing_folder
-from tiler.export import EXPORT_RECORD, RunFiles, RunSource
+from tiler.formats.export import EXPORT_RECORD, RunFiles, RunSource
 from tiler.formats.foam_case import INLET, OUTLET, write_system, write_wind_case
 from tiler.formats.foam_files import LABEL_LIMIT
 from tiler.formats.foam_part import FoamPlan, PartCounts, PointPlaces, write_part
@@ -23,7 +22,8 @@ from tiler.formats.foam_patches import FIRST_BUILDING, GROUND_ZONE, is_house
 from tiler.formats.partition import split_pieces
 from tiler.formats.pieces import Pieces
 from tiler.formats.region_faces import Ints, find_outer, survey_faces
-from tiler.mesh_pieces import MeshPiece, open_pieces
+from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
+from tiler.store.atomic import replacing_folder
 
 
 def export_openfoam(

@@ -2,11 +2,11 @@
 
 from typing import Protocol
 
-from tiler.mesh_pieces import MeshPiece
+from tiler.mesh_files.mesh_pieces import MeshPiece
 
 
 class Pieces(Protocol):
-    """A mesh in pieces, as `tiler.mesh_pieces.MeshPieces` has them of a run."""
+    """A mesh in pieces, as `tiler.mesh_files.mesh_pieces.MeshPieces` has them of a run."""
 
     @property
     def names(self) -> tuple[str, ...]:

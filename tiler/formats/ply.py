@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import InputError
-from tiler.atomic import replacing
-from tiler.export import RunSource
+from tiler.formats.export import RunSource
 from tiler.formats.foam_patches import patch_of_key
 from tiler.formats.surface import Surface, SurfaceSurvey, open_surface, place_vertices, survey_surface
+from tiler.store.atomic import replacing
 
 VERTEX_BYTES = 24
 # PLY has no integers of 64 bits; the number of a building is below 2^53, so a double holds it exactly.

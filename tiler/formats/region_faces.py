@@ -19,7 +19,7 @@ from pipeline.mesh import Marker, Region
 from stitch.cell_faces import CellFaces, find_cell_faces
 from stitch.conformity import group_rows
 from tiler.formats.pieces import Pieces
-from tiler.mesh_pieces import MeshPiece
+from tiler.mesh_files.mesh_pieces import MeshPiece
 
 Ints = NDArray[np.int64]
 # Given a piece, the key of a set of facets, or of cells, for each of them; several sets may have one.

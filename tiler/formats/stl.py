@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.atomic import replacing
-from tiler.export import RunSource
+from tiler.formats.export import RunSource
 from tiler.formats.foam_patches import facets_by_key, patch_of_key
 from tiler.formats.rows import slices
 from tiler.formats.surface import Surface, keys_asked, open_surface, survey_surface
+from tiler.store.atomic import replacing
 
 _CORNER = "      vertex" + " %23.16e" * 3 + "\n"
 # Each number has the same width, so that the place of every facet is known from counts.

@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from tiler.export import RunSource
+from tiler.formats.export import RunSource
 from tiler.formats.foam_patches import PATCHES, patch_keys
 from tiler.formats.rows import blocks_of
-from tiler.merged import VERTEX_ID, number_piece
-from tiler.mesh_pieces import MeshPieces, mark_sides, open_pieces
-from tiler.vtk_files import read_vtp
+from tiler.mesh_files.merged import VERTEX_ID, number_piece
+from tiler.mesh_files.mesh_pieces import MeshPieces, mark_sides, open_pieces
+from tiler.mesh_files.vtk_files import read_vtp
 
 WORD = 64  # points in a word of `VertexSet`
 
 
 class SurfacePiece(Protocol):
-    """The part of the boundary that one tile holds, as `tiler.mesh_pieces.MeshPiece` has it too."""
+    """The part of the boundary that one tile holds, as `tiler.mesh_files.mesh_pieces.MeshPiece` has it too."""
 
     @property
     def points(self) -> NDArray[np.float64]:

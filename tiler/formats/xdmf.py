@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import OutputError
-from tiler.atomic import replacing
-from tiler.export import RunSource
+from tiler.formats.export import RunSource
 from tiler.formats.pieces import Pieces
 from tiler.formats.rows import blocks_of
-from tiler.mesh_pieces import MeshPieces, open_pieces
+from tiler.mesh_files.mesh_pieces import MeshPieces, open_pieces
+from tiler.store.atomic import replacing
 
 DATA = ".h5"  # suffix of the second file
 ARRAYS = {

@@ -9,18 +9,6 @@ import pyproj
 
 from pipeline.errors import InputError
 from pipeline.notes import Note
-from tiler.clouds import CloudHeader
-from tiler.crs import (
-    SAME_PLACE,
-    crs_name,
-    crs_text,
-    horizontal_crs,
-    is_on_its_place,
-    is_one,
-    same_crs,
-    scale_of,
-    utm_crs,
-)
 from tiler.georeference.cloud_crs import (
     Asked,
     CloudGroup,
@@ -34,12 +22,24 @@ from tiler.georeference.cloud_crs import (
     group_clouds,
     read_wish,
 )
+from tiler.georeference.crs import (
+    SAME_PLACE,
+    crs_name,
+    crs_text,
+    horizontal_crs,
+    is_on_its_place,
+    is_one,
+    same_crs,
+    scale_of,
+    utm_crs,
+)
 from tiler.georeference.footprints import find_shown_axes, footprint_frame
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.georeference.metric import LIKELY, MetricCrs, find_metric
 from tiler.georeference.operation import Operation, find_operation
 from tiler.georeference.units import unit_name
 from tiler.georeference.words import axes_words, boxes_meet
+from tiler.pointclouds.clouds import CloudHeader
 
 FOOTPRINTS = "the footprints"  # subject of their operation
 LARGEST_SCALE = 0.004  # how far the scale of a projection may be from 1: 4 m in a kilometre

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import pyproj
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-from tiler.crs import crs_name, geographic_box
+from tiler.georeference.crs import crs_name, geographic_box
 
 Box = tuple[float, float, float, float]
 

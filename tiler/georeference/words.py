@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import pyproj
 
-from tiler.clouds import CloudHeader
-from tiler.crs import crs_name
+from tiler.georeference.crs import crs_name
 from tiler.georeference.metric import MetricCrs
+from tiler.pointclouds.clouds import CloudHeader
 
 Box = tuple[float, float, float, float]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError, InputError
-from tiler.places import in_bucket, place
-from tiler.plain_text import printable
+from tiler.objects.places import in_bucket, place
+from tiler.words.plain_text import printable
 
 EVERY = 1.0  # s between two looks at a log that is followed
 JOB_HELP = "number of a job, or folder of its run"
@@ -68,15 +68,15 @@ def job_line(job: dict[str, Any]) -> str:
 
 
 def _submit(options: argparse.Namespace) -> int:
-    from tiler.api import with_file
-    from tiler.config import make_config
+    from tiler.config.config import make_config
+    from tiler.interface.api import with_file
     from tiler.jobs.submission import submit
 
     if options.array < 0 or options.array > 100_000:
         raise ConfigError(f"--array {options.array}: 1 to 100000 elements expected")
     config = make_config(with_file(vars(options)))
     if not options.dry_run:
-        from tiler.planning import check_sources
+        from tiler.planning.plan import check_sources
 
         check_sources(config)
     print(submit(config, array=options.array, dry_run=options.dry_run))

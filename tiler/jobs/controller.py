@@ -73,7 +73,7 @@ class Controller:
             signal.signal(number, self._handle)
         if self._is_cancelled() or not self._makes_progress():
             return FAILED
-        driver = subprocess.Popen([sys.executable, "-m", "tiler.cli", *run_words(self._out)])
+        driver = subprocess.Popen([sys.executable, "-m", "tiler.cli.main", *run_words(self._out)])
         handed_over = False
         while driver.poll() is None:
             if self._told_to_end:

@@ -12,17 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError
-from tiler import fork_server
-from tiler.addresses import ANYWHERE
-from tiler.atomic import replacing
-from tiler.dask_settings import BOTH, SCHEDULER, WORKER, as_variables
-from tiler.executors import Executor
+from tiler.engine.task import Failure, Task
+from tiler.engine.task_limits import REFUSE_AT, Limits
+from tiler.executors import fork_server
+from tiler.executors.addresses import ANYWHERE
+from tiler.executors.dask_settings import BOTH, SCHEDULER, WORKER, as_variables
+from tiler.executors.executor import Executor
 from tiler.jobs.queues import QUEUES, JobSize, Queue, QueueError
 from tiler.jobs.table import Cluster
-from tiler.limits import REFUSE_AT, Limits
-from tiler.plain_text import say_nothing
 from tiler.scheduler.executor import ClusterError, Dask
-from tiler.task import Failure, Task
+from tiler.store.atomic import replacing
+from tiler.words.plain_text import say_nothing
 
 JOB = "job"  # folder in that of a run, with all that its jobs need and print
 WORKER_JOBS = "workers.json"  # in it: the numbers of worker jobs that wait or run
@@ -109,7 +109,7 @@ def job_queue(
     from distributed import Client
     from distributed.utils import silence_logging_cmgr
 
-    from tiler.worker_setup import WorkerSetup
+    from tiler.executors.worker_setup import WorkerSetup
 
     memory = int(table.worker.memory * 2**30)
     (folder / "logs").mkdir(parents=True, exist_ok=True)

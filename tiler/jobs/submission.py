@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError, InputError
-from tiler.atomic import replacing
-from tiler.config import Config, write_config
+from tiler.config.config import Config, write_config
 from tiler.jobs.jobqueue import JOB, NANNY, begin_words, python_words, read_worker_jobs, worker_script
 from tiler.jobs.queues import QUEUES, STOP_SIGNAL, JobSize, Queue, QueueError
 from tiler.jobs.table import Cluster, read_cluster
-from tiler.places import absolute
+from tiler.objects.places import absolute
+from tiler.store.atomic import replacing
 
 RECORD, TABLE, PARAMETERS, SCRIPT = "job.json", "cluster.toml", "run.toml", "job.sh"
 LOGS = "logs"
@@ -138,7 +138,7 @@ def array_script(table: Cluster, out: Path, n: int) -> str:
     )
     words = ["join", str(out / JOB / PARAMETERS), "--out", str(out)]
     words += ["--workers", str(worker.processes), "--memory-limit", f"{worker.memory:g}"]
-    command = f"exec {python_words(table)} -m tiler.cli {shlex.join(words)}"
+    command = f"exec {python_words(table)} -m tiler.cli.main {shlex.join(words)}"
     lines = [*QUEUES[table.type].header(table, size), "", *begin_words(table), command]
     return "\n".join(lines) + "\n"
 

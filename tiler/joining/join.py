@@ -19,11 +19,13 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import CityError, ConfigError, OutputError
-from tiler.config import Config
-from tiler.crew import Crew
-from tiler.engine import StoppedError
-from tiler.executors import Executor
-from tiler.folder_lock import is_held
+from tiler.config.config import Config
+from tiler.engine.engine import StoppedError
+from tiler.engine.keys import code_versions
+from tiler.engine.task_limits import limit_workers
+from tiler.executors.executor import Executor
+from tiler.executors.kernels import prepare
+from tiler.executors.worker_processes import Crew
 from tiler.joining.lease import (
     LOOK,
     PREFIX,
@@ -41,15 +43,13 @@ from tiler.joining.lease import (
 )
 from tiler.joining.member import Ended, Left, serve
 from tiler.joining.spool import HOLDER, SPOOL, Spool
-from tiler.kernels import prepare
-from tiler.keys import code_versions
-from tiler.limits import limit_workers
-from tiler.out_folder import RUN_RECORD, check_folder
-from tiler.places import is_url
-from tiler.plain_text import say_nothing, shorten
-from tiler.planning import check_sources
-from tiler.run import is_repeated, run, tell_error
-from tiler.watching import Watcher
+from tiler.monitoring.watchers import Watcher
+from tiler.objects.places import is_url
+from tiler.planning.plan import check_sources
+from tiler.store.folder_lock import is_held
+from tiler.words.plain_text import say_nothing, shorten
+from tiler.workflow.out_folder import RUN_RECORD, check_folder
+from tiler.workflow.run import is_repeated, run, tell_error
 
 MAX_IDLE = 600.0  # s that a member waits for a folder that another run holds
 MEMBERS = "members."
@@ -106,7 +106,7 @@ def join(
     ConfigError
         If members differ in a parameter or in a version of code, or one is not to be used here.
     CityError
-        What `tiler.run.run` raises, in the process that drives; and if the folder is not free in time.
+        What `tiler.workflow.run.run` raises, in the process that drives; and if the folder is not free in time.
     """
     refused = [what for what in ("overwrite", "scheduler", "cluster", "dask") if getattr(config, what)]
     if refused:

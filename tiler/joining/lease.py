@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import CityError, OutputError
-from tiler.folder_lock import Owner, is_alive, tell_owner, this_process
+from tiler.store.folder_lock import Owner, is_alive, tell_owner, this_process
 
 BEAT = 3.0  # s between two heartbeats
 SILENCE = 30.0  # s without one, after which a process counts as dead

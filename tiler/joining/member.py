@@ -9,11 +9,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from tiler.crew import Crew, Given
+from tiler.engine.stopping import stops
+from tiler.executors.worker_processes import Crew, Given
 from tiler.joining.lease import LOOK, SILENCE, Heart, Holder, Pulse, is_over, remove_folder, write_holder
 from tiler.joining.mailbox import GoneError, MailReader, MailWriter
 from tiler.joining.spool import HOLDER, INBOX, OUTBOX, Pause
-from tiler.stopping import stops
 
 STOPPED = 130  # exit code
 

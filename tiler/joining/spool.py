@@ -18,8 +18,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tiler.crew import Crew, Function, Given, Outcome
-from tiler.executors import LEAST_WINDOW, WINDOW
+from tiler.engine.task import Failure, Record, Task
+from tiler.engine.task_limits import tell_death
+from tiler.executors.executor import LEAST_WINDOW, WINDOW
+from tiler.executors.worker_processes import Crew, Function, Given, Outcome
 from tiler.joining.lease import (
     LOOK,
     SILENCE,
@@ -31,8 +33,6 @@ from tiler.joining.lease import (
     remove_folder,
 )
 from tiler.joining.mailbox import GoneError, MailReader, MailWriter
-from tiler.limits import tell_death
-from tiler.task import Failure, Record, Task
 
 SPOOL = ".spool"  # in the folder of a run, as long as members are at work
 HOLDER, INBOX, OUTBOX = "holder", "inbox", "outbox"

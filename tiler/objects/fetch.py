@@ -4,13 +4,13 @@ from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import ConfigError, InputError
-from tiler.atomic import replacing
-from tiler.audit import Audit
-from tiler.folder_lock import LOCK, is_held, only_run
 from tiler.objects.local_copy import copy_object
 from tiler.objects.path import ObjectPath
-from tiler.out_folder import check_folder
-from tiler.places import in_bucket, place
+from tiler.objects.places import in_bucket, place
+from tiler.store.atomic import replacing
+from tiler.store.audit import Audit
+from tiler.store.folder_lock import LOCK, is_held, only_run
+from tiler.workflow.out_folder import check_folder
 
 
 def fetch_run(source: str, folder: Path, tell: Callable[[str], None]) -> bool:

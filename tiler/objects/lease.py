@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from pipeline.errors import ConfigError, OutputError
-from tiler import folder_lock
-from tiler.folder_lock import BUSY, LOCK, NEXT, Owner
 from tiler.objects.path import ObjectPath
 from tiler.objects.requests import ChangedError
-from tiler.plain_text import say_nothing
+from tiler.store import folder_lock
+from tiler.store.folder_lock import BUSY, LOCK, NEXT, Owner
+from tiler.words.plain_text import say_nothing
 
 
 class Lease:

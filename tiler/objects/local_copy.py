@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import InputError
-from tiler.places import in_bucket
+from tiler.objects.places import in_bucket
 
 if TYPE_CHECKING:
     from tiler.objects.path import ObjectPath

@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import Any, TypeVar
 
 from pipeline.errors import ConfigError
-from tiler.places import StoreUnreachableError
+from tiler.objects.places import StoreUnreachableError
 
 T = TypeVar("T")
 # s between two tries, doubled each time, up to a half of it taken off at random

@@ -6,11 +6,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pipeline.errors import OutputError
-from tiler.events import EventLog, begin_file
+from tiler.engine.task import WAITED, Record
+from tiler.monitoring.events import EventLog, begin_file
+from tiler.monitoring.watchers import Watcher
 from tiler.objects.path import ObjectPath
 from tiler.objects.requests import WAITS
-from tiler.task import WAITED, Record
-from tiler.watching import Watcher
 
 PUT_EVERY = 60.0  # s between two puts of the events
 PUT_BYTES = 16 * 2**20  # size up to which they are put before the end
@@ -55,7 +55,7 @@ class WaitWatch(Watcher):
     Parameters
     ----------
     check : callable
-        Raises OutputError if it has, as `tiler.folder_lock.only_run` gives it.
+        Raises OutputError if it has, as `tiler.store.folder_lock.only_run` gives it.
     """
 
     def __init__(self, check: Callable[[], None]) -> None:

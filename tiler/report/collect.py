@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.histograms import QUALITY_BINS, Histogram, merge_histograms
-from tiler.paint import fill_polygons
+from tiler.citymodels.tables import unpack_polygons
+from tiler.pictures.paint import fill_polygons
 from tiler.report.record import RunFacts
-from tiler.store import Store
-from tiler.tables import unpack_polygons
+from tiler.store.store import Store
 
 MAP_PIXELS = 900  # of the longer side of the map of footprints
 MAP_SAMPLES = 2  # looked at along each of them

@@ -5,7 +5,7 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
-from tiler.plain_text import printable
+from tiler.words.plain_text import printable
 
 
 class Page:

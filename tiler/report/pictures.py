@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.painted_pictures import light_city, paint_city, paint_cut
-from tiler.picture_data import find_middle, load_city
+from tiler.pictures.painted_pictures import light_city, paint_city, paint_cut
+from tiler.pictures.picture_data import find_middle, load_city
 from tiler.report.page import figure, paragraph, text
 
 SIZE = (1120, 700)

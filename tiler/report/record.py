@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from tiler.json_stream import JsonStream
-from tiler.out_folder import RUN_RECORD
-from tiler.run_folder import SCHEMA, WRONG_FIELD, broken_field, opened_json
+from tiler.citymodels.json_stream import JsonStream
+from tiler.workflow.out_folder import RUN_RECORD
+from tiler.workflow.run_folder import SCHEMA, WRONG_FIELD, broken_field, opened_json
 
 SHOWN = 50  # notes of a kind that the report lists
 PLACES = 300  # notes of a kind that its map shows

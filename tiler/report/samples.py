@@ -17,13 +17,13 @@ from pipeline.mesh import ColumnMesh, PlaneMesh
 from pipeline.quality import measure_cells
 from pipeline.residuals import ResidualSums, merge_residuals, sum_residuals
 from pipeline.surface_points import NOWHERE, measure_surface
-from tiler.ingest import CELL
-from tiler.out_folder import STORE
-from tiler.readers import read_cloud
-from tiler.results import COLUMN_ARRAYS, unpack_columns
-from tiler.stage import Box, Scope
-from tiler.store import Store
-from tiler.task import Task
+from tiler.engine.stage import Box, Scope
+from tiler.engine.task import Task
+from tiler.pointclouds.ingest import CELL
+from tiler.stages.readers import read_cloud
+from tiler.store.results import COLUMN_ARRAYS, unpack_columns
+from tiler.store.store import Store
+from tiler.workflow.out_folder import STORE
 
 MOST_TILES = 32  # that are looked at
 NEAR = 20.0  # m from a seam

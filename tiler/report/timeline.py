@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.events import read_events
-from tiler.stage_groups import group_of_stage
+from tiler.monitoring.events import read_events
+from tiler.words.stage_groups import group_of_stage
 
 BINS = 240  # columns of the Gantt chart
 
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """How busy each group of stages was over the time of a run (`tiler.stage_groups`).
+    """How busy each group of stages was over the time of a run (`tiler.words.stage_groups`).
 
     Attributes
     ----------

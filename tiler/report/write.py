@@ -3,8 +3,6 @@
 from pathlib import Path
 
 from pipeline.errors import ConfigError, InputError
-from tiler.atomic import replacing
-from tiler.out_folder import EVENTS, REPORT, RUN_RECORD, STORE
 from tiler.report import sections
 from tiler.report.collect import collect_numbers
 from tiler.report.page import Page, paragraph
@@ -12,8 +10,10 @@ from tiler.report.pictures import tell_pictures
 from tiler.report.record import RunFacts, read_run_facts
 from tiler.report.samples import measure_samples
 from tiler.report.timeline import read_timeline
-from tiler.run_folder import WRONG_FIELD, broken_field
-from tiler.store import Store
+from tiler.store.atomic import replacing
+from tiler.store.store import Store
+from tiler.workflow.out_folder import EVENTS, REPORT, RUN_RECORD, STORE
+from tiler.workflow.run_folder import WRONG_FIELD, broken_field
 
 
 def write_report(directory: Path) -> Path:

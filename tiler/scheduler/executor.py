@@ -15,15 +15,23 @@ from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
 from pipeline.errors import CityError
-from tiler import fork_server
-from tiler.addresses import ANYWHERE
-from tiler.crew import BYSTANDER, Function, Given
-from tiler.dask_settings import BOTH, SCHEDULER, WORKER
-from tiler.executors import LEAST_WINDOW, WINDOW, Executor
-from tiler.limits import REFUSE_AT, Limits, WorkerError, run_guarded, share_memory, tell_death, tell_memory
+from tiler.engine.task import Failure, Record, Task
+from tiler.engine.task_limits import (
+    REFUSE_AT,
+    Limits,
+    WorkerError,
+    run_guarded,
+    share_memory,
+    tell_death,
+    tell_memory,
+)
+from tiler.executors import fork_server
+from tiler.executors.addresses import ANYWHERE
+from tiler.executors.dask_settings import BOTH, SCHEDULER, WORKER
+from tiler.executors.executor import LEAST_WINDOW, WINDOW, Executor
+from tiler.executors.worker_processes import BYSTANDER, Function, Given
 from tiler.scheduler.check import ClusterMismatchError, UnansweredError, check_cluster, tell_refusal
 from tiler.scheduler.terms import Refusal, Terms, run_on_terms
-from tiler.task import Failure, Record, Task
 
 Guard = Callable[..., Any]  # runs a task
 
@@ -72,7 +80,7 @@ class Dask:
     also after the one that lets go of a result, and a task that waits for another one so long.
 
     Where a worker dies, Dask blames all tasks that it had. Here a task is blamed if it had begun, which its file
-    tells (`tiler.limits`); the others are sent again.
+    tells (`tiler.engine.task_limits`); the others are sent again.
     """
 
     def __init__(
@@ -386,7 +394,7 @@ def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHE
     from dask import config
     from distributed import Client, LocalCluster
 
-    from tiler.worker_setup import WorkerSetup
+    from tiler.executors.worker_setup import WorkerSetup
 
     limits = limits or Limits(memory=share_memory(workers))
     # Everything is bound to this machine, on free ports: two runs do not meet. A dead process shows by its closed

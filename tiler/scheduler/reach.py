@@ -7,11 +7,11 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 from pipeline.errors import CityError
-from tiler.clouds import find_clouds
-from tiler.config import Config
-from tiler.executors import Executor
-from tiler.limits import Limits
-from tiler.places import absolute, is_url
+from tiler.config.config import Config
+from tiler.engine.task_limits import Limits
+from tiler.executors.executor import Executor
+from tiler.objects.places import absolute, is_url
+from tiler.pointclouds.clouds import find_clouds
 from tiler.scheduler.check import check_cluster
 from tiler.scheduler.executor import Dask
 from tiler.scheduler.terms import Terms, offer_terms, own_terms

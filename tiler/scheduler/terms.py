@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from tiler.atomic import replacing
-from tiler.limits import run_guarded
+from tiler.engine.stage import Facts
+from tiler.engine.task import Failure, Record, Task
+from tiler.engine.task_limits import run_guarded
 from tiler.scheduler.versions import digest_versions, tell_versions
-from tiler.stage import Facts
-from tiler.task import Failure, Record, Task
+from tiler.store.atomic import replacing
 
 PROBE = ".cluster.json"  # in the folder of a run, as long as its tasks are on a cluster
 GRACE = 5.0  # s for a shared folder to show a new file

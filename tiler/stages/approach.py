@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from pipeline.approach import Border, approach_terrain, border_nodes, make_border
 from pipeline.raster import NodeWindow, cut_nodes, grow_window, node_window, window_of
-from tiler.config import Config
-from tiler.readers import join_rasters
-from tiler.stage import Facts, Read, Scope, Stage
+from tiler.config.config import Config
+from tiler.engine.stage import Facts, Read, Scope, Stage
+from tiler.engine.task import Task
 from tiler.stages.inputs import own_window
-from tiler.store import Store
-from tiler.task import Task
+from tiler.stages.readers import join_rasters
+from tiler.store.store import Store
 
 APPROACH, RIM = "approach", "rim"
 

@@ -25,16 +25,8 @@ from pipeline.terrain import cut_terrain
 from pipeline.tile import measure_city, prepare_footprints
 from pipeline.unmarked_roofs import MAY_BE_ROOF
 from stitch.grid import Key
-from tiler.clusters import pack_clusters, place_in_grid, unpack_clusters
-from tiler.config import Config
-from tiler.context import find_owned, region_around, tile_key
-from tiler.options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
-from tiler.readers import grow, read_known_terrain, read_own_outlines
-from tiler.run_folder import PARTS
-from tiler.stage import Box, Facts, Read, Scope, Stage
-from tiler.stages.house_points import add_unmarked, extent_of, find_surfaces, points_near
-from tiler.stages.inputs import halo_of_points
-from tiler.tables import (
+from tiler.citymodels.clusters import pack_clusters, place_in_grid, unpack_clusters
+from tiler.citymodels.tables import (
     ARRAYS_TO_RAISE,
     ARRAYS_TO_SHAPE,
     make_buildings,
@@ -45,7 +37,15 @@ from tiler.tables import (
     unpack_houses,
     unpack_polygons,
 )
-from tiler.task import Result, Task
+from tiler.config.config import Config
+from tiler.config.step_options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
+from tiler.engine.stage import Box, Facts, Read, Scope, Stage
+from tiler.engine.task import Result, Task
+from tiler.planning.context import find_owned, region_around, tile_key
+from tiler.stages.house_points import add_unmarked, extent_of, find_surfaces, points_near
+from tiler.stages.inputs import halo_of_points
+from tiler.stages.readers import grow, read_known_terrain, read_own_outlines
+from tiler.workflow.run_folder import PARTS
 
 TERRAIN = ("dtm_spacing", "ground_filter")
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from pipeline.building_facts import tell_buildings
 from pipeline.citymodel import CityModel, number_ids
 from pipeline.errors import InputError
-from tiler.cityjson import Attributes, write_city_blocks
-from tiler.stage import Facts, Read, Scope, Stage
-from tiler.tables import (
+from tiler.citymodels.cityjson import Attributes, write_city_blocks
+from tiler.citymodels.tables import (
     BUILDING_ARRAYS,
     Buildings,
     join_buildings,
@@ -21,8 +20,9 @@ from tiler.tables import (
     unpack_buildings,
     unpack_polygons,
 )
-from tiler.task import Task
-from tiler.written import FILES, state_files
+from tiler.engine.stage import Facts, Read, Scope, Stage
+from tiler.engine.task import Task
+from tiler.store.stated_files import FILES, state_files
 
 FULL_CITY_MODEL = "citymodel-full.city.json"
 CITY_MODEL = "citymodel.city.json"

@@ -8,16 +8,16 @@ import shapely
 from pipeline.groups import adjacent_houses
 from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
 from pipeline.notes import Note
-from tiler.config import Config
-from tiler.domain import GUIDELINE, Domain, height_in_metres, is_low
-from tiler.options import PAD_PARAMETERS, layer_parameters, mesh_options
-from tiler.readers import grow, read_known_terrain
-from tiler.stage import Facts, Read, Scope, Stage
+from tiler.citymodels.tables import unpack_buildings, unpack_polygons
+from tiler.config.config import Config
+from tiler.config.domain_height import GUIDELINE, Domain, height_in_metres, is_low
+from tiler.config.step_options import PAD_PARAMETERS, layer_parameters, mesh_options
+from tiler.engine.stage import Facts, Read, Scope, Stage
+from tiler.engine.task import Task
 from tiler.stages.approach import terrain_stage
 from tiler.stages.city import chooses_layers_later
 from tiler.stages.left_out import LEFT_OUT, left_out_stage
-from tiler.tables import unpack_buildings, unpack_polygons
-from tiler.task import Task
+from tiler.stages.readers import grow, read_known_terrain
 
 LOW_DOMAIN = "domain-lower-than-guidelines"
 

@@ -15,9 +15,9 @@ from pipeline.pointcloud import PointCloud
 from pipeline.raster import Dtm
 from pipeline.roof_points import RoofPoints, add_roof_points, keep_roof_points
 from pipeline.unmarked_roofs import MAY_BE_ROOF, PLANTS, UnmarkedRoofs, are_roofs, find_bare, locate_unmarked
-from tiler.readers import grow, read_cloud
-from tiler.stage import Box
-from tiler.task import Task
+from tiler.engine.stage import Box
+from tiler.engine.task import Task
+from tiler.stages.readers import grow, read_cloud
 
 Rows = NDArray[np.int64]
 

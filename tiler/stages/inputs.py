@@ -29,17 +29,17 @@ from pipeline.terrain_fill import (
     merge_coarse,
 )
 from stitch.grid import Key, has_tile
-from tiler.clouds import KEY_POINTS
-from tiler.config import Config
-from tiler.context import tile_key
-from tiler.footprint_index import scan_footprints
+from tiler.citymodels.tables import pack_polygons
+from tiler.config.config import Config
+from tiler.engine.stage import Box, Facts, Read, Scope, Stage
+from tiler.engine.task import Task
+from tiler.footprints.footprint_index import scan_footprints
 from tiler.georeference.frame import Frame
-from tiler.ingest import CELL, read_cells
-from tiler.places import place
-from tiler.readers import clip, grow, join_rasters, read_bands, read_outlines, read_units
-from tiler.stage import Box, Facts, Read, Scope, Stage
-from tiler.tables import pack_polygons
-from tiler.task import Task
+from tiler.objects.places import place
+from tiler.planning.context import tile_key
+from tiler.pointclouds.clouds import KEY_POINTS
+from tiler.pointclouds.ingest import CELL, read_cells
+from tiler.stages.readers import clip, grow, join_rasters, read_bands, read_outlines, read_units
 
 
 def input_stages(config: Config) -> list[Stage]:

@@ -16,14 +16,14 @@ from pipeline.raster import Dtm, window_of
 from pipeline.roof_points import locate_roof_points
 from pipeline.terrain import cut_terrain
 from pipeline.tile import measure_city
-from tiler.config import Config
-from tiler.context import find_owned, region_around
-from tiler.options import CITY_PARAMETERS, city_options
-from tiler.readers import grow, read_cloud, read_known_terrain
-from tiler.stage import Box, Facts, Read, Scope, Stage
+from tiler.citymodels.tables import pack_polygons, unpack_polygons
+from tiler.config.config import Config
+from tiler.config.step_options import CITY_PARAMETERS, city_options
+from tiler.engine.stage import Box, Facts, Read, Scope, Stage
+from tiler.engine.task import Task
+from tiler.planning.context import find_owned, region_around
 from tiler.stages.inputs import halo_of_points
-from tiler.tables import pack_polygons, unpack_polygons
-from tiler.task import Task
+from tiler.stages.readers import grow, read_cloud, read_known_terrain
 
 LEFT_OUT = "left-out"
 COVERED = 0.5  # share of a footprint's area from which on the mesh has a building for it

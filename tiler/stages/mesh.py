@@ -29,10 +29,10 @@ from stitch.seams import SURROUNDINGS, Seam, find_vertices, trace_seam
 from stitch.soil_columns import fill_corner_soil, fill_seam_soil, join_seam
 from stitch.tiles import Sides, mesh_tile
 from stitch.walls import cut_walls
-from tiler.config import Config
-from tiler.context import seam_key, seam_name, tile_key
-from tiler.domain import Domain
-from tiler.options import (
+from tiler.citymodels.tables import NearBuildings
+from tiler.config.config import Config
+from tiler.config.domain_height import Domain
+from tiler.config.step_options import (
     PAD_PARAMETERS,
     PLANE_PARAMETERS,
     SIZE_PARAMETERS,
@@ -42,14 +42,14 @@ from tiler.options import (
     plane_options,
     soil_options,
 )
-from tiler.stage import Facts, Read, Scope, Stage
+from tiler.engine.stage import Facts, Read, Scope, Stage
+from tiler.engine.task import Task
+from tiler.planning.context import seam_key, seam_name, tile_key
 from tiler.stages.approach import terrain_stage
 from tiler.stages.city import chooses_layers_later
 from tiler.stages.seam_tables import pack_columns, pack_seam, unpack_levels, unpack_pinched, unpack_seam
 from tiler.stages.soil import lay_soil, unpack_pinched_soil, unpack_soil
 from tiler.stages.surroundings import find_sizes, halos, read_surroundings, terrain_around, terrain_halo
-from tiler.tables import NearBuildings
-from tiler.task import Task
 
 
 def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:

@@ -31,20 +31,20 @@ from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
 from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
 from stitch.grid import Key, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
 from stitch.numbering import corner_part, first_id, make_offsets, number_columns, seam_part, tile_part
-from tiler.config import Config
-from tiler.context import find_owned, seam_key, seam_name, tile_key, tile_name
-from tiler.merged import VERTEX_ID
-from tiler.mesh_parts import find_tile_parts, join_tiles, read_tile_parts
-from tiler.readers import read_bands, read_buildings, read_terrain
-from tiler.results import COLUMN_ARRAYS, unpack_columns
-from tiler.run_folder import REGION
-from tiler.stage import Facts, Read, Scope, Stage
+from tiler.citymodels.tables import unpack_polygons
+from tiler.config.config import Config
+from tiler.engine.stage import Facts, Read, Scope, Stage
+from tiler.engine.task import Result, Task
+from tiler.mesh_files.merged import VERTEX_ID
+from tiler.mesh_files.mesh_parts import find_tile_parts, join_tiles, read_tile_parts
+from tiler.mesh_files.vtk_files import Rows, Values, write_vtp_blocks, write_vtu_blocks
+from tiler.planning.context import find_owned, seam_key, seam_name, tile_key, tile_name
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.left_out import read_polygons
-from tiler.tables import unpack_polygons
-from tiler.task import Result, Task
-from tiler.vtk_files import Rows, Values, write_vtp_blocks, write_vtu_blocks
-from tiler.written import FILES, state_files
+from tiler.stages.readers import read_bands, read_buildings, read_terrain
+from tiler.store.results import COLUMN_ARRAYS, unpack_columns
+from tiler.store.stated_files import FILES, state_files
+from tiler.workflow.run_folder import REGION
 
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
 ID_ARRAYS = ("shared", "shared_id")

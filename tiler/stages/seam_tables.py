@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.mesh import ColumnMesh, PlaneMesh
 from pipeline.nodes import Levels
 from stitch.seams import Seam
-from tiler.task import Result
+from tiler.engine.task import Result
 
 NO_PLANE = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))
 

@@ -12,7 +12,7 @@ from pipeline.nodes import Levels, SeamColumns, join_levels, take_columns
 from pipeline.notes import Note
 from pipeline.sizes import SizeField
 from pipeline.underground import SoilOptions, add_soil, count_soil_cells
-from tiler.task import Result, Task
+from tiler.engine.task import Result, Task
 
 
 def unpack_soil(arrays: dict[str, NDArray[Any]]) -> Levels:

@@ -13,11 +13,11 @@ from pipeline.spacing import top_reach
 from pipeline.terrain import cut_terrain
 from stitch.grid import Key, nominal_corner
 from stitch.tiles import sizes_halo, tile_halo
-from tiler.domain import Domain
-from tiler.options import mesh_options, size_rule
-from tiler.readers import grow, read_buildings, read_known_terrain, region_window
-from tiler.tables import NearBuildings
-from tiler.task import Task
+from tiler.citymodels.tables import NearBuildings
+from tiler.config.domain_height import Domain
+from tiler.config.step_options import mesh_options, size_rule
+from tiler.engine.task import Task
+from tiler.stages.readers import grow, read_buildings, read_known_terrain, region_window
 
 
 def terrain_halo(given: Any, domain: Domain | None = None) -> float:

@@ -1,0 +1,1 @@
+"""What `citystitch check` proves from the written files."""

@@ -1,0 +1,298 @@
+"""`citystitch check`: prove from the written files that a run's mesh is right."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pipeline.errors import InputError
+from pipeline.mesh import Marker
+from stitch.frontier import Settled, add_rim, close_frontier, start_frontier
+from tiler.check import city_proofs, pad_proofs, proofs, soil_proofs
+from tiler.check.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
+from tiler.check.proofs import Dtm, Fault, Finding, Proof, Vertices
+from tiler.citymodels.building_index import BuildingIndex, index_buildings
+from tiler.mesh_files.mesh_parts import tell_parts
+from tiler.mesh_files.vtk_files import read_piece_paths
+from tiler.stages.citymodel import CITY_MODEL
+from tiler.workflow.out_folder import RUN_RECORD, STORE
+from tiler.workflow.run_folder import PARTS, RunRecord, read_run_record
+
+VOLUME_INDEX = "mesh.pvtu"
+BOUNDARY_INDEX = "boundary.pvtp"
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What was proved of a run folder.
+
+    Attributes
+    ----------
+    directory : Path
+        The folder.
+    proofs : tuple of Proof
+        All claims, in a fixed order, with the faults of each.
+    remarks : tuple of str
+        What is no fault, but must be known before a solver runs.
+    facts : mapping of str to float
+        Numbers read on the way: ``cells``, ``points``, ``facets``, ``building parts``, ``non_manifold_edges``,
+        ``volume`` and ``smallest_cell`` (m³), ``seam_faces``, ``missing_facets``, ``parts`` of the air that
+        share no face.
+    """
+
+    directory: Path
+    proofs: tuple[Proof, ...]
+    facts: Mapping[str, float]
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """All faults."""
+        return tuple(fault for proof in self.proofs for fault in proof.faults)
+
+    @property
+    def ok(self) -> bool:
+        """Whether every claim is proved."""
+        return not self.faults
+
+    def lines(self) -> list[str]:
+        """Return the report as text: one line a claim, and one below it for each of its faults."""
+        lines = []
+        for proof in self.proofs:
+            lines.append(f"{'FAULT' if proof.faults else 'ok   '} {proof.claim}")
+            lines += [f"      {_tell(fault)}" for fault in proof.faults]
+        n = len({fault.kind for fault in self.faults})
+        verdict = "everything is proved" if self.ok else f"{n} {'kind' if n == 1 else 'kinds'} of fault"
+        if self.remarks:
+            verdict += f", {'but' if self.ok else 'and'} see the {'note' if len(self.remarks) == 1 else 'notes'}"
+        return [*lines, *(f"NOTE  {remark}" for remark in self.remarks), f"{self.directory}: {verdict}"]
+
+
+def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
+    """Prove that the mesh in a run folder is conforming, watertight, and that of its city model and DTM.
+
+    Parameters
+    ----------
+    directory : Path
+        The folder of a run.
+    load_dtm : callable
+        Given the path of the store, returns the terrain, which has ``sample(xy (n, 2)) -> z (n,)``.
+
+    Returns
+    -------
+    CheckReport
+        Claims and faults.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged.
+
+    Notes
+    -----
+    Pieces are read one after the other, along the long side of the region: memory holds one piece with the
+    buildings and the terrain around it, what waits for a neighbour on the frontier (`stitch.frontier`), besides
+    some 100 bytes a building and 500 a piece.
+    """
+    record = read_run_record(directory / RUN_RECORD)
+    with index_buildings(directory / CITY_MODEL) as index:
+        files = _in_order(_pair_pieces(directory), record)
+        dtm = load_dtm(directory / STORE)
+        sums = _Sums.start(len(index))
+        frontier = start_frontier()
+        for number, (volume, boundary) in enumerate(files):
+            piece = read_piece(directory / volume, directory / boundary, record.bounds, soil=record.depth > 0)
+            rim = replace(piece.rim, part=piece.rim.part + len(sums.part_cells))
+            frontier, settled, fresh = add_rim(frontier, rim, number)
+            sums.add_piece(piece, fresh, record, index, dtm)
+            sums.add_settled(settled)
+        sums.add_settled(close_frontier(frontier))
+        claims, facts = _conclude(sums, len(files), record, index)
+        parts = sums.count_parts()
+        remarks = (tell_parts(parts),) if len(parts) > 1 else ()
+        return CheckReport(directory, claims, {**facts, "parts": len(parts)}, remarks)
+
+
+@dataclass(eq=False)
+class _Sums:
+    """What has been found so far: by claim, by building, and in numbers."""
+
+    found: dict[str, Finding]
+    built: city_proofs.Built
+    counts: dict[str, int]
+    smallest: float
+    faults: tuple[Fault, ...]
+    crowded: Vertices  # (c, 2): where edges have more than two facets
+    seams: NDArray[np.int64]  # (s, 2): pairs of pieces that share faces
+    part_cells: NDArray[np.int64]  # (p,): cells of each part of a piece
+    part_soil: NDArray[np.bool_]  # (p,): whether it is soil
+    joined: NDArray[np.int64]  # (j, 2): pairs of parts that share faces
+
+    @classmethod
+    def start(cls, n_buildings: int) -> "_Sums":
+        built = city_proofs.start_built(n_buildings)
+        counts = {"cells": 0, "points": 0, "facets": 0, PARTS: n_buildings}
+        pairs, part = np.empty((0, 2), np.int64), (np.empty(0, np.int64), np.empty(0, np.bool_))
+        return cls({}, built, counts, np.inf, (), np.empty((0, 2)), pairs, *part, pairs)
+
+    def add_piece(
+        self, piece: Piece, fresh: NDArray[np.bool_], record: RunRecord, index: BuildingIndex, dtm: Dtm
+    ) -> None:
+        """Add what a piece says; `fresh` are the points of its rim that no earlier piece had."""
+        surface = piece.surface
+        rows = _find_buildings(index, piece)
+        buildings = index.take(rows)
+        ground = take_vertices(piece, Marker.GROUND, GROUND, fresh)
+        found = {
+            "same": piece.same_boundary,
+            "closed": piece.closed,
+            "marks": city_proofs.check_marks(surface, buildings, soil=record.depth > 0),
+            "box": proofs.check_box(surface, record.bounds, piece.rim.edges),
+            "top": proofs.check_top(take_vertices(piece, Marker.TOP, TOP, fresh), record.top),
+            "ground": proofs.check_ground(ground, dtm),
+            "roofs": city_proofs.check_roofs(surface, buildings),
+            "walls": city_proofs.check_walls(surface, buildings),
+            "sizes": proofs.check_sizes(surface, piece.outline, piece.air),
+        }
+        if record.core is not None:
+            found["pad"] = pad_proofs.check_pad(surface, ground, record.bounds, record.core, record.rim)
+        if record.depth:
+            found |= {
+                "between": piece.ground,
+                "bottom": soil_proofs.check_bottom(surface, record.depth),
+                "foundations": soil_proofs.check_foundations(surface, dtm),
+                "soil": soil_proofs.check_soil_sizes(surface, piece.soil),
+            }
+        for name, finding in found.items():
+            self._join(name, finding)
+        city_proofs.add_built(self.built, rows, city_proofs.find_built(surface, buildings, piece.outline))
+        self.counts["cells"] += piece.n_cells
+        self.counts["points"] += piece.n_points + int((piece.rim.points[fresh, 3] == ANY).sum())
+        self.counts["facets"] += len(surface.boundary.facets)
+        self.smallest = min(self.smallest, piece.smallest)
+        self.faults = proofs.merge_faults((*self.faults, *piece.faults))
+        self._add_crowded(piece.crowded)
+        self.part_cells = np.concatenate((self.part_cells, piece.part_cells))
+        self.part_soil = np.concatenate((self.part_soil, piece.part_soil))
+
+    def add_settled(self, settled: Settled) -> None:
+        """Add what is settled between pieces."""
+        self._join("seams", proofs.check_seams(settled))
+        self._join("closed", proofs.check_closed(settled.open_lines, settled.crowded_lines))
+        self._add_crowded(settled.crowded_lines)
+        if len(settled.seams):
+            self.seams = np.unique(np.concatenate((self.seams, settled.seams)), axis=0)
+            self.joined = np.unique(np.concatenate((self.joined, settled.joined)), axis=0)
+
+    def count_parts(self) -> list[int]:
+        """Cells of the parts of the air that share no face, the largest first."""
+        n = len(self.part_cells)
+        pairs = coo_array((np.ones(len(self.joined)), tuple(self.joined.T)), shape=(n, n))
+        n_parts, label = connected_components(pairs, directed=False)
+        air = ~self.part_soil
+        cells = np.bincount(label[air], self.part_cells[air], n_parts).astype(np.int64)
+        return sorted(cells[cells > 0].tolist(), reverse=True)
+
+    def _join(self, name: str, finding: Finding) -> None:
+        self.found[name] = proofs.join_findings(self.found.get(name, Finding()), finding)
+
+    def _add_crowded(self, edges: Vertices) -> None:
+        self.crowded = np.unique(np.concatenate((self.crowded, edges.mean(axis=1)[:, :2])), axis=0)
+
+
+def _conclude(
+    sums: _Sums, n_pieces: int, record: RunRecord, index: BuildingIndex
+) -> tuple[tuple[Proof, ...], Mapping[str, float]]:
+    """Make the claims and the facts of what was found."""
+    found, bounds = sums.found, record.bounds
+    partial = found["box"].sums["missing"] > 0
+    facts = sums.counts | {
+        "non_manifold_edges": int(found["closed"].sums["crowded"]),
+        "volume": found["sizes"].sums["cells"],
+        "smallest_cell": sums.smallest,
+        "seam_faces": int(found["seams"].sums["faces"]),
+        "missing_facets": int(found["box"].sums["missing"]),
+    }
+    claims: tuple[Proof, ...] = (
+        _prove_cells(sums, n_pieces),
+        proofs.prove_seams(found["seams"], len(sums.seams), n_pieces),
+        proofs.prove_same_boundary(found["same"]),
+        proofs.prove_closed(found["closed"], sums.crowded),
+        city_proofs.prove_marks(found["marks"]),
+        proofs.prove_box(found["box"], bounds),
+        proofs.prove_top(found["top"], record.top),
+        proofs.prove_ground(found["ground"]),
+        city_proofs.prove_roofs(found["roofs"]),
+        city_proofs.prove_walls(found["walls"]),
+        city_proofs.prove_buildings(sums.built, index, bounds, partial=partial),
+        proofs.prove_plan(found["sizes"], bounds, partial=partial),
+        proofs.prove_volume(found["sizes"]),
+        proofs.prove_record(record, sums.counts, partial=partial),
+    )
+    if record.core is not None:
+        claims += (pad_proofs.prove_pad(found["pad"], record.core, record.rim),)
+    if record.depth:
+        claims += (
+            soil_proofs.prove_between(found["between"]),
+            soil_proofs.prove_bottom(found["bottom"], record.depth),
+            soil_proofs.prove_foundations(found["foundations"]),
+            soil_proofs.prove_soil_sizes(found["soil"], found["sizes"]),
+        )
+        facts |= {"soil_volume": found["soil"].sums["cells"]}
+    return claims, facts
+
+
+def _tell(fault: Fault) -> str:
+    places = "; ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in fault.places)
+    return f"{fault.kind}: {fault.count}, {fault.detail}" + (f", at {places}" if places else "")
+
+
+def _pair_pieces(directory: Path) -> list[tuple[str, str]]:
+    """Return the volume and boundary file of every piece, below the directory: they have one name."""
+    volumes, boundaries = (
+        {path.stem: str(path.relative_to(directory)) for path in read_piece_paths(directory / index)}
+        for index in (VOLUME_INDEX, BOUNDARY_INDEX)
+    )
+    alone = sorted(volumes.keys() ^ boundaries.keys())
+    if alone:
+        names = f"{VOLUME_INDEX} and {BOUNDARY_INDEX}"
+        raise InputError(f"{directory}: only one of {names} names the piece {alone[0]!r}; run again")
+    return [(path, boundaries[name]) for name, path in volumes.items()]
+
+
+def _in_order(files: list[tuple[str, str]], record: RunRecord) -> list[tuple[str, str]]:
+    """Put pieces in an order in which few wait: across the region, then along its long side.
+
+    What waits for a neighbour is then no more than the pieces across have. Where the record does not state the
+    boxes of all tiles, pieces stay in the order of the index.
+    """
+    west, south, east, north = record.bounds
+    axes = (0, 1) if east - west >= north - south else (1, 0)
+    corners = [record.tiles.get(Path(volume).stem) for volume, _ in files]
+    known = [corner for corner in corners if corner is not None]
+    if len(known) < len(files):
+        return files
+    order = sorted(range(len(files)), key=lambda k: [known[k][axis] for axis in axes])
+    return [files[k] for k in order]
+
+
+def _find_buildings(index: BuildingIndex, piece: Piece) -> NDArray[np.int64]:
+    """Find the buildings that a piece may have anything of: around its plan, and those that its facets name."""
+    named = index.find_rows(np.unique(piece.surface.boundary.building))
+    rows = [named[named >= 0]]
+    if len(piece.outline):
+        (west, south), (east, north) = (ends(piece.outline, axis=(0, 1)).tolist() for ends in (np.min, np.max))
+        rows.append(index.find_near((west, south, east, north)))
+    return np.unique(np.concatenate(rows))
+
+
+def _prove_cells(sums: _Sums, n_pieces: int) -> Proof:
+    claim = (
+        f"{sums.counts['cells']} cells in {n_pieces} pieces: every face in one or two of them,"
+        f" none inverted or flat (smallest {sums.smallest:.3g} m³), no vertex unused or duplicate"
+    )
+    return Proof(claim, sums.faults)

@@ -1,0 +1,1 @@
+"""City models in the store and as CityJSON."""

@@ -1,0 +1,307 @@
+"""The buildings of a city model larger than memory: indexed by number and by place, loaded where needed."""
+
+from array import array
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryFile, gettempdir
+from typing import IO, Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError, OutputError
+from tiler.citymodels.json_stream import JsonStream
+from tiler.workflow.run_folder import WRONG_FIELD, Buildings, broken_field, opened_json
+
+CITYJSON = "2.0"
+MAX_NUMBER = 2**53  # of a building
+BLOCK = 1 << 14  # vertices that are read at once
+KEPT_BLOCKS = 32
+HEAD = np.dtype([("ground", "<f8"), ("roof", "<f8")])
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class BuildingIndex:
+    """All buildings of a city model, by ascending number: 36 bytes of each in memory, the rest in a file.
+
+    Attributes
+    ----------
+    numbers : int64, (n,)
+        Attribute ``number``.
+    box : float32, (n, 4)
+        Box of the footprint, west, south, east, north (m), rounded; NaN for an empty one.
+    start, size : int64 and int32, (n,)
+        Where the building lies in the file, and how long it is (bytes).
+    file : binary file
+        Heights and footprints.
+    """
+
+    numbers: NDArray[np.int64]
+    box: NDArray[np.float32]
+    start: NDArray[np.int64]
+    size: NDArray[np.int32]
+    file: IO[bytes]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def find_rows(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Find the row of each number, (k,) to (k,); -1 where the city model has none."""
+        if not len(self):
+            return np.full(len(numbers), -1)
+        row = np.searchsorted(self.numbers, numbers).clip(max=len(self) - 1)
+        return np.where(self.numbers[row] == numbers, row, -1)
+
+    def find_near(self, box: Box) -> NDArray[np.int64]:
+        """Find the rows of buildings whose box meets another one (m), or nearly so; ascending."""
+        # Rounded alike, boxes that meet still do.
+        west, south, east, north = np.array(box, np.float32)
+        own = self.box
+        near = (own[:, 0] <= east) & (own[:, 1] <= north) & (own[:, 2] >= west) & (own[:, 3] >= south)
+        return np.flatnonzero(near)
+
+    def take(self, rows: NDArray[np.int64]) -> Buildings:
+        """Load the buildings of ascending rows."""
+        head: NDArray[Any] = np.empty(len(rows), HEAD)
+        shapes = []
+        for k in np.argsort(self.start[rows], kind="stable").tolist():
+            self.file.seek(int(self.start[rows[k]]))
+            data = self.file.read(int(self.size[rows[k]]))
+            head[k] = np.frombuffer(data, HEAD, 1)[0]
+            shapes.append((k, data[HEAD.itemsize :]))
+        footprints = np.empty(len(rows), np.object_)
+        footprints[[k for k, _ in shapes]] = shapely.from_wkb([data for _, data in shapes])
+        return Buildings(self.numbers[rows], footprints, head["ground"].copy(), head["roof"].copy())
+
+
+@contextmanager
+def index_buildings(path: Path) -> Iterator[BuildingIndex]:
+    """Index the buildings of a CityJSON file, or their parts: numbers, heights and LoD 0 footprints.
+
+    Parameters
+    ----------
+    path : Path
+        The file, in any layout.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, or a building lacks one of these or shares its number.
+
+    Notes
+    -----
+    The file is read twice, one object at a time: first its vertices, which wait in a temporary file too, then what
+    refers to them. Temporary files take about half of its size, where `tempfile` puts them (``TMPDIR``).
+    """
+    with TemporaryFile() as file:
+        with TemporaryFile() as spool:
+            vertices = spool_vertices(path, spool)
+            index = _read_objects(path, vertices, file)
+        if np.any(index.numbers[1:] == index.numbers[:-1]):
+            raise InputError(f"{path}: two buildings have one number; give each its own id and run again")
+        yield index
+
+
+class Vertices:
+    """The vertices of a city model in a file of float64 (n, 3), read in blocks of which the last few are kept.
+
+    Parameters
+    ----------
+    file : binary file
+        The vertices as the city model has them, without its transform.
+    n : int
+        How many there are.
+    head : mapping
+        Members ``transform`` and, if it has any, ``metadata`` of the city model.
+    """
+
+    def __init__(self, file: IO[bytes], n: int, head: Mapping[str, Any]) -> None:
+        self._file, self._n, self.head = file, n, head
+        transform = head["transform"]
+        self._scale, self._translate = (np.array(transform[name], np.float64) for name in ("scale", "translate"))
+        np.zeros(3) * self._scale + self._translate  # both fit, or it is told here
+        self._blocks: dict[int, NDArray[np.float64]] = {}
+
+    def __len__(self) -> int:
+        return self._n
+
+    def take(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Take vertices (k, 3) in metres."""
+        return self.take_raw(rows) * self._scale + self._translate
+
+    def take_raw(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Take vertices (k, 3) as the city model has them: whole numbers."""
+        found = np.empty((len(rows), 3))
+        block = rows // BLOCK
+        for number in np.unique(block).tolist():
+            there = block == number
+            found[there] = self._block(number)[rows[there] - number * BLOCK]
+        return found
+
+    def _block(self, number: int) -> NDArray[np.float64]:
+        block = self._blocks.pop(number, None)
+        if block is None:
+            self._file.seek(number * BLOCK * 24)
+            block = np.frombuffer(self._file.read(BLOCK * 24)).reshape(-1, 3)
+            while len(self._blocks) >= KEPT_BLOCKS:
+                del self._blocks[next(iter(self._blocks))]
+        self._blocks[number] = block  # the youngest is the last
+        return block
+
+
+def spool_vertices(path: Path, spool: IO[bytes]) -> Vertices:
+    """Read all of a CityJSON file but its objects.
+
+    Parameters
+    ----------
+    path : Path
+        The file, in any layout.
+    spool : binary file
+        Empty, to be kept open as long as the vertices are used.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged.
+    OutputError
+        If the spool cannot be written.
+    """
+    small: dict[str, Any] = {}
+    n = 0
+    try:
+        with opened_json(path) as stream:
+            for key in stream.members():
+                if key in ("type", "version", "transform", "metadata"):
+                    small[key] = stream.value()
+                elif key == "vertices":
+                    n = _spool_vertices(stream, spool)
+                    small[key] = ()
+                else:
+                    small[key] = stream.peek()
+                    stream.skip()
+            stream.finish()
+        if small["type"] != "CityJSON" or small["version"] != CITYJSON:
+            raise InputError(f"{path}: is no CityJSON {CITYJSON} file; run again")
+        _ = small["vertices"]
+        if small["CityObjects"] != "{":
+            raise TypeError("CityObjects is no object")
+        return Vertices(spool, n, small)
+    except WRONG_FIELD as error:
+        raise broken_field(path, error) from None
+
+
+def _spool_vertices(stream: JsonStream, spool: IO[bytes]) -> int:
+    n, batch = 0, []
+    if stream.peek() != "[":
+        raise TypeError("vertices is no array")
+    for vertex in stream.elements():
+        batch.append(vertex)
+        if len(batch) == BLOCK:
+            _write(spool, _rows(batch))
+            n, batch = n + len(batch), []
+    _write(spool, _rows(batch))
+    return n + len(batch)
+
+
+def _write(file: IO[bytes], data: Any) -> None:
+    try:
+        file.write(data)
+    except OSError as error:
+        raise OutputError(
+            f"{gettempdir()}: no temporary file can be written ({error.strerror}); free space there or set TMPDIR"
+        ) from error
+
+
+def _rows(vertices: list[Any]) -> NDArray[np.float64]:
+    rows = np.array(vertices, np.float64)
+    if vertices and rows.shape != (len(vertices), 3):
+        raise ValueError(f"vertices of shape {rows.shape[1:]}")
+    return rows
+
+
+def _read_objects(path: Path, vertices: Vertices, file: IO[bytes]) -> BuildingIndex:
+    """Read the objects of a CityJSON file that have no parts, and write their heights and footprints."""
+    numbers, boxes, starts, sizes = array("q"), array("f"), array("q"), array("i")
+    start = 0
+    for name, thing in read_objects(path):
+        if has_parts(path, thing):
+            continue
+        number, ground, roof, footprint = read_building(path, name, thing, vertices)
+        data = np.array([(ground, roof)], HEAD).tobytes() + shapely.to_wkb(footprint)
+        _write(file, data)
+        numbers.append(number)
+        boxes.extend(shapely.bounds(footprint).tolist())
+        starts.append(start)
+        sizes.append(len(data))
+        start += len(data)
+    order = np.argsort(np.frombuffer(numbers, np.int64), kind="stable")
+    return BuildingIndex(
+        np.frombuffer(numbers, np.int64)[order],
+        np.frombuffer(boxes, np.float32).reshape(-1, 4)[order],
+        np.frombuffer(starts, np.int64)[order],
+        np.frombuffer(sizes, np.int32)[order],
+        file,
+    )
+
+
+def read_objects(path: Path) -> Iterator[tuple[str, Any]]:
+    """Read the objects of a CityJSON file one at a time, by name; InputError if it is missing or no JSON."""
+    with opened_json(path) as stream:
+        for key in stream.members():
+            if key != "CityObjects":
+                stream.skip()
+                continue
+            for name in stream.members():
+                yield name, stream.value()
+
+
+def has_parts(path: Path, thing: Any) -> bool:
+    """Tell a house that consists of parts from a building or part with a shape of its own."""
+    try:
+        return "children" in thing
+    except TypeError as error:
+        raise broken_field(path, error) from None
+
+
+def read_building(
+    path: Path, name: str, thing: Mapping[str, Any], vertices: Vertices
+) -> tuple[int, float, float, Any]:
+    """Take number, ground and roof height (m) and footprint of a building of a city model.
+
+    Raises
+    ------
+    InputError
+        If one of these is missing or wrong.
+    """
+    try:
+        values = thing["attributes"]
+        if not 0 <= values["number"] < MAX_NUMBER:
+            raise ValueError(f"number {values['number']}; bound: {MAX_NUMBER}")
+        number, ground, roof = (
+            int(values["number"]),
+            float(values["ground_height"]),
+            float(values["roof_height"]),
+        )
+        (geometry,) = (part for part in thing["geometry"] if str(part["lod"]) == "0")
+        surfaces = [_read_polygon(rings, vertices) for rings in geometry["boundaries"]]
+    except (*WRONG_FIELD, shapely.GEOSException) as error:
+        raise InputError(
+            f"{path}: building {name!r}: a field is missing or wrong ({error!r}); run again"
+        ) from None
+    return number, ground, roof, surfaces[0] if len(surfaces) == 1 else shapely.multipolygons(surfaces)
+
+
+def _read_polygon(rings: list[list[int]], vertices: Vertices) -> Any:
+    shell, *holes = (vertices.take(_checked(ring, len(vertices)))[:, :2] for ring in rings)
+    return shapely.Polygon(shell, holes)
+
+
+def _checked(ring: list[int], n_vertices: int) -> NDArray[np.int64]:
+    indices = np.array(ring, np.int64)
+    if indices.ndim != 1 or indices.min() < 0 or indices.max() >= n_vertices:
+        raise IndexError(f"vertex {indices.min()}..{indices.max()} of {n_vertices}")
+    return indices

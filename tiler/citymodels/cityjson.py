@@ -1,0 +1,426 @@
+"""The city model as a CityJSON 2.0 file, and back (steps 1.7 and 2.4)."""
+
+import hashlib
+import json
+import uuid
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
+from math import isfinite
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, Any, BinaryIO
+
+import numpy as np
+import pyproj
+import shapely
+from numpy.typing import NDArray
+from pyproj.exceptions import CRSError
+
+from pipeline.citymodel import CityModel
+from pipeline.errors import ConfigError, InputError
+from pipeline.notes import Note
+from pipeline.solids import Solids, build_solids
+from tiler.citymodels.number_set import NumberSet
+from tiler.store.atomic import replacing
+
+# Coordinates are whole multiples of this length (m).
+GRID = 0.001
+# Attributes of every building; further columns may not take their names.
+ATTRIBUTES = ("number", "ground_height", "roof_height", "height", "members")
+RUN = 512  # buildings that are written at once, and share their vertices
+COPY_BYTES = 1 << 20
+ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+GROUND, ROOF, WALL = range(3)
+# Semantic surfaces of every solid, by the numbers above.
+SURFACES = '[{"type":"GroundSurface"},{"type":"RoofSurface"},{"type":"WallSurface"}]'
+WITHOUT_COMMA = {bool, int, float, type(None)}  # types of values whose text has no comma
+Attributes = Mapping[str, Sequence[object]]
+
+
+def write_city_model(
+    path: Path,
+    model: CityModel,
+    *,
+    crs: str,
+    bounds: Sequence[float],
+    title: str = "",
+    attributes: Attributes | None = None,
+) -> tuple[Note, ...]:
+    """Write the buildings as CityJSON 2.0: LoD0 footprints and LoD1.2 solids.
+
+    Parameters
+    ----------
+    path : Path
+        File to write; it appears whole or not at all.
+    model : CityModel
+        The buildings. Each becomes a ``Building`` whose key is its id; the parts of a house become
+        ``BuildingPart`` objects below a ``Building`` that has no geometry of its own.
+    crs : str
+        The region's CRS in any form that pyproj reads: ``"EPSG:28992"``, WKT.
+    bounds : 6 floats
+        Region ``(x0, y0, z0, x1, y1, z1)`` (m). The lower corner, floored, is the file's origin.
+    title : str
+        Title of the dataset; the file has none if empty.
+    attributes : mapping of str to a sequence of n values
+        Further attributes, one column each. NaN is written as null.
+
+    Returns
+    -------
+    tuple of Note
+        Those of `pipeline.solids.build_solids`: a building whose footprint is lost has no geometry in the
+        file, a flat one has no solid. ``crs-without-epsg``: the file names no reference system.
+
+    Raises
+    ------
+    ValueError
+        If two buildings have one id, a footprint is not a Polygon, a height or bound is not finite,
+        or a column of `attributes` has the wrong length or one of our names.
+    ConfigError
+        If pyproj does not know the CRS.
+    OutputError
+        If the file cannot be written.
+
+    Notes
+    -----
+    Coordinates are rounded to 1 mm; the heights among the attributes are not. Equal input gives equal
+    bytes: no clock is read, the identifier is a hash of the buildings. An empty model makes a valid file.
+
+    References
+    ----------
+    CityJSON 2.0.1, https://www.cityjson.org/specs/2.0.1/
+    """
+    return write_city_blocks(path, [(model, attributes or {})], crs=crs, bounds=bounds, title=title)
+
+
+def write_city_blocks(
+    path: Path,
+    blocks: Iterable[tuple[CityModel, Attributes]],
+    *,
+    crs: str,
+    bounds: Sequence[float],
+    title: str = "",
+) -> tuple[Note, ...]:
+    """Write buildings that come in blocks, as `write_city_model` does, without ever holding all of them.
+
+    Parameters
+    ----------
+    path, crs, bounds, title
+        As in `write_city_model`.
+    blocks : iterable of (CityModel, attributes)
+        The buildings and their further attributes, the same columns in every block.
+
+    Returns
+    -------
+    tuple of Note
+        As from `write_city_model`.
+
+    Raises
+    ------
+    ValueError
+        As from `write_city_model`; or if blocks have different columns.
+    ConfigError, OutputError
+        As from `write_city_model`.
+
+    Notes
+    -----
+    The bytes do not depend on how the buildings are cut into blocks. One object a line, then one vertex a line,
+    then what is known only then: extent and identifier. Memory holds a block and `RUN` buildings, the numbers of
+    all, and the ids of those that are parts; vertices wait in a temporary file beside `path`. Buildings of one
+    run share their vertices.
+    """
+    if len(bounds) != 6 or not np.all(np.isfinite(bounds)):
+        raise ValueError(f"bounds {tuple(bounds)} must be 6 finite numbers")
+    system = _reference_system(crs)
+    origin = np.floor(np.asarray(bounds[:3], dtype=np.float64))
+    head = {"type": "CityJSON", "version": "2.0", "transform": {"scale": [GRID] * 3, "translate": origin.tolist()}}
+    with replacing(path) as part, part.open("wb") as file, TemporaryFile(dir=path.parent) as spool:
+        file.write(f"{_text(head)[:-1]},\n".encode("ascii"))
+        writer = _Writer(file, spool, origin)
+        for model, columns in _cut_runs(blocks):
+            writer.add(model, columns)
+        writer.finish()
+        metadata: dict[str, Any] = {
+            "geographicalExtent": _extent(bounds, writer.box),
+            "identifier": str(uuid.UUID(bytes=writer.digest.digest()[:16], version=5)),
+        }
+        if system is not None:
+            metadata["referenceSystem"] = system
+        if title:
+            metadata["title"] = title
+        file.write(f',\n"metadata":{_text(metadata)}}}\n'.encode("ascii"))
+    notes = tuple(writer.notes)
+    if system is None:
+        notes = (*notes, Note("crs-without-epsg", detail=f"{crs}: the city model names no reference system"))
+    return notes
+
+
+class _Writer:
+    """Writes objects to a file and vertices to another, and keeps what must be known at the end."""
+
+    def __init__(self, file: BinaryIO, spool: IO[bytes], origin: NDArray[np.float64]) -> None:
+        self.file, self.spool, self.origin = file, spool, origin
+        # A version 5 identifier is this hash of a name space and a name: the name is all that we write.
+        self.digest = hashlib.sha1(uuid.NAMESPACE_URL.bytes, usedforsecurity=False)
+        self.box = np.empty((0, 3))
+        self.notes: list[Note] = []
+        self.children: dict[str, list[str]] = {}
+        self.seen = NumberSet()
+        self.n_objects = self.n_vertices = 0
+        self._write(b'"CityObjects":{')
+
+    def add(self, model: CityModel, extra: Attributes) -> None:
+        """Write the objects of a run."""
+        columns = _columns(model, extra)
+        self._check_ids(model.ids)
+        solids, notes = build_solids(model, self.origin, grid=GRID)
+        self.notes += notes
+        attributes, geometry = _attribute_texts(columns, len(model)), _geometry_texts(solids, self.n_vertices)
+        objects = []
+        for name, house, *told in zip(model.ids.tolist(), model.house.tolist(), attributes, geometry, strict=True):
+            objects.append(_object_text(name, house, *told))
+            if house != name:
+                self.children.setdefault(house, []).append(name)
+        self._objects(objects)
+        if len(solids.vertices):
+            places = solids.vertices * GRID + self.origin
+            self.box = np.vstack((self.box, places.min(axis=0), places.max(axis=0)))
+            self.box = np.stack((self.box.min(axis=0), self.box.max(axis=0)))
+            # All at once: a call for each takes twelve times as long, the encoder of lists three times.
+            text = ",\n".join(["[%d,%d,%d]"] * len(solids.vertices)) % tuple(solids.vertices.reshape(-1).tolist())
+            self.spool.write(f"{',' if self.n_vertices else ''}\n{text}".encode("ascii"))
+            self.n_vertices += len(solids.vertices)
+
+    def finish(self) -> None:
+        """Write the houses that have parts, and the vertices."""
+        mixed = self.seen.has(_hash_names(self.children))
+        for is_row, (house, children) in zip(mixed.tolist(), self.children.items(), strict=True):
+            if is_row:
+                raise ValueError(f"building {house}: is a row and has parts, it may be one of these")
+            content = _text({"type": "Building", "children": children})
+            self._objects([f"{_text(house)}:{content}"])
+        self._write(b'\n},\n"vertices":[')
+        self.spool.seek(0)
+        while piece := self.spool.read(COPY_BYTES):
+            self._write(piece)
+        self._write(b"\n]")
+
+    def _check_ids(self, ids: NDArray[np.str_]) -> None:
+        """Refuse two rows of one id."""
+        new = _hash_names(ids.tolist())
+        again = self.seen.has(new)
+        again[np.argsort(new, kind="stable")[1:]] |= np.diff(np.sort(new)) == 0
+        if again.any():
+            raise ValueError(f"building {ids[again][0]}: 2 buildings have this id, at most 1 may")
+        self.seen.add(new)
+
+    def _objects(self, texts: Sequence[str]) -> None:
+        """Write objects one a line."""
+        if texts:
+            before = ",\n" if self.n_objects else "\n"
+            self._write((before + ",\n".join(texts)).encode("ascii"))
+            self.n_objects += len(texts)
+
+    def _write(self, data: bytes) -> None:
+        self.digest.update(data)
+        self.file.write(data)
+
+
+def read_city_model(path: Path) -> CityModel:
+    """Read a file of `write_city_model`.
+
+    Parameters
+    ----------
+    path : Path
+        CityJSON file.
+
+    Returns
+    -------
+    CityModel
+        The buildings in the file's order: footprints with the file's 1 mm, all else as it was given. A
+        building without geometry has an empty Polygon.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is not one of ours.
+    """
+    try:
+        return _parse(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check path and permissions") from error
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+        raise InputError(
+            f"{path}: not a city model of citystitch ({type(error).__name__}: {error}); write it again"
+        ) from error
+
+
+def _hash_names(names: Collection[str]) -> NDArray[np.int64]:
+    hashes = (hashlib.blake2b(name.encode(), digest_size=8).digest() for name in names)
+    return np.frombuffer(b"".join(hashes), np.int64)
+
+
+def _cut_runs(blocks: Iterable[tuple[CityModel, Attributes]]) -> Iterator[tuple[CityModel, Attributes]]:
+    """Put blocks together and cut them anew, into runs of `RUN` buildings."""
+    waiting: list[tuple[CityModel, Attributes]] = []
+    for model, columns in blocks:
+        waiting.append((model, columns))
+        while (n_rows := sum(len(part) for part, _ in waiting)) >= RUN:
+            joined = _join_blocks(waiting)
+            yield _take_rows(joined, slice(0, RUN))
+            waiting = [_take_rows(joined, slice(RUN, n_rows))]
+    yield from [_join_blocks(waiting)] if waiting else []
+
+
+def _join_blocks(blocks: Sequence[tuple[CityModel, Attributes]]) -> tuple[CityModel, Attributes]:
+    models, names = [model for model, _ in blocks], blocks[0][1].keys()
+    for model, columns in blocks:
+        if columns.keys() != names:
+            raise ValueError(
+                f"blocks with the attributes {sorted(names)} and {sorted(columns)}; expected equal ones"
+            )
+        for name, column in columns.items():
+            if len(column) != len(model):
+                raise ValueError(f"attribute {name!r} has {len(column)} values for {len(model)} buildings")
+    joined = CityModel(
+        polygons=np.concatenate([model.polygons for model in models]),
+        ids=np.concatenate([model.ids for model in models]),
+        numbers=np.concatenate([model.numbers for model in models]),
+        ground=np.concatenate([model.ground for model in models]),
+        roof=np.concatenate([model.roof for model in models]),
+        members=tuple(names for model in models for names in model.members),
+        house=np.concatenate([model.house for model in models]),
+    )
+    return joined, {name: [value for _, columns in blocks for value in columns[name]] for name in names}
+
+
+def _take_rows(block: tuple[CityModel, Attributes], rows: slice) -> tuple[CityModel, Attributes]:
+    model, columns = block
+    taken = CityModel(
+        model.polygons[rows],
+        model.ids[rows],
+        model.numbers[rows],
+        model.ground[rows],
+        model.roof[rows],
+        model.members[rows],
+        model.house[rows],
+    )
+    return taken, {name: column[rows] for name, column in columns.items()}
+
+
+def _object_text(name: str, house: str, attributes: str, geometry: str) -> str:
+    """Write a city object: a building, or a part of the house that the row names."""
+    kind, parents = ("Building", "") if name == house else ("BuildingPart", f',"parents":[{_text(house)}]')
+    return f'{_text(name)}:{{"type":"{kind}","attributes":{attributes},"geometry":{geometry}{parents}}}'
+
+
+def _columns(model: CityModel, extra: Attributes) -> dict[str, Sequence[object]]:
+    """Gather the attributes by name."""
+    for name in extra:
+        if name in ATTRIBUTES:
+            raise ValueError(f"attribute {name!r} is one of ours; rename the column")
+    own: tuple[Sequence[object], ...] = (
+        model.numbers.tolist(),
+        model.ground.tolist(),
+        model.roof.tolist(),
+        (model.roof - model.ground).tolist(),
+        [[str(name) for name in names] for names in model.members],
+    )
+    return {**dict(zip(ATTRIBUTES, own, strict=True)), **extra}
+
+
+def _attribute_texts(columns: Attributes, n: int) -> list[str]:
+    """Write the attributes of each of n buildings."""
+    form = ",".join(f"{_text(name).replace('%', '%%')}:%s" for name in columns)
+    texts = [_value_texts(column) for column in columns.values()]
+    return [f"{{{form}}}" % row for row in zip(*texts, strict=True)] if n else []
+
+
+def _value_texts(column: Sequence[object]) -> list[str]:
+    """Write each value of a column; NaN and infinity as null."""
+    plain = [value.item() if isinstance(value, np.generic) else value for value in column]
+    values = [None if isinstance(value, float) and not isfinite(value) else value for value in plain]
+    if set(map(type, values)) <= WITHOUT_COMMA:
+        return _text(values)[1:-1].split(",")  # all at once: a call for each takes ten times as long
+    return [_text(value) for value in values]
+
+
+def _reference_system(crs: str) -> str | None:
+    """Name the CRS by its EPSG code as OGC does; None if it has no code."""
+    try:
+        code = pyproj.CRS.from_user_input(crs).to_epsg()
+    except CRSError as error:
+        raise ConfigError(f"CRS {crs!r}: unknown to pyproj; give a code such as EPSG:28992") from error
+    return None if code is None else f"https://www.opengis.net/def/crs/EPSG/0/{code}"
+
+
+def _extent(bounds: Sequence[float], points: NDArray[np.floating]) -> list[float]:
+    """Box of the region, grown by the points beyond it."""
+    box = np.asarray(bounds, dtype=np.float64).reshape(2, 3)
+    low, high = np.vstack([box[:1], points]).min(axis=0), np.vstack([box[1:], points]).max(axis=0)
+    return [round(float(value), 3) for value in (*low, *high)]
+
+
+def _geometry_texts(solids: Solids, first: int) -> list[str]:
+    """Write the geometry of each building, LoD0 and LoD1.2 if it has a solid, on vertices from `first` on.
+
+    Text is put together here: of a million lists, Python's encoder would take twice as long as all else.
+    """
+    low, high = ([str(vertex) for vertex in (corners + first).tolist()] for corners in (solids.low, solids.high))
+    walls = [f"[[{a},{b},{c},{d}]]" for a, b, c, d in (solids.walls + first).tolist()]
+    start, building = solids.ring_start.tolist(), solids.building_start.tolist()
+    texts = []
+    for has_solid, (ring, end) in zip(solids.has_solid.tolist(), pairwise(building), strict=True):
+        rings = list(pairwise(start[ring : end + 1]))
+        objects = [_floor_text(low, rings)] if rings else []
+        if rings and has_solid:
+            objects.append(_solid_text(low, high, walls[start[ring] : start[end]], rings))
+        texts.append(f"[{','.join(objects)}]")
+    return texts
+
+
+def _floor_text(low: list[str], rings: list[tuple[int, int]]) -> str:
+    floor = ",".join(f"[{','.join(low[a:b])}]" for a, b in rings)
+    return f'{{"type":"MultiSurface","lod":"0","boundaries":[[{floor}]]}}'
+
+
+def _solid_text(low: list[str], high: list[str], walls: list[str], rings: list[tuple[int, int]]) -> str:
+    """Put one closed shell together; the floor is turned over to look down."""
+    floor = ",".join(f"[{','.join(reversed(low[a:b]))}]" for a, b in rings)
+    roof = ",".join(f"[{','.join(high[a:b])}]" for a, b in rings)
+    kinds = f"{GROUND},{ROOF}" + f",{WALL}" * len(walls)
+    shell = ",".join((f"[{floor}]", f"[{roof}]", *walls))
+    return (
+        f'{{"type":"Solid","lod":"1.2","boundaries":[[{shell}]],'
+        f'"semantics":{{"surfaces":{SURFACES},"values":[[{kinds}]]}}}}'
+    )
+
+
+def _text(document: object) -> str:
+    return ENCODER.encode(document)
+
+
+def _parse(document: dict[str, Any]) -> CityModel:
+    transform = document["transform"]
+    vertices = np.array(document["vertices"], dtype=np.float64).reshape(-1, 3)[:, :2]
+    vertices = vertices * transform["scale"][:2] + transform["translate"][:2]
+    objects = {name: item for name, item in document["CityObjects"].items() if "children" not in item}
+    rows = [item["attributes"] for item in objects.values()]
+    polygons = np.empty(len(objects), dtype=np.object_)
+    polygons[:] = [_footprint(item["geometry"], vertices) for item in objects.values()]
+    return CityModel(
+        polygons=polygons,
+        ids=np.array(list(objects), dtype=np.str_),
+        numbers=np.array([row["number"] for row in rows], dtype=np.int64),
+        ground=np.array([row["ground_height"] for row in rows], dtype=np.float64),
+        roof=np.array([row["roof_height"] for row in rows], dtype=np.float64),
+        members=tuple(tuple(row["members"]) for row in rows),
+        house=np.array([item.get("parents", [name])[0] for name, item in objects.items()], dtype=np.str_),
+    )
+
+
+def _footprint(geometry: list[dict[str, Any]], xy: NDArray[np.float64]) -> shapely.Polygon:
+    for item in geometry:
+        if item["lod"] == "0":
+            shell, *holes = (xy[ring] for ring in item["boundaries"][0])
+            return shapely.Polygon(shell, holes)
+    return shapely.Polygon()

@@ -1,0 +1,1 @@
+"""The command line: parser, handlers, values with a minus sign."""

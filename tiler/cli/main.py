@@ -1,0 +1,389 @@
+"""The command line: `citystitch run | plan | check | status | report | render | export` and others."""
+
+import argparse
+import gc
+import json
+import logging
+import os
+import signal
+import sys
+import tempfile
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import CityError, ConfigError
+from tiler.cli.negative_values import mark_values
+from tiler.cli.parser import Handler, build_parser
+from tiler.config.config import Config, annotated_defaults, make_config
+from tiler.executors import fork_server
+from tiler.executors.importing import uncollected
+from tiler.executors.kept_memory import keep_memory, look_seldom
+from tiler.formats.export import FORMATS, refuse_strangers
+from tiler.interface.api import with_file
+from tiler.jobs.commands import describe_job, find_run, job_line
+from tiler.objects.places import place, refuse_bucket
+from tiler.words.plain_text import printable
+from tiler.words.std_streams import guard_streams
+
+if TYPE_CHECKING:
+    from tiler.interface.synth import SynthFiles
+
+EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+DEMO_TILES = 3  # tiles along each side of the demo's city, fewer where they would be too small
+LEAST_DEMO_TILE = 150.0  # m
+EXPORT_OPTIONS = {option for kind in FORMATS.values() for option in kind.options}
+BLOCK = Path(__file__).parents[1] / "demo_block"  # real data of a few hundred kilobytes
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Without the program's name; those of the process if not given.
+    """
+    _find_cache()
+    if arguments is None:
+        guard_streams()
+        _silence_libraries()
+    parser = make_parser()
+    options, unknown = parser.parse_known_args(mark_values(sys.argv[1:] if arguments is None else arguments))
+    if unknown:
+        options.parser.refuse_unknown(unknown)
+    handler: Handler = options.handler
+    try:
+        return handler(options)
+    except CityError as error:
+        if options.traceback:
+            raise
+        print("citystitch:", "\n".join(map(printable, error.lines)), file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("citystitch: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        if options.traceback:
+            raise
+        reason = printable(" ".join(str(error).split()))
+        print(f"citystitch: {type(error).__name__}: {reason}; --traceback tells where", file=sys.stderr)
+        return EXIT_FAILED
+    finally:
+        if arguments is None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said; Python would end with a traceback
+            gc.freeze()  # the process ends: a last look for garbage in all that was imported takes 0.2 s
+
+
+def say(text: str) -> None:
+    """Print one line at once, whatever a path or an attribute in it holds; into a log file, too."""
+    print(printable(text), flush=True)
+
+
+def _find_cache() -> None:
+    """Let compiled code be cached in the temporary folder where neither package nor home can be written."""
+    places = (Path(__file__).parents[1], Path.home())
+    if "NUMBA_CACHE_DIR" not in os.environ and not any(os.access(place, os.W_OK) for place in places):
+        os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"citystitch-{os.getuid()}")
+
+
+def _silence_libraries() -> None:
+    """
+    Keep the warnings of libraries from the user, who can do nothing about them, here and in workers.
+
+    Their logs are kept from the terminal in this process alone: Dask adds no handler of its own where there is one
+    already, and says a lot, with tracebacks, about connections that end when a run is interrupted.
+    """
+    logging.getLogger().addHandler(logging.NullHandler())
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        os.environ["PYTHONWARNINGS"] = "ignore"
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of all commands."""
+    return build_parser(HANDLERS)
+
+
+def _run(options: argparse.Namespace) -> int:
+    config = make_config(with_file(vars(options)))
+    if options.only is None:
+        dashboard = None if options.no_dashboard else options.dashboard_address
+        words = {"quiet": options.quiet, "verbose": options.verbose, "log": options.log_json}
+        return _run_config(config, dashboard=dashboard, report=options.report, **words)
+    if options.log_json is not None:
+        raise ConfigError("--log-json tells of a whole run; leave out it or --only")
+    from tiler.workflow.single_tile import run_alone
+
+    print(run_alone(config, options.only, say=None if options.quiet else say))
+    return 0
+
+
+def _run_config(
+    config: Config,
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+    log: Path | None = None,
+    dashboard: str | None = None,
+    report: bool = False,
+) -> int:
+    if config.has_crew:
+        fork_server.limit_threads()
+    elif config.workers and not config.on_cluster:
+        fork_server.begin(dask=True)
+    look_seldom()
+    if not config.workers:
+        keep_memory()
+    with uncollected():
+        if config.has_crew:
+            fork_server.begin(forked=True)
+        from tiler.executors.kernels import count_cores
+        from tiler.monitoring.events import EventLog, open_log
+        from tiler.monitoring.terminal import make_views, print_last_line, print_summary
+        from tiler.workflow.out_folder import refuse_result
+        from tiler.workflow.run import run
+
+    if report:
+        refuse_bucket(config.out, "--report")
+    out = place(config.out)
+    watchers = make_views(quiet=quiet, verbose=verbose)
+    if log is not None:
+        refuse_result(out, log)
+        watchers.append(EventLog(log, open_log(log), every=0.0))
+    record = run(config, watchers=watchers, dashboard=dashboard, compilers=config.workers or count_cores())
+    if report:
+        _report_run(out, quiet=quiet)
+    if quiet:
+        print_last_line(record, out)
+    else:
+        print_summary(record, out)
+    code: int = record["exit_code"]
+    return code
+
+
+def _join(options: argparse.Namespace) -> int:
+    config = make_config(with_file(vars(options)))
+    fork_server.limit_threads()
+    look_seldom()
+    with uncollected():
+        fork_server.begin(forked=True)
+        from tiler.joining.join import join
+        from tiler.monitoring.terminal import make_views, print_last_line, print_summary
+
+    joined = join(
+        config,
+        member=options.member,
+        max_idle=options.max_idle,
+        views=lambda: make_views(quiet=options.quiet, verbose=options.verbose),
+        say=None if options.quiet else say,
+    )
+    if joined.error:
+        print(f"citystitch: {printable(joined.error)}", file=sys.stderr)
+    elif joined.record is not None:
+        show = print_last_line if options.quiet else print_summary
+        show(joined.record, Path(config.out))
+    elif not options.quiet:
+        say(f"{config.out}: the run is done")
+    return joined.exit_code
+
+
+def _plan(options: argparse.Namespace) -> int:
+    from tiler.planning.plan_report import plan_run
+
+    config = make_config(with_file(vars(options)))
+    plan_run(config, json_file=options.json_file, picture=options.picture)
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    if options.store:
+        from tiler.store.audit import audit_run
+
+        return 0 if audit_run(options.directory, print) else EXIT_FAILED
+    refuse_bucket(options.directory, "check without --store")
+    refuse_strangers(options.directory)
+    return _check_folder(options.directory)
+
+
+def _check_folder(directory: Path) -> int:
+    from tiler.check.check import check_run
+    from tiler.store.results import StoredTerrain
+
+    report = check_run(directory, StoredTerrain)
+    print("\n".join(map(printable, report.lines())))
+    return 0 if report.ok else EXIT_FAILED
+
+
+def _status(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from tiler.monitoring.status import print_status, read_status
+    from tiler.workflow.out_folder import PROGRESS
+
+    directory = find_run(options.job)
+    job = describe_job(directory)
+    if job is not None and not options.as_json:
+        say(job_line(job))
+    if job is not None and not (directory / PROGRESS).is_file():
+        if options.as_json:
+            print(json.dumps({"state": "not begun", "job": job}, indent=1))
+        return 0
+    status = read_status(directory)
+    if options.as_json:
+        print(json.dumps(status if job is None else status | {"job": job}, indent=1))
+    else:
+        print_status(directory, status, Console(highlight=False))
+    return 0
+
+
+def _dashboard(options: argparse.Namespace) -> int:
+    from tiler.dashboard.server import show_folder
+
+    show_folder(options.directory, f"{options.host}:{options.port}", say)
+    return 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from tiler.report import write_report
+
+    refuse_strangers(options.directory)
+    say(str(write_report(options.directory)))
+    return 0
+
+
+def _report_run(out: Path, *, quiet: bool) -> None:
+    """Write the report of a run that has just ended; the mesh is there, whatever becomes of it."""
+    from tiler.report import write_report
+
+    try:
+        path = write_report(out)
+        if not quiet:
+            say(f"report: {path}")
+    except Exception as error:
+        reason = str(error) if isinstance(error, CityError) else f"{type(error).__name__}: {error}"
+        print(
+            f"citystitch: no report: {printable(reason)}; citystitch report {printable(str(out))} tries again",
+            file=sys.stderr,
+        )
+
+
+def _fetch(options: argparse.Namespace) -> int:
+    from tiler.objects.fetch import fetch_run
+
+    return 0 if fetch_run(options.source, options.directory, say) else EXIT_FAILED
+
+
+def _synth(options: argparse.Namespace) -> int:
+    _write_city(options.directory, options)
+    return 0
+
+
+def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":
+    from tiler.interface.synth import write_city
+
+    files = write_city(
+        directory,
+        size=options.size,
+        buildings=options.buildings,
+        density=options.density,
+        relief=options.relief,
+        seed=options.seed,
+    )
+    clouds, shapefile = files.clouds[0].parent, files.shapefile
+    say(f"{len(files.clouds)} LAZ files in {clouds}, footprints in {shapefile} and {files.footprints.name}")
+    return files
+
+
+def _demo(options: argparse.Namespace) -> int:
+    out: Path = options.out
+    files = _write_city(out / "city", options)
+    clouds, footprints = [str(path) for path in files.clouds], str(files.shapefile)
+    tile_size = max(options.size / DEMO_TILES, LEAST_DEMO_TILE)
+    city = {"pointcloud": clouds, "footprints": footprints, "tile_size": tile_size, "workers": 2}
+    block = {
+        "pointcloud": [str(BLOCK / "cloud.laz")],
+        "footprints": str(BLOCK / "footprints.geojson"),
+        "mesh_size": 5.0,
+    }
+    pictures = {out / "demo.png": "overview", out / "tiles.png": "tiles"}
+    codes = [
+        _demonstrate("a synthetic city, tile by tile", city, out / "result", pictures),
+        _demonstrate("a block of Amsterdam", block, out / "block", {out / "block.png": "boundary"}),
+    ]
+    return max(codes)
+
+
+def _demonstrate(title: str, inputs: dict[str, Any], out: Path, pictures: dict[Path, str]) -> int:
+    """Mesh, check and draw; returns the exit code of the check."""
+    from tiler.pictures.render import render_run
+
+    print(f"\n{title}")
+    _run_config(make_config(inputs | {"out": str(out), "overwrite": True}), report=True)
+    code = _check_folder(out)
+    for picture, what in pictures.items():
+        render_run(out, picture, what=what)
+        say(f"picture: {picture}")
+    say(f"mesh:    {out / 'mesh.pvtu'} (open it in ParaView)")
+    return code
+
+
+def _render(options: argparse.Namespace) -> int:
+    from tiler.pictures.render import render_run
+
+    refuse_strangers(options.directory)
+    render_run(options.directory, options.output, what=options.what, say=say)
+    say(str(options.output))
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    from tiler.formats.export import export_run
+
+    refuse_strangers(options.directory)
+    given = {name: value for name, value in vars(options).items() if name in EXPORT_OPTIONS}
+    export_run(options.directory, options.output, name=options.format, overwrite=options.overwrite, options=given)
+    say(str(options.output))
+    return 0
+
+
+def _kernels(options: argparse.Namespace) -> int:
+    from tiler.executors.kernels import compile_kernels, count_cores, describe_kernels
+
+    if options.workers < 0:
+        raise ConfigError(f"--workers {options.workers}: must be 0 or above; 0 is one a core")
+    failed = compile_kernels(options.workers or count_cores())
+    for line in failed:
+        print(f"citystitch: not compiled: {printable(line)}", file=sys.stderr)
+    if failed:
+        return EXIT_FAILED
+    say(describe_kernels())
+    return 0
+
+
+def _config(_: argparse.Namespace) -> int:
+    print(annotated_defaults())
+    return 0
+
+
+HANDLERS: Mapping[str, Handler] = {
+    "run": _run,
+    "join": _join,
+    "plan": _plan,
+    "check": _check,
+    "status": _status,
+    "dashboard": _dashboard,
+    "report": _report,
+    "fetch": _fetch,
+    "synth": _synth,
+    "demo": _demo,
+    "render": _render,
+    "export": _export,
+    "kernels": _kernels,
+    "config": _config,
+}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,309 @@
+"""The options of every command."""
+
+import argparse
+import dataclasses
+import importlib.metadata
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+from pipeline.errors import ConfigError
+from tiler.config.config import Config
+from tiler.config.domain_height import Height
+from tiler.executors.addresses import ANYWHERE
+from tiler.formats.export import FORMATS
+from tiler.interface.api import POSITIONAL
+from tiler.jobs.commands import add_job_commands
+from tiler.objects.places import place, refuse_bucket
+from tiler.words.did_you_mean import Parser
+
+Handler = Callable[[argparse.Namespace], int]
+Group = Any  # of options, as `ArgumentParser.add_argument_group` makes it
+EXIT_CODES = (
+    "Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 3 done but for parts listed in run.json, "
+    "130 stopped."
+)
+METAVARS = {str: "NAME", float: "NUMBER", int: "NUMBER"}
+# What a value is, where its type does not tell.
+KINDS = {
+    **dict.fromkeys(("footprints", "cluster", "tls_ca", "tls_cert", "tls_key"), "FILE"),
+    **{"out": "DIR", "crs": "EPSG", "layer": "LAYER", "scheduler": "ADDRESS"},
+    **dict.fromkeys(("id_attribute", "height_attribute"), "ATTRIBUTE"),
+}
+# What a first run needs stands first in the help of a run, what is for studies of the method last.
+ESSENTIAL = (
+    *("footprints", "out", "crs", "bounds", "mesh_size", "domain_height", "border", "tile_size", "workers"),
+    "overwrite",
+)
+RESEARCH = (
+    *("vertex_tolerance", "ground_margin", "ground_percentile", "roof_height", "roof_percentile"),
+    *("roof_clearance", "simplify", "clearance_floor", "roof_group", "min_angle", "mesher", "least_spacing"),
+    *("most_spacing", "stagger", "improve_passes", "layer_height", "smoother", "smoothing_tolerance"),
+    "fem_tolerance",
+)
+TITLES = {
+    "essentials": "essentials",
+    "input": "input, in more detail",
+    "terrain": "terrain",
+    "buildings": "buildings",
+    "simplify": "city model",
+    "mesh": "mesh: layers, grading, pad, soil",
+    "run": "where and how it runs",
+    "watch": "what it shows and writes",
+    "research": "research: other ways of the method, and their tolerances",
+}
+
+
+def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
+    """Make the parser of all commands; the parameters of a run come from `Config`.
+
+    Parameters
+    ----------
+    handlers : mapping
+        What does each command, by its name.
+    """
+    common = Parser(add_help=False)
+    common.add_argument("--traceback", action="store_true", help="show where in the code an error arose")
+    parser = Parser(
+        prog="citystitch",
+        description="LiDAR point clouds and building footprints in, one conforming tetrahedral city mesh out.",
+        epilog=EXIT_CODES,
+    )
+    parser.add_argument("--version", action=_Version, help="print the version and end")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    def add(name: str, handler: Handler, text: str) -> argparse.ArgumentParser:
+        sub: argparse.ArgumentParser = commands.add_parser(
+            name, help=text, description=text, epilog=EXIT_CODES, parents=[common]
+        )
+        sub.set_defaults(handler=handler, parser=sub)
+        return sub
+
+    def command(name: str, text: str) -> argparse.ArgumentParser:
+        return add(name, handlers[name], text)
+
+    run = command("run", "mesh a region from point clouds and footprints")
+    shown = _add_inputs(run)
+    shown.add_argument(
+        "--dashboard-address",
+        default=ANYWHERE,
+        metavar="HOST:PORT",
+        help="where the page of the run is shown while it is at work (default: a free port of 127.0.0.1)",
+    )
+    shown.add_argument("--no-dashboard", action="store_true", help="show no page of the run")
+    shown.add_argument(
+        "--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure"
+    )
+    words = shown.add_mutually_exclusive_group()
+    words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
+    words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
+    shown.add_argument("--log-json", type=Path, metavar="FILE", help="write what happens, a JSON object a line")
+    shown.add_argument(
+        "--report",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="write report.html at the end, as `citystitch report` does",
+    )
+    _add_join(command("join", "work at a run together with others, on any machines that share its folder"))
+    plan = command("plan", "tell what a run would do and take, without doing it")
+    plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
+    plan.add_argument("--picture", type=Path, metavar="FILE.png", help="draw tiles, files and footprints")
+    _add_inputs(plan)
+    check = command("check", "prove from the written files that a mesh is right")
+    check.add_argument("directory", type=place, metavar="DIR", help="folder of a run")
+    check.add_argument(
+        "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
+    )
+    status = command("status", "tell how far a run is, whether it is alive, and how to go on")
+    status.add_argument("job", metavar="DIR|JOB", help="folder of a run, or number of its job")
+    status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
+    board = command("dashboard", "show the page of a run, at work, ended or dead, from its folder")
+    board.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
+    board.add_argument(
+        "--port", type=int, default=0, metavar="N", help="port to listen at; 0: a free one (default)"
+    )
+    board.add_argument(
+        "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
+    )
+    report = command("report", "write report.html: what a run made, how good it is, what was left out")
+    report.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
+    _add_fetch(command("fetch", "fetch the folder of a run from a bucket, and verify its checksums"))
+    synth = command("synth", "write a synthetic city: point cloud and footprints")
+    synth.add_argument("directory", type=Path, metavar="DIR", help="folder to write to")
+    _add_city(synth, size=1000.0, buildings=500)
+    _add_demo(command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one"))
+    render = command("render", "draw a picture of a run")
+    render.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
+    render.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="PNG file to write")
+    render.add_argument(
+        "--what",
+        choices=("boundary", "mesh", "overview", "tiles", "sizes", "quality", "citymodel"),
+        default="boundary",
+        help="what to draw; sizes: triangles from above, by the length of their edges; quality: the boundary by "
+        "the cells behind it; citymodel: blocks on the terrain",
+    )
+    add_job_commands(add, _add_inputs)
+    _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
+    _add_kernels(
+        command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
+    )
+    command("config", "print all parameters of a run, annotated, as a configuration file")
+    return parser
+
+
+def _add_demo(demo: argparse.ArgumentParser) -> None:
+    """Add where the demonstration writes, and its city."""
+    demo.add_argument(
+        "--out", type=Path, default=Path("demo"), metavar="DIR", help="folder to write to (default: demo)"
+    )
+    _add_city(demo, size=600.0, buildings=220)
+
+
+def _add_kernels(kernels: argparse.ArgumentParser) -> None:
+    """Add how many processes compile."""
+    kernels.add_argument(
+        "--workers", type=int, default=0, metavar="NUMBER", help="processes; 0: one a core, 8 at most (default)"
+    )
+
+
+def _add_inputs(parser: argparse.ArgumentParser) -> Group:
+    """Add point clouds, and the parameters of a run; gives the group of further options."""
+    parser.usage = f"{parser.prog} POINTCLOUD... [--footprints FILE] [--out DIR] [--option VALUE ...]"
+    parser.add_argument(
+        POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
+    )
+    return _add_parameters(parser)
+
+
+def _add_join(join: argparse.ArgumentParser) -> None:
+    """Add the options of one that joins a run: those of the run, and a few of its own."""
+    _add_inputs(join)
+    join.add_argument("--member", default="", metavar="NAME", help="its name (default: its element of an array)")
+    join.add_argument(
+        "--max-idle",
+        type=float,
+        default=600.0,
+        metavar="SECONDS",
+        help="how long to wait for a folder that a run holds which is not one to join (default: 600)",
+    )
+    words = join.add_mutually_exclusive_group()
+    words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
+    words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
+
+
+def _add_parameters(parser: argparse.ArgumentParser) -> Group:
+    """Add an option for every parameter of a run; what is not given is left to the file or default.
+
+    Gives the group of further options: on what a command shows and writes.
+    """
+    hints = get_type_hints(Config)
+    entries = [entry for entry in dataclasses.fields(Config) if entry.name != POSITIONAL]
+    entries.sort(key=lambda entry: (list(TITLES).index(_group_of(entry)), _rank(entry)))
+    groups = {key: parser.add_argument_group(title) for key, title in TITLES.items()}
+    for entry in entries:
+        data, wanted = entry.metadata, hints[entry.name]
+        group = groups[_group_of(entry)]
+        words: dict[str, Any] = {"dest": entry.name, "default": argparse.SUPPRESS, "help": _help(entry)}
+        if wanted is bool:
+            words["action"] = argparse.BooleanOptionalAction
+        elif get_origin(wanted) is tuple and get_args(wanted)[0] == Height:
+            words |= {"type": str, "nargs": "+", "metavar": "M|nH"}
+        elif get_origin(wanted) is tuple and get_args(wanted)[0] is int:
+            words |= {"type": str, "metavar": "N,N"}
+        elif get_origin(wanted) is tuple:
+            words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
+        elif wanted == Height:
+            words |= {"type": str, "metavar": "M|nH"}
+        else:
+            unit = KINDS.get(entry.name, "" if wanted is str else data["unit"].upper())
+            words |= {"type": wanted, "metavar": unit or METAVARS[wanted]}
+            if data["choices"]:
+                words |= {"choices": data["choices"], "metavar": None}
+        group.add_argument(f"--{entry.name.replace('_', '-')}", **words)
+    return groups["watch"]
+
+
+def _group_of(entry: "dataclasses.Field[Any]") -> str:
+    """Group of a parameter in the help: essentials, its section, or research."""
+    if entry.name in ESSENTIAL:
+        return "essentials"
+    return "research" if entry.name in RESEARCH else str(entry.metadata["section"])
+
+
+def _rank(entry: "dataclasses.Field[Any]") -> int:
+    return ESSENTIAL.index(entry.name) if entry.name in ESSENTIAL else 0
+
+
+class _Version(argparse.Action):
+    """Prints the version: read only when it is asked for."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None) -> None:
+        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, default=argparse.SUPPRESS, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        """Print it and end."""
+        try:
+            version = importlib.metadata.version("citystitch")
+        except importlib.metadata.PackageNotFoundError:
+            version = "of a source tree that is not installed"
+        print(f"citystitch {version}")
+        parser.exit()
+
+
+def _help(entry: "dataclasses.Field[Any]") -> str:
+    data = entry.metadata
+    shown = isinstance(entry.default, (int, float)) and not isinstance(entry.default, bool)
+    default = f"default: {entry.default:g}" if shown else f"default: {entry.default}" if entry.default else ""
+    facts = ", ".join(fact for fact in (default, data["unit"], data["source"]) if fact)
+    return f"{data['text']} ({facts})".replace("%", "%%") if facts else data["text"]
+
+
+def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int) -> None:
+    parser.add_argument("--size", type=float, default=size, help=f"side of the city in m (default: {size:g})")
+    parser.add_argument("--buildings", type=int, default=buildings, help=f"their number (default: {buildings})")
+    parser.add_argument("--density", type=float, default=1.5, help="points per m2 (default: 1.5)")
+    parser.add_argument("--relief", type=float, default=20.0, help="height of the hills in m (default: 20)")
+    parser.add_argument("--seed", type=int, default=1, help="same seed, same bytes (default: 1)")
+
+
+def _add_fetch(fetch: argparse.ArgumentParser) -> None:
+    fetch.add_argument("source", metavar="s3://BUCKET/NAME", help="what --out of the run was")
+    fetch.add_argument("directory", type=Path, metavar="DIR", help="folder to write")
+
+
+def _add_export(export: argparse.ArgumentParser) -> None:
+    """Add the options of all formats, and the table of these below them."""
+    export.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
+    export.add_argument("--format", choices=tuple(FORMATS), metavar="NAME", required=True, help="see below")
+    export.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write")
+    export.add_argument("--overwrite", action="store_true", help="replace it if it exists")
+    given: dict[str, dict[str, Any]] = {
+        "parts": {"type": int, "metavar": "N", "help": "decomposed for N processes instead of whole"},
+        "case": {"choices": ("wind",), "help": "add the files of a simulation"},
+        "buildings": {
+            "choices": ("patches", "zones"),
+            "help": "one patch a building instead of walls and roofs; zones: one face zone beside them (openfoam)",
+        },
+        "largest_part": {
+            "action": "store_true",
+            "help": "of a mesh in parts that share no face, the one of the most cells alone",
+        },
+        "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
+    }
+    for option, words in given.items():
+        takers = ", ".join(name for name, kind in FORMATS.items() if option in kind.options)
+        words |= {"default": argparse.SUPPRESS, "help": f"{takers}: {words['help']}"}
+        export.add_argument(f"--{option.replace('_', '-')}", **words)
+    width = max(map(len, FORMATS))
+    rows = [f"  {name:<{width}}  {kind.description}" for name, kind in FORMATS.items()]
+    export.formatter_class = argparse.RawDescriptionHelpFormatter
+    export.epilog = "\n".join(["formats:", *rows, "", EXIT_CODES])
+
+
+def _on_disk(text: str) -> Path:
+    """Take the folder of a command that reads files of a disk."""
+    try:
+        refuse_bucket(text, "this command")
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return Path(text)

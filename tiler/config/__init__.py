@@ -1,0 +1,1 @@
+"""Parameters of a run, and what follows from them alone."""

@@ -1,0 +1,731 @@
+"""Every parameter of a run, once: default, unit, meaning, source. The command line and TOML follow it."""
+
+import dataclasses
+import json
+import math
+import os
+import tomllib
+import unicodedata
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+from pipeline.classes import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
+from pipeline.errors import ConfigError
+from stitch.least import LEAST_TILE
+from tiler.config.domain_height import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
+from tiler.config.pad_widths import check_widths
+from tiler.config.tile_size import LEAST_SIDE, choose_tile_size
+from tiler.objects.places import check_url, is_url
+from tiler.words.did_you_mean import suggest
+from tiler.words.plain_text import shorten
+
+MAX_CONFIG_BYTES = 1_000_000
+MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
+MAX_INT = 2**53
+UNSET = ""
+PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is given for the open
+NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
+LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
+
+
+def _parameter(
+    default: Any,
+    section: str,
+    text: str,
+    *,
+    unit: str = "",
+    source: str = "",
+    choices: tuple[str, ...] = (),
+    above: float | None = None,
+    least: float | None = None,
+    most: float | None = None,
+) -> Any:
+    """Declare a parameter: its section in TOML, its bounds, and all that a user should know of it."""
+    metadata = {
+        "section": section, "text": text, "unit": unit, "source": source,
+        "choices": choices, "above": above, "least": least, "most": most,
+    }  # fmt: skip
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Config:
+    """The parameters of a run; the field's metadata says what each means.
+
+    Examples
+    --------
+    >>> Config(pointcloud=("a.laz",), mesh_size=5.0).layer_height_or_default
+    5.0
+    """
+
+    pointcloud: tuple[str, ...] = _parameter(
+        (), "input", "LAS, LAZ or COPC files, globs or folders with such files"
+    )
+    footprints: str = _parameter(
+        UNSET,
+        "input",
+        "SHP, GPKG, GeoJSON or GeoParquet file of building footprints; without it, terrain only",
+    )
+    layer: str = _parameter(UNSET, "input", "layer of the footprint file; empty: its only or first one")
+    id_attribute: str = _parameter(
+        UNSET, "input", "attribute that holds building ids; empty: a well-known name, else ids from geometry"
+    )
+    height_attribute: str = _parameter(
+        UNSET, "input", "attribute with heights above ground, for buildings without roof points", unit="m"
+    )
+    crs: str = _parameter(
+        UNSET, "input", "CRS of the region, as EPSG:NNNN; empty: that of the data, where it states one"
+    )
+    reproject: bool = _parameter(
+        False, "input", "reproject point clouds that are in another CRS than the region's, in degrees, or in a "
+        "projection without true lengths (Web Mercator): to crs, or to their UTM zone",
+    )  # fmt: skip
+    align: bool = _parameter(
+        False, "input", "move the footprints by the shift that fits the roofs in the point cloud best, as measured"
+    )
+    height_unit: str = _parameter(
+        UNSET, "input", "unit of heights of the point clouds, whatever they state: m, ft, or ftUS (US survey "
+        "feet); empty: what they state, else metres, or feet where plan is in feet",
+        choices=(UNSET, "m", "ft", "ftUS"),
+    )  # fmt: skip
+    bounds: tuple[float, ...] = _parameter(
+        (), "input", "region as xmin ymin xmax ymax; empty: whole metres within the point clouds", unit="m"
+    )
+    building_classes: tuple[int, ...] = _parameter(
+        (BUILDING,), "input", "classes of points that mark buildings, as 6,67",
+        source="ASPRS LAS 1.4", least=0, most=255,
+    )  # fmt: skip
+    skip_unreadable: bool = _parameter(
+        False, "input", "leave out point-cloud files that cannot be read, list them, and end with exit code 3"
+    )
+    dtm_spacing: float = _parameter(
+        1.0, "terrain", "spacing of the terrain grid", unit="m", source="paper, step 1.3", above=0
+    )
+    ground_filter: bool = _parameter(
+        False, "terrain", "find ground points by an own filter, for clouds without ground classes"
+    )
+    min_building_area: float = _parameter(5.0, "buildings", "smaller footprints are dropped", unit="m2", least=0)
+    vertex_tolerance: float = _parameter(
+        0.01, "buildings", "vertices closer than this are one; also the bound for needless ones", unit="m",
+        source="paper, step 1.4", above=0, most=0.5,
+    )  # fmt: skip
+    ground_margin: float = _parameter(
+        1.0, "buildings", "ground points lie within this distance of a footprint", unit="m",
+        source="paper, step 1.5", above=0,
+    )  # fmt: skip
+    ground_percentile: float = _parameter(
+        10.0, "buildings", "ground height of a building, percentile of its ground points", unit="%",
+        source="paper, step 1.6", least=0, most=100,
+    )  # fmt: skip
+    roof_height: str = _parameter(
+        "median", "buildings", "roof height of a building: the median of its roof points, or roof_percentile (the "
+        "paper's)", choices=("median", "percentile"),
+    )  # fmt: skip
+    roof_percentile: float = _parameter(
+        90.0, "buildings", "percentile of the roof points with roof_height = percentile", unit="%",
+        source="paper, step 1.6", least=0, most=100,
+    )  # fmt: skip
+    default_height: float = _parameter(
+        6.0, "buildings", "height above ground without roof points and attribute; 0 drops the building",
+        unit="m", least=0,
+    )  # fmt: skip
+    roof_clearance: float = _parameter(
+        2.0, "buildings", "roofs are raised to this height above the highest terrain at their walls", unit="m",
+        above=0,
+    )  # fmt: skip
+    border: str = _parameter(
+        "clip", "buildings", "buildings on the region's border are clipped to it less the clearance, or dropped",
+        choices=("clip", "drop"),
+    )  # fmt: skip
+    simplify: str = _parameter(
+        "clearance", "simplify", "clearance: one planar graph of walls that keeps every house; paper: merging",
+        source="paper, step 2.1", choices=("clearance", "paper"),
+    )  # fmt: skip
+    clearance: float = _parameter(
+        1.0, "simplify", "least distance of walls; with simplify = paper, buildings closer than this are merged",
+        unit="m", source="paper, step 2.1", least=0.1,
+    )  # fmt: skip
+    clearance_floor: float = _parameter(
+        0.1, "simplify", "with simplify = paper: finer details of one building are repaired", unit="m",
+        above=0,
+    )  # fmt: skip
+    min_courtyard_area: float = _parameter(5.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
+    split_levels: bool = _parameter(
+        True, "simplify", "divide houses where their roof points show a step, with simplify = clearance"
+    )
+    roof_group: float = _parameter(
+        2.5, "simplify", "adjacent houses closer in height than this get one roof, with simplify = clearance",
+        unit="m", least=0,
+    )  # fmt: skip
+    manifold: bool = _parameter(
+        False, "simplify", "open or close the corners in which houses touch in a point only"
+    )
+    mesh_size: float = _parameter(
+        10.0, "mesh", "target edge length h: triangles of the plane mesh have about h^2/2 at most", unit="m",
+        source="paper, step 3.1", least=0.1,
+    )  # fmt: skip
+    open_size: float = _parameter(
+        0.0, "mesh", "target edge length far from walls, above mesh_size, which is that at walls; 0 takes "
+        "mesh_size everywhere", unit="m", least=0,
+    )  # fmt: skip
+    grading: float = _parameter(
+        0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size or pad", above=0,
+        most=1,
+    )  # fmt: skip
+    pad: tuple[float | str, ...] = _parameter(
+        (), "mesh", "width of a margin of bare ground around the region, which flattens outwards and has coarser "
+        "cells: one for all sides, or west east south north; metres, or 5H for five times the height of the "
+        "tallest building; empty: none", unit="m",
+    )  # fmt: skip
+    min_angle: float = _parameter(
+        0.0, "mesh", "least angle of the plane mesh, but at sharp corners; 0 takes the mesher's own: 28 adaptive, "
+        "25 layered", unit="degrees", source="paper, step 3.1", least=0, most=32,
+    )  # fmt: skip
+    domain_height: float | str = _parameter(
+        100.0, "mesh", "height of the domain above the terrain: metres, or 6H for six times the height of the "
+        "tallest building", unit="m", source="paper, step 3.2", above=0,
+    )  # fmt: skip
+    top: str = _parameter(
+        "terrain", "mesh", "top of the domain: it follows the smoothed terrain, or is flat, domain_height above "
+        "the highest terrain of the region", choices=("terrain", "flat"),
+    )  # fmt: skip
+    first_layer: float = _parameter(
+        0.0, "mesh", "height of the lowest cells above open ground, from which vertical spacing grows; 0 for a "
+        "spacing that is the same at all heights", unit="m", least=0,
+    )  # fmt: skip
+    layer_growth: float = _parameter(
+        1.2, "mesh", "with first_layer: ratio by which each layer is higher than the one below it", least=1, most=3
+    )
+    underground: float = _parameter(
+        0.0, "mesh", "depth of the soil that is meshed below the terrain, with the ground inside; 0 for none",
+        unit="m", least=0, most=10_000,
+    )  # fmt: skip
+    mesher: str = _parameter(
+        "adaptive", "mesh", "how columns are filled: each by its own levels, or by the paper's layers",
+        source="paper, steps 3.2-3.5", choices=("adaptive", "layered"),
+    )  # fmt: skip
+    least_spacing: float = _parameter(
+        0.1, "mesh", "least vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=1
+    )
+    most_spacing: float = _parameter(
+        0.8, "mesh", "largest vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=5
+    )
+    stagger: float = _parameter(
+        0.8, "mesh", "shift of neighbouring columns with mesher = adaptive; 0 for none, 1 for thirds of a step",
+        least=0, most=1,
+    )  # fmt: skip
+    improve_passes: int = _parameter(
+        1, "mesh", "rounds of moving levels at the worst cells with mesher = adaptive", least=0, most=20
+    )
+    layer_height: float = _parameter(
+        0.0, "mesh", "height of a layer with mesher = layered; 0 takes the mesh size", unit="m",
+        source="paper, step 3.2", least=0,
+    )  # fmt: skip
+    smoother: str = _parameter(
+        "columns", "mesh", "with mesher = layered: fast filter and column solver, or the paper's finite elements",
+        source="paper, steps 3.3 and 3.5", choices=("columns", "fem"),
+    )  # fmt: skip
+    smoothing_tolerance: float = _parameter(
+        0.003,
+        "mesh",
+        "largest residual over the diagonal with smoother = columns; heights are then within about "
+        "ten times this of the exact solution",
+        unit="m",
+        above=0,
+    )
+    fem_tolerance: float = _parameter(
+        1e-8, "mesh", "relative residual of the linear systems with smoother = fem", above=0, most=1e-2
+    )
+    tile_size: float = _parameter(
+        0.0,
+        "run",
+        "side of a tile, at least 14 mesh sizes; tiles are aligned to multiples of it in the CRS; 0 takes 1250 m, "
+        "and less for meshes finer than 10 m (660 m for 5 m, 350 m for 2.5 m), which have more cells",
+        unit="m",
+        least=0,
+    )
+    workers: int = _parameter(
+        0, "run", "worker processes on this machine; 0 runs in this process", least=0, most=1024
+    )
+    dask: bool = _parameter(
+        False, "run", "workers on this machine are those of a Dask scheduler, with Dask's own pages; some slower"
+    )
+    memory_limit: float = _parameter(
+        0.0, "run", "memory of a worker on this machine; 0 shares out nine tenths of what there is", unit="GiB",
+        least=0,
+    )  # fmt: skip
+    time_limit: float = _parameter(
+        3600.0, "run", "a task that takes longer in a worker of one thread is ended; 0 for no limit", unit="s",
+        least=0,
+    )  # fmt: skip
+    retries: int = _parameter(
+        1, "run", "how often a task that fails is tried again before its tile is left out", least=0, most=100
+    )
+    store_patience: float = _parameter(
+        600.0, "run", "how long a run waits for the bucket of its results where that does not answer", unit="s",
+        least=0,
+    )  # fmt: skip
+    scheduler: str = _parameter(
+        UNSET, "run", "address of a running Dask scheduler, whose workers see the same files; instead of workers"
+    )
+    tls_ca: str = _parameter(
+        UNSET, "run", "with a scheduler at tls://: certificate file of the cluster's authority; empty: that of "
+        "Dask's configuration",
+    )  # fmt: skip
+    tls_cert: str = _parameter(UNSET, "run", "likewise: certificate file of this client")
+    tls_key: str = _parameter(UNSET, "run", "likewise: file of its key; empty: in that of the certificate")
+    cluster: str = _parameter(
+        UNSET,
+        "run",
+        "TOML file that describes a cluster, whose batch system starts the workers; instead of workers",
+    )
+    allow_empty: bool = _parameter(
+        False, "run", "accept a mesh without buildings although footprints were given; else the run fails"
+    )
+    out: str = _parameter("out", "run", "folder for the results, or s3://BUCKET/NAME")
+    overwrite: bool = _parameter(
+        False, "run", "remove the results of an earlier run in that folder, and start anew"
+    )
+
+    @property
+    def on_cluster(self) -> bool:
+        """Whether workers are of a cluster, not of this machine."""
+        return bool(self.scheduler or self.cluster)
+
+    @property
+    def has_crew(self) -> bool:
+        """Whether tasks run in worker processes of this machine, without Dask."""
+        return bool(self.workers) and not self.on_cluster and not self.dask
+
+    @property
+    def padded(self) -> bool:
+        """Whether there is a pad around the region."""
+        return any(width != 0 for width in self.pad)
+
+    @property
+    def largest_size(self) -> float:
+        """Largest target edge length within the region (m)."""
+        return self.open_size or self.mesh_size
+
+    @property
+    def graded_size(self) -> float:
+        """Largest target edge length of region and pad where sizes are graded (m); 0 where all are the same.
+
+        Without ``open_size`` that of the pad is three times the mesh size, or as much as the size of tiles allows
+        and, with the adaptive mesher, a height of the domain in metres.
+        """
+        if self.open_size or not self.padded:
+            return self.open_size
+        most = self.tile_size_or_default / LEAST_TILE
+        if self.mesher == "adaptive" and not isinstance(self.domain_height, str):
+            most = min(most, self.domain_height / (2 * self.most_spacing))
+        size = min(PAD_COARSENING * self.mesh_size, most * (1 - ROUNDING))
+        return size if size > self.mesh_size else 0.0
+
+    @property
+    def layer_height_or_default(self) -> float:
+        """Height of a layer (m): the mesh size where none is given."""
+        return self.layer_height or self.mesh_size
+
+    @property
+    def tile_size_or_default(self) -> float:
+        """Side of a tile (m), which follows the mesh size where none is given."""
+        return self.tile_size or choose_tile_size(self.mesh_size, self.largest_size)
+
+    @property
+    def expected_height(self) -> float:
+        """Height of the domain (m); before there is a city model, a multiple is that of an expected building."""
+        return height_in_metres(self.domain_height, EXPECTED_TALLEST)
+
+
+# Parameters that count only where another one has a certain value.
+CONDITIONS = {
+    "roof_percentile": ("roof_height", "percentile"),
+    "clearance_floor": ("simplify", "paper"),
+    "split_levels": ("simplify", "clearance"),
+    "roof_group": ("simplify", "clearance"),
+    "manifold": ("simplify", "clearance"),
+    "least_spacing": ("mesher", "adaptive"),
+    "most_spacing": ("mesher", "adaptive"),
+    "stagger": ("mesher", "adaptive"),
+    "improve_passes": ("mesher", "adaptive"),
+    "layer_height": ("mesher", "layered"),
+    "smoother": ("mesher", "layered"),
+    "smoothing_tolerance": ("mesher", "layered"),
+    "fem_tolerance": ("mesher", "layered"),
+}
+TLS = ("tls_ca", "tls_cert", "tls_key")
+SOIL = ("least_spacing", "most_spacing", "stagger")  # of these, those that count for soil with either mesher
+
+
+def idle_parameters(config: Config) -> list[str]:
+    """Sentences about the parameters that are not at their default, but have no effect.
+
+    Examples
+    --------
+    >>> idle_parameters(Config(smoother="fem"))
+    ['smoother = fem has no effect: it counts with mesher = layered']
+    """
+    default = Config()
+    idle = [
+        f"{name} = {getattr(config, name)} has no effect: it counts with {other} = {value}"
+        for name, (other, value) in CONDITIONS.items()
+        if getattr(config, name) != getattr(default, name)
+        and getattr(config, other) != value
+        and not (config.underground and name in SOIL)
+    ]
+    if config.grading != default.grading and not config.graded_size:
+        idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
+    if config.layer_growth != default.layer_growth and not config.first_layer:
+        idle.append(f"layer_growth = {config.layer_growth:g} has no effect: it counts with first_layer above 0")
+    if config.dask and (config.on_cluster or not config.workers):
+        idle.append("dask has no effect: it counts with workers above 0, on this machine")
+    if not config.scheduler:
+        idle += [f"{name} has no effect: it counts with scheduler" for name in TLS if getattr(config, name)]
+    return idle
+
+
+def load_config(path: Path) -> dict[str, Any]:
+    """Read the parameters that a TOML file gives.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is no TOML, or has an unknown section or parameter.
+
+    Notes
+    -----
+    Relative paths of inputs and of the output folder are taken from the file's folder.
+    """
+    document = _read_toml(path)
+    values: dict[str, Any] = {}
+    sections = {entry.name: entry.metadata["section"] for entry in dataclasses.fields(Config)}
+    for section, table in document.items():
+        if section not in sections.values() or not isinstance(table, dict):
+            offer = suggest(section, sections.values())
+            raise ConfigError(
+                f"{path}: unknown section [{shorten(section, 100)}]{offer}; `citystitch config` lists all"
+            )
+        for name, value in table.items():
+            if sections.get(name) != section:
+                offer = f"; it stands in [{sections[name]}]" if name in sections else suggest(name, sections)
+                raise ConfigError(
+                    f"{path}: unknown parameter {shorten(name, 100)} in [{section}]{offer}; `citystitch config` "
+                    "lists all"
+                )
+            values[name] = _relative_to(path.parent, name, value)
+    return values
+
+
+def check_reach(path: Path, values: Mapping[str, Any]) -> None:
+    """Refuse what a configuration file may not decide, as it may come from someone else.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    values : mapping
+        The parameters that it gives, less those that the command line gives.
+
+    Raises
+    ------
+    ConfigError
+        If the output folder lies outside the file's folder, by ``..``, an absolute path or a symbolic link; or if
+        it names a scheduler, or a cluster: who connects to one runs what it sends.
+    """
+    out = values.get("out", UNSET)
+    if isinstance(out, str) and "\0" not in out:
+        if is_url(out):
+            raise ConfigError(f"{path}: out leads to {out}; give it on the command line, with --out")
+        home, target = (Path(os.path.realpath(place)) for place in (path.parent, out or "."))
+        if out and not target.is_relative_to(home):
+            raise ConfigError(
+                f"{path}: out leads to {target}, outside the folder of the file; give it on the command line, "
+                "with --out"
+            )
+    if values.get("scheduler"):
+        raise ConfigError(
+            f"{path}: a file may not name a scheduler, as its address is trusted with this machine; give it on "
+            "the command line, with --scheduler"
+        )
+    if values.get("cluster"):
+        raise ConfigError(
+            f"{path}: a file may not name a cluster, as the lines of its jobs are run; give it on the command "
+            "line, with --cluster"
+        )
+
+
+def make_config(values: Mapping[str, Any]) -> Config:
+    """Check the values of parameters and fill in defaults.
+
+    Raises
+    ------
+    ConfigError
+        With the parameter, its value against its bound, for a value of the wrong type or out of bounds.
+    """
+    hints = get_type_hints(Config)
+    checked = {}
+    for entry in dataclasses.fields(Config):
+        if entry.name in values:
+            value = _convert(entry.name, values[entry.name], hints[entry.name])
+            _check_bounds(entry.name, value, entry.metadata)
+            checked[entry.name] = value
+    config = Config(**checked)
+    _check_together(config)
+    return config
+
+
+def annotated_defaults() -> str:
+    """Write all parameters with their defaults, meaning, unit and source as TOML."""
+    return write_config(Config(), "all parameters with their defaults")
+
+
+def write_config(config: Config, title: str = "the parameters of a run") -> str:
+    """Write all parameters with their values, meaning, unit and source as TOML."""
+    lines = [f"# citystitch configuration: {title}.", ""]
+    section = ""
+    for entry in dataclasses.fields(Config):
+        data = entry.metadata
+        if data["section"] != section:
+            section = data["section"]
+            lines += [f"[{section}]"]
+        facts = [data["text"]]
+        facts += [f"unit: {data['unit']}"] if data["unit"] else []
+        facts += [f"one of: {', '.join(data['choices'])}"] if len(data["choices"]) > 1 else []
+        facts += [f"({data['source']})"] if data["source"] else []
+        lines += [f"# {'; '.join(facts)}", f"{entry.name} = {_toml(getattr(config, entry.name))}", ""]
+    return "\n".join(lines)
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path}: is no regular file; give a configuration file")
+        with path.open("rb") as file:
+            content = file.read(MAX_CONFIG_BYTES + 1)
+        if len(content) > MAX_CONFIG_BYTES:
+            raise ConfigError(
+                f"{path}: {path.stat().st_size} bytes > {MAX_CONFIG_BYTES}; this is no configuration"
+            )
+        return tomllib.loads(content.decode())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: its values are nested too deep; this is no configuration") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid TOML ({error}); see `citystitch config` for a template") from error
+
+
+def _relative_to(folder: Path, name: str, value: Any) -> Any:
+    if name == "pointcloud" and isinstance(value, (str, list)):
+        value = [value] if isinstance(value, str) else value
+        return [_below(folder, item) if isinstance(item, str) else item for item in value]
+    if name in ("footprints", "out", *TLS) and isinstance(value, str) and value:
+        return _below(folder, value)
+    return value
+
+
+def _below(folder: Path, text: str) -> str:
+    return text if is_url(text) else str(folder / text)
+
+
+def _convert(name: str, value: Any, wanted: Any) -> Any:
+    if wanted == Height:
+        wanted = str if isinstance(value, str) else float
+        converted = _convert(name, value, wanted)
+        return read_height(converted, name)
+    if get_origin(wanted) is tuple:
+        if get_args(wanted)[0] is int and isinstance(value, str):
+            value = _split_numbers(name, value)
+        if isinstance(value, str) or not isinstance(value, (list, tuple)):
+            value = [value]
+        return tuple(_convert(name, item, get_args(wanted)[0]) for item in value)
+    if isinstance(value, int) and abs(value) > MAX_INT:
+        raise ConfigError(f"{name}: a whole number of {value.bit_length()} bits; at most 2^53 is taken")
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not wanted:
+        raise ConfigError(f"{name} = {_shown(value)}: {wanted.__name__} expected, not {type(value).__name__}")
+    if isinstance(value, str):
+        _check_text(name, value)
+        if name in ("pointcloud", "footprints", "out"):
+            check_url(value)
+    return value
+
+
+def _split_numbers(name: str, text: str) -> list[int]:
+    """Read whole numbers with commas between them, as the command line gives them."""
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"{name} = {_shown(text)}: whole numbers with commas expected, as 6,67") from None
+
+
+def _check_text(name: str, text: str) -> None:
+    if len(text) > MAX_TEXT:
+        raise ConfigError(f"{name}: {len(text)} characters; at most {MAX_TEXT} are taken")
+    allowed = "\n\r\t" if name == "crs" else ""  # WKT has lines
+    if any(sign not in allowed and unicodedata.category(sign) == "Cc" for sign in text):
+        raise ConfigError(f"{name} = {_shown(text)}: has control characters; write it without them")
+
+
+def _shown(value: Any) -> str:
+    """Show a value in a message; tables and lists by their kind alone, as they may be deep."""
+    if isinstance(value, (dict, list)):
+        return "{...}" if isinstance(value, dict) else "[...]"
+    return shorten(repr(value), 100)
+
+
+def _check_bounds(name: str, value: Any, data: Mapping[str, Any]) -> None:
+    if data["choices"] and value not in data["choices"]:
+        raise ConfigError(f"{name} = {_shown(value)}: must be one of {', '.join(data['choices'])}")
+    if isinstance(value, tuple) and data["least"] is not None:
+        for item in value:
+            _check_bounds(name, item, data)
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return
+    unit = f" {data['unit']}" if data["unit"] else ""
+    above, least, most = data["above"], data["least"], data["most"]
+    if not math.isfinite(value):
+        raise ConfigError(f"{name} = {value}: must be a finite number")
+    if above is not None and not value > above:
+        raise ConfigError(f"{name} = {value:g}{unit}: must be above {above:g}{unit}")
+    if least is not None and not value >= least:
+        raise ConfigError(f"{name} = {value:g}{unit}: must be at least {least:g}{unit}")
+    if most is not None and not value <= most:
+        raise ConfigError(f"{name} = {value:g}{unit}: must be at most {most:g}{unit}")
+
+
+def _check_together(config: Config) -> None:
+    if config.bounds:
+        if len(config.bounds) != 4 or not all(math.isfinite(value) for value in config.bounds):
+            raise ConfigError(f"bounds = {list(config.bounds)}: four finite numbers xmin ymin xmax ymax expected")
+        xmin, ymin, xmax, ymax = config.bounds
+        if xmax - xmin < config.mesh_size or ymax - ymin < config.mesh_size:
+            raise ConfigError(
+                f"bounds = {list(config.bounds)}: {xmax - xmin:g} x {ymax - ymin:g} m is smaller than one cell "
+                f"of {config.mesh_size:g} m; give xmin ymin xmax ymax"
+            )
+    _check_classes(config.building_classes)
+    if config.clearance_floor > config.clearance:
+        raise ConfigError(
+            f"clearance_floor = {config.clearance_floor:g} m: must be at most clearance = {config.clearance:g} m"
+        )
+    if config.open_size and config.open_size <= config.mesh_size:
+        raise ConfigError(
+            f"open_size = {config.open_size:g} m: must be above mesh_size = {config.mesh_size:g} m; 0 takes "
+            "mesh_size everywhere"
+        )
+    if config.least_spacing > config.most_spacing:
+        raise ConfigError(
+            f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
+        )
+    least = config.least_spacing * config.mesh_size
+    if 0 < config.underground < least:
+        raise ConfigError(
+            f"underground = {config.underground:g} m: at least {least:g} m (least_spacing x mesh_size), the least "
+            "height of a cell; raise it, lower --least-spacing, or give 0 for no soil"
+        )
+    spacing = largest_spacing(config, config.largest_size)
+    if config.first_layer > spacing:
+        size = "open_size" if config.open_size else "mesh_size"
+        source = "layer_height" if config.mesher == "layered" else f"most_spacing x {size}"
+        raise ConfigError(
+            f"first_layer = {config.first_layer:g} m: at most the largest vertical spacing, {spacing:g} m "
+            f"({source}); lower --first-layer"
+        )
+    if 0 < config.first_layer < LEAST_FIRST_LAYER * config.mesh_size:
+        raise ConfigError(
+            f"first_layer = {config.first_layer:g} m: at least {LEAST_FIRST_LAYER:g} of mesh_size = "
+            f"{config.mesh_size:g} m; raise --first-layer or lower --mesh-size"
+        )
+    _check_pad(config)
+    _check_way(config)
+    if not isinstance(config.domain_height, str):
+        check_height(config, config.domain_height)
+
+
+def _check_classes(classes: tuple[int, ...]) -> None:
+    if not classes:
+        raise ConfigError(
+            f"building_classes is empty; give at least one, {BUILDING} in most clouds: where a file has none of "
+            "them, roofs are found without"
+        )
+    for number in sorted(set(classes) & set(NO_BUILDINGS)):
+        raise ConfigError(
+            f"building_classes = {_shown(classes)}: {number} is ground (2), water (9) or noise (7, 18) and marks "
+            "no buildings; leave it out"
+        )
+
+
+def _check_way(config: Config) -> None:
+    """Check how and where the run takes place."""
+    if 0 < config.tile_size < LEAST_SIDE:
+        raise ConfigError(
+            f"tile_size = {config.tile_size:g} m: at least {LEAST_SIDE:g} m; raise it, or give 0 for one that "
+            "follows the mesh size"
+        )
+    if config.cluster and is_url(config.out):
+        raise ConfigError(
+            f"out = {config.out} with a cluster: jobs keep their scripts and logs in the output folder; give one "
+            "of a file system that all nodes see"
+        )
+    if config.scheduler and config.cluster:
+        raise ConfigError(
+            f"scheduler = {_shown(config.scheduler)} and cluster = {_shown(config.cluster)}: workers are of one "
+            "or the other; leave one out"
+        )
+
+
+def _check_pad(config: Config) -> None:
+    if len(config.pad) not in (0, 1, 4):
+        raise ConfigError(
+            f"pad: {len(config.pad)} widths; give one for all sides, or four: west east south north (on the "
+            "command line behind the point clouds)"
+        )
+    check_widths(config.pad, mesh_size=config.mesh_size, dtm_spacing=config.dtm_spacing)
+
+
+def largest_spacing(config: Config, largest_size: float) -> float:
+    """Largest vertical spacing (m), of either mesher, where edges are as long as that (m)."""
+    if config.mesher == "layered":
+        return config.layer_height_or_default
+    return config.most_spacing * largest_size
+
+
+def check_height(config: Config, height: float) -> None:
+    """Refuse a domain of less than two layers.
+
+    Raises
+    ------
+    ConfigError
+        With the spacing against the height (m).
+    """
+    spacing = largest_spacing(config, max(config.largest_size, config.graded_size))
+    if spacing <= height / 2:
+        return
+    shown = f"domain_height = {height:g} m"
+    if isinstance(config.domain_height, str):
+        shown = f"domain_height = {config.domain_height}, here {height:g} m"
+    if config.mesher == "layered":
+        raise ConfigError(
+            f"layer height {spacing:g} m: at most half of {shown}; lower --layer-height or raise --domain-height"
+        )
+    name = "open_size" if config.open_size else "mesh_size"
+    move = f"lower --most-spacing or --{name.replace('_', '-')}"
+    if config.graded_size and not config.open_size:
+        name, move = f"the pad's size of {config.graded_size:g} m", "lower --most-spacing, give an --open-size"
+    raise ConfigError(
+        f"vertical spacing of up to {spacing:g} m (most_spacing x {name}): at most half of {shown}; {move}, or "
+        "raise --domain-height"
+    )
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(_toml(item) for item in value)}]"
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)

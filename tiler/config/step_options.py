@@ -1,0 +1,146 @@
+"""From the parameters of a run to the options of the steps, and which parameters each of these needs."""
+
+from typing import Any
+
+from pipeline.adaptive import AdaptiveOptions
+from pipeline.city import CityOptions
+from pipeline.growth import Growth, count_steps
+from pipeline.layered import LayeredOptions
+from pipeline.sizes import SizeRule
+from pipeline.spacing import SpacingLimits
+from pipeline.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
+from pipeline.underground import SoilOptions
+from tiler.config.config import Config
+from tiler.config.domain_height import Domain
+from tiler.engine.task import Declared
+
+# Parameters of the city model; two are raised by what the mesh needs, see `derived_parameters`.
+CITY_PARAMETERS = (
+    *("min_building_area", "vertex_tolerance", "ground_margin", "ground_percentile", "roof_height"),
+    *("roof_percentile", "default_height", "roof_clearance_or_spacing", "border", "simplify", "clearance"),
+    *("clearance_floor", "min_courtyard_area", "split_levels", "roof_group_or_spacing", "manifold"),
+)
+# Parameters of seams and plane meshes.
+PLANE_PARAMETERS = ("mesh_size", "min_angle", "mesher")
+# Further ones of both where sizes are graded.
+SIZE_PARAMETERS = ("open_size", "grading")
+# Further ones of both where there is a pad; the first also of what reads its terrain.
+PAD_PARAMETERS = ("core_bounds", "graded_size")
+# Parameters of the columns.
+LAYER_PARAMETERS = (
+    *("mesh_size", "mesher", "domain_height", "least_spacing", "most_spacing", "stagger", "improve_passes"),
+    *("layer_height", "layer_height_or_default", "smoother", "smoothing_tolerance", "fem_tolerance"),
+)
+# Parameters of the soil, which counts only where it is asked for.
+SOIL_PARAMETERS = ("underground", "mesh_size", "least_spacing", "most_spacing", "stagger")
+
+
+def derived_parameters(config: Config) -> dict[str, float]:
+    """Parameters that follow from others, by name: a stage that declares one does not depend on the others.
+
+    ``graded_size`` is the largest target edge length of region and pad, ``tile_size_or_default`` the side of a
+    tile (m).
+    ``roof_clearance_or_spacing`` and ``roof_group_or_spacing`` (m) are at least the least vertical spacing of the
+    adaptive mesher: heights closer than that cannot both be exact in a column.
+    """
+    spacing = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
+    return {
+        "layer_height_or_default": config.layer_height_or_default,
+        "graded_size": config.graded_size,
+        "tile_size_or_default": config.tile_size_or_default,
+        "roof_clearance_or_spacing": max(config.roof_clearance, spacing),
+        "roof_group_or_spacing": max(config.roof_group, spacing),
+    }
+
+
+def needs_region(config: Config) -> bool:
+    """Whether height, top or pad of the domain follow from what the whole region holds."""
+    return config.padded or config.top == "flat" or isinstance(config.domain_height, str)
+
+
+def layer_parameters(config: Config) -> tuple[str, ...]:
+    """Parameters of the columns: those of features only where these are used, so that keys stay without them."""
+    growth = ("first_layer", "layer_growth") if config.first_layer else ()
+    return (*LAYER_PARAMETERS, *growth, *(("top_elevation",) if config.top == "flat" else ()))
+
+
+def expected_levels(config: Config, spacing: float) -> float:
+    """Number of levels of a column over flat ground, for forecasts, with this spacing without growth (m)."""
+    if not config.first_layer:
+        return config.expected_height / spacing
+    return float(count_steps(config.expected_height, spacing, config.first_layer, config.layer_growth))
+
+
+def city_options(given: Any) -> CityOptions:
+    """Options of steps 1.4 to 2.3; `given` has the parameters as attributes."""
+    return CityOptions(
+        min_building_area=given.min_building_area,
+        vertex_tolerance=given.vertex_tolerance,
+        ground_margin=given.ground_margin,
+        ground_percentile=given.ground_percentile,
+        roof_percentile=given.roof_percentile if given.roof_height == "percentile" else 50.0,
+        default_height=given.default_height,
+        roof_clearance=given.roof_clearance_or_spacing,
+        border="clip" if given.border == "clip" else "drop",
+        simplify="paper" if given.simplify == "paper" else "clearance",
+        clearance=given.clearance,
+        clearance_floor=given.clearance_floor,
+        min_courtyard_area=given.min_courtyard_area,
+        split_levels=given.split_levels,
+        roof_group=given.roof_group_or_spacing,
+        manifold=given.manifold,
+    )
+
+
+def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | AdaptiveOptions:
+    """Options of steps 3.2 to 3.5, of the mesher that is chosen; with a domain, its height and top."""
+    if domain is None:
+        domain = Domain(given.domain_height, _optional(given, "top_elevation", None))
+    first = _optional(given, "first_layer", 0.0)
+    growth = Growth(first, given.layer_growth) if first else None
+    if given.mesher == "adaptive":
+        return AdaptiveOptions(
+            mesh_size=given.mesh_size,
+            domain_height=domain.height,
+            limits=SpacingLimits(given.least_spacing, given.most_spacing),
+            stagger=given.stagger,
+            passes=given.improve_passes,
+            growth=growth,
+            top=domain.top,
+        )
+    return LayeredOptions(
+        mesh_size=given.mesh_size,
+        layer_height=given.layer_height_or_default,
+        domain_height=domain.height,
+        smoother="fem" if given.smoother == "fem" else "columns",
+        tolerance=given.smoothing_tolerance,
+        fem_tolerance=given.fem_tolerance,
+        growth=growth,
+        top=domain.top,
+    )
+
+
+def size_rule(given: Any, largest: float) -> SizeRule:
+    """Rule of the sizes in the plane, with the largest one (m), where they are graded."""
+    return SizeRule(given.mesh_size, largest, given.grading)
+
+
+def soil_options(given: Any) -> SoilOptions:
+    """Options of the soil, the same with both meshers."""
+    limits = SpacingLimits(given.least_spacing, given.most_spacing)
+    return SoilOptions(given.underground, given.mesh_size, limits, given.stagger)
+
+
+def plane_options(given: Any) -> dict[str, Any]:
+    """Options of step 3.1: ``min_angle``, ``refinements`` and ``passes``."""
+    adaptive = given.mesher == "adaptive"
+    return {
+        "min_angle": given.min_angle or (ADAPTIVE_ANGLE if adaptive else PAPER_ANGLE),
+        "refinements": ADAPTIVE_REFINEMENTS if adaptive else 0,
+        "passes": ADAPTIVE_PASSES if adaptive else 0,
+    }
+
+
+def _optional(given: Any, name: str, default: Any) -> Any:
+    """Value of a parameter that a stage declares only where it counts."""
+    return given.get(name, default) if isinstance(given, Declared) else getattr(given, name, default)

@@ -1,0 +1,1 @@
+"""The stage engine: stages, tasks, keys, records, failures."""

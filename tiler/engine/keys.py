@@ -1,0 +1,150 @@
+"""Keys: a hash of all that a result depends on, so that resume and partial rebuild are one mechanism."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from enum import Enum
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+
+from tiler.engine.stage import Box, Layout, Scope, Stage
+from tiler.georeference.frame import AS_IT_IS, Frame
+
+# What computes results: a change of one of their versions redoes everything.
+CODE = (
+    "citystitch",
+    "numpy",
+    "scipy",
+    "shapely",
+    "numba",
+    "triangle",
+    "pyamg",
+    "laspy",
+    "lazrs",
+    "pyogrio",
+    "pyproj",
+    "deflate",
+)
+DIGEST = "BLAKE3"  # how contents are hashed: a result with a digest of another kind is computed anew
+
+
+def stage_digest(stage: Stage, parameters: Mapping[str, Any], layout: Layout) -> bytes:
+    """Hash what all items of a stage share: stage, versions of the code, declared parameters, region.
+
+    Parameters
+    ----------
+    stage : Stage
+        The stage.
+    parameters : mapping
+        Values of its declared parameters.
+    layout : Layout
+        Its bounds and identity are taken.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is no plain value (numbers, strings, None, and dicts, lists, tuples, dataclasses of those).
+    """
+    values = {}
+    for name, value in parameters.items():
+        try:
+            values[name] = json.dumps(value, sort_keys=True, default=_plain)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"parameter {name} of stage {stage.name}: {error}") from error
+    parts: list[Any] = [stage.name, stage.scope.value, stage.version, code_versions(), values]
+    parts += [_hex(layout.bounds), layout.identity, DIGEST]
+    return _hash(json.dumps(parts, sort_keys=True).encode())
+
+
+def item_key(
+    shared: bytes,
+    name: str,
+    box: Box,
+    identity: str,
+    refs: Iterable[tuple[str, Iterable[tuple[str, str]]]],
+    gaps: Iterable[Box] = (),
+) -> str:
+    """Hash what one result depends on.
+
+    Parameters
+    ----------
+    shared : bytes
+        `stage_digest` of its stage.
+    name : str
+        Item.
+    box : tuple of float
+        Its box (m).
+    identity : str
+        Identity of the file, for the scope FILE; else empty.
+    refs : iterable
+        For each stage that is read, in a fixed order, its name, and name and digest of each result, in a fixed
+        order. A result that was computed anew and came out the same changes no key.
+    gaps : iterable of tuple of float
+        Boxes near it that no tile covers (m).
+
+    Returns
+    -------
+    str
+        32 hexadecimal digits.
+    """
+    parts = [name, _hex(box), identity, [[stage, list(items)] for stage, items in refs], sorted(map(_hex, gaps))]
+    return _hash(shared + json.dumps(parts).encode()).hex()
+
+
+def declared_values(stage: Stage, parameters: Any) -> dict[str, Any]:
+    """Take the declared parameters of a stage; ValueError if one is not there."""
+    missing = [name for name in stage.parameters if not hasattr(parameters, name)]
+    if missing:
+        raise ValueError(f"stage {stage.name} declares parameters that are not there: {', '.join(missing)}")
+    return {name: getattr(parameters, name) for name in sorted(stage.parameters)}
+
+
+def file_identity(layout: Layout, scope: Scope, name: str) -> tuple[str, str, Frame]:
+    """Give path, identity and frame of a file item; those of none for other scopes.
+
+    The frame is part of the identity, unless coordinates are taken as they are.
+    """
+    if scope is not Scope.FILE:
+        return "", "", AS_IT_IS
+    item = layout.files[name]
+    framed = item.identity if item.frame == AS_IT_IS else f"{item.identity} {item.frame}"
+    return item.path, framed, item.frame
+
+
+@cache
+def code_versions() -> tuple[tuple[str, str], ...]:
+    """Names and versions of this package and of those that it computes with, ``"unknown"`` for one without."""
+    return tuple((name, version_of(name)) for name in CODE)
+
+
+def version_of(name: str) -> str:
+    """Version of an installed package, ``"unknown"`` for one without."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _hex(box: Box) -> list[str]:
+    return [float(v).hex() for v in box]
+
+
+def _hash(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=16).digest()
+
+
+def _plain(value: object) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} has no plain form")

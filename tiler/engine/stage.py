@@ -1,0 +1,184 @@
+"""What a stage declares, and the layout: the items of every scope with their boxes."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+from tiler.georeference.frame import AS_IT_IS, Frame
+
+if TYPE_CHECKING:
+    from tiler.engine.task import Task
+
+Box = tuple[float, float, float, float]
+Facts = dict[str, Any]
+
+REGION_ITEM = "region"
+
+
+class Scope(Enum):
+    """What a stage is computed for, one result each."""
+
+    FILE = "file"
+    TILE = "tile"
+    SEAM = "seam"
+    REGION = "region"
+
+
+@dataclass(frozen=True)
+class Read:
+    """What a stage reads of another one.
+
+    All items of that stage are read whose box meets the reader's own box grown by the halo; boxes are closed, so
+    touching counts. A stage of the whole region reads all, and is read by all.
+
+    Attributes
+    ----------
+    stage : str
+        Name of the stage that is read.
+    halo : float
+        How far around the reader's box (m).
+    by_extent : bool
+        Use, instead of the box of a read item, the ``"extent"`` among the facts of its result: four numbers, or
+        None for an item that holds nothing and is never read. Such a stage must have run in an earlier call.
+    around : str
+        A stage of an earlier call: the ``"extent"`` that its result for the same item states takes the place of
+        the reader's box; nothing is read where it is None.
+    own : bool
+        Read the item of the reader's own name alone.
+    named_by : str
+        A stage of an earlier call: read the items listed as ``"names"`` among the facts of its result for the
+        same item.
+    optional : bool
+        An item that was set aside is left out. Otherwise, and where it is the item of the reader's own name, the
+        reader is not run either. With `own`, an item that the stage was not run for is left out, too.
+    beside : bool
+        Leave out the items that meet the reader's box in a corner only: of the tiles around a tile the four beside
+        it and itself are read, of the seams its own four.
+    others_by_name : bool
+        Of all items but the one of the reader's own name it counts only that they are there, not what they hold:
+        their content is in no key, and the reader must not look at it. It does not wait for them either: they are
+        taken to be there, and the reader runs again in the end if one of them failed.
+    """
+
+    stage: str
+    halo: float = 0.0
+    by_extent: bool = False
+    around: str = ""
+    own: bool = False
+    named_by: str = ""
+    optional: bool = False
+    beside: bool = False
+    others_by_name: bool = False
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.halo) and self.halo >= 0):
+            raise ValueError(f"read of {self.stage}: halo {self.halo} m, expected 0 or more")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A step of a run: a pure function, and all that its result depends on.
+
+    Attributes
+    ----------
+    name : str
+        Name, and the folder in the store.
+    scope : Scope
+        What it is computed for.
+    function : callable
+        Top-level function of a `Task`; it gives back facts: a small dict of plain JSON values.
+    reads : tuple of Read
+        The stages whose results it may read.
+    parameters : tuple of str
+        The attributes of the run's parameters that it may use; a change of another one does not touch its results.
+    version : int
+        Raise it when the function computes something else.
+    """
+
+    name: str
+    scope: Scope
+    function: "Callable[[Task], Facts]"
+    reads: tuple[Read, ...] = ()
+    parameters: tuple[str, ...] = ()
+    version: int = 1
+
+
+@dataclass(frozen=True)
+class FileItem:
+    """An input file.
+
+    Attributes
+    ----------
+    path : str
+        Where it is; no part of any key.
+    box : tuple of float
+        xmin, ymin, xmax, ymax of its content (m).
+    identity : str
+        Changes when the content does: path, size and time of change, say.
+    frame : Frame
+        How its coordinates become those of the region.
+    """
+
+    path: str
+    box: Box
+    identity: str
+    frame: Frame = AS_IT_IS
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The items of every scope, by name.
+
+    Attributes
+    ----------
+    files : mapping of str to FileItem
+        Input files.
+    tiles, seams : mapping of str to tuple of float
+        Boxes of tiles and seams: xmin, ymin, xmax, ymax (m).
+    bounds : tuple of float
+        Box of the region (m), the box of its one item ``"region"``.
+    identity : str
+        What else all results depend on, such as the CRS; part of every key.
+    absent : tuple of tuple of float
+        Boxes within the region that no tile covers (m); part of the keys of tiles and seams near them.
+    near : float
+        How far from its extent a tile or seam may look whether there is a tile (m).
+
+    Raises
+    ------
+    ValueError
+        If a box is not finite or upside down.
+    """
+
+    files: Mapping[str, FileItem] = field(default_factory=dict)
+    tiles: Mapping[str, Box] = field(default_factory=dict)
+    seams: Mapping[str, Box] = field(default_factory=dict)
+    bounds: Box = (0.0, 0.0, 0.0, 0.0)
+    identity: str = ""
+    absent: tuple[Box, ...] = ()
+    near: float = 0.0
+
+    def __post_init__(self) -> None:
+        for scope in Scope:
+            for name, box in self.boxes(scope).items():
+                check_box(f"{scope.value} {name}", box)
+
+    def boxes(self, scope: Scope) -> Mapping[str, Box]:
+        """Give the items of a scope with their boxes."""
+        match scope:
+            case Scope.FILE:
+                return {name: item.box for name, item in self.files.items()}
+            case Scope.TILE:
+                return self.tiles
+            case Scope.SEAM:
+                return self.seams
+            case Scope.REGION:
+                return {REGION_ITEM: self.bounds}
+
+
+def check_box(name: str, box: Box) -> None:
+    """Raise ValueError unless a box is four finite numbers, low before high."""
+    if len(box) != 4 or not all(math.isfinite(v) for v in box) or box[0] > box[2] or box[1] > box[3]:
+        raise ValueError(f"{name}: box {tuple(box)}, expected finite xmin, ymin, xmax, ymax")

@@ -1,0 +1,230 @@
+"""The plan of a run: which items there are, what each reads, and who waits for whom; arrays, few objects."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from tiler.engine.stage import Box, Layout, Read, Scope, Stage, check_box
+
+
+@dataclass(frozen=True, eq=False)
+class Refs:
+    """What the items of a stage read of one other stage.
+
+    Attributes
+    ----------
+    stage : str
+        Stage that is read.
+    start : int64, (n_items + 1,)
+        Where the refs of each item begin in ``index``.
+    index : int32, (n_refs,)
+        Positions among the read stage's items, ascending for each reader.
+    """
+
+    stage: str
+    start: NDArray[np.int64]
+    index: NDArray[np.int32]
+
+    def of(self, item: int) -> NDArray[np.int32]:
+        """Give the positions that one item reads."""
+        return self.index[self.start[item] : self.start[item + 1]]
+
+
+@dataclass(frozen=True, eq=False)
+class Items:
+    """The items of a stage, sorted by name.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Their names.
+    boxes : float64, (n, 4)
+        Their boxes (m).
+    """
+
+    names: tuple[str, ...]
+    boxes: NDArray[np.float64]
+
+
+def order_stages(stages: Sequence[Stage], earlier: Collection[str]) -> list[Stage]:
+    """Sort stages so that each comes after those it reads; otherwise as given.
+
+    Raises
+    ------
+    ValueError
+        If a name comes twice, a stage is unknown, the reads form a cycle, or an extent is read of a stage of the
+        same call.
+    """
+    names = [stage.name for stage in stages]
+    if len(set(names)) < len(names):
+        raise ValueError(f"a stage is given twice: {', '.join(names)}")
+    for stage in stages:
+        for read in stage.reads:
+            if read.stage not in names and read.stage not in earlier:
+                raise ValueError(
+                    f"stage {stage.name} reads stage {read.stage}, which was not run and is not given"
+                )
+            early = [read.stage] * read.by_extent + [name for name in (read.around, read.named_by) if name]
+            for name in early:
+                if name in names or name not in earlier:
+                    raise ValueError(
+                        f"stage {stage.name} reads {read.stage} by facts of {name}: run {name} in an earlier call"
+                    )
+    done: list[Stage] = []
+    left = list(stages)
+    while left:
+        waiting = {stage.name for stage in left}
+        ready = [s for s in left if not any(read.stage in waiting for read in s.reads)]
+        if not ready:
+            raise ValueError(f"stages read each other in a cycle: {', '.join(sorted(waiting))}")
+        done.append(ready[0])
+        left.remove(ready[0])
+    return done
+
+
+def list_items(stage: Stage, layout: Layout, only: Collection[str] | None) -> Items:
+    """List the items of a stage, all or some; ValueError for a name that is not in the layout."""
+    boxes = layout.boxes(stage.scope)
+    unknown = sorted(set(only or ()) - set(boxes))
+    if unknown:
+        raise ValueError(f"stage {stage.name}: no {stage.scope.value} {', '.join(unknown)} in the layout")
+    return list_all(boxes if only is None else {name: boxes[name] for name in set(only)})
+
+
+def list_all(boxes: Mapping[str, Box]) -> Items:
+    """List items by their boxes."""
+    names = tuple(sorted(boxes))
+    return Items(names, np.array([boxes[name] for name in names], dtype=np.float64).reshape(-1, 4))
+
+
+def find_refs(stage: Stage, items: Items, source: str, reach: Items, *, everything: bool) -> Refs:
+    """Find what each item of a stage reads of another stage.
+
+    Parameters
+    ----------
+    stage : Stage
+        The reading stage; all its reads of the source are joined.
+    items : Items
+        Its items.
+    source : str
+        The stage that is read.
+    reach : Items
+        Items of the source; a box of NaN is never read.
+    everything : bool
+        True if one of the two is of the whole region.
+
+    Notes
+    -----
+    A tree of the boxes: O((n + m) log m). Boxes are compared as they are, so a box that touches is found exactly.
+    """
+    n_items, n_source = len(items.names), len(reach.names)
+    there = np.flatnonzero(~np.isnan(reach.boxes[:, 0]))
+    if everything:
+        pairs = np.stack([np.repeat(np.arange(n_items), len(there)), np.tile(there, n_items)])
+    else:
+        tree = shapely.STRtree(shapely.box(*reach.boxes[there].T))
+        found = [
+            _query(tree, items.boxes, reach.boxes[there], read) for read in stage.reads if read.stage == source
+        ]
+        pairs = np.concatenate([np.empty((2, 0), np.int64), *found], axis=1)
+        pairs[1] = there[pairs[1]] if len(there) else pairs[1]
+    return _make_refs(source, pairs, n_items, n_source)
+
+
+def list_refs(items: Items, source: str, reach: Items, listed: Mapping[str, Sequence[str]]) -> Refs:
+    """Make the refs of items that name what they read; ValueError for a name that is not among `reach`."""
+    place = {name: k for k, name in enumerate(reach.names)}
+    unknown = sorted({name for names in listed.values() for name in names} - set(place))
+    if unknown:
+        raise ValueError(f"stage {source} has no item {', '.join(unknown)}")
+    pairs = [(row, place[name]) for row, item in enumerate(items.names) for name in listed[item]]
+    return _make_refs(source, np.array(pairs, np.int64).reshape(-1, 2).T, len(items.names), len(reach.names))
+
+
+def _make_refs(source: str, pairs: NDArray[np.int64], n_items: int, n_source: int) -> Refs:
+    flat = np.sort(pairs[0] * max(n_source, 1) + pairs[1])
+    flat = flat[np.diff(flat, prepend=-1) > 0]  # np.unique imports masked arrays: 0.03 s before the first task
+    reader, index = flat // max(n_source, 1), flat % max(n_source, 1)
+    start = np.searchsorted(reader, np.arange(n_items + 1)).astype(np.int64)
+    return Refs(source, start, index.astype(np.int32))
+
+
+def extents(items: Items, facts: Mapping[str, Mapping[str, Any]], stage: str) -> Items:
+    """Replace the boxes of items by the extents that their results state; NaN where there is nothing.
+
+    Raises
+    ------
+    ValueError
+        If a result states no extent, or one that is no box.
+    """
+    boxes = np.full((len(items.names), 4), np.nan)
+    for row, name in enumerate(items.names):
+        if "extent" not in facts[name]:
+            raise ValueError(f"stage {stage}, {name}: its facts have no extent")
+        extent: Box | None = facts[name]["extent"]
+        if extent is not None:
+            check_box(f"extent of stage {stage}, {name}", extent)
+            boxes[row] = extent
+    return Items(items.names, boxes)
+
+
+def reads_everything(reader: Scope, source: Scope) -> bool:
+    """Whether a stage reads all items of another one, wherever they are."""
+    return Scope.REGION in (reader, source)
+
+
+def invert(refs: Sequence[tuple[int, Refs, int]], n_tasks: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Turn refs around: which tasks wait for each task.
+
+    Parameters
+    ----------
+    refs : sequence of (int, Refs, int)
+        Number of the reading stage's first task, its refs, and number of the read stage's first task.
+    n_tasks : int
+        Number of all tasks.
+
+    Returns
+    -------
+    start : int64, (n_tasks + 1,)
+        Where the waiting tasks of each begin.
+    waiting : int32, (n_refs,)
+        Their numbers.
+    """
+    none = np.empty(0, np.int32)
+    reading = [none, *(readers(r) + np.int32(first) for first, r, _ in refs)]
+    sources = [none, *(r.index + np.int32(base) for _, r, base in refs)]
+    reader, source = np.concatenate(reading), np.concatenate(sources)
+    order = np.argsort(source, kind="stable")
+    start = np.searchsorted(source[order], np.arange(n_tasks + 1)).astype(np.int64)
+    return start, reader[order].astype(np.int32)
+
+
+def readers(refs: Refs) -> NDArray[np.int32]:
+    """Give the reading item of each ref."""
+    counts = np.diff(refs.start)
+    return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+
+
+def joined_reads(stage: Stage) -> list[tuple[str, list[Read]]]:
+    """Group the reads of a stage by what they read, sorted by name."""
+    names = sorted({read.stage for read in stage.reads})
+    return [(name, [read for read in stage.reads if read.stage == name]) for name in names]
+
+
+def _query(
+    tree: shapely.STRtree, boxes: NDArray[np.float64], reached: NDArray[np.float64], read: Read
+) -> NDArray[np.int64]:
+    """Find the pairs (2, k) of rows of `boxes` and of `reached`, which are the tree's, that a read joins."""
+    some = np.flatnonzero(~np.isnan(boxes[:, 0]))
+    grown = boxes[some] + read.halo * np.array([-1, -1, 1, 1])
+    pairs: NDArray[np.int64] = np.asarray(tree.query(shapely.box(*grown.T)), dtype=np.int64)
+    if read.beside:
+        one, other = grown[pairs[0]], reached[pairs[1]]
+        common = np.minimum(one[:, 2:], other[:, 2:]) - np.maximum(one[:, :2], other[:, :2])
+        pairs = pairs[:, (common > 0).any(axis=1)]
+    pairs[0] = some[pairs[0]] if len(some) else pairs[0]
+    return pairs

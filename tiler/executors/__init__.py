@@ -1,0 +1,1 @@
+"""Where tasks run: this process or worker processes of this machine, and how these start."""

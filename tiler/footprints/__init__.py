@@ -1,0 +1,1 @@
+"""Building footprints of vector files: outlines, ids, heights."""

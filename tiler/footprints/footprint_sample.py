@@ -1,0 +1,151 @@
+"""A look at the footprints before a run: how many there are, where, and how finely they are drawn."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from tiler.config.config import Config
+from tiler.footprints.footprint_source import FootprintSource, make_footprints, open_source
+from tiler.georeference.frame import Frame, box_to_region
+from tiler.objects.places import place
+from tiler.planning.region import Region
+from tiler.vectors.layers import BATCH, scan_layer
+
+SAMPLE_FEATURES = 500_000  # features that are read; of a larger file the first ones, and they stand for all
+CHAIN_TOLERANCE = 0.2  # m; what a run takes from outlines before anything else
+
+
+@dataclass(frozen=True, eq=False)
+class FootprintSample:
+    """Footprints of a region, or the first ones of very many.
+
+    Attributes
+    ----------
+    total : int
+        How many the region has; an estimate unless the sample is complete.
+    complete : bool
+        Whether the sample has all of them.
+    polygons : object, (n,)
+        Polygons and multipolygons of the sample, in the region's CRS.
+    box : float64, (n, 4)
+        xmin, ymin, xmax, ymax of each (m).
+    area : float64, (n,)
+        Their areas (m2).
+    detail : float64, (n,)
+        How much finer than the mesh their walls are: the sum of 1/e - 1/h over walls, with e the length of the
+        wall, but at least the clearance and at most the mesh size h (1/m).
+    octaves : float64, (n,)
+        The same as the sum of log2(h/e).
+    """
+
+    total: int
+    complete: bool
+    polygons: NDArray[np.object_]
+    box: NDArray[np.float64]
+    area: NDArray[np.float64]
+    detail: NDArray[np.float64]
+    octaves: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.polygons)
+
+
+def sample_footprints(
+    config: Config, region: Region, *, frame: Frame | None = None, limit: int = SAMPLE_FEATURES
+) -> FootprintSample | None:
+    """Read the footprints of a region, or enough of them to know the rest.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the run.
+    region : Region
+        The region.
+    frame : Frame, optional
+        How coordinates of the footprints become those of the region; by default as the CRSs have it.
+    limit : int
+        Reading stops after this many footprints.
+
+    Returns
+    -------
+    FootprintSample or None
+        None if no footprints are configured.
+
+    Raises
+    ------
+    InputError, ConfigError
+        As a run does: if the file, its layer or attributes cannot be read.
+
+    Notes
+    -----
+    Ids are not looked at. The number in the region of a file that is larger is that of all its features, less the
+    share of the layer's extent that lies outside; it counts where the layer tells its number and extent.
+    """
+    if not config.footprints:
+        return None
+    crs = pyproj.CRS.from_user_input(region.crs)
+    source = open_source(
+        place(config.footprints),
+        crs=crs,
+        bounds=region.bounds,
+        layer=config.layer,
+        id_attribute=config.id_attribute,
+        frame=frame,
+        height_attribute=config.height_attribute,
+    )
+    parts, n_read, complete = [np.empty(0, np.object_)], 0, True
+    for features in scan_layer(source.layer, source.columns, source.box, batch=min(BATCH, limit)):
+        if n_read >= limit:
+            complete = False
+            break
+        parts.append(make_footprints(source, features, frozenset(), Counter())[0].polygons)
+        n_read += len(parts[-1])
+    polygons = np.concatenate(parts)
+    total = len(polygons) if complete else max(len(polygons), _number_within(source, region, crs))
+    detail, octaves = measure_detail(polygons, clearance=config.clearance, mesh_size=config.mesh_size)
+    return FootprintSample(
+        total, complete, polygons, shapely.bounds(polygons).reshape(-1, 4), shapely.area(polygons), detail, octaves
+    )
+
+
+def measure_detail(
+    polygons: NDArray[np.object_], *, clearance: float, mesh_size: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Measure how much finer than the mesh the walls of each polygon are.
+
+    Returns
+    -------
+    detail, octaves : float64, (n,)
+        See `FootprintSample`.
+
+    Examples
+    --------
+    >>> measure_detail(np.array([shapely.box(0, 0, 5, 40)]), clearance=1.0, mesh_size=10.0)
+    (array([0.2]), array([2.]))
+    """
+    simple = shapely.simplify(polygons, CHAIN_TOLERANCE, preserve_topology=False)
+    rings, owner = shapely.get_rings(simple, return_index=True)
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
+    same = ring[1:] == ring[:-1]
+    length = np.hypot(*(xy[1:] - xy[:-1])[same].T)
+    edge = np.clip(length, min(clearance, mesh_size), mesh_size)
+    house = owner[ring[1:][same]]
+    detail = np.bincount(house, weights=1 / edge - 1 / mesh_size, minlength=len(polygons))
+    octaves = np.bincount(house, weights=np.log2(mesh_size / edge), minlength=len(polygons))
+    return detail.astype(np.float64), octaves.astype(np.float64)
+
+
+def _number_within(source: FootprintSource, region: Region, crs: pyproj.CRS) -> int:
+    """Share of a layer's features that a region has, were they spread evenly over the layer's extent."""
+    extent, n = source.layer.extent, source.layer.n_features
+    if extent is None or n < 0:
+        return 0
+    if source.frame.changes_plan:
+        extent = box_to_region(source.frame, extent)
+    sides = [max(0.0, min(extent[k + 2], region.bounds[k + 2]) - max(extent[k], region.bounds[k])) for k in (0, 1)]
+    area = (extent[2] - extent[0]) * (extent[3] - extent[1])
+    return round(n * sides[0] * sides[1] / area) if area > 0 else n

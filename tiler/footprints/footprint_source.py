@@ -1,0 +1,271 @@
+"""A footprint file opened: which attributes, which CRS, and features made footprints (step 1.2)."""
+
+from collections import Counter
+from collections.abc import Set
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.citymodel import Footprints, make_ids
+from pipeline.errors import InputError
+from pipeline.notes import Note
+from tiler.footprints.footprint_attributes import (
+    explain_repeated,
+    find_attribute,
+    find_id_attribute,
+    height_columns,
+    id_columns,
+    read_heights,
+    read_ids,
+)
+from tiler.footprints.plan_outlines import Finding, outline_all
+from tiler.georeference.crs import crs_name, horizontal_crs
+from tiler.georeference.footprints import footprint_frame
+from tiler.georeference.frame import Frame, box_to_file, to_region
+from tiler.pointclouds.las_header import COORDINATE_LIMIT
+from tiler.vectors.features import Box, Features
+from tiler.vectors.layers import Layer, describe_layer
+from tiler.vectors.osm_tags import STOREY, find_osm_tags, is_building
+
+_NOWHERE = (float("nan"),) * 4
+
+
+@dataclass(frozen=True, eq=False)
+class FootprintSource:
+    """How footprints are read from one layer.
+
+    Attributes
+    ----------
+    layer : Layer
+        The layer.
+    id_name, height_name : str
+        Attributes with the id and with the height above ground, ``""`` for none.
+    frame : Frame
+        How coordinates of the file become those of the region.
+    bounds : tuple of 4 floats
+        The region (m), in its own CRS.
+    box : tuple of 4 floats
+        The region in the file's CRS.
+    notes : tuple of Note
+        What was assumed about the CRS.
+    """
+
+    layer: Layer
+    id_name: str
+    height_name: str
+    frame: Frame
+    bounds: Box
+    box: Box
+    notes: tuple[Note, ...]
+
+    @property
+    def columns(self) -> list[str]:
+        """Attributes that `make_footprints` needs."""
+        ids = id_columns(self.layer, self.id_name)
+        return list(dict.fromkeys([*ids, *height_columns(self.layer, self.height_name)]))
+
+
+def open_source(
+    path: Path,
+    *,
+    crs: pyproj.CRS,
+    bounds: Box,
+    layer: str,
+    id_attribute: str,
+    height_attribute: str,
+    frame: Frame | None = None,
+) -> FootprintSource:
+    """Decide how footprints are read from a file.
+
+    Parameters
+    ----------
+    path, crs, bounds, layer, id_attribute, height_attribute, frame
+        As `read_footprints` has them.
+
+    Returns
+    -------
+    FootprintSource
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or its coordinates do not fit its CRS.
+    ConfigError
+        If the layer or an attribute does not exist.
+    """
+    info = describe_layer(path, layer)
+    id_name, height_name = find_id_attribute(info, id_attribute), find_attribute(info, height_attribute)
+    own = horizontal_crs(info.crs)
+    _check_extent(info, own or crs)
+    if frame is None:
+        frame = Frame() if own is None else footprint_frame(own, crs, bounds)[0]
+    box = box_to_file(frame, bounds) if frame.changes_plan else bounds
+    return FootprintSource(
+        info, id_name, height_name, frame, bounds, box, tuple(_crs_notes(info, own, crs, frame))
+    )
+
+
+def make_footprints(
+    source: FootprintSource, features: Features, repeated: Set[str], counts: Counter[str]
+) -> tuple[Footprints, list[Note]]:
+    """Make footprints of features.
+
+    Parameters
+    ----------
+    source : FootprintSource
+        Where they come from.
+    features : Features
+        Any of its features, with the attributes that `FootprintSource.columns` names.
+    repeated : set of str
+        Ids that several different geometries of the file carry: they are completed by the geometry.
+    counts : Counter of str
+        Numbers of features, by the kind of the note that a file gets for all of them: see `count_notes_of`.
+
+    Returns
+    -------
+    Footprints
+        Those that meet the region, in the order of the features.
+    list of Note
+        As `read_footprints` gives them.
+    """
+    tags = find_osm_tags(source.layer.fields)
+    wanted = np.ones(len(features.wkb), np.bool_) if tags is None else is_building(tags, features.columns)
+    outlines = outline_all(features.wkb, metre=source.layer.metre)
+    counts["footprints-without-geometry"] += sum(blob is None for blob in features.wkb) - len(features.broken)
+    names = read_ids(source.layer, source.id_name, features) if source.id_name else [""] * len(features.wkb)
+    notes = _unreadable(features, names)
+    geometry, rows = outlines.geometry, outlines.rows
+    if source.frame.changes_plan:
+        geometry = shapely.transform(geometry, partial(to_region, source.frame))
+    keep, wrong = _finite_within(geometry, source.bounds)
+    counts["footprints-not-buildings"] += int((keep & ~wanted[rows]).sum())
+    keep &= wanted[rows]
+    found = [finding for finding in outlines.findings if wanted[finding.row] and _is_near(finding, source.box)]
+    notes += _tell(found, source, features, names)
+    notes += _tell(
+        [finding for finding in _not_finite(rows[wrong]) if wanted[finding.row]], source, features, names
+    )
+    geometry, rows = geometry[keep], rows[keep]
+    ids, told = _ids(source, geometry, np.array([names[row] for row in rows], np.str_), repeated)
+    notes += told
+    height, by_levels, bad = read_heights(source.layer, source.height_name, features)
+    counts["footprint-heights-by-levels"] += int(by_levels[rows].sum())
+    none = np.array([bool(bad[row]) for row in rows], np.bool_)
+    notes += _notes("footprint-height-missing", geometry[none], [bad[row] for row in rows[none]], ids[none])
+    return Footprints(geometry, ids, height[rows]), notes
+
+
+def count_notes_of(source: FootprintSource, counts: Counter[str]) -> list[Note]:
+    """Make one note a file of each kind that `make_footprints` counts."""
+    details = {
+        "footprints-without-geometry": "{} features have no geometry",
+        "footprints-not-buildings": "{} polygons without building=* or building:part=* are left out",
+        "footprint-heights-by-levels": f"{{}} heights are building:levels x {STOREY:g} m",
+    }
+    name = source.layer.path.name
+    return [
+        Note(kind, name, detail=detail.format(counts[kind]))
+        for kind, detail in details.items()
+        if counts[kind] > 0
+    ]
+
+
+def _crs_notes(info: Layer, own: pyproj.CRS | None, crs: pyproj.CRS, frame: Frame) -> list[Note]:
+    name = info.path.name
+    if own is None and not frame.changes_plan:
+        return [Note("footprints-without-crs", name, detail=f"taken as {crs_name(crs)}, the region's CRS")]
+    if own is None:
+        return [Note("footprints-without-crs", name, detail="taken in the CRS and units of the point clouds")]
+    if frame.changes_plan:
+        return [Note("footprints-reprojected", name, detail=f"from {crs_name(own)} to {crs_name(crs)}")]
+    return []
+
+
+def _check_extent(info: Layer, crs: pyproj.CRS) -> None:
+    """Refuse degrees beyond the pole: GeoJSON without a CRS means degrees, whatever its author meant."""
+    if crs.is_geographic and info.extent is not None and max(abs(v) for v in info.extent) > 360:
+        raise InputError(
+            f"{info.path}: states {crs_name(crs)} (degrees), but its coordinates reach "
+            f"{max(info.extent, key=abs):g}; GeoJSON without a CRS means degrees: state the true one, "
+            f'ogr2ogr -a_srs EPSG:<code> mended.gpkg "{info.path}"'
+        )
+
+
+def _finite_within(geometry: NDArray[np.object_], bounds: Box) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Tell the geometries that meet a box, and list those that are not finite."""
+    coordinates, owner = shapely.get_coordinates(geometry, return_index=True)
+    finite = np.ones(len(geometry), bool)
+    finite[owner[~(np.abs(coordinates) <= COORDINATE_LIMIT).all(axis=1)]] = False  # NaN too
+    keep = finite.copy()
+    keep[finite] = shapely.intersects(geometry[finite], shapely.box(*bounds))
+    return keep, np.flatnonzero(~finite)
+
+
+def _not_finite(rows: NDArray[np.int64]) -> list[Finding]:
+    detail = f"a coordinate is NaN, infinite, or beyond ±{COORDINATE_LIMIT:g} m"
+    return [Finding("footprint-not-finite", row, detail, _NOWHERE) for row in rows.tolist()]
+
+
+def _is_near(finding: Finding, box: Box) -> bool:
+    """Whether something was found at a box, or where there is no place."""
+    xmin, ymin, xmax, ymax = finding.box
+    return not (xmin > box[2] or xmax < box[0] or ymin > box[3] or ymax < box[1])
+
+
+def _tell(findings: list[Finding], source: FootprintSource, features: Features, names: list[str]) -> list[Note]:
+    """Make notes of findings, at the middle of the bounding box in the region's CRS."""
+    notes = []
+    for finding in findings:
+        x, y = (finding.box[0] + finding.box[2]) / 2, (finding.box[1] + finding.box[3]) / 2
+        if source.frame.changes_plan and np.isfinite((x, y)).all():
+            x, y = to_region(source.frame, np.array([(x, y)]))[0].tolist()
+        detail = f"feature {features.fids[finding.row]}: {finding.detail}"
+        notes.append(Note(finding.kind, names[finding.row], float(x), float(y), detail))
+    return notes
+
+
+def _unreadable(features: Features, names: list[str]) -> list[Note]:
+    return [
+        Note("footprint-unreadable", names[row], detail=f"feature {features.fids[row]}: {reason}")
+        for row, reason in sorted(features.broken.items())
+    ]
+
+
+def _ids(
+    source: FootprintSource, geometry: NDArray[np.object_], given: NDArray[np.str_], repeated: Set[str]
+) -> tuple[NDArray[np.str_], list[Note]]:
+    """Give each footprint its id, see `read_footprints`."""
+    missing = given == ""
+    again = np.fromiter((name in repeated for name in given.tolist()), bool, len(given)) & ~missing
+    made = np.full(len(given), "", dtype="<U14")
+    made[missing | again] = make_ids(geometry[missing | again])
+    ids = np.where(missing, made, given)
+    ids = np.where(again, np.char.add(np.char.add(given, "-"), made), ids)
+    if not source.id_name:
+        return ids, []
+    notes = _notes("footprint-id-missing", geometry[missing], "named by its geometry", made[missing])
+    reasons = [explain_repeated(source.layer, source.id_name, name) for name in given[again].tolist()]
+    notes += _notes("footprint-id-repeated", geometry[again], reasons, ids[again])
+    return ids, notes
+
+
+def _notes(
+    kind: str,
+    geometry: NDArray[np.object_],
+    detail: str | list[str],
+    subjects: NDArray[np.str_] | None = None,
+) -> list[Note]:
+    """Make one note a geometry, at the middle of its bounding box."""
+    boxes = shapely.bounds(geometry)
+    x, y = (boxes[:, 0] + boxes[:, 2]) / 2, (boxes[:, 1] + boxes[:, 3]) / 2
+    details = [detail] * len(geometry) if isinstance(detail, str) else detail
+    names = [""] * len(geometry) if subjects is None else [str(name) for name in subjects]
+    return [
+        Note(kind, name, float(px), float(py), text)
+        for name, px, py, text in zip(names, x, y, details, strict=True)
+    ]

@@ -1,0 +1,224 @@
+"""The Python interface, as `import tiler` gives it: the command line calls the same functions."""
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import ConfigError
+from tiler.config.config import Config, check_reach, load_config, make_config
+from tiler.objects.places import refuse_bucket
+
+if TYPE_CHECKING:
+    from tiler.engine.stage import Stage
+    from tiler.interface.city_mesh import CityMesh
+    from tiler.interface.plan_view import RunPlan
+    from tiler.interface.synth import SynthFiles
+
+Source = str | Path
+POSITIONAL = "pointcloud"
+PARAMETERS = tuple(entry.name for entry in dataclasses.fields(Config))
+
+
+def mesh(
+    pointcloud: Source | Sequence[Source],
+    footprints: Source = "",
+    *,
+    progress: bool = True,
+    stages: "Sequence[Stage]" = (),
+    stage_parameters: Mapping[str, Any] | None = None,
+    **parameters: Any,
+) -> "CityMesh":
+    """Mesh a region: `citystitch run`.
+
+    Parameters
+    ----------
+    pointcloud : path, or sequence of paths
+        LAS, LAZ or COPC files, globs or folders with such files; or one configuration file, ``"x.toml"``.
+    footprints : path
+        SHP, GPKG, GeoJSON or GeoParquet file of building footprints; without it, terrain only.
+    progress : bool
+        Whether to tell how far it is: a bar that moves in a notebook, elsewhere what the command shows.
+    stages : sequence of Stage
+        Stages of your own, run after ours.
+    stage_parameters : mapping
+        Parameters that these declare.
+    **parameters
+        All parameters of a run, as `citystitch config` lists them: ``out="out"``, ``mesh_size=10``,
+        ``tile_size=600``, ``workers=2``. They win over those of a configuration file.
+
+    Returns
+    -------
+    CityMesh
+        The mesh in the output folder. Tiles that failed are in its ``missing``; the rest is meshed.
+
+    Raises
+    ------
+    TypeError
+        If a parameter is unknown.
+    ConfigError
+        If a value is of the wrong type or out of bounds; if a script asks for workers and does not
+        keep its calls below ``if __name__ == "__main__":``.
+    CityError
+        If nothing could be made of the input.
+
+    Notes
+    -----
+    A folder that holds an earlier run, finished or not, is brought up to date: only what has changed is computed,
+    and the files are those of a run into an empty folder, byte for byte. Stop a run once (Ctrl-C, or the square of
+    the notebook), and what runs is finished; call it again, and it goes on.
+
+    Examples
+    --------
+    >>> import tiler
+    >>> city = tiler.mesh("tiles/*.laz", "buildings.gpkg", mesh_size=10, out="out")  # doctest: +SKIP
+    >>> city.check().ok  # doctest: +SKIP
+    True
+    """
+    from tiler.interface.city_mesh import CityMesh
+    from tiler.workflow.run import run
+
+    config = _configure(pointcloud, footprints, parameters)
+    refuse_bucket(config.out, "a mesh in Python")
+    _check_script(config.workers)
+    run(config, stages=stages, parameters=stage_parameters, **_show(progress))
+    return CityMesh(config.out)
+
+
+def plan(pointcloud: Source | Sequence[Source], footprints: Source = "", **parameters: Any) -> "RunPlan":
+    """Tell what a run would do and take, from headers alone: `citystitch plan`.
+
+    Parameters
+    ----------
+    pointcloud, footprints, **parameters
+        As for `mesh`.
+
+    Returns
+    -------
+    RunPlan
+        Its numbers in ``facts``; a notebook shows them as text.
+
+    Raises
+    ------
+    TypeError, CityError
+        As `mesh`.
+
+    Examples
+    --------
+    >>> import tiler
+    >>> tiler.plan("tiles/*.laz", "buildings.gpkg", tile_size=600, workers=4)  # doctest: +SKIP
+    """
+    from tiler.interface.plan_view import plan_config
+
+    return plan_config(_configure(pointcloud, footprints, parameters))
+
+
+def open_folder(folder: Source) -> "CityMesh":
+    """Open the mesh of a finished run.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of the run, ``out`` of `mesh` or of the command line.
+
+    Raises
+    ------
+    InputError
+        If it holds no finished run, or a file of it is missing or damaged.
+    """
+    from tiler.interface.city_mesh import CityMesh
+
+    return CityMesh(folder)
+
+
+def write_city(folder: Source, *, size: float = 1000.0, buildings: int = 500, **options: Any) -> "SynthFiles":
+    """Write a synthetic city: `citystitch synth`. The same parameters give the same bytes.
+
+    Parameters
+    ----------
+    folder : path
+        Folder to write to; made if it is missing.
+    size : float
+        Side of the city (m).
+    buildings : int
+        Their number.
+    **options
+        ``density`` (points/m²), ``relief`` (height of the hills, m), ``seed``: see
+        `tiler.interface.synth.write_city`.
+
+    Returns
+    -------
+    SynthFiles
+        Paths of the ``clouds``, the ``footprints`` as GPKG, and others.
+
+    Raises
+    ------
+    ConfigError
+        If a parameter is out of range, or the folder cannot be written.
+    """
+    from tiler.interface.synth import write_city as write
+
+    return write(Path(folder), size=size, buildings=buildings, **options)
+
+
+def with_file(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Put the parameters of a configuration file below those that are given.
+
+    Parameters
+    ----------
+    options : mapping
+        With ``pointcloud``, a list of sources, one of which may be a configuration file. What is no parameter of a
+        run is passed over.
+
+    Raises
+    ------
+    ConfigError
+        If several configuration files are given, or one cannot be read or asks for what it may not.
+    """
+    values = {name: value for name, value in options.items() if name in PARAMETERS}
+    sources: list[str] = values.pop(POSITIONAL)
+    files = [source for source in sources if source.lower().endswith(".toml")]
+    if len(files) > 1:
+        raise ConfigError(f"{len(files)} configuration files given ({', '.join(files)}); give one")
+    clouds = [source for source in sources if source not in files]
+    given = load_config(Path(files[0])) if files else {}
+    if files:
+        check_reach(Path(files[0]), {name: value for name, value in given.items() if name not in values})
+    return given | ({POSITIONAL: clouds} if clouds else {}) | values
+
+
+def _check_script(workers: int) -> None:
+    """Refuse a script that its own workers would run again: they are processes that import it."""
+    path = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+    if workers and path.suffix == ".py" and path.is_file() and "__name__" not in path.read_text(errors="replace"):
+        raise ConfigError(
+            f"workers = {workers}: each imports {path}, which would mesh again; put its calls below "
+            'if __name__ == "__main__":, or give workers=0'
+        )
+
+
+def _show(progress: bool) -> dict[str, Any]:
+    """Choose who tells how far a run is."""
+    from tiler.interface.notebook_progress import NotebookProgress, in_notebook
+
+    if not progress:
+        return {}
+    if in_notebook():
+        return {"watchers": [NotebookProgress()]}
+    from tiler.monitoring.terminal import make_views
+
+    return {"watchers": make_views()}
+
+
+def _configure(pointcloud: Source | Sequence[Source], footprints: Source, parameters: Mapping[str, Any]) -> Config:
+    for name in parameters:
+        if name not in PARAMETERS:
+            near = get_close_matches(name, PARAMETERS, 1)
+            hint = f"did you mean {near[0]}?" if near else "citystitch config lists all"
+            raise TypeError(f"unknown parameter {name!r}; {hint}")
+    sources = [pointcloud] if isinstance(pointcloud, (str, Path)) else pointcloud
+    values = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
+    values |= {"footprints": str(footprints)} if footprints else {}
+    return make_config(with_file({POSITIONAL: list(map(str, sources)), **values}))

@@ -1,0 +1,1 @@
+"""The pieces of a mesh as VTK's files, and the mesh of all pieces."""

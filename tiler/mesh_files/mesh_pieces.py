@@ -1,0 +1,175 @@
+"""The mesh of a finished run, piece by piece, with its points numbered from 0 on over the whole region (step 3.6).
+
+What exporters are written on: one piece is in memory at a time, and the store is not read.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.mesh import Marker, Region
+from stitch.numbering import Numbering
+from tiler.formats.export import RUN_RECORD, RunFiles, RunSource, find_files
+from tiler.mesh_files.merged import VERTEX_ID, number_piece, read_numbering
+from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
+from tiler.workflow.run_folder import REGION, read_run_record
+
+SIDE = 1e-6  # m; how far from a side of the region a facet on it may be
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPiece:
+    """The part of the mesh that one tile holds: ``n`` points, ``m`` cells, ``f`` facets.
+
+    Attributes
+    ----------
+    name : str
+        The tile, ``"60_-3"``: its column and row in the CRS.
+    points : float64, (n, 3)
+        Points that its cells use (m).
+    cells : int32, (m, 4)
+        Tetrahedra of positive volume, as rows of `points`.
+    facets : int32, (f, 3)
+        Facets of the region's boundary, as rows of `points`, counter-clockwise seen from outside; faces that it
+        shares with another tile are not among them. With soil, the ground is there although it is inside.
+    marker : int32, (f,)
+        `pipeline.mesh.Marker` of each facet.
+    building : int64, (f,)
+        Number of each facet's building, -1 where there is none.
+    ids : int64, (n,)
+        Number of each point over the whole region, 0 to ``n_points - 1`` of `MeshPieces`. A point that several
+        tiles have is bitwise the same in all of them, and has one number.
+    region : int8, (m,), or None
+        `pipeline.mesh.Region` of each cell; None where all is air.
+    """
+
+    name: str
+    points: NDArray[np.float64]
+    cells: NDArray[np.int32]
+    facets: NDArray[np.int32]
+    marker: NDArray[np.int32]
+    building: NDArray[np.int64]
+    ids: NDArray[np.int64]
+    region: NDArray[np.int8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPieces:
+    """The pieces of a finished run.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Its tiles, sorted.
+    files : RunFiles
+        The files that hold them, in the same order.
+    numbering : Numbering
+        From the ids in the pieces to numbers without gaps.
+    """
+
+    names: tuple[str, ...]
+    files: RunFiles
+    numbering: Numbering
+
+    @property
+    def n_points(self) -> int:
+        """Number of different points of the whole mesh."""
+        return self.numbering.n_points
+
+    def read(self, k: int) -> MeshPiece:
+        """Read piece `k`.
+
+        Raises
+        ------
+        InputError
+            If a file of it is missing or damaged, or the two do not fit together.
+        """
+        path = self.files.volumes[k]
+        volume, boundary = read_vtu(path), read_vtp(self.files.boundaries[k])
+        return MeshPiece(
+            self.names[k],
+            volume.mesh.points,
+            volume.mesh.cells,
+            _facets_in_volume(self.files.boundaries[k], volume, boundary),
+            mark_sides(self.files, boundary),
+            boundary.boundary.building,
+            number_piece(path, volume.point_data.get(VERTEX_ID), self.numbering),
+            _regions(path, volume) if self.files.depth else None,
+        )
+
+
+def mark_sides(files: RunFiles, piece: BoundaryPiece) -> NDArray[np.int32]:
+    """Give the markers of a boundary piece; the outer sides of a part of a mesh are those of its region.
+
+    A side of the whole mesh that lies towards a tile that is not there is ``missing``; where it is the westernmost
+    of the part that is taken alone, it is its west side, and so on.
+    """
+    marker = piece.boundary.marker
+    if files.sides is None:
+        return marker
+    marker = marker.copy()
+    rows = np.flatnonzero(marker == Marker.MISSING)
+    corners = piece.points[piece.boundary.facets[rows], :2]
+    west, south, east, north = files.sides
+    for axis, side, name in (
+        (0, west, Marker.WEST),
+        (0, east, Marker.EAST),
+        (1, south, Marker.SOUTH),
+        (1, north, Marker.NORTH),
+    ):
+        marker[rows[(np.abs(corners[:, :, axis] - side) <= SIDE).all(axis=1)]] = name
+    return marker
+
+
+def open_pieces(source: RunSource) -> MeshPieces:
+    """Open the mesh of a finished run.
+
+    Parameters
+    ----------
+    source : Path or RunFiles
+        Folder of the run, or the files of it that are wanted.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no finished run, or a file of it is missing or damaged.
+
+    Notes
+    -----
+    The ids of all points are read once, a piece at a time; memory holds some 100 bytes for each tile's parts.
+    """
+    files = source if isinstance(source, RunFiles) else find_files(source)
+    directory = files.directory
+    names = tuple(path.stem for path in files.volumes)
+    if names != tuple(path.stem for path in files.boundaries) or list(names) != sorted(set(names)):
+        raise InputError(f"{directory}: the indexes of mesh and boundary name other tiles; run again")
+    numbering = read_numbering(files.volumes)
+    counted = read_run_record(directory / RUN_RECORD).counts["points"]
+    if files.whole and numbering.n_points != counted:
+        raise InputError(
+            f"{directory}: its pieces have {numbering.n_points} different {VERTEX_ID}, {RUN_RECORD} says "
+            f"{counted} points; run again"
+        )
+    return MeshPieces(names, files, numbering)
+
+
+def _regions(path: Path, volume: VolumePiece) -> NDArray[np.int8]:
+    region = volume.cell_data.get(REGION)
+    if region is None or region.dtype != np.int8 or not np.isin(region, list(Region)).all():
+        raise InputError(f"{path}: has no cell array {REGION!r} of 0 (air) and 1 (soil) alone; run the tile again")
+    return region
+
+
+def _facets_in_volume(path: Path, volume: VolumePiece, boundary: BoundaryPiece) -> NDArray[np.int32]:
+    """Give facets as rows of the volume's points."""
+    vertex, points = boundary.vertex, volume.mesh.points
+    if vertex.size and (vertex.min() < 0 or vertex.max() >= len(points)):
+        raise InputError(
+            f"{path}: vertex {vertex.min()}..{vertex.max()} of the volume's {len(points)}; run the tile again"
+        )
+    if points[vertex].tobytes() != boundary.points.tobytes():
+        raise InputError(f"{path}: its points are not those of the volume; run the tile again")
+    return vertex.astype(np.int32)[boundary.boundary.facets]

@@ -1,0 +1,1 @@
+"""Who watches a run: events, progress, status, the terminal."""

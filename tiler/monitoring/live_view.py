@@ -1,0 +1,204 @@
+"""The live view of a run on a terminal: stages at work, workers, memory, warnings, time left."""
+
+import threading
+import time
+from collections import deque
+from itertools import islice
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from tiler.engine.stage import Scope
+from tiler.engine.task import Record
+from tiler.monitoring.plain_view import Line, Lines
+from tiler.monitoring.tally import StageTally, Tally, tell_duration
+from tiler.monitoring.watchers import Item, RunStart, Watcher
+from tiler.words.note_words import say_notes
+from tiler.words.plain_text import printable
+
+LEAST_EVERY = 0.5  # s between two pictures
+SHARE = 0.005  # of the time that drawing may take
+NAME, WORDS, BAR = 16, 38, 60  # characters: of a stage's name, of the words beside a bar, of a bar at most
+WIDE = 110  # characters; from here on there is more to see
+ROWS = 10  # stages at work that are shown
+REST = 4  # rows of the view besides them, and the cursor's
+FULL, EMPTY, PLAIN_FULL, PLAIN_EMPTY = "━", "─", "#", "-"
+
+
+class LiveView(Watcher):
+    """Shows a run in the last rows of a terminal.
+
+    Parameters
+    ----------
+    console : Console
+        The terminal.
+    tally : Tally
+        Told before this one.
+    verbose : bool
+        A line for each item too.
+
+    Notes
+    -----
+    A thread of its own draws, and prints the lines that wait in a queue: what tells it something, a signal's
+    handler too, never waits. It draws as often as `SHARE` of the time allows.
+    """
+
+    def __init__(self, console: Console, tally: Tally, *, verbose: bool = False) -> None:
+        self._console, self._tally = console, tally
+        self._waiting: deque[Line] = deque()
+        self._lines = Lines(self._waiting.append, verbose=verbose)
+        self._live = Live(console=console, auto_refresh=False, transient=True, vertical_overflow="crop")
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._draw_now_and_then, name="view", daemon=True)
+
+    def begin(self, start: RunStart) -> None:
+        """Begin to draw."""
+        self._lines.begin(start)
+        self._live.start()
+        self._thread.start()
+
+    def planned(self, stage: str, scope: Scope, total: int) -> None:
+        """Take note of how many items a stage has."""
+        self._lines.planned(stage, scope, total)
+
+    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
+        """Tell a finished group of stages, or each item."""
+        self._lines(stage, done, total, record)
+
+    def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
+        """Tell a failure."""
+        self._lines.failed(stage, name, reason, needs)
+
+    def say(self, text: str) -> None:
+        """Tell it, above the view."""
+        self._lines.say(text)
+        if not self._thread.is_alive():
+            self._print_lines()
+
+    def end(self, status: str, error: str = "") -> None:
+        """Take the view away, and print what waits."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._live.stop()
+        self._print_lines()
+
+    def _draw_now_and_then(self) -> None:
+        pause = 0.0
+        while not self._stop.wait(pause):
+            began = time.thread_time()
+            self._print_lines()
+            size = self._console.size
+            self._live.update(
+                draw(self._tally, size.width, size.height, plain=is_plain(self._console)), refresh=True
+            )
+            pause = max(LEAST_EVERY, (time.thread_time() - began) / SHARE)
+
+    def _print_lines(self) -> None:
+        lines = [self._waiting.popleft() for _ in range(len(self._waiting))]
+        if lines:
+            texts = (Text(printable(line.text), "red" if line.bad else "") for line in lines)
+            self._console.print(Text("\n").join(texts))
+
+
+def is_plain(console: Console) -> bool:
+    """Tell whether a terminal shows ASCII alone."""
+    return not console.encoding.lower().startswith("utf")
+
+
+def draw(tally: Tally, width: int, height: int, *, plain: bool = False) -> Text:
+    """Draw how far a run is.
+
+    Parameters
+    ----------
+    tally : Tally
+        What is known.
+    width, height : int
+        Characters and rows of the terminal.
+    plain : bool
+        In ASCII alone.
+
+    Returns
+    -------
+    Text
+        Rows that are shorter than `width`, and fewer than `height`: a terminal must not wrap or scroll them.
+    """
+    at_work = [(name, state) for name, state in tally.groups().items() if state.running and state.left]
+    room = max(min(ROWS, height - REST), 0)
+    shown = at_work if len(at_work) <= room else at_work[: max(room - 1, 0)]
+    rows = [_draw_stage(tally, name, state, width, plain=plain) for name, state in shown]
+    if len(at_work) > len(shown) and room:
+        rows.append(Text(f"  and {len(at_work) - len(shown)} more steps at work"))
+    rows += [_draw_all(tally, width, plain=plain), _draw_facts(tally, width)]
+    for row in rows:
+        row.truncate(width - 1, overflow="ellipsis" if not plain else "crop")
+    return Text("\n").join(rows)
+
+
+def _draw_stage(tally: Tally, name: str, state: StageTally, width: int, *, plain: bool) -> Text:
+    words = f" {f'{state.done:,}/{state.total:,}':>13} {_tell_rate(tally.rate(state)):>9} {_tell_mean(state):>13}"
+    more = f"  {state.running:,} in hand" if width >= WIDE else ""
+    more += f"  {state.failed:,} failed" if state.failed else ""
+    share = state.done / state.total if state.total else 0.0
+    return (
+        _bar(printable(name), share, width, plain=plain).append(words).append(more, "red" if state.failed else "")
+    )
+
+
+def _draw_all(tally: Tally, width: int, *, plain: bool) -> Text:
+    groups = list(tally.groups().values())
+    finished = sum(not state.left for state in groups)
+    left, share = tally.time_left(), tally.share_done()
+    if not tally.began:
+        when = "starting"
+    elif finished == len(groups):
+        when = "writing it down"
+    else:
+        when = "" if left is None else f"~ {tell_duration(left)} left"
+    row = _bar("all", share, width, plain=plain)
+    row.stylize("bold", 0, NAME)
+    return row.append(f" {share:4.0%} {when:>15}  {finished:,} of {len(groups):,} steps")
+
+
+def _draw_facts(tally: Tally, width: int) -> Text:
+    seconds = int(tally.elapsed)
+    workers = _count(tally.workers, "worker") if tally.workers else "a cluster"
+    parts = [f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}", workers]
+    parts.append(f"{_count(tally.in_hand, 'task')} in hand")
+    if tally.peak_memory:
+        parts.append(f"peak {tally.peak_memory / 2**20:,.0f} MiB")
+    row = Text("  " + ", ".join(parts))
+    if tally.failures:
+        row.append(f", {tally.failures:,} failed", "red")
+    number = tally.warnings.total()
+    if number:
+        row.append(f", {_count(number, 'warning')}", "yellow")
+        if width >= WIDE:
+            kinds = islice(tally.warnings.most_common(), 5)
+            row.append(": " + ", ".join(printable(say_notes(kind, n)) for kind, n in kinds))
+    return row
+
+
+def _bar(name: str, share: float, width: int, *, plain: bool) -> Text:
+    """Draw a name and a bar; characters tell what is done, colours only help."""
+    length = max(min(BAR, width - NAME - WORDS - 4), 4)
+    done = int(length * min(share, 1.0))
+    row = Text(f"  {name[:NAME]:<{NAME}} ")
+    row.append((PLAIN_FULL if plain else FULL) * done, "green")
+    return row.append((PLAIN_EMPTY if plain else EMPTY) * (length - done), "dim")
+
+
+def _tell_rate(rate: float) -> str:
+    if not rate:
+        return ""
+    return f"{rate:,.1f}/s" if rate >= 1 else f"{60 * rate:.1f}/min"
+
+
+def _tell_mean(state: StageTally) -> str:
+    ran = state.done - state.reused
+    return f"{state.seconds / ran:,.2f} s each" if ran > 0 else ""
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

@@ -1,0 +1,288 @@
+"""What a picture of a run is made from: its boundary and its volume cut open, gathered piece by piece."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.mesh import Marker, Region, TetMesh
+from stitch.grid import Key
+from tiler.mesh_files.facet_quality import measure_facets
+from tiler.mesh_files.vtk_files import TETRA, BoundaryPiece, VolumePiece, read_piece_paths, read_vtp, read_vtu
+from tiler.pictures.coarsening import Facets, coarsen, join_facets
+from tiler.planning.context import tile_key
+from tiler.workflow.run_folder import REGION
+
+BOUNDARY_INDEX, VOLUME_INDEX = "boundary.pvtp", "mesh.pvtu"
+SHOWN = (Marker.GROUND, Marker.WALL, Marker.ROOF)
+MOST_BYTES = 80_000_000  # of the files of cells that are shown one by one: some 10 million cells
+MOST_FACETS = 2_000_000  # of a picture; those of larger regions are made coarser
+FIRST_STEP = 1.0  # m, between vertices that are made one; doubled until there are few enough
+
+
+@dataclass(frozen=True, eq=False)
+class City:
+    """The boundary, moved to the origin.
+
+    Attributes
+    ----------
+    points : float64, (n, 3)
+        Vertices (m) from `origin`, each once.
+    facets : int64, (k, 3)
+        Ground, walls and roofs, counter-clockwise seen from the air.
+    marker : int32, (k,)
+        `Marker` of each facet.
+    building : int64, (k,)
+        Number of the building of each facet, -1 on the ground.
+    piece : int32, (k,)
+        Row of `names` for each facet.
+    names : tuple of str
+        Names of the pieces, which are those of tiles.
+    origin : float64, (3,)
+        Middle of the region, at the height of the lowest ground.
+    quality : float32, (k,)
+        Radius ratio of the cell behind each facet; NaN where nobody asked.
+    step : float
+        Vertices closer than some of this are one (m); 0 where all are shown.
+    """
+
+    points: NDArray[np.float64]
+    facets: NDArray[np.int64]
+    marker: NDArray[np.int32]
+    building: NDArray[np.int64]
+    piece: NDArray[np.int32]
+    names: tuple[str, ...]
+    origin: NDArray[np.float64]
+    quality: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+    step: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Air:
+    """The surface of the cells behind a cut.
+
+    Attributes
+    ----------
+    points : float64, (n, 3)
+        Vertices (m) from the city's origin, each once.
+    facets : int64, (k, 3)
+        Triangles, all of them between the cells and what is not among them.
+    """
+
+    points: NDArray[np.float64]
+    facets: NDArray[np.int64]
+
+
+def find_middle(directory: Path, *, most: int = MOST_BYTES) -> frozenset[str] | None:
+    """Find the tiles around the middle of a region whose volume is small enough to be shown cell by cell.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of a run.
+    most : int
+        Size that the files of their cells may have (bytes).
+
+    Returns
+    -------
+    frozenset of str or None
+        Names of at least one tile; None where all are few enough.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, or a piece is not named after a tile.
+    """
+    paths = _find_pieces(directory / VOLUME_INDEX)
+    try:
+        sizes = [path.stat().st_size for path in paths]
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); run again") from error
+    if sum(sizes) <= most:
+        return None
+    keys = np.array([read_key(path.stem) for path in paths])
+    ring = np.abs(keys - (keys.min(axis=0) + keys.max(axis=0)) // 2).max(axis=1)
+    ring -= ring.min()
+    total = np.cumsum(np.bincount(ring, sizes))
+    last = max(0, int(np.searchsorted(total, most, side="right")) - 1)
+    return frozenset(path.stem for path, k in zip(paths, ring.tolist(), strict=True) if k <= last)
+
+
+def load_city(
+    directory: Path,
+    *,
+    most: int = MOST_FACETS,
+    quality: bool = False,
+    only: frozenset[str] | None = None,
+) -> City:
+    """Read ground, walls and roofs of all pieces of ``boundary.pvtp``, and sew them together.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of a run.
+    most : int
+        Facets from which on they are made coarser (`tiler.pictures.coarsening`).
+    quality : bool
+        Read ``mesh.pvtu`` too, for the radius ratio of the cell behind each facet.
+    only : frozenset of str, optional
+        Names of the pieces to read, all by default.
+
+    Raises
+    ------
+    InputError
+        If a file or a piece of it is missing or damaged, or if there is no ground.
+
+    Notes
+    -----
+    Vertices on seams have the same bytes in both pieces, so that sewing needs no tolerance, and the picture
+    has no lines between tiles. Memory holds one whole piece, and of all of them what is shown: at most two times
+    `most` facets.
+    """
+    paths = _find_pieces(directory / BOUNDARY_INDEX, only)
+    volumes = _find_pieces(directory / VOLUME_INDEX, only) if quality else []
+    if quality and [path.stem for path in volumes] != [path.stem for path in paths]:
+        raise InputError(f"{directory}: {VOLUME_INDEX} and {BOUNDARY_INDEX} have other pieces; run again")
+    parts: list[Facets] = []
+    n_facets, n_read, step = 0, 0, 0.0
+    for row, path in enumerate(paths):
+        piece = read_vtp(path)
+        n_read += len(piece.boundary.facets)
+        part = _take_shown(piece, row, volumes[row] if quality else None)
+        part = coarsen(part, step) if step and len(part) else part
+        parts.append(part)
+        n_facets += len(part)
+        while n_facets > most:
+            step = 2 * step if step else FIRST_STEP
+            parts = [coarsen(join_facets(parts), step)]
+            n_facets = len(parts[0])
+    found = join_facets(parts)
+    if not np.any(found.marker == Marker.GROUND):
+        raise InputError(f"{directory / BOUNDARY_INDEX}: none of {n_read} facets is marked as ground; run again")
+    found = coarsen(found, step) if step else found
+    xyz, corners = sew(found.points, found.corners)
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    origin = np.array([*(low + high)[:2] / 2, low[2]])
+    return City(
+        points=xyz - origin,
+        facets=corners[:, ::-1],  # the file's look out of the air, which is where the camera is
+        marker=found.marker,
+        building=found.building,
+        piece=found.piece,
+        names=tuple(path.stem for path in paths),
+        origin=origin,
+        quality=found.quality,
+        step=step,
+    )
+
+
+def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[str] | None = None) -> Air:
+    """Read the surface of the whole tetrahedra in the northern half, from ``mesh.pvtu``.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of a run.
+    origin : float64, (3,)
+        Where the city was moved from (m); the cut is there.
+    only : frozenset of str, optional
+        Names of the pieces to read, all by default.
+
+    Raises
+    ------
+    InputError
+        If the file or a piece of it is missing or damaged, or has no cell there.
+
+    Notes
+    -----
+    Memory holds one whole piece, and of all of them the surface: faces that two pieces share are not on it.
+    """
+    points, facets, n_points = [], [], 0
+    for path in _find_pieces(directory / VOLUME_INDEX, only):
+        shell = _find_shell(_take_air(read_vtu(path)), float(origin[1]))
+        points.append(shell.points)
+        facets.append(shell.facets + n_points)
+        n_points += len(shell.points)
+    if not n_points:
+        raise InputError(f"{directory / VOLUME_INDEX}: has no cell north of y = {origin[1]:.1f} m; run again")
+    xyz, corners = sew(np.concatenate(points), np.concatenate(facets))
+    return Air(xyz - origin, corners[_find_single(corners)])
+
+
+def sew(points: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Keep the points that facets use, equal ones once.
+
+    Examples
+    --------
+    >>> points, facets = sew(np.array([[0.0, 1, 0], [7, 7, 7], [0, 1, 0], [0, 0, 0]]), np.array([[0, 3, 2]]))
+    >>> points.tolist(), facets.tolist()
+    ([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[1, 0, 1]])
+    """
+    used = np.unique(facets)
+    order = used[np.lexsort(points[used].T)]
+    new = np.ones(len(order), dtype=np.bool_)
+    new[1:] = np.any(points[order[1:]] != points[order[:-1]], axis=1)
+    index = np.empty(len(points), dtype=np.int64)
+    index[order] = np.cumsum(new) - 1
+    return points[order[new]], index[facets]
+
+
+def read_key(name: str) -> Key:
+    """Take the tile of a piece from its name; InputError if it is not named after one."""
+    try:
+        return tile_key(name)
+    except ValueError:
+        raise InputError(f"the piece {name!r} is not named after a tile, as '60_243' is; run again") from None
+
+
+def _find_pieces(path: Path, only: frozenset[str] | None = None) -> list[Path]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; run citystitch first, or name its output folder")
+    return [piece for piece in read_piece_paths(path) if only is None or piece.stem in only]
+
+
+def _take_shown(piece: BoundaryPiece, row: int, volume: Path | None) -> Facets:
+    """Take ground, walls and roofs, with the quality of the cells of a volume piece behind them."""
+    boundary = piece.boundary
+    shown = np.isin(boundary.marker, SHOWN)
+    used, corners = np.unique(boundary.facets[shown], return_inverse=True)
+    ratio = np.full(len(shown), np.nan, np.float32)
+    if volume is not None:
+        ratio = measure_facets(read_vtu(volume).mesh, piece)
+    return Facets(
+        piece.points[used],
+        corners.reshape(-1, 3).astype(np.int64, copy=False),
+        boundary.marker[shown],
+        np.full(len(corners.reshape(-1, 3)), row, np.int32),
+        boundary.building[shown],
+        ratio[shown],
+    )
+
+
+def _take_air(piece: VolumePiece) -> TetMesh:
+    """Leave out the soil, if there is some."""
+    region = piece.cell_data.get(REGION)
+    return piece.mesh if region is None else TetMesh(piece.mesh.points, piece.mesh.cells[region == Region.AIR])
+
+
+def _find_shell(mesh: TetMesh, south: float) -> Air:
+    """Surface of the cells whose middle is north of a line."""
+    import pyvista
+
+    cells = mesh.cells[mesh.points[mesh.cells, 1].mean(axis=1) > south]
+    if len(cells) == 0:
+        return Air(np.empty((0, 3)), np.empty((0, 3), np.int64))
+    shell = pyvista.UnstructuredGrid({TETRA: cells}, mesh.points).extract_surface(algorithm=None)
+    return Air(np.asarray(shell.points, np.float64), np.asarray(shell.regular_faces, np.int64))
+
+
+def _find_single(facets: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which triangles there are once, whatever the order of their corners."""
+    corners = np.sort(facets, axis=1)
+    order = np.lexsort(corners.T)
+    same = np.all(corners[order[1:]] == corners[order[:-1]], axis=1)
+    single = np.ones(len(facets), np.bool_)
+    single[order[1:][same]] = single[order[:-1][same]] = False
+    return single

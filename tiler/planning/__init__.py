@@ -1,0 +1,1 @@
+"""The plan of a run from headers alone: region, tiles, files, forecast."""

@@ -1,0 +1,253 @@
+"""The plan of a run: region, tiles and files, from headers alone."""
+
+import math
+import re
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+
+from pipeline.errors import ConfigError, InputError
+from pipeline.notes import Note
+from stitch.grid import TileGrid, make_grid, tiles_present
+from tiler.config.config import Config, idle_parameters
+from tiler.engine.stage import FileItem, Layout
+from tiler.georeference.cloud_crs import Asked
+from tiler.georeference.crs import crs_text
+from tiler.georeference.establish import FOOTPRINTS, Georeference, establish_georeference, find_inexact
+from tiler.georeference.operation import Operation
+from tiler.objects.places import in_bucket, place
+from tiler.objects.requests import WAITS
+from tiler.planning.context import choose_tiles, make_layout, tile_key
+from tiler.planning.region import (
+    Region,
+    check_points,
+    check_region,
+    check_sizes,
+    choose_bounds,
+    describe_overhang,
+    describe_pad,
+    foresee_pad,
+)
+from tiler.pointclouds.clouds import CloudHeader, find_clouds, read_header
+from tiler.vectors.layers import describe_layer
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is known before any point is read.
+
+    Attributes
+    ----------
+    region : Region
+        What is meshed.
+    headers : list of CloudHeader
+        All point-cloud files that can be read.
+    messages : list of str
+        Sentences that the user should read.
+    unreadable : dict
+        Files left out, with the reason.
+    grid : TileGrid
+        Tiles, those without any point cloud left out.
+    layout : Layout
+        Items of every scope.
+    survey : Survey
+        What it was made of, all tiles included.
+    """
+
+    region: Region
+    headers: list[CloudHeader]
+    messages: list[str]
+    unreadable: dict[str, str]
+    grid: TileGrid
+    layout: Layout
+    survey: "Survey"
+
+    @property
+    def georeference(self) -> Georeference:
+        """Where the region lies."""
+        return self.survey.georeference
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What headers alone tell of a run, before anything is listed by name.
+
+    Attributes
+    ----------
+    region : Region
+        What is meshed.
+    headers : list of CloudHeader
+        All point-cloud files that can be read.
+    clouds : list of CloudHeader
+        Those of them that have points and meet the region.
+    messages : list of str
+        Sentences that the user should read.
+    unreadable : dict
+        Files left out, with the reason.
+    grid : TileGrid
+        Tiles, those without any point cloud left out.
+    georeference : Georeference
+        Where the region lies, and how coordinates of its input get there.
+    meshed : TileGrid
+        The same, and those of the pad where there is one; where its width follows from the tallest building, that
+        of an expected one counts.
+    """
+
+    region: Region
+    headers: list[CloudHeader]
+    clouds: list[CloudHeader]
+    messages: list[str]
+    unreadable: dict[str, str]
+    grid: TileGrid
+    georeference: Georeference
+    meshed: TileGrid
+
+
+def check_sources(config: Config) -> None:
+    """Raise ConfigError if no point cloud is named."""
+    if not config.pointcloud:
+        raise ConfigError("no point cloud: give files, globs or folders, as in `citystitch run tiles/*.laz`")
+
+
+def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
+    """Find out what a run has to do, from headers alone.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the run.
+    say : callable
+        Called with sentences that the user should read.
+
+    Raises
+    ------
+    CityError
+        If an input is missing or unreadable, or does not fit the others.
+    """
+    WAITS.working = False  # whatever this process did before
+    found = survey_inputs(config, say)
+    layout = make_layout(found.grid, file_items(found.clouds), identity=found.region.crs)
+    return Plan(found.region, found.headers, found.messages, found.unreadable, found.grid, layout, found)
+
+
+def leave_out(plan: Plan, tiles: Collection[str], files: Collection[str]) -> Plan:
+    """Plan the same run without some tiles and files, by name: the others keep their results."""
+    present = tiles_present(plan.grid).copy()
+    for tile in tiles:
+        key = tile_key(tile)
+        present[key.i - plan.grid.first.i, key.j - plan.grid.first.j] = False
+    grid = replace(plan.grid, present=present)
+    kept = {name: item for name, item in plan.layout.files.items() if name not in files}
+    return replace(plan, grid=grid, layout=make_layout(grid, kept, identity=plan.layout.identity))
+
+
+def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
+    """Read headers, and choose region and tiles; parameters and errors as for `make_plan`.
+
+    Notes
+    -----
+    Tiles stay arrays: a country of half a million tiles takes no longer than its headers.
+    """
+    paths = find_clouds(config.pointcloud)
+    headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
+    found = find_georeference(config, headers)
+    headers, messages = found.clouds, list(found.messages)
+    region = Region(choose_bounds(config.bounds, headers), crs_text(found.crs), config.tile_size_or_default)
+    check_region(region, config.largest_size, headers, kind="open" if config.open_size else "mesh")
+    check_sizes(region, config)
+    clouds = [header for header in headers if header.n_points and _meets(header, region)]
+    whole = make_grid(
+        region.bounds,
+        tile_size=config.tile_size_or_default,
+        mesh_size=config.mesh_size,
+        open_size=config.open_size,
+    )
+    grid = choose_tiles(whole, [header.bounds[:4] for header in clouds])
+    present = tiles_present(grid)
+    n_tiles, n_absent = int(present.sum()), int((~present).sum())
+    if config.smoother == "fem" and config.mesher == "layered" and n_tiles > 1:
+        side = math.ceil(max(region.bounds[2] - region.bounds[0], region.bounds[3] - region.bounds[1]))
+        raise ConfigError(
+            f"smoother = fem knows nothing of seams, and the region has {n_tiles} tiles; take smoother = columns, "
+            f"or --tile-size {2 * side}"
+        )
+    messages += [*describe_overhang(region.bounds, headers), *idle_parameters(config)]
+    messages += describe_pad(region.bounds, headers) if config.padded else []
+    if n_absent:
+        messages.append(f"{n_absent} of {n_absent + n_tiles} tiles have no point cloud and are left out")
+    if not config.footprints:
+        messages.append("no footprints given: the mesh has terrain only")
+    for message in messages:
+        say(message)
+    return Survey(region, headers, clouds, messages, unreadable, grid, found, foresee_pad(grid, config))
+
+
+def find_georeference(config: Config, headers: Sequence[CloudHeader]) -> Georeference:
+    """Establish where the region lies, of headers of clouds and of the footprints' layer."""
+    check_points(headers)
+    asked = Asked(config.crs, config.reproject, config.height_unit)
+    layer = describe_layer(place(config.footprints), config.layer) if config.footprints else None
+    crs, extent = (None, None) if layer is None else (layer.crs, layer.extent)
+    found = establish_georeference(asked, headers, crs, extent)
+    inexact = find_inexact(found, config.clearance)
+    words = [_describe_inexact(found.operations[note.subject], note.subject, config) for note in inexact]
+    void = [
+        Note("cloud-void-header-box", header.path.name, detail="the box in the header is void; that of the points")
+        for header in headers
+        if header.box_of_points
+    ]
+    if void:
+        have = (
+            "1 point cloud has no sound box in its"
+            if len(void) == 1
+            else f"{len(void)} point clouds have no sound box in their"
+        )
+        words.append(f"{have} header; the points were read for it")
+    notes = [*found.notes, *void, *inexact]
+    return replace(found, messages=[*found.messages, *words], notes=notes)
+
+
+def _describe_inexact(operation: Operation, subject: str, config: Config) -> str:
+    aligned = config.align and subject == FOOTPRINTS
+    end = "--align moves them by what the points show" if aligned else "the run ends with exit code 3"
+    return f"{subject}: {operation.exact}, worse than the clearance of {config.clearance:g} m; {end}"
+
+
+def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:
+    """Name files by their stem, those of one stem by a number behind it."""
+    items: dict[str, FileItem] = {}
+    for header in clouds:
+        stem = re.sub(r"[^\w-]", "_", header.path.stem)
+        name = next(name for k in count(1) if (name := f"{stem}-{k}" if k > 1 else stem) not in items)
+        items[name] = FileItem(str(header.path), header.bounds[:4], identify(header.path), header.frame)
+    return items
+
+
+def identify(path: Path) -> str:
+    """Change when a file does: its size and the time of its last change; of an object its tag, if it has one."""
+    if in_bucket(path):
+        found = path.stat()
+        return f"{found.st_size} {found.e_tag or found.st_mtime_ns}"
+    state = path.stat()
+    return f"{state.st_size} {state.st_mtime_ns}"
+
+
+def _read_headers(paths: Sequence[Path], *, skip: bool) -> tuple[list[CloudHeader], dict[str, str]]:
+    headers: list[CloudHeader] = []
+    unreadable: dict[str, str] = {}
+    for path in paths:
+        try:
+            headers.append(read_header(path))
+        except InputError as error:
+            if not skip:
+                raise
+            unreadable[str(path)] = str(error)
+    return headers, unreadable
+
+
+def _meets(header: CloudHeader, region: Region) -> bool:
+    xmin, ymin, xmax, ymax = region.bounds
+    return not (
+        header.bounds[0] > xmax or header.bounds[2] < xmin or header.bounds[1] > ymax or header.bounds[3] < ymin
+    )

@@ -1,0 +1,1 @@
+"""Point cloud files: headers, chunks, COPC, and points dealt out to cells."""

@@ -1,0 +1,243 @@
+"""`citystitch check --store`: hold every artefact of a run folder against its checksum."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import CityError, InputError
+from tiler.engine.task import APART
+from tiler.store.checksums import is_sealed
+from tiler.store.folder_lock import is_held
+from tiler.store.manifest import Entry, read_manifest
+from tiler.store.stated_files import FILES, GONE, tell_change
+from tiler.store.store import Store
+from tiler.store.zarr_files import GROUP
+from tiler.workflow.out_folder import INDEXES, MANIFEST_PATH, PIECES, RUN_RECORD, STORE
+
+STRAY = "is not of this run"
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A damaged artefact: its path below the run's folder, and what is wrong with it."""
+
+    path: str
+    what: str
+
+    def __str__(self) -> str:
+        """Give it as a line of text."""
+        return f"{self.path}: {self.what}"
+
+
+class Audit:
+    """The audit of a run folder: iterate over it once, for one damage after the other.
+
+    Parameters
+    ----------
+    directory : Path
+        The folder of a run; no run should be at work there.
+    deep : bool
+        Decompress every chunk and compute the digest of every result anew, beside the checksums of the files.
+
+    Attributes
+    ----------
+    finished : bool
+        Whether the run was finished, so that what is missing is known.
+    n_results, n_files : int
+        Results and files beside the store that were looked at.
+    n_bytes : int
+        Size of these files, and of the files of these results.
+
+    Raises
+    ------
+    InputError
+        If the folder is not that of a run.
+
+    Notes
+    -----
+    One file is read at a time, a megabyte or a chunk of it; the names of one stage's results and the paths of the
+    pieces are held.
+    """
+
+    def __init__(self, directory: Path, *, deep: bool = True) -> None:
+        if not any((directory / name).exists() for name in (RUN_RECORD, STORE)):
+            raise InputError(f"{directory}: holds neither {RUN_RECORD} nor {STORE}; give the folder of a run")
+        self.directory, self.deep = directory, deep
+        self.finished = False
+        self.n_results = self.n_files = self.n_bytes = 0
+        self._store = Store(directory / STORE)
+        self._manifest = directory / MANIFEST_PATH
+        self._is_listed = False  # what there must be is known
+
+    def __iter__(self) -> Iterator[Damage]:
+        yield from self.check_top()
+        yield from self.check_results()
+
+    def check_top(self) -> Iterator[Damage]:
+        """Check the record, the manifest, and the files that the manifest alone states."""
+        record, change = read_sealed_record(self.directory / RUN_RECORD)
+        if change:
+            yield Damage(RUN_RECORD, change)
+        self.finished = record.get("status") == "done" if not change else self._manifest.exists()
+        if not self.finished:
+            return
+        try:
+            (last,) = (line for line in read_manifest(self._manifest) if not isinstance(line, Entry))
+            self._is_listed = True
+            yield from self._check_files(last)
+        except InputError as error:
+            yield Damage(MANIFEST_PATH, _reason(error, self._manifest) if self._manifest.exists() else GONE)
+            for name in INDEXES:
+                if not (self.directory / name).exists():
+                    yield Damage(name, GONE)
+
+    def check_results(self) -> Iterator[Damage]:
+        """Check all results and their files, and look for what is neither; after `check_top`."""
+        stages: set[str] = set()
+        files: set[str] = set()
+        for stage, group in groupby(self._entries(), lambda entry: entry.stage):
+            stages.add(stage)
+            names: set[str] = set()
+            for entry in group:
+                names.add(entry.name)
+                files.update(entry.files)
+                yield from self._check_result(entry)
+                yield from self._check_files(entry.files)
+            for name in self._store.names(stage):
+                if name not in names:
+                    yield Damage(f"{STORE}/{stage}/{name}", STRAY)
+        for stage in self._store.stages():
+            if stage not in stages:
+                yield Damage(f"{STORE}/{stage}", STRAY)
+        for path in self._store.find_strays():
+            yield Damage(path.relative_to(self.directory).as_posix(), STRAY)
+        if self._is_listed:
+            for folder, suffix in PIECES.items():
+                for path in sorted((self.directory / folder).glob(f"*{suffix}")):
+                    name = path.relative_to(self.directory).as_posix()
+                    if name not in files:
+                        yield Damage(name, STRAY)
+
+    def _entries(self) -> Iterator[Entry]:
+        """List the results as the manifest does; without one, those that are there, with what they state."""
+        if self._is_listed:
+            yield from (line for line in read_manifest(self._manifest) if isinstance(line, Entry))
+            return
+        for stage in self._store.stages():
+            for name in self._store.names(stage):
+                yield self._entry(stage, name)
+
+    def _entry(self, stage: str, name: str) -> Entry:
+        try:
+            attributes, digest = self._store.describe(stage, name)
+            return Entry(stage, name, attributes["key"], digest, attributes["facts"].get(FILES, {}))
+        except (CityError, KeyError, ValueError):
+            return Entry(stage, name, "", "", {})
+
+    def _check_result(self, entry: Entry) -> Iterator[Damage]:
+        self.n_results += 1
+        folder = self._store.folder(entry.stage, entry.name)
+        self.n_bytes += sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        place = f"{STORE}/{entry.stage}/{entry.name}"
+        damage = self._store.find_damage(entry.stage, entry.name)
+        if not folder.exists():
+            yield Damage(place, GONE)
+            return
+        for path, what in damage.items():
+            yield Damage(f"{place}/{path}", what)
+        if not damage:
+            yield from self._check_content(entry, place)
+
+    def _check_content(self, entry: Entry, place: str) -> Iterator[Damage]:
+        """Check a result whose files are as they were written against what the manifest and its digest say."""
+        attributes, digest = self._store.describe(entry.stage, entry.name)
+        if (attributes.get("key"), digest) != (entry.key, entry.digest):
+            yield Damage(f"{place}/{GROUP}", "has another key or digest than the run that was finished")
+        elif self.deep:
+            try:
+                computed = self._store.compute_digest(entry.stage, entry.name, apart=APART)
+            except InputError as error:
+                yield Damage(place, _reason(error, self._store.folder(entry.stage, entry.name)))
+                return
+            if computed != digest:
+                yield Damage(place, f"its content has the digest {computed}, stated is {digest}")
+
+    def _check_files(self, files: Mapping[str, Any]) -> Iterator[Damage]:
+        for path, stated in sorted(files.items()):
+            self.n_files += 1
+            change = tell_change(self.directory / path, stated)
+            if change:
+                yield Damage(path, change)
+            if change != GONE:
+                self.n_bytes += (self.directory / path).stat().st_size
+
+
+def read_sealed_record(path: Path) -> tuple[dict[str, Any], str]:
+    """Read ``run.json``, and say what is wrong with it: nothing if it is as it was written.
+
+    Returns
+    -------
+    dict
+        What it holds, empty where that is no JSON object.
+    str
+        What is wrong.
+    """
+    try:
+        text = path.read_bytes()
+    except FileNotFoundError:
+        return {}, GONE
+    except OSError as error:
+        return {}, f"cannot be read ({error.strerror})"
+    try:
+        record = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        return {}, f"is no JSON ({error})"
+    if not isinstance(record, dict):
+        return {}, "is no JSON object"
+    return record, "" if is_sealed(text) else "its checksum differs"
+
+
+def audit_run(directory: Path, tell: Callable[[str], None]) -> bool:
+    """Audit a run folder, and tell it line by line.
+
+    Parameters
+    ----------
+    directory : Path
+        The folder of a run.
+    tell : callable
+        Called with a line for each damaged artefact, and with one at the end.
+
+    Returns
+    -------
+    bool
+        Whether all is as it was written.
+
+    Raises
+    ------
+    InputError
+        If the folder is not that of a run, or a run is at work there.
+    """
+    if is_held(directory):
+        raise InputError(f"{directory}: a run is at work there; wait for its end")
+    audit, n_damaged = Audit(directory), 0
+    for damage in audit:
+        n_damaged += 1
+        tell(f"DAMAGED {damage}")
+    seen = f"{audit.n_results} results and {audit.n_files} files beside the store, {audit.n_bytes / 1e6:.1f} MB"
+    if not audit.finished:
+        seen += ", of a run that is not finished: what is missing is not known"
+    if n_damaged:
+        verdict = f"{n_damaged} damaged; give the command of the run again: it makes these anew, and no more"
+    else:
+        verdict = "every byte is as it was written"
+    tell(f"{directory}: {seen}: {verdict}")
+    return not n_damaged
+
+
+def _reason(error: InputError, path: Path) -> str:
+    """Take place and next move out of the message of a reader: both are told otherwise."""
+    text = str(error).removeprefix(f"{path}: ")
+    return text.rsplit("; ", 1)[0]

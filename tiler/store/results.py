@@ -1,0 +1,97 @@
+"""Results of a run, read from its store: columns of a tile, terrain of the region."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.mesh import ColumnMesh, PlaneMesh
+from pipeline.raster import Dtm, NodeWindow, grow_window, node_window, sample_dtm
+from pipeline.terrain import cut_terrain, join_terrain
+from tiler.store.store import Store
+
+COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom")
+APPROACH = "approach"
+KEPT_CHUNKS = 9  # tiles of terrain that stay in memory
+
+
+def read_columns(store: Store, tile: str) -> tuple[ColumnMesh, NDArray[np.int64]]:
+    """Read the columns of a tile.
+
+    Returns
+    -------
+    ColumnMesh
+        The mesh; `PlaneMesh.building` has rows of the second result.
+    int64, (b,)
+        Numbers of the buildings that the tile meets, ascending.
+    """
+    arrays, attributes = store.read("columns", tile, names=COLUMN_ARRAYS)
+    return unpack_columns(arrays, attributes["facts"]["order"])
+
+
+def unpack_columns(arrays: Mapping[str, NDArray[Any]], order: Any) -> tuple[ColumnMesh, NDArray[np.int64]]:
+    """Make columns of the arrays of the stage ``columns``, as `read_columns` does."""
+    numbers, row = np.unique(arrays["building"], return_inverse=True)
+    outside = int(len(numbers) > 0 and numbers[0] < 0)
+    rows: NDArray[np.int32] = (row.reshape(-1) - outside).astype(np.int32)
+    plane = PlaneMesh(arrays["xy"], arrays["triangles"], rows)
+    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], order), numbers[outside:]
+
+
+class StoredTerrain:
+    """The terrain of a run, read from its store tile by tile.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the store.
+
+    Raises
+    ------
+    InputError
+        If it holds no terrain.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._store = Store(path)
+        pad = self._store.names(APPROACH)  # with a pad, what has the terrain of both
+        self._stage = APPROACH if pad else "terrain"
+        self._names = np.array(pad or self._store.names("terrain"), np.str_)
+        if not len(self._names):
+            raise InputError(f"{path}: holds no terrain; run citystitch again")
+        self._windows = np.empty((len(self._names), 4), np.int64)  # i0, j0, nx, ny
+        for k, name in enumerate(self._names.tolist()):
+            facts = self._store.attributes(self._stage, name)["facts"]
+            self._windows[k] = [facts[part] for part in ("i0", "j0", "nx", "ny")]
+        self._spacing = float(facts["spacing"])
+        some = self._windows[(self._windows[:, 2:] > 0).all(axis=1)]
+        low, high = some[:, :2].min(axis=0), (some[:, :2] + some[:, 2:]).max(axis=0)
+        self._region = NodeWindow(*low.tolist(), *(high - low).tolist())
+        self._chunks: dict[str, Dtm] = {}
+
+    def sample(self, xy: NDArray[np.float64], /) -> NDArray[np.float64]:
+        """Ground height (m) at each place, (n, 2) to (n,). Memory is that of the terrain around them."""
+        if len(xy) == 0:
+            return np.empty(0)
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        window = grow_window(node_window(box, self._spacing), 0, within=self._region)
+        low, size = self._windows[:, :2], self._windows[:, 2:]
+        begin, end = (window.i0, window.j0), (window.i0 + window.nx, window.j0 + window.ny)
+        met = ((low < end) & (low + size > begin) & (size > 0)).all(axis=1)
+        parts = [self._chunk(k) for k in np.flatnonzero(met).tolist()]
+        return sample_dtm(cut_terrain(join_terrain(parts, window), window), xy)
+
+    def _chunk(self, k: int) -> Dtm:
+        name = str(self._names[k])
+        chunk = self._chunks.pop(name, None)
+        if chunk is None:
+            while len(self._chunks) >= KEPT_CHUNKS:
+                del self._chunks[next(iter(self._chunks))]
+            i0, j0 = self._windows[k, :2].tolist()
+            chunk = Dtm(self._store.read(self._stage, name)[0]["z"], i0, j0, self._spacing)
+        self._chunks[name] = chunk  # the youngest is the last
+        return chunk

@@ -1,0 +1,221 @@
+"""Vector files: what a layer says about itself, and its features within a box (step 1.2)."""
+
+import os
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyproj
+
+from pipeline.errors import ConfigError, InputError
+from pipeline.notes import Note
+from tiler.objects.local_copy import local_copy
+from tiler.objects.places import in_bucket
+from tiler.vectors import geoparquet
+from tiler.vectors.features import Box, Features, to_objects
+from tiler.vectors.gdal_features import check_readable, scan_features
+from tiler.vectors.gdal_layer import GdalLayer, has_whole_ids, open_layer
+from tiler.vectors.osm_tags import STOREY, find_osm_tags
+from tiler.vectors.vector_forms import read_head
+
+BATCH = 50_000  # features in memory at once
+
+_DEGREE = 111_320.0  # m, of latitude
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What one layer of a vector file says about itself.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    name : str
+        Name of the layer; ``""`` for Parquet, which has one.
+    crs : pyproj.CRS or None
+        As stated, None if not.
+    fields : tuple of str
+        Names of the attributes.
+    n_features : int
+        Number of features; -1 if the driver would have to read them all to know.
+    extent : tuple of 4 floats, or None
+        xmin, ymin, xmax, ymax in the file's CRS; None if unknown or if there are no features.
+    fid_name : str
+        What stands for the numbers of the features where it is asked for as an attribute: of a GeoJSON with whole
+        numbers as ids ``"id"``, which is among `fields` then; the column of a GeoPackage, which is not.
+    notes : tuple of Note
+        What was assumed about the file.
+    gdal : GdalLayer or None
+        How GDAL reads it; None for Parquet.
+    """
+
+    path: Path
+    name: str
+    crs: pyproj.CRS | None
+    fields: tuple[str, ...]
+    n_features: int
+    extent: Box | None
+    fid_name: str = ""
+    notes: tuple[Note, ...] = ()
+    gdal: GdalLayer | None = None
+
+    @property
+    def metre(self) -> float:
+        """Length of a metre in units of the coordinates, to a percent."""
+        if self.crs is None:
+            return 1.0
+        if self.crs.is_geographic:
+            return 1 / _DEGREE
+        return 1 / float(self.crs.axis_info[0].unit_conversion_factor) if self.crs.axis_info else 1.0
+
+
+def describe_layer(path: Path, layer: str = "") -> Layer:
+    """Describe a layer without reading its features.
+
+    Parameters
+    ----------
+    path : Path
+        SHP, GPKG, GeoJSON, FlatGeobuf, OSM or GeoParquet; see `check_form`. Of an object, Parquet is read by
+        ranges; all others are fetched first.
+    layer : str
+        Name of the layer; ``""`` for the only one that has geometries.
+
+    Returns
+    -------
+    Layer
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, or has no layer with geometries.
+    ConfigError
+        If the layer does not exist, or if there are several and none is named.
+    """
+    if not geoparquet.is_parquet(path):
+        path = local_copy(path)
+    if not in_bucket(path) and not os.path.exists(path):  # Path.exists raises where a name is too long
+        raise InputError(f"{path}: no such file; check the path of the footprints")
+    if geoparquet.is_parquet(path):
+        if layer:
+            raise ConfigError(f"{path}: Parquet has no layers, but layer {layer!r} is asked for; leave it out")
+        read_head(path)
+        column, fields, n_features, extent = geoparquet.describe(path)
+        return Layer(path, "", column.crs, fields, n_features, extent, notes=column.notes)
+    gdal = open_layer(path, layer)
+    fields, fid_name = gdal.fields, gdal.fid_name
+    if "json" in gdal.driver.lower() and "id" not in fields and has_whole_ids(path):
+        fields, fid_name = (*fields, "id"), "id"
+    return Layer(
+        path,
+        gdal.name,
+        _parse(path, gdal.info["crs"]),
+        fields,
+        int(gdal.info["features"]),
+        gdal.extent,
+        fid_name,
+        tuple(_notes(gdal)),
+        gdal,
+    )
+
+
+def scan_layer(
+    layer: Layer, columns: Sequence[str], box: Box | None, *, geometry: bool = True, batch: int = BATCH
+) -> Iterator[Features]:
+    """Read the features of a layer that may meet a box, once, by batches.
+
+    Parameters
+    ----------
+    layer : Layer
+        From `describe_layer`.
+    columns : sequence of str
+        Attributes to read.
+    box : tuple of 4 floats, or None
+        xmin, ymin, xmax, ymax in the file's CRS; None for all features.
+    geometry : bool
+        False leaves the geometries out: None in every row.
+    batch : int
+        Features in memory at once.
+
+    Yields
+    ------
+    Features
+        In the order of the file or of its spatial index; all that meet the box, and others too. Features without
+        geometry have no place and may be absent.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged.
+
+    Notes
+    -----
+    A file with a spatial index is read by query, another from end to end: see `scan_features`.
+    """
+    if layer.gdal is None:
+        yield from geoparquet.scan(layer.path, columns, box, geometry=geometry, batch=batch)
+        return
+    if box is not None and layer.extent is not None and _holds(box, layer.extent):
+        box = None  # all features: then their number is known, and can be checked
+    n_read = 0
+    own = [name for name in columns if name != layer.fid_name or name in layer.gdal.fields]
+    for features in scan_features(layer.gdal, own, box, geometry=geometry, batch=batch):
+        n_read += len(features.wkb)
+        if len(own) < len(columns):
+            features.columns[layer.fid_name] = to_objects(features.fids.tolist())
+        yield features
+    # An extract of OSM does not tell its number, and its stream too ends at damage without a word.
+    if (box is None and n_read < layer.n_features) or (geometry and layer.gdal.driver == "OSM"):
+        check_readable(layer.gdal)
+
+
+def _notes(gdal: GdalLayer) -> Iterator[Note]:
+    name = gdal.path.name
+    if find_osm_tags(gdal.fields) is not None:
+        detail = (
+            "building=* and building:part=* are taken; heights, where there are no roof points, by the tag "
+            f"height, else building:levels x {STOREY:g} m"
+        )
+        yield Note("footprints-of-osm", name, detail=detail)
+    if gdal.chosen and gdal.driver != "OSM":
+        detail = f"{gdal.name}; building:part in the layer lines is not read: give the extract itself for it"
+        yield Note("footprints-layer-chosen", name, detail=detail)
+
+
+def _holds(box: Box, extent: Box) -> bool:
+    low = box[0] <= extent[0] and box[1] <= extent[1]
+    return low and box[2] >= extent[2] and box[3] >= extent[3]
+
+
+def _stored_crs(path: Path, text: str) -> pyproj.CRS | None:
+    """Parse the definition that a GeoPackage has of a CRS: GDAL names codes that PROJ's register may lack."""
+    authority, _, code = text.partition(":")
+    if path.suffix.lower() != ".gpkg" or not code.isdigit():
+        return None
+    query = (
+        "select definition from gpkg_spatial_ref_sys "
+        "where organization = ? collate nocase and organization_coordsys_id = ?"
+    )
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as table:
+            (definition,) = table.execute(query, (authority, int(code))).fetchone()
+            return pyproj.CRS.from_wkt(definition)
+    except (sqlite3.Error, TypeError, ValueError, pyproj.exceptions.CRSError):
+        return None
+
+
+def _parse(path: Path, text: str | None) -> pyproj.CRS | None:
+    if text is None:
+        return None
+    try:
+        return pyproj.CRS.from_user_input(text)
+    except pyproj.exceptions.CRSError as error:
+        stored = _stored_crs(path, text)
+        if stored is not None:
+            return stored
+        raise InputError(
+            f"{path}: its CRS cannot be parsed ({text[:60]!r}...); write it anew: "
+            f'ogr2ogr -a_srs EPSG:<code> mended.gpkg "{path}"'
+        ) from error

@@ -1,0 +1,169 @@
+"""OpenStreetMap data as footprints: which features are buildings, their ids and their heights (step 1.2).
+
+OSM reaches a run as an extract (``.osm``, ``.osm.pbf``), as what ogr2ogr made of one (``osm_id``, ``osm_way_id``,
+``other_tags``), and as GeoJSON or GPKG of Overpass, QuickOSM and OSMnx (``@id``, ``full_id``, ``osmid``).
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tiler.vectors.lengths import metres_of, number_of
+
+STOREY = 3.0  # m; height of a level where a building has only their number
+# Attributes that only OSM data have, in lower case.
+_MARKS = ("osm_id", "osm_way_id", "@id", "full_id", "osmid")
+_TAGS = ("other_tags", "all_tags")  # all further tags in one text: hstore, or JSON from GDAL 3.7 on
+_PAIR = re.compile(r'"((?:[^"\\]|\\.)*)"\s*(?:=>|:)\s*"((?:[^"\\]|\\.)*)"')
+_KEYS = ("building", "building:part", "height", "building:levels")
+
+
+@dataclass(frozen=True)
+class OsmTags:
+    """Where a layer of OSM data keeps what a run needs.
+
+    Attributes
+    ----------
+    column : mapping of str to str
+        Attribute of each tag that has one of its own.
+    more : str
+        Attribute with all further tags as text, ``""`` for none.
+    relation_id, way_id : str
+        Attributes with the ids of relations and of ways, ``""`` where the layer has not both.
+    """
+
+    column: Mapping[str, str]
+    more: str
+    relation_id: str
+    way_id: str
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Attributes that are read."""
+        named = [*self.column.values(), self.more, self.relation_id, self.way_id]
+        return tuple(dict.fromkeys(name for name in named if name))
+
+
+def find_osm_tags(fields: Sequence[str]) -> OsmTags | None:
+    """Find the tags of OSM data among the attributes of a layer.
+
+    Returns
+    -------
+    OsmTags or None
+        None for other data: without an id of OSM, or without the tag ``building``.
+
+    Examples
+    --------
+    >>> find_osm_tags(["osm_id", "osm_way_id", "building", "other_tags"]).fields
+    ('building', 'other_tags', 'osm_id', 'osm_way_id')
+    >>> find_osm_tags(["id", "building"]) is None
+    True
+    """
+    lower = {field.lower().replace("_", ":") if field[:1] != "@" else field: field for field in reversed(fields)}
+    column = {key: lower[key] for key in _KEYS if key in lower}
+    more = next((lower[name.replace("_", ":")] for name in _TAGS if name.replace("_", ":") in lower), "")
+    if not any(mark.replace("_", ":") in lower for mark in _MARKS) or not (more or "building" in column):
+        return None
+    both = "osm:id" in lower and "osm:way:id" in lower
+    ids = (lower["osm:id"], lower["osm:way:id"]) if both else ("", "")
+    return OsmTags(column, more, *ids)
+
+
+def is_building(tags: OsmTags, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """Tell the features with ``building=*`` or ``building:part=*``, whose value is not ``no``.
+
+    Parameters
+    ----------
+    tags : OsmTags
+        Of the layer.
+    columns : mapping of str to (n,) arrays
+        The attributes that `OsmTags.fields` names.
+
+    Returns
+    -------
+    bool, (n,)
+    """
+    house, part = (values_of(tags, key, columns) for key in ("building", "building:part"))
+    return np.array([_is_set(a) or _is_set(b) for a, b in zip(house, part, strict=True)], np.bool_)
+
+
+def osm_ids(tags: OsmTags, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.object_]:
+    """Give the ids of ways and relations, which are numbered apart, as ``way/123`` and ``relation/7``.
+
+    Returns
+    -------
+    object, (n,)
+        None where there is neither.
+    """
+    pairs = zip(columns[tags.relation_id], columns[tags.way_id], strict=True)
+    ids = [_prefixed("relation", relation) or _prefixed("way", way) for relation, way in pairs]
+    return np.array([*ids, None], np.object_)[:-1]
+
+
+def osm_heights(
+    tags: OsmTags, columns: Mapping[str, NDArray[Any]]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.object_]]:
+    """Give the heights by ``height``, else by ``building:levels`` of `STOREY` each.
+
+    Returns
+    -------
+    height : float64, (n,)
+        Height (m), NaN where neither can be read.
+    by_levels : bool, (n,)
+        True where it is by levels.
+    unread : object, (n,)
+        Values of the tag ``height`` that are no height above 0 m; None elsewhere.
+    """
+    given, levels = (values_of(tags, key, columns) for key in ("height", "building:levels"))
+    height = np.array([metres_of(value) for value in given], np.float64)
+    bad = ~(np.isfinite(height) & (height > 0))
+    unread = np.array(
+        [value if wrong and _text(value) else None for value, wrong in zip(given, bad, strict=True)] + [None],
+        np.object_,
+    )[:-1]
+    by_levels = STOREY * np.array([number_of(value) for value in levels], np.float64)
+    by_levels[~(np.isfinite(by_levels) & (by_levels > 0))] = np.nan
+    return np.where(bad, by_levels, height), bad & np.isfinite(by_levels), unread
+
+
+def values_of(tags: OsmTags, key: str, columns: Mapping[str, NDArray[Any]]) -> list[Any]:
+    """Give the values of a tag: of its own attribute, else of the text with all further tags."""
+    n = len(next(iter(columns.values()))) if columns else 0
+    own = columns[tags.column[key]] if key in tags.column else [None] * n
+    if not tags.more:
+        return list(own)
+    texts = columns[tags.more]
+    return [value if _text(value) else _parse(text).get(key) for value, text in zip(own, texts, strict=True)]
+
+
+def _parse(text: Any) -> dict[str, str]:
+    if not isinstance(text, str):
+        return {}
+    return {_unescape(key): _unescape(value) for key, value in _PAIR.findall(text)}
+
+
+def _unescape(text: str) -> str:
+    return re.sub(r"\\(.)", r"\1", text)
+
+
+def _is_set(value: Any) -> bool:
+    text = _text(value).lower()
+    return text not in ("", "no", "false")
+
+
+def _prefixed(kind: str, value: Any) -> str | None:
+    text = _text(value)
+    if not text:
+        return None
+    return text if "/" in text else f"{kind}/{text}"
+
+
+def _text(value: Any) -> str:
+    """Write a value as text, whole floats as integers; ``""`` for none, as a column with nulls has NaN."""
+    if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
+        return ""
+    return f"{value:.17g}" if isinstance(value, float | np.floating) else str(value).strip()

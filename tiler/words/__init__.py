@@ -1,0 +1,1 @@
+"""Words that users read: notes, steps, suggestions, safe text."""

@@ -1,0 +1,1 @@
+"""A run from configuration to record: stages in their order, folder, failed tiles, summary."""

@@ -1,0 +1,410 @@
+"""A run: from a configuration to a folder with the mesh, its city model and its record."""
+
+import dataclasses
+import json
+import platform
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import CityError, OutputError
+from tiler.config.config import Config
+from tiler.dashboard.server import read_address, watched
+from tiler.engine.engine import StoppedError
+from tiler.engine.keys import code_versions
+from tiler.engine.stage import Stage
+from tiler.engine.stopping import stops
+from tiler.engine.task import peak_memory
+from tiler.engine.task_limits import TASKS, Limits, limit_workers, machine_memory
+from tiler.executors.addresses import ANYWHERE
+from tiler.executors.executor import Executor, processes, serial
+from tiler.executors.kernels import prepare
+from tiler.jobs.table import read_cluster
+from tiler.joining.lease import LostFolderError
+from tiler.joining.spool import SPOOL
+from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
+from tiler.monitoring.progress import Announce
+from tiler.monitoring.watchers import LOST, Listener, Watcher, Watchers
+from tiler.objects.places import in_bucket, place
+from tiler.planning.forecast import warn_of_memory
+from tiler.planning.pad import Pad
+from tiler.planning.padded_layout import pad_plan
+from tiler.planning.plan import Plan, check_sources, make_plan
+from tiler.report.kept_report import give_back_report
+from tiler.scheduler.executor import local
+from tiler.scheduler.reach import reach_cluster, spell_out
+from tiler.store.atomic import replacing, sync_meanwhile
+from tiler.store.audit import Audit
+from tiler.store.checksums import seal
+from tiler.store.folder_lock import only_run
+from tiler.store.manifest import find_remade, write_manifest
+from tiler.store.stated_files import state_files
+from tiler.workflow.empty_run import EmptyMeshError, is_empty
+from tiler.workflow.failed_tiles import (
+    HolesError,
+    Missing,
+    find_missing,
+    leave_holes,
+    save_config,
+)
+from tiler.workflow.other_region import find_missing_folders, refuse_other_region, remove_folders
+from tiler.workflow.out_folder import (
+    INDEXES,
+    MANIFEST_PATH,
+    RUN_RECORD,
+    STORE,
+    check_folder,
+    clear_folder,
+    refuse_inputs_within,
+    remove_strangers,
+)
+from tiler.workflow.own_stages import OwnStages, check_own, run_own_stages
+from tiler.workflow.run_watchers import begin_watching
+from tiler.workflow.stage_sequence import make_engine, run_stages
+from tiler.workflow.summary import describe_tasks, summarise_run
+
+SCHEMA = 1  # version of run.json's layout
+OwnExecutor = Callable[[Callable[[str], None]], AbstractContextManager[Executor]]
+
+
+@dataclass(frozen=True)
+class _Means:
+    """What a run is done with.
+
+    Attributes
+    ----------
+    dashboard : str or None
+        Where its page is shown, ``HOST:PORT``.
+    shown : Path
+        Folder of the events that the page is made of.
+    own_executor : callable or None
+        Makes the executor of one who brings it.
+    cluster : Executor or None
+        Of the scheduler that was asked for.
+    compilers : int
+        Number of processes that compile kernels before the first task; 0 where they are compiled as they are
+        needed.
+    """
+
+    dashboard: str | None
+    shown: Path
+    own_executor: OwnExecutor | None
+    cluster: Executor | None
+    compilers: int
+
+
+def run(
+    config: Config,
+    *,
+    announce: Announce | None = None,
+    say: Callable[[str], None] | None = None,
+    stages: Sequence[Stage] = (),
+    parameters: Mapping[str, Any] | None = None,
+    watchers: Sequence[Watcher] = (),
+    dashboard: str | None = None,
+    executor: OwnExecutor | None = None,
+    compilers: int | None = None,
+) -> dict[str, Any]:
+    """Mesh a region as configured.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the run.
+    announce : callable, optional
+        Called with the name of each stage and the seconds of all its items when it is done.
+    say : callable, optional
+        Called with sentences that the user should read.
+    stages : sequence of Stage, optional
+        Further stages, run after ours; they may read these and each other.
+    parameters : mapping, optional
+        Parameters that further stages declare, besides those of `config`.
+    watchers : sequence of Watcher
+        Told what is planned, begun, done and said; of the end too, if the run fails before it has begun.
+    dashboard : str, optional
+        Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
+        default. `say` is told its URL.
+    executor : callable, optional
+        Given what tells the run's watchers a sentence, makes the executor of all tasks, a context; by default
+        that which `config` asks for.
+    compilers : int, optional
+        Processes that compile kernels before the first task of a run on this machine, if that was not done here,
+        and the same run has not been done before; 0: each when it is needed. By default as many as workers, so
+        that a run in one process starts none.
+
+    Returns
+    -------
+    dict
+        What ``run.json`` holds. ``exit_code`` is 0, or 3 if parts were left out.
+
+    Raises
+    ------
+    CityError
+        If nothing could be made of the input; once the run has begun, ``run.json`` says so. EmptyMeshError where
+        footprints were given and no building was meshed, unless ``allow_empty``: what was meshed stays.
+    ValueError
+        If a further stage has the name of one of ours, or a further parameter that of one of `config`.
+
+    Notes
+    -----
+    A folder that holds an earlier run, finished or not, is brought up to date: what is in its store, and has the
+    same key, is not computed again. Results are those of a run into an empty folder, byte for byte. Every byte
+    that is used again is held against its checksum first; what is damaged is computed anew and noted
+    (``damaged-artefact``).
+    """
+    told = Watchers(watchers if say is None else [*watchers, Listener(say)])
+    config = spell_out(config)
+    made: list[Path] = []
+    try:
+        check_sources(config)
+        if config.cluster:
+            read_cluster(Path(config.cluster))
+        if dashboard is not None:
+            read_address(dashboard)
+        out = place(config.out, config.store_patience)
+        own = check_own(config, stages, parameters)
+        made = find_missing_folders(out)
+        check_folder(out, overwrite=config.overwrite)
+        with only_run(out, told.say) as check, _beside(out, check, told) as shown:
+            earlier = check_folder(out, overwrite=config.overwrite)
+            damage = _find_damage(out) if earlier and not config.overwrite else {}
+            with reach_cluster(config) as cluster:
+                here = executor is None and not config.on_cluster
+                compilers = config.workers if compilers is None else compilers
+                beforehand = here and not is_repeated(config)
+                means = _Means(dashboard, shown, executor, cluster, compilers if beforehand else 0)
+                return _run(config, out, earlier, damage, own, announce, told, means)
+    except BaseException as error:
+        remove_folders(made)  # those of a run that has begun are not empty
+        with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
+            told.end("failed", tell_error(error))
+        raise
+
+
+def _run(
+    config: Config,
+    out: Path,
+    earlier: list[str],
+    damage: Mapping[str, str],
+    own: OwnStages,
+    announce: Announce | None,
+    watchers: Watchers,
+    means: _Means,
+) -> dict[str, Any]:
+    say = watchers.say
+    start, untouched = time.perf_counter(), True
+    record: dict[str, Any] = {
+        "schema": SCHEMA,
+        "checksum": "0" * 8,
+        "status": "running",
+        **_describe(config),
+    }
+    failed = True
+    try:
+        # Nothing of an earlier run is touched before the inputs are known to be there; then, before anything else
+        # changes, its record no longer says that it is done, whatever happens to the power.
+        plan = _plan(config, out, say, fresh=config.overwrite or not earlier)
+        untouched = False
+        _write_record(out, record, durable=bool(earlier))
+        if not earlier and not in_bucket(out):
+            sync_meanwhile(out / RUN_RECORD)  # nothing is there yet that a loss of power could make it lie about
+        clear_folder(out, earlier, overwrite=config.overwrite)
+        if not in_bucket(out):
+            shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
+            if means.own_executor is None:
+                shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
+        save_config(config, out)
+        progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=means.shown)
+        record |= _mesh_region(config, out, plan, own, watchers, damage, means)
+        record["finished"] = progress.finished
+        for message in record["messages"][len(plan.messages) :]:
+            say(message)
+        _refuse_empty(config, record)
+        give_back_report(out, changed=bool(record["tasks"]["ran"]))
+        record["status"] = "done"
+        say(describe_tasks(record["tasks"]))
+        if in_bucket(out):
+            from tiler.objects.watch import describe_waits, tell_waits
+
+            record["store_waits"] = describe_waits()
+            if waits := tell_waits():
+                say(waits)
+        failed = False
+    except LostFolderError as error:
+        untouched = True  # the folder is another process's now
+        watchers.end(LOST, str(error))
+        raise
+    except StoppedError as error:
+        record |= {"status": "stopped", "error": str(error)}
+        raise
+    except BaseException as error:
+        record |= {"status": "failed", "error": tell_error(error)}
+        raise
+    finally:
+        record["seconds_total"] = round(time.perf_counter() - start, 3)
+        # Where an error is told already, that its record cannot be written either would only hide it.
+        with suppress(OutputError) if failed else nullcontext():
+            if not untouched:
+                _write_record(out, record)
+            watchers.end(record["status"], record.get("error", ""))
+    return record
+
+
+def _plan(config: Config, out: Path, say: Callable[[str], None], *, fresh: bool) -> Plan:
+    """Plan a run; refuse inputs among its results and, unless it begins anew, the folder of another region."""
+    plan = make_plan(config, say)
+    footprints = [config.footprints] if config.footprints else []
+    for warning in _foresee(plan, config):
+        plan.messages.append(warning)
+        say(warning)
+    refuse_inputs_within(out, [*(header.path for header in plan.headers), *map(place, footprints)])
+    if not fresh:
+        refuse_other_region(out, plan.region, [*config.pointcloud, *footprints])
+    return plan
+
+
+def _refuse_empty(config: Config, record: dict[str, Any]) -> None:
+    """Raise EmptyMeshError if footprints were given and no building was meshed, unless that is allowed."""
+    if is_empty(config, record["counts"]) and not config.allow_empty:
+        record["exit_code"] = EmptyMeshError.exit_code
+        raise EmptyMeshError(record["empty"])
+
+
+def _mesh_region(
+    config: Config,
+    out: Path,
+    plan: Plan,
+    own: OwnStages,
+    watchers: Watchers,
+    damage: Mapping[str, str],
+    means: _Means,
+) -> dict[str, Any]:
+    """Run all stages, and write the indexes of their pieces and the manifest.
+
+    Where a file or a tile fails on the way to the city model, the region is planned again without it: what that
+    does not touch has its result already. Where one fails later, its neighbours keep the seam with it.
+    """
+    missing = Missing()
+    if means.compilers:
+        _prepare(means.compilers, watchers.say)
+    with (
+        _executor(config, means, watchers.say) as executor,
+        watched(means.shown, means.dashboard, getattr(executor, "scheduler", None), watchers.say),
+    ):
+        while True:
+            engine = make_engine(config, out, plan, executor, own, watchers)
+            with stops(engine.stop, watchers.say):
+                try:
+                    rounds = run_stages(engine, config)
+                except HolesError:
+                    plan, missing = leave_holes(plan, missing, engine)
+                    watchers.say(f"left out so far: {', '.join(sorted(missing.tiles))}; going on with the rest")
+                    continue
+                run_own_stages(engine, own, config)
+            break
+    if config.padded:
+        plan = pad_plan(plan, Pad(plan.region.bounds, engine.context.grid))
+    missing = find_missing(plan, missing, engine)
+    remade = {
+        f"{STORE}/{stage}/{name}": what
+        for (stage, name), what in find_remade(out / MANIFEST_PATH, engine.records).items()
+    }
+    engine.prune()
+    engine.store.remove_strays()
+    tiles = sorted(plan.layout.tiles.keys() - missing.tiles.keys())
+    remove_strangers(out, tiles)
+    write_pvtu(out / "mesh.pvtu", [out / "mesh" / f"{tile}.vtu" for tile in tiles])
+    write_pvtp(out / "boundary.pvtp", [out / "boundary" / f"{tile}.vtp" for tile in tiles])
+    indexes = state_files(out, [out / name for name in INDEXES])
+    write_manifest(out / MANIFEST_PATH, engine.records, indexes)
+    summary = summarise_run(engine, plan, config, rounds, missing, dict(damage) | remade)
+    return summary | {"driver_memory_bytes": peak_memory()}
+
+
+def is_repeated(config: Config) -> bool:
+    """Tell whether the same was run to its end before: next to nothing is left to compute, and to compile."""
+    with suppress(OSError, ValueError, TypeError, OutputError):
+        known = json.loads((place(config.out, config.store_patience) / RUN_RECORD).read_bytes())
+        said: dict[str, Any] = json.loads(json.dumps(_describe(config), default=str))
+        return not config.overwrite and known == known | said | {"status": "done"}
+    return False
+
+
+def _describe(config: Config) -> dict[str, Any]:
+    """What a record says of the parameters of a run, and of the code."""
+    versions = {"python": platform.python_version()} | dict(code_versions())
+    return {"parameters": dataclasses.asdict(config), "versions": versions}
+
+
+def _prepare(processes: int, say: Callable[[str], None]) -> None:
+    try:
+        prepare(processes, say)
+    except KeyboardInterrupt:
+        raise StoppedError("stopped before the first task; the same command begins again") from None
+
+
+@contextmanager
+def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iterator[Executor]:
+    if means.own_executor is not None:
+        with means.own_executor(say) as executor:
+            yield executor
+    elif means.cluster is not None:
+        yield means.cluster
+    elif config.cluster:
+        from tiler.jobs.jobqueue import JOB, job_queue
+
+        table, folder = read_cluster(Path(config.cluster)), Path(config.out).absolute() / JOB
+        with job_queue(
+            table, folder, Limits(config.time_limit), dashboard=means.dashboard or ANYWHERE, say=say
+        ) as executor:
+            yield executor
+    elif config.has_crew:
+        with processes(config.workers, limit_workers(config)) as executor:
+            yield executor
+    elif config.workers:
+        with local(config.workers, limit_workers(config), dashboard=means.dashboard or ANYWHERE) as executor:
+            yield executor
+    else:
+        with serial() as executor:
+            yield executor
+
+
+@contextmanager
+def _beside(out: Path, check: Callable[[], None], watchers: Watchers) -> Iterator[Path]:
+    """Give the folder of the events that the page of a run is made of; of one in a bucket, watch the store too."""
+    if not in_bucket(out):
+        yield out
+        return
+    from tiler.objects.watch import WaitWatch, telling
+
+    watchers.add(WaitWatch(check))
+    with tempfile.TemporaryDirectory(prefix="citystitch-") as name, telling(watchers.say):
+        yield Path(name)
+
+
+def _find_damage(out: Path) -> dict[str, str]:
+    """Say what is wrong with the files of a finished run that belong to no result.
+
+    Of results and their files it is told by who makes them anew.
+    """
+    return {found.path: found.what for found in Audit(out, deep=False).check_top()}
+
+
+def _foresee(plan: Plan, config: Config) -> list[str]:
+    """Say which tiles may not fit into the memory of this machine."""
+    return [] if config.on_cluster else warn_of_memory(plan.survey, config, memory=machine_memory())
+
+
+def tell_error(error: BaseException) -> str:
+    """What an error that ends a run is, for its record."""
+    return str(error) if isinstance(error, CityError) else f"{type(error).__name__}: {error}"
+
+
+def _write_record(out: Path, record: dict[str, Any], *, durable: bool = True) -> None:
+    with replacing(out / RUN_RECORD, durable=durable) as part:
+        part.write_bytes(seal(json.dumps(record, indent=1, default=str).encode() + b"\n"))

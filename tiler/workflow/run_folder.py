@@ -1,0 +1,277 @@
+"""What a run folder says about itself: its record, buildings, volume pieces."""
+
+import math
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from json import JSONDecodeError
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.mesh import Region, TetMesh
+from tiler.citymodels.json_stream import JsonStream, NoJsonError
+
+SCHEMA = 1  # of run.json
+RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")
+TILES = "tiles"
+PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
+REGION = "region"  # cell array of a piece with soil
+# How a field that is missing, or of another type, or too large, shows when it is used.
+WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
+
+
+@dataclass(frozen=True)
+class MeshPart:
+    """A part of a mesh that shares no face with others: cells, tiles, and those that have other cells too."""
+
+    cells: int
+    tiles: tuple[str, ...] = ()
+    divided: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """The part of ``run.json`` that the files can be held against.
+
+    Attributes
+    ----------
+    status : str
+        ``"done"`` when every tile is.
+    bounds : tuple of 4 floats
+        West, south, east and north border of the region (m).
+    top : float
+        Absolute height of the top (m) where the mesher makes it flat, NaN where it does not.
+    counts : mapping of str to int
+        ``cells``, ``points``, ``facets`` and ``building parts``.
+    tiles : mapping of str to tuple of 4 floats or None
+        Boxes of the tiles by name (m), as far as they are stated.
+    depth : float
+        Depth of the soil below the terrain (m), 0 where there is none.
+    core : tuple of 4 floats or None
+        The region without its pad (m); None without a pad.
+    rim : float
+        Height of the ground along the outer sides of the pad (m), NaN without one.
+    parts : tuple of MeshPart
+        Parts of the mesh, that of the most cells first; of many those beyond the first are empty. None at all
+        where the record does not tell.
+    """
+
+    status: str
+    bounds: tuple[float, float, float, float]
+    top: float
+    counts: Mapping[str, int]
+    tiles: Mapping[str, tuple[float, ...] | None] = field(default_factory=dict)
+    depth: float = 0.0
+    core: tuple[float, float, float, float] | None = None
+    rim: float = math.nan
+    parts: tuple[MeshPart, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Buildings:
+    """Buildings of a CityJSON file, by ascending number.
+
+    Attributes
+    ----------
+    numbers : int64, (n,)
+        Attribute ``number``: what the boundary's array ``building`` refers to.
+    footprints : object, (n,)
+        shapely Polygons, or MultiPolygons where the file has several surfaces (m).
+    ground, roof : float64, (n,)
+        Attributes ``ground_height`` and ``roof_height``, absolute (m).
+    """
+
+    numbers: NDArray[np.int64]
+    footprints: NDArray[np.object_]
+    ground: NDArray[np.float64]
+    roof: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @cached_property
+    def tree(self) -> shapely.STRtree:
+        """Footprints by place."""
+        return shapely.STRtree(self.footprints)
+
+
+def read_run_record(path: Path) -> RunRecord:
+    """Read ``run.json``.
+
+    Raises
+    ------
+    InputError
+        If it is missing or damaged, or has another schema.
+    """
+    record = _read_members(path, RECORD_MEMBERS)
+    try:
+        if record["schema"] != SCHEMA:
+            raise InputError(f"{path}: schema {record['schema']!r}, expected {SCHEMA}; run again")
+        if record["status"] == "failed":
+            raise InputError(f"{path}: the run failed ({record['error']}); mend that and run again")
+        if "region" not in record:
+            raise InputError(f"{path}: the run is {record['status']} and has no mesh yet; wait, or run again")
+        west, south, east, north = (float(value) for value in record["region"]["bounds"])
+        top = float(record["region"].get("top", math.nan))
+        counts = {name: int(record["counts"][name]) for name in ("cells", "points", "facets")}
+        # A record of an earlier version counts parts as buildings.
+        counts[PARTS] = int(record["counts"][PARTS if PARTS in record["counts"] else "buildings"])
+        status = str(record["status"])
+        depth = float(record.get("parameters", {}).get("underground", 0.0))
+        core, rim = _read_pad(record["region"])
+        parts = _read_parts(record.get("parts") or {}, counts["cells"])
+    except WRONG_FIELD as error:
+        raise broken_field(path, error) from None
+    if not (west < east and south < north and math.isfinite(west + south + east + north)):
+        raise InputError(f"{path}: region bounds {west, south, east, north} are no box; run again")
+    if not 0 <= depth < math.inf:
+        raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
+    tiles = record.get(TILES) or {}
+    return RunRecord(status, (west, south, east, north), top, counts, tiles, depth, core, rim, parts)
+
+
+def _read_parts(found: Mapping[str, Any], n_cells: int) -> tuple[MeshPart, ...]:
+    n = min(int(found.get("n", 0)), n_cells)
+    listed = [
+        MeshPart(int(part["cells"]), tuple(map(str, part["tiles"])), tuple(map(str, part["divided"])))
+        for part in found.get("largest", ())
+    ]
+    return (*listed, *[MeshPart(0)] * max(n - len(listed), 0))[: max(n, 0)]
+
+
+def _read_pad(region: Mapping[str, Any]) -> tuple[tuple[float, float, float, float] | None, float]:
+    if "core" not in region:
+        return None, math.nan
+    west, south, east, north = (float(value) for value in region["core"])
+    return (west, south, east, north), float(region["rim"])
+
+
+def read_crs(path: Path) -> str:
+    """Read from ``run.json`` in which CRS the run's coordinates are.
+
+    Raises
+    ------
+    InputError
+        If it is missing or damaged, or names no CRS.
+    """
+    record = _read_members(path, ("region",))
+    try:
+        crs = record["region"]["crs"]
+        if not isinstance(crs, str) or not crs:
+            raise TypeError(f"crs is {crs!r}")
+    except WRONG_FIELD as error:
+        raise broken_field(path, error) from None
+    return crs
+
+
+def read_volume(path: Path, *, regions: bool = False) -> tuple[TetMesh, NDArray[np.int8]]:
+    """Read a VTU piece with meshio: a reader that is not ours.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    regions : bool
+        Whether its cells must tell their region.
+
+    Returns
+    -------
+    TetMesh
+        The mesh.
+    int8, (n_cells,)
+        `pipeline.mesh.Region` of each cell: all air if they need not tell.
+
+    Raises
+    ------
+    InputError
+        If meshio cannot read it, if it holds something else than finite points and tetrahedra, or lacks a region.
+
+    Notes
+    -----
+    meshio takes some 130 bytes a cell for a moment.
+    """
+    import meshio  # here, as it takes 50 ms and a run needs it not
+
+    try:
+        mesh = meshio.vtu.read(str(path))
+    # A damaged file shows in many ways, SystemExit among them.
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            f"{path}: meshio cannot read it ({type(error).__name__}: {error}); run the tile again"
+        ) from None
+    blocks = [block.data for block in mesh.cells if block.type == "tetra"]
+    if len(blocks) != len(mesh.cells) or mesh.points.ndim != 2 or mesh.points.shape[1] != 3:
+        kinds = ", ".join(block.type for block in mesh.cells)
+        raise InputError(f"{path}: holds {kinds}, not tetrahedra; run the tile again")
+    cells = np.concatenate(blocks) if blocks else np.empty((0, 4), np.int64)
+    if cells.size and (cells.min() < 0 or cells.max() >= len(mesh.points)):
+        raise InputError(
+            f"{path}: vertex {cells.min()}..{cells.max()} of {len(mesh.points)} points; run the tile again"
+        )
+    if not np.isfinite(mesh.points).all():
+        raise InputError(f"{path}: a coordinate is not finite; run the tile again")
+    region = np.full(len(cells), Region.AIR, np.int8)
+    if regions:
+        known = mesh.cell_data.get(REGION, [])
+        if len(known) != 1 or known[0].shape != region.shape or not np.isin(known[0], list(Region)).all():
+            raise InputError(
+                f"{path}: has no cell array {REGION!r} of 0 (air) and 1 (soil) alone; run the tile again"
+            )
+        region = known[0].astype(np.int8)
+    return TetMesh(mesh.points.astype(np.float64, copy=False), cells.astype(np.int32)), region
+
+
+@contextmanager
+def opened_json(path: Path) -> Iterator[JsonStream]:
+    """Open a JSON file whose content is an object, to be read member by member.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is no JSON object, here or wherever it is read inside of the context.
+    """
+    try:
+        with path.open(encoding="utf-8") as file:
+            stream = JsonStream(file)
+            if stream.peek() not in ("{", ""):
+                raise InputError(f"{path}: is no JSON object; run again")
+            yield stream
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); run again") from error
+    except (JSONDecodeError, UnicodeDecodeError, NoJsonError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON ({error}); run again") from None
+
+
+def broken_field(path: Path, error: Exception) -> InputError:
+    """Make the error of a file with a `WRONG_FIELD`."""
+    return InputError(f"{path}: a field is missing or wrong ({error!r}); run again")
+
+
+def _read_members(path: Path, names: Collection[str]) -> dict[str, Any]:
+    """Read some members of a JSON object; of tiles, their boxes (n, 4) by name."""
+    found: dict[str, Any] = {}
+    with opened_json(path) as stream:
+        for key in stream.members():
+            if key == TILES and stream.peek() == "{":
+                found[key] = {name: _box(stream.value()) for name in stream.members()}
+            elif key in names:
+                found[key] = stream.value()
+            else:
+                stream.skip()
+        stream.finish()
+    return found
+
+
+def _box(tile: Any) -> tuple[float, ...] | None:
+    """Take the box of a tile (m), None where it has none."""
+    try:
+        west, south, east, north = map(float, tile["box"])
+    except WRONG_FIELD:
+        return None
+    return west, south, east, north

@@ -1,0 +1,154 @@
+"""The stages of a run in their order, over an engine."""
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
+from tiler.config.config import Config
+from tiler.config.step_options import derived_parameters
+from tiler.engine.engine import Engine, Progress
+from tiler.engine.failures import Policy
+from tiler.engine.stage import REGION_ITEM
+from tiler.executors.executor import Executor
+from tiler.objects.places import place
+from tiler.planning.context import RunContext, pack_tiles
+from tiler.planning.padded_layout import CORE_STAGE
+from tiler.planning.plan import Plan, identify
+from tiler.stages.alignment import alignment_stages, shift_of
+from tiler.stages.city import first_round, house_stage, later_round, member_stage, model_stage, shape_stage
+from tiler.stages.citymodel import city_model_stages
+from tiler.stages.inputs import fill_stage, input_stages, lake_stage
+from tiler.stages.mesh import mesh_stages
+from tiler.stages.pieces import fit_stage, piece_stages
+from tiler.workflow.failed_tiles import (
+    stop_at_holes,
+)
+from tiler.workflow.out_folder import (
+    STORE,
+)
+from tiler.workflow.own_stages import OwnStages
+from tiler.workflow.settled_domain import settle_domain
+
+
+def run_stages(engine: Engine, config: Config) -> int:
+    """Run all stages in their order; returns how often clusters of houses were simplified.
+
+    Parameters
+    ----------
+    engine : Engine
+        Engine over the region's items.
+    config : Config
+        Parameters of the run.
+    """
+    rounds = run_city_stages(engine, config)
+    domain = settle_domain(engine, config)
+    # Nothing waits for these: first in a call, so last of what may run, they fill the time in which others wait.
+    of_model = [fit_stage(config), *city_model_stages()]
+    if config.footprints and not config.align:
+        of_model = [*alignment_stages(config), *of_model]
+    meshed = [*mesh_stages(config, domain), *piece_stages()]
+    if config.padded:
+        engine.tell_layout()
+        both = engine.layout, engine.context
+        engine.lay_out(*engine.laid_out(CORE_STAGE))
+        engine.run(*of_model)
+        engine.lay_out(*both)
+        engine.run(*meshed)
+    else:
+        engine.run(*of_model, *meshed)
+    # Beside a tile without a piece, others were written as if they had a neighbour.
+    while lost := [name for stage, name in engine.set_aside if stage == "pieces"]:
+        for tile in lost:
+            engine.give_up(("pieces", tile), ("columns", tile))
+        engine.run(*piece_stages())
+    return rounds
+
+
+def run_city_stages(engine: Engine, config: Config, *, shift: tuple[float, float] | None = None) -> int:
+    """Run the stages up to the simplified city model; parameters and result as for `run_stages`.
+
+    A shift of the footprints (m) that is known is taken, and not measured.
+
+    Raises
+    ------
+    HolesError
+        If an item was set aside.
+    """
+    if shift is not None:
+        engine.add_parameters(footprints_shift=shift)
+    elif config.align and config.footprints:
+        _align(engine, config)
+    engine.run(*input_stages(config))
+    stop_at_holes(engine)
+    deep = engine.records["coarse", REGION_ITEM].facts["deep"]
+    engine.run(lake_stage(), fill_stage(), items={"lakes": deep})
+    stop_at_holes(engine)
+    engine.run(house_stage(config))
+    stop_at_holes(engine)
+    engine.run(*first_round(config))
+    stop_at_holes(engine)
+    engine.run(shape_stage(0))
+    stop_at_holes(engine)
+    last = 0
+    while True:
+        engine.run(*later_round(config, last + 1))
+        stop_at_holes(engine)
+        if not engine.records[f"join-{last + 1}", REGION_ITEM].facts["joined"]:
+            break
+        last += 1
+        engine.run(member_stage(last))
+        stop_at_holes(engine)
+        engine.run(shape_stage(last))
+        stop_at_holes(engine)
+    engine.run(model_stage(config, last))
+    stop_at_holes(engine)
+    return last + 1
+
+
+def _align(engine: Engine, config: Config) -> None:
+    """Measure the shift between footprints and roofs before footprints are used, and take it from now on."""
+    wanted = {"points", "footprints"}
+    before = [stage for stage in input_stages(config) if stage.name in wanted]
+    engine.run(*before, *alignment_stages(config))
+    stop_at_holes(engine)
+    engine.add_parameters(footprints_shift=shift_of(engine.records["shift", REGION_ITEM].facts))
+
+
+def make_engine(
+    config: Config,
+    out: Path,
+    plan: Plan,
+    executor: Executor,
+    own: OwnStages,
+    progress: Progress | None = None,
+    *,
+    set_aside: bool = True,
+) -> Engine:
+    """Make the engine of a run over the items of its plan; failures are set aside, or end it."""
+    context = RunContext(
+        plan.region.bounds,
+        plan.region.crs,
+        config.tile_size_or_default,
+        config.mesh_size,
+        pack_tiles(plan.grid),
+        str(out),
+        config.open_size,
+    )
+    footprints = place(config.footprints) if config.footprints else None
+    parameters = SimpleNamespace(
+        **dataclasses.asdict(config),
+        **own.parameters,
+        **derived_parameters(config),
+        footprints_identity=identify(footprints) if footprints else "",
+        footprints_frame=dataclasses.astuple(plan.georeference.footprints),
+        footprints_shift=(0.0, 0.0),
+    )
+    return Engine(
+        out / STORE,
+        plan.layout,
+        parameters=parameters,
+        context=context,
+        executor=executor,
+        progress=progress,
+        policy=Policy(retries=config.retries, set_aside=set_aside),
+    )
