@@ -59,3 +59,19 @@ def test_imports_follow_the_arrows(path: Path) -> None:
             assert not (package == "stitch" and name in COMPOSING), f"{place} imports {name}"
         if top in HOMES:
             assert place.startswith(HOMES[top]), f"{place} imports {name}"
+
+
+LARGE = {"formats"}  # one file a format
+
+
+@pytest.mark.parametrize(
+    "package", sorted(path.parent for path in (ROOT / "tiler").glob("*/__init__.py")), ids=str
+)
+def test_a_package_of_the_tiler_is_a_few_files_and_says_what_it_is(package: Path) -> None:
+    modules = [path for path in package.glob("*.py") if path.name != "__init__.py"]
+    assert 4 <= len(modules) <= 15 or package.name in LARGE
+    assert ast.get_docstring(ast.parse((package / "__init__.py").read_text()))
+
+
+def test_no_module_of_the_tiler_lies_beside_its_packages() -> None:
+    assert [path.name for path in (ROOT / "tiler").glob("*.py")] == ["__init__.py"]
