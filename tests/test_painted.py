@@ -18,6 +18,7 @@ from tests.scene import PIECES, write_scene
 from tiler.cli.main import main
 from tiler.mesh_files.facet_quality import measure_facets
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
+from tiler.pictures import render
 from tiler.pictures.coarsening import Facets, coarsen, join_facets
 from tiler.pictures.paint import SUN, Scene, View, fill_polygons, paint
 from tiler.pictures.painted_pictures import paint_blocks, paint_cut
@@ -189,7 +190,7 @@ def test_what_reaches_behind_the_camera_is_left_out() -> None:
 def test_render_paints_quality_and_the_city_model(
     small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(__import__("tiler.pictures.render").render.SIZES, "quality", (320, 240))
+    monkeypatch.setitem(render.SIZES, "quality", (320, 240))
     for what, size in (("quality", (320, 240)), ("citymodel", (1600, 1000))):
         files = [tmp_path / f"{what}{k}.png" for k in range(2)]
         for file in files:

@@ -217,7 +217,7 @@ def test_a_cloud_without_ground_class_needs_the_filter(
     assert "--ground-filter" in capsys.readouterr().err
     assert json.loads((out / "run.json").read_text())["status"] == "failed"
     assert main(["check", str(out)]) == 1
-    assert "the run failed (stage coarse" in capsys.readouterr().err
+    assert "the run failed (terrain: coarse grid" in capsys.readouterr().err
     assert main([*command, "--ground-filter", "--overwrite"]) == 0
     assert json.loads((out / "run.json").read_text())["notes"]["ground-filter"]["count"] == 1
     assert check_run(out, StoredTerrain).ok

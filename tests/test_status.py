@@ -194,7 +194,7 @@ def test_the_command_has_all_parameters(tmp_path: Path, others: dict[str, Any]) 
 
 def test_stages_of_the_users_own_have_no_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     RunProgress(tmp_path, make_config({"pointcloud": ["a.laz"]}), {}, command="")
-    assert "call tiler.workflow.run.run again as before" in show(tmp_path, capsys)
+    assert "call tiler.workflow.run.run again, with the same stages" in show(tmp_path, capsys)
 
 
 def test_what_is_no_run_and_what_is_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -166,7 +166,7 @@ def test_bounds_that_are_none_are_those_of_the_points(city: Path, capsys: Captur
     patch_cloud(179, "d", value)(city)
     found = call(capsys, *arguments(city))
     assert found.code == 0
-    assert "their points were read for it" in found.out
+    assert "points were read for it" in found.out
 
 
 def test_no_claim_of_a_file_takes_memory(city: Path) -> None:

@@ -333,7 +333,8 @@ def _frame(text: str) -> tuple[str, str]:
     """File, from its package on, and function of a sample's frame."""
     name, _, place = text.partition(" (")
     path = Path(place.rstrip(")").rpartition(":")[0])
-    return "/".join(path.parts[-2:]) if "stages" not in path.parts else "/".join(path.parts[-3:]), name
+    ours = [k for k, part in enumerate(path.parts) if part in PACKAGES]
+    return "/".join(path.parts[ours[-1] :] if ours else path.parts[-2:]), name
 
 
 def study_startup(cities: Cities, out: Path) -> list[dict[str, Any]]:
