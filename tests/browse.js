@@ -49,7 +49,7 @@ const colourAt = (page, name) => page.evaluate((wanted) => {
     await page.click('#legend button[data-state="done"]');
     seen.withoutDone = await drawn(page);
     await page.click('#legend button[data-state="done"]');
-    await page.selectOption("#stage", "ground");
+    await page.selectOption("#stage", "terrain");
     await page.waitForFunction(() => document.querySelector('#legend button[data-state="failed"]').dataset.count === "0");
     seen.ground = await legend(page);
     seen.failuresOfGround = await text(page, "#no-failures");

@@ -279,7 +279,7 @@ def test_wrong_workers_take_no_part_in_a_run(tmp_path: Path) -> None:
         assert line.startswith("numpy: ")
         assert ", 0.1 there (tcp://127.0.0.1:" in line
         assert "install the same versions" in advice
-        assert list(out.iterdir()) == []
+        assert not out.exists()
     told = _run_with_a_late_worker(city, out, f"{wrong}:{ROOT}", tmp_path / "late", code=2)
     assert "a worker has joined that cannot take tasks of this run" in told
     assert ", 0.1 there (tcp://127.0.0.1:" in told

@@ -116,7 +116,7 @@ def test_real_blocks_have_a_flat_top_above_grown_layers(shared_data: Path, meshe
     report = prove(tmp_path)
     assert report.facts["seam_faces"] > 5000
     assert record["notes"][LOW_DOMAIN]["count"] == 1
-    assert record["quality"]["radius_ratio"]["0"] > 0.05
+    assert record["quality"]["radius_ratio"]["0"] > 0.03
 
 
 @pytest.mark.parametrize(

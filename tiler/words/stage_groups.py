@@ -18,6 +18,8 @@ STAGES: dict[str, tuple[str, str]] = {
     "footprints": (BUILDINGS, "footprint file"),
     "outlines": (BUILDINGS, "footprints of tiles"),
     "reserved": (BUILDINGS, "ids"),
+    "alignment": (BUILDINGS, "footprints over roofs"),
+    "shift": (BUILDINGS, "shift of the footprints"),
     "houses": (BUILDINGS, "outlines and heights"),
     "near-": (SIMPLIFICATION, "close buildings"),
     "join-": (SIMPLIFICATION, "clusters"),
