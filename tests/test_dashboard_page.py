@@ -69,7 +69,7 @@ def test_the_map_shows_the_tiles_in_their_states(seen: dict[str, Any]) -> None:
 
 def test_a_failure_is_listed_with_the_command_that_reproduces_it(seen: dict[str, Any]) -> None:
     item, reason, command = seen["failures"][0]
-    assert item == "columns 0_0"
+    assert item == "mesh: columns of cells 0_0"
     assert reason == "a column does not ascend <img src=x onerror=alert(1)>"
     assert command.startswith("citystitch run out/config.toml --only 0_0 --traceback")
     assert len(seen["failures"]) == 2
@@ -81,7 +81,7 @@ def test_filters_work(seen: dict[str, Any]) -> None:
     assert seen["withoutDone"] == without
     assert seen["ground"]["failed"] == 0
     assert seen["ground"]["done"] + seen["ground"]["reused"] > seen["legend"]["done"] + seen["legend"]["reused"]
-    assert seen["failuresOfGround"] == "None in stage ground."
+    assert seen["failuresOfGround"] == "None in terrain."
 
 
 def test_values_are_coloured_by_a_scale(seen: dict[str, Any]) -> None:
@@ -102,8 +102,8 @@ def test_keys_alone_reach_everything(seen: dict[str, Any]) -> None:
         "map",
         "waiting",
         "failed",
-        "ground",
-        "columns 0_0",
+        "terrain",
+        "mesh: columns of cells 0_0",
     ]
     places = [reached.index(name) for name in wanted]
     assert places == sorted(places), "in the order in which they are read"
