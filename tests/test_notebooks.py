@@ -80,7 +80,7 @@ def test_first_mesh(tmp_path: Path) -> None:
     assert ratio
     assert float(ratio[1]) == pytest.approx(quality["0"], abs=2e-3)
     assert float(ratio[2]) == pytest.approx(quality["50"], abs=2e-3)
-    assert f"{counts['buildings']} buildings, " in said
+    assert f"{counts['building parts']} building parts, " in said
     assert 'src="data:image/jpeg;base64,' in shown
     assert f"<td>{counts['cells']:,}</td>" in shown
     tasks = city.record["tasks"]["all"]
@@ -102,7 +102,7 @@ def test_own_data(tmp_path: Path, shared_data: Path, monkeypatch: pytest.MonkeyP
     for kind, group in city.record["notes"].items():
         assert re.search(rf"^ *{group['count']}  {kind}: ", said, flags=re.MULTILINE)
     houses = len({building.house for building in city.buildings()})
-    assert f"{houses} houses, {city.record['counts']['buildings']} parts" in said
+    assert f"{houses} houses, {city.record['counts']['building parts']} parts" in said
     assert houses > 300
     assert 'src="data:image/jpeg;base64,' in shown
     assert len(pictures) == 1
