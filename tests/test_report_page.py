@@ -76,5 +76,5 @@ def test_a_failed_tile_is_on_the_map_and_in_the_list(small_run: Path, tmp_path: 
     for view in found.values():
         assert [(one["tiles"], one["missing"]) for one in view["maps"]] == [(3, 1)] * 3
     text = (copy / "report.html").read_text()
-    assert f"{name} failed: stage columns: out of memory" in text
+    assert f"{name} failed: mesh: columns of cells: out of memory" in text
     assert command in text
