@@ -30,18 +30,23 @@ def join_pairs(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
     return name
 
 
+@kernel(inline="always")
+def unite(parent: NDArray[np.int64], a: int, b: int) -> None:
+    """Unite the sets of two things, which are trees, with path halving; a parent is never above its child."""
+    while parent[a] != a:
+        parent[a] = parent[parent[a]]
+        a = parent[a]
+    while parent[b] != b:
+        parent[b] = parent[parent[b]]
+        b = parent[b]
+    parent[max(a, b)] = min(a, b)
+
+
 @kernel
 def _unite(parent: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Unite sets that are trees, with path halving; a parent is never above its child."""
+    """Unite the sets of all pairs."""
     for k in range(len(pairs)):
-        a, b = pairs[k]
-        while parent[a] != a:
-            parent[a] = parent[parent[a]]
-            a = parent[a]
-        while parent[b] != b:
-            parent[b] = parent[parent[b]]
-            b = parent[b]
-        parent[max(a, b)] = min(a, b)
+        unite(parent, pairs[k, 0], pairs[k, 1])
     for i in range(len(parent)):
         parent[i] = parent[parent[i]]
     return parent

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.components import unite
 from pipeline.kernel import kernel
 
 # The faces of a cell of positive volume, counter-clockwise seen from outside.
@@ -380,14 +381,7 @@ def _face_states(cells, n_points):  # type: ignore[no-untyped-def]  # noqa: PLR0
             for at in range(i, j):
                 state[faces[order[at]]] = kind
             if j - i == 2:
-                a, b = faces[order[i]] // 4, faces[order[i + 1]] // 4
-                while parent[a] != a:
-                    parent[a] = parent[parent[a]]
-                    a = parent[a]
-                while parent[b] != b:
-                    parent[b] = parent[parent[b]]
-                    b = parent[b]
-                parent[max(a, b)] = min(a, b)
+                unite(parent, faces[order[i]] // 4, faces[order[i + 1]] // 4)
             i = j
     for cell in range(len(cells)):
         parent[cell] = parent[parent[cell]]

@@ -98,12 +98,11 @@ def _height_unit(crs: pyproj.CRS | None, keys: dict[int, float]) -> float | None
     if unit is not None:
         return unit
     vertical = _from_epsg(int(keys.get(VERTICAL_CRS, 0)))
-    return None if vertical is None or not vertical.is_vertical else height_unit_of_vertical(vertical)
-
-
-def height_unit_of_vertical(crs: pyproj.CRS) -> float:
-    """Metres of a unit of a vertical CRS."""
-    return exact_unit(crs.axis_info[0].unit_conversion_factor)
+    return (
+        None
+        if vertical is None or not vertical.is_vertical
+        else exact_unit(vertical.axis_info[0].unit_conversion_factor)
+    )
 
 
 def _keys(records: list[object]) -> dict[int, float]:

@@ -6,7 +6,7 @@ import laspy
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.classes import GROUND
+from pipeline.classes import GROUND, KEY_POINT
 from pipeline.las_points import Triple, find_coordinates, find_range
 from tiler.georeference.frame import STEP, Frame, origin_of, to_region
 
@@ -15,7 +15,6 @@ _FIELDS = laspy.DecompressionSelection
 # gives a field that is left out the first value of its chunk for all points.
 FIELDS = _FIELDS.XY_RETURNS_CHANNEL | _FIELDS.Z | _FIELDS.CLASSIFICATION | _FIELDS.FLAGS
 
-KEY_POINT = 8  # class of model key points in the point formats 0 to 5, reserved in the others
 LAST_LEGACY_FORMAT = 5
 MOST_UNITS = 2**31 - 1
 
