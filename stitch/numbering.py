@@ -18,7 +18,7 @@ Ids are unique where a region has fewer than 2**15 tiles to a side. They have ga
 wanted, the ids are counted by their order (`Numbering`).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +56,26 @@ class Numbering:
         return int(self.offset[-1])
 
 
+@dataclass(frozen=True, eq=False)
+class PartCounts:
+    """Points of a tile.
+
+    Attributes
+    ----------
+    own : int
+        Points of no seam.
+    part, levels : int64, (p,)
+        Codes of the tile's seams and corners, and how many levels each has.
+    unused : int64, (u,)
+        Ids of those levels that the tile has no cell at: the tiles around it may have one.
+    """
+
+    own: int
+    part: Ints
+    levels: Ints
+    unused: Ints
+
+
 def corner_part(key: Key) -> int:
     """Code of a corner."""
     return _part(0, key.i, key.j)
@@ -82,16 +102,48 @@ def first_id(part: int) -> int:
     return part << LOCAL_BITS
 
 
-def count_points(levels: Levels) -> tuple[int, int, int]:
-    """Count the points of a seam's columns: of its first corner, between its corners, of its last corner."""
-    start = levels.start
-    return int(start[1] - start[0]), int(start[-2] - start[1]), int(start[-1] - start[-2])
+def count_by_part(
+    mesh: ColumnMesh, used: NDArray[np.bool_], shared: NDArray[np.int32], lowest: Ints
+) -> PartCounts:
+    """Count the points of a tile by parts.
+
+    Parameters
+    ----------
+    mesh : ColumnMesh
+        The tile's mesh.
+    used : bool, (n_levels,)
+        Levels that its cells use.
+    shared, lowest : int32 and int64, (k,)
+        As in `number_columns`.
+    """
+    first, row = np.unique(lowest, return_index=True)
+    begin = mesh.z_start[shared[row]]
+    count = mesh.z_start[shared[row] + 1] - begin
+    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    there = used[np.repeat(begin, count) + within]
+    unused = (np.repeat(first, count) + within)[~there]
+    part, of = np.unique(first >> LOCAL_BITS, return_inverse=True)
+    levels = np.bincount(of, count, len(part)).astype(np.int64)
+    return PartCounts(int(used.sum() - there.sum()), part, levels, unused)
 
 
-def count_inner_points(mesh: ColumnMesh, seams: Sequence[NDArray[np.int32]]) -> int:
-    """Count the points of a tile that no seam within the region has; `seams` are their vertices in its mesh."""
-    vertex = np.unique(np.concatenate([np.empty(0, np.int32), *seams]))
-    return int(len(mesh.z) - np.diff(mesh.z_start)[vertex].sum())
+def count_all_points(tiles: Sequence[PartCounts]) -> int:
+    """Count the points of some tiles, each once: those that some tile uses.
+
+    Examples
+    --------
+    >>> one = PartCounts(5, np.array([7]), np.array([4]), np.array([7, 9]) + first_id(7))
+    >>> two = PartCounts(2, np.array([7]), np.array([4]), np.array([9]) + first_id(7))
+    >>> count_all_points([one]), count_all_points([one, two])
+    (7, 10)
+    """
+    part, first, n_tiles = np.unique(
+        np.concatenate([tile.part for tile in tiles]), return_index=True, return_counts=True
+    )
+    levels = np.concatenate([tile.levels for tile in tiles])[first]
+    unused, n_unused = np.unique(np.concatenate([tile.unused for tile in tiles]), return_counts=True)
+    by_all = n_unused == n_tiles[np.searchsorted(part, unused >> LOCAL_BITS)]
+    return int(sum(tile.own for tile in tiles) + levels.sum() - by_all.sum())
 
 
 def seam_ids(key: SeamKey, levels: Levels) -> Ints:
@@ -146,31 +198,6 @@ def number_columns(mesh: ColumnMesh, shared: NDArray[np.int32], lowest: Ints, fi
     own = ids < 0
     ids[own] = first + np.cumsum(count[own]) - count[own]
     return ids
-
-
-def make_offsets(counts: Mapping[int, int]) -> tuple[Ints, Ints]:
-    """Find where each part begins, of numbers without gaps.
-
-    Parameters
-    ----------
-    counts : mapping of int to int
-        Points of each part, by its code; those without any are left out.
-
-    Returns
-    -------
-    part : int64, (p,)
-        Codes, ascending.
-    offset : int64, (p + 1,)
-        The lowest number of each part, and the number of all points.
-
-    Examples
-    --------
-    >>> make_offsets({7: 5, 3: 2, 4: 0})
-    (array([3, 7]), array([0, 2, 7]))
-    """
-    some = sorted((part, count) for part, count in counts.items() if count)
-    part, count = np.array(some, np.int64).reshape(-1, 2).T
-    return part, np.concatenate(([0], np.cumsum(count)))
 
 
 def collect_ids(pieces: Iterable[Ints]) -> Numbering:

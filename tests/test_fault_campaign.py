@@ -26,6 +26,7 @@ from tiler.engine.task import Task
 from tiler.planning.context import seam_key, tile_name
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
+from tiler.words.stage_groups import title_of_stage
 from tiler.workflow.run import run
 
 Fault = Callable[[Task], None]
@@ -43,7 +44,7 @@ ASIDE = ("proofs", "fit", "own")  # what takes no tile with it
 OTHER = {"early": "late", "late": "early"}
 # Each kind before there is a city model, or after it.
 PAIRS = list(zip(KINDS, ("early", "late") * 3, strict=True))
-REGION = ("coarse", "join-0", "citymodel", "numbers")
+REGION = ("coarse", "join-0", "citymodel", "report")
 # One worker a core; a task that hangs is ended soon, one that allocates is refused.
 LIMITS = {"workers": 2, "time_limit": 6.0, "memory_limit": 1.0, "retries": 0}
 
@@ -188,7 +189,7 @@ def test_a_stage_of_the_region_ends_the_run(city: SparseCity, tmp_path: Path, st
     with injected({stage: {"region": KINDS[kind][0]}}), pytest.raises((CityError, ZeroDivisionError)) as caught:
         run(city.config(out, **LIMITS), stages=[OWN])
     words = " ".join([str(caught.value), *getattr(caught.value, "__notes__", [])])
-    assert f"stage {stage}, region region" in words
+    assert title_of_stage(stage) in words
     assert getattr(caught.value, "exit_code", 1) == 1
     assert json.loads((out / "run.json").read_text())["status"] == "failed"
     assert run(city.config(out, **LIMITS), stages=[OWN])["exit_code"] == 0

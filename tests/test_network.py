@@ -248,8 +248,8 @@ def test_a_driver_that_is_cut_off_for_good_ends_and_goes_on_later(
         cluster((scheduler, worker), files, tmp_path / "cluster") as (address, _),
         ExitStack() as stack,
     ):
-        shorter = "import sys; from tiler import cli; from tiler.scheduler import reach; "
-        shorter += "reach.PATIENCE = 11; sys.exit(cli.main())"
+        shorter = "import sys; from tiler.cli import main; from tiler.scheduler import reach; "
+        shorter += "reach.PATIENCE = 11; sys.exit(main.main())"
         command = command_from(driver, city, out, address, files)
         at = command.index("-m")
         environment = ["env", "DASK_DISTRIBUTED__COMM__TIMEOUTS__TCP=11s"]

@@ -14,16 +14,13 @@ from pipeline.columns import find_used_points, split_boundary
 from pipeline.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
 from pipeline.terrain import Dtm, sample_dtm
 from stitch.facets import Side, find_seam_edges
-from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile
+from stitch.grid import Key, SeamKey, TileGrid, seams_of_tile
 from stitch.numbering import (
-    corner_part,
-    count_inner_points,
-    count_points,
+    count_all_points,
+    count_by_part,
     first_id,
-    make_offsets,
     number_columns,
     seam_ids,
-    seam_part,
     tile_part,
 )
 from stitch.seam_columns import tile_columns
@@ -100,27 +97,25 @@ def number_city(city: City) -> dict[Key, NDArray[np.int64]]:
     """Give the points of all tiles their ids."""
     ids = {}
     for key, tile in city.tiles.items():
-        shared = [find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy) for seam in tile.columns]
-        lowest = [seam_ids(seam, levels) for seam, levels in tile.columns.items()]
         start = tile.mesh.z_start
-        column = number_columns(
-            tile.mesh, np.concatenate(shared), np.concatenate(lowest), first_id(tile_part(key))
-        )
+        column = number_columns(tile.mesh, *_number_seams(tile), first_id(tile_part(key)))
         ids[key] = np.repeat(column - start[:-1], np.diff(start)) + np.arange(start[-1])
     return ids
 
 
 def count_city(city: City) -> int:
     """Count the points of all parts, as a run does."""
-    counts: dict[int, int] = {}
-    for key, tile in city.tiles.items():
-        shared = []
-        for seam, levels in tile.columns.items():
-            shared.append(find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy))
-            low, high = (corner_part(corner) for corner in ends_of_seam(seam))
-            counts |= zip((low, seam_part(seam), high), count_points(levels), strict=True)
-        counts[tile_part(key)] = count_inner_points(tile.mesh, shared)
-    return int(make_offsets(counts)[1][-1])
+    counts = []
+    for tile in city.tiles.values():
+        shared, lowest = _number_seams(tile)
+        counts.append(count_by_part(tile.mesh, find_used_points(tile.mesh), shared, lowest))
+    return count_all_points(counts)
+
+
+def _number_seams(tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    shared = [find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy) for seam in tile.columns]
+    lowest = [seam_ids(seam, levels) for seam, levels in tile.columns.items()]
+    return np.concatenate(shared), np.concatenate(lowest)
 
 
 def write_numbered(folder: Path, city: City) -> tuple[list[Path], list[Path]]:

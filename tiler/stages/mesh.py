@@ -22,7 +22,7 @@ from stitch.corners import Corner, place_corner
 from stitch.facets import Side, find_seam_edges
 from stitch.grid import Bounds, Key, SeamKey, ends_of_seam, is_pinched, seams_of_tile
 from stitch.layered_seams import fill_corner_layers, fill_seam_layers
-from stitch.numbering import corner_part, count_inner_points, count_points, first_id, seam_ids
+from stitch.numbering import corner_part, first_id, seam_ids
 from stitch.patches import mesh_patch
 from stitch.seam_columns import fill_corner, fill_seam, tile_columns
 from stitch.seams import SURROUNDINGS, Seam, find_vertices, trace_seam
@@ -68,7 +68,7 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     seams, columns = (
         (make_seam_with_soil, make_columns_with_soil) if config.underground else (make_seam, make_columns)
     )
-    version = 5 if config.mesher == "layered" else 3
+    version = 6 if config.mesher == "layered" else 4
     return [
         Stage("seams", Scope.SEAM, seams, tuple(reads), parameters, version=version),
         Stage("columns", Scope.TILE, columns, (*reads, Read("seams", beside=True)), parameters, version=version),
@@ -141,8 +141,7 @@ def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
             )
             below = fill_seam_soil(seam, (low, high), levels, terrain, soil, sizes=sizes)
         task.put(soil_start=below.start, soil_z=below.z)
-        levels = join_seam(below, levels)
-    return facts | {"points": count_points(levels)}
+    return facts
 
 
 def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
@@ -201,16 +200,14 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
     keys = [seam_key(name) for name in names]
     lowest = [seam_ids(keys[k], levels) for k, (_, levels) in zip(inner, given_columns, strict=True)]
     for key, name in zip(keys, names, strict=True):
-        ends = [ends_of_seam(key)[k] for k, _ in found[name].facts.get("pinched", [])]
+        ends = [ends_of_seam(key)[k] for k in found[name].facts.get("pinched", [])]
         lowest += [np.array([first_id(corner_part(corner))]) for corner in ends]
     task.put(
         shared=np.concatenate([np.empty(0, np.int32), *shared]),
         shared_id=np.concatenate([np.empty(0, np.int64), *lowest]),
     )
-    inner_points = count_inner_points(columns, shared)
     underground = {} if soil is None else {"soil": {"depth (m)": soil.depth, "cells": n_cells}}
     return underground | {
-        "inner_points": inner_points,
         "order": columns.order,
         "facts": {"smallest gap (m)": round(gap, 4)} | dataclasses.asdict(report),
         "counts": {
@@ -268,8 +265,8 @@ def _fill_pinched(
     sizes: SizeField | None,
     soil: SoilOptions | None,
     task: Task,
-) -> list[list[int]]:
-    """Fill the columns of the ends of a border in which two tiles meet alone; tell which, with their points."""
+) -> list[int]:
+    """Fill the columns of the ends of a border in which two tiles meet alone; tell which."""
     pinched = []
     for k, (corner, place) in enumerate(zip(ends_of_seam(key), ends, strict=True)):
         if is_pinched(task.context.grid, corner):
@@ -278,8 +275,7 @@ def _fill_pinched(
             if soil is not None:
                 below = fill_corner_soil(place, levels, terrain_around(corner, dtm, task), soil, sizes=sizes)
                 task.put(**{f"end{k}_soil_start": below.start, f"end{k}_soil_z": below.z})
-                levels = join_seam(below, levels)
-            pinched.append([k, len(levels.z)])
+            pinched.append(k)
     return pinched
 
 

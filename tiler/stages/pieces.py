@@ -1,4 +1,4 @@
-"""Stage 3.6: a piece of the mesh and of its boundary a tile, numbers for the whole region, proof of the seams."""
+"""Stage 3.6: a piece of the mesh and of its boundary a tile, proof of the seams, quality of the region."""
 
 import hashlib
 from collections import Counter
@@ -29,8 +29,8 @@ from pipeline.point_fidelity import (
 )
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
 from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
-from stitch.grid import Key, ends_of_seam, is_border, seams_of_tile, tiles_of_seam
-from stitch.numbering import corner_part, first_id, make_offsets, number_columns, seam_part, tile_part
+from stitch.grid import Key, is_border, seams_of_tile, tiles_of_seam
+from stitch.numbering import PartCounts, count_all_points, count_by_part, first_id, number_columns, tile_part
 from tiler.citymodels.tables import unpack_polygons
 from tiler.config.config import Config
 from tiler.engine.stage import Facts, Read, Scope, Stage
@@ -64,42 +64,15 @@ def fit_stage(config: Config) -> Stage:
 
 def piece_stages() -> list[Stage]:
     """Stages from columns to files; the last reads the fit, too."""
-    meshed = (Read("seams", optional=True), Read("columns", optional=True))
     beside = (Read("columns", beside=True, others_by_name=True, optional=True),)
     return [
-        Stage("numbers", Scope.REGION, number_parts, meshed, version=3),
         # Of the tiles around it a piece asks only which of them there are.
-        Stage("pieces", Scope.TILE, write_piece, beside, version=5),
+        Stage("pieces", Scope.TILE, write_piece, beside, version=6),
         Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces", beside=True, optional=True),)),
         Stage(
-            "report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True)), version=2
+            "report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True)), version=3
         ),
     ]
-
-
-def number_parts(task: Task) -> Facts:
-    """Find where the points of each corner, seam and tile begin if all are numbered without gaps.
-
-    A seam between two tiles that failed has no points in any file.
-    """
-    counts: dict[int, int] = {}
-    there = {tile_key(name) for name in task.refs["columns"]}
-    for result in task.read("seams", ()):
-        key = seam_key(result.name)
-        if there.isdisjoint(tiles_of_seam(key)):
-            continue
-        start, end = ends_of_seam(key)
-        if result.facts["border"]:
-            for k, n_points in result.facts["pinched"]:
-                counts[corner_part((start, end)[k])] = n_points
-        else:
-            first, inner, last = result.facts["points"]
-            counts |= {corner_part(start): first, seam_part(key): inner, corner_part(end): last}
-    for result in task.read("columns", ()):
-        counts[tile_part(tile_key(result.name))] = result.facts["inner_points"]
-    part, offset = make_offsets(counts)
-    task.put(part=part, offset=offset)
-    return {"points": int(offset[-1])}
 
 
 def write_piece(task: Task) -> Facts:
@@ -130,6 +103,8 @@ def write_piece(task: Task) -> Facts:
     if found:
         task.put(**found)
     points, meter = UsedPoints(mesh, used), QualityMeter()
+    counted = count_by_part(mesh, used, arrays["shared"], arrays["shared_id"])
+    task.put(part=counted.part, part_levels=counted.levels, unused=counted.unused)
     lowest = number_columns(mesh, arrays["shared"], arrays["shared_id"], first_id(tile_part(key)))
 
     def make_ids(levels: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -154,6 +129,7 @@ def write_piece(task: Task) -> Facts:
         task.put(**{name: histogram.counts, f"{name}_range": _range(histogram)})
     return {
         "counts": {"cells": cells.n_cells, "facets": len(boundary.facets), "seam faces": len(shared)},
+        "points": counted.own,
         "seams": seams,
         "parts": parts,
         FILES: written,
@@ -225,8 +201,10 @@ def measure_fit(task: Task) -> Facts:
 def sum_up(task: Task) -> Facts:
     """Add up the quality of all cells and the fit of all points, and join the parts of tiles, over the region."""
     quality: dict[str, Histogram] = {}
-    tiles = []
+    tiles, points = [], []
     for result in task.read("pieces"):
+        arrays = result.arrays
+        points.append(PartCounts(result.facts["points"], arrays["part"], arrays["part_levels"], arrays["unused"]))
         faces = {seam: found["faces"] for seam, found in result.facts["seams"].items()}
         sides = [seam_name(seam) for seam in seams_of_tile(tile_key(result.name))]
         tiles.append(read_tile_parts(result.name, result.facts["parts"], faces, result.arrays, sides))
@@ -240,7 +218,7 @@ def sum_up(task: Task) -> Facts:
         sums = FidelitySums(**{kind: _residuals(result, kind) for kind in KINDS})
         total = merge_fidelity([total, sums]) if total is not None else sums
     facts: Facts = {"quality": histogram_percentiles(quality), "building_points": dict(building_points)}
-    facts["parts"] = join_tiles(tiles)
+    facts |= {"parts": join_tiles(tiles), "points": count_all_points(points)}
     return facts | {"fidelity": fidelity_table(conclude_fidelity(total)) if total is not None else {}}
 
 

@@ -51,7 +51,7 @@ def unpack_pinched(seam: Seam, result: Result) -> list[tuple[Seam, Levels]]:
             dataclasses.replace(seam, xy=seam.xy[[-k]]),
             Levels(arrays[f"end{k}_start"], arrays[f"end{k}_z"], arrays[f"end{k}_surface"]),
         )
-        for k, _ in result.facts.get("pinched", [])
+        for k in result.facts.get("pinched", [])
     ]
 
 

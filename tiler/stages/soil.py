@@ -24,7 +24,7 @@ def unpack_pinched_soil(result: Result) -> list[Levels]:
     """Read the columns of soil of the ends of a border in which two tiles meet alone, as `unpack_pinched` does."""
     arrays = result.arrays
     return [
-        _levels(arrays[f"end{k}_soil_start"], arrays[f"end{k}_soil_z"]) for k, _ in result.facts.get("pinched", [])
+        _levels(arrays[f"end{k}_soil_start"], arrays[f"end{k}_soil_z"]) for k in result.facts.get("pinched", [])
     ]
 
 

@@ -35,7 +35,6 @@ STAGES: dict[str, tuple[str, str]] = {
     "seams": (SEAMS, "seams"),
     "columns": (MESH, "columns of cells"),
     "pieces": (OUTPUT, "files of the mesh"),
-    "numbers": (OUTPUT, "numbers of points"),
     "citymodel": (OUTPUT, "file of the city model"),
     "citymodel-full": (OUTPUT, "file of the full city model"),
     "fit": (OUTPUT, "distance of points to the model"),

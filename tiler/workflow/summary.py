@@ -221,7 +221,7 @@ def _join_counts(engine: Engine, plan: Plan, rounds: int) -> dict[str, int]:
                 total["facets"] += counts["facets"]
             else:
                 add_counts(total, counts)
-    total["points"] = engine.records["numbers", REGION_ITEM].facts["points"]
+    total["points"] = engine.records["report", REGION_ITEM].facts["points"]
     return dict(total)
 
 
