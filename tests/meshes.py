@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.citymodel import CityModel, number_ids
 from pipeline.mesh import Boundary, Marker, TetMesh
+from tiler.citymodels.cityjson import write_city_model
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
 
 Square = tuple[int, int]
@@ -145,7 +146,9 @@ def write_run(
     region = {"bounds": list(city.bounds), "crs": "EPSG:28992"}
     record = {"schema": 1, "status": "done", "region": region, "counts": counts, "quality": {}}
     (directory / "run.json").write_text(json.dumps(record))
-    (directory / "citymodel.city.json").write_text(json.dumps(_make_cityjson(city.model)))
+    (x0, y0, x1, y1), z = city.bounds, city.mesh.points[:, 2]
+    box = (x0, y0, z.min(), x1, y1, z.max())
+    write_city_model(directory / "citymodel.city.json", city.model, crs="EPSG:28992", bounds=box)
 
 
 def edit_json(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
@@ -217,33 +220,3 @@ def _mark(
     if not near.any():
         return Marker.GROUND, -1
     return Marker.ROOF if up < 0 else Marker.WALL, int(model.numbers[near.argmax()])
-
-
-def _make_cityjson(model: CityModel) -> dict[str, Any]:
-    scale, translate = 0.001, [*CORNER, 0.0]
-    vertices: list[list[int]] = []
-    objects = {}
-    rows = zip(model.polygons, model.ids, model.numbers, model.ground, model.roof, strict=True)
-    for polygon, name, number, ground, roof in rows:
-        rings = []
-        for ring in shapely.get_rings(polygon):
-            xy = shapely.get_coordinates(ring)[:-1]
-            places = np.column_stack([xy, np.full(len(xy), ground)])
-            rings.append(list(range(len(vertices), len(vertices) + len(xy))))
-            vertices += np.rint((places - translate) / scale).astype(int).tolist()
-        objects[str(name)] = {
-            "type": "Building",
-            "attributes": {
-                "number": int(number),
-                "ground_height": float(ground),
-                "roof_height": float(roof),
-            },
-            "geometry": [{"type": "MultiSurface", "lod": "0", "boundaries": [rings]}],
-        }
-    return {
-        "type": "CityJSON",
-        "version": "2.0",
-        "transform": {"scale": [scale] * 3, "translate": translate},
-        "CityObjects": objects,
-        "vertices": vertices,
-    }

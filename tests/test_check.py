@@ -39,7 +39,7 @@ from tiler.mesh_files.vtk_files import write_vtp, write_vtu
 from tiler.mesh_files.vtk_xml import make_stream, write_data_file
 
 Tamper = Callable[[TinyCity], TinyCity]
-N_PROOFS = 14
+N_PROOFS = 15
 
 
 @pytest.fixture(scope="module")
@@ -209,8 +209,8 @@ def fill_house(city: TinyCity) -> TinyCity:
 
 def leave_house_out_of_model(city: TinyCity) -> TinyCity:
     model, keep = city.model, np.arange(len(city.model)) != 1
-    rows = {name: getattr(model, name)[keep] for name in ("polygons", "ids", "numbers", "ground", "roof")}
-    return replace(city, model=replace(model, **rows))
+    rows = {name: getattr(model, name)[keep] for name in ("polygons", "ids", "numbers", "ground", "roof", "house")}
+    return replace(city, model=replace(model, **rows, members=model.members[:1] + model.members[2:]))
 
 
 def raise_roof_in_model(city: TinyCity) -> TinyCity:
@@ -509,6 +509,50 @@ def add_building(model: dict[str, Any]) -> None:
     model["CityObjects"]["another"] = new
 
 
+def take_solid(model: dict[str, Any], house: str = "corner-a") -> list[Any]:
+    """Faces of the solid of a house."""
+    faces: list[Any] = model["CityObjects"][house]["geometry"][1]["boundaries"][0]
+    return faces
+
+
+def raise_vertices(model: dict[str, Any]) -> None:
+    """The roof of a solid 5 m up, walls too; attributes as they were."""
+    for vertex in {vertex for ring in take_solid(model)[1] for vertex in ring}:
+        model["vertices"][vertex][2] += 5000
+
+
+def move_solid(model: dict[str, Any]) -> None:
+    """The whole solid 2 m to the east, the outline as it was."""
+    place = {}
+    for face in take_solid(model):
+        for ring in face:
+            for k, vertex in enumerate(ring):
+                if vertex not in place:
+                    x, y, z = model["vertices"][vertex]
+                    place[vertex] = len(model["vertices"])
+                    model["vertices"].append([x + 2000, y, z])
+                ring[k] = place[vertex]
+
+
+def turn_solid(model: dict[str, Any]) -> None:
+    for face in take_solid(model):
+        for ring in face:
+            ring.reverse()
+
+
+def drop_solid(model: dict[str, Any]) -> None:
+    del model["CityObjects"]["corner-a"]["geometry"][1]
+
+
+def drop_wall(model: dict[str, Any]) -> None:
+    take_solid(model).pop()
+    model["CityObjects"]["corner-a"]["geometry"][1]["semantics"]["values"][0].pop()
+
+
+def add_parent(model: dict[str, Any]) -> None:
+    model["CityObjects"]["corner-a"]["parents"] = ["corner-b"]
+
+
 def nudge_volume(folder: Path) -> None:
     """Move a wall vertex by the last bit of its x, in the volume alone."""
     mesh = make_city().mesh
@@ -576,6 +620,16 @@ FILES: dict[str, tuple[Callable[[Path], None], set[str]]] = {
         ),
         {"roof-height"},
     ),
+    "solid raised": (edit_model(raise_vertices), {"solid-height", "solid-volume"}),
+    "solid moved": (edit_model(move_solid), {"solid-plan"}),
+    "solid inside out": (edit_model(turn_solid), {"solid-volume"}),
+    "solid gone": (edit_model(drop_solid), {"solid-missing"}),
+    "solid open": (edit_model(drop_wall), {"solid-open"}),
+    "height off": (
+        edit_model(lambda model: model["CityObjects"]["corner-a"]["attributes"].update(height=3.0)),
+        {"height-attribute"},
+    ),
+    "part of another house": (edit_model(add_parent), {"parts"}),
     "last bit of a vertex": (nudge_volume, {"facet-missing", "facet-extra", "vertex-link"}),
     "other order of points": (shuffle_vertices, {"vertex-link"}),
     "boundary vertex twice": (unmerge_boundary, {"vertex-duplicate", "vertex-link"}),

@@ -15,6 +15,7 @@ from stitch.frontier import Settled, add_rim, close_frontier, start_frontier
 from tiler.check import city_proofs, pad_proofs, proofs, soil_proofs
 from tiler.check.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
 from tiler.check.proofs import Dtm, Fault, Finding, Proof, Vertices
+from tiler.check.solid_proofs import SolidProofs
 from tiler.citymodels.building_index import BuildingIndex, index_buildings
 from tiler.mesh_files.mesh_parts import tell_parts
 from tiler.mesh_files.vtk_files import read_piece_paths
@@ -99,7 +100,8 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
     some 100 bytes a building and 500 a piece.
     """
     record = read_run_record(directory / RUN_RECORD)
-    with index_buildings(directory / CITY_MODEL) as index:
+    solids = SolidProofs()
+    with index_buildings(directory / CITY_MODEL, solids.add) as index:
         files = _in_order(_pair_pieces(directory), record)
         dtm = load_dtm(directory / STORE)
         sums = _Sums.start(len(index))
@@ -112,6 +114,7 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
             sums.add_settled(settled)
         sums.add_settled(close_frontier(frontier))
         claims, facts = _conclude(sums, len(files), record, index)
+        claims += (solids.prove(),)
         parts = sums.count_parts()
         remarks = (tell_parts(parts),) if len(parts) > 1 else ()
         return CheckReport(directory, claims, {**facts, "parts": len(parts)}, remarks)

@@ -1,7 +1,7 @@
 """The buildings of a city model larger than memory: indexed by number and by place, loaded where needed."""
 
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ BLOCK = 1 << 14  # vertices that are read at once
 KEPT_BLOCKS = 32
 HEAD = np.dtype([("ground", "<f8"), ("roof", "<f8")])
 Box = tuple[float, float, float, float]
+See = Callable[[str, Any, "Vertices", tuple[float, float, Any] | None], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +80,16 @@ class BuildingIndex:
 
 
 @contextmanager
-def index_buildings(path: Path) -> Iterator[BuildingIndex]:
+def index_buildings(path: Path, see: See | None = None) -> Iterator[BuildingIndex]:
     """Index the buildings of a CityJSON file, or their parts: numbers, heights and LoD 0 footprints.
 
     Parameters
     ----------
     path : Path
         The file, in any layout.
+    see : callable, optional
+        Is called with each object as it is read: its id, itself, the vertices, and the heights of ground and roof
+        (m) and footprint that were read of it, or None for a house of parts.
 
     Raises
     ------
@@ -100,7 +104,7 @@ def index_buildings(path: Path) -> Iterator[BuildingIndex]:
     with TemporaryFile() as file:
         with TemporaryFile() as spool:
             vertices = spool_vertices(path, spool)
-            index = _read_objects(path, vertices, file)
+            index = _read_objects(path, vertices, file, see)
         if np.any(index.numbers[1:] == index.numbers[:-1]):
             raise InputError(f"{path}: two buildings have one number; give each its own id and run again")
         yield index
@@ -223,14 +227,18 @@ def _rows(vertices: list[Any]) -> NDArray[np.float64]:
     return rows
 
 
-def _read_objects(path: Path, vertices: Vertices, file: IO[bytes]) -> BuildingIndex:
+def _read_objects(path: Path, vertices: Vertices, file: IO[bytes], see: See | None) -> BuildingIndex:
     """Read the objects of a CityJSON file that have no parts, and write their heights and footprints."""
     numbers, boxes, starts, sizes = array("q"), array("f"), array("q"), array("i")
     start = 0
     for name, thing in read_objects(path):
         if has_parts(path, thing):
+            if see is not None:
+                see(name, thing, vertices, None)
             continue
         number, ground, roof, footprint = read_building(path, name, thing, vertices)
+        if see is not None:
+            see(name, thing, vertices, (ground, roof, footprint))
         data = np.array([(ground, roof)], HEAD).tobytes() + shapely.to_wkb(footprint)
         _write(file, data)
         numbers.append(number)
@@ -296,11 +304,12 @@ def read_building(
 
 
 def _read_polygon(rings: list[list[int]], vertices: Vertices) -> Any:
-    shell, *holes = (vertices.take(_checked(ring, len(vertices)))[:, :2] for ring in rings)
+    shell, *holes = (vertices.take(check_indices(ring, len(vertices)))[:, :2] for ring in rings)
     return shapely.Polygon(shell, holes)
 
 
-def _checked(ring: list[int], n_vertices: int) -> NDArray[np.int64]:
+def check_indices(ring: list[int], n_vertices: int) -> NDArray[np.int64]:
+    """Make an array of a ring's vertices; IndexError if the city model has not so many."""
     indices = np.array(ring, np.int64)
     if indices.ndim != 1 or indices.min() < 0 or indices.max() >= n_vertices:
         raise IndexError(f"vertex {indices.min()}..{indices.max()} of {n_vertices}")
