@@ -92,6 +92,19 @@ def test_a_refused_run_leaves_no_folder(tmp_path: Path, capsys: Capture, wrong: 
     assert not (tmp_path / "new").exists()
 
 
+def test_a_run_that_fails_before_a_cloud_is_read_leaves_no_folder(tmp_path: Path, capsys: Capture) -> None:
+    city = write_city(tmp_path / "city")
+    cloud = city / "cloud.laz"
+    data = bytearray(cloud.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 200] = b"\xff" * 200
+    cloud.write_bytes(data)
+    assert call(capsys, "run", cloud, "--out", tmp_path / "new" / "out", *QUICK).code == 1
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "old").mkdir()
+    assert call(capsys, "run", cloud, "--out", tmp_path / "old", *QUICK).code == 1
+    assert json.loads((tmp_path / "old" / "run.json").read_text())["status"] == "failed"
+
+
 def test_a_folder_that_was_there_stays(tmp_path: Path, capsys: Capture) -> None:
     city = write_city(tmp_path / "city")
     (tmp_path / "out").mkdir()

@@ -1,5 +1,6 @@
 """Refuse to run into a folder that holds the finished run of another region."""
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from tiler.georeference.crs import same_crs
 from tiler.objects.places import absolute, in_bucket
 from tiler.planning.region import Region
 from tiler.words.plain_text import tell_box
-from tiler.workflow.out_folder import RUN_RECORD
+from tiler.workflow.out_folder import RUN_RECORD, STORE
 from tiler.workflow.run_folder import WRONG_FIELD, opened_json
 
 COMMON = 0.5  # share of the larger region's area from which on other files are newer ones of the same region
@@ -118,5 +119,14 @@ def remove_folders(made: Sequence[Path]) -> None:
     for folder in made:
         try:
             folder.rmdir()
+        except FileNotFoundError:
+            continue
         except OSError:
             return
+
+
+def remove_if_useless(made: Sequence[Path]) -> None:
+    """Remove what a failed run has written where no point cloud was read: a next run would save nothing by it."""
+    if made and not any(made[0].glob(f"{STORE}/points/*/")):
+        shutil.rmtree(made[0], ignore_errors=True)
+        remove_folders(made)

@@ -52,7 +52,12 @@ from tiler.workflow.failed_tiles import (
     leave_holes,
     save_config,
 )
-from tiler.workflow.other_region import find_missing_folders, refuse_other_region, remove_folders
+from tiler.workflow.other_region import (
+    find_missing_folders,
+    refuse_other_region,
+    remove_folders,
+    remove_if_useless,
+)
 from tiler.workflow.out_folder import (
     INDEXES,
     MANIFEST_PATH,
@@ -178,11 +183,17 @@ def run(
                 compilers = config.workers if compilers is None else compilers
                 beforehand = here and not is_repeated(config)
                 means = _Means(dashboard, shown, executor, cluster, compilers if beforehand else 0)
-                return _run(config, out, earlier, damage, own, announce, told, means)
+                try:
+                    return _run(config, out, earlier, damage, own, announce, told, means)
+                except (StoppedError, LostFolderError):
+                    raise
+                except Exception:
+                    remove_if_useless(made)
+                    raise
     except BaseException as error:
-        remove_folders(made)  # those of a run that has begun are not empty
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
             told.end("failed", tell_error(error))
+        remove_folders(made)
         raise
 
 
