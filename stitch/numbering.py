@@ -137,6 +137,8 @@ def count_all_points(tiles: Sequence[PartCounts]) -> int:
     >>> count_all_points([one]), count_all_points([one, two])
     (7, 10)
     """
+    if not tiles:
+        return 0
     part, first, n_tiles = np.unique(
         np.concatenate([tile.part for tile in tiles]), return_index=True, return_counts=True
     )

@@ -5,6 +5,7 @@ import gzip
 import json
 import math
 from collections.abc import Callable
+from http.client import responses
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +67,12 @@ class Base(RequestHandler):
         if self.loopback and _host_name(self.request.host) not in LOOPBACK:
             raise HTTPError(403, reason="ask by 127.0.0.1 or localhost")
 
-    def write_error(self, status_code: int, **_: Any) -> None:
+    def write_error(self, status_code: int, **others: Any) -> None:
         """Say what is wrong in one line of plain text."""
+        error = others.get("exc_info", (None, None, None))[1]
+        reason = getattr(error, "reason", None) or responses.get(status_code, "unknown")
         self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish(f"{status_code} {self._reason}\n")
+        self.finish(f"{status_code} {reason}\n")
 
     async def reply(self, make: Callable[[], tuple[str, str]]) -> None:
         """Make an answer and its type in a thread of its own, and send it, packed where that is worth it."""
