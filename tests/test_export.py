@@ -12,7 +12,7 @@ import pytest
 from pipeline.errors import OutputError
 from tiler.cli.main import main
 from tiler.config.config import make_config
-from tiler.formats.export import FORMATS, export_run
+from tiler.export.export import export_run, list_formats, load_format
 from tiler.interface.synth import write_city
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu
 from tiler.workflow.run import run
@@ -127,8 +127,9 @@ def test_help_has_a_line_a_format(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         main(["export", "--help"])
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    for name, kind in FORMATS.items():
-        assert [name, *kind.description.split()] in lines
+    for name in list_formats():
+        words = [name, *load_format(name).description.split()]
+        assert words in [line[: len(words)] for line in lines]
 
 
 def test_a_file_is_replaced_on_request_alone(
@@ -213,7 +214,7 @@ def test_what_is_no_finished_run_is_refused(
 
 
 def test_wrong_arguments_and_places(tiled: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="format 'nope' must be one of vtu, vtp"):
+    with pytest.raises(ValueError, match="format 'nope' must be one of cgns, cityjsonseq"):
         export_run(tiled, tmp_path / "all.obj", name="nope")
     with pytest.raises(OutputError, match=r"all.vtu: cannot be written \(No such file or directory\)"):
         export_run(tiled, tmp_path / "none" / "all.vtu", name="vtu")

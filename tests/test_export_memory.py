@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.hand_pieces import HandPieces, box_pieces
-from tiler.formats import msh, region_faces, rows
+from tiler.export import region_faces, rows
+from tiler.formats import msh
 from tiler.formats.openfoam import write_openfoam
 
 BLOCK = 2**10

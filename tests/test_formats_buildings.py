@@ -17,8 +17,8 @@ from tests.test_formats_cgns import corners_of, read_with_vtk
 from tests.test_formats_glb import read_document, turned, validate
 from tests.test_formats_msh import check_with_gmsh
 from tiler.cli.main import main
-from tiler.formats.export import FORMATS, export_run
-from tiler.formats.foam_patches import HOUSE, building_name
+from tiler.export.export import export_run, load_format
+from tiler.export.foam_patches import HOUSE, building_name
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.vtk_files import read_vtp
 
@@ -30,7 +30,7 @@ PER_PATCH = ["stl", "obj", "glb", "msh", "msh2", "cgns"]
 def exported(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The small city with a patch a building, in all formats that have one."""
     folder = tmp_path_factory.mktemp("buildings")
-    files = {name: folder / f"{name}{FORMATS[name].suffix}" for name in PER_PATCH}
+    files = {name: folder / f"{name}{load_format(name).suffix}" for name in PER_PATCH}
     for name, path in files.items():
         command = ["export", str(small_run), "--format", name, "-o", str(path)]
         assert main([*command, "--buildings", "patches"]) == 0
@@ -149,7 +149,7 @@ def test_numbers_stand_beside_the_facets_in_vtp(small_run: Path, tmp_path: Path)
 def test_formats_without_patches_say_so(
     small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
-    target = tmp_path / f"x{FORMATS[name].suffix}"
+    target = tmp_path / f"x{load_format(name).suffix}"
     command = ["export", str(small_run), "--format", name, "-o", str(target), "--buildings", "patches"]
     assert main(command) == 2
     assert f"--buildings: format {name} does not take it" in capsys.readouterr().err

@@ -16,10 +16,10 @@ from pipeline.mesh import Marker
 from tests.hand_pieces import box_pieces
 from tests.programs import run_program
 from tiler.cli.main import main
+from tiler.export.export import export_run
+from tiler.export.foam_patches import HOUSE, PATCHES, building_name
 from tiler.formats import cgns
 from tiler.formats.cgns import write_cgns
-from tiler.formats.export import export_run
-from tiler.formats.foam_patches import HOUSE, PATCHES, building_name
 from tiler.mesh_files.mesh_pieces import open_pieces
 
 Corners = NDArray[np.float64]

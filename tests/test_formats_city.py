@@ -16,9 +16,9 @@ from pipeline.errors import CityError, InputError, OutputError
 from tests.cityjson_rules import file_faults, solid_faults
 from tiler.citymodels.cityjson import read_city_model, write_city_model
 from tiler.cli.main import main
+from tiler.export.export import export_run
 from tiler.formats import gpkg
 from tiler.formats.cityjsonseq import CITY_MODEL, write_cityjsonseq
-from tiler.formats.export import export_run
 from tiler.formats.gpkg import write_gpkg
 
 SUFFIX = {"cityjsonseq": "jsonl", "gpkg": "gpkg"}

@@ -17,9 +17,9 @@ from tests.hand_pieces import HandPieces, box_pieces
 from tests.programs import run_program
 from tests.test_formats_surfaces import Facets, facets_of, open_edges, rows_of
 from tiler.cli.main import main
+from tiler.export.export import export_run
+from tiler.export.foam_patches import PATCHES
 from tiler.formats import glb
-from tiler.formats.export import export_run
-from tiler.formats.foam_patches import PATCHES
 from tiler.formats.glb import write_glb
 from tiler.mesh_files.mesh_pieces import open_pieces
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pipeline.mesh import Marker
 from tests.programs import mesh_is_ok, read_check, run_foam, run_program
 from tiler.cli.main import main
-from tiler.formats.export import export_run
-from tiler.formats.foam_patches import PATCHES
+from tiler.export.export import export_run
+from tiler.export.foam_patches import PATCHES
 from tiler.formats.msh import AIR
 from tiler.mesh_files.mesh_pieces import open_pieces
 

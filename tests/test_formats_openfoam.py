@@ -26,12 +26,13 @@ from tests.foam_reader import (
 from tests.hand_pieces import HandPieces, box_pieces
 from tests.programs import mesh_is_ok, read_check, run_foam
 from tiler.cli.main import main
-from tiler.formats import openfoam, region_faces
-from tiler.formats.export import export_run
-from tiler.formats.foam_patches import PATCHES
+from tiler.export import region_faces
+from tiler.export.export import export_run
+from tiler.export.foam_patches import PATCHES
+from tiler.export.partition import split_pieces
+from tiler.export.pieces import Pieces
+from tiler.formats import openfoam
 from tiler.formats.openfoam import write_openfoam
-from tiler.formats.partition import split_pieces
-from tiler.formats.pieces import Pieces
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu
 from tiler.store.atomic import replacing_folder
 

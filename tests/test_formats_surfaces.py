@@ -15,12 +15,12 @@ from pipeline.errors import CityError
 from pipeline.mesh import Boundary, Marker
 from tests.hand_pieces import HandPieces, box_pieces
 from tiler.cli.main import main
-from tiler.formats.export import export_run
-from tiler.formats.foam_patches import PATCHES
+from tiler.export.export import export_run
+from tiler.export.foam_patches import PATCHES
+from tiler.export.surface import VertexSet, open_surface
 from tiler.formats.obj import write_obj
 from tiler.formats.ply import write_ply
 from tiler.formats.stl import write_stl
-from tiler.formats.surface import VertexSet, open_surface
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.vtk_files import read_vtp, write_vtp
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.errors import OutputError
 from tests.programs import MPI, PACKAGES, run_program
 from tiler.cli.main import main
-from tiler.formats.export import export_run
+from tiler.export.export import export_run
 from tiler.mesh_files.mesh_pieces import open_pieces
 
 POISSON = Path(__file__).with_name("poisson_dolfinx.py")

@@ -17,9 +17,10 @@ from tests.bad_input import call, write_cloud, write_houses
 from tests.cities import cloud_over
 from tiler.check.check import check_run
 from tiler.config.config import make_config
-from tiler.formats.export import export_run, find_files, take_largest_part
+from tiler.export.export import export_run
 from tiler.mesh_files.mesh_parts import TileParts, join_tiles, label_triangles, tell_parts
 from tiler.mesh_files.mesh_pieces import open_pieces
+from tiler.mesh_files.run_files import find_files, take_largest_part
 from tiler.report import write_report
 from tiler.store.results import StoredTerrain
 from tiler.workflow.run import run

@@ -26,7 +26,7 @@ from tiler.config.config import Config, check_height, load_config, make_config
 from tiler.config.pad_widths import widths_in_metres
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
-from tiler.formats.export import export_run
+from tiler.export.export import export_run
 from tiler.mesh_files.vtk_files import read_vtu
 from tiler.planning.context import absent_tiles, choose_tiles
 from tiler.planning.pad import pad_bounds, pad_grid

@@ -36,7 +36,7 @@ from tests.test_tiles import prove_local, put_beside
 from tests.tiles import hash_files, make_town, run_of, write_town
 from tiler.check.check import CheckReport, check_run
 from tiler.config.config import Config, idle_parameters, make_config
-from tiler.formats.export import export_run
+from tiler.export.export import export_run
 from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu, write_vtp, write_vtu
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store

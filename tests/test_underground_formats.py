@@ -22,8 +22,8 @@ from tests.programs import mesh_is_ok, read_check, run_foam, run_program
 from tests.test_formats_openfoam import MESH, assert_in_order, volumes_of
 from tiler.cli.main import main
 from tiler.config.config import make_config
-from tiler.formats.export import FORMATS, export_run
-from tiler.formats.foam_patches import PATCHES
+from tiler.export.export import export_run, list_formats, load_format
+from tiler.export.foam_patches import PATCHES
 from tiler.formats.openfoam import write_openfoam
 from tiler.interface.synth import write_city
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
@@ -279,9 +279,9 @@ def test_a_surface_without_its_ground_is_closed(soil_run: Path, tmp_path: Path) 
     assert len(pair_edges(np.concatenate((outer, np.array(groups["ground"], np.int32)))).open) > 0
 
 
-@pytest.mark.parametrize("name", sorted(FORMATS.keys() - {"cgns"}))
+@pytest.mark.parametrize("name", sorted({*list_formats()} - {"cgns"}))
 def test_every_other_format_takes_a_mesh_with_soil(soil_run: Path, tmp_path: Path, name: str) -> None:
-    target = tmp_path / f"a{FORMATS[name].suffix}"
+    target = tmp_path / f"a{load_format(name).suffix}"
     export_run(soil_run, target, name=name)
     assert target.exists()
 

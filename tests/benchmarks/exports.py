@@ -18,7 +18,7 @@ from typing import Any
 from tests.benchmarks.bench_report import REPORT
 from tests.benchmarks.reliability import replace_between
 from tests.benchmarks.runs import citystitch, record_of
-from tiler.formats.export import FORMATS, export_run
+from tiler.export.export import export_run, list_formats, load_format
 
 BOUND = 2**30  # bytes of memory that no export may exceed: all of them stream
 ALONE = "--alone"  # the process that exports once, and says what it took
@@ -28,7 +28,7 @@ BY_BUILDING = ("openfoam", "cgns", "msh", "glb")
 
 def cases(n_tiles: int) -> list[tuple[str, dict[str, Any]]]:
     """Formats and options to measure: each format as it is, and what else changes its memory."""
-    found: list[tuple[str, dict[str, Any]]] = [(name, {}) for name in FORMATS]
+    found: list[tuple[str, dict[str, Any]]] = [(name, {}) for name in list_formats()]
     found.append(("vtu", {"scalars": True}))
     found += [(name, {"buildings": "patches"}) for name in BY_BUILDING]
     if n_tiles >= PARTS:
@@ -51,7 +51,7 @@ def export_alone(directory: Path, output: Path, name: str, options: Mapping[str,
 def measure(directory: Path, name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Export in a fresh process to a folder that is gone afterwards."""
     with tempfile.TemporaryDirectory() as folder:
-        output = str(Path(folder) / f"city{FORMATS[name].suffix}")
+        output = str(Path(folder) / f"city{load_format(name).suffix}")
         words = [ALONE, str(directory), output, name, json.dumps(options)]
         done = subprocess.run(
             [sys.executable, "-m", "tests.benchmarks.exports", *words], check=True, capture_output=True, text=True

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
-from tiler.cli.parser import Handler, build_parser
+from tiler.cli.parser import EXPORT_OPTION, Handler, build_parser
 from tiler.config.config import Config, annotated_defaults, make_config
 from tiler.executors import fork_server
 from tiler.executors.importing import uncollected
 from tiler.executors.kept_memory import keep_memory, look_seldom
-from tiler.formats.export import FORMATS, refuse_strangers
 from tiler.interface.api import with_file
 from tiler.jobs.commands import describe_job, find_run, job_line
+from tiler.mesh_files.run_files import refuse_strangers
 from tiler.objects.places import place, refuse_bucket
 from tiler.words.plain_text import printable
 from tiler.words.std_streams import guard_streams
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 DEMO_TILES = 3  # tiles along each side of the demo's city, fewer where they would be too small
 LEAST_DEMO_TILE = 150.0  # m
-EXPORT_OPTIONS = {option for kind in FORMATS.values() for option in kind.options}
 BLOCK = Path(__file__).parents[1] / "demo_block"  # real data of a few hundred kilobytes
 
 
@@ -339,10 +338,14 @@ def _render(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from tiler.formats.export import export_run
+    from tiler.export.export import export_run
 
     refuse_strangers(options.directory)
-    given = {name: value for name, value in vars(options).items() if name in EXPORT_OPTIONS}
+    given = {
+        name.removeprefix(EXPORT_OPTION): value
+        for name, value in vars(options).items()
+        if name.startswith(EXPORT_OPTION)
+    }
     export_run(options.directory, options.output, name=options.format, overwrite=options.overwrite, options=given)
     say(str(options.output))
     return 0

@@ -11,7 +11,7 @@ from pipeline.errors import ConfigError
 from tiler.config.config import Config
 from tiler.config.domain_height import Height
 from tiler.executors.addresses import ANYWHERE
-from tiler.formats.export import FORMATS
+from tiler.export.export import list_formats, load_format
 from tiler.interface.api import POSITIONAL
 from tiler.jobs.commands import add_job_commands
 from tiler.objects.places import place, refuse_bucket
@@ -30,6 +30,7 @@ KINDS = {
     **{"out": "DIR", "crs": "EPSG", "layer": "LAYER", "scheduler": "ADDRESS"},
     **dict.fromkeys(("id_attribute", "height_attribute"), "ATTRIBUTE"),
 }
+EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
 # What a first run needs stands first in the help of a run, what is for studies of the method last.
 ESSENTIAL = (
     *("footprints", "out", "crs", "bounds", "mesh_size", "domain_height", "border", "tile_size", "workers"),
@@ -74,7 +75,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
 
     def add(name: str, handler: Handler, text: str) -> argparse.ArgumentParser:
         sub: argparse.ArgumentParser = commands.add_parser(
-            name, help=text, description=text, epilog=EXIT_CODES, parents=[common]
+            name, help=text, description=text, epilog=EXIT_CODES, parents=[common], conflict_handler="resolve"
         )
         sub.set_defaults(handler=handler, parser=sub)
         return sub
@@ -271,10 +272,28 @@ def _add_fetch(fetch: argparse.ArgumentParser) -> None:
     fetch.add_argument("directory", type=Path, metavar="DIR", help="folder to write")
 
 
+class _ExportHelp(argparse.Action):
+    """Print help with the table of formats, which is made of their modules."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        names = list_formats()
+        width = max(map(len, names))
+        rows = []
+        for name in names:
+            kind = load_format(name)
+            options = ", ".join(f"--{option.replace('_', '-')}" for option in kind.options)
+            rows.append(f"  {name:<{width}}  {kind.description}" + (f" ({options})" if options else ""))
+        parser.formatter_class = argparse.RawDescriptionHelpFormatter
+        parser.epilog = "\n".join(["formats:", *rows, "", EXIT_CODES])
+        parser.print_help()
+        parser.exit()
+
+
 def _add_export(export: argparse.ArgumentParser) -> None:
-    """Add the options of all formats, and the table of these below them."""
+    """Add the options of all formats; which of them a format takes is told by it."""
+    export.add_argument("-h", "--help", nargs=0, action=_ExportHelp, help="show this help message and exit")
     export.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
-    export.add_argument("--format", choices=tuple(FORMATS), metavar="NAME", required=True, help="see below")
+    export.add_argument("--format", choices=list_formats(), metavar="NAME", required=True, help="see below")
     export.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write")
     export.add_argument("--overwrite", action="store_true", help="replace it if it exists")
     given: dict[str, dict[str, Any]] = {
@@ -282,7 +301,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         "case": {"choices": ("wind",), "help": "add the files of a simulation"},
         "buildings": {
             "choices": ("patches", "zones"),
-            "help": "one patch a building instead of walls and roofs; zones: one face zone beside them (openfoam)",
+            "help": "one patch a building instead of walls and roofs; zones: one face zone beside them",
         },
         "largest_part": {
             "action": "store_true",
@@ -291,13 +310,9 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
     }
     for option, words in given.items():
-        takers = ", ".join(name for name, kind in FORMATS.items() if option in kind.options)
-        words |= {"default": argparse.SUPPRESS, "help": f"{takers}: {words['help']}"}
-        export.add_argument(f"--{option.replace('_', '-')}", **words)
-    width = max(map(len, FORMATS))
-    rows = [f"  {name:<{width}}  {kind.description}" for name, kind in FORMATS.items()]
-    export.formatter_class = argparse.RawDescriptionHelpFormatter
-    export.epilog = "\n".join(["formats:", *rows, "", EXIT_CODES])
+        export.add_argument(
+            f"--{option.replace('_', '-')}", dest=EXPORT_OPTION + option, default=argparse.SUPPRESS, **words
+        )
 
 
 def _on_disk(text: str) -> Path:

@@ -1,1 +1,1 @@
-"""Files that solvers and viewers read as they are, one format a file: see `tiler.formats.export.FORMATS`."""
+"""One file format a module, by its name, with a `tiler.export.export.Format` called ``FORMAT``."""

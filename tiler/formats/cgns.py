@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError
-from tiler.formats.export import RUN_RECORD, RunFiles, RunSource
-from tiler.formats.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
-from tiler.formats.pieces import Pieces
-from tiler.formats.rows import blocks_of
+from tiler.export.export import PER_BUILDING, Format
+from tiler.export.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
+from tiler.export.pieces import Pieces
+from tiler.export.rows import blocks_of
 from tiler.formats.xdmf import as_output_error
 from tiler.mesh_files.mesh_pieces import open_pieces
+from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
 from tiler.store.atomic import replacing
 from tiler.workflow.run_folder import read_crs
 
@@ -215,3 +216,6 @@ def _describe(group: h5py.Group, name: str, label: str, kind: str) -> None:
 
 def _characters(text: str) -> NDArray[np.int8]:
     return np.frombuffer(text.encode(), np.int8)
+
+
+FORMAT = Format("mesh and named patches as CGNS in HDF5", export_cgns, options=PER_BUILDING, suffix=".cgns")

@@ -10,6 +10,8 @@ import numpy as np
 
 from pipeline.errors import InputError
 from tiler.citymodels.building_index import Vertices, has_parts, read_objects, spool_vertices
+from tiler.export.export import Format
+from tiler.mesh_files.run_files import RunFiles
 from tiler.store.atomic import replacing
 from tiler.workflow.run_folder import WRONG_FIELD, broken_field
 
@@ -142,3 +144,10 @@ def _move(boundaries: Any, places: Mapping[int, int]) -> list[Any]:
 
 def _line(document: Any) -> bytes:
     return (json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n").encode("ascii")
+
+
+def _write(path: Path, files: RunFiles) -> None:
+    export_cityjsonseq(path, files.directory)
+
+
+FORMAT = Format("the simplified city model as CityJSONSeq, one feature a building", _write, suffix=".jsonl")

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.mesh import Marker
-from tiler.formats.export import RUN_RECORD, RunFiles, RunSource
-from tiler.formats.foam_patches import FIRST_BUILDING, PATCHES, building_name, facets_by_key, is_house
-from tiler.formats.surface import (
+from tiler.export.export import PER_BUILDING, Format
+from tiler.export.foam_patches import FIRST_BUILDING, PATCHES, building_name, facets_by_key, is_house
+from tiler.export.surface import (
     Surface,
     SurfacePiece,
     SurfaceSurvey,
@@ -24,6 +24,7 @@ from tiler.formats.surface import (
     place_vertices,
     survey_surface,
 )
+from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
 from tiler.store.atomic import replacing
 from tiler.workflow.run_folder import read_crs
 
@@ -210,3 +211,8 @@ def _material(marker: Marker) -> dict[str, Any]:
     surface = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
     material = {"name": PATCHES[marker], "pbrMetallicRoughness": surface, "doubleSided": True}
     return material if solid else material | {"alphaMode": "BLEND"}
+
+
+FORMAT = Format(
+    "the boundary as glTF 2.0, binary, one material a patch", export_glb, options=PER_BUILDING, suffix=".glb"
+)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import OutputError
 from tiler.citymodels.building_index import has_parts, read_building, read_objects, spool_vertices
+from tiler.export.export import Format
 from tiler.formats.cityjsonseq import CITY_MODEL
-from tiler.formats.export import RUN_RECORD
+from tiler.mesh_files.run_files import RUN_RECORD, RunFiles
 from tiler.store.atomic import replacing
 from tiler.workflow.run_folder import read_crs
 
@@ -146,3 +147,10 @@ def _fixed_time() -> Iterator[None]:
         yield
     finally:
         pyogrio.set_gdal_config_options(dict.fromkeys(TIME))
+
+
+def _write(path: Path, files: RunFiles) -> None:
+    export_gpkg(path, files.directory)
+
+
+FORMAT = Format("the simplified footprints with heights as GeoPackage", _write, suffix=".gpkg")

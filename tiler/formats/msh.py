@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.mesh import Marker, Region
-from tiler.formats.export import RunSource
-from tiler.formats.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
-from tiler.formats.pieces import Pieces
-from tiler.formats.rows import blocks_of, slices
+from tiler.export.export import PER_BUILDING, Format
+from tiler.export.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
+from tiler.export.pieces import Pieces
+from tiler.export.rows import blocks_of, slices
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
+from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
 
 # No marker has one of these numbers: some programs know groups by number alone.
@@ -250,3 +251,6 @@ def _write_lines(file: BinaryIO, line: str, rows: NDArray[Any]) -> None:
     for some in slices(len(rows)):
         numbers = rows[some].ravel().tolist()
         file.write((line * (some.stop - some.start) % tuple(numbers)).encode())
+
+
+FORMAT = Format("Gmsh's MSH 4.1, binary", export_msh, options=PER_BUILDING, suffix=".msh")

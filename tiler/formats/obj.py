@@ -5,10 +5,11 @@ from typing import Any, BinaryIO
 
 from numpy.typing import NDArray
 
-from tiler.formats.export import RunSource
-from tiler.formats.foam_patches import facets_by_key, patch_of_key
-from tiler.formats.rows import slices
-from tiler.formats.surface import Surface, keys_asked, open_surface, place_vertices, survey_surface
+from tiler.export.export import PER_BUILDING, Format
+from tiler.export.foam_patches import facets_by_key, patch_of_key
+from tiler.export.rows import slices
+from tiler.export.surface import Surface, keys_asked, open_surface, place_vertices, survey_surface
+from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
 
 VERTEX = "v" + " %24.16e" * 3 + "\n"
@@ -87,3 +88,8 @@ def _write_lines(file: BinaryIO, line: str, rows: NDArray[Any]) -> None:
     for some in slices(len(rows)):
         part = rows[some]
         file.write((line * len(part) % tuple(part.ravel().tolist())).encode())
+
+
+FORMAT = Format(
+    "the boundary as Wavefront OBJ, one group a patch", export_obj, options=PER_BUILDING, suffix=".obj"
+)

@@ -14,15 +14,16 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from pipeline.errors import CityError, ConfigError, InputError
-from tiler.formats.export import EXPORT_RECORD, RunFiles, RunSource
-from tiler.formats.foam_case import INLET, OUTLET, write_system, write_wind_case
-from tiler.formats.foam_files import LABEL_LIMIT
-from tiler.formats.foam_part import FoamPlan, PartCounts, PointPlaces, write_part
-from tiler.formats.foam_patches import FIRST_BUILDING, GROUND_ZONE, is_house
-from tiler.formats.partition import split_pieces
-from tiler.formats.pieces import Pieces
-from tiler.formats.region_faces import Ints, find_outer, survey_faces
+from tiler.export.export import EXPORT_RECORD, LARGEST_PART, Format
+from tiler.export.foam_case import INLET, OUTLET, write_system, write_wind_case
+from tiler.export.foam_files import LABEL_LIMIT
+from tiler.export.foam_part import FoamPlan, PartCounts, PointPlaces, write_part
+from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, is_house
+from tiler.export.partition import split_pieces
+from tiler.export.pieces import Pieces
+from tiler.export.region_faces import Ints, find_outer, survey_faces
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
+from tiler.mesh_files.run_files import RunFiles, RunSource
 from tiler.store.atomic import replacing_folder
 
 
@@ -174,3 +175,12 @@ def _by_ground(piece: MeshPiece) -> Ints:
 
 def _by_region(piece: MeshPiece) -> Ints:
     return np.empty(0, np.int64) if piece.region is None else piece.region.astype(np.int64)
+
+
+FORMAT = Format(
+    "a case folder of OpenFOAM",
+    export_openfoam,
+    options=("parts", "case", "buildings", LARGEST_PART),
+    buildings=("patches", "zones"),
+    folder=True,
+)

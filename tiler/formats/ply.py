@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import InputError
-from tiler.formats.export import RunSource
-from tiler.formats.foam_patches import patch_of_key
-from tiler.formats.surface import Surface, SurfaceSurvey, open_surface, place_vertices, survey_surface
+from tiler.export.export import LARGEST_PART, Format
+from tiler.export.foam_patches import patch_of_key
+from tiler.export.surface import Surface, SurfaceSurvey, open_surface, place_vertices, survey_surface
+from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
 
 VERTEX_BYTES = 24
@@ -95,3 +96,8 @@ def _header(survey: SurfaceSurvey) -> bytes:
         "",
     ]
     return "\n".join(lines).encode()
+
+
+FORMAT = Format(
+    "the boundary as PLY, binary, with marker and building", export_ply, options=(LARGEST_PART,), suffix=".ply"
+)

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.formats.export import RunSource
-from tiler.formats.foam_patches import facets_by_key, patch_of_key
-from tiler.formats.rows import slices
-from tiler.formats.surface import Surface, keys_asked, open_surface, survey_surface
+from tiler.export.export import PER_BUILDING, Format
+from tiler.export.foam_patches import facets_by_key, patch_of_key
+from tiler.export.rows import slices
+from tiler.export.surface import Surface, keys_asked, open_surface, survey_surface
+from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
 
 _CORNER = "      vertex" + " %23.16e" * 3 + "\n"
@@ -94,3 +95,6 @@ def _render(corners: NDArray[np.float64]) -> bytes:
 def _wide_enough(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Take for 0 what needs three digits of exponent: no metre is that short."""
     return np.where(np.abs(values) < 1e-99, 0.0, values)
+
+
+FORMAT = Format("the boundary as STL, text, one solid a patch", export_stl, options=PER_BUILDING, suffix=".stl")

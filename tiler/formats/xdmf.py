@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import OutputError
-from tiler.formats.export import RunSource
-from tiler.formats.pieces import Pieces
-from tiler.formats.rows import blocks_of
+from tiler.export.export import LARGEST_PART, Format
+from tiler.export.pieces import Pieces
+from tiler.export.rows import blocks_of
 from tiler.mesh_files.mesh_pieces import MeshPieces, open_pieces
+from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
 
 DATA = ".h5"  # suffix of the second file
@@ -154,3 +155,12 @@ def _render(data: str, n_points: int, n_cells: int, n_facets: int, tags: tuple[s
 
     cells = grid("mesh", "Tetrahedron", n_cells, "cells", tags)
     return HEAD + cells + grid("facets", "Triangle", n_facets, "facets", ("marker", "building")) + TAIL
+
+
+FORMAT = Format(
+    "mesh and marked facets for FEniCS and ParaView, with a file .h5 beside it",
+    export_xdmf,
+    options=(LARGEST_PART,),
+    suffix=".xdmf",
+    companion=".h5",
+)

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import CityError, ConfigError
-from tiler.formats.export import RUN_RECORD, export_run, find_files
+from tiler.export.export import export_run
+from tiler.mesh_files.run_files import RUN_RECORD, find_files
 from tiler.store.atomic import replacing
 
 if TYPE_CHECKING:

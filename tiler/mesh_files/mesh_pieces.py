@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.mesh import Marker, Region
 from stitch.numbering import Numbering
-from tiler.formats.export import RUN_RECORD, RunFiles, RunSource, find_files
 from tiler.mesh_files.merged import VERTEX_ID, number_piece, read_numbering
+from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource, find_files
 from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
 from tiler.workflow.run_folder import REGION, read_run_record
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch.cell_faces import CellFaces
-from tiler.formats.foam_files import FoamFaces, FoamList, foam_header
-from tiler.formats.foam_patches import (
+from tiler.export.foam_files import FoamFaces, FoamList, foam_header
+from tiler.export.foam_patches import (
     GROUND_ZONE,
     POLY_MESH,
     ZonesFile,
@@ -21,8 +21,8 @@ from tiler.formats.foam_patches import (
     runs_of,
     write_boundary,
 )
-from tiler.formats.pieces import Pieces
-from tiler.formats.region_faces import (
+from tiler.export.pieces import Pieces
+from tiler.export.region_faces import (
     FacetSets,
     Ints,
     OwnFaces,

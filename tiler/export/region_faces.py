@@ -18,7 +18,7 @@ from pipeline.errors import InputError
 from pipeline.mesh import Marker, Region
 from stitch.cell_faces import CellFaces, find_cell_faces
 from stitch.conformity import group_rows
-from tiler.formats.pieces import Pieces
+from tiler.export.pieces import Pieces
 from tiler.mesh_files.mesh_pieces import MeshPiece
 
 Ints = NDArray[np.int64]

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from tiler.formats.foam_files import foam_header
+from tiler.export.foam_files import foam_header
 
 CASES = ("wind",)
 SPEED, HEIGHT, ROUGHNESS = 5.0, 10.0, 0.5  # m/s at m above the inlet's lowest point; m

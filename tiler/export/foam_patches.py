@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.mesh import Marker, Region
-from tiler.formats.foam_files import foam_header
-from tiler.formats.region_faces import FacetSets, Ints
+from tiler.export.foam_files import foam_header
+from tiler.export.region_faces import FacetSets, Ints
 
 POLY_MESH = "constant/polyMesh"
 PATCHES = {

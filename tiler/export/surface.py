@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from tiler.formats.export import RunSource
-from tiler.formats.foam_patches import PATCHES, patch_keys
-from tiler.formats.rows import blocks_of
+from tiler.export.foam_patches import PATCHES, patch_keys
+from tiler.export.rows import blocks_of
 from tiler.mesh_files.merged import VERTEX_ID, number_piece
 from tiler.mesh_files.mesh_pieces import MeshPieces, mark_sides, open_pieces
+from tiler.mesh_files.run_files import RunSource
 from tiler.mesh_files.vtk_files import read_vtp
 
 WORD = 64  # points in a word of `VertexSet`

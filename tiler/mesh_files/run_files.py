@@ -1,0 +1,109 @@
+"""The files of a finished run that writers read, found by its index files."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pipeline.errors import ConfigError, InputError
+
+RUN_RECORD, VOLUME_INDEX, BOUNDARY_INDEX = "run.json", "mesh.pvtu", "boundary.pvtp"
+
+
+@dataclass(frozen=True)
+class RunFiles:
+    """The files of a finished run that a writer may read.
+
+    Attributes
+    ----------
+    directory : Path
+        Folder of the run.
+    volumes, boundaries : tuple of Path
+        VTU and VTP pieces, in the order of the index files: by name of tile.
+    depth : float
+        Depth of its soil (m), 0 where it has none.
+    parts : int
+        Parts of the mesh that share no face, 0 where its record does not tell.
+    sides : tuple of float or None
+        West, south, east and north side (m) of the part of the mesh that these are the files of; None where they
+        are those of the whole mesh.
+    """
+
+    directory: Path
+    volumes: tuple[Path, ...]
+    boundaries: tuple[Path, ...]
+    depth: float = 0.0
+    parts: int = 0
+    sides: tuple[float, float, float, float] | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Whether these are the files of the whole mesh."""
+        return self.sides is None
+
+
+RunSource = Path | RunFiles
+
+
+def find_files(directory: Path) -> RunFiles:
+    """Find the pieces of a finished run.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no finished run, or a file of it is missing or damaged.
+    """
+    from tiler.mesh_files.vtk_files import read_piece_paths
+    from tiler.workflow.run_folder import read_run_record
+
+    refuse_strangers(directory)
+    record = directory / RUN_RECORD
+    found = read_run_record(record)
+    if found.status != "done":
+        raise InputError(f"{record}: the run is {found.status!r}, not 'done'; finish it or run again")
+    volumes, boundaries = (read_piece_paths(directory / name) for name in (VOLUME_INDEX, BOUNDARY_INDEX))
+    return RunFiles(directory, tuple(volumes), tuple(boundaries), found.depth, len(found.parts))
+
+
+def refuse_strangers(directory: Path) -> None:
+    """Raise InputError if a folder is not that of a run: whatever else it may hold."""
+    if not directory.is_dir():
+        what = "is a file" if directory.exists() else "no such folder"
+        raise InputError(f"{directory}: {what}; run citystitch first, or give what --out of a run was")
+    if not (directory / RUN_RECORD).is_file():
+        raise InputError(
+            f"{directory}: is not the folder of a run, it has no {RUN_RECORD}; run citystitch first, or give what "
+            "--out of a run was"
+        )
+
+
+def take_largest_part(files: RunFiles) -> RunFiles:
+    """Take the pieces of the part of a mesh that has the most cells, where parts share no face.
+
+    Raises
+    ------
+    InputError
+        If the record of the run does not tell of parts.
+    ConfigError
+        If a tile has cells of this part and of another one.
+    """
+    from tiler.workflow.run_folder import read_run_record
+
+    record = files.directory / RUN_RECORD
+    found = read_run_record(record)
+    parts = found.parts
+    if not parts:
+        raise InputError(f"{record}: does not say which parts the mesh has; run again")
+    if len(parts) == 1:
+        return files
+    if divided := parts[0].divided:
+        raise ConfigError(
+            f"--largest-part: tile {divided[0]} has cells of this part and of another one, and pieces are taken "
+            "whole; mesh again with another --bounds or --tile-size"
+        )
+    wanted = set(parts[0].tiles)
+    kept = [tuple(path for path in paths if path.stem in wanted) for paths in (files.volumes, files.boundaries)]
+    boxes = [box for name in parts[0].tiles if (box := found.tiles.get(name)) is not None]
+    if len(boxes) < len(wanted):
+        raise InputError(f"{record}: does not tell the boxes of all tiles; run again")
+    west, south, east, north = zip(*boxes, strict=True)
+    sides = (min(west), min(south), max(east), max(north))
+    return replace(files, volumes=kept[0], boundaries=kept[1], parts=1, sides=sides)
