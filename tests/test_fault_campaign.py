@@ -39,8 +39,8 @@ KINDS: dict[str, tuple[Fault, str]] = {
     "kill -9": (is_killed, "killed"),
 }
 EARLY = ("ground", "houses", "shapes-0")  # a tile each, before there is a city model
-LATE = ("columns", "pieces", "fit", "own")  # a tile each, afterwards; seams and proofs come to these
-ASIDE = ("proofs", "fit", "own")  # what takes no tile with it
+LATE = ("columns", "pieces", "fit", "own")  # a tile each, afterwards; seams come to these
+ASIDE = ("fit", "own")  # what takes no tile with it
 OTHER = {"early": "late", "late": "early"}
 # Each kind before there is a city model, or after it.
 PAIRS = list(zip(KINDS, ("early", "late") * 3, strict=True))
@@ -72,12 +72,10 @@ def draw(city: SparseCity, rng: np.random.Generator, *, early: bool) -> dict[str
     if early:
         return dict(zip(EARLY, tiles, strict=False))
     chosen = dict(zip(LATE, tiles, strict=False))
-    names = Store(city.out / "store.zarr").names("proofs")
+    names = Store(city.out / "store.zarr").names("seams")
     inner = [str(seam) for seam in rng.permutation(names) if set(sides(str(seam))) <= set(tiles)]
     free = [seam for seam in inner if not set(sides(seam)) & set(chosen.values())]
-    first, *others = free
-    second = next(seam for seam in others if not set(sides(seam)) & set(sides(first)))
-    return chosen | {"seams": first, "proofs": second}
+    return chosen | {"seams": free[0]}
 
 
 def sides(seam: str) -> tuple[str, ...]:
@@ -204,7 +202,7 @@ def test_two_tiles_that_fail_side_by_side(city: SparseCity, tmp_path: Path) -> N
     out = tmp_path / "out"
     shutil.copytree(city.out, out)
     seam = next(
-        name for name in Store(out / "store.zarr").names("proofs") if set(sides(name)) <= set(city.record["tiles"])
+        name for name in Store(out / "store.zarr").names("seams") if set(sides(name)) <= set(city.record["tiles"])
     )
     faults = {"columns": dict.fromkeys(sides(seam), raises)}
     for tile in sides(seam):
@@ -221,11 +219,11 @@ def test_no_two_items_share_a_tile(tmp_path: Path) -> None:
     store = Store(tmp_path / "store.zarr")
     for i in range(6):
         for j in range(5):
-            store.write("proofs", f"y{i}_{j}", {})
+            store.write("seams", f"y{i}_{j}", {})
     record: dict[str, Any] = {"tiles": dict.fromkeys(rows)}
     for seed in range(20):
         items = draw(SparseCity(tmp_path, tmp_path, record, {}), np.random.default_rng(seed), early=False)
-        assert set(items) == {*LATE, "seams", "proofs"}
-        touched = Counter([items[stage] for stage in LATE] + [*sides(items["seams"]), *sides(items["proofs"])])
+        assert set(items) == {*LATE, "seams"}
+        touched = Counter([items[stage] for stage in LATE] + [*sides(items["seams"])])
         assert max(touched.values()) == 1
         assert set(touched) <= set(rows)

@@ -15,7 +15,7 @@ from shapely import affinity
 
 from pipeline.adaptive import mesh_adaptive
 from pipeline.columns import expand_cells, extract_boundary, find_used_points, split_boundary
-from pipeline.errors import InputError, OutputError
+from pipeline.errors import GeometryError, InputError, OutputError
 from pipeline.mesh import Boundary, Marker, SeamEdges, TetMesh
 from pipeline.plane import mesh_plane
 from stitch.conformity import match_facets, pair_cell_faces, pair_edges, pair_faces
@@ -53,6 +53,7 @@ from tests.tiled_runs import (
 from tiler.check.check import CheckReport, check_run
 from tiler.mesh_files.merged import VERTEX_ID, write_merged_boundary, write_merged_volume
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_vtu
+from tiler.stages.pieces import prove_seams
 
 SQUARE: Bounds = (0.0, 0.0, 420.0, 420.0)
 FOUR = make_grid(SQUARE, tile_size=210.0, mesh_size=10.0)
@@ -496,3 +497,10 @@ def test_missing_pieces_are_told_and_the_rest_is_proved(tmp_path: Path, nine: Ci
     assert any(
         f"{report.facts['missing_facets']} facets bound pieces that are missing" in line for line in report.lines()
     )
+
+
+def test_seams_that_differ_are_an_error() -> None:
+    one, other = {"faces": 2, "hash": "a"}, {"faces": 2, "hash": "b"}
+    assert prove_seams([("0_0", "x1_0", one), ("1_0", "x1_0", one), ("0_0", "y0_1", other)])["seam faces"] == 2
+    with pytest.raises(GeometryError, match="seam x1_0: tiles 0_0 and 1_0 have different faces"):
+        prove_seams([("0_0", "x1_0", one), ("1_0", "x1_0", other)])

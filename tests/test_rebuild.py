@@ -289,15 +289,15 @@ def test_rings_and_coarse_nodes_are_kept_only_where_a_lake_is_deep(nine: Town) -
 @pytest.mark.parametrize(
     ("change", "first"),
     [
-        ({"stagger": 0.5}, {"seams", "columns", "pieces", "proofs", "report"}),
+        ({"stagger": 0.5}, {"seams", "columns", "pieces", "report"}),
         pytest.param(
             {"mesh_size": 9.0},
-            {"seams", "columns", "pieces", "proofs", "report"},
+            {"seams", "columns", "pieces", "report"},
             marks=pytest.mark.long,
         ),
         pytest.param(
             {"domain_height": 75.0},
-            {"domain", "seams", "columns", "pieces", "proofs", "report"},
+            {"domain", "seams", "columns", "pieces", "report"},
             marks=pytest.mark.long,
         ),
     ],
@@ -335,7 +335,7 @@ def test_an_update_that_is_cut_off_states_no_finished_mesh_and_goes_on(nine: Tow
     (town.out / ".citymodel.city.99.1.part.json").write_text("half")
     (town.out / "run.json").write_text(json.dumps({"schema": 1, "status": "running"}))
     _, ran = update(town)
-    assert stages(ran) <= {"seams", "columns", "pieces", "proofs", "report"}
+    assert stages(ran) <= {"seams", "columns", "pieces", "report"}
     assert hashes(town.out) == hashes(nine.out)
 
 

@@ -40,7 +40,7 @@ STEPS: Mapping[str, tuple[str, ...]] = {
     "3.1 plane mesh": ("columns: 3.1 plane mesh", "seams: 3.1 seams"),
     "3.2-3.5 columns": ("columns: 3.2-3.5 columns", "seams: 3.2-3.5 columns of seams", "layers", CHOICE),
     "3.6 pieces": ("pieces",),
-    "fit, proofs, report": ("fit", "proofs", "report"),
+    "fit, report": ("fit", "report"),
 }
 
 

@@ -1,7 +1,8 @@
-"""Stage 3.6: a piece of the mesh and of its boundary a tile, proof of the seams, quality of the region."""
+"""Stage 3.6: a piece of the mesh and of its boundary a tile, quality, parts and seams of the region."""
 
 import hashlib
 from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from pipeline.point_fidelity import (
 )
 from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
 from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
-from stitch.grid import Key, is_border, seams_of_tile, tiles_of_seam
+from stitch.grid import Key, seams_of_tile
 from stitch.numbering import PartCounts, count_all_points, count_by_part, first_id, number_columns, tile_part
 from tiler.citymodels.tables import unpack_polygons
 from tiler.config.config import Config
@@ -38,7 +39,7 @@ from tiler.engine.task import Result, Task
 from tiler.mesh_files.merged import VERTEX_ID
 from tiler.mesh_files.mesh_parts import find_tile_parts, join_tiles, read_tile_parts
 from tiler.mesh_files.vtk_files import Rows, Values, write_vtp_blocks, write_vtu_blocks
-from tiler.planning.context import find_owned, seam_key, seam_name, tile_key, tile_name
+from tiler.planning.context import find_owned, seam_name, tile_key, tile_name
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.left_out import read_polygons
 from tiler.stages.readers import read_bands, read_buildings, read_terrain
@@ -68,9 +69,8 @@ def piece_stages() -> list[Stage]:
     return [
         # Of the tiles around it a piece asks only which of them there are.
         Stage("pieces", Scope.TILE, write_piece, beside, version=6),
-        Stage("proofs", Scope.SEAM, prove_seam, (Read("pieces", beside=True, optional=True),)),
         Stage(
-            "report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True)), version=3
+            "report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True)), version=4
         ),
     ]
 
@@ -150,25 +150,45 @@ def _measured_rows(
     return Rows(cells.n_cells, 4, np.dtype(np.int32), make)
 
 
-def prove_seam(task: Task) -> Facts:
-    """Prove that both tiles of a seam have the same faces on it, bit for bit.
+def prove_seams(sides: Iterable[tuple[str, str, Facts]]) -> Facts:
+    """Prove that both tiles of each seam have the same faces on it, bit for bit.
+
+    Parameters
+    ----------
+    sides : iterable of (str, str, dict)
+        A tile, a seam, and number and hash of the faces that the tile has on it.
+
+    Returns
+    -------
+    dict
+        ``seams`` and ``seam faces`` that two tiles share.
 
     Raises
     ------
     GeometryError
-        If they do not.
+        If two tiles have other faces on their seam.
+
+    Examples
+    --------
+    >>> here, there = ("0_0", "x1_0", {"faces": 2, "hash": "a"}), ("1_0", "x1_0", {"faces": 2, "hash": "a"})
+    >>> prove_seams([here, there, ("1_0", "x2_0", {"faces": 3, "hash": "b"})])
+    {'seams': 1, 'seam faces': 2}
     """
-    key = seam_key(task.name)
-    names = [tile_name(tile) for tile in tiles_of_seam(key)]
-    found = [result.facts["seams"].get(task.name) for result in task.read("pieces", ()) if result.name in names]
-    if is_border(task.context.grid, key) or len(found) < 2:
-        return {"faces": 0, "proved": False}
-    one, other = found
-    if one is None or one != other:
-        raise GeometryError(
-            f"its two tiles have other faces on it: {one} and {other}; this is a fault of citystitch"
-        )
-    return {"faces": one["faces"], "proved": True}
+    waiting: dict[str, tuple[str, Facts]] = {}
+    counts = {"seams": 0, "seam faces": 0}
+    for tile, seam, found in sides:
+        if seam not in waiting:
+            waiting[seam] = tile, found
+            continue
+        other, first = waiting.pop(seam)
+        if first != found:
+            raise GeometryError(
+                f"seam {seam}: tiles {other} and {tile} have different faces on it: {first} and {found}; "
+                "this is a fault of citystitch"
+            )
+        counts["seams"] += 1
+        counts["seam faces"] += found["faces"]
+    return counts
 
 
 def measure_fit(task: Task) -> Facts:
@@ -199,15 +219,16 @@ def measure_fit(task: Task) -> Facts:
 
 
 def sum_up(task: Task) -> Facts:
-    """Add up the quality of all cells and the fit of all points, and join the parts of tiles, over the region."""
+    """Add up quality, fit and points over the region, join the parts of tiles, and prove the seams (step 3.6)."""
     quality: dict[str, Histogram] = {}
-    tiles, points = [], []
+    tiles, points, sides = [], [], []
     for result in task.read("pieces"):
+        sides += [(result.name, seam, found) for seam, found in result.facts["seams"].items()]
         arrays = result.arrays
         points.append(PartCounts(result.facts["points"], arrays["part"], arrays["part_levels"], arrays["unused"]))
         faces = {seam: found["faces"] for seam, found in result.facts["seams"].items()}
-        sides = [seam_name(seam) for seam in seams_of_tile(tile_key(result.name))]
-        tiles.append(read_tile_parts(result.name, result.facts["parts"], faces, result.arrays, sides))
+        names = [seam_name(seam) for seam in seams_of_tile(tile_key(result.name))]
+        tiles.append(read_tile_parts(result.name, result.facts["parts"], faces, result.arrays, names))
         for name, (limits, _) in QUALITY_BINS.items():
             part = _histogram(result.arrays, name, limits)
             quality[name] = merge_histograms([quality[name], part]) if name in quality else part
@@ -218,7 +239,7 @@ def sum_up(task: Task) -> Facts:
         sums = FidelitySums(**{kind: _residuals(result, kind) for kind in KINDS})
         total = merge_fidelity([total, sums]) if total is not None else sums
     facts: Facts = {"quality": histogram_percentiles(quality), "building_points": dict(building_points)}
-    facts |= {"parts": join_tiles(tiles), "points": count_all_points(points)}
+    facts |= {"parts": join_tiles(tiles), "points": count_all_points(points), "counts": prove_seams(sides)}
     return facts | {"fidelity": fidelity_table(conclude_fidelity(total)) if total is not None else {}}
 
 

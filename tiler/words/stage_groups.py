@@ -38,7 +38,6 @@ STAGES: dict[str, tuple[str, str]] = {
     "citymodel": (OUTPUT, "file of the city model"),
     "citymodel-full": (OUTPUT, "file of the full city model"),
     "fit": (OUTPUT, "distance of points to the model"),
-    "proofs": (OUTPUT, "proof of seams"),
     "report": (OUTPUT, "quality"),
 }
 

@@ -36,7 +36,7 @@ class Missing:
     files : frozenset of str
         Files that could not be read, by the name of their item.
     others : tuple of SetAside
-        What failed without taking a tile with it: stages of the user's own, proofs.
+        What failed without taking a tile with it: stages of the user's own, fit.
     """
 
     tiles: dict[str, SetAside] = dataclasses.field(default_factory=dict)

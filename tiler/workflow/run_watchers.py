@@ -13,7 +13,7 @@ from tiler.planning.region import foresee_pad
 from tiler.workflow.out_folder import EVENTS
 from tiler.workflow.own_stages import OwnStages, list_stages, stages_of_pad
 
-NOT_ALONE = ("proofs", "fit")  # stages of tiles and seams that `tiler.workflow.single_tile.run_alone` does without
+NOT_ALONE = ("fit",)  # stages of tiles and seams that `tiler.workflow.single_tile.run_alone` does without
 
 
 def begin_watching(

@@ -214,10 +214,7 @@ def _join_counts(engine: Engine, plan: Plan, rounds: int) -> dict[str, int]:
             counts = record.facts.get("counts", {})
             if stage == "points":
                 counts = {f"points {name}": n for name, n in counts.items()}
-            if stage == "proofs":
-                total["seams"] += record.facts["faces"] > 0
-                total["seam faces"] += record.facts["faces"]
-            elif stage == "pieces":
+            if stage == "pieces":
                 total["facets"] += counts["facets"]
             else:
                 add_counts(total, counts)
