@@ -14,7 +14,7 @@ import psutil
 
 from tests.test_run import hashes
 from tiler.config.config import Config, make_config
-from tiler.executors import fork_server
+from tiler.executors.dask_settings import METHOD
 from tiler.interface.synth import write_city
 from tiler.workflow.own_stages import list_stages
 from tiler.workflow.run import run
@@ -134,7 +134,7 @@ def workers(process: "subprocess.Popen[bytes]") -> list[psutil.Process]:
     found = []
     for child in children(process):
         with suppress(psutil.NoSuchProcess):
-            if child.ppid() != process.pid or fork_server.METHOD != "forkserver":
+            if child.ppid() != process.pid or METHOD != "forkserver":
                 found.append(child)
     return sorted(found, key=lambda child: child.pid)
 

@@ -23,18 +23,23 @@ from tests.test_run import hashes
 from tiler.config.config import Config
 from tiler.engine.stage import Facts, Scope, Stage
 from tiler.engine.task import Task
-from tiler.scheduler import check as cluster_check
-from tiler.scheduler import terms
-from tiler.scheduler.check import (
+from tiler.executors import worker_requirements
+from tiler.executors.remote_cluster import connect
+from tiler.executors.versions import LIBRARIES, MISSING, NATIVE, tell_versions
+from tiler.executors.worker_requirements import (
+    PROBE,
     ClusterMismatchError,
+    Requirements,
     UnansweredError,
     check_cluster,
+    check_files,
     compare_files,
     compare_versions,
+    find_mismatch,
+    own_requirements,
+    require_files,
 )
-from tiler.scheduler.reach import connect, spell_out
-from tiler.scheduler.terms import PROBE, Terms, check_files, offer_terms, own_terms
-from tiler.scheduler.versions import LIBRARIES, MISSING, NATIVE, tell_versions
+from tiler.workflow.run import use_absolute_paths
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +74,7 @@ def test_every_library_of_the_keys_is_compared() -> None:
 def test_citystitch_counts_by_its_sources(tmp_path: Path) -> None:
     for package in ("pipeline", "stitch", "tiler"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    words = "from tiler.scheduler.versions import tell_versions; print(tell_versions(())['citystitch'])"
+    words = "from tiler.executors.versions import tell_versions; print(tell_versions(())['citystitch'])"
 
     def ask() -> str:
         command = [sys.executable, "-c", words]
@@ -100,7 +105,7 @@ def test_differences_are_a_line_each() -> None:
 def test_a_cluster_of_the_same_versions_will_do(client: Client, tmp_path: Path) -> None:
     file = tmp_path / "a.laz"
     file.write_bytes(b"12")
-    with offer_terms(tmp_path, [file]) as given:
+    with require_files(tmp_path, [file]) as given:
         check_cluster(client, "inproc", given)
         assert (tmp_path / PROBE).is_file()
     assert not (tmp_path / PROBE).exists()
@@ -108,9 +113,9 @@ def test_a_cluster_of_the_same_versions_will_do(client: Client, tmp_path: Path) 
 
 def test_other_versions_are_refused(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     here = other_versions(GEOS="9.9.9", distributed="1.0")
-    monkeypatch.setattr(cluster_check, "own_versions", lambda: here)
+    monkeypatch.setattr(worker_requirements, "own_versions", lambda: here)
     with pytest.raises(ClusterMismatchError) as caught:
-        check_cluster(client, "tcp://a:1", own_terms())
+        check_cluster(client, "tcp://a:1", own_requirements())
     first, *lines, last = caught.value.lines
     assert first == "tcp://a:1: this cluster cannot take the tasks of this run, and nothing was written"
     assert last.startswith("install the same versions there")
@@ -126,10 +131,10 @@ def test_other_versions_are_refused(client: Client, monkeypatch: pytest.MonkeyPa
 def test_other_files_are_refused(
     fault: str, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster_check, "GRACE", 0.0)
+    monkeypatch.setattr(worker_requirements, "GRACE", 0.0)
     file = tmp_path / "a.laz"
     file.write_bytes(b"12")
-    with offer_terms(tmp_path, [file]) as given:
+    with require_files(tmp_path, [file]) as given:
         match fault:
             case "gone":
                 (tmp_path / PROBE).unlink()
@@ -151,27 +156,27 @@ def test_other_files_are_refused(
 
 
 def test_a_worker_that_does_not_answer_is_told(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster_check, "ANSWER", 0.2)
-    monkeypatch.setattr(cluster_check, "PROBE", "__import__('time').sleep(1)")
+    monkeypatch.setattr(worker_requirements, "ANSWER", 0.2)
+    monkeypatch.setattr(worker_requirements, "ASK_VERSIONS", "__import__('time').sleep(1)")
     with pytest.raises(UnansweredError, match=r"not all workers have answered within 0\.2 s"):
-        check_cluster(client, "tcp://a:1", own_terms())
+        check_cluster(client, "tcp://a:1", own_requirements())
 
 
 def test_a_task_is_refused_by_a_worker_that_joins_late(
     client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its terms are looked at once for a run, in the worker; the run ends, whatever its policy."""
+    """Requirements are looked at once for a run, in the worker; the run ends, whatever its policy."""
     with connect(client.scheduler.address) as executor:
         make(tmp_path / "good", executor).run(Stage("a", Scope.TILE, nothing))
-    monkeypatch.setattr(terms, "own_versions", lambda: other_versions(numpy="0.1"))
-    terms._refuse.cache_clear()
+    monkeypatch.setattr(worker_requirements, "own_versions", lambda: other_versions(numpy="0.1"))
+    find_mismatch.cache_clear()
     try:
-        with connect(client.scheduler.address, terms=Terms("another")) as executor:
+        with connect(client.scheduler.address, requirements=Requirements("another")) as executor:
             engine = make(tmp_path / "bad", executor, layout=grid_layout(2))
             with pytest.raises(ClusterMismatchError) as caught:
                 engine.run(Stage("a", Scope.TILE, nothing))
     finally:
-        terms._refuse.cache_clear()
+        find_mismatch.cache_clear()
     first, line, last = caught.value.lines
     assert "a worker has joined that cannot take tasks of this run; all that was done is kept" in first
     assert line.startswith("numpy: ")
@@ -204,15 +209,15 @@ def test_tasks_that_cannot_be_sent_end_a_run_and_nothing_waits_for_them(client: 
 @pytest.mark.parametrize("workers", [{"scheduler": "tcp://a:1"}, {"cluster": "slurm.toml"}])
 def test_paths_of_a_run_on_a_cluster_are_absolute(workers: dict[str, str]) -> None:
     given = Config(pointcloud=("a/*.laz",), footprints="f.gpkg", out="out")
-    assert spell_out(given) == given
-    found = spell_out(dataclasses.replace(given, **workers))  # type: ignore[arg-type]
+    assert use_absolute_paths(given) == given
+    found = use_absolute_paths(dataclasses.replace(given, **workers))  # type: ignore[arg-type]
     here = str(Path.cwd())
     assert found.pointcloud == (f"{here}/a/*.laz",)
     assert (found.footprints, found.out) == (f"{here}/f.gpkg", f"{here}/out")
 
 
-def test_terms_without_files_ask_for_none() -> None:
-    assert check_files(own_terms()) == {}
+def test_requirements_without_files_ask_for_none() -> None:
+    assert check_files(own_requirements()) == {}
 
 
 @contextmanager

@@ -24,10 +24,9 @@ from tests.sparse_city import ROOT, make_city
 from tests.test_run import hashes
 from tiler.cli.main import make_parser
 from tiler.config.config import Config, check_reach, load_config
-from tiler.executors import fork_server
-from tiler.executors.dask_settings import BOTH, SCHEDULER, WORKER, as_variables
+from tiler.executors.dask_settings import BOTH, ENVIRONMENT, SCHEDULER, WORKER, as_variables
+from tiler.executors.remote_cluster import PATIENCE
 from tiler.objects.places import is_url
-from tiler.scheduler.reach import PATIENCE
 
 DEPLOY = ROOT / "deploy"
 KUBERNETES = DEPLOY / "kubernetes"
@@ -117,7 +116,7 @@ def test_what_jobs_are_given_is_a_configuration() -> None:
 def test_dasks_settings_are_those_of_local_workers() -> None:
     settings = yaml.safe_load((DEPLOY / "dask.yaml").read_text())
     given = settings["distributed"]
-    assert given["nanny"].pop("pre-spawn-environ") == dict(fork_server.ENVIRONMENT)
+    assert given["nanny"].pop("pre-spawn-environ") == dict(ENVIRONMENT)
     # A silent worker is let live as long as a task may hold its interpreter.
     assert parse_timedelta(given["scheduler"].pop("worker-ttl")) > Config().time_limit
     assert parse_timedelta(given.pop("comm")["timeouts"]["tcp"]) == PATIENCE

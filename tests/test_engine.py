@@ -22,10 +22,9 @@ from tiler.engine.engine import Engine
 from tiler.engine.keys import item_key, stage_digest
 from tiler.engine.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
 from tiler.engine.task import Failure, Record, Task
-from tiler.engine.task_limits import Limits
-from tiler.executors.executor import Executor, Serial, processes
-from tiler.scheduler.executor import local
-from tiler.scheduler.reach import connect
+from tiler.executors.executor import Executor, Serial
+from tiler.executors.local_cluster import local
+from tiler.executors.remote_cluster import connect
 from tiler.store.stated_files import state_files
 from tiler.store.store import Store
 
@@ -167,22 +166,16 @@ def two_workers() -> Iterator[Executor]:
 
 
 @pytest.fixture(scope="module")
-def two_processes() -> Iterator[Executor]:
-    with processes(2, Limits(memory=2**30)) as executor:
-        yield executor
-
-
-@pytest.fixture(scope="module")
 def serial_run(tmp_path_factory: pytest.TempPathFactory) -> Engine:
     return run_all(make(tmp_path_factory.mktemp("serial")))
 
 
 def test_any_executor_and_any_order_give_the_same_bytes(
-    serial_run: Engine, one_worker: Executor, two_workers: Executor, two_processes: Executor, tmp_path: Path
+    serial_run: Engine, one_worker: Executor, two_workers: Executor, tmp_path: Path
 ) -> None:
     expected = contents(serial_run.store.path)
     assert len(expected) == 3 + 9 + 12 + 9 + 1 + 2 * 12  # groups, and twelve zarr arrays of one chunk each
-    executors = {"one": one_worker, "two": two_workers, "processes": two_processes}
+    executors = {"one": one_worker, "two": two_workers}
     executors |= {f"shuffled{k}": Shuffled(k) for k in range(3)}
     for name, executor in executors.items():
         engine = run_all(make(tmp_path / name, executor))
@@ -446,11 +439,11 @@ def test_what_killed_runs_left_is_swept(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.partial"))
 
 
-@pytest.mark.parametrize("where", ["serial", "dask", "processes"])
+@pytest.mark.parametrize("where", ["serial", "dask"])
 def test_the_first_error_names_stage_and_item_and_leaves_nothing(
-    where: str, two_workers: Executor, two_processes: Executor, tmp_path: Path
+    where: str, two_workers: Executor, tmp_path: Path
 ) -> None:
-    executor = {"serial": Serial(), "dask": two_workers, "processes": two_processes}[where]
+    executor = {"serial": Serial(), "dask": two_workers}[where]
     engine = make(tmp_path, executor, layout=grid_layout(6))
     with pytest.raises(GeometryError, match=r"^stage fails, tile 1\.1: no valid result$") as caught:
         engine.run(Stage("fails", Scope.TILE, fails, parameters=("scale",)))
@@ -463,10 +456,8 @@ def test_the_first_error_names_stage_and_item_and_leaves_nothing(
     assert len(engine.store.names("after")) == 36
 
 
-def test_other_errors_keep_their_type_and_say_where(
-    two_workers: Executor, two_processes: Executor, tmp_path: Path
-) -> None:
-    for executor in (Serial(), two_workers, two_processes):
+def test_other_errors_keep_their_type_and_say_where(two_workers: Executor, tmp_path: Path) -> None:
+    for executor in (Serial(), two_workers):
         with pytest.raises(ZeroDivisionError) as caught:
             make(tmp_path, executor).run(Stage("divides", Scope.REGION, divides))
         notes = "\n".join(caught.value.__notes__)
@@ -477,10 +468,10 @@ def test_other_errors_keep_their_type_and_say_where(
 
 
 def test_what_cannot_be_sent_or_read_is_an_error_and_what_waits_is_dropped(
-    two_processes: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two_workers: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Functions of a notebook or a script are sent as they are."""
-    engine = make(tmp_path, two_processes)
+    engine = make(tmp_path, two_workers)
     lock = threading.Lock()
     with pytest.raises(TypeError, match=r"cannot pickle '_thread\.lock'"):
         engine.run(Stage("unsent", Scope.TILE, lambda task: {"locked": lock.locked()}))
@@ -686,12 +677,11 @@ def test_connect_runs_on_a_foreign_scheduler(serial_run: Engine, two_workers: Ex
     assert contents(engine.store.path) == contents(serial_run.store.path)
 
 
-@pytest.mark.parametrize("executor", ["local(1)", "processes(1)"])
-def test_an_interrupt_leaves_no_processes(executor: str, tmp_path: Path) -> None:
+def test_an_interrupt_leaves_no_processes(tmp_path: Path) -> None:
     code = (
         "from tests.test_engine import *\n"
         "if __name__ == '__main__':\n"
-        f"    with {executor} as executor:\n"
+        "    with local(1) as executor:\n"
         f"        make(Path({str(tmp_path)!r}), executor).run(Stage('sleeps', Scope.TILE, sleeps))\n"
     )
     script = tmp_path / "main.py"

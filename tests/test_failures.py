@@ -2,14 +2,11 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
-from distributed import Client
 
 from pipeline.errors import GeometryError, OutputError
 from tests.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
@@ -19,8 +16,8 @@ from tiler.engine.failures import Policy
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Record, Task
 from tiler.engine.task_limits import TASKS, Limits
-from tiler.executors.executor import Executor, Serial, processes
-from tiler.scheduler.executor import Dask, local
+from tiler.executors.executor import Executor, Serial
+from tiler.executors.local_cluster import local
 
 A = Stage("a", Scope.TILE, nothing)
 B = Stage("b", Scope.TILE, seen, (Read("a", 1.0),))
@@ -32,21 +29,9 @@ MEMORY, SECONDS = 2**30, 3.0
 
 
 @pytest.fixture(scope="module")
-def dask() -> Iterator[Executor]:
+def workers() -> Iterator[Executor]:
     with local(2, Limits(SECONDS, MEMORY)) as executor:
         yield executor
-
-
-@pytest.fixture(scope="module")
-def plain() -> Iterator[Executor]:
-    with processes(2, Limits(SECONDS, MEMORY)) as executor:
-        yield executor
-
-
-@pytest.fixture(params=["dask", "plain"])
-def workers(request: pytest.FixtureRequest) -> Executor:
-    executor: Executor = request.getfixturevalue(request.param)
-    return executor
 
 
 def faulty(stage: Stage, **faults: Callable[[Task], None]) -> Stage:
@@ -61,11 +46,6 @@ def no_geometry(_: Task) -> None:
 
 def full_disk(_: Task) -> None:
     raise OutputError("disk full")
-
-
-def sleeps(_: Task) -> Facts:
-    time.sleep(0.15)
-    return {}
 
 
 def leaves_its_time(task: Task) -> Facts:
@@ -178,87 +158,6 @@ def test_of_what_waits_for_a_worker_the_lowest_rank_begins_first(tmp_path: Path)
     assert order[:9] == sorted(order[:9])
 
 
-def fills(executor: Executor) -> list[int]:
-    """Number of tasks in each batch that an executor sends from now on."""
-    assert isinstance(executor, Dask)
-    sizes: list[int] = []
-    take = executor._next_batch
-
-    def take_and_count() -> list[Any]:
-        batch = take()
-        sizes.extend([len(batch)] if batch else [])
-        return batch
-
-    executor._next_batch = take_and_count  # type: ignore[method-assign]
-    return sizes
-
-
-def test_short_tasks_go_together_once_they_are_known(tmp_path: Path) -> None:
-    layout = grid_layout(8)
-    with local(2) as executor:
-        sizes = fills(executor)
-        engine = make(tmp_path, executor, layout=layout)
-        engine.run(A, B)
-        assert len(engine.store.names("a")) == len(engine.store.names("b")) == 64
-        assert sum(sizes) == 128
-        # No worker gets all that is left as long as another could take half of it.
-        assert sizes[:8] == [1] * 8
-        assert 2 < max(sizes) <= 8
-        sizes.clear()
-        slow = replace(A, name="slow", function=sleeps, parameters=())
-        make(tmp_path / "slow", executor, layout=grid_layout(3)).run(slow)
-        assert set(sizes) == {1}
-
-
-def test_what_is_told_need_not_be_fetched_and_what_is_not_heard_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fetched: list[str] = []
-    gather = Client._gather_remote
-
-    async def count(self: Any, direct: bool, local_worker: Any) -> Any:
-        fetched.append("some")
-        return await gather(self, direct, local_worker)
-
-    monkeypatch.setattr(Client, "_gather_remote", count)
-    with local(1) as executor:
-        assert isinstance(executor, Dask)
-        heard = make(tmp_path / "heard", executor)
-        heard.run(A)
-        assert not fetched
-        executor._client.unsubscribe_topic(executor._topic)
-        deaf = make(tmp_path / "deaf", executor)
-        deaf.run(A)
-        assert fetched
-        assert not executor._told
-    assert contents(heard.store.path) == contents(deaf.store.path)
-
-
-def test_messages_go_at_once_also_to_a_worker_that_takes_the_place_of_another(tmp_path: Path) -> None:
-    with local(1) as executor:
-        assert isinstance(executor, Dask)
-        assert executor.scheduler is not None
-        first = set(executor.scheduler.stream_comms)
-        assert executor._client.scheduler_comm.interval == 0.0
-        assert [to_worker.interval for to_worker in executor.scheduler.stream_comms.values()] == [0.0]
-        make(tmp_path, executor, policy=ASIDE).run(faulty(A, t0_0=Once(is_killed, tmp_path / "mark")))
-        assert not first & set(executor.scheduler.stream_comms)
-        assert [to_worker.interval for to_worker in executor.scheduler.stream_comms.values()] == [0.0]
-
-
-def test_of_tasks_that_go_together_only_the_one_that_kills_is_blamed(dask: Executor, tmp_path: Path) -> None:
-    """Those before it are there, those after it go again."""
-    sizes = fills(dask)
-    names = {f"t{i}_{j}" for i in range(3, 8) for j in (2, 5)}
-    engine = make(tmp_path, dask, policy=ASIDE, layout=grid_layout(8))
-    engine.run(faulty(replace(A, name="batched"), **dict.fromkeys(names, segfaults)))
-    assert max(sizes) > 1
-    assert {(name, one.kind, one.attempts) for (_, name), one in engine.set_aside.items()} == {
-        (name[1:].replace("_", "."), "crash", 2) for name in names
-    }
-    assert len(engine.store.names("batched")) == 64 - len(names)
-
-
 def test_a_trace_file_that_cannot_be_written_ends_the_run(workers: Executor, tmp_path: Path) -> None:
     """It is the disk's fault, not that of any tile."""
     (tmp_path / TASKS).write_text("")
@@ -292,19 +191,16 @@ def test_a_process_that_was_killed_is_nobodys_fault_at_first(workers: Executor, 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("where", "seconds"), [(local, 90), (processes, 15)])
-def test_processes_that_die_again_and_again_are_replaced(
-    where: Callable[..., AbstractContextManager[Executor]], seconds: float, tmp_path: Path
-) -> None:
+def test_processes_that_die_again_and_again_are_replaced(tmp_path: Path) -> None:
     """One that is just starting when Dask gives up its predecessor, 15 s after that died, lives on."""
     begin = time.monotonic()
-    with where(2, Limits(0.0, MEMORY)) as executor:
+    with local(2, Limits(0.0, MEMORY)) as executor:
         for k in range(1000):
             faults = {f"t{i}_{j}": is_killed for i, j in ((0, 0), (1, 1), (2, 2))[: 1 + k % 3]}
             engine = make(tmp_path / f"{k}", executor, policy=Policy(retries=0, set_aside=True))
             engine.run(faulty(A, **faults))
             assert len(engine.set_aside) == len(faults)
-            if time.monotonic() - begin > seconds:
+            if time.monotonic() - begin > 90.0:  # s
                 break
 
 

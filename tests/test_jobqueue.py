@@ -16,16 +16,16 @@ from tests.test_engine import make
 from tiler.engine.stage import Facts, Scope, Stage
 from tiler.engine.task import Task
 from tiler.engine.task_limits import Limits
-from tiler.executors import fork_server
+from tiler.executors.dask_executor import ClusterError
+from tiler.executors.dask_settings import ENVIRONMENT, METHOD, start_fork_server
 from tiler.jobs.jobqueue import LOSSES, SETTINGS, UNBORN, QueuedDask, _Jobs, read_worker_jobs
 from tiler.jobs.queues import QueueError
 from tiler.jobs.table import Cluster
-from tiler.scheduler.executor import ClusterError
 
 HERE: dict[str, Any] = {  # workers that begin quickly, and again as often as they end
     "distributed.deploy.lost-worker-timeout": "3650 days",
-    "distributed.nanny.pre-spawn-environ": dict(fork_server.ENVIRONMENT),
-    "distributed.worker.multiprocessing-method": fork_server.METHOD,
+    "distributed.nanny.pre-spawn-environ": dict(ENVIRONMENT),
+    "distributed.worker.multiprocessing-method": METHOD,
     "distributed.worker.daemon": False,
 }
 
@@ -66,7 +66,7 @@ def queued(workers: int = 2, broken: str = "") -> Iterator[QueuedDask]:
     from dask import config
     from distributed import Client, LocalCluster
 
-    fork_server.begin()
+    start_fork_server()
     with (
         config.set(dict(SETTINGS) | HERE),
         LocalCluster(
@@ -101,7 +101,7 @@ def test_a_task_on_a_retiring_worker_is_not_lost(tmp_path: Path) -> None:
 
 
 def test_workers_that_never_come_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tiler.scheduler.executor.LOOK", 0.2)
+    monkeypatch.setattr("tiler.executors.dask_executor.LOOK", 0.2)
     with (
         queued(workers=0, broken="5 worker jobs in a row ended before their worker was there") as executor,
         pytest.raises(ClusterError, match="5 worker jobs in a row"),

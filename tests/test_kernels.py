@@ -29,7 +29,6 @@ from tiler.executors.kernels import (
     prepare,
     read_list,
 )
-from tiler.joining.join import join
 from tiler.workflow.run import run
 
 ROOT = Path(__file__).parents[1]
@@ -200,21 +199,15 @@ def test_the_same_run_again_compiles_nothing_beforehand(
 ) -> None:
     asked: list[str] = []
     monkeypatch.setattr("tiler.workflow.run.prepare", lambda processes, say: asked.append("run"))
-    monkeypatch.setattr("tiler.joining.join.prepare", lambda processes, say: asked.append("join"))
     config = city.config(tmp_path / "out", workers=1)
     for _ in range(2):
         run(config)
-    assert asked == ["run"]
-    join(config)
     assert asked == ["run"]
     run(dataclasses.replace(config, domain_height=90.0))
     assert asked == ["run"] * 2
     for _ in range(2):
         run(dataclasses.replace(config, domain_height=90.0, overwrite=True))
     assert asked == ["run"] * 4
-    (tmp_path / "out" / "run.json").write_text("[]")
-    join(config)
-    assert asked == ["run"] * 4 + ["join"]
 
 
 def test_ctrl_c_while_kernels_are_compiled_stops_a_run(

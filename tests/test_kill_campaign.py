@@ -203,10 +203,8 @@ def finish_with_one_worker(victim: Victim, target: int, folder: Path) -> None:
         victim.finish()
 
 
-@pytest.mark.parametrize("dask", [False, pytest.param(True, marks=pytest.mark.long)])
-def test_killed_processes_lose_nothing(small: SparseCity, tmp_path: Path, *, dask: bool) -> None:
+def test_killed_processes_lose_nothing(small: SparseCity, tmp_path: Path) -> None:
     victim = Victim(small, tmp_path, np.random.default_rng(1))
-    victim.options += ["--dask"] if dask else []
     try:
         for kind, target in zip(("worker", "driver", "group"), victim.targets(4), strict=False):
             assert victim.kill(kind, target)
@@ -229,9 +227,7 @@ def test_a_lost_scheduler_is_one_clear_error(small: SparseCity, tmp_path: Path) 
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("kind", "seed"), ROUNDS)
 def test_kills_at_random_moments(large: SparseCity, tmp_path: Path, kind: str, seed: int) -> None:
-    """Every other round with workers of Dask."""
     victim = Victim(large, tmp_path / "run", np.random.default_rng([seed, len(kind)]))
-    victim.options += ["--dask"] if seed % 2 else []
     try:
         if kind == CLUSTER:
             *targets, last = victim.targets(KILLS)

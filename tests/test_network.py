@@ -17,9 +17,9 @@ from tests.namespaces import Host, certificates, dask_command, hosts
 from tests.sparse_city import ROOT, SparseCity, children, count_results, make_city, start
 from tests.test_run import hashes
 from tiler.config.config import idle_parameters, make_config
-from tiler.scheduler import transport
-from tiler.scheduler.reach import connect
-from tiler.scheduler.transport import TlsFiles, check_answer, make_security
+from tiler.executors import transport
+from tiler.executors.remote_cluster import connect
+from tiler.executors.transport import TlsFiles, check_answer, make_security
 from tiler.workflow.failed_tiles import save_config
 
 CUT = 30.0  # s
@@ -248,8 +248,8 @@ def test_a_driver_that_is_cut_off_for_good_ends_and_goes_on_later(
         cluster((scheduler, worker), files, tmp_path / "cluster") as (address, _),
         ExitStack() as stack,
     ):
-        shorter = "import sys; from tiler.cli import main; from tiler.scheduler import reach; "
-        shorter += "reach.PATIENCE = 11; sys.exit(main.main())"
+        shorter = "import sys; from tiler.cli import main; from tiler.executors import remote_cluster; "
+        shorter += "remote_cluster.PATIENCE = 11; sys.exit(main.main())"
         command = command_from(driver, city, out, address, files)
         at = command.index("-m")
         environment = ["env", "DASK_DISTRIBUTED__COMM__TIMEOUTS__TCP=11s"]

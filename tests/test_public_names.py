@@ -15,7 +15,6 @@ SETTABLE = {"sys.stdout", "sys.stderr"}
 # Files that still have to be mended; one that is leaves this list.
 WAITING = {
     "pipeline/kernel_library.py",
-    "tiler/executors/fork_server.py",
     "tiler/executors/numba_registry.py",
     "tiler/jobs/jobqueue.py",
     "tiler/store/zarr_files.py",

@@ -26,7 +26,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
     return Town(start.folder, start.out, run(start.config(start.out)))
 
 
-def start(town: Town, out: Path, workers: int, *, dask: bool = False) -> "subprocess.Popen[str]":
+def start(town: Town, out: Path, workers: int) -> "subprocess.Popen[str]":
     config = town.config(out)
     command = [
         sys.executable,
@@ -38,7 +38,7 @@ def start(town: Town, out: Path, workers: int, *, dask: bool = False) -> "subpro
         config.footprints,
     ]
     command += ["--out", str(out), "--tile-size", str(config.tile_size), "--domain-height", "70"]
-    command += ["--workers", str(workers), *(["--dask"] if dask else [])]
+    command += ["--workers", str(workers)]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     )
@@ -57,14 +57,10 @@ def interrupt(process: "subprocess.Popen[str]", number: int = signal.SIGINT) -> 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize(
-    ("workers", "dask"), [(0, False), (2, False), pytest.param(2, True, marks=pytest.mark.long)]
-)
-def test_one_ctrl_c_lets_what_runs_end(
-    workers: int, number: int, town: Town, tmp_path: Path, *, dask: bool
-) -> None:
+@pytest.mark.parametrize("workers", [0, 2])
+def test_one_ctrl_c_lets_what_runs_end(workers: int, number: int, town: Town, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    process = start(town, out, workers, dask=dask)
+    process = start(town, out, workers)
     wait_for(out, "ground")
     if number == signal.SIGINT:
         interrupt(process)
@@ -95,10 +91,9 @@ sys.exit(main())
     assert ended.stderr == "citystitch: no/such.laz: no such file or folder; check the path\n"
 
 
-@pytest.mark.parametrize("dask", [False, pytest.param(True, marks=pytest.mark.long)])
-def test_two_end_at_once_and_nothing_is_lost(town: Town, tmp_path: Path, *, dask: bool) -> None:
+def test_two_end_at_once_and_nothing_is_lost(town: Town, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    process = start(town, out, 2, dask=dask)
+    process = start(town, out, 2)
     wait_for(out, "ground")
     interrupt(process)
     time.sleep(0.05)

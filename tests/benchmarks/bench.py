@@ -27,9 +27,7 @@ import numpy as np
 from tests.benchmarks.bench_report import (
     AT_ONCE,
     CHOICE,
-    DASK,
     DOCS,
-    JOINED,
     MEASURED,
     step_seconds,
     write_report,
@@ -49,8 +47,6 @@ Kind = tuple[str, str, int, tuple[str, ...]]
 KINDS: tuple[Kind, ...] = (
     ("one process", "run", 0, ()),
     ("2 workers", "run", 2, ()),
-    (DASK, "run", 2, ("--dask",)),
-    (JOINED, "join", 2, ()),
 )
 ONE_WORKER: Kind = ("1 worker", "run", 1, ())
 PACKAGES = ("pipeline", "stitch", "tiler")
@@ -159,17 +155,17 @@ def inner_seconds(out: Path) -> dict[str, float]:
 
 
 def study_driver(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """Memory of the driver by the number of tiles, of 150 m with hardly a house, two workers of Dask."""
+    """Memory of the driver by the number of tiles, of 150 m with hardly a house, two workers."""
     rows = []
     for n in TILES_A_SIDE:
         city = cities.make(150 * n, n * n // 2, 0.5)
-        found = measure(city, out, "--tile-size", "150", "--workers", "2", "--dask", cores=2)
+        found = measure(city, out, "--tile-size", "150", "--workers", "2", cores=2)
         rows.append(found | {"tiles a side": n})
     return rows
 
 
 def study_workers(cities: Cities, out: Path) -> list[dict[str, Any]]:
-    """(d) Cities of 2.5 km and more serially, with workers, with those of Dask, and as a member of `join`.
+    """(d) Cities of 2.5 km and more serially and with workers.
 
     Runs take turns. The time is that of the command, with all that it imports.
     """

@@ -20,7 +20,6 @@ LEAST_INNER = 0.004  # s: events tell thousandths
 MEASURED = "measured"  # day of each study, beside the studies
 # Key and title of a table's first column, where they are not the study's own key.
 TITLES = {"cells": ("mesh size", "mesh size (m)"), "area": ("area", "area (km²)")}
-DASK, JOINED = "2 workers of Dask", "`join` with 2 workers"
 AT_ONCE = "one process, beside another such run"
 OTHERS = "<!-- exports -->"  # what `make bench-exports` has written begins here
 
@@ -220,7 +219,7 @@ def _workers(rows: Rows) -> list[str]:
         lines += [*_runs([row for row in rows if row["side"] == side], "run as"), ""]
     return [
         *lines,
-        *_speedups(rows, "side", "km", 1000, "2 workers", DASK, JOINED),
+        *_speedups(rows, "side", "km", 1000, "2 workers"),
         "",
         *_limit(rows),
     ]
@@ -304,21 +303,21 @@ SECTIONS: Sequence[tuple[str, str, str, Callable[[Rows], list[str]]]] = (
     (
         "driver",
         "Memory of the driver",
-        "Tiles of 150 m with hardly a house; client and Dask's scheduler in one process, two workers (`--dask`).",
+        "Tiles of 150 m with hardly a house; client and Dask's scheduler in one process, two workers.",
         _driver,
     ),
     (
         "workers",
         "(d) Workers",
         "Cities with 480 buildings a km²; the time of the command, the middle one of 5 runs, of 3 above 5 km, in "
-        "turn.\n`citystitch join` has the same worker processes, and looks for members in its folder.",
+        "turn.",
         _workers,
     ),
     (
         "waits",
         "What two workers lose",
         "By the events of runs in turn; the middle one of 3 by the time of the command. Imports take most of what "
-        "comes\nbefore the first task. Tasks take longer beside another one, and beside Dask's driver (`--dask`). "
+        "comes\nbefore the first task. Tasks take longer beside another one, and beside Dask's driver. "
         "A\nworker is without one where all wait for the last tile of a stage, and between one task and the next.",
         _waits,
     ),

@@ -23,9 +23,9 @@ from tiler.engine.engine import Engine, StoppedError
 from tiler.engine.records import Records
 from tiler.engine.task import Record
 from tiler.executors.executor import Executor
+from tiler.executors.local_cluster import local
 from tiler.monitoring.progress import RunProgress
 from tiler.planning.plan import Plan, make_plan
-from tiler.scheduler.executor import local
 from tiler.store.manifest import find_remade, write_manifest
 from tiler.workflow.failed_tiles import HolesError, Missing, find_missing, leave_holes
 from tiler.workflow.out_folder import MANIFEST_PATH, STORE
@@ -191,7 +191,7 @@ def run_dask(country: str, n_tiles: int, workers: int, folder: Path) -> dict[str
     config, plan, told = survey(country, n_tiles, folder)
     shutil.rmtree(config.out, ignore_errors=True)
     store = StandInStore(Path(config.out) / STORE, plan.layout, config.tile_size)
-    with local(workers) as executor, patch("tiler.scheduler.executor.run_guarded", instant):
+    with local(workers) as executor, patch("tiler.executors.dask_executor.run_guarded", instant):
         time.sleep(SETTLE)
         gc.collect()
         told["memory_cluster"] = memory()

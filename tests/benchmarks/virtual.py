@@ -14,8 +14,7 @@ from pipeline.errors import CityError
 from tests.benchmarks.recorded import choose, draw, make_facts
 from tiler.engine.stage import Box, Facts, Layout, Scope
 from tiler.engine.task import Failure, Record, Task, run_task
-from tiler.executors.executor import LEAST_WINDOW, WINDOW
-from tiler.executors.worker_processes import Function
+from tiler.executors.executor import LEAST_TASKS, TASKS_PER_WORKER, Function
 from tiler.store.store import Store
 
 VERIFIED = 1e9  # bytes/s; how fast an earlier result is held against its checksums
@@ -120,7 +119,7 @@ class VirtualWorkers:
     """
 
     def __init__(self, workers: int, store: StandInStore | None = None, fail: float = 0.0) -> None:
-        self.workers, self.window = workers, max(WINDOW * workers, LEAST_WINDOW)
+        self.workers, self.window = workers, max(TASKS_PER_WORKER * workers, LEAST_TASKS)
         self.clock = self.busy = self.own = 0.0
         self.done = self.reused = self.in_flight = 0
         self.flying = 0.0  # integral of the number of tasks in flight over virtual time

@@ -17,9 +17,7 @@ from pipeline.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
 from tiler.cli.parser import EXPORT_OPTION, Handler, build_parser
 from tiler.config.config import Config, annotated_defaults, make_config
-from tiler.executors import fork_server
-from tiler.executors.importing import uncollected
-from tiler.executors.kept_memory import keep_memory, look_seldom
+from tiler.executors.dask_settings import GARBAGE, start_fork_server
 from tiler.interface.api import with_file
 from tiler.jobs.commands import describe_job, find_run, job_line
 from tiler.mesh_files.run_files import refuse_strangers
@@ -128,21 +126,14 @@ def _run_config(
     dashboard: str | None = None,
     report: bool = False,
 ) -> int:
-    if config.has_crew:
-        fork_server.limit_threads()
-    elif config.workers and not config.on_cluster:
-        fork_server.begin(dask=True)
-    look_seldom()
-    if not config.workers:
-        keep_memory()
-    with uncollected():
-        if config.has_crew:
-            fork_server.begin(forked=True)
-        from tiler.executors.kernels import count_cores
-        from tiler.monitoring.events import EventLog, open_log
-        from tiler.monitoring.terminal import make_views, print_last_line, print_summary
-        from tiler.workflow.out_folder import refuse_result
-        from tiler.workflow.run import run
+    if config.workers and not config.on_cluster:
+        start_fork_server()
+    gc.set_threshold(GARBAGE)
+    from tiler.executors.kernels import count_cores
+    from tiler.monitoring.events import EventLog, open_log
+    from tiler.monitoring.terminal import make_views, print_last_line, print_summary
+    from tiler.workflow.out_folder import refuse_result
+    from tiler.workflow.run import run
 
     if report:
         refuse_bucket(config.out, "--report")
@@ -160,32 +151,6 @@ def _run_config(
         print_summary(record, out)
     code: int = record["exit_code"]
     return code
-
-
-def _join(options: argparse.Namespace) -> int:
-    config = make_config(with_file(vars(options)))
-    fork_server.limit_threads()
-    look_seldom()
-    with uncollected():
-        fork_server.begin(forked=True)
-        from tiler.joining.join import join
-        from tiler.monitoring.terminal import make_views, print_last_line, print_summary
-
-    joined = join(
-        config,
-        member=options.member,
-        max_idle=options.max_idle,
-        views=lambda: make_views(quiet=options.quiet, verbose=options.verbose),
-        say=None if options.quiet else say,
-    )
-    if joined.error:
-        print(f"citystitch: {printable(joined.error)}", file=sys.stderr)
-    elif joined.record is not None:
-        show = print_last_line if options.quiet else print_summary
-        show(joined.record, Path(config.out))
-    elif not options.quiet:
-        say(f"{config.out}: the run is done")
-    return joined.exit_code
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -372,7 +337,6 @@ def _config(_: argparse.Namespace) -> int:
 
 HANDLERS: Mapping[str, Handler] = {
     "run": _run,
-    "join": _join,
     "plan": _plan,
     "check": _check,
     "status": _status,

@@ -10,7 +10,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from pipeline.errors import ConfigError
 from tiler.config.config import Config
 from tiler.config.domain_height import Height
-from tiler.executors.addresses import ANYWHERE
+from tiler.executors.dask_settings import ANYWHERE
 from tiler.export.export import list_formats, load_format
 from tiler.interface.api import POSITIONAL
 from tiler.jobs.commands import add_job_commands
@@ -105,7 +105,6 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
         default=False,
         help="write report.html at the end, as `citystitch report` does",
     )
-    _add_join(command("join", "work at a run together with others, on any machines that share its folder"))
     plan = command("plan", "tell what a run would do and take, without doing it")
     plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
     plan.add_argument("--picture", type=Path, metavar="FILE.png", help="draw tiles, files and footprints")
@@ -174,22 +173,6 @@ def _add_inputs(parser: argparse.ArgumentParser) -> Group:
         POSITIONAL, nargs="*", metavar="POINTCLOUD", help="files, globs or folders; or one config.toml"
     )
     return _add_parameters(parser)
-
-
-def _add_join(join: argparse.ArgumentParser) -> None:
-    """Add the options of one that joins a run: those of the run, and a few of its own."""
-    _add_inputs(join)
-    join.add_argument("--member", default="", metavar="NAME", help="its name (default: its element of an array)")
-    join.add_argument(
-        "--max-idle",
-        type=float,
-        default=600.0,
-        metavar="SECONDS",
-        help="how long to wait for a folder that a run holds which is not one to join (default: 600)",
-    )
-    words = join.add_mutually_exclusive_group()
-    words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
-    words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
 
 
 def _add_parameters(parser: argparse.ArgumentParser) -> Group:

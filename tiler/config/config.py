@@ -249,9 +249,6 @@ class Config:
     workers: int = _parameter(
         0, "run", "worker processes on this machine; 0 runs in this process", least=0, most=1024
     )
-    dask: bool = _parameter(
-        False, "run", "workers on this machine are those of a Dask scheduler, with Dask's own pages; some slower"
-    )
     memory_limit: float = _parameter(
         0.0, "run", "memory of a worker on this machine; 0 shares out nine tenths of what there is", unit="GiB",
         least=0,
@@ -293,11 +290,6 @@ class Config:
     def on_cluster(self) -> bool:
         """Whether workers are of a cluster, not of this machine."""
         return bool(self.scheduler or self.cluster)
-
-    @property
-    def has_crew(self) -> bool:
-        """Whether tasks run in worker processes of this machine, without Dask."""
-        return bool(self.workers) and not self.on_cluster and not self.dask
 
     @property
     def padded(self) -> bool:
@@ -380,8 +372,6 @@ def idle_parameters(config: Config) -> list[str]:
         idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
     if config.layer_growth != default.layer_growth and not config.first_layer:
         idle.append(f"layer_growth = {config.layer_growth:g} has no effect: it counts with first_layer above 0")
-    if config.dask and (config.on_cluster or not config.workers):
-        idle.append("dask has no effect: it counts with workers above 0, on this machine")
     if not config.scheduler:
         idle += [f"{name} has no effect: it counts with scheduler" for name in TLS if getattr(config, name)]
     return idle

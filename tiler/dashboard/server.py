@@ -12,7 +12,7 @@ from typing import Any
 from pipeline.errors import ConfigError
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.metrics import Collector
-from tiler.executors.addresses import ANYWHERE
+from tiler.executors.dask_settings import ANYWHERE
 
 PREFIX = "/citystitch"
 MOST_BODY = 0  # bytes of a body that is taken: nobody has anything to send

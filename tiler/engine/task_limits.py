@@ -163,7 +163,7 @@ def trim_memory() -> None:
 
     Notes
     -----
-    A worker keeps what it freed (`tiler.executors.fork_server`), and small things that live on keep all that
+    A worker keeps what it freed (`tiler.executors.dask_settings`), and small things that live on keep all that
     lies below. To give it back takes time, and so does getting it anew: for workers that hold much.
     """
     import ctypes

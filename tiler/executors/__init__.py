@@ -1,1 +1,1 @@
-"""Where tasks run: this process or worker processes of this machine, and how these start."""
+"""Where tasks run: in this process, or on the workers of a Dask scheduler, here or anywhere."""

@@ -1,18 +1,30 @@
-"""What Dask's schedulers and workers are told, wherever they run: on this machine, in jobs, in anybody's cluster.
+"""Settings of Dask for schedulers and workers, on this machine, in jobs, or in any cluster (`deploy/dask.yaml`).
 
-No array is in Dask's hands, so there is nothing to spill and nothing to pause for. Its logs of transitions, of
-its own load and of what was submitted hold on to memory: they are kept short, and its samples of what a worker's
-thread is at, 0.2 MB a second that stay for an hour, are not taken. It looks at itself and at its memory less often
-than it would. All tasks in flight lie with the workers, each of which begins with those of the highest priority:
-Dask would keep the many of one stage back, behind the few of all others. What waits for a worker that is at work
-goes to one that is not within a tenth of a second, not within one.
+Nothing is spilled and no worker pauses, as Dask holds no array here. Logs of transitions, of its load and of what
+was submitted are kept short, and no samples of the call stack are taken (0.2 MB/s that stay for an hour). Memory
+and load are looked at less often. All submitted tasks are sent to workers at once, which begin those of highest
+priority first; idle workers steal within 0.1 s. Dask does not send the tasks of a dead worker again by itself:
+`tiler.executors.dask_executor` tells by their trace files which of them had begun.
 """
 
+import os
+import sys
 from collections.abc import Mapping
+from multiprocessing import forkserver
 from typing import Any
 
 from tiler.engine.task_limits import KILL_AT
 
+# Of worker processes, before Python starts. One thread each. malloc keeps what was freed for the next task (some
+# 200 MB): Dask's own settings give it back at once, which costs a third of a run in page faults.
+ENVIRONMENT: Mapping[str, int] = {
+    "OMP_NUM_THREADS": 1,
+    "MKL_NUM_THREADS": 1,
+    "OPENBLAS_NUM_THREADS": 1,
+    "MALLOC_ARENA_MAX": 1,
+    "MALLOC_TRIM_THRESHOLD_": 2**28,
+    "MALLOC_MMAP_THRESHOLD_": 2**25,
+}
 SCHEDULER: Mapping[str, Any] = {
     "distributed.scheduler.allowed-failures": 0,
     "distributed.scheduler.worker-saturation": "inf",
@@ -33,6 +45,23 @@ BOTH: Mapping[str, Any] = {
     "distributed.admin.system-monitor.interval": "2s",
     "distributed.admin.tick.interval": "500ms",
 }
+ANYWHERE = "127.0.0.1:0"  # a free port of this machine, for this machine
+GARBAGE = 10_000  # new objects after which Python looks for cycles, of which tasks leave next to none
+METHOD = "forkserver" if sys.platform == "linux" else "spawn"
+# A dead process shows by its closed connection, so a worker that is silent because its task holds the interpreter
+# is not given up. The nanny of a dead one starts another: the cluster would give up one that is still starting
+# 15 s after its predecessor died.
+LOCAL: Mapping[str, Any] = {
+    **SCHEDULER,
+    **WORKER,
+    **BOTH,
+    "distributed.nanny.pre-spawn-environ": dict(ENVIRONMENT),
+    "distributed.worker.multiprocessing-method": METHOD,
+    "distributed.worker.daemon": False,
+    "distributed.scheduler.worker-ttl": None,
+    "distributed.deploy.lost-worker-timeout": "3650 days",
+}
+PRELOADED = ("distributed.nanny", "tiler.executors.local_cluster", "tiler.workflow.own_stages")
 
 
 def as_variables(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -44,3 +73,15 @@ def as_variables(settings: Mapping[str, Any]) -> dict[str, Any]:
     {'DASK_DISTRIBUTED__WORKER__MEMORY__MONITOR_INTERVAL': '200ms'}
     """
     return {"DASK_" + name.upper().replace(".", "__").replace("-", "_"): value for name, value in settings.items()}
+
+
+def start_fork_server() -> None:
+    """Start Python's fork server in the background, which imports `PRELOADED` once for all workers here.
+
+    A second call does nothing. `ENVIRONMENT` is set in this process, as Dask's nanny does it too.
+    """
+    if METHOD == "forkserver":
+        for name, value in ENVIRONMENT.items():
+            os.environ.setdefault(name, str(value))
+        forkserver.set_forkserver_preload(list(PRELOADED))
+        forkserver.ensure_running()

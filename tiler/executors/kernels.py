@@ -12,14 +12,13 @@ import platform
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import connection
+from multiprocessing import connection, get_context
 from pathlib import Path
 from typing import Any
 
 from llvmlite import binding
 
 from tiler.engine.keys import version_of
-from tiler.executors import fork_server
 
 ROOT = Path(__file__).parents[2]
 LIST = Path(__file__).parents[1] / "kernels.json"  # written by tests/record_kernels.py
@@ -135,9 +134,13 @@ def _share_out(pipes: list[Any], modules: list[tuple[str, Signatures]]) -> list[
 def _processes(number: int) -> Iterator[list[Any]]:
     """Give the pipes of as many processes that compile; they end with the context, at once."""
     started, pipes = [], []
+    methods = get_context("spawn")
     try:
         for _ in range(number):
-            process, pipe = fork_server.start(_work)
+            pipe, other_end = methods.Pipe()
+            process = methods.Process(target=_work, args=(other_end,), daemon=True)
+            process.start()
+            other_end.close()
             started.append(process)
             pipes.append(pipe)
         yield pipes

@@ -1,4 +1,4 @@
-"""Workers as jobs of a batch system, brought up by dask-jobqueue as there is work, see `tiler.scheduler`."""
+"""Workers as jobs of a batch system, brought up by dask-jobqueue as there is work, see `tiler.executors`."""
 
 import asyncio
 import json
@@ -14,13 +14,11 @@ from typing import Any
 from pipeline.errors import ConfigError
 from tiler.engine.task import Failure, Task
 from tiler.engine.task_limits import REFUSE_AT, Limits
-from tiler.executors import fork_server
-from tiler.executors.addresses import ANYWHERE
-from tiler.executors.dask_settings import BOTH, SCHEDULER, WORKER, as_variables
+from tiler.executors.dask_executor import ClusterError, DaskExecutor
+from tiler.executors.dask_settings import ANYWHERE, BOTH, ENVIRONMENT, SCHEDULER, WORKER, as_variables
 from tiler.executors.executor import Executor
 from tiler.jobs.queues import QUEUES, JobSize, Queue, QueueError
 from tiler.jobs.table import Cluster
-from tiler.scheduler.executor import ClusterError, Dask
 from tiler.store.atomic import replacing
 from tiler.words.plain_text import say_nothing
 
@@ -39,14 +37,14 @@ SETTINGS: Mapping[str, Any] = {
 }
 # What a worker's own process is told; as variables, since its job has no other settings of Dask.
 VARIABLES: Mapping[str, Any] = {
-    **fork_server.ENVIRONMENT,
+    **ENVIRONMENT,
     **as_variables(WORKER),
     **as_variables(BOTH),
     "PYTHONWARNINGS": "ignore",
 }
 
 
-class QueuedDask(Dask):
+class QueuedDask(DaskExecutor):
     """Tasks on workers that come and go with their jobs.
 
     Notes
@@ -109,7 +107,7 @@ def job_queue(
     from distributed import Client
     from distributed.utils import silence_logging_cmgr
 
-    from tiler.executors.worker_setup import WorkerSetup
+    from tiler.executors.local_cluster import WorkerSetup
 
     memory = int(table.worker.memory * 2**30)
     (folder / "logs").mkdir(parents=True, exist_ok=True)

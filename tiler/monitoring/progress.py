@@ -15,7 +15,7 @@ from typing import Any
 from tiler.config.config import Config
 from tiler.engine.stage import Scope
 from tiler.engine.task import Record
-from tiler.monitoring.watchers import LOST, Item, Watcher
+from tiler.monitoring.watchers import Item, Watcher
 from tiler.store.atomic import replacing
 from tiler.workflow.out_folder import PROGRESS
 
@@ -129,9 +129,8 @@ class RunProgress(Watcher):
             self._announce(f"{stage} ({total})", state.seconds)
 
     def end(self, status: str, error: str = "") -> None:
-        """Write how the run ended; not if it is another process's by now."""
-        if status != LOST:
-            self.write(status, error)
+        """Write how the run ended."""
+        self.write(status, error)
 
     def write(self, status: str, error: str = "") -> None:
         """Write the file.

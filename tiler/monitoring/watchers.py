@@ -15,7 +15,6 @@ from tiler.planning.context import seam_key, tile_name
 from tiler.workflow.failed_tiles import command_alone
 
 Item = tuple[str, str]  # stage and name
-LOST = "lost"  # status of a run that another process drives by now: nothing of it is written any more
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """A layer of a vector file opened by GDAL: which one, by which options, and what it says about itself (step 1.2).
 
 pyogrio is imported where it is used: few tasks need it, and it brings pyarrow, where that is there, whose memory
-has a thread of its own; a process is forked while it has one thread alone (`tiler.executors.fork_server`).
+has a thread of its own.
 """
 
 import json

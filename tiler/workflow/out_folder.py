@@ -9,8 +9,8 @@ from typing import Any
 
 from pipeline.errors import ConfigError, OutputError
 from tiler.engine.task_limits import TASKS
+from tiler.executors.worker_requirements import PROBE
 from tiler.objects.places import in_bucket
-from tiler.scheduler.terms import PROBE
 from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL
 from tiler.store.store import MANIFEST
 

@@ -21,23 +21,19 @@ from tiler.engine.stage import Stage
 from tiler.engine.stopping import stops
 from tiler.engine.task import peak_memory
 from tiler.engine.task_limits import TASKS, Limits, limit_workers, machine_memory
-from tiler.executors.addresses import ANYWHERE
-from tiler.executors.executor import Executor, processes, serial
+from tiler.executors.dask_settings import ANYWHERE
+from tiler.executors.executor import Executor, serial
 from tiler.executors.kernels import prepare
 from tiler.jobs.table import read_cluster
-from tiler.joining.lease import LostFolderError
-from tiler.joining.spool import SPOOL
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
 from tiler.monitoring.progress import Announce
-from tiler.monitoring.watchers import LOST, Listener, Watcher, Watchers
-from tiler.objects.places import in_bucket, place
+from tiler.monitoring.watchers import Listener, Watcher, Watchers
+from tiler.objects.places import absolute, in_bucket, place
 from tiler.planning.forecast import warn_of_memory
 from tiler.planning.pad import Pad
 from tiler.planning.padded_layout import pad_plan
 from tiler.planning.plan import Plan, check_sources, make_plan
 from tiler.report.kept_report import give_back_report
-from tiler.scheduler.executor import local
-from tiler.scheduler.reach import reach_cluster, spell_out
 from tiler.store.atomic import replacing, sync_meanwhile
 from tiler.store.audit import Audit
 from tiler.store.checksums import seal
@@ -74,7 +70,6 @@ from tiler.workflow.stage_sequence import make_engine, run_stages
 from tiler.workflow.summary import describe_tasks, summarise_run
 
 SCHEMA = 1  # version of run.json's layout
-OwnExecutor = Callable[[Callable[[str], None]], AbstractContextManager[Executor]]
 
 
 @dataclass(frozen=True)
@@ -87,8 +82,6 @@ class _Means:
         Where its page is shown, ``HOST:PORT``.
     shown : Path
         Folder of the events that the page is made of.
-    own_executor : callable or None
-        Makes the executor of one who brings it.
     cluster : Executor or None
         Of the scheduler that was asked for.
     compilers : int
@@ -98,7 +91,6 @@ class _Means:
 
     dashboard: str | None
     shown: Path
-    own_executor: OwnExecutor | None
     cluster: Executor | None
     compilers: int
 
@@ -112,7 +104,6 @@ def run(
     parameters: Mapping[str, Any] | None = None,
     watchers: Sequence[Watcher] = (),
     dashboard: str | None = None,
-    executor: OwnExecutor | None = None,
     compilers: int | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
@@ -134,9 +125,6 @@ def run(
     dashboard : str, optional
         Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
         default. `say` is told its URL.
-    executor : callable, optional
-        Given what tells the run's watchers a sentence, makes the executor of all tasks, a context; by default
-        that which `config` asks for.
     compilers : int, optional
         Processes that compile kernels before the first task of a run on this machine, if that was not done here,
         and the same run has not been done before; 0: each when it is needed. By default as many as workers, so
@@ -163,7 +151,7 @@ def run(
     (``damaged-artefact``).
     """
     told = Watchers(watchers if say is None else [*watchers, Listener(say)])
-    config = spell_out(config)
+    config = use_absolute_paths(config)
     made: list[Path] = []
     try:
         check_sources(config)
@@ -178,14 +166,13 @@ def run(
         with only_run(out, told.say) as check, _beside(out, check, told) as shown:
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
-            with reach_cluster(config) as cluster:
-                here = executor is None and not config.on_cluster
+            with _connect(config) as cluster:
                 compilers = config.workers if compilers is None else compilers
-                beforehand = here and not is_repeated(config)
-                means = _Means(dashboard, shown, executor, cluster, compilers if beforehand else 0)
+                beforehand = not config.on_cluster and not is_repeated(config)
+                means = _Means(dashboard, shown, cluster, compilers if beforehand else 0)
                 try:
                     return _run(config, out, earlier, damage, own, announce, told, means)
-                except (StoppedError, LostFolderError):
+                except StoppedError:
                     raise
                 except Exception:
                     remove_if_useless(made)
@@ -227,8 +214,6 @@ def _run(
         clear_folder(out, earlier, overwrite=config.overwrite)
         if not in_bucket(out):
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
-            if means.own_executor is None:
-                shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
         save_config(config, out)
         progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=means.shown)
         record |= _mesh_region(config, out, plan, own, watchers, damage, means)
@@ -246,10 +231,6 @@ def _run(
             if waits := tell_waits():
                 say(waits)
         failed = False
-    except LostFolderError as error:
-        untouched = True  # the folder is another process's now
-        watchers.end(LOST, str(error))
-        raise
     except StoppedError as error:
         record |= {"status": "stopped", "error": str(error)}
         raise
@@ -359,12 +340,30 @@ def _prepare(processes: int, say: Callable[[str], None]) -> None:
         raise StoppedError("stopped before the first task; the same command begins again") from None
 
 
+def use_absolute_paths(config: Config) -> Config:
+    """Make the paths of a run absolute where it is on a cluster: a worker has another current folder."""
+    if not config.on_cluster:
+        return config
+    return dataclasses.replace(
+        config,
+        pointcloud=tuple(map(absolute, config.pointcloud)),
+        footprints=absolute(config.footprints) if config.footprints else "",
+        out=absolute(config.out),
+    )
+
+
+def _connect(config: Config) -> AbstractContextManager[Executor | None]:
+    """Connect to the scheduler of a run; None where there is none."""
+    if not config.scheduler:
+        return nullcontext()
+    from tiler.executors.remote_cluster import connect_run
+
+    return connect_run(config)
+
+
 @contextmanager
 def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iterator[Executor]:
-    if means.own_executor is not None:
-        with means.own_executor(say) as executor:
-            yield executor
-    elif means.cluster is not None:
+    if means.cluster is not None:
         yield means.cluster
     elif config.cluster:
         from tiler.jobs.jobqueue import JOB, job_queue
@@ -374,10 +373,9 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
             table, folder, Limits(config.time_limit), dashboard=means.dashboard or ANYWHERE, say=say
         ) as executor:
             yield executor
-    elif config.has_crew:
-        with processes(config.workers, limit_workers(config)) as executor:
-            yield executor
     elif config.workers:
+        from tiler.executors.local_cluster import local
+
         with local(config.workers, limit_workers(config), dashboard=means.dashboard or ANYWHERE) as executor:
             yield executor
     else:

@@ -1,29 +1,32 @@
-"""A run on somebody's Dask cluster: the way to it, what its workers must meet, and paths that hold there."""
+"""Workers of a Dask cluster that is running already: connection, and check of its workers."""
 
-import dataclasses
 import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
+from dask import config as settings
+from dask.utils import parse_timedelta
+from distributed import Client
+from distributed.utils import silence_logging_cmgr
+
 from pipeline.errors import CityError
 from tiler.config.config import Config
 from tiler.engine.task_limits import Limits
+from tiler.executors.dask_executor import DaskExecutor
 from tiler.executors.executor import Executor
-from tiler.objects.places import absolute, is_url
+from tiler.executors.transport import NO_FILES, TlsFiles, check_answer, make_security
+from tiler.executors.worker_requirements import Requirements, check_cluster, own_requirements, require_files
+from tiler.objects.places import is_url
 from tiler.pointclouds.clouds import find_clouds
-from tiler.scheduler.check import check_cluster
-from tiler.scheduler.executor import Dask
-from tiler.scheduler.terms import Terms, offer_terms, own_terms
-from tiler.scheduler.transport import NO_FILES, TlsFiles, check_answer, make_security
 
 TCP_TIMEOUT = "distributed.comm.timeouts.tcp"
 PATIENCE = 120.0  # s that a link may be cut; Dask by itself gives it up after 30 s
 
 
 @contextmanager
-def reach_cluster(config: Config) -> Iterator[Executor | None]:
-    """Connect to the scheduler of a run, and hold its workers against this process; None where there is none.
+def connect_run(config: Config) -> Iterator[Executor]:
+    """Connect to the scheduler of a run, and compare its workers with this process.
 
     Parameters
     ----------
@@ -33,38 +36,23 @@ def reach_cluster(config: Config) -> Iterator[Executor | None]:
     Raises
     ------
     CityError
-        As `connect` and `tiler.scheduler.terms.offer_terms`; nothing is left in the folder.
+        As `connect` and `tiler.executors.worker_requirements.require_files`; nothing is left in the folder.
     """
-    if not config.scheduler:
-        yield None
-        return
     given = [str(path) for path in (*find_clouds(config.pointcloud), config.footprints) if str(path)]
     files = [Path(path) for path in given if not is_url(path)]
     # Who reaches a bucket reaches the same one, and is told in its first task if it does not.
     with (
-        nullcontext(own_terms())
+        nullcontext(own_requirements())
         if is_url(config.out)
-        else offer_terms(Path(config.out).absolute(), files) as terms,
+        else require_files(Path(config.out).absolute(), files) as requirements,
         connect(
             config.scheduler,
             Limits(config.time_limit),
             tls=TlsFiles(config.tls_ca, config.tls_cert, config.tls_key),
-            terms=terms,
+            requirements=requirements,
         ) as executor,
     ):
         yield executor
-
-
-def spell_out(config: Config) -> Config:
-    """Make the paths of a run absolute where it is on a cluster: a worker has another current folder."""
-    if not config.on_cluster:
-        return config
-    return dataclasses.replace(
-        config,
-        pointcloud=tuple(map(absolute, config.pointcloud)),
-        footprints=absolute(config.footprints) if config.footprints else "",
-        out=absolute(config.out),
-    )
 
 
 @contextmanager
@@ -73,7 +61,7 @@ def connect(
     limits: Limits | None = None,
     *,
     tls: TlsFiles = NO_FILES,
-    terms: Terms | None = None,
+    requirements: Requirements | None = None,
 ) -> Iterator[Executor]:
     """Run tasks on a Dask cluster whose workers see the same store and files; it is left running.
 
@@ -85,7 +73,7 @@ def connect(
         The time limit holds if workers have one thread each; the memory limit is the cluster's own.
     tls : TlsFiles
         Files of TLS; those of Dask's configuration by default.
-    terms : Terms, optional
+    requirements : Requirements, optional
         What its workers must meet; their versions alone by default.
 
     Raises
@@ -93,8 +81,8 @@ def connect(
     CityError
         If nothing answers there, or it has no workers.
     ConfigError
-        If it cannot be reached that way, or a worker does not meet the terms: see `tiler.scheduler.transport` and
-        `tiler.scheduler.check`.
+        If it cannot be reached that way, or a worker does not meet the requirements: see
+        `tiler.executors.transport` and `tiler.executors.worker_requirements`.
 
     Notes
     -----
@@ -102,17 +90,12 @@ def connect(
     `ClusterError`, and so does a cluster that has had no worker for `NO_WORKERS` seconds. A link to the scheduler
     that is cut is lost after `PATIENCE`, or what Dask's configuration has for it if that is more.
     """
-    from dask import config
-    from dask.utils import parse_timedelta
-    from distributed import Client
-    from distributed.utils import silence_logging_cmgr
-
     security = make_security(address, tls)
     check_answer(address, security)
-    terms = terms or own_terms()
-    patience = max(parse_timedelta(config.get(TCP_TIMEOUT)), PATIENCE)
+    requirements = requirements or own_requirements()
+    patience = max(parse_timedelta(settings.get(TCP_TIMEOUT)), PATIENCE)
     with ExitStack() as stack:
-        stack.enter_context(config.set({TCP_TIMEOUT: f"{patience:g}s"}))
+        stack.enter_context(settings.set({TCP_TIMEOUT: f"{patience:g}s"}))
         try:
             client = Client(address, security=security)
         except (OSError, RuntimeError) as error:
@@ -125,6 +108,6 @@ def connect(
         threads = list(client.nthreads().values())
         if not threads:
             raise CityError(f"{address}: the scheduler has no workers; start some and run again")
-        check_cluster(client, address, terms)
+        check_cluster(client, address, requirements)
         seconds = limits.seconds if limits is not None and max(threads) == 1 else 0.0
-        yield Dask(client, sum(threads), Limits(seconds), terms=terms)
+        yield DaskExecutor(client, sum(threads), Limits(seconds), requirements=requirements)

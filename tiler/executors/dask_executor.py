@@ -1,0 +1,294 @@
+"""Tasks on the workers of a Dask scheduler, on this machine or anywhere."""
+
+import time
+import uuid
+from collections import Counter, deque
+from concurrent.futures import CancelledError
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from typing import Any, NamedTuple
+
+from pipeline.errors import CityError
+from tiler.engine.task import Failure, Task
+from tiler.engine.task_limits import Limits, WorkerError, run_guarded, tell_death, tell_memory
+from tiler.executors.executor import LEAST_TASKS, TASKS_PER_WORKER, Function, Outcome
+from tiler.executors.worker_requirements import (
+    ClusterMismatchError,
+    Mismatch,
+    Requirements,
+    UnansweredError,
+    check_cluster,
+    find_mismatch,
+)
+
+BYSTANDER = 20  # how often a task may be lost with a worker that died before it began, before it is an error
+LOOK = 5.0  # s without a result, after which the scheduler is asked whether it has workers
+NO_WORKERS = 300.0  # s without any worker, after which a run ends; a busy machine starts them slowly
+
+
+class ClusterError(CityError):
+    """The Dask cluster of a run is gone: start it again, the same command goes on."""
+
+
+class _Given(NamedTuple):
+    """A task as the engine submitted it."""
+
+    ticket: int
+    function: Function
+    task: Task
+    rank: int
+
+
+class DaskExecutor:
+    """Tasks on the workers of a Dask scheduler.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        Connected client.
+    workers : int
+        Number of threads that run tasks.
+    limits : Limits
+        What a task may take.
+    scheduler : distributed.Scheduler, optional
+        The scheduler, where it is in this process: its HTTP server shows the page of the run.
+    requirements : Requirements, optional
+        What a worker must meet that was not started from here. A task that comes back from one that does not meet
+        them fails with a `ClusterMismatchError`, which ends a run.
+
+    Notes
+    -----
+    Where a worker dies, Dask blames all tasks that it had. Here a task is blamed if it had begun, which its trace
+    file tells (`tiler.engine.task_limits`); the others are sent again.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        workers: int,
+        limits: Limits | None = None,
+        scheduler: Any | None = None,
+        *,
+        requirements: Requirements | None = None,
+    ) -> None:
+        self.workers, self.scheduler = workers, scheduler
+        self._client, self._limits, self._requirements = client, limits or Limits(), requirements
+        self._round = uuid.uuid4().hex  # of tasks that are dropped together
+        self._waiting: list[_Given] = []
+        self._sent: dict[str, tuple[Any, _Given]] = {}  # future and task by key
+        self._ready: SimpleQueue[tuple[str, Any]] = SimpleQueue()  # key, and the result or the error
+        self._done: deque[tuple[int, Outcome]] = deque()
+        self._losses: Counter[int] = Counter()  # by ticket
+        self._lost = False
+
+    @property
+    def window(self) -> int:
+        """Some for each worker."""
+        return max(TASKS_PER_WORKER * self.workers, LEAST_TASKS)
+
+    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
+        """Take a task, the lower its rank the sooner it begins; ClusterError if the scheduler is lost."""
+        self._check_scheduler()
+        self._waiting.append(_Given(ticket, function, task, rank))
+
+    def wait(self) -> tuple[int, Outcome]:
+        """Wait until any task is done.
+
+        Raises
+        ------
+        ClusterError
+            If the scheduler is lost, or has had no worker for `NO_WORKERS` seconds.
+        """
+        while not self._done:
+            self._send()
+            self._take(*self._next())
+        return self._done.popleft()
+
+    def drop_waiting(self) -> set[int]:
+        """Let workers refuse what they have not begun, and wait until they have ended the rest.
+
+        Without a scheduler nobody can be asked; what workers then still commit is what a task of that key gives.
+        """
+        dropped = {given.ticket for given in self._waiting}
+        self._waiting.clear()
+        try:
+            self._check_scheduler()
+            self._client.run(refuse_round, self._round, on_error="ignore")
+            while self._sent:
+                key, found = self._next()
+                future, given = self._sent.pop(key)
+                dropped.add(given.ticket)
+                self._outcome(found, given)
+                future.release()
+        except (OSError, RuntimeError, CancelledError, ClusterError):
+            if not self._is_lost():
+                raise
+            dropped |= {given.ticket for _, given in self._sent.values()}
+            self._sent.clear()
+        self._round = uuid.uuid4().hex
+        return dropped
+
+    def _send(self) -> None:
+        """Send all that waits in one call, as most of what a call costs it costs once."""
+        from dask import annotate
+        from distributed.protocol.pickle import dumps
+
+        if not self._waiting:
+            return
+        batch, self._waiting = self._waiting, []
+        keys = [f"{given.task.stage}-{uuid.uuid4().hex}" for given in batch]  # a second try has another one
+        priority = {key: -given.rank for key, given in zip(keys, batch, strict=True)}
+        try:
+            packed = [dumps((given.function, given.task)) for given in batch]
+        except Exception:  # a function that cannot be sent
+            self._waiting = batch
+            raise
+        with annotate(priority=priority.get):
+            futures = self._client.map(
+                run_packed,
+                packed,
+                key=keys,
+                pure=False,
+                retries=0,
+                seconds=self._limits.seconds,
+                in_round=self._round,
+                requirements=self._requirements,
+            )
+        for future, given in zip(futures, batch, strict=True):
+            self._sent[future.key] = future, given
+            self._client.loop.add_callback(self._follow, future)
+
+    async def _follow(self, future: Any) -> None:
+        """Put the result of a task, or its error, into the queue when it is there."""
+        try:
+            found = await future
+        except Exception as error:
+            found = error
+        self._ready.put((future.key, found))
+
+    def _next(self) -> tuple[str, Any]:
+        """Wait for the next result; Dask itself would wait for ever where there are no workers."""
+        began = time.monotonic()
+        while True:
+            with suppress(Empty):
+                key, found = self._ready.get(timeout=LOOK)
+                if key in self._sent:
+                    return key, found
+                continue
+            self._check_scheduler()
+            now = time.monotonic()
+            if self._has_workers():
+                began = now
+            elif now - began >= NO_WORKERS:
+                raise ClusterError(
+                    f"the Dask scheduler has no worker for {now - began:.0f} s, bound {NO_WORKERS:g} s; "
+                    "start some, the same command goes on where it ended"
+                )
+
+    def _take(self, key: str, found: Any) -> None:
+        """Take the result of a task; what had not begun when its worker died is sent again."""
+        future, given = self._sent[key]
+        outcome = self._outcome(found, given)
+        del self._sent[key]
+        future.release()
+        if outcome is None:
+            self._losses[given.ticket] += 1
+            self._waiting.append(given)
+        else:
+            self._losses.pop(given.ticket, None)
+            self._done.append((given.ticket, outcome))
+
+    def _outcome(self, found: Any, given: _Given) -> Outcome | None:
+        """Record or failure of a task; None if it must be sent again."""
+        from distributed import KilledWorker
+
+        match found:
+            case Failure(kind="memory"):
+                return tell_memory(found, self._limits)
+            case Mismatch():
+                return Failure(found.as_error(self._address))
+            case KilledWorker():
+                death = tell_death(given.task, self._limits)
+                if death is not None and self._forgives(given.task, death):
+                    return None
+                return death or self._bystander(given.ticket)
+            case CancelledError():  # of a lost scheduler alone
+                self._lost = True
+                self._check_scheduler()
+            case Exception():  # of Dask itself: a module that a worker lacks
+                return Failure(self._find_mismatch() or found)
+        outcome: Outcome | None = found
+        return outcome
+
+    def _bystander(self, ticket: int) -> Failure | None:
+        """Failure of a task that had not begun in a worker that died; None if it must be sent again."""
+        if mismatch := self._find_mismatch():
+            return Failure(mismatch)
+        if self._losses[ticket] < BYSTANDER:
+            return None
+        return Failure(WorkerError(f"{BYSTANDER} workers died before they began it; look at their logs"))
+
+    def _forgives(self, task: Task, death: Failure) -> bool:
+        """Tell whether a task is sent again as if it had not begun, whose worker died with it."""
+        return False
+
+    def _has_workers(self) -> bool:
+        try:
+            return bool(self._client.nthreads())
+        except (OSError, RuntimeError, CancelledError):
+            self._check_scheduler()
+            return True
+
+    def _find_mismatch(self) -> Exception | None:
+        """Ask workers again: one may have joined that cannot even read a task, and dies of it."""
+        if self._requirements is None:
+            return None
+        try:
+            check_cluster(self._client, self._address, self._requirements, late=True)
+        except ClusterMismatchError as error:
+            return error
+        except UnansweredError:  # one is out of reach: what the others run is theirs
+            return None
+        except (OSError, RuntimeError, CancelledError):
+            self._check_scheduler()
+        return None
+
+    def _check_scheduler(self) -> None:
+        if self._is_lost():
+            raise ClusterError(
+                "the connection to the Dask scheduler is lost; all that was done is kept: start a scheduler and "
+                "workers, the same command goes on where it ended"
+            )
+
+    def _is_lost(self) -> bool:
+        """Tell whether the client has lost its scheduler since it sent what is in flight."""
+        return self._lost or self._client.status != "running"
+
+    @property
+    def _address(self) -> str:
+        return str(self._client.scheduler.address)
+
+
+_REFUSED = set[str]()  # rounds, in a worker
+
+
+def refuse_round(dropped: str) -> None:
+    """In a worker: begin no task of a round any more."""
+    _REFUSED.add(dropped)
+
+
+def run_packed(
+    packed: bytes, *, seconds: float, in_round: str, requirements: Requirements | None
+) -> Outcome | Mismatch | None:
+    """In a worker: run a task as it was sent; an error of reading it is its failure, None if it was dropped."""
+    from distributed.protocol.pickle import loads
+
+    if in_round in _REFUSED:
+        return None
+    if requirements is not None and (mismatch := find_mismatch(requirements)):
+        return mismatch
+    try:
+        function, task = loads(packed)
+    except Exception as error:
+        return Failure(RuntimeError(f"cannot be read by a worker: {type(error).__name__}: {error}"))
+    return run_guarded(function, task, seconds)

@@ -1,1 +1,0 @@
-"""`citystitch join`: processes that work at one run through its folder alone."""
