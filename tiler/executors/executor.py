@@ -8,7 +8,6 @@ from typing import Protocol
 
 from tiler.engine.task import Failure, Record, Task, run_task
 from tiler.engine.task_limits import Limits, share_memory, tell_memory
-from tiler.executors.numba_registry import look_up
 from tiler.executors.worker_processes import WEIGH, Crew, Function, Given
 
 WINDOW, LEAST_WINDOW = 4, 8  # tasks in hand for each worker, and at least
@@ -108,7 +107,6 @@ class Processes:
 @contextmanager
 def serial() -> Iterator[Executor]:
     """Run tasks in this process."""
-    look_up()
     yield Serial()
 
 

@@ -5,10 +5,8 @@ import importlib
 from tiler.executors.fork_server import SHARED
 from tiler.executors.importing import uncollected
 from tiler.executors.kept_memory import look_seldom
-from tiler.executors.numba_registry import look_up
 
 with uncollected():
     for name in SHARED:
         importlib.import_module(name)
-    look_up()
 look_seldom()

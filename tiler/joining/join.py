@@ -49,7 +49,7 @@ from tiler.planning.plan import check_sources
 from tiler.store.folder_lock import is_held
 from tiler.words.plain_text import say_nothing, shorten
 from tiler.workflow.out_folder import RUN_RECORD, check_folder
-from tiler.workflow.run import is_repeated, run, tell_error
+from tiler.workflow.run import run, tell_error
 
 MAX_IDLE = 600.0  # s that a member waits for a folder that another run holds
 MEMBERS = "members."
@@ -124,8 +124,7 @@ def join(
     if spool.is_symlink():
         raise ConfigError(f"{spool}: is a symbolic link; remove it")
     workers = max(config.workers, 1)
-    if not is_repeated(config):
-        prepare(workers, say or say_nothing)
+    prepare(config.mesher, workers, say or say_nothing)
     with closing(Crew(workers, limit_workers(config))) as crew:
         me = this_holder(name, crew.workers, describe_member(config))
         return _Joining(config, me, crew, max_idle, views, say or say_nothing).go()
