@@ -13,8 +13,8 @@ Result = TypeVar("Result")
 def kernel(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]: ...
 @overload
 def kernel(**options: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]: ...
-def kernel(function: Callable[..., Any] | None = None, **options: str) -> Any:
-    """Apply `numba.njit`, which has no types: ``@kernel``, or ``@kernel(inline="always")`` with further options."""
+def kernel(function: Any = None, **options: str) -> Any:
+    """Apply `numba.njit`, which has no types: ``@kernel``, or ``@kernel(inline="always")`` with options."""
     if function is None:
         return lambda function: kernel(function, **options)
     try:

@@ -136,7 +136,7 @@ def test_that_kernels_are_not_kept_is_told(
 def test_a_run_of_the_block_that_fails_leaves_no_stamp(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(kernels, "cache_folder", lambda: tmp_path)
     monkeypatch.setitem(WAYS, "adaptive", ("--mesher", "other"))
-    assert compile_kernels("adaptive").startswith("exit code 2: citystitch: ")
+    assert compile_kernels("adaptive").startswith("exit code 2: usage: citystitch run")
     assert not are_compiled(["adaptive"])
 
 

@@ -1,7 +1,7 @@
 """Kernels are compiled by runs of a built-in block of houses, once for a machine and a version of the code.
 
-numba compiles a kernel at its first call and keeps it on disk. Left to that, all workers of a first run compile the
-same kernels at the same time, each 100 of them.
+numba compiles a kernel at its first call and keeps it on disk. Left to that, each worker of a first run compiles
+nearly all of its 100 kernels for itself: 100 s of processor time.
 """
 
 import hashlib
@@ -21,8 +21,9 @@ from pipeline import growth
 from tiler.engine.keys import code_versions
 
 BLOCK = Path(__file__).parents[1] / "demo_block"
+TILES = ("--mesh-size", "7", "--tile-size", "100")  # the block is four tiles, with seams
 # Options that have kernels of their own; a run of either mesher by default needs those of the way of that name.
-WAYS = {
+WAYS: dict[str, tuple[str, ...]] = {
     "adaptive": (),
     "layered": ("--mesher", "layered"),
     "other": ("--simplify", "paper", "--ground-filter", "--first-layer", "1", "--pad", "100", "--report"),
@@ -51,14 +52,15 @@ def prepare(mesher: str, workers: int, say: Callable[[str], None]) -> None:
 
 
 def are_compiled(ways: Iterable[str] = WAYS) -> bool:
-    """Tell whether `compile_kernels` has done its work for such a processor with these versions; True without numba's compiler."""
+    """Tell whether `compile_kernels` has done its work with these versions for such a processor."""
     folder = cache_folder()
-    return bool(numba.config.DISABLE_JIT) or (folder is not None and all(_stamp(folder, way).exists() for way in ways))
+    stamped = folder is not None and all(_stamp(folder, way).exists() for way in ways)
+    return stamped or bool(numba.config.DISABLE_JIT)
 
 
 def compile_kernels(way: str) -> str:
-    """Compile the kernels of a way by a run of the built-in block in a process of its own; gives what failed, or ``""``."""
-    inputs = [BLOCK / "cloud.laz", "--footprints", BLOCK / "footprints.geojson", "--tile-size", "140"]
+    """Compile the kernels of a way by a run of the block in a process of its own; gives what failed, or ``""``."""
+    inputs = [str(BLOCK / "cloud.laz"), "--footprints", str(BLOCK / "footprints.geojson"), *TILES]
     with tempfile.TemporaryDirectory(prefix="citystitch-") as out:
         options = ["--workers", "0", "--quiet", "--no-dashboard", "--out", f"{out}/run", *WAYS[way]]
         command = [sys.executable, "-m", "tiler.cli", "run", *inputs, *options]
