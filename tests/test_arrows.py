@@ -28,9 +28,7 @@ HOMES = {
     "triangle": ("pipeline/plane.py",),
     "numba": (
         "pipeline/kernel.py",
-        "pipeline/kernel_library.py",
         "tiler/executors/kernels.py",
-        "tiler/executors/numba_registry.py",
     ),
 }
 

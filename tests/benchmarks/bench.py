@@ -50,7 +50,6 @@ KINDS: tuple[Kind, ...] = (
 )
 ONE_WORKER: Kind = ("1 worker", "run", 1, ())
 PACKAGES = ("pipeline", "stitch", "tiler")
-CALL = ("pipeline/kernel.py", "Kernel.__call__")
 WAYS = (
     "",
     "--mesher layered",
@@ -318,7 +317,7 @@ def count_samples(lines: Iterable[str]) -> dict[str, int]:
         if "MainThread" not in stack:
             continue
         frames = [_frame(frame) for frame in stack.split(";")]
-        ours = [frame for frame in frames if frame[0].split("/")[0] in PACKAGES and frame != CALL]
+        ours = [frame for frame in frames if frame[0].split("/")[0] in PACKAGES]
         in_task = any(name == "run_task" for _, name in ours)
         place = ": ".join(ours[-1]) if in_task else "driver: outside of tasks"
         counts[place] = counts.get(place, 0) + int(number)

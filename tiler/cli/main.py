@@ -129,7 +129,6 @@ def _run_config(
     if config.workers and not config.on_cluster:
         start_fork_server()
     gc.set_threshold(GARBAGE)
-    from tiler.executors.kernels import count_cores
     from tiler.monitoring.events import EventLog, open_log
     from tiler.monitoring.terminal import make_views, print_last_line, print_summary
     from tiler.workflow.out_folder import refuse_result
@@ -142,7 +141,7 @@ def _run_config(
     if log is not None:
         refuse_result(out, log)
         watchers.append(EventLog(log, open_log(log), every=0.0))
-    record = run(config, watchers=watchers, dashboard=dashboard, compilers=config.workers or count_cores())
+    record = run(config, watchers=watchers, dashboard=dashboard)
     if report:
         _report_run(out, quiet=quiet)
     if quiet:
@@ -316,17 +315,14 @@ def _export(options: argparse.Namespace) -> int:
     return 0
 
 
-def _kernels(options: argparse.Namespace) -> int:
-    from tiler.executors.kernels import compile_kernels, count_cores, describe_kernels
+def _kernels(_: argparse.Namespace) -> int:
+    from tiler.executors.kernels import WAYS, cache_folder, compile_kernels
 
-    if options.workers < 0:
-        raise ConfigError(f"--workers {options.workers}: must be 0 or above; 0 is one a core")
-    failed = compile_kernels(options.workers or count_cores())
-    for line in failed:
-        print(f"citystitch: not compiled: {printable(line)}", file=sys.stderr)
-    if failed:
-        return EXIT_FAILED
-    say(describe_kernels())
+    for way in WAYS:
+        if error := compile_kernels(way):
+            print(f"citystitch: kernels are not compiled: {printable(error)}", file=sys.stderr)
+            return EXIT_FAILED
+    say(f"kernels are compiled for this machine, kept in {cache_folder()} and the like")
     return 0
 
 

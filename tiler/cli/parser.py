@@ -144,9 +144,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     )
     add_job_commands(add, _add_inputs)
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
-    _add_kernels(
-        command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
-    )
+    command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
     command("config", "print all parameters of a run, annotated, as a configuration file")
     return parser
 
@@ -157,13 +155,6 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("demo"), metavar="DIR", help="folder to write to (default: demo)"
     )
     _add_city(demo, size=600.0, buildings=220)
-
-
-def _add_kernels(kernels: argparse.ArgumentParser) -> None:
-    """Add how many processes compile."""
-    kernels.add_argument(
-        "--workers", type=int, default=0, metavar="NUMBER", help="processes; 0: one a core, 8 at most (default)"
-    )
 
 
 def _add_inputs(parser: argparse.ArgumentParser) -> Group:

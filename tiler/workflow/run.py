@@ -84,15 +84,11 @@ class _Means:
         Folder of the events that the page is made of.
     cluster : Executor or None
         Of the scheduler that was asked for.
-    compilers : int
-        Number of processes that compile kernels before the first task; 0 where they are compiled as they are
-        needed.
     """
 
     dashboard: str | None
     shown: Path
     cluster: Executor | None
-    compilers: int
 
 
 def run(
@@ -104,7 +100,6 @@ def run(
     parameters: Mapping[str, Any] | None = None,
     watchers: Sequence[Watcher] = (),
     dashboard: str | None = None,
-    compilers: int | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -125,10 +120,6 @@ def run(
     dashboard : str, optional
         Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
         default. `say` is told its URL.
-    compilers : int, optional
-        Processes that compile kernels before the first task of a run on this machine, if that was not done here,
-        and the same run has not been done before; 0: each when it is needed. By default as many as workers, so
-        that a run in one process starts none.
 
     Returns
     -------
@@ -167,9 +158,7 @@ def run(
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
             with _connect(config) as cluster:
-                compilers = config.workers if compilers is None else compilers
-                beforehand = not config.on_cluster and not is_repeated(config)
-                means = _Means(dashboard, shown, cluster, compilers if beforehand else 0)
+                means = _Means(dashboard, shown, cluster)
                 try:
                     return _run(config, out, earlier, damage, own, announce, told, means)
                 except StoppedError:
@@ -282,8 +271,8 @@ def _mesh_region(
     does not touch has its result already. Where one fails later, its neighbours keep the seam with it.
     """
     missing = Missing()
-    if means.compilers:
-        _prepare(means.compilers, watchers.say)
+    if not config.on_cluster:
+        _prepare(config, watchers.say)
     with (
         _executor(config, means, watchers.say) as executor,
         watched(means.shown, means.dashboard, getattr(executor, "scheduler", None), watchers.say),
@@ -318,24 +307,15 @@ def _mesh_region(
     return summary | {"driver_memory_bytes": peak_memory()}
 
 
-def is_repeated(config: Config) -> bool:
-    """Tell whether the same was run to its end before: next to nothing is left to compute, and to compile."""
-    with suppress(OSError, ValueError, TypeError, OutputError):
-        known = json.loads((place(config.out, config.store_patience) / RUN_RECORD).read_bytes())
-        said: dict[str, Any] = json.loads(json.dumps(_describe(config), default=str))
-        return not config.overwrite and known == known | said | {"status": "done"}
-    return False
-
-
 def _describe(config: Config) -> dict[str, Any]:
     """What a record says of the parameters of a run, and of the code."""
     versions = {"python": platform.python_version()} | dict(code_versions())
     return {"parameters": dataclasses.asdict(config), "versions": versions}
 
 
-def _prepare(processes: int, say: Callable[[str], None]) -> None:
+def _prepare(config: Config, say: Callable[[str], None]) -> None:
     try:
-        prepare(processes, say)
+        prepare(config.mesher, config.workers, say)
     except KeyboardInterrupt:
         raise StoppedError("stopped before the first task; the same command begins again") from None
 
