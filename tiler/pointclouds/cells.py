@@ -1,6 +1,6 @@
 """Rows in order of the cells of a fixed grid, so that what lies in a box is a few ranges of rows."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,23 +8,12 @@ from numpy.typing import NDArray
 Box = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class CellOrder:
-    """The order that puts rows into cells.
+class CellOrder(NamedTuple):
+    """The order that puts rows into cells."""
 
-    Attributes
-    ----------
-    order : int64, (k,)
-        Rows by ascending cell, row-major (j, then i); the rows of a cell in their old order.
-    cell : int64, (c, 2)
-        Cells (i, j) that have rows, in that order.
-    start : int64, (c + 1,)
-        The rows of cell k are ``order[start[k]:start[k + 1]]``.
-    """
-
-    order: NDArray[np.int64]
-    cell: NDArray[np.int64]
-    start: NDArray[np.int64]
+    order: NDArray[np.int64]  # (k,): rows by ascending cell (j, then i), those of a cell in their old order
+    cell: NDArray[np.int64]  # (c, 2): cells (i, j) that have rows
+    start: NDArray[np.int64]  # (c + 1,): the rows of cell k are order[start[k]:start[k + 1]]
 
 
 def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.bool_] | None = None) -> CellOrder:
@@ -109,19 +98,7 @@ def select_cells(
 
 
 def row_ranges(wanted: NDArray[np.bool_], start: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Give the rows of the wanted cells as ranges, merged where one follows another.
-
-    Parameters
-    ----------
-    wanted : bool, (c,)
-        Which cells.
-    start : int64, (c + 1,)
-        First row of each cell, and the number of rows.
-
-    Returns
-    -------
-    list of (row_start, row_stop)
-    """
+    """Give the rows of the wanted cells, bool (c,), as ranges, merged where one follows another."""
     change = np.flatnonzero(np.diff(wanted.astype(np.int8), prepend=0, append=0))
     rows = start[change].reshape(-1, 2)
     return [(int(first), int(stop)) for first, stop in rows if stop > first]

@@ -88,20 +88,10 @@ def find_clouds(sources: Sequence[str | Path]) -> list[Path]:
 def read_header(path: str | Path) -> CloudHeader:
     """Read the header of a LAS, LAZ or COPC file.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    CloudHeader
-
     Raises
     ------
     InputError
-        If the file is missing, is not LAS, is shorter than its header claims, or its header has values that
-        are not finite or absurd (see `tiler.pointclouds.las_header`).
+        As `read_las_header`.
 
     Notes
     -----
@@ -113,16 +103,8 @@ def read_header(path: str | Path) -> CloudHeader:
     stated = read_las_crs(header)
     bounds = box_of_points(path, header)
     differs = not np.allclose(bounds, box_of_header(header), rtol=0.0, atol=SLACK, equal_nan=True)
-    return CloudHeader(
-        path,
-        header.point_count,
-        bounds,
-        stated.crs,
-        stated.plan_unit,
-        stated.height_unit,
-        stated.unread,
-        differs,
-    )
+    units = stated.plan_unit, stated.height_unit
+    return CloudHeader(path, header.point_count, bounds, stated.crs, *units, stated.unread, differs)
 
 
 def _expand(source: Path) -> list[Path]:

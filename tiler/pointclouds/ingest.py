@@ -124,22 +124,7 @@ def read_cells(
 
 
 def select_usable(chunk: PointChunk, bounds: Box, counts: dict[str, int]) -> NDArray[np.bool_]:
-    """Select the usable points of a chunk, and count what became of each.
-
-    Parameters
-    ----------
-    chunk : PointChunk
-        Points of a file in the region's CRS, n of them.
-    bounds : tuple of 4 floats
-        xmin, ymin, xmax, ymax (m); the borders belong to the box.
-    counts : dict of str to int
-        The counts of a `PointBlock`; this chunk's are added.
-
-    Returns
-    -------
-    bool, (n,)
-        Which points to keep.
-    """
+    """Tell the usable points of a chunk in a box (m), bool (n,), and add to the counts of a `PointBlock`."""
     verdict = judge_points(
         chunk.x, chunk.y, chunk.z, chunk.scale, chunk.offset, chunk.classification, chunk.withheld, bounds
     )

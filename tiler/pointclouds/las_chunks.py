@@ -76,30 +76,19 @@ class PointChunk:
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Nodes of a COPC file that hold points, in the order of the file.
+    """Nodes of a COPC file that hold points, in the order of the file."""
 
-    Attributes
-    ----------
-    box : float64, (n, 4)
-        xmin, ymin, xmax, ymax of each node in the file's CRS.
-    offset, size, count : int64, (n,)
-        First byte of the node's points, how many bytes, and how many points.
-    """
-
-    box: NDArray[np.float64]
-    offset: NDArray[np.int64]
-    size: NDArray[np.int64]
-    count: NDArray[np.int64]
+    box: NDArray[np.float64]  # (n, 4): xmin, ymin, xmax, ymax in the file's CRS
+    offset: NDArray[np.int64]  # (n,): first byte of the node's points
+    size: NDArray[np.int64]  # (n,): how many bytes
+    count: NDArray[np.int64]  # (n,): how many points
 
 
 def nodes_near(path: Path, header: laspy.LasHeader, bounds: Box, frame: Frame = AS_IT_IS) -> Nodes | None:
     """Find the nodes of a COPC file that have all of its points in a box of the region's CRS (m).
 
-    Returns
-    -------
-    Nodes or None
-        None where the file is to be read from end to end: it is no COPC, its octree cannot be trusted, or the box
-        covers half or more of the box in the header.
+    None where the file is to be read from end to end: it is no COPC, its octree cannot be trusted, or the box
+    covers half or more of the box in the header.
     """
     if header.point_count == 0 or has_void_box(header):
         return None
@@ -117,14 +106,8 @@ def nodes_near(path: Path, header: laspy.LasHeader, bounds: Box, frame: Frame = 
 def read_octree(path: Path, header: laspy.LasHeader) -> Nodes | None:
     """Read the octree of a file with points; None for one that is no COPC, or whose octree cannot be trusted.
 
-    Notes
-    -----
-    `laspy.copc.CopcReader.query` has the points of all nodes near a box in memory at once, so only its pages are
-    used. COPC is known by its content, not by its name.
-
-    References
-    ----------
-    COPC 1.0, sections "Info VLR" and "Hierarchy VLR".
+    COPC is known by its content, not by its name. `laspy.copc.CopcReader.query` has the points of all nodes near a
+    box in memory at once, so its pages alone are used.
     """
     info = next((one for one in header.vlrs if isinstance(one, CopcInfoVlr)), None)
     if info is None:
@@ -277,33 +260,19 @@ def _check_within(path: Path, chunk: PointChunk, box: NDArray[np.float64], place
 
 
 def take_chunk(record: laspy.ScaleAwarePointRecord) -> PointChunk:
-    """Take what the steps need of a chunk of points.
+    """Take what the steps need of points that laspy read, in the file's CRS.
 
-    Parameters
-    ----------
-    record : laspy.ScaleAwarePointRecord
-        Points as laspy reads them.
-
-    Returns
-    -------
-    PointChunk
-        In the file's CRS.
-
-    Notes
-    -----
     Class 8 is that of model key points, thinned ground, in the point formats 0 to 5 (LAS 1.4 R15, table 9), and
     reserved in the formats 6 to 10 (table 17).
     """
-    classes = np.ascontiguousarray(record.classification, np.uint8)
-    n_key_points = 0
-    if record.point_format.id <= LAST_LEGACY_FORMAT:
-        key = classes == KEY_POINT
-        n_key_points = int(np.count_nonzero(key))
-        if n_key_points:
-            classes = np.where(key, np.uint8(GROUND), classes)
-    (a, b, c), (x, y, z) = (np.asarray(values, np.float64).tolist() for values in (record.scales, record.offsets))
+    classes = np.array(record.classification, np.uint8)
+    key = (classes == KEY_POINT) & (record.point_format.id <= LAST_LEGACY_FORMAT)
+    classes[key] = GROUND
+    (a, b, c), (x, y, z) = record.scales.tolist(), record.offsets.tolist()
     withheld = np.asarray(np.asarray(record.withheld) != 0)
-    return PointChunk(record.X, record.Y, record.Z, (a, b, c), (x, y, z), classes, withheld, n_key_points)
+    return PointChunk(
+        record.X, record.Y, record.Z, (a, b, c), (x, y, z), classes, withheld, int(np.count_nonzero(key))
+    )
 
 
 def coordinates_of(chunk: PointChunk) -> NDArray[np.float64]:
@@ -312,22 +281,11 @@ def coordinates_of(chunk: PointChunk) -> NDArray[np.float64]:
 
 
 def place_chunk(chunk: PointChunk, frame: Frame, middle: tuple[float, float]) -> PointChunk:
-    """Give a chunk in the region's CRS.
+    """Give a chunk of a file in the region's CRS (m).
 
-    Parameters
-    ----------
-    chunk : PointChunk
-        In the file's CRS.
-    frame : Frame
-        How coordinates of the file become those of the region.
-    middle : tuple of 2 floats
-        Middle of the file in the region's CRS (m): reprojected points are counted from near it.
-
-    Returns
-    -------
-    PointChunk
-        In metres. Where units and axes alone change, the units of the file stay, exactly; reprojected points are
-        rounded to millimetres. A point without a place in the region's CRS is withheld.
+    Where units and axes alone change, the units of the file stay, exactly. Reprojected points are rounded to
+    millimetres and counted from near `middle`, that of the file in the region's CRS; a point without a place there
+    is withheld.
     """
     if frame == AS_IT_IS:
         return chunk

@@ -125,9 +125,8 @@ def _check_records(path: Path, file: BinaryIO, size: int) -> tuple[int, int]:
     if head[:4] != b"LASF":
         raise InputError(f"{path}: is no LAS or LAZ file: it begins with {head[:4]!r}, not b'LASF'; leave it out")
     extended = head[25:26] >= b"\4"
-    shortest = _LAS_14_HEADER if extended else _HEADER
-    if len(head) < shortest:
-        raise InputError(f"{path}: ends at byte {size}, within its {shortest}-byte header; {AGAIN}")
+    if len(head) < (_LAS_14_HEADER if extended else _HEADER):
+        raise InputError(f"{path}: ends at byte {size}, within its header; {AGAIN}")
     header_size, begin, n_vlrs = struct.unpack_from("<HII", head, 94)
     if not header_size + n_vlrs * _VLR_HEADER <= begin <= size:
         raise InputError(
