@@ -1,6 +1,7 @@
 """Inputs are read once: points dealt out to cells, footprints to a grid, both found again by box."""
 
 import dataclasses
+import struct
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -295,6 +296,29 @@ def test_an_octree_that_does_not_fit_is_not_used(copc_file: Path, tmp_path: Path
         patch(bad, place, form, value)
         assert read_octree(bad, read_las_header(bad)) is None
         np.testing.assert_array_equal(sorted_rows(whole(list(read_cells(bad, box)))), expected)
+
+
+def test_laspy_seeks_to_other_points_in_copc(copc_file: Path) -> None:
+    """Why nodes are not read by `laspy.LasReader.seek`."""
+    header = read_las_header(copc_file)
+    nodes = read_octree(copc_file, header)
+    assert nodes is not None
+    first, count = int(nodes.count[0]), int(nodes.count[1])
+    with laspy.open(copc_file, laz_backend=laspy.LazBackend.Lazrs) as reader:
+        reader.seek(first)
+        found = reader.read_points(count).array
+    assert (found != laspy.read(copc_file).points.array[first : first + count]).any()
+
+
+def test_pages_in_a_circle_are_not_followed(copc_file: Path, tmp_path: Path) -> None:
+    data = copc_file.read_bytes()
+    offset, size = struct.unpack_from("<QQ", data, 375 + 54 + 40)
+    bad = tmp_path / "bad.laz"
+    bad.write_bytes(data)
+    for entry in range(offset, offset + size, 32):
+        patch(bad, entry + 16, "Qii", offset, size, -1)
+    header = read_las_header(bad)
+    assert read_octree(bad, header) is None
 
 
 def test_points_outside_their_node_are_refused(tmp_path: Path) -> None:

@@ -117,7 +117,7 @@ def read_cells(
         found = order_by_cell(coordinates_of(chunk), float(size), among=kept)
         total.update(dict(zip(map(tuple, found.cell.tolist()), np.diff(found.start).tolist(), strict=True)))
         _check_density(path, total, size)
-        units = np.column_stack([axis[found.order] for axis in (chunk.x, chunk.y, chunk.z)])
+        units = np.column_stack([chunk.x, chunk.y, chunk.z]).take(found.order, axis=0)
         classes = chunk.classification[found.order]
         there = np.flatnonzero(count_values(chunk.classification)).astype(np.uint8)
         yield PointBlock(units, chunk.scale, chunk.offset, classes, found.cell, found.start, there, counts)

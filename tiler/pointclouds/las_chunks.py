@@ -249,7 +249,8 @@ def _read_bytes(file: BinaryIO, place: int, size: int) -> bytes:
 def _check_within(path: Path, chunk: PointChunk, box: NDArray[np.float64], place: str) -> None:
     """Refuse points outside a box, or each its own: laspy gives them, and tiles are planned without them."""
     xy = coordinates_of(chunk)[:, :2]
-    stray = ((xy < box[..., :2] - SLACK) | (xy > box[..., 2:] + SLACK)).any(axis=1)
+    (x, y), (xmin, ymin, xmax, ymax) = xy.T, box.T
+    stray = (x < xmin - SLACK) | (x > xmax + SLACK) | (y < ymin - SLACK) | (y > ymax + SLACK)
     if stray.any():
         x, y = xy[stray][0]
         raise InputError(
