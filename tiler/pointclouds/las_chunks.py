@@ -209,7 +209,7 @@ def _read(path: Path, header: laspy.LasHeader, nodes: Nodes | None) -> Iterator[
 
 
 def _step(header: laspy.LasHeader) -> int:
-    return max(1, min(CHUNK_POINTS, CHUNK_BYTES // header.point_format.size))
+    return max(1, min(CHUNK_POINTS, CHUNK_BYTES // int(header.point_format.size)))
 
 
 def _all_records(path: Path, header: laspy.LasHeader) -> Iterator[Record]:

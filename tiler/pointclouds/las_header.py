@@ -28,6 +28,7 @@ POINTS_PER_BYTE = 16
 # Bytes of the records before the points, and of those behind them that are read: a CRS takes some kilobytes.
 # Waveforms behind the points may be larger, and are left alone.
 RECORD_BYTES = 64_000_000
+_MANY_RECORDS = 1_000_000
 _EMPTY_LAZ = 1000  # what follows the header of a LAZ file without points is shorter than this
 
 
@@ -145,6 +146,8 @@ def _check_records(path: Path, file: BinaryIO, size: int) -> tuple[int, int]:
         raise InputError(
             f"{path}: {n_evlrs} extended records from byte {first}, but the file has {size} bytes; {AGAIN}"
         )
+    if n_evlrs > _MANY_RECORDS:
+        raise InputError(f"{path}: {n_evlrs} extended records > {_MANY_RECORDS}; {AGAIN}")
     end = _follow(file, first, n_evlrs, _EVLR_HEADER, 8, size)
     if end > size:
         raise InputError(f"{path}: its {n_evlrs} extended records end at byte {end} of {size}; {AGAIN}")
