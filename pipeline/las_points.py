@@ -52,21 +52,6 @@ def find_coordinates(
 
 
 @kernel
-def find_range(units: NDArray[np.int32]) -> tuple[int, int]:
-    """Give the least and the greatest of units, at least one; numpy takes three times as long in records.
-
-    Examples
-    --------
-    >>> find_range(np.array([3, -1, 7, 2], np.int32))
-    (-1, 7)
-    """
-    low = high = units[0]
-    for value in units:
-        low, high = min(low, value), max(high, value)
-    return low, high
-
-
-@kernel
 def count_values(values: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Count how often each of 256 values occurs, int64 (256,), in a fifth of the time that numpy takes.
 
@@ -83,29 +68,6 @@ def count_values(values: NDArray[np.uint8]) -> NDArray[np.int64]:
     for turn in some:
         count += turn
     return count
-
-
-@kernel
-def put_units(
-    x: NDArray[np.int32],
-    y: NDArray[np.int32],
-    z: NDArray[np.int32],
-    classification: NDArray[np.uint8],
-    place: NDArray[np.int64],
-    n: int,
-) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
-    """Put n points in places of their own, (m,), -1 for those to leave out: int32 (n, 3) in units, and classes.
-
-    Points are read in the order of the file, and written to as many strands as there are cells: either is close to
-    the one before, while taking them cell by cell would look all over the file.
-    """
-    units, classes = np.empty((n, 3), np.int32), np.empty(n, np.uint8)
-    for k in range(len(place)):
-        to = place[k]
-        if to >= 0:
-            units[to, 0], units[to, 1], units[to, 2] = x[k], y[k], z[k]
-            classes[to] = classification[k]
-    return units, classes
 
 
 @kernel

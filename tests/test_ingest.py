@@ -1,6 +1,7 @@
 """Inputs are read once: points dealt out to cells, footprints to a grid, both found again by box."""
 
 import dataclasses
+import struct
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from pipeline.notes import Note, count_notes
 from pipeline.pointcloud import PointCloud
 from tests.test_clouds import EVERYWHERE, ORIGIN, patch, write_cloud
 from tests.test_vectors import RD, square, write, write_parquet
+from tests.whole_clouds import read_points
 from tiler.citymodels.tables import unpack_polygons
 from tiler.config.config import Config
 from tiler.engine.engine import Engine
@@ -36,12 +38,12 @@ from tiler.footprints.footprint_index import (
 from tiler.footprints.footprint_reader import read_footprints
 from tiler.footprints.repeated_ids import find_repeated_ids
 from tiler.georeference.frame import AS_IT_IS, Frame
-from tiler.pointclouds import clouds
+from tiler.pointclouds import las_chunks
 from tiler.pointclouds.cells import Box, select_cells
-from tiler.pointclouds.clouds import find_clouds, read_points
-from tiler.pointclouds.copc import read_index
+from tiler.pointclouds.clouds import find_clouds
 from tiler.pointclouds.ingest import CELL, PointBlock, read_cells
-from tiler.pointclouds.las_header import read_promise
+from tiler.pointclouds.las_chunks import nodes_near, read_chunks, read_octree
+from tiler.pointclouds.las_header import read_las_header
 from tiler.stages import inputs
 from tiler.stages.inputs import input_stages
 from tiler.store.store import Store
@@ -121,7 +123,7 @@ def test_cells_are_the_same_in_every_region(cloud_file: Path) -> None:
 
 
 def test_a_box_finds_all_its_points(cloud_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clouds, "CHUNK_POINTS", 3000)
+    monkeypatch.setattr(las_chunks, "CHUNK_POINTS", 3000)
     blocks = list(read_cells(cloud_file, EVERYWHERE))
     assert len(blocks) == 7
     x, y, _ = ORIGIN
@@ -135,7 +137,7 @@ def test_a_box_finds_all_its_points(cloud_file: Path, monkeypatch: pytest.Monkey
 
 def test_blocks_add_up_to_the_file(cloud_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     box = (ORIGIN[0] - 100, ORIGIN[1] - 100, ORIGIN[0] + 100, ORIGIN[1] + 100)
-    monkeypatch.setattr(clouds, "CHUNK_POINTS", 999)
+    monkeypatch.setattr(las_chunks, "CHUNK_POINTS", 999)
     blocks = list(read_cells(cloud_file, box))
     kept, counts = read_points(cloud_file, box)
     assert len(blocks) == 21
@@ -227,20 +229,21 @@ def copc_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_copc_by_query_is_copc_from_end_to_end(copc_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     x, y, _ = ORIGIN
     box = (x - 100, y - 300, x + 30.5, y - 128)
-    monkeypatch.setattr(clouds, "CHUNK_POINTS", 500)
-    looked = [len(chunk) for chunk, _ in clouds.read_chunks(copc_file, box)]
+    monkeypatch.setattr(las_chunks, "CHUNK_POINTS", 500)
+    header = read_las_header(copc_file)
+    looked = [len(chunk) for chunk in read_chunks(copc_file, header, nodes_near(copc_file, header, box))]
     assert max(looked) < 2500  # a node here has 2000 points at most
     assert len(looked) > 1
     assert sum(looked) < 0.6 * 6000
     query = list(read_cells(copc_file, box))
-    monkeypatch.setattr(clouds, "QUERY_SHARE", 0.0)
+    monkeypatch.setattr(las_chunks, "QUERY_SHARE", 0.0)
     plain = list(read_cells(copc_file, box))
     assert total(query) == total(plain)
     assert total(query)["kept"] > 50
     np.testing.assert_array_equal(sorted_rows(whole(query)), sorted_rows(whole(plain)))
-    monkeypatch.setattr(clouds, "CHUNK_POINTS", 10**6)
+    monkeypatch.setattr(las_chunks, "CHUNK_POINTS", 10**6)
     (once,) = read_cells(copc_file, box)
-    monkeypatch.setattr(clouds, "QUERY_SHARE", 0.5)
+    monkeypatch.setattr(las_chunks, "QUERY_SHARE", 0.5)
     (same,) = read_cells(copc_file, box)
     assert once.units.tobytes() == same.units.tobytes()  # in the same order, too
     assert set(same.classes) == {1, 2, 6, 7}
@@ -260,11 +263,11 @@ def test_copc_in_feet_is_queried_by_the_box_of_the_region(copc_file: Path) -> No
 
 def test_copc_is_queried_only_where_that_saves_half(copc_file: Path) -> None:
     x, y, _ = ORIGIN
-    skipped = [
-        next(clouds.read_chunks(copc_file, (x - 600, y - 600, right, y + 600)))[1] for right in (x - 20, x + 20)
-    ]
-    assert skipped[0] > 1000
-    assert skipped[1] == 0
+    header = read_las_header(copc_file)
+    nodes = nodes_near(copc_file, header, (x - 600, y - 600, x - 20, y + 600))
+    assert nodes is not None
+    assert nodes.count.sum() < 5000
+    assert nodes_near(copc_file, header, (x - 600, y - 600, x + 20, y + 600)) is None
 
 
 def test_copc_away_from_the_box_is_not_read(copc_file: Path) -> None:
@@ -277,7 +280,7 @@ def test_an_octree_that_does_not_fit_is_not_used(copc_file: Path, tmp_path: Path
     x, y, _ = ORIGIN
     box = (x - 100, y - 300, x + 30.5, y - 128)
     data = copc_file.read_bytes()
-    assert read_index(copc_file, read_promise(copc_file)) is not None
+    assert read_octree(copc_file, read_las_header(copc_file)) is not None
     expected = sorted_rows(whole(list(read_cells(copc_file, box))))
     info = 375 + 54
     for place, form, value in (
@@ -291,8 +294,31 @@ def test_an_octree_that_does_not_fit_is_not_used(copc_file: Path, tmp_path: Path
         bad = tmp_path / "bad.laz"
         bad.write_bytes(data)
         patch(bad, place, form, value)
-        assert read_index(bad, read_promise(bad)) is None
+        assert read_octree(bad, read_las_header(bad)) is None
         np.testing.assert_array_equal(sorted_rows(whole(list(read_cells(bad, box)))), expected)
+
+
+def test_laspy_seeks_to_other_points_in_copc(copc_file: Path) -> None:
+    """Why nodes are not read by `laspy.LasReader.seek`."""
+    header = read_las_header(copc_file)
+    nodes = read_octree(copc_file, header)
+    assert nodes is not None
+    first, count = int(nodes.count[0]), int(nodes.count[1])
+    with laspy.open(copc_file, laz_backend=laspy.LazBackend.Lazrs) as reader:
+        reader.seek(first)
+        found = reader.read_points(count).array
+    assert (found != laspy.read(copc_file).points.array[first : first + count]).any()
+
+
+def test_pages_in_a_circle_are_not_followed(copc_file: Path, tmp_path: Path) -> None:
+    data = copc_file.read_bytes()
+    offset, size = struct.unpack_from("<QQ", data, 375 + 54 + 40)
+    bad = tmp_path / "bad.laz"
+    bad.write_bytes(data)
+    for entry in range(offset, offset + size, 32):
+        patch(bad, entry + 16, "Qii", offset, size, -1)
+    header = read_las_header(bad)
+    assert read_octree(bad, header) is None
 
 
 def test_points_outside_their_node_are_refused(tmp_path: Path) -> None:

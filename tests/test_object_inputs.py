@@ -14,12 +14,13 @@ from pipeline.errors import InputError
 from tests.object_servers import FileServer, file_server
 from tests.test_ingest import write_copc
 from tests.test_vectors import RD, write_parquet
+from tests.whole_clouds import read_points
 from tiler.footprints.footprint_reader import read_footprint_crs, read_footprints
 from tiler.objects import requests as object_requests
 from tiler.objects.local_copy import local_copy
 from tiler.objects.places import StoreUnreachableError, place
 from tiler.planning.plan import identify
-from tiler.pointclouds.clouds import find_clouds, read_header, read_points
+from tiler.pointclouds.clouds import find_clouds, read_header
 from tiler.pointclouds.ingest import read_cells
 
 pytest.importorskip("obstore")

@@ -20,7 +20,8 @@ from pipeline.point_fidelity import Residuals, measure_fidelity, measure_houses,
 from pipeline.pointcloud import PointCloud
 from pipeline.roof_points import locate_roof_points, make_roof_points
 from tests.cities import tilted_dtm
-from tiler.pointclouds.clouds import find_clouds, read_points
+from tests.whole_clouds import read_points
+from tiler.pointclouds.clouds import find_clouds
 
 HOUSE = shapely.box(10, 10, 20, 20)
 DTM = tilted_dtm((0.0, 0.0, 40.0, 40.0), height=1.0)

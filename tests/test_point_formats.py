@@ -16,9 +16,10 @@ from laspy.vlrs.vlrlist import VLRList
 from tests.deliveries import write_delivery
 from tests.test_clouds import EVERYWHERE, ORIGIN
 from tests.test_deliveries import DELIVERIES
+from tests.whole_clouds import read_points
 from tiler.cli.main import main
 from tiler.config.config import load_config, make_config, write_config
-from tiler.pointclouds.clouds import find_clouds, read_header, read_points
+from tiler.pointclouds.clouds import find_clouds, read_header
 from tiler.pointclouds.ingest import read_cells
 from tiler.workflow.failed_tiles import command_alone
 

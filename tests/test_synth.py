@@ -15,11 +15,12 @@ import shapely
 
 from pipeline.errors import ConfigError
 from pipeline.synthetic import ORIGIN, SyntheticCity, city_points, make_city, terrain_height
+from tests.whole_clouds import read_points
 from tiler.footprints.footprint_reader import read_footprint_crs, read_footprints
 from tiler.georeference.cloud_crs import Asked
 from tiler.georeference.establish import establish_georeference
 from tiler.interface.synth import SynthFiles, write_city
-from tiler.pointclouds.clouds import find_clouds, read_header, read_points
+from tiler.pointclouds.clouds import find_clouds, read_header
 
 SWEREF = pyproj.CRS("EPSG:3006")
 X, Y = ORIGIN

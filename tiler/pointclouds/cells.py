@@ -1,40 +1,23 @@
 """Rows in order of the cells of a fixed grid, so that what lies in a box is a few ranges of rows."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.kernel import kernel
-
 Box = tuple[float, float, float, float]
-Pair = tuple[float, float]
-
-MOST_CELLS = 1 << 20  # that rows are counted in; 65 km square of those of points
 
 
-@dataclass(frozen=True, eq=False)
-class CellOrder:
-    """The order that puts rows into cells.
+class CellOrder(NamedTuple):
+    """The order that puts rows into cells."""
 
-    Attributes
-    ----------
-    order : int64, (k,)
-        Rows by ascending cell, row-major (j, then i); the rows of a cell in their old order.
-    cell : int64, (c, 2)
-        Cells (i, j) that have rows, in that order.
-    start : int64, (c + 1,)
-        The rows of cell k are ``order[start[k]:start[k + 1]]``.
-    """
-
-    order: NDArray[np.int64]
-    cell: NDArray[np.int64]
-    start: NDArray[np.int64]
+    order: NDArray[np.int64]  # (k,): rows by ascending cell (j, then i), those of a cell in their old order
+    cell: NDArray[np.int64]  # (c, 2): cells (i, j) that have rows
+    start: NDArray[np.int64]  # (c + 1,): the rows of cell k are order[start[k]:start[k + 1]]
 
 
 def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.bool_] | None = None) -> CellOrder:
-    """Order places by the cells of the grid with the corners at multiples of a size.
+    """Order points in plan by the cells of the grid with the corners at multiples of a size.
 
     Parameters
     ----------
@@ -56,8 +39,7 @@ def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.boo
 
     Notes
     -----
-    Cell (i, j) holds i = floor(x / size), j = floor(y / size): it depends on the place alone. O(n) where
-    no more than `MOST_CELLS` are spanned, else O(n log n).
+    Cell (i, j) holds i = floor(x / size), j = floor(y / size): it depends on the coordinates alone.
 
     Examples
     --------
@@ -67,65 +49,20 @@ def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.boo
     """
     if not size > 0:
         raise ValueError(f"size of cells {size} m must be positive")
-    among = np.ones(len(xy), np.bool_) if among is None else among
-    place, cell, start = find_places(xy[:, 0], xy[:, 1], (1.0, 1.0), (0.0, 0.0), among, float(size))
-    rows = np.flatnonzero(place >= 0)
-    order = np.empty(len(rows), np.int64)
-    order[place[rows]] = rows
-    return CellOrder(order, cell, start)
-
-
-def find_places(
-    x: NDArray[Any], y: NDArray[Any], scale: Pair, offset: Pair, among: NDArray[np.bool_], size: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Find the places of coordinates in whole units, ``units * scale + offset`` (m), in order of their cells.
-
-    Parameters
-    ----------
-    x, y : int32, (n,)
-        Coordinates in units; numbers of another type are taken as they are.
-    scale, offset : pair of float
-        Size of a unit along both axes, and place of unit 0 (m).
-    among : bool, (n,)
-        Rows to order.
-    size : float
-        Side of a cell (m), positive.
-
-    Returns
-    -------
-    place : int64, (n,)
-        Place of each row in the order that `order_by_cell` gives of the same coordinates; -1 for other rows.
-    cell, start : int64
-        As in `CellOrder`.
-    """
-    place, n_cells, first, low, width = _number_cells(x, y, scale, offset, among, size)
-    key, count = _put_in_order(place, n_cells) if n_cells <= MOST_CELLS else _sort_keys(place)
+    rows = np.arange(len(xy)) if among is None else np.flatnonzero(among)
+    if not len(rows):
+        return CellOrder(rows, np.empty((0, 2), np.int64), np.zeros(1, np.int64))
+    i, j = (np.floor(values[rows] / size).astype(np.int64) for values in (xy[:, 0], xy[:, 1]))
+    first, low = i.min(), j.min()
+    width = i.max() - first + 1
+    key = (j - low) * width + i - first
+    # numpy sorts keys of 16 bits in one pass; wider ones take ten times as long
+    order = np.argsort(key.astype(np.min_scalar_type(key.max())), kind="stable")
+    key = key[order]
+    start = np.flatnonzero(np.diff(key, prepend=-1))
+    key = key[start]
     cell = np.column_stack([key % width + first, key // width + low])
-    return place, cell, np.concatenate([[0], np.cumsum(count)])
-
-
-@kernel
-def _number_cells(
-    x: NDArray[Any], y: NDArray[Any], scale: Pair, offset: Pair, among: NDArray[np.bool_], size: float
-) -> tuple[NDArray[np.int64], int, int, int, int]:
-    """Number the cells around some rows; gives each row's, how many, the first (i, j), and how many in a line."""
-    number = np.full(len(x), -1, np.int64)
-    low_x = low_y = np.inf
-    high_x = high_y = -np.inf
-    for k in range(len(x)):
-        if among[k]:
-            at_x, at_y = x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1]
-            low_x, high_x = min(low_x, at_x), max(high_x, at_x)
-            low_y, high_y = min(low_y, at_y), max(high_y, at_y)
-    if low_x > high_x:
-        return number, 0, 0, 0, 1
-    first, low = int(np.floor(low_x / size)), int(np.floor(low_y / size))
-    width = int(np.floor(high_x / size)) - first + 1
-    for k in range(len(x)):
-        if among[k]:
-            at_x, at_y = x[k] * scale[0] + offset[0], y[k] * scale[1] + offset[1]
-            number[k] = (int(np.floor(at_y / size)) - low) * width + int(np.floor(at_x / size)) - first
-    return number, (int(np.floor(high_y / size)) - low + 1) * width, first, low, width
+    return CellOrder(rows[order], cell, np.append(start, len(rows)))
 
 
 def select_cells(
@@ -161,49 +98,7 @@ def select_cells(
 
 
 def row_ranges(wanted: NDArray[np.bool_], start: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Give the rows of the wanted cells as ranges, merged where one follows another.
-
-    Parameters
-    ----------
-    wanted : bool, (c,)
-        Which cells.
-    start : int64, (c + 1,)
-        First row of each cell, and the number of rows.
-
-    Returns
-    -------
-    list of (row_start, row_stop)
-    """
+    """Give the rows of the wanted cells, bool (c,), as ranges, merged where one follows another."""
     change = np.flatnonzero(np.diff(wanted.astype(np.int8), prepend=0, append=0))
     rows = start[change].reshape(-1, 2)
     return [(int(first), int(stop)) for first, stop in rows if stop > first]
-
-
-def _put_in_order(place: NDArray[np.int64], n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Turn keys below n into their places in ascending order, equal ones in their old order; -1 stays.
-
-    Gives the keys that there are, and how many rows have each.
-    """
-    count = np.bincount(place[place >= 0], minlength=n)
-    _take_places(place, np.cumsum(count) - count)
-    key = np.flatnonzero(count)
-    return key, count[key]
-
-
-@kernel
-def _take_places(place: NDArray[np.int64], free: NDArray[np.int64]) -> None:
-    """Give each key its next free place."""
-    for k in range(len(place)):
-        key = place[k]
-        if key >= 0:
-            place[k] = free[key]
-            free[key] += 1
-
-
-def _sort_keys(place: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Do what `_put_in_order` does, for keys of any size."""
-    rows = np.flatnonzero(place >= 0)
-    rows = rows[np.argsort(place[rows], kind="stable")]
-    key, count = np.unique(place[rows], return_counts=True)
-    place[rows] = np.arange(len(rows))
-    return key, count

@@ -9,11 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.las_points import Triple, count_values, put_units
+from pipeline.las_points import KEPT, REASONS, Triple, count_values, judge_points
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.objects.places import as_place
-from tiler.pointclouds.cells import Box, find_places
-from tiler.pointclouds.clouds import COUNTED, read_chunks, select_usable
+from tiler.pointclouds.cells import Box, order_by_cell
+from tiler.pointclouds.las_chunks import PointChunk, coordinates_of, nodes_near, read_chunks
+from tiler.pointclouds.las_header import read_las_header
+
+COUNTED = ("read", "outside", "withheld", "noise", "absurd", "kept")
+KEY_POINTS = "key points"
 
 # Side of a cell (m). A box of 250 m reads 1.25, 1.54 and 2.14 times its points in cells of 32, 64 and 128 m, in
 # 21, 14 and 10 ranges of rows: 64 m is between many small reads and much that is read in vain.
@@ -43,7 +47,9 @@ class PointBlock:
     classes : uint8, (k,)
         Classes that occur among all points that were looked at, inside the box or not, usable or not.
     counts : dict of str to int
-        As `read_points` gives them; they add up over the blocks of a file.
+        ``read`` = ``outside`` + ``withheld`` + ``noise`` + ``absurd`` + ``kept``; each point counts once. Where
+        there are any, ``key points`` are those of ``read`` with the class of model key points: ground. Counts add
+        up over the blocks of a file.
     """
 
     units: NDArray[np.int32]
@@ -80,33 +86,54 @@ def read_cells(
     Raises
     ------
     InputError
-        As `read_points`, and if a cell has more than `MOST_POINTS`.
+        If the file cannot be read or is damaged, see `read_las_header` and `read_chunks`, and if a cell has more
+        than `MOST_POINTS`.
     ValueError
         If the size is not positive.
 
     Notes
     -----
-    The points and the counts are those of `read_points`. A COPC file is read by its octree where the box
-    covers less than half of the file: nodes away from the box are not read, and their points count as
-    outside. `PointBlock.classes` is then of the nodes that were read. The octree's upper nodes, a thinned
-    copy of the whole file, are always among them, so that a class missing there is rare in the file.
+    Dropped are, in this order: points outside the box, withheld points, the noise classes 7 and 18, and points
+    with a height that is not within ±10 km.
+
+    A COPC file is read by its octree where the box covers less than half of the file: nodes away from the box are
+    not read, and their points count as outside. `PointBlock.classes` is then of the nodes that were read. The
+    octree's upper nodes, a thinned copy of the whole file, are always among them, so that a class missing there is
+    rare in the file.
 
     Memory is that of one chunk, some 60 bytes a point, whatever the size of the file.
     """
-    if not size > 0:
-        raise ValueError(f"size of cells {size} m must be positive")
+    path = as_place(path)
+    header = read_las_header(path)
+    nodes = nodes_near(path, header, bounds, frame)
+    n_skipped = 0 if nodes is None else header.point_count - int(nodes.count.sum())
     total: Counter[tuple[int, int]] = Counter()
-    for chunk, n_skipped in read_chunks(as_place(path), bounds, frame=frame):
+    for chunk in read_chunks(path, header, nodes, frame):
         counts = dict.fromkeys(COUNTED, 0)
         kept = select_usable(chunk, bounds, counts)
         counts["read"] += n_skipped
         counts["outside"] += n_skipped
-        place, cell, start = find_places(chunk.x, chunk.y, chunk.scale[:2], chunk.offset[:2], kept, float(size))
-        total.update(dict(zip(map(tuple, cell.tolist()), np.diff(start).tolist(), strict=True)))
-        _check_density(as_place(path), total, size)
-        units, classes = put_units(chunk.x, chunk.y, chunk.z, chunk.classification, place, int(start[-1]))
+        n_skipped = 0
+        found = order_by_cell(coordinates_of(chunk), float(size), among=kept)
+        total.update(dict(zip(map(tuple, found.cell.tolist()), np.diff(found.start).tolist(), strict=True)))
+        _check_density(path, total, size)
+        units = np.column_stack([chunk.x, chunk.y, chunk.z]).take(found.order, axis=0)
+        classes = chunk.classification[found.order]
         there = np.flatnonzero(count_values(chunk.classification)).astype(np.uint8)
-        yield PointBlock(units, chunk.scale, chunk.offset, classes, cell, start, there, counts)
+        yield PointBlock(units, chunk.scale, chunk.offset, classes, found.cell, found.start, there, counts)
+
+
+def select_usable(chunk: PointChunk, bounds: Box, counts: dict[str, int]) -> NDArray[np.bool_]:
+    """Tell the usable points of a chunk in a box (m), bool (n,), and add to the counts of a `PointBlock`."""
+    verdict = judge_points(
+        chunk.x, chunk.y, chunk.z, chunk.scale, chunk.offset, chunk.classification, chunk.withheld, bounds
+    )
+    for reason, number in zip(REASONS, count_values(verdict)[: len(REASONS)].tolist(), strict=True):
+        counts[reason] += number
+    counts["read"] += len(chunk)
+    if chunk.n_key_points:
+        counts[KEY_POINTS] = counts.get(KEY_POINTS, 0) + chunk.n_key_points
+    return np.asarray(verdict == KEPT)
 
 
 def _check_density(path: Path, total: Counter[tuple[int, int]], size: float) -> None:

@@ -1,22 +1,46 @@
-"""A chunk of the points of a LAS file, as arrays of whole units, and the same in the region's CRS (step 1.1)."""
+"""Points of a LAS, LAZ or COPC file by chunks: those near a box, as arrays of whole units (step 1.1)."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO
 
 import laspy
+import lazrs
 import numpy as np
+from laspy.copc import CopcInfoVlr, HierarchyPage
+from laspy.vlrs.known import LasZipVlr
 from numpy.typing import NDArray
 
 from pipeline.classes import GROUND, KEY_POINT
-from pipeline.las_points import Triple, find_coordinates, find_range
-from tiler.georeference.frame import STEP, Frame, origin_of, to_region
+from pipeline.errors import InputError
+from pipeline.las_points import Triple, find_coordinates
+from tiler.georeference.frame import AS_IT_IS, STEP, Frame, box_to_file, box_to_region, origin_of, to_region
+from tiler.objects.places import source_of
+from tiler.pointclouds.las_header import AGAIN, Box3, box_of_header, has_void_box, laspy_as_input_error
 
-_FIELDS = laspy.DecompressionSelection
-# Fields to decompress where points are stored by fields (formats 6 to 10): coordinates, class and withheld. laspy
-# gives a field that is left out the first value of its chunk for all points.
-FIELDS = _FIELDS.XY_RETURNS_CHANNEL | _FIELDS.Z | _FIELDS.CLASSIFICATION | _FIELDS.FLAGS
+CHUNK_POINTS = 1_000_000
+CHUNK_BYTES = 64_000_000  # wins over CHUNK_POINTS where a point has many extra bytes
+SLACK = (
+    1.0  # m that a point may lie outside the header's box or its COPC node, or a node outside the octree's cube
+)
+QUERY_SHARE = 0.5  # a COPC file is read by its octree where less than this share of its box is wanted
 
+# Fields to decompress in formats 6 to 10. laspy gives a field that is left out its chunk's first value for all
+# points: without the flags, all of a chunk may be withheld.
+FIELDS = (
+    laspy.DecompressionSelection.XY_RETURNS_CHANNEL
+    | laspy.DecompressionSelection.Z
+    | laspy.DecompressionSelection.CLASSIFICATION
+    | laspy.DecompressionSelection.FLAGS
+)
 LAST_LEGACY_FORMAT = 5
 MOST_UNITS = 2**31 - 1
+MOST_LEVELS = 32
+_MANY_BYTES = 2**30  # of one COPC node, uncompressed; writers put some 10^5 points of 30 to 60 bytes there
+
+Box = tuple[float, float, float, float]
+Record = tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64] | None]  # points, and the box of each one's node
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,43 +74,206 @@ class PointChunk:
         return len(self.x)
 
 
-def take_chunk(record: laspy.ScaleAwarePointRecord) -> PointChunk:
-    """Take what the steps need of a chunk of points.
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """Nodes of a COPC file that hold points, in the order of the file."""
+
+    box: NDArray[np.float64]  # (n, 4): xmin, ymin, xmax, ymax in the file's CRS
+    offset: NDArray[np.int64]  # (n,): first byte of the node's points
+    size: NDArray[np.int64]  # (n,): how many bytes
+    count: NDArray[np.int64]  # (n,): how many points
+
+
+def nodes_near(path: Path, header: laspy.LasHeader, bounds: Box, frame: Frame = AS_IT_IS) -> Nodes | None:
+    """Find the nodes of a COPC file that have all of its points in a box of the region's CRS (m).
+
+    None where the file is to be read from end to end: it is no COPC, its octree cannot be trusted, or the box
+    covers half or more of the box in the header.
+    """
+    if header.point_count == 0 or has_void_box(header):
+        return None
+    xmin, ymin, xmax, ymax = box_to_file(frame, bounds)
+    (x0, y0), (x1, y1) = header.mins[:2].tolist(), header.maxs[:2].tolist()
+    covered = max(min(x1, xmax) - max(x0, xmin), 0.0) * max(min(y1, ymax) - max(y0, ymin), 0.0)
+    nodes = read_octree(path, header) if covered < QUERY_SHARE * (x1 - x0) * (y1 - y0) else None
+    if nodes is None:
+        return None
+    low_x, low_y, high_x, high_y = nodes.box.T
+    near = (low_x <= xmax + SLACK) & (high_x >= xmin - SLACK) & (low_y <= ymax + SLACK) & (high_y >= ymin - SLACK)
+    return Nodes(nodes.box[near], nodes.offset[near], nodes.size[near], nodes.count[near])
+
+
+def read_octree(path: Path, header: laspy.LasHeader) -> Nodes | None:
+    """Read the octree of a file with points; None for one that is no COPC, or whose octree cannot be trusted.
+
+    COPC is known by its content, not by its name. `laspy.copc.CopcReader.query` has the points of all nodes near a
+    box in memory at once, so its pages alone are used.
+    """
+    info = next((one for one in header.vlrs if isinstance(one, CopcInfoVlr)), None)
+    if info is None:
+        return None
+    found, total = [], 0
+    with path.open("rb") as file:
+        n_bytes = file.seek(0, 2)
+        pages = [(info.hierarchy_root_offset, info.hierarchy_root_size)]
+        for place, length in pages:
+            total += length
+            # laspy would follow pages in circles, and those that lie beyond the end of the file
+            if not (0 < length <= n_bytes - place and total <= n_bytes):
+                return None
+            file.seek(place)
+            for entry in HierarchyPage.from_bytes(file.read(length)).entries.values():
+                if entry.point_count == -1:
+                    pages.append((entry.offset, entry.byte_size))
+                elif entry.point_count > 0:
+                    key = entry.key
+                    found.append((entry.offset, entry.byte_size, entry.point_count, key.level, key.x, key.y))
+    offset, size, count, level, x, y = np.array(sorted(found), np.float64).reshape(-1, 6).T
+    width = 2 * info.halfsize / 2.0**level
+    low = (info.center[:2] - info.halfsize)[:, None] + np.array([x, y]) * width
+    reach = np.abs(np.array([header.mins, header.maxs]) - info.center)[:, :2].max()
+    sound = (
+        count.sum() == header.point_count  # a page is missing, or a node is there twice
+        and reach <= info.halfsize + SLACK  # NaN too: nodes are elsewhere than the points
+        and ((level >= 0) & (level < MOST_LEVELS)).all()
+        and (count < _MANY_BYTES // header.point_format.size).all()  # a node is read at once
+        and ((size > 0) & (offset + size <= n_bytes)).all()
+        and size.sum() <= n_bytes  # none lies over another
+    )
+    whole = (values.astype(np.int64) for values in (offset, size, count))
+    return Nodes(np.vstack([low, low + width]).T, *whole) if sound else None
+
+
+def read_chunks(
+    path: Path, header: laspy.LasHeader, nodes: Nodes | None = None, frame: Frame = AS_IT_IS
+) -> Iterator[PointChunk]:
+    """Read points of a file by chunks.
 
     Parameters
     ----------
-    record : laspy.ScaleAwarePointRecord
-        Points as laspy reads them.
+    path : Path
+        LAS, LAZ or COPC file.
+    header : laspy.LasHeader
+        Of `read_las_header`.
+    nodes : Nodes, optional
+        Which nodes of a COPC file, from `nodes_near`; all points by default.
+    frame : Frame
+        How coordinates of the file become those of the region.
 
-    Returns
-    -------
+    Yields
+    ------
     PointChunk
-        In the file's CRS.
+        Some million points in the region's CRS, in the order of the file; one without points where there are none.
 
-    Notes
-    -----
+    Raises
+    ------
+    InputError
+        If the file cannot be read, ends early, is damaged, or has points more than 1 m outside the bounds that its
+        header states, or outside their node of a COPC file: it would be missing from the tiles it belongs to.
+    """
+    middle = (0.0, 0.0)
+    if frame.source and header.point_count:
+        xmin, ymin, xmax, ymax = box_to_region(frame, box_of_points(path, header)[:4])
+        middle = (xmin + xmax) / 2, (ymin + ymax) / 2
+    for chunk in _read(path, header, nodes):
+        yield place_chunk(chunk, frame, middle)
+
+
+def box_of_points(path: Path, header: laspy.LasHeader) -> Box3:
+    """Give the box that a header states, or that of all points where it is void, as `box_of_header`."""
+    if not has_void_box(header):
+        return box_of_header(header)
+    ends = [f(coordinates_of(chunk), axis=0) for chunk in read_chunks(path, header) for f in (np.min, np.max)]
+    (xmin, ymin, zmin), (xmax, ymax, zmax) = np.min(ends, axis=0).tolist(), np.max(ends, axis=0).tolist()
+    return xmin, ymin, xmax, ymax, zmin, zmax
+
+
+def _read(path: Path, header: laspy.LasHeader, nodes: Nodes | None) -> Iterator[PointChunk]:
+    """Yield chunks in the file's CRS; fail if there are fewer points than the header or the nodes claim."""
+    claimed = header.point_count if nodes is None else int(nodes.count.sum())
+    if claimed == 0:
+        yield take_chunk(laspy.ScaleAwarePointRecord.zeros(0, header=header))
+        return
+    n_read, header_box = 0, np.concatenate([header.mins[:2], header.maxs[:2]])
+    with laspy_as_input_error(path, lambda: f"{n_read} of {header.point_count} points could be read"):
+        for record, box in _all_records(path, header) if nodes is None else _node_records(path, header, nodes):
+            n_read += len(record)
+            chunk = take_chunk(record)
+            if not has_void_box(header):
+                _check_within(path, chunk, header_box, "the bounds in its header")
+            if box is not None:
+                _check_within(path, chunk, box, "their node of the COPC index")
+            yield chunk
+    if n_read != claimed:  # laspy logs it
+        raise InputError(f"{path}: {n_read} of {claimed} points could be read; {AGAIN}")
+
+
+def _step(header: laspy.LasHeader) -> int:
+    return max(1, min(CHUNK_POINTS, CHUNK_BYTES // int(header.point_format.size)))
+
+
+def _all_records(path: Path, header: laspy.LasHeader) -> Iterator[Record]:
+    with laspy.open(
+        source_of(path), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False, decompression_selection=FIELDS
+    ) as reader:
+        for record in reader.chunk_iterator(_step(header)):
+            yield record, None
+
+
+def _node_records(path: Path, header: laspy.LasHeader, nodes: Nodes) -> Iterator[Record]:
+    """Yield as many nodes as have some million points, or one; with the box of each point's node.
+
+    `laspy.LasReader.seek` would give other points: it takes each chunk for one of fixed size.
+    """
+    zipped = next(one for one in header.vlrs if isinstance(one, LasZipVlr)).record_data
+    batch = (np.cumsum(nodes.count) - nodes.count) // _step(header)
+    with path.open("rb") as file:
+        for part in np.split(np.arange(len(batch)), np.flatnonzero(np.diff(batch)) + 1):
+            count, size = nodes.count[part], nodes.size[part]
+            blobs = [
+                _read_bytes(file, *place) for place in zip(nodes.offset[part].tolist(), size.tolist(), strict=True)
+            ]
+            raw = np.zeros(int(count.sum()) * header.point_format.size, np.uint8)
+            table = list(zip(count.tolist(), size.tolist(), strict=True))
+            lazrs.decompress_points_with_chunk_table(b"".join(blobs), zipped, raw, table, FIELDS.to_lazrs())
+            packed = laspy.PackedPointRecord.from_buffer(raw, header.point_format)
+            record = laspy.ScaleAwarePointRecord(packed.array, packed.point_format, header.scales, header.offsets)
+            yield record, np.repeat(nodes.box[part], count, axis=0)
+
+
+def _read_bytes(file: BinaryIO, place: int, size: int) -> bytes:
+    file.seek(place)
+    return file.read(size)
+
+
+def _check_within(path: Path, chunk: PointChunk, box: NDArray[np.float64], place: str) -> None:
+    """Refuse points outside a box, or each its own: laspy gives them, and tiles are planned without them."""
+    xy = coordinates_of(chunk)[:, :2]
+    (x, y), (xmin, ymin, xmax, ymax) = xy.T, box.T
+    stray = (x < xmin - SLACK) | (x > xmax + SLACK) | (y < ymin - SLACK) | (y > ymax + SLACK)
+    if stray.any():
+        x, y = xy[stray][0]
+        raise InputError(
+            f"{path}: {np.count_nonzero(stray)} of {len(xy)} points lie more than {SLACK:g} m outside {place}, "
+            f"the first at ({x:.2f}, {y:.2f}): the file is damaged; {AGAIN}, or rewrite it: "
+            f"pdal translate {path.name} plain.laz"
+        )
+
+
+def take_chunk(record: laspy.ScaleAwarePointRecord) -> PointChunk:
+    """Take what the steps need of points that laspy read, in the file's CRS.
+
     Class 8 is that of model key points, thinned ground, in the point formats 0 to 5 (LAS 1.4 R15, table 9), and
     reserved in the formats 6 to 10 (table 17).
     """
-    classes = np.ascontiguousarray(record.classification, np.uint8)
-    n_key_points = 0
-    if record.point_format.id <= LAST_LEGACY_FORMAT:
-        key = classes == KEY_POINT
-        n_key_points = int(np.count_nonzero(key))
-        if n_key_points:
-            classes = np.where(key, np.uint8(GROUND), classes)
-    (a, b, c), (x, y, z) = (np.asarray(values, np.float64).tolist() for values in (record.scales, record.offsets))
+    classes = np.array(record.classification, np.uint8)
+    key = (classes == KEY_POINT) & (record.point_format.id <= LAST_LEGACY_FORMAT)
+    classes[key] = GROUND
+    (a, b, c), (x, y, z) = record.scales.tolist(), record.offsets.tolist()
     withheld = np.asarray(np.asarray(record.withheld) != 0)
-    array = record.array
-    return PointChunk(array["X"], array["Y"], array["Z"], (a, b, c), (x, y, z), classes, withheld, n_key_points)
-
-
-def ends_of(chunk: PointChunk) -> NDArray[np.float64]:
-    """Give the coordinates of the least and the greatest units along each axis, (2, 3); (0, 3) of none."""
-    if len(chunk) == 0:
-        return np.empty((0, 3))
-    x, y, z = (np.array(find_range(units), np.int32) for units in (chunk.x, chunk.y, chunk.z))
-    return np.asarray(find_coordinates(x, y, z, chunk.scale, chunk.offset))
+    return PointChunk(
+        record.X, record.Y, record.Z, (a, b, c), (x, y, z), classes, withheld, int(np.count_nonzero(key))
+    )
 
 
 def coordinates_of(chunk: PointChunk) -> NDArray[np.float64]:
@@ -95,64 +282,25 @@ def coordinates_of(chunk: PointChunk) -> NDArray[np.float64]:
 
 
 def place_chunk(chunk: PointChunk, frame: Frame, middle: tuple[float, float]) -> PointChunk:
-    """Give a chunk in the region's CRS.
+    """Give a chunk of a file in the region's CRS (m).
 
-    Parameters
-    ----------
-    chunk : PointChunk
-        In the file's CRS.
-    frame : Frame
-        How coordinates of the file become those of the region.
-    middle : tuple of 2 floats
-        Middle of the file in the region's CRS (m): reprojected points are counted from near it.
-
-    Returns
-    -------
-    PointChunk
-        In metres. Where units and axes alone change, the units of the file stay, exactly; reprojected points are
-        rounded to millimetres. A point without a place in the region's CRS is withheld.
+    Where units and axes alone change, the units of the file stay, exactly. Reprojected points are rounded to
+    millimetres and counted from near `middle`, that of the file in the region's CRS; a point without a place there
+    is withheld.
     """
-    scale, offset = _heights(chunk, frame)
-    if not frame.source:
-        return _turn(chunk, frame, scale, offset)
-    plan = coordinates_of(chunk)[:, :2]
-    start = origin_of(middle)
-    units = (to_region(frame, plan) - start) / STEP
-    there = np.abs(units).max(axis=1) <= MOST_UNITS  # infinite or NaN where there is none
-    x, y = np.rint(np.where(there[:, None], units, 0.0)).astype(np.int32).T.copy()
-    return PointChunk(
-        x,
-        y,
-        chunk.z,
-        (STEP, STEP, scale),
-        (*start, offset),
-        chunk.classification,
-        chunk.withheld | ~there,
-        chunk.n_key_points,
-    )
-
-
-def _heights(chunk: PointChunk, frame: Frame) -> tuple[float, float]:
-    return chunk.scale[2] * frame.height, chunk.offset[2] * frame.height
-
-
-def _turn(chunk: PointChunk, frame: Frame, z_scale: float, z_offset: float) -> PointChunk:
-    """Change units and axes."""
-    if frame.east == (0, 1.0) and frame.north == (1, 1.0):
-        x, y = chunk.x, chunk.y
-        scale, offset = chunk.scale[:2], chunk.offset[:2]
-    else:
-        both = (chunk.x, chunk.y)
-        x, y = (both[axis] if unit > 0 else -both[axis] for axis, unit in (frame.east, frame.north))
-        scale = tuple(chunk.scale[axis] * abs(unit) for axis, unit in (frame.east, frame.north))  # type: ignore[assignment]
-        offset = tuple(chunk.offset[axis] * unit for axis, unit in (frame.east, frame.north))  # type: ignore[assignment]
-    return PointChunk(
-        x,
-        y,
-        chunk.z,
-        (*scale, z_scale),
-        (*offset, z_offset),
-        chunk.classification,
-        chunk.withheld,
-        chunk.n_key_points,
-    )
+    if frame == AS_IT_IS:
+        return chunk
+    z_scale, z_offset = chunk.scale[2] * frame.height, chunk.offset[2] * frame.height
+    if frame.source:
+        start = origin_of(middle)
+        units = (to_region(frame, coordinates_of(chunk)[:, :2]) - start) / STEP
+        there = np.abs(units).max(axis=1) <= MOST_UNITS  # infinite or NaN where there is none
+        x, y = np.rint(np.where(there[:, None], units, 0.0)).astype(np.int32).T.copy()
+        scale, offset = (STEP, STEP, z_scale), (*start, z_offset)
+        return replace(chunk, x=x, y=y, scale=scale, offset=offset, withheld=chunk.withheld | ~there)
+    (east, x_unit), (north, y_unit) = frame.east, frame.north
+    both = chunk.x, chunk.y
+    x, y = (both[axis] if unit > 0 else -both[axis] for axis, unit in (frame.east, frame.north))
+    scale = chunk.scale[east] * abs(x_unit), chunk.scale[north] * abs(y_unit), z_scale
+    offset = chunk.offset[east] * x_unit, chunk.offset[north] * y_unit, z_offset
+    return replace(chunk, x=x, y=y, scale=scale, offset=offset)

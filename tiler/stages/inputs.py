@@ -37,8 +37,7 @@ from tiler.footprints.footprint_index import scan_footprints
 from tiler.georeference.frame import Frame
 from tiler.objects.places import place
 from tiler.planning.context import tile_key
-from tiler.pointclouds.clouds import KEY_POINTS
-from tiler.pointclouds.ingest import CELL, read_cells
+from tiler.pointclouds.ingest import CELL, KEY_POINTS, read_cells
 from tiler.stages.readers import clip, grow, join_rasters, read_bands, read_outlines, read_units
 
 
