@@ -30,7 +30,7 @@ from tiler.joining.spool import SPOOL
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
 from tiler.monitoring.progress import Announce
 from tiler.monitoring.watchers import LOST, Listener, Watcher, Watchers
-from tiler.objects.places import in_bucket, place
+from tiler.objects.places import in_bucket, local_folder, place
 from tiler.planning.forecast import warn_of_memory
 from tiler.planning.pad import Pad
 from tiler.planning.padded_layout import pad_plan
@@ -69,7 +69,7 @@ from tiler.workflow.out_folder import (
     remove_strangers,
 )
 from tiler.workflow.own_stages import OwnStages, check_own, run_own_stages
-from tiler.workflow.run_watchers import begin_watching
+from tiler.workflow.run_watchers import LeaseWatch, begin_watching
 from tiler.workflow.stage_sequence import make_engine, run_stages
 from tiler.workflow.summary import describe_tasks, summarise_run
 
@@ -225,10 +225,9 @@ def _run(
         if not earlier and not in_bucket(out):
             sync_meanwhile(out / RUN_RECORD)  # nothing is there yet that a loss of power could make it lie about
         clear_folder(out, earlier, overwrite=config.overwrite)
-        if not in_bucket(out):
-            shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
-            if means.own_executor is None:
-                shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
+        shutil.rmtree(local_folder(out) / TASKS, ignore_errors=True)  # of workers that were killed
+        if not in_bucket(out) and means.own_executor is None:
+            shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
         save_config(config, out)
         progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=means.shown)
         record |= _mesh_region(config, out, plan, own, watchers, damage, means)
@@ -239,12 +238,6 @@ def _run(
         give_back_report(out, changed=bool(record["tasks"]["ran"]))
         record["status"] = "done"
         say(describe_tasks(record["tasks"]))
-        if in_bucket(out):
-            from tiler.objects.watch import describe_waits, tell_waits
-
-            record["store_waits"] = describe_waits()
-            if waits := tell_waits():
-                say(waits)
         failed = False
     except LostFolderError as error:
         untouched = True  # the folder is another process's now
@@ -387,14 +380,12 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
 
 @contextmanager
 def _beside(out: Path, check: Callable[[], None], watchers: Watchers) -> Iterator[Path]:
-    """Give the folder of the events that the page of a run is made of; of one in a bucket, watch the store too."""
+    """Give the folder of the events that the page of a run is made of; of one in a bucket, watch its lease."""
     if not in_bucket(out):
         yield out
         return
-    from tiler.objects.watch import WaitWatch, telling
-
-    watchers.add(WaitWatch(check))
-    with tempfile.TemporaryDirectory(prefix="citystitch-") as name, telling(watchers.say):
+    watchers.add(LeaseWatch(check))
+    with tempfile.TemporaryDirectory(prefix="citystitch-") as name:
         yield Path(name)
 
 
