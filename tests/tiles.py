@@ -171,7 +171,6 @@ def open_engine(config: Config) -> Iterator[tuple[Engine, Plan]]:
         config.tile_size,
         config.mesh_size,
         pack_tiles(plan.grid),
-        str(out),
         config.open_size,
     )
     parameters = SimpleNamespace(

@@ -175,14 +175,14 @@ def remove(path: Place) -> None:
         path.unlink()
 
 
-def find_within(paths: Iterable[Path], folders: Iterable[Path]) -> Path | None:
+def find_within(paths: Iterable[Path], folders: Iterable[Place]) -> Path | None:
     """Find the first place that is one of some others, or lies below one, links followed; None if none does."""
     ends = tuple(f"{_follow(folder)}/" for folder in folders)
     return next((path for path in paths if f"{_follow(path)}/".startswith(ends)), None)
 
 
-def _follow(path: Path) -> str:
-    return str(path) if in_bucket(path) else os.path.realpath(path)
+def _follow(path: Place) -> str:
+    return str(path) if in_bucket(path) else os.path.realpath(str(path))
 
 
 def local_folder(folder: Path) -> Path:

@@ -140,7 +140,7 @@ def remove_strangers(out: Path, tiles: Collection[str]) -> None:
         ) from error
 
 
-def _remove_strangers(out: Path, tiles: Collection[str]) -> None:
+def _remove_strangers(out: Place, tiles: Collection[str]) -> None:
     for folder, suffix in PIECES.items():
         for path in (out / folder).glob(f"*{suffix}"):
             if path.stem not in tiles:
@@ -152,15 +152,15 @@ def _remove_strangers(out: Path, tiles: Collection[str]) -> None:
             path.unlink()
 
 
-def refuse_links(out: Path) -> None:
+def refuse_links(out: Place) -> None:
     """Raise ConfigError if the folder of a run, or a folder of results in it, is a symbolic link."""
     store = out / STORE
-    stages = sorted(store.iterdir()) if store.is_dir() and not store.is_symlink() else []
+    stages = sorted(store.iterdir(), key=str) if store.is_dir() and not store.is_symlink() else []
     for path in (out, *(out / name for name in RESULTS), *stages):
         if path.is_symlink():
             raise ConfigError(
-                f"{path}: is a symbolic link to {os.readlink(path)}; give the folder itself as --out, or remove "
-                "the link"
+                f"{path}: is a symbolic link to {os.readlink(str(path))}; give the folder itself as --out, or "
+                "remove the link"
             )
 
 

@@ -30,7 +30,7 @@ from tiler.joining.spool import SPOOL
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
 from tiler.monitoring.progress import Announce
 from tiler.monitoring.watchers import LOST, Listener, Watcher, Watchers
-from tiler.objects.places import in_bucket, local_folder, place
+from tiler.objects.places import in_bucket, place
 from tiler.planning.forecast import warn_of_memory
 from tiler.planning.pad import Pad
 from tiler.planning.padded_layout import pad_plan
@@ -222,12 +222,13 @@ def _run(
         plan = _plan(config, out, say, fresh=config.overwrite or not earlier)
         untouched = False
         _write_record(out, record, durable=bool(earlier))
-        if not earlier and not in_bucket(out):
-            sync_meanwhile(out / RUN_RECORD)  # nothing is there yet that a loss of power could make it lie about
         clear_folder(out, earlier, overwrite=config.overwrite)
-        shutil.rmtree(local_folder(out) / TASKS, ignore_errors=True)  # of workers that were killed
-        if not in_bucket(out) and means.own_executor is None:
-            shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
+        if not in_bucket(out):
+            if not earlier:  # after a loss of power there is nothing yet that the record could lie about
+                sync_meanwhile(out / RUN_RECORD)
+            shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
+            if means.own_executor is None:
+                shutil.rmtree(out / SPOOL, ignore_errors=True)  # of members that were killed
         save_config(config, out)
         progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=means.shown)
         record |= _mesh_region(config, out, plan, own, watchers, damage, means)

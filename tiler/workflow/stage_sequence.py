@@ -131,7 +131,6 @@ def make_engine(
         config.tile_size_or_default,
         config.mesh_size,
         pack_tiles(plan.grid),
-        str(out),
         config.open_size,
     )
     footprints = place(config.footprints) if config.footprints else None
