@@ -262,7 +262,13 @@ def test_what_another_try_may_mend_is_tried_again(proxy: FlakyProxy, tmp_path: P
     assert path.read_bytes() == b"x"
 
 
-def test_patience_ends(proxy: FlakyProxy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_patience_is_shorter_than_s3_takes_a_signed_request() -> None:
+    assert make_config({"store_patience": 840.0}).store_patience == 840.0
+    with pytest.raises(ConfigError, match="store_patience"):
+        make_config({"store_patience": 900.0})
+
+
+def test_patience_ends(proxy: FlakyProxy) -> None:
     url = f"s3://{BUCKET}/run"
     fail_first(proxy, "503", 10**6)
     text = r"no sound answer for \d s, bound 0\.05 s \(status 503\); the same command goes on where the run ended"

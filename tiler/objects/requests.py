@@ -76,27 +76,28 @@ def ask(place: object, patience: float, request: Callable[["S3Store | HTTPStore"
     try:
         found = request(store)
     except Exception as error:
-        final, reason = _judge(error)
-        _known.update([root] if final or reason.startswith("status") else [])
-        if final:
-            raise final from None
+        answer = _judge(error)
+        if isinstance(answer, Exception):
+            _known.add(root)
+            raise answer from None
         waited = f"for {time.monotonic() - start:.0f} s"
         if bound == patience:
             raise StoreUnreachableError(
-                f"{place}: no sound answer {waited}, bound {patience:g} s ({reason}); the same command "
+                f"{place}: no sound answer {waited}, bound {patience:g} s ({answer}); the same command "
                 "goes on where the run ended"
             ) from None
-        if root not in _known:
+        if not answer.startswith("status"):
             raise StoreUnreachableError(
-                f"{place}: nothing has answered at {root} {waited} ({reason}); check the address"
+                f"{place}: nothing has answered at {root} {waited} ({answer}); check the address"
             ) from None
-        return ask(place, patience, request, root)  # the address is right: it is worth waiting for
+        _known.add(root)  # the address is right: it is worth waiting for
+        return ask(place, patience, request, root)
     _known.add(root)
     return found
 
 
-def _judge(error: Exception) -> tuple[Exception | None, str]:
-    """Give the plain error for one of obstore, or none and a few words where it has repeated the request."""
+def _judge(error: Exception) -> Exception | str:
+    """Give the plain error for one of obstore, or a few words where it has repeated the request in vain."""
     from obstore import exceptions
 
     text = str(error)
@@ -104,7 +105,7 @@ def _judge(error: Exception) -> tuple[Exception | None, str]:
     number = int(status[1]) if status else 0
     denied = (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError, PermissionError)
     if isinstance(error, exceptions.PreconditionError | exceptions.AlreadyExistsError):
-        return ChangedError(), ""
+        return ChangedError()
     if number == 405:  # which obstore takes for an object that is not there
         kind, words = errno.EIO, "refused with status 405; the server must take HEAD and GET"
     elif "NoSuchBucket" in text:
@@ -116,20 +117,20 @@ def _judge(error: Exception) -> tuple[Exception | None, str]:
         words = "no credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a role"
     elif number in (401, 403) or isinstance(error, denied):  # listings give a generic error
         kind, words = errno.EACCES, "access denied; check credentials and rights"
-    elif isinstance(error, exceptions.NotSupportedError) or re.search("range.*support|support.*range", text, re.I):
+    elif isinstance(error, exceptions.NotSupportedError):
         kind, words = errno.EOPNOTSUPP, "the server gives no ranges of files; download the file"
     elif not isinstance(error, exceptions.GenericError):
-        return error, ""
+        return error
     elif "Header missing" in text:
         kind, words = errno.EIO, "the server does not tell the size of the file; download it"
     elif 0 < number < 500 and number not in (408, 429):
         code = re.search(r"<Code>(\w+)</Code>", text)
         kind, words = errno.EIO, f"refused with status {number}" + (f", {code[1]}" if code else "")
     elif number:
-        return None, f"status {number}"
+        return f"status {number}"
     else:
-        return None, "no connection" if "error sending request" in text else "the answer broke off"
-    return OSError(kind, words), ""  # a FileNotFoundError or PermissionError by its number
+        return "no connection" if "error sending request" in text else "the answer broke off"
+    return OSError(kind, words)  # a FileNotFoundError or PermissionError by its number
 
 
 def make_store(root: str, patience: float) -> "S3Store | HTTPStore":
