@@ -12,6 +12,7 @@ from tests.loopback import serving
 OWN = {"connection", "transfer-encoding", "keep-alive", "content-length", "date", "server"}
 ERRORS = {
     "403": b"<Error><Code>AccessDenied</Code><Message>Access Denied</Message></Error>",
+    "429": b"<Error><Code>TooManyRequests</Code><Message>Please reduce your request rate.</Message></Error>",
     "500": b"<Error><Code>InternalError</Code><Message>We encountered an internal error.</Message></Error>",
     "503": b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>",
 }

@@ -3,7 +3,7 @@
 import json
 import pickle
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,19 +11,22 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigError, InputError, OutputError
+from tests.flaky_proxy import FlakyProxy, flaky_proxy
+from tests.object_servers import BUCKET, S3Server, environment, s3_server
 from tests.test_run import hashes
 from tests.towns import Town, make_town
 from tiler.cli.main import main
 from tiler.config.config import load_config, make_config
 from tiler.engine.stage import Scope
-from tiler.objects import range_file
+from tiler.engine.task import Task, run_task
+from tiler.objects import path as object_path
 from tiler.objects import requests as object_requests
-from tiler.objects.fetch import fetch_run
-from tiler.objects.path import ObjectPath
-from tiler.objects.places import StoreUnreachableError, absolute, place
-from tiler.objects.range_file import RangeFile
+from tiler.objects.path import ObjectPath, RangeFile
+from tiler.objects.places import Place, absolute, find_within, identify, place, remove
+from tiler.objects.requests import ChangedError, StoreUnreachableError, trust_addresses
 from tiler.store import folder_lock
 from tiler.store.store import Store
+from tiler.workflow.fetch import fetch_run
 from tiler.workflow.run import run
 
 obstore = pytest.importorskip("obstore")
@@ -40,11 +43,17 @@ class Memory:
         self.rule: Callable[[], None] = lambda: None
         self.n_asked = 0
 
-    def client(self, root: str) -> Any:
+    def make_store(self, root: str, patience: float) -> Any:
         assert root == "s3://bucket"
+        return self
+
+    def get(self, *words: Any, **options: Any) -> Any:
         self.n_asked += 1
         self.rule()
-        return self.store
+        return self.store.get(*words, **options)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.store, name)
 
     def list_keys(self) -> list[str]:
         return sorted(meta["path"] for part in obstore.list(self.store) for meta in part)
@@ -53,19 +62,31 @@ class Memory:
 @pytest.fixture
 def memory(monkeypatch: pytest.MonkeyPatch) -> Memory:
     found = Memory()
-    monkeypatch.setattr(object_requests, "_client", found.client)
+    monkeypatch.setattr(object_requests, "make_store", found.make_store)
     return found
 
 
+@pytest.fixture(scope="module")
+def server() -> Iterator[S3Server]:
+    pytest.importorskip("moto")
+    with s3_server() as found:
+        yield found
+
+
 @pytest.fixture
-def hasty(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Waits are short, and what they tell is kept."""
-    said: list[str] = []
-    monkeypatch.setattr(object_requests, "FIRST_DELAY", 0.001)
-    monkeypatch.setattr(object_requests, "TOLD_AFTER", 0.02)
-    waits = object_requests.Waits(tell=said.append)
-    monkeypatch.setattr(object_requests, "WAITS", waits)
-    return said
+def proxy(server: S3Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[FlakyProxy]:
+    """A real server, behind a proxy that fails on demand; nothing has answered to this process so far."""
+    monkeypatch.setattr(object_requests, "_known", set())
+    with flaky_proxy(server.port) as found:
+        for name, value in environment(found.url).items():
+            monkeypatch.setenv(name, value)
+        yield found
+
+
+def fail_first(proxy: FlakyProxy, fault: str, n: int = 2) -> None:
+    """Let the next requests fail."""
+    proxy.seen.clear()
+    proxy.fault = lambda number, _method, _path: fault if number < n else ""
 
 
 def bucket(url: str = URL, patience: float = 600.0) -> ObjectPath:
@@ -201,7 +222,7 @@ def test_a_writer_that_is_killed_leaves_no_result(memory: Memory, monkeypatch: p
 def test_a_chunk_that_vanished_or_changed_is_found(memory: Memory) -> None:
     store = Store(cast(Path, bucket()))
     store.write("stage", "name", ARRAYS)
-    chunk = next(path for path in bucket().rglob() if path.key.endswith("large/c/1"))
+    chunk = next(path for path in bucket().rglob("*") if path.key.endswith("large/c/1"))
     whole = chunk.read_bytes()
     chunk.unlink()
     assert store.find_damage("stage", "name") == {"large/c/1": "is not there"}
@@ -211,44 +232,145 @@ def test_a_chunk_that_vanished_or_changed_is_found(memory: Memory) -> None:
     assert store.find_damage("stage", "name") == {"large/c/1": "its checksum differs"}
 
 
-def test_requests_are_repeated_and_counted(memory: Memory, hasty: list[str]) -> None:
-    failures = iter([error(500), error(503), error(429)])
+@pytest.mark.parametrize("fault", ["500", "503", "429", "cut", "lost"])
+def test_what_another_try_may_mend_is_tried_again(proxy: FlakyProxy, tmp_path: Path, fault: str) -> None:
+    """Of every kind of request that is made of a store."""
+    path, data = bucket(f"s3://{BUCKET}/{fault}/a"), bytes(range(256)) * 30_000
+    (tmp_path / "large").write_bytes(data)
 
-    def rule() -> None:
-        for failure in failures:
-            raise failure
+    def check(request: Callable[[], Any], expected: Any) -> None:
+        fail_first(proxy, fault)
+        assert request() == expected
+        assert proxy.failed[fault] == 2
+        proxy.failed.clear()
 
-    memory.rule = rule
-    bucket().write_bytes(b"x")
-    assert memory.n_asked == 4
-    assert object_requests.WAITS.retries == 3
-    assert object_requests.WAITS.seconds > 0
-    assert bucket().read_bytes() == b"x"
-    assert memory.n_asked == 5
-
-
-def test_a_pause_is_told_and_ends_with_patience(memory: Memory, hasty: list[str]) -> None:
-    begin = time.monotonic()
-
-    def rule() -> None:
-        if time.monotonic() < begin + 0.1:
-            raise error(503)
-
-    memory.rule = rule
-    bucket().write_bytes(b"x")
-    assert "does not answer (status 503): waiting for it, at most 600 s" in hasty[0]
-    assert "answers again after" in hasty[1]
-    assert len(hasty) == 2
-
-    def never() -> None:
-        raise obstore.exceptions.GenericError("HTTP error: error sending request")
-
-    memory.rule = never
-    with pytest.raises(StoreUnreachableError, match=r"bound 0\.05 s \(no connection\); the same command goes on"):
-        Store(cast(Path, bucket(patience=0.05))).read("stage", "name")
+    check(lambda: path.put_file(tmp_path / "large"), None)
+    check(lambda: (path / "b").write_bytes(b"x"), None)
+    check(lambda: path.read_bytes() == data, True)
+    check(lambda: path.read_range(3, 9), data[3:9])
+    check(path.parent.list_sizes, {"a": len(data), "a/b": 1})
+    check(lambda: [one.name for one in path.parent.iterdir()], ["a", "a"])
+    check(path.is_file, True)
+    check(path.unlink, None)
+    check(lambda: path.delete([path / "b", path / "c"]), None)
+    fail_first(proxy, fault)
+    if fault == "lost":  # the second try finds what the first has put
+        with pytest.raises(ChangedError):
+            path.put_if(b"x", None)
+    else:
+        assert path.put_if(b"x", None) == path.stat().e_tag
+    assert path.read_bytes() == b"x"
 
 
-def test_what_another_try_does_not_mend_is_not_tried_again(memory: Memory, hasty: list[str]) -> None:
+def test_patience_is_shorter_than_s3_takes_a_signed_request() -> None:
+    assert make_config({"store_patience": 840.0}).store_patience == 840.0
+    with pytest.raises(ConfigError, match="store_patience"):
+        make_config({"store_patience": 900.0})
+
+
+def test_patience_ends(proxy: FlakyProxy) -> None:
+    url = f"s3://{BUCKET}/run"
+    fail_first(proxy, "503", 10**6)
+    text = r"no sound answer for \d s, bound 0\.05 s \(status 503\); the same command goes on where the run ended"
+    with pytest.raises(StoreUnreachableError, match=text):
+        Store(cast(Path, bucket(url, patience=0.05))).read("stage", "name")
+    fail_first(proxy, "cut", 10**6)
+    with pytest.raises(StoreUnreachableError, match=r"\(no connection\)"):
+        bucket(url, patience=0.05).write_bytes(b"x")
+
+
+def test_an_address_that_never_answered_is_given_up_soon(
+    proxy: FlakyProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(object_requests, "FIRST_PATIENCE", 0.2)
+    path = bucket(f"s3://{BUCKET}/run")
+
+    def go_silent(fault: str) -> None:
+        end = time.monotonic() + 1.0
+        proxy.fault = lambda _number, _method, _path: fault if time.monotonic() < end else ""
+
+    go_silent("cut")
+    with pytest.raises(StoreUnreachableError, match=rf"nothing has answered at s3://{BUCKET} .*check the address"):
+        path.read_bytes()
+    trust_addresses(True)  # a worker that starts in a pause waits
+    go_silent("cut")
+    path.write_bytes(b"x")
+    trust_addresses(False)
+    go_silent("cut")  # as does who was answered before
+    assert path.read_bytes() == b"x"
+    monkeypatch.setattr(object_requests, "_known", set())
+    go_silent("503")  # and who is answered at all
+    assert path.read_bytes() == b"x"
+
+
+def test_who_does_tasks_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(object_requests, "_known", set())
+    given = Task("s", "n", Scope.TILE, (0.0, 0.0, 1.0, 1.0), None, None, "", Store(tmp_path), {}, "k", tmp_path)
+    run_task(lambda _: {}, given)
+    assert object_requests._known == {object_requests.EVERY}
+
+
+def test_a_lease_is_taken_though_the_answer_was_lost(proxy: FlakyProxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folder_lock, "BEAT", 0.01)
+    out = bucket(f"s3://{BUCKET}/lease")
+
+    def lose_first(kind: str) -> None:
+        seen: list[int] = []
+
+        def fault(number: int, method: str, path: str) -> str:
+            if method == kind and path.endswith(folder_lock.LOCK):
+                seen.append(number)
+            return "lost" if seen == [number] else ""
+
+        proxy.fault = fault
+
+    lose_first("PUT")
+    with folder_lock.only_run(cast(Path, out)) as check:
+        wait_until(lambda: json.loads((out / folder_lock.LOCK).read_bytes())["beats"] > 0)
+        lose_first("PUT")  # of a beat
+        beats = json.loads((out / folder_lock.LOCK).read_bytes())["beats"]
+        wait_until(lambda: json.loads((out / folder_lock.LOCK).read_bytes())["beats"] > beats + 2)
+        check()
+    assert proxy.failed["lost"] == 2
+    assert not out.exists()
+
+
+def test_disk_and_bucket_do_the_same(memory: Memory, tmp_path: Path) -> None:
+    """What runs and readers do with a place."""
+
+    def check(out: Place, write: Callable[[str], object]) -> list[object]:
+        for name in ("mesh/1.vtu", "mesh/0.vtu", "run.json", "store/a/b/c"):
+            write(name)
+        found: list[object] = [out.name, (out / "mesh" / "1.vtu").stem, (out / "x.laz").suffix]
+        found += [out.parent.exists(), out.is_dir(), out.is_file(), (out / "run.json").is_file(), out.is_symlink()]
+        found += [sorted(path.name for path in out.iterdir()), sorted(path.name for path in out.glob("*.json"))]
+        found += sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file())
+        found += [(out / "run.json").read_bytes(), (out / "mesh" / "2.vtu").exists(), (out / "none").is_dir()]
+        (out / "run.json").unlink()
+        remove(out / "store")
+        remove(out / "mesh" / "0.vtu")
+        return [*found, *sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file())]
+
+    def write(name: str) -> None:
+        path = tmp_path / "run" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(name.encode())
+
+    there = bucket()
+    objects = check(there, lambda name: (there / name).write_bytes(name.encode()))
+    assert objects == check(tmp_path / "run", write)
+    assert identify(there / "mesh/1.vtu").split()[0] == identify(tmp_path / "run/mesh/1.vtu").split()[0] == "10"
+
+
+def test_a_place_within_others_is_found(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    url = place("s3://bucket/a/b")
+    assert find_within([tmp_path / "ab", tmp_path / "link" / "c"], [tmp_path / "a"]) == tmp_path / "link" / "c"
+    assert find_within([tmp_path / "a", url], [place("s3://bucket/a")]) == url
+    assert find_within([url, tmp_path], [tmp_path / "a", place("s3://bucket/a/bc")]) is None
+
+
+def test_what_another_try_does_not_mend_is_not_tried_again(memory: Memory) -> None:
     def expect(failure: Exception, kind: type[Exception], text: str) -> None:
         def rule() -> None:
             raise failure
@@ -291,8 +413,8 @@ def test_one_run_at_a_time_by_a_lease(memory: Memory, monkeypatch: pytest.Monkey
 
 
 def test_a_range_reader_reads_as_a_file_does(memory: Memory, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(range_file, "LEAST", 16)
-    monkeypatch.setattr(range_file, "MOST", 64)
+    monkeypatch.setattr(object_path, "LEAST", 16)
+    monkeypatch.setattr(object_path, "MOST", 64)
     rng = np.random.default_rng(1)
     data = rng.integers(0, 256, 1000, np.uint8).tobytes()
     bucket().write_bytes(data)
@@ -327,7 +449,6 @@ def test_a_run_in_a_bucket_has_the_bytes_of_one_on_a_disk(
     said: list[str] = []
     record = run(make_config({**vars(town.config(tmp_path)), "out": URL}), say=said.append)
     assert record["exit_code"] == 0
-    assert record["store_waits"]["driver_retries"] == 0
     assert main(["status", URL]) == 0
     assert "done" in capsys.readouterr().out
     assert main(["check", "--store", URL]) == 0
@@ -336,7 +457,8 @@ def test_a_run_in_a_bucket_has_the_bytes_of_one_on_a_disk(
     assert hashes(tmp_path / "out") == hashes(town.out)
     # What has vanished is found, and that alone is made again.
     for name in ("store.zarr/columns/", "boundary/"):
-        victim = next(path for path in (bucket() / name.rstrip("/")).rglob() if not path.key.endswith("zarr.json"))
+        below = (bucket() / name.rstrip("/")).rglob("*")
+        victim = next(path for path in below if not path.key.endswith("zarr.json"))
         victim.unlink()
     assert main(["check", "--store", URL]) == 1
     again = run(make_config({**vars(town.config(tmp_path)), "out": URL}))
@@ -370,39 +492,3 @@ def test_an_object_that_would_lead_out_of_the_folder_is_not_fetched(memory: Memo
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="nothing lies below"):
         fetch_run("s3://bucket/none", tmp_path / "out", lambda _: None)
-
-
-def test_an_address_that_never_answered_is_given_up_soon(
-    memory: Memory, hasty: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(object_requests, "FIRST_PATIENCE", 0.05)
-    monkeypatch.setattr(object_requests, "_answered", set())
-    monkeypatch.setattr(object_requests.WAITS, "working", False)
-    begin = time.monotonic()
-
-    def rule() -> None:
-        if time.monotonic() < begin + 0.3:
-            raise obstore.exceptions.GenericError("HTTP error: error sending request")
-
-    memory.rule = rule
-    with pytest.raises(StoreUnreachableError, match=r"nothing has answered at s3://bucket .*check the address"):
-        bucket().read_bytes()
-    monkeypatch.setattr(object_requests.WAITS, "working", True)  # a worker that starts in a pause waits
-    bucket().write_bytes(b"x")
-    monkeypatch.setattr(object_requests.WAITS, "working", False)
-    begin = time.monotonic()  # as does who was answered before
-    assert bucket().read_bytes() == b"x"
-
-
-def test_who_does_tasks_waits(
-    memory: Memory, hasty: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from tiler.engine import task as tasks
-
-    monkeypatch.setattr(tasks, "WAITS", object_requests.WAITS)
-    assert not object_requests.WAITS.working
-    given = tasks.Task(
-        "s", "n", Scope.TILE, (0.0, 0.0, 1.0, 1.0), None, None, "", Store(tmp_path), {}, "k", tmp_path
-    )
-    tasks.run_task(lambda _: {}, given)
-    assert object_requests.WAITS.working

@@ -24,8 +24,9 @@ from tiler.config.step_options import derived_parameters
 from tiler.engine.engine import Engine
 from tiler.engine.stage import REGION_ITEM
 from tiler.executors.executor import serial
+from tiler.objects.places import identify
 from tiler.planning.context import RunContext, pack_tiles
-from tiler.planning.plan import Plan, identify, make_plan
+from tiler.planning.plan import Plan, make_plan
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.mesh import mesh_stages
 from tiler.workflow.run import run
@@ -170,7 +171,6 @@ def open_engine(config: Config) -> Iterator[tuple[Engine, Plan]]:
         config.tile_size,
         config.mesh_size,
         pack_tiles(plan.grid),
-        str(out),
         config.open_size,
     )
     parameters = SimpleNamespace(

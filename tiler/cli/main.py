@@ -233,7 +233,7 @@ def _report_run(out: Path, *, quiet: bool) -> None:
 
 
 def _fetch(options: argparse.Namespace) -> int:
-    from tiler.objects.fetch import fetch_run
+    from tiler.workflow.fetch import fetch_run
 
     return 0 if fetch_run(options.source, options.directory, say) else EXIT_FAILED
 

@@ -261,8 +261,8 @@ class Config:
         1, "run", "how often a task that fails is tried again before its tile is left out", least=0, most=100
     )
     store_patience: float = _parameter(
-        600.0, "run", "how long a run waits for the bucket of its results where that does not answer", unit="s",
-        least=0,
+        600.0, "run", "how long a run waits for the bucket of its results where that does not answer: less than "
+        "the 15 minutes for which S3 takes a signed request", unit="s", least=0, most=840,
     )  # fmt: skip
     scheduler: str = _parameter(
         UNSET, "run", "address of a running Dask scheduler, whose workers see the same files; instead of workers"

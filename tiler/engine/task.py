@@ -18,14 +18,13 @@ from pipeline.errors import CityError
 from pipeline.notes import Note, count_notes
 from tiler.engine.stage import Box, Facts, Scope
 from tiler.georeference.frame import AS_IT_IS, Frame
-from tiler.objects.places import in_bucket
-from tiler.objects.requests import WAITS
+from tiler.objects.requests import trust_addresses
+from tiler.objects.results import files_for
 from tiler.store.result_writer import Writer, plain_json
 from tiler.store.stated_files import FILES, check_files, find_changed_files
 from tiler.store.store import Store
 
 APART = ("key",)  # attributes of a result that are no content
-WAITED = "waiting for the store"  # step of a record: the time that requests to a bucket were repeated
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,11 +255,6 @@ class Task:
     @contextmanager
     def output(self) -> Iterator[Path]:
         """Give the folder for files that the result states; in a bucket they are put when all are written."""
-        if not in_bucket(self.folder):
-            yield Path(self.context.out)
-            return
-        from tiler.objects.results import files_for
-
         with files_for(self.folder) as folder:
             yield folder
 
@@ -286,8 +280,8 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
     it was written; a damaged one is computed again. An error leaves nothing behind. Errors come back as values; a
     RuntimeError with the text stands for one that cannot be pickled.
     """
-    start, waited = time.perf_counter(), _waited(task)
-    WAITS.working = True
+    start = time.perf_counter()
+    trust_addresses(True)
     try:
         earlier = _take_earlier(task)
         if isinstance(earlier, Record):
@@ -305,8 +299,6 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
     finally:
         task._writer = None
     seconds = {step: round(value, 4) for step, value in task._seconds.items()}
-    if waiting := _waited(task) - waited:
-        seconds[WAITED] = round(waiting, 4)
     seconds["all"] = round(time.perf_counter() - start, 4)
     return Record(
         task.stage,
@@ -319,11 +311,6 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
         peak_memory=peak_memory(),
         damage=earlier,
     )
-
-
-def _waited(task: Task) -> float:
-    """Seconds that this process has waited for buckets so far."""
-    return WAITS.seconds if in_bucket(task.folder) else 0.0
 
 
 def _take_earlier(task: Task) -> Record | str:

@@ -6,10 +6,8 @@ limit; the file goes when the task ends. What is found in it afterwards says whi
 """
 
 import faulthandler
-import hashlib
 import os
 import resource
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -20,7 +18,7 @@ from pipeline.errors import CityError, OutputError
 from tiler.config.config import Config
 from tiler.engine.stage import Facts
 from tiler.engine.task import Failure, Record, Task, run_task
-from tiler.objects.places import in_bucket
+from tiler.objects.places import local_folder
 
 TASKS = ".tasks"  # folder beside the store, with a file for every task that runs
 TIMEOUT = "Timeout ("  # how the fault handler begins at the time limit
@@ -59,11 +57,8 @@ class Limits:
 
 def trace_file(task: Task) -> Path:
     """File that is there while a task runs in a worker."""
-    folder = task.store.path.parent
-    if in_bucket(folder):  # on this machine alone: a driver elsewhere counts how many workers died of a task
-        run = hashlib.blake2b(str(folder).encode(), digest_size=8).hexdigest()
-        folder = Path(tempfile.gettempdir()) / f"citystitch-{os.getuid()}-{run}"
-    return folder / TASKS / f"{task.stage}.{task.name}.txt"
+    # Of a bucket, on this machine alone: a driver elsewhere counts how many workers died of a task.
+    return local_folder(task.store.path.parent) / TASKS / f"{task.stage}.{task.name}.txt"
 
 
 def run_guarded(function: Callable[[Task], Facts], task: Task, seconds: float) -> Record | Failure:

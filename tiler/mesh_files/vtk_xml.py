@@ -20,7 +20,7 @@ from deflate import zlib_compress
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from tiler.objects.places import in_bucket, read_at_most
+from tiler.objects.places import read_at_most
 from tiler.store.atomic import replacing
 
 BLOCK_BYTES = 1 << 18  # uncompressed bytes of a zlib block
@@ -28,8 +28,8 @@ LEVEL = 1  # of libdeflate
 OTHER_LEVELS = (2, 6, 12, 0)
 THOROUGH = 10  # a level that finds what steady sequences repeat: less than half the bytes of the others
 HEAD_BYTES = 1 << 20  # bound on the XML in front of the data
-OBJECT_HEAD = 1 << 16  # bytes that are asked for to find it
-TOGETHER, BLOCK = 16, 1000  # heads of objects that are asked for at a time, and that wait
+PIECE_HEAD = 1 << 16  # bytes of a piece of our own in which it ends
+TOGETHER, BLOCK = 16, 1000  # heads of pieces that are read at a time, and that wait
 INDEX_BYTES = 1 << 28  # bound on an index file
 MAX_RATIO = 1032  # zlib cannot compress better than this
 # VTK's names of the types that we write.
@@ -201,19 +201,18 @@ def write_index(path: Path, pieces: Sequence[Path], kind: str) -> None:
 
 
 def _declare_all(pieces: Sequence[Path], kind: str) -> Iterator[dict[str, list[str]]]:
-    """Read the declarations of pieces in their order; of objects, some at a time."""
-    if not in_bucket(pieces[0]):
-        yield from (_declarations(piece, kind) for piece in pieces)
-        return
+    """Read the declarations of pieces in their order, some at a time: most of it is waiting for disk or bucket."""
     with ThreadPoolExecutor(TOGETHER) as pool:
         for start in range(0, len(pieces), BLOCK):
             yield from pool.map(lambda piece: _declarations(piece, kind), pieces[start : start + BLOCK])
 
 
 def _declarations(path: Path, kind: str) -> dict[str, list[str]]:
-    remote = in_bucket(path)
-    with _opened_head(path) if remote else opened(path) as file:
-        piece = _read_head(path, file, kind).piece
+    try:
+        head = io.BytesIO(read_at_most(path, PIECE_HEAD))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); run the tile again") from error
+    piece = _read_head(path, head, kind).piece
     return {
         section: [
             _declaration(array.get("type", ""), array.get("Name", ""), array.get("NumberOfComponents", "1"))
@@ -244,15 +243,6 @@ def opened(path: Path) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
             yield file
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); run the tile again") from error
-
-
-@contextmanager
-def _opened_head(path: Path) -> Iterator[BinaryIO]:
-    """Open what of an object holds the declarations of our own pieces: one request."""
-    try:
-        yield io.BytesIO(read_at_most(path, OBJECT_HEAD))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); run the tile again") from error
 

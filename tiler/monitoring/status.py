@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipeline.errors import InputError
-from tiler.objects.places import in_bucket
+from tiler.monitoring.terminal import next_commands
 from tiler.store.folder_lock import is_held
 from tiler.words.note_words import say_notes
 from tiler.words.stage_groups import group_stages, title_of_stage
@@ -132,7 +132,7 @@ def _next_move(directory: Path, status: dict[str, Any]) -> str:
     if status["state"] == "running":
         return f"next: wait, and ask again: citystitch status {directory}"
     if status["state"] == "done":
-        return f"next: citystitch {f'fetch {directory} DIR' if in_bucket(directory) else f'check {directory}'}"
+        return f"next: {' '.join(next_commands(directory)[0])}"
     if not status["command"]:
         return "to go on where it ended: call tiler.workflow.run.run again, with the same stages of your own"
     return f"to go on where it ended, in {status['directory']}:\n{status['command']}"

@@ -13,7 +13,7 @@ from tiler.monitoring.live_view import LiveView
 from tiler.monitoring.plain_view import PlainView, QuietView
 from tiler.monitoring.tally import Tally
 from tiler.monitoring.watchers import Watcher
-from tiler.objects.places import in_bucket
+from tiler.objects.places import Place, in_bucket
 from tiler.words.note_words import say_notes
 from tiler.words.plain_text import printable
 from tiler.words.stage_groups import title_of_stage
@@ -93,7 +93,7 @@ def tell_buildings(counts: Mapping[str, int]) -> str:
     return words if parts == n else f"{words} ({parts:,} parts)"
 
 
-def next_commands(out: Path) -> Sequence[Sequence[str]]:
+def next_commands(out: Place) -> Sequence[Sequence[str]]:
     """List what to do with a finished run: prove it, look at it, take it along."""
     folder = str(out)
     if in_bucket(out):

@@ -1,4 +1,9 @@
-"""One run at a time for the results in a bucket: an object that names its owner, put on conditions and beaten."""
+"""One run at a time for the results in a bucket: an object that names its owner, put on conditions as a heartbeat.
+
+The object is put if there is none (``If-None-Match``), and replaced if it is the one that was read (``If-Match``):
+the store decides who is first. An owner on this machine is asked for by its process; to another one it is listened
+for `SILENCE` seconds, by the tag that each heartbeat changes. A killed run leaves its lease, for the next to take.
+"""
 
 import dataclasses
 import json
@@ -16,17 +21,7 @@ from tiler.words.plain_text import say_nothing
 
 
 class Lease:
-    """A lease that is held.
-
-    Parameters
-    ----------
-    path : ObjectPath
-        Its object.
-    owner : Owner
-        This process.
-    e_tag : str
-        Tag of the object.
-    """
+    """A lease that is held: its object, this process, and the tag that the object has now."""
 
     def __init__(self, path: ObjectPath, owner: Owner, e_tag: str) -> None:
         self._path, self._owner, self._tag = path, owner, e_tag
@@ -48,8 +43,7 @@ class Lease:
         self._stop.set()
         self._thread.join()
         with suppress(OSError, OutputError):
-            found = _read(self._path)
-            if found is not None and found[0] is not None and found[0].token == self._owner.token:
+            if _find_tag(self._path, self._owner):
                 self._path.unlink()
 
     def _beat(self) -> None:
@@ -57,19 +51,13 @@ class Lease:
         while not self._stop.wait(folder_lock.BEAT):
             beats += 1
             with suppress(OSError, OutputError):  # a store that is not there has no other owner either
-                self._put(beats)
-
-    def _put(self, beats: int) -> None:
-        try:
-            self._tag = self._path.put_if(_text(self._owner, beats), self._tag)
-        except (ChangedError, FileNotFoundError):
-            # A request that was repeated finds what it has put itself.
-            found = _read(self._path)
-            if found is not None and found[0] is not None and found[0].token == self._owner.token:
-                self._tag = found[1]
-            else:
-                self._lost = True
-                self._stop.set()
+                try:
+                    self._tag = self._path.put_if(_text(self._owner, beats), self._tag)
+                except (ChangedError, FileNotFoundError):
+                    self._tag = _find_tag(self._path, self._owner)
+                    if not self._tag:
+                        self._lost = True
+                        return
 
 
 @contextmanager
@@ -87,13 +75,6 @@ def only_run_in_bucket(folder: ObjectPath, say: Callable[[str], None]) -> Iterat
     ------
     ConfigError
         If another run is at work there, or nothing can be put there.
-
-    Notes
-    -----
-    The object is put if there is none (``If-None-Match``), and replaced if it is the one that was read
-    (``If-Match``): the store decides who is first. An owner on this machine is asked for by its process; to
-    another one it is listened for `SILENCE` seconds, by the tag that each beat changes. A killed run leaves its
-    lease, which the next one takes.
     """
     path, owner = folder / LOCK, folder_lock.this_process()
     try:
@@ -117,17 +98,23 @@ def _take(path: ObjectPath, owner: Owner, say: Callable[[str], None]) -> str:
     while True:
         found = _read(path)
         if found is not None:
+            name = f" ({folder_lock.tell_owner(found[0])})" if found[0] is not None else ""
             if _lives(path, *found, say=say):
-                raise ConfigError(f"{path.parent}: {BUSY}{_words(found[0])}; {NEXT}")
-            say(f"{path.parent}: taken over from{_words(found[0]) or ' a run'}, which is dead")
+                raise ConfigError(f"{path.parent}: {BUSY}{name}; {NEXT}")
+            say(f"{path.parent}: taken over from{name or ' a run'}, which is dead")
         try:
             return path.put_if(_text(owner, 0), None if found is None else found[1])
         except (ChangedError, FileNotFoundError) as error:
             if isinstance(error, FileNotFoundError) and found is None:
                 raise
-            now = _read(path)  # ours, if the request was repeated
-            if now is not None and now[0] == owner:
-                return now[1]
+            if tag := _find_tag(path, owner):
+                return tag
+
+
+def _find_tag(path: ObjectPath, owner: Owner) -> str:
+    """Give the tag of a lease that is this owner's, else nothing: a put that was repeated finds its own object."""
+    found = _read(path)
+    return found[1] if found is not None and found[0] is not None and found[0].token == owner.token else ""
 
 
 def _read(path: ObjectPath) -> tuple[Owner | None, str] | None:
@@ -161,7 +148,3 @@ def _lives(path: ObjectPath, owner: Owner | None, e_tag: str, say: Callable[[str
 
 def _text(owner: Owner, beats: int) -> bytes:
     return json.dumps(dataclasses.asdict(owner) | {"beats": beats}).encode() + b"\n"
-
-
-def _words(owner: Owner | None) -> str:
-    return f" ({folder_lock.tell_owner(owner)})" if owner is not None else ""

@@ -1,21 +1,52 @@
-"""Places of inputs and results: paths on a disk, objects of a bucket (``s3://``), files of a server (``http://``)."""
+"""Places of inputs and results: paths on a disk, objects of a bucket (``s3://``), files of a server (``http://``).
 
+Which of them a place is, `place` chooses once, by its text. What both do is in `Place`; what they do in different
+ways, in the functions here.
+"""
+
+import hashlib
+import os
 import re
-from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, TypeGuard, cast
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path, PurePath
+from typing import BinaryIO, Protocol, Self, TypeGuard, cast
 
-from pipeline.errors import ConfigError, OutputError
-
-if TYPE_CHECKING:
-    from tiler.objects.path import ObjectPath
+from pipeline.errors import ConfigError
+from tiler.objects.path import ObjectPath, delete_below
 
 PATIENCE = 600.0  # s that a request is repeated for where nothing sound answers
 _URL = re.compile(r"(s3|https?)://", re.IGNORECASE)
 _OTHER = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://")
 
 
-class StoreUnreachableError(OutputError):
-    """A bucket or server has not answered for all of a run's patience: the run ends, and may be resumed."""
+class Place(Protocol):
+    """What runs and readers do with a path of a disk and with an object of a bucket.
+
+    `pathlib.Path` has all of it, and so has `ObjectPath`. Files are written by `tiler.store.atomic.replacing` and
+    `tiler.objects.results`: whole, or not at all.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def stem(self) -> str: ...
+    @property
+    def suffix(self) -> str: ...
+    @property
+    def parent(self) -> Self: ...
+    def __truediv__(self, name: str, /) -> Self: ...
+    def relative_to(self, other: Self, /) -> PurePath: ...
+    def is_file(self) -> bool: ...
+    def is_dir(self) -> bool: ...
+    def is_symlink(self) -> bool: ...
+    def exists(self) -> bool: ...
+    def read_bytes(self) -> bytes: ...
+    def unlink(self) -> None: ...
+    def iterdir(self) -> Iterator[Self]: ...
+    def glob(self, pattern: str, /) -> Iterator[Self]: ...
+    def rglob(self, pattern: str, /) -> Iterator[Self]: ...
 
 
 def is_url(text: str) -> bool:
@@ -29,9 +60,9 @@ def is_url(text: str) -> bool:
     return _URL.match(text) is not None
 
 
-def in_bucket(path: object) -> "TypeGuard[ObjectPath]":
+def in_bucket(path: object) -> TypeGuard[ObjectPath]:
     """Tell whether a place is an `ObjectPath`: what is written there is put whole, and nothing is renamed."""
-    return getattr(path, "is_remote", False)
+    return isinstance(path, ObjectPath)
 
 
 def place(text: str, patience: float = PATIENCE) -> Path:
@@ -47,7 +78,7 @@ def place(text: str, patience: float = PATIENCE) -> Path:
     Returns
     -------
     Path
-        Of a URL an `ObjectPath`, which has the part of `Path` that runs and readers use.
+        Of a URL an `ObjectPath`, for all that takes a `Place`.
 
     Raises
     ------
@@ -56,8 +87,6 @@ def place(text: str, patience: float = PATIENCE) -> Path:
     """
     if not is_url(text):
         return Path(text)
-    from tiler.objects.path import ObjectPath
-
     check_url(text)
     scheme, rest = text.split("://", 1)
     host, _, key = rest.partition("/")
@@ -117,9 +146,51 @@ def check_url(text: str) -> None:
 def read_at_most(path: Path, n_bytes: int) -> bytes:
     """Read the first bytes of a file, no more than so many."""
     if in_bucket(path):
-        return path.read_bytes(n_bytes)
+        return path.read_range(0, n_bytes)
     with path.open("rb") as file:
         return file.read(n_bytes)
+
+
+def identify(path: Path | ObjectPath) -> str:
+    """Change when a file does: its size and the time of its last change; of an object its tag, if it has one."""
+    if in_bucket(path):
+        found = path.stat()
+        return f"{found.st_size} {found.e_tag or found.st_mtime_ns}"
+    state = path.stat()
+    return f"{state.st_size} {state.st_mtime_ns}"
+
+
+def is_missing(path: Path) -> bool:
+    """Tell whether a path of a disk names nothing; of an object, its first reader tells."""
+    return not in_bucket(path) and not os.path.exists(path)  # Path.exists raises where a name is too long
+
+
+def remove(path: Place) -> None:
+    """Remove a file, or a folder and all in it."""
+    if in_bucket(path):
+        delete_below(path)
+    elif path.is_dir():
+        shutil.rmtree(str(path))
+    else:
+        path.unlink()
+
+
+def find_within(paths: Iterable[Path], folders: Iterable[Place]) -> Path | None:
+    """Find the first place that is one of some others, or lies below one, links followed; None if none does."""
+    ends = tuple(f"{_follow(folder)}/" for folder in folders)
+    return next((path for path in paths if f"{_follow(path)}/".startswith(ends)), None)
+
+
+def _follow(path: Place) -> str:
+    return str(path) if in_bucket(path) else os.path.realpath(str(path))
+
+
+def local_folder(folder: Path) -> Path:
+    """Give where a machine keeps what is its own of a run: the folder itself, of a bucket one of this user."""
+    if not in_bucket(folder):
+        return folder
+    run = hashlib.blake2b(str(folder).encode(), digest_size=8).hexdigest()
+    return Path(tempfile.gettempdir()) / f"citystitch-{os.getuid()}-{run}"
 
 
 def refuse_bucket(path: str | Path, what: str) -> None:

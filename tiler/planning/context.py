@@ -41,8 +41,6 @@ class RunContext:
         Side of a tile and target edge length (m).
     present : bytes
         Which tiles there are, see `pack_tiles`.
-    out : str
-        Folder of the run's files.
     open_size : float
         Largest target edge length (m) where sizes are graded, else 0.
     """
@@ -52,7 +50,6 @@ class RunContext:
     tile_size: float
     mesh_size: float
     present: bytes
-    out: str
     open_size: float = 0.0
 
     @property

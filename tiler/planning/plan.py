@@ -16,8 +16,8 @@ from tiler.georeference.cloud_crs import Asked
 from tiler.georeference.crs import crs_text
 from tiler.georeference.establish import FOOTPRINTS, Georeference, establish_georeference, find_inexact
 from tiler.georeference.operation import Operation
-from tiler.objects.places import in_bucket, place
-from tiler.objects.requests import WAITS
+from tiler.objects.places import identify, place
+from tiler.objects.requests import trust_addresses
 from tiler.planning.context import choose_tiles, make_layout, tile_key
 from tiler.planning.region import (
     Region,
@@ -125,7 +125,7 @@ def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
     CityError
         If an input is missing or unreadable, or does not fit the others.
     """
-    WAITS.working = False  # whatever this process did before
+    trust_addresses(False)  # whatever this process did before
     found = survey_inputs(config, say)
     layout = make_layout(found.grid, file_items(found.clouds), identity=found.region.crs)
     return Plan(found.region, found.headers, found.messages, found.unreadable, found.grid, layout, found)
@@ -222,15 +222,6 @@ def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:
         name = next(name for k in count(1) if (name := f"{stem}-{k}" if k > 1 else stem) not in items)
         items[name] = FileItem(str(header.path), header.bounds[:4], identify(header.path), header.frame)
     return items
-
-
-def identify(path: Path) -> str:
-    """Change when a file does: its size and the time of its last change; of an object its tag, if it has one."""
-    if in_bucket(path):
-        found = path.stat()
-        return f"{found.st_size} {found.e_tag or found.st_mtime_ns}"
-    state = path.stat()
-    return f"{state.st_size} {state.st_mtime_ns}"
 
 
 def _read_headers(paths: Sequence[Path], *, skip: bool) -> tuple[list[CloudHeader], dict[str, str]]:

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from pipeline.errors import OutputError
-from tiler.objects.places import in_bucket
 from tiler.store.atomic import replacing
 from tiler.workflow.out_folder import EARLIER_REPORT, REPORT
 
@@ -29,8 +28,6 @@ def give_back_report(out: Path, *, changed: bool) -> None:
     OutputError
         If it cannot be written.
     """
-    if in_bucket(out):
-        return
     earlier, report = out / EARLIER_REPORT, out / REPORT
     try:
         if not earlier.is_file():

@@ -1,6 +1,5 @@
 """Vector files: what a layer says about itself, and its features within a box (step 1.2)."""
 
-import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -11,8 +10,8 @@ import pyproj
 
 from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note
-from tiler.objects.local_copy import local_copy
-from tiler.objects.places import in_bucket
+from tiler.objects.places import is_missing
+from tiler.objects.results import local_copy
 from tiler.vectors import geoparquet
 from tiler.vectors.features import Box, Features, to_objects
 from tiler.vectors.gdal_features import check_readable, scan_features
@@ -96,7 +95,7 @@ def describe_layer(path: Path, layer: str = "") -> Layer:
     """
     if not geoparquet.is_parquet(path):
         path = local_copy(path)
-    if not in_bucket(path) and not os.path.exists(path):  # Path.exists raises where a name is too long
+    if is_missing(path):
         raise InputError(f"{path}: no such file; check the path of the footprints")
     if geoparquet.is_parquet(path):
         if layer:

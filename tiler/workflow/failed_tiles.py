@@ -124,7 +124,7 @@ def save_config(config: Config, out: Path) -> None:
         config,
         pointcloud=tuple(map(absolute, config.pointcloud)),
         footprints=absolute(config.footprints) if config.footprints else "",
-        out=str(out.absolute()),
+        out=absolute(str(out)),
         scheduler="",  # which no file may name
         tls_ca="",
         tls_cert="",

@@ -2,15 +2,15 @@
 
 import json
 import os
-import shutil
 from collections.abc import Collection, Iterable, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError, OutputError
 from tiler.engine.task_limits import TASKS
 from tiler.executors.worker_requirements import PROBE
-from tiler.objects.places import in_bucket
+from tiler.objects.places import Place, find_within, in_bucket, remove
 from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL
 from tiler.store.store import MANIFEST
 
@@ -51,8 +51,7 @@ def check_folder(out: Path, *, overwrite: bool) -> list[str]:
         If it cannot be written, or holds results without the record of a run; or if it, or a folder of results in
         it, is a symbolic link: what is removed there would be somewhere else.
     """
-    remote = in_bucket(out)
-    if remote:
+    if in_bucket(out):
         return _check_bucket(out, overwrite=overwrite)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; give another --out")
@@ -68,7 +67,7 @@ def check_folder(out: Path, *, overwrite: bool) -> list[str]:
     return earlier
 
 
-def _check_bucket(out: Path, *, overwrite: bool) -> list[str]:
+def _check_bucket(out: Place, *, overwrite: bool) -> list[str]:
     """As `check_folder`; whether it can be written is known when the lease is."""
     try:
         there = {path.name for path in out.iterdir()}
@@ -79,7 +78,7 @@ def _check_bucket(out: Path, *, overwrite: bool) -> list[str]:
     return earlier
 
 
-def _check_earlier(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
+def _check_earlier(out: Place, earlier: Sequence[str], *, overwrite: bool) -> None:
     if earlier and not _is_ours(out):
         raise ConfigError(f"{out}: holds {', '.join(earlier)}, but no run.json of a run; give another --out")
     if earlier and not overwrite and not _has_record(out):
@@ -117,22 +116,11 @@ def clear_folder(out: Path, earlier: Sequence[str], *, overwrite: bool) -> None:
             if name == REPORT and not overwrite and not in_bucket(out):
                 path.replace(out / EARLIER_REPORT)
             else:
-                _remove(path)
+                remove(path)
         for folder in PIECES:
             (out / folder).mkdir(exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written ({error.strerror}); give another --out") from error
-
-
-def _remove(path: Path) -> None:
-    if in_bucket(path):
-        from tiler.objects.path import delete_below
-
-        delete_below(path)
-    elif path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink()
 
 
 def remove_strangers(out: Path, tiles: Collection[str]) -> None:
@@ -152,31 +140,27 @@ def remove_strangers(out: Path, tiles: Collection[str]) -> None:
         ) from error
 
 
-def _remove_strangers(out: Path, tiles: Collection[str]) -> None:
+def _remove_strangers(out: Place, tiles: Collection[str]) -> None:
     for folder, suffix in PIECES.items():
         for path in (out / folder).glob(f"*{suffix}"):
             if path.stem not in tiles:
                 path.unlink()
-    if in_bucket(out):
-        return  # nothing unfinished is in a bucket
-    (out / PROBE).unlink(missing_ok=True)
-    for name in map(Path, (*RESULTS, PROBE)):
-        for path in out.glob(PART.format(stem=name.stem, suffix=name.suffix)):
-            if path.is_file():
-                path.unlink()
+    names = [Path(name) for name in (*RESULTS, PROBE)]
+    unfinished = [PART.format(stem=name.stem, suffix=name.suffix) for name in names]
+    for path in out.iterdir():
+        if any(fnmatchcase(path.name, pattern) for pattern in (PROBE, *unfinished)) and path.is_file():
+            path.unlink()
 
 
-def refuse_links(out: Path) -> None:
+def refuse_links(out: Place) -> None:
     """Raise ConfigError if the folder of a run, or a folder of results in it, is a symbolic link."""
-    if in_bucket(out):
-        return
     store = out / STORE
-    stages = sorted(store.iterdir()) if store.is_dir() and not store.is_symlink() else []
+    stages = sorted(store.iterdir(), key=str) if store.is_dir() and not store.is_symlink() else []
     for path in (out, *(out / name for name in RESULTS), *stages):
         if path.is_symlink():
             raise ConfigError(
-                f"{path}: is a symbolic link to {os.readlink(path)}; give the folder itself as --out, or remove "
-                "the link"
+                f"{path}: is a symbolic link to {os.readlink(str(path))}; give the folder itself as --out, or "
+                "remove the link"
             )
 
 
@@ -188,39 +172,27 @@ def refuse_inputs_within(out: Path, inputs: Iterable[Path]) -> None:
     ConfigError
         With the first such input.
     """
-    results = _find_results(out)
-    for path in inputs:
-        if _is_within(path, results):
-            raise ConfigError(f"{path}: an input lies among the results in {out}; move it, or give another --out")
+    path = find_within(inputs, _list_results(out))
+    if path is not None:
+        raise ConfigError(f"{path}: an input lies among the results in {out}; move it, or give another --out")
 
 
 def refuse_result(out: Path, log: Path) -> None:
     """Refuse a file for `--log-json` that a run writes or removes itself; ConfigError with its name."""
-    if _is_within(log, _find_results(out)):
+    if find_within([log], _list_results(out)) is not None:
         raise ConfigError(f"--log-json {log}: lies among the results in {out}; give another file")
 
 
-def _find_results(out: Path) -> list[Path]:
-    """Where the results of a run go, links followed."""
-    return [_follow(out / name) for name in RESULTS]
+def _list_results(out: Path) -> list[Path]:
+    return [out / name for name in RESULTS]
 
 
-def _is_within(path: Path, results: Sequence[Path]) -> bool:
-    real = _follow(path)
-    return any(in_bucket(real) == in_bucket(result) and real.is_relative_to(result) for result in results)
-
-
-def _follow(path: Path) -> Path:
-    remote = in_bucket(path)
-    return path if remote else Path(os.path.realpath(path))
-
-
-def _is_ours(out: Path) -> bool:
+def _is_ours(out: Place) -> bool:
     """Tell whether a run has been in a folder: a lost record is mended."""
     return any((out / name).is_file() for name in (RUN_RECORD, PROGRESS, MANIFEST_PATH))
 
 
-def _has_record(out: Path) -> bool:
+def _has_record(out: Place) -> bool:
     """Tell whether some file says what run it was; a damaged one is mended."""
     if (out / MANIFEST_PATH).is_file():
         return True
@@ -230,7 +202,7 @@ def _has_record(out: Path) -> bool:
     )
 
 
-def _read_object(path: Path) -> dict[str, Any]:
+def _read_object(path: Place) -> dict[str, Any]:
     """Read a JSON object; an empty one where there is none."""
     try:
         found = json.loads(path.read_bytes())

@@ -65,7 +65,7 @@ from tiler.workflow.out_folder import (
     remove_strangers,
 )
 from tiler.workflow.own_stages import OwnStages, check_own, run_own_stages
-from tiler.workflow.run_watchers import begin_watching
+from tiler.workflow.run_watchers import LeaseWatch, begin_watching
 from tiler.workflow.stage_sequence import make_engine, run_stages
 from tiler.workflow.summary import describe_tasks, summarise_run
 
@@ -198,10 +198,10 @@ def _run(
         plan = _plan(config, out, say, fresh=config.overwrite or not earlier)
         untouched = False
         _write_record(out, record, durable=bool(earlier))
-        if not earlier and not in_bucket(out):
-            sync_meanwhile(out / RUN_RECORD)  # nothing is there yet that a loss of power could make it lie about
         clear_folder(out, earlier, overwrite=config.overwrite)
         if not in_bucket(out):
+            if not earlier:  # after a loss of power there is nothing yet that the record could lie about
+                sync_meanwhile(out / RUN_RECORD)
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(config, out)
         progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=means.shown)
@@ -213,12 +213,6 @@ def _run(
         give_back_report(out, changed=bool(record["tasks"]["ran"]))
         record["status"] = "done"
         say(describe_tasks(record["tasks"]))
-        if in_bucket(out):
-            from tiler.objects.watch import describe_waits, tell_waits
-
-            record["store_waits"] = describe_waits()
-            if waits := tell_waits():
-                say(waits)
         failed = False
     except StoppedError as error:
         record |= {"status": "stopped", "error": str(error)}
@@ -365,14 +359,12 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
 
 @contextmanager
 def _beside(out: Path, check: Callable[[], None], watchers: Watchers) -> Iterator[Path]:
-    """Give the folder of the events that the page of a run is made of; of one in a bucket, watch the store too."""
+    """Give the folder of the events that the page of a run is made of; of one in a bucket, watch its lease."""
     if not in_bucket(out):
         yield out
         return
-    from tiler.objects.watch import WaitWatch, telling
-
-    watchers.add(WaitWatch(check))
-    with tempfile.TemporaryDirectory(prefix="citystitch-") as name, telling(watchers.say):
+    watchers.add(LeaseWatch(check))
+    with tempfile.TemporaryDirectory(prefix="citystitch-") as name:
         yield Path(name)
 
 

@@ -1,19 +1,76 @@
 """Who watches every run: ``progress.json`` and ``events.jsonl`` in its folder, and those of its caller."""
 
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
+from pipeline.errors import OutputError
 from tiler.config.config import Config
+from tiler.engine.task import Record
 from tiler.monitoring.events import EventLog, begin_file
 from tiler.monitoring.progress import Announce, RunProgress, command_line
-from tiler.monitoring.watchers import RunStart, Watchers
-from tiler.objects.places import in_bucket
+from tiler.monitoring.watchers import RunStart, Watcher, Watchers
 from tiler.planning.context import make_layout
 from tiler.planning.plan import Plan
 from tiler.planning.region import foresee_pad
+from tiler.store.atomic import replacing
 from tiler.workflow.out_folder import EVENTS
 from tiler.workflow.own_stages import OwnStages, list_stages, stages_of_pad
 
 NOT_ALONE = ("fit",)  # stages of tiles and seams that `tiler.workflow.single_tile.run_alone` does without
+PUT_EVERY = 60.0  # s between two puts of the events of a run in a bucket
+PUT_BYTES = 16 * 2**20  # size up to which they are put before the end
+
+
+class CopiedEvents(EventLog):
+    """`EventLog` of a run in a bucket: a file on a disk, put at the end, and once a minute while it is small.
+
+    Parameters
+    ----------
+    target : Path
+        The object.
+    folder : Path
+        Where the file is.
+    """
+
+    def __init__(self, target: Path, folder: Path) -> None:
+        self._local, self._target, self._put = folder / target.name, target, time.monotonic()
+        super().__init__(self._local, begin_file(self._local))
+
+    def end(self, status: str, error: str = "") -> None:
+        """Write how the run ended, and put the file."""
+        super().end(status, error)
+        self._copy()
+
+    def _write(self) -> None:
+        super()._write()
+        if time.monotonic() - self._put >= PUT_EVERY and self._local.stat().st_size <= PUT_BYTES:
+            self._put = time.monotonic()
+            with suppress(OutputError):  # tried again; the run learns by its results
+                self._copy()
+
+    def _copy(self) -> None:
+        with replacing(self._target) as part:
+            shutil.copyfile(self._local, part)
+
+
+class LeaseWatch(Watcher):
+    """Ends a run that has lost its lease.
+
+    Parameters
+    ----------
+    check : callable
+        Raises OutputError if it has, as `tiler.store.folder_lock.only_run` gives it.
+    """
+
+    def __init__(self, check: Callable[[], None]) -> None:
+        self._check = check
+
+    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
+        """Look at the lease whenever an item is done."""
+        self._check()
 
 
 def begin_watching(
@@ -62,12 +119,11 @@ def begin_watching(
     totals = {name: total for name, (_, total) in expected.items()}
     progress = RunProgress(out, config, totals, announce=announce, command=command)
     watchers.add(progress)
-    if in_bucket(out) and shown is not None:
-        from tiler.objects.watch import BucketEvents
-
-        watchers.add(BucketEvents(out / EVENTS, shown))
+    events = out / EVENTS
+    if shown is not None and shown != out:
+        watchers.add(CopiedEvents(events, shown))
     else:
-        watchers.add(EventLog(out / EVENTS, begin_file(out / EVENTS)))
+        watchers.add(EventLog(events, begin_file(events)))
     start = RunStart(
         out=out,
         command=command,

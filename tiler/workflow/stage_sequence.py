@@ -10,10 +10,10 @@ from tiler.engine.engine import Engine, Progress
 from tiler.engine.failures import Policy
 from tiler.engine.stage import REGION_ITEM
 from tiler.executors.executor import Executor
-from tiler.objects.places import place
+from tiler.objects.places import identify, place
 from tiler.planning.context import RunContext, pack_tiles
 from tiler.planning.padded_layout import CORE_STAGE
-from tiler.planning.plan import Plan, identify
+from tiler.planning.plan import Plan
 from tiler.stages.alignment import alignment_stages, shift_of
 from tiler.stages.city import first_round, house_stage, later_round, member_stage, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
@@ -131,7 +131,6 @@ def make_engine(
         config.tile_size_or_default,
         config.mesh_size,
         pack_tiles(plan.grid),
-        str(out),
         config.open_size,
     )
     footprints = place(config.footprints) if config.footprints else None

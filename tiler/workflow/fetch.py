@@ -4,9 +4,9 @@ from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import ConfigError, InputError
-from tiler.objects.local_copy import copy_object
 from tiler.objects.path import ObjectPath
 from tiler.objects.places import in_bucket, place
+from tiler.objects.results import copy_object
 from tiler.store.atomic import replacing
 from tiler.store.audit import Audit
 from tiler.store.folder_lock import LOCK, is_held, only_run
@@ -38,7 +38,7 @@ def fetch_run(source: str, folder: Path, tell: Callable[[str], None]) -> bool:
         If there is no run, one is at work there, or an object has a name that would lead out of the folder.
     """
     target = place(source)
-    if not in_bucket(target) or not source.lower().startswith("s3://"):
+    if not in_bucket(target) or not target.root.startswith("s3://"):
         raise ConfigError(f"{source}: is no run in a bucket; give s3://BUCKET/NAME")
     try:
         sizes = target.list_sizes()
