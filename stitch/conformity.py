@@ -343,9 +343,9 @@ def _ordered_face(cells, i, k):  # type: ignore[no-untyped-def]  # pragma: no co
 
 @kernel
 def _face_states(cells, n_points):  # type: ignore[no-untyped-def]  # noqa: PLR0912  # pragma: no cover
-    """Mark each of the 4 m faces as interior, exterior, same-side or shared; tell the cell beyond a face of two, -1 for others.
+    """Mark each of the 4 m faces as interior, exterior, same-side or shared.
 
-    Of both faces only one has the other's cell.
+    Of the two faces that meet, one gets the cell of the other; all others get -1.
     """
     n_faces = 4 * len(cells)
     start = np.zeros(n_points + 1, np.int64)

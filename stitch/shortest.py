@@ -29,9 +29,9 @@ def find_shortest(
 
     Notes
     -----
-    Distances are scipy's. Of equally short paths scipy does not say which one it takes, so the path is followed back
-    from the end: of the vertices that lead to one at its distance, to the nearest to the start, of equally near ones
-    to that of the lowest number.
+    Distances are scipy's. Of equally short paths scipy does not say which one it takes, so the path is followed
+    back from the end: of the vertices that lead to one at its distance, to the nearest to the start, of equally
+    near ones to that of the lowest number.
 
     Examples
     --------
