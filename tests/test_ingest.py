@@ -45,7 +45,6 @@ from tiler.pointclouds.las_header import read_promise
 from tiler.stages import inputs
 from tiler.stages.inputs import input_stages
 from tiler.store.store import Store
-from tiler.vectors import gdal_features
 from tiler.vectors.layers import describe_layer, scan_layer
 
 SIDE = 1000.0
@@ -484,21 +483,6 @@ def test_ids_of_what_is_no_polygon_do_not_count(tmp_path: Path) -> None:
     path = write(tmp_path / "a.gpkg", shapes, {"id": [7, 7, 7, 2**60 + 1]})
     assert find_repeated_ids(describe_layer(path), "id") == set()
     assert in_box(scan(path), REGION).ids.tolist() == [str(2**60 + 1), "7"]
-
-
-def test_without_pyarrow_the_same_comes_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shapes, fields = houses(50)
-    fields["id"][7] = None
-    fields["n"] = np.array([k if k % 3 else np.nan for k in range(50)])
-    path = write_any(tmp_path / "a.gpkg", shapes, fields)
-    streamed = {
-        name: list(scan_footprints(path, crs=RD, bounds=REGION, id_attribute=name)) for name in ("id", "n")
-    }
-    monkeypatch.setattr(gdal_features, "find_spec", lambda _name: None)
-    for name, blocks in streamed.items():
-        (block,) = scan_footprints(path, crs=RD, bounds=REGION, id_attribute=name, batch=10)
-        assert_same(in_box([block], REGION), in_box(blocks, REGION))
-        assert block.notes == tuple(notes_of(blocks))
 
 
 def test_notes_of_the_file_come_once(tmp_path: Path) -> None:

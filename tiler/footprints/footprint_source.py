@@ -135,7 +135,7 @@ def make_footprints(
     """
     tags = find_osm_tags(source.layer.fields)
     wanted = np.ones(len(features.wkb), np.bool_) if tags is None else is_building(tags, features.columns)
-    outlines = outline_all(features.wkb, metre=source.layer.metre)
+    outlines = outline_all(features.wkb, metre=source.layer.metre, curved=features.curved)
     counts["footprints-without-geometry"] += sum(blob is None for blob in features.wkb) - len(features.broken)
     names = read_ids(source.layer, source.id_name, features) if source.id_name else [""] * len(features.wkb)
     notes = _unreadable(features, names)

@@ -58,7 +58,7 @@ def describe(path: Path) -> tuple[GeometryColumn, tuple[str, ...], int, Box | No
     Raises
     ------
     InputError
-        If the file is damaged, has no geometries that are known, or if pyarrow is not installed.
+        If the file is damaged, or has no geometries that are known.
     """
     with _arrow_as_input_error(path):
         table, column = _open(path)
@@ -139,7 +139,7 @@ def _rows_of(table: Any, groups: list[int]) -> NDArray[np.int64]:
 
 def _may_meet(wkb: NDArray[np.object_], box: Box) -> NDArray[np.bool_]:
     """Whether the bounding boxes of geometries meet a box; True too where one is unknown, or not finite."""
-    xmin, ymin, xmax, ymax = shapely.bounds(parse_wkb(wkb)).reshape(-1, 4).T
+    xmin, ymin, xmax, ymax = shapely.bounds(parse_wkb(wkb)[0]).reshape(-1, 4).T
     away: NDArray[np.bool_] = (xmin > box[2]) | (xmax < box[0]) | (ymin > box[3]) | (ymax < box[1])
     stored = np.array([blob is not None for blob in wkb], np.bool_)
     return stored & ~away
@@ -180,12 +180,8 @@ def _check_expanded(path: Path, part: Any) -> None:
 
 
 def _open(path: Path, columns: Sequence[str] = ()) -> tuple[Any, GeometryColumn]:
-    try:
-        import pyarrow.parquet
-    except ImportError as error:
-        raise InputError(
-            f"{path}: Parquet needs pyarrow; pip install 'citystitch[parquet]', or convert the file to GPKG"
-        ) from error
+    import pyarrow.parquet
+
     table = pyarrow.parquet.ParquetFile(source_of(path))
     size, n_rows = path.stat().st_size, table.metadata.num_rows
     if n_rows > size:
