@@ -2,8 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 
 def join_pairs(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -26,6 +24,9 @@ def join_pairs(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
     >>> join_pairs(4, np.array([[3, 1]]))
     array([0, 1, 2, 1])
     """
+    from scipy.sparse import coo_array  # 0.3 s, which a plan need not wait for
+    from scipy.sparse.csgraph import connected_components
+
     if not len(pairs):
         return np.arange(n)
     graph = coo_array((np.ones(len(pairs), np.bool_), tuple(pairs.T)), shape=(n, n))

@@ -2,8 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 
 def find_shortest(
@@ -39,6 +37,9 @@ def find_shortest(
     >>> find_shortest(edges, np.array([1.0, 1.0, 3.0]), np.ones(3, bool), 0, 2)
     array([0, 1, 2])
     """
+    from scipy.sparse import coo_array  # 0.3 s, which a plan need not wait for
+    from scipy.sparse.csgraph import dijkstra
+
     kept = usable[edges].all(axis=1)
     ends = np.concatenate((edges[kept], edges[kept, ::-1])).T
     graph = coo_array((np.tile(cost[kept], 2), tuple(ends)), shape=(len(usable),) * 2).tocsr()

@@ -20,7 +20,7 @@ from pipeline.citymodel import Footprints, make_ids
 from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note, count_notes
 from tests.footprint_files import BOX, RD, OsmTown, X, Y, blob, chain, face, square, write_gpkg, write_table
-from tiler.footprints.footprint_reader import read_footprints
+from tests.footprint_reading import read_footprints
 from tiler.vectors import gdal_features
 from tiler.workflow.summary import INCOMPLETE
 

@@ -18,6 +18,7 @@ from pipeline.errors import InputError
 from pipeline.las_points import cut_units
 from pipeline.notes import Note, count_notes
 from pipeline.pointcloud import PointCloud
+from tests.footprint_reading import read_footprints
 from tests.test_clouds import EVERYWHERE, ORIGIN, patch, write_cloud
 from tests.test_vectors import RD, square, write, write_parquet
 from tiler.citymodels.tables import unpack_polygons
@@ -28,12 +29,11 @@ from tiler.executors.executor import Serial
 from tiler.footprints.footprint_index import (
     FOOTPRINT_CELL,
     FootprintBlock,
+    FootprintRows,
     join_footprints,
     scan_footprints,
     select_footprints,
-    take_rows,
 )
-from tiler.footprints.footprint_reader import read_footprints
 from tiler.footprints.repeated_ids import find_repeated_ids
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.pointclouds import clouds
@@ -49,6 +49,18 @@ from tiler.vectors.layers import describe_layer, scan_layer
 
 SIDE = 1000.0
 NEAR = [(-2, -2), (-1, 0), (0, 0), (1, 1), (4, 4)]  # tiles, the last one empty
+
+
+def take_rows(rows: FootprintRows, first: int, stop: int) -> FootprintRows:
+    """Take a range of rows, as a partial read of a store gives it."""
+    base, begin, end = (int(rows.wkb_start[row]) for row in (0, first, stop))
+    return FootprintRows(
+        rows.wkb[begin - base : end - base],
+        rows.wkb_start[first : stop + 1],
+        rows.ids[first:stop],
+        rows.given_height[first:stop],
+        rows.box[first:stop],
+    )
 
 
 def sorted_rows(cloud: PointCloud) -> np.ndarray:

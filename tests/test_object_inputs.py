@@ -11,10 +11,10 @@ import pytest
 import shapely
 
 from pipeline.errors import InputError
+from tests.footprint_reading import read_footprint_crs, read_footprints
 from tests.object_servers import FileServer, file_server
 from tests.test_ingest import write_copc
 from tests.test_vectors import RD, write_parquet
-from tiler.footprints.footprint_reader import read_footprint_crs, read_footprints
 from tiler.objects import requests as object_requests
 from tiler.objects.local_copy import local_copy
 from tiler.objects.places import StoreUnreachableError, place
