@@ -36,8 +36,8 @@ from stitch.seams import Seam, trace_seam
 from stitch.tiles import mesh_tile, sizes_halo, tile_halo
 from stitch.walls import cut_walls
 from tests.cities import Bounds, city_of, crowded_blocks, hilly_dtm
+from tests.footprint_reading import read_footprints
 from tests.whole_clouds import read_points
-from tiler.footprints.footprint_reader import read_footprints
 from tiler.pointclouds.clouds import find_clouds
 
 MIN_ANGLE = 28.0

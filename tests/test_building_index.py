@@ -3,7 +3,6 @@
 import json
 import tracemalloc
 from collections.abc import Callable, Iterator
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -19,84 +18,63 @@ from tiler.check.check import _in_order
 from tiler.citymodels import building_index, json_stream
 from tiler.citymodels.building_index import index_buildings
 from tiler.citymodels.cityjson import write_city_blocks
-from tiler.citymodels.json_stream import JsonStream
+from tiler.citymodels.json_stream import iterate_elements, iterate_members, read_members
 from tiler.workflow.run_folder import RunRecord
 
-LEAVES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5)
+INTEGERS = st.integers(-(2**62), 2**62)
+TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=5)
+LEAVES = st.none() | st.booleans() | INTEGERS | st.floats(allow_nan=False, allow_infinity=False) | TEXT
 DOCUMENTS = st.dictionaries(
-    st.text(max_size=3),
-    st.recursive(
-        LEAVES, lambda inner: st.lists(inner) | st.dictionaries(st.text(max_size=3), inner), max_leaves=8
-    ),
+    st.text("abc", min_size=1, max_size=3),
+    st.recursive(LEAVES, lambda inner: st.lists(inner) | st.dictionaries(TEXT, inner), max_leaves=8),
     max_size=5,
 )
 
 
-def streamed(text: str, characters: int) -> Any:
-    """Read an object by its members, arrays and objects in it by theirs, with so many characters at a time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(json_stream, "READ_CHARACTERS", characters)
-        stream = JsonStream(StringIO(text))
-        found: dict[str, Any] = {}
-        for key in stream.members():
-            if stream.peek() == "{":
-                found[key] = {name: stream.value() for name in stream.members()}
-            elif stream.peek() == "[":
-                found[key] = list(stream.elements())
-            else:
-                found[key] = stream.value()
-        stream.finish()
+def streamed(path: Path) -> Any:
+    """Read an object by its members, arrays and objects in it by theirs."""
+    found, large = read_members(path, lambda _name: False)
+    for name, kind in large.items():
+        found[name] = (
+            list(iterate_elements(path, name)) if kind == "start_array" else dict(iterate_members(path, name))
+        )
     return found
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(DOCUMENTS, st.integers(1, 9), st.sampled_from([None, 0, 2]), st.booleans())
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture])
+@given(DOCUMENTS, st.sampled_from([None, 0, 2]), st.booleans())
 def test_a_document_is_what_json_makes_of_it(
-    document: dict[str, Any], characters: int, indent: int | None, ascii_only: bool
+    tmp_path: Path, document: dict[str, Any], indent: int | None, ascii_only: bool
 ) -> None:
-    text = json.dumps(document, indent=indent, ensure_ascii=ascii_only)
-    assert streamed(text, characters) == json.loads(text)
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(document, indent=indent, ensure_ascii=ascii_only), encoding="utf-8")
+    assert streamed(path) == document
+    assert read_members(path, lambda _name: True) == (document, {})
 
 
-def test_numbers_and_names_are_cut_anywhere() -> None:
-    text = '{"a": [-12.5e-3, 1e5, 123456789012345678901, NaN, -Infinity], "b" : 3.25 , "c": true}'
-    for characters in range(1, len(text)):
-        assert repr(streamed(text, characters)) == repr(json.loads(text))
-
-
-@pytest.mark.parametrize("characters", [1, 5, 1000])
-def test_what_is_no_json_is_an_error_wherever_it_breaks(characters: int) -> None:
+def test_what_is_no_json_is_an_error_wherever_it_breaks(tmp_path: Path) -> None:
     text = '{"a": [1, {"x": [2]}], "b": {"c": 3.5, "d": "e"}, "f": -4}'
-    for end in range(len(text)):
-        with pytest.raises(ValueError, match=r"."):
-            streamed(text[:end], characters)
-    for broken in (text + "}", text.replace(":", ";"), text.replace('"b"', "7"), text.replace("],", "] ]")):
-        with pytest.raises(ValueError, match=r"."):
-            streamed(broken, characters)
+    path = tmp_path / "a.json"
+    broken = [text[:end] for end in range(len(text))]
+    broken += [text + "}", text.replace(":", ";"), text.replace('"b"', "7"), text.replace("],", "] ]")]
+    for content in (*broken, "[1]", "3", text.replace("3.5", "NaN"), text.replace("2", "[" * 200 + "]" * 200)):
+        path.write_text(content)
+        with pytest.raises(InputError, match=r"a\.json: (is no JSON|nests deeper)"):
+            streamed(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        streamed(tmp_path / "none.json")
 
 
-def test_a_value_without_end_is_not_read_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(json_stream, "READ_CHARACTERS", 100)
-    monkeypatch.setattr(json_stream, "MOST_CHARACTERS", 1000)
-    file = StringIO('{"a": "' + "x" * 100_000)
-    stream = JsonStream(file)
-    with pytest.raises(ValueError, match="Unterminated"):
-        [stream.value() for _ in stream.members()]
-    assert file.tell() < 5000
-
-
-def test_what_is_skipped_is_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(json_stream, "READ_CHARACTERS", 1000)
-    stream = JsonStream(StringIO('{"a": [' + "7, " * 100_000 + '7], "b": {"c": [1]}, "d": "e", "f": 2}'))
-    members = stream.members()
+def test_what_is_skipped_is_not_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(json_stream.OPTIONS, "buf_size", 1000)
+    path = tmp_path / "a.json"
+    path.write_text('{"a": [' + "7, " * 100_000 + '7], "b": {"c": [1]}, "d": "e", "f": 2}')
     tracemalloc.start()
-    for key in members:
-        if key == "f":
-            assert stream.value() == 2
-        else:
-            stream.skip()
+    found, large = read_members(path, lambda _name: False)
+    assert sum(iterate_elements(path, "a")) == 700_007
     assert tracemalloc.get_traced_memory()[1] < 50_000
     tracemalloc.stop()
+    assert (found, large) == ({"d": "e", "f": 2}, {"a": "start_array", "b": "start_map"})
 
 
 def octagons(n: int) -> Iterator[tuple[CityModel, dict[str, Any]]]:
@@ -181,7 +159,7 @@ def test_a_city_model_without_buildings(tmp_path: Path) -> None:
 
 def test_memory_is_a_hundred_bytes_a_building(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(building_index, "BLOCK", 256)
-    monkeypatch.setattr(json_stream, "READ_CHARACTERS", 10_000)
+    monkeypatch.setitem(json_stream.OPTIONS, "buf_size", 10_000)
     peaks = []
     for n in (1000, 3000):
         file = write(tmp_path / f"{n}.json", n)

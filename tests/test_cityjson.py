@@ -237,7 +237,7 @@ def test_blocks_of_any_size_give_the_same_bytes(target: Path, monkeypatch: pytes
 def test_blocks_that_do_not_fit_together_leave_no_file(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cityjson, "RUN", 2)
     model = make_model(*(translate(HOUSE, 40 * i, 0) for i in range(5)), ids=["a", "b", "c", "d", "a"])
-    with pytest.raises(ValueError, match="building a: 2 buildings have this id"):
+    with pytest.raises(ValueError, match="1 of the buildings have the id of another one"):
         write_city_blocks(target, cut_blocks(model, [2]), crs="EPSG:28992", bounds=BOUNDS)
     model = replace(make_model(*model.polygons, ids=["a", "b", "c", "d", "e"]), house=np.array(list("abcda")))
     with pytest.raises(ValueError, match="building a: is a row and has parts"):

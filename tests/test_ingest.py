@@ -19,6 +19,7 @@ from pipeline.errors import InputError
 from pipeline.las_points import cut_units
 from pipeline.notes import Note, count_notes
 from pipeline.pointcloud import PointCloud
+from tests.footprint_reading import read_footprints
 from tests.test_clouds import EVERYWHERE, ORIGIN, patch, write_cloud
 from tests.test_vectors import RD, square, write, write_parquet
 from tests.whole_clouds import read_points
@@ -30,12 +31,11 @@ from tiler.executors.executor import Serial
 from tiler.footprints.footprint_index import (
     FOOTPRINT_CELL,
     FootprintBlock,
+    FootprintRows,
     join_footprints,
     scan_footprints,
     select_footprints,
-    take_rows,
 )
-from tiler.footprints.footprint_reader import read_footprints
 from tiler.footprints.repeated_ids import find_repeated_ids
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.pointclouds import las_chunks
@@ -47,11 +47,22 @@ from tiler.pointclouds.las_header import read_las_header
 from tiler.stages import inputs
 from tiler.stages.inputs import input_stages
 from tiler.store.store import Store
-from tiler.vectors import gdal_features
 from tiler.vectors.layers import describe_layer, scan_layer
 
 SIDE = 1000.0
 NEAR = [(-2, -2), (-1, 0), (0, 0), (1, 1), (4, 4)]  # tiles, the last one empty
+
+
+def take_rows(rows: FootprintRows, first: int, stop: int) -> FootprintRows:
+    """Take a range of rows, as a partial read of a store gives it."""
+    base, begin, end = (int(rows.wkb_start[row]) for row in (0, first, stop))
+    return FootprintRows(
+        rows.wkb[begin - base : end - base],
+        rows.wkb_start[first : stop + 1],
+        rows.ids[first:stop],
+        rows.given_height[first:stop],
+        rows.box[first:stop],
+    )
 
 
 def sorted_rows(cloud: PointCloud) -> np.ndarray:
@@ -510,21 +521,6 @@ def test_ids_of_what_is_no_polygon_do_not_count(tmp_path: Path) -> None:
     path = write(tmp_path / "a.gpkg", shapes, {"id": [7, 7, 7, 2**60 + 1]})
     assert find_repeated_ids(describe_layer(path), "id") == set()
     assert in_box(scan(path), REGION).ids.tolist() == [str(2**60 + 1), "7"]
-
-
-def test_without_pyarrow_the_same_comes_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shapes, fields = houses(50)
-    fields["id"][7] = None
-    fields["n"] = np.array([k if k % 3 else np.nan for k in range(50)])
-    path = write_any(tmp_path / "a.gpkg", shapes, fields)
-    streamed = {
-        name: list(scan_footprints(path, crs=RD, bounds=REGION, id_attribute=name)) for name in ("id", "n")
-    }
-    monkeypatch.setattr(gdal_features, "find_spec", lambda _name: None)
-    for name, blocks in streamed.items():
-        (block,) = scan_footprints(path, crs=RD, bounds=REGION, id_attribute=name, batch=10)
-        assert_same(in_box([block], REGION), in_box(blocks, REGION))
-        assert block.notes == tuple(notes_of(blocks))
 
 
 def test_notes_of_the_file_come_once(tmp_path: Path) -> None:

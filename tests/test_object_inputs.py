@@ -11,11 +11,11 @@ import pytest
 import shapely
 
 from pipeline.errors import InputError
+from tests.footprint_reading import read_footprint_crs, read_footprints
 from tests.object_servers import FileServer, file_server
 from tests.test_ingest import write_copc
 from tests.test_vectors import RD, write_parquet
 from tests.whole_clouds import read_points
-from tiler.footprints.footprint_reader import read_footprint_crs, read_footprints
 from tiler.objects.places import identify, place
 from tiler.objects.requests import StoreUnreachableError
 from tiler.objects.results import local_copy

@@ -15,8 +15,8 @@ import shapely
 
 from pipeline.errors import ConfigError
 from pipeline.synthetic import ORIGIN, SyntheticCity, city_points, make_city, terrain_height
+from tests.footprint_reading import read_footprint_crs, read_footprints
 from tests.whole_clouds import read_points
-from tiler.footprints.footprint_reader import read_footprint_crs, read_footprints
 from tiler.georeference.cloud_crs import Asked
 from tiler.georeference.establish import establish_georeference
 from tiler.interface.synth import SynthFiles, write_city

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.citymodel import Footprints, make_ids
 from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note, count_notes
-from tiler.footprints.footprint_reader import read_footprint_crs, read_footprints
+from tests.footprint_reading import read_footprint_crs, read_footprints
 
 RD = pyproj.CRS("EPSG:28992")
 WGS84 = pyproj.CRS("EPSG:4326")

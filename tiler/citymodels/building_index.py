@@ -4,6 +4,7 @@ from array import array
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
 from typing import IO, Any
@@ -13,8 +14,8 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError, OutputError
-from tiler.citymodels.json_stream import JsonStream
-from tiler.workflow.run_folder import WRONG_FIELD, Buildings, broken_field, opened_json
+from tiler.citymodels.json_stream import iterate_elements, iterate_members, read_members
+from tiler.workflow.run_folder import WRONG_FIELD, Buildings, broken_field
 
 CITYJSON = "2.0"
 MAX_NUMBER = 2**53  # of a building
@@ -98,8 +99,9 @@ def index_buildings(path: Path, see: See | None = None) -> Iterator[BuildingInde
 
     Notes
     -----
-    The file is read twice, one object at a time: first its vertices, which wait in a temporary file too, then what
-    refers to them. Temporary files take about half of its size, where `tempfile` puts them (``TMPDIR``).
+    The file is read three times, one object at a time: its small members, its vertices, which wait in a temporary
+    file too, then what refers to them. Temporary files take about half of its size, where `tempfile` puts them
+    (``TMPDIR``).
     """
     with TemporaryFile() as file:
         with TemporaryFile() as spool:
@@ -174,41 +176,24 @@ def spool_vertices(path: Path, spool: IO[bytes]) -> Vertices:
     OutputError
         If the spool cannot be written.
     """
-    small: dict[str, Any] = {}
-    n = 0
     try:
-        with opened_json(path) as stream:
-            for key in stream.members():
-                if key in ("type", "version", "transform", "metadata"):
-                    small[key] = stream.value()
-                elif key == "vertices":
-                    n = _spool_vertices(stream, spool)
-                    small[key] = ()
-                else:
-                    small[key] = stream.peek()
-                    stream.skip()
-            stream.finish()
-        if small["type"] != "CityJSON" or small["version"] != CITYJSON:
+        head, large = read_members(path, ("transform", "metadata").__contains__)
+        if head["type"] != "CityJSON" or head["version"] != CITYJSON:
             raise InputError(f"{path}: is no CityJSON {CITYJSON} file; run again")
-        _ = small["vertices"]
-        if small["CityObjects"] != "{":
-            raise TypeError("CityObjects is no object")
-        return Vertices(spool, n, small)
+        if large["vertices"] != "start_array" or large["CityObjects"] != "start_map":
+            raise TypeError("vertices is no array, or CityObjects no object")
+        n = 0
+        for rows in _cut(iterate_elements(path, "vertices")):
+            _write(spool, _rows(rows))
+            n += len(rows)
+        return Vertices(spool, n, head)
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
 
 
-def _spool_vertices(stream: JsonStream, spool: IO[bytes]) -> int:
-    n, batch = 0, []
-    if stream.peek() != "[":
-        raise TypeError("vertices is no array")
-    for vertex in stream.elements():
-        batch.append(vertex)
-        if len(batch) == BLOCK:
-            _write(spool, _rows(batch))
-            n, batch = n + len(batch), []
-    _write(spool, _rows(batch))
-    return n + len(batch)
+def _cut(items: Iterator[Any]) -> Iterator[list[Any]]:
+    while batch := list(islice(items, BLOCK)):
+        yield batch
 
 
 def _write(file: IO[bytes], data: Any) -> None:
@@ -222,7 +207,7 @@ def _write(file: IO[bytes], data: Any) -> None:
 
 def _rows(vertices: list[Any]) -> NDArray[np.float64]:
     rows = np.array(vertices, np.float64)
-    if vertices and rows.shape != (len(vertices), 3):
+    if rows.shape != (len(vertices), 3):
         raise ValueError(f"vertices of shape {rows.shape[1:]}")
     return rows
 
@@ -258,13 +243,7 @@ def _read_objects(path: Path, vertices: Vertices, file: IO[bytes], see: See | No
 
 def read_objects(path: Path) -> Iterator[tuple[str, Any]]:
     """Read the objects of a CityJSON file one at a time, by name; InputError if it is missing or no JSON."""
-    with opened_json(path) as stream:
-        for key in stream.members():
-            if key != "CityObjects":
-                stream.skip()
-                continue
-            for name in stream.members():
-                yield name, stream.value()
+    return iterate_members(path, "CityObjects")
 
 
 def has_parts(path: Path, thing: Any) -> bool:

@@ -20,7 +20,6 @@ from pipeline.citymodel import CityModel
 from pipeline.errors import ConfigError, InputError
 from pipeline.notes import Note
 from pipeline.solids import Solids, build_solids
-from tiler.citymodels.number_set import NumberSet
 from tiler.store.atomic import replacing
 
 # Coordinates are whole multiples of this length (m).
@@ -164,7 +163,7 @@ class _Writer:
         self.box = np.empty((0, 3))
         self.notes: list[Note] = []
         self.children: dict[str, list[str]] = {}
-        self.seen = NumberSet()
+        self.hashes: list[NDArray[np.int64]] = []
         self.n_objects = self.n_vertices = 0
         self._write(b'"CityObjects":{')
 
@@ -192,7 +191,11 @@ class _Writer:
 
     def finish(self) -> None:
         """Write the houses that have parts, and the vertices."""
-        mixed = self.seen.has(_hash_names(self.children))
+        hashes = np.sort(np.concatenate([np.empty(0, np.int64), *self.hashes]))
+        n_again = int((hashes[1:] == hashes[:-1]).sum())
+        if n_again:
+            raise ValueError(f"{n_again} of the buildings have the id of another one, none may")
+        mixed = np.isin(_hash_names(self.children), hashes)
         for is_row, (house, children) in zip(mixed.tolist(), self.children.items(), strict=True):
             if is_row:
                 raise ValueError(f"building {house}: is a row and has parts, it may be one of these")
@@ -205,13 +208,11 @@ class _Writer:
         self._write(b"\n]")
 
     def _check_ids(self, ids: NDArray[np.str_]) -> None:
-        """Refuse two rows of one id."""
-        new = _hash_names(ids.tolist())
-        again = self.seen.has(new)
-        again[np.argsort(new, kind="stable")[1:]] |= np.diff(np.sort(new)) == 0
-        if again.any():
-            raise ValueError(f"building {ids[again][0]}: 2 buildings have this id, at most 1 may")
-        self.seen.add(new)
+        """Refuse two rows of one id in a run; the hashes of all, 8 bytes a building, are compared at the end."""
+        names, times = np.unique(ids, return_counts=True)
+        if (times > 1).any():
+            raise ValueError(f"building {names[times > 1][0]}: 2 buildings have this id, at most 1 may")
+        self.hashes.append(_hash_names(ids.tolist()))
 
     def _objects(self, texts: Sequence[str]) -> None:
         """Write objects one a line."""

@@ -1,136 +1,83 @@
-"""JSON files larger than memory, read member by member."""
+"""JSON files larger than memory, read by ijson: small members, or a large one entry by entry."""
 
-import json
-import re
-from collections.abc import Iterator
-from typing import Any, TextIO
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
 
-READ_CHARACTERS = 1 << 20
-MOST_CHARACTERS = 1 << 26  # of one value
-_SPACE = " \t\r\n"
-_NUMBER = re.compile(r"[-+.eE0-9]*")
+import ijson
+
+from pipeline.errors import InputError
+
+DEEPEST = 100  # levels: ours have ten at most
+BUFFER = 1 << 18  # bytes that are read at once
+OPTIONS = {"use_float": True, "buf_size": BUFFER}
 
 
-class NoJsonError(ValueError):
-    """The document is no JSON."""
-
-
-class JsonStream:
-    """Reads one JSON document from its beginning to its end, in any layout.
-
-    The caller goes into objects by `members` and into arrays by `elements`, and takes by `value` what is small.
-    Values are those of `json.loads`.
+def read_members(path: Path, wanted: Callable[[str], bool]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Read the small members of the object that a JSON file holds.
 
     Parameters
     ----------
-    file : text file
-        Open for reading.
+    path : Path
+        The file, in any layout; it is read to its end.
+    wanted : callable
+        Tells by its name whether an object or array is small; other values are always taken.
+
+    Returns
+    -------
+    dict of str to any
+        Values that were taken, as `json.loads` makes them.
+    dict of str to str
+        The objects and arrays that were not, ``"start_map"`` or ``"start_array"``.
 
     Raises
     ------
-    NoJsonError, JSONDecodeError
-        From all methods: if the document is no JSON there, or a value has more than `MOST_CHARACTERS`.
-
-    Notes
-    -----
-    Memory holds the value that is read, and a megabyte.
-
-    Examples
-    --------
-    >>> from io import StringIO
-    >>> stream = JsonStream(StringIO('{"n": 3, "rows": [[1, 2], [3, 4]]}'))
-    >>> [list(stream.elements()) if key == "rows" else stream.value() for key in stream.members()]
-    [3, [[1, 2], [3, 4]]]
-    >>> stream.finish()
+    InputError
+        If the file cannot be read, is no JSON object, or nests deeper than `DEEPEST`.
     """
+    taken: dict[str, Any] = {}
+    large: dict[str, str] = {}
+    depth, name, builder = 0, "", None
+    with _opened(path) as file:
+        for event, value in ijson.basic_parse(file, **OPTIONS):
+            opens = event in ("start_map", "start_array")
+            depth -= event in ("end_map", "end_array")
+            if depth == 0 and event not in ("start_map", "end_map"):
+                raise InputError(f"{path}: is no JSON object; run again")
+            if depth == DEEPEST:
+                raise InputError(f"{path}: nests deeper than {DEEPEST} levels; run again")
+            if depth == 1 and event == "map_key":
+                name, builder = value, ijson.ObjectBuilder()
+            elif depth == 1 and opens and not wanted(name):
+                large[name], builder = event, None
+            elif depth and builder is not None:
+                builder.event(event, value)
+                if depth == 1 and not opens:
+                    taken[name] = builder.value
+            depth += opens
+    return taken, large
 
-    def __init__(self, file: TextIO) -> None:
-        self._file = file
-        self._text = ""
-        self._at = 0
-        self._ended = False
-        self._decoder = json.JSONDecoder()
 
-    def peek(self) -> str:
-        """Give the next character that is no space, and leave it; an empty string at the end."""
-        while True:
-            while self._at < len(self._text):
-                if self._text[self._at] not in _SPACE:
-                    return self._text[self._at]
-                self._at += 1
-            if not self._fill():
-                return ""
+def iterate_members(path: Path, name: str) -> Iterator[tuple[str, Any]]:
+    """Read the members of a member that is an object, one at a time; InputError as from `read_members`."""
+    with _opened(path) as file:
+        yield from ijson.kvitems(file, name, **OPTIONS)
 
-    def value(self) -> Any:
-        """Take the next value whole."""
-        self.peek()
-        while True:
-            try:
-                found, end = self._decoder.raw_decode(self._text, self._at)
-                # A number at the end of what was read may go on.
-                if self._ended or _NUMBER.match(self._text, end).end() < len(self._text):  # type: ignore[union-attr]
-                    self._at = end
-                    return found
-            except json.JSONDecodeError:
-                if self._ended or len(self._text) - self._at > MOST_CHARACTERS:
-                    raise
-            self._fill()
 
-    def members(self) -> Iterator[str]:
-        """Go into an object: after each key its value must be taken, or gone into."""
-        self._take("{")
-        if self.peek() == "}":
-            self._at += 1
-            return
-        while True:
-            key = self.value()
-            if not isinstance(key, str):
-                raise NoJsonError(f"key {key!r} is no string")
-            self._take(":")
-            yield key
-            if self._take(",}") == "}":
-                return
+def iterate_elements(path: Path, name: str) -> Iterator[Any]:
+    """Read the elements of a member that is an array, one at a time; InputError as from `read_members`."""
+    with _opened(path) as file:
+        yield from ijson.items(file, f"{name}.item", **OPTIONS)
 
-    def elements(self) -> Iterator[Any]:
-        """Go into an array, and take its values one after the other."""
-        self._take("[")
-        if self.peek() == "]":
-            self._at += 1
-            return
-        while True:
-            yield self.value()
-            if self._take(",]") == "]":
-                return
 
-    def skip(self) -> None:
-        """Leave out the next value; of an object or an array one member is held at a time."""
-        first = self.peek()
-        if first == "{":
-            for _ in self.members():
-                self.value()
-        elif first == "[":
-            for _ in self.elements():
-                pass
-        else:
-            self.value()
-
-    def finish(self) -> None:
-        """Make sure that nothing is left."""
-        if self.peek():
-            raise NoJsonError(f"{self.peek()!r} after the end")
-
-    def _take(self, expected: str) -> str:
-        found = self.peek()
-        if not found or found not in expected:
-            raise NoJsonError(f"{found!r} instead of {' or '.join(expected)}" if found else "it ends too early")
-        self._at += 1
-        return found
-
-    def _fill(self) -> bool:
-        """Read on, twice as much while one value takes more and more; False at the end."""
-        self._text = self._text[self._at :]
-        self._at = 0
-        more = self._file.read(max(READ_CHARACTERS, len(self._text)))
-        self._text += more
-        self._ended = not more
-        return bool(more)
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); run again") from error
+    except ijson.JSONError as error:
+        reason = str(error).split("\n", maxsplit=1)[0]
+        raise InputError(f"{path}: is no JSON ({reason}); run again") from None

@@ -68,7 +68,10 @@ class FootprintBlock:
     cell_box : float64, (c, 4)
         The box around the boxes of each cell's footprints (m).
     notes : tuple of Note
-        As `read_footprints` gives them; they add up over the blocks of a file.
+        What was converted, left out, assumed or renamed; they add up over the blocks of a file. One a footprint
+        for what `outline_all` tells, ``footprint-not-finite``, ``footprint-id-missing``,
+        ``footprint-id-repeated`` and ``footprint-height-missing``; one a file for ``footprints-without-crs``,
+        ``footprints-reprojected``, ``footprints-outside`` and ``footprints-reader-warning``.
     """
 
     rows: FootprintRows
@@ -94,7 +97,7 @@ def scan_footprints(
     Parameters
     ----------
     path, crs, bounds, layer, id_attribute, height_attribute, frame
-        As `read_footprints` has them.
+        As `open_source` has them.
     batch : int
         Features in memory at once.
 
@@ -165,30 +168,6 @@ def select_footprints(cell_box: NDArray[np.float64], start: NDArray[np.int64], b
     [(0, 5)]
     """
     return row_ranges(_meets(cell_box, box), start)
-
-
-def take_rows(rows: FootprintRows, first: int, stop: int) -> FootprintRows:
-    """Take a range of rows, as a partial read of a store gives it.
-
-    Parameters
-    ----------
-    rows : FootprintRows
-        All rows.
-    first, stop : int
-        The range.
-
-    Returns
-    -------
-    FootprintRows
-    """
-    base, begin, end = (int(rows.wkb_start[row]) for row in (0, first, stop))
-    return FootprintRows(
-        rows.wkb[begin - base : end - base],
-        rows.wkb_start[first : stop + 1],
-        rows.ids[first:stop],
-        rows.given_height[first:stop],
-        rows.box[first:stop],
-    )
 
 
 def join_footprints(parts: Sequence[FootprintRows], box: Box) -> Footprints:

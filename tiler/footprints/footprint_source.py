@@ -84,8 +84,20 @@ def open_source(
 
     Parameters
     ----------
-    path, crs, bounds, layer, id_attribute, height_attribute, frame
-        As `read_footprints` has them.
+    path : Path
+        SHP, GPKG, GeoJSON, FlatGeobuf, OSM or GeoParquet.
+    crs : pyproj.CRS
+        The region's CRS, to which footprints in another are reprojected.
+    bounds : tuple of 4 floats
+        xmin, ymin, xmax, ymax in the region's CRS (m); the borders belong to the box.
+    layer : str
+        Name of the layer, ``""`` for the only one.
+    id_attribute : str
+        Attribute with the building's id; ``""`` for the first of `ID_ATTRIBUTES` that the layer has.
+    height_attribute : str
+        Attribute with the height above ground (m); ``""`` for none.
+    frame : Frame, optional
+        How coordinates of the file become those of the region; by default as the CRSs have it.
 
     Returns
     -------
@@ -131,11 +143,11 @@ def make_footprints(
     Footprints
         Those that meet the region, in the order of the features.
     list of Note
-        As `read_footprints` gives them.
+        As a `FootprintBlock` has them.
     """
     tags = find_osm_tags(source.layer.fields)
     wanted = np.ones(len(features.wkb), np.bool_) if tags is None else is_building(tags, features.columns)
-    outlines = outline_all(features.wkb, metre=source.layer.metre)
+    outlines = outline_all(features.wkb, metre=source.layer.metre, curved=features.curved)
     counts["footprints-without-geometry"] += sum(blob is None for blob in features.wkb) - len(features.broken)
     names = read_ids(source.layer, source.id_name, features) if source.id_name else [""] * len(features.wkb)
     notes = _unreadable(features, names)
@@ -221,11 +233,11 @@ def _tell(findings: list[Finding], source: FootprintSource, features: Features, 
     """Make notes of findings, at the middle of the bounding box in the region's CRS."""
     notes = []
     for finding in findings:
-        x, y = (finding.box[0] + finding.box[2]) / 2, (finding.box[1] + finding.box[3]) / 2
-        if source.frame.changes_plan and np.isfinite((x, y)).all():
-            x, y = to_region(source.frame, np.array([(x, y)]))[0].tolist()
+        place = np.add(finding.box[:2], finding.box[2:]) / 2
+        if source.frame.changes_plan and np.isfinite(place).all():
+            place = to_region(source.frame, place[None])[0]
         detail = f"feature {features.fids[finding.row]}: {finding.detail}"
-        notes.append(Note(finding.kind, names[finding.row], float(x), float(y), detail))
+        notes.append(Note(finding.kind, names[finding.row], *place.tolist(), detail))
     return notes
 
 
@@ -239,7 +251,7 @@ def _unreadable(features: Features, names: list[str]) -> list[Note]:
 def _ids(
     source: FootprintSource, geometry: NDArray[np.object_], given: NDArray[np.str_], repeated: Set[str]
 ) -> tuple[NDArray[np.str_], list[Note]]:
-    """Give each footprint its id, see `read_footprints`."""
+    """Give each footprint its id: its own, completed by its geometry where that is repeated, or the geometry's."""
     missing = given == ""
     again = np.fromiter((name in repeated for name in given.tolist()), bool, len(given)) & ~missing
     made = np.full(len(given), "", dtype="<U14")
@@ -248,24 +260,17 @@ def _ids(
     ids = np.where(again, np.char.add(np.char.add(given, "-"), made), ids)
     if not source.id_name:
         return ids, []
-    notes = _notes("footprint-id-missing", geometry[missing], "named by its geometry", made[missing])
+    notes = _notes(
+        "footprint-id-missing", geometry[missing], ["named by its geometry"] * int(missing.sum()), made[missing]
+    )
     reasons = [explain_repeated(source.layer, source.id_name, name) for name in given[again].tolist()]
     notes += _notes("footprint-id-repeated", geometry[again], reasons, ids[again])
     return ids, notes
 
 
-def _notes(
-    kind: str,
-    geometry: NDArray[np.object_],
-    detail: str | list[str],
-    subjects: NDArray[np.str_] | None = None,
-) -> list[Note]:
+def _notes(kind: str, geometry: NDArray[np.object_], details: list[str], subjects: NDArray[np.str_]) -> list[Note]:
     """Make one note a geometry, at the middle of its bounding box."""
-    boxes = shapely.bounds(geometry)
-    x, y = (boxes[:, 0] + boxes[:, 2]) / 2, (boxes[:, 1] + boxes[:, 3]) / 2
-    details = [detail] * len(geometry) if isinstance(detail, str) else detail
-    names = [""] * len(geometry) if subjects is None else [str(name) for name in subjects]
-    return [
-        Note(kind, name, float(px), float(py), text)
-        for name, px, py, text in zip(names, x, y, details, strict=True)
-    ]
+    boxes = shapely.bounds(geometry).reshape(-1, 4)
+    places = ((boxes[:, :2] + boxes[:, 2:]) / 2).tolist()
+    told = zip(subjects.tolist(), places, details, strict=True)
+    return [Note(kind, name, *place, detail) for name, place, detail in told]

@@ -1,7 +1,6 @@
 """Plan outlines of the geometries of a footprint file, whatever their kind (step 1.2)."""
 
-import struct
-from collections.abc import Iterator
+from collections.abc import Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,17 +10,14 @@ from numpy.typing import NDArray
 from tiler.footprints.closed_lines import outline_lines
 from tiler.footprints.surfaces import is_surface, outline_faces
 from tiler.pointclouds.las_header import COORDINATE_LIMIT
-from tiler.vectors.arcs import SAGITTA
 from tiler.vectors.features import Box
-from tiler.vectors.wkb import parse_wkb, read_header
-from tiler.vectors.wkb_shapes import read_shape
+from tiler.vectors.wkb import parse_wkb
 
 # Vertices of one footprint: the largest of a national register have some thousands. Up to this many take less than
 # a minute however they lie, beyond it the time of geometric predicates grows with the square.
 MAX_VERTICES = 100_000
 _POLYGONAL = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)
 _LINEAR = (shapely.GeometryType.LINESTRING, shapely.GeometryType.LINEARRING)
-_PLAIN = range(1, 7)  # kinds of well-known binary that GEOS reads by itself: point to multipolygon
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ class Outlines:
     findings: list[Finding] = field(default_factory=list)
 
 
-def outline_all(wkb: NDArray[np.object_], *, metre: float = 1.0) -> Outlines:
+def outline_all(wkb: NDArray[np.object_], *, metre: float = 1.0, curved: Set[int] = frozenset()) -> Outlines:
     """Give the plan outlines of geometries.
 
     Parameters
@@ -74,11 +70,13 @@ def outline_all(wkb: NDArray[np.object_], *, metre: float = 1.0) -> Outlines:
         Well-known binary, None where there is none.
     metre : float
         Length of a metre in units of the coordinates: 1, some 9e-6 where these are degrees.
+    curved : set of int
+        Rows whose arcs GDAL made segments.
 
     Returns
     -------
     Outlines
-        Polygons as they came; arcs made segments within `SAGITTA` (``footprint-curve-linearised``); of surfaces in
+        Polygons as they came, those of arcs told (``footprint-curve-linearised``); of surfaces in
         space and collections of polygons the outline of their faces (``footprint-outline-of-surface``); what
         closed lines enclose (``footprint-from-line``). Left out: ``footprint-not-polygon``,
         ``footprint-not-finite``, ``footprint-unreadable``, ``footprint-too-many-vertices``.
@@ -87,14 +85,12 @@ def outline_all(wkb: NDArray[np.object_], *, metre: float = 1.0) -> Outlines:
     -----
     Polygons alone are parsed and tested all at once; each of the others takes some 0.1 ms.
     """
-    plain = np.array([blob is not None and _is_plain(blob) for blob in wkb], np.bool_)
-    geometry = np.full(len(wkb), None, np.object_)
-    geometry[plain] = parse_wkb(wkb[plain])
-    found = dict[int, list[tuple[str, str]]]()
-    surfaces = set(_read_others(wkb, ~plain, geometry, found, metre))
+    geometry, surfaces, broken = parse_wkb(wkb)
+    found = {row: [("footprint-unreadable", reason)] for row, reason in broken.items()}
+    for row in curved:
+        told = f"arcs made segments of 4 degrees at most: {shapely.get_num_coordinates(geometry[row])} vertices"
+        found[row] = [("footprint-curve-linearised", told)]
     kinds = shapely.get_type_id(geometry)
-    for row in np.flatnonzero(plain & (kinds < 0)).tolist():
-        found[row] = [("footprint-unreadable", "its geometry cannot be parsed")]
     polygonal = np.flatnonzero(np.isin(kinds, _POLYGONAL))
     surfaces |= set(polygonal[is_surface(geometry[polygonal])].tolist())
     place = shapely.bounds(geometry).reshape(-1, 4)
@@ -121,39 +117,6 @@ def outline_all(wkb: NDArray[np.object_], *, metre: float = 1.0) -> Outlines:
 def _box_of(sides: NDArray[np.float64]) -> Box:
     xmin, ymin, xmax, ymax = sides.tolist()
     return xmin, ymin, xmax, ymax
-
-
-def _is_plain(blob: bytes) -> bool:
-    try:
-        return read_header(blob, 0).kind in _PLAIN
-    except struct.error:
-        return True  # GEOS finds no geometry either
-
-
-def _read_others(
-    wkb: NDArray[np.object_],
-    others: NDArray[np.bool_],
-    geometry: NDArray[np.object_],
-    found: dict[int, list[tuple[str, str]]],
-    metre: float,
-) -> Iterator[int]:
-    """Read curves, surfaces and collections into `geometry`, and give the rows of surfaces."""
-    for row in np.flatnonzero(others).tolist():
-        if wkb[row] is None:
-            continue
-        try:
-            shape = read_shape(wkb[row], tolerance=SAGITTA * metre, max_vertices=MAX_VERTICES)
-        except ValueError as error:
-            found[row] = [("footprint-unreadable", f"its geometry cannot be parsed: {error}")]
-            continue
-        geometry[row] = shape.geometry
-        if shape.curved:
-            detail = (
-                f"arcs made segments within {SAGITTA} m: {shapely.get_num_coordinates(shape.geometry)} vertices"
-            )
-            found[row] = [("footprint-curve-linearised", detail)]
-        if shape.surface:
-            yield row
 
 
 def _outline_surface(

@@ -1,8 +1,8 @@
 """What the report takes from ``run.json``: small members, tiles as a table, of notes the first of each kind."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from tiler.citymodels.json_stream import JsonStream
+from tiler.citymodels.json_stream import iterate_elements, iterate_members, read_members
 from tiler.workflow.out_folder import RUN_RECORD
-from tiler.workflow.run_folder import SCHEMA, WRONG_FIELD, broken_field, opened_json
+from tiler.workflow.run_folder import SCHEMA, WRONG_FIELD, broken_field
 
 SHOWN = 50  # notes of a kind that the report lists
 PLACES = 300  # notes of a kind that its map shows
@@ -107,21 +107,21 @@ def read_run_facts(directory: Path) -> RunFacts:
 
     Notes
     -----
-    Memory is some hundred bytes a tile, and of notes what is shown.
+    Memory is some hundred bytes a tile, and the notes of one kind, of which a record lists ten thousand at most.
     """
     path = directory / RUN_RECORD
-    reading = _Reading()
-    with opened_json(path) as stream:
-        try:
-            for key in stream.members():
-                reading.take(stream, key)
-            stream.finish()
-            facts = reading.finish()
-            bounds = facts.bounds
-        except WRONG_FIELD as error:
-            if isinstance(error, ValueError) and type(error) is not ValueError:
-                raise  # no JSON: the context tells
-            raise broken_field(path, error) from None
+    members, large = read_members(path, lambda name: name not in ("tiles", "notes", *LISTED))
+    try:
+        lengths = {}
+        for name in LISTED:
+            if name in large:
+                members[name], lengths[name] = _read_first(path, name, large[name])
+        tiles = _tabulate([(name, *_of_tile(tile)) for name, tile in iterate_members(path, "tiles")])
+        notes = tuple(_group(kind, found) for kind, found in iterate_members(path, "notes"))
+        facts = RunFacts(members, lengths, tiles, notes)
+        bounds = facts.bounds
+    except WRONG_FIELD as error:
+        raise broken_field(path, error) from None
     if facts.members.get("schema") != SCHEMA:
         raise InputError(f"{path}: schema {facts.members.get('schema')!r}, expected {SCHEMA}; run again")
     status = facts.members.get("status")
@@ -136,66 +136,26 @@ def read_run_facts(directory: Path) -> RunFacts:
     return facts
 
 
-@dataclass
-class _Reading:
-    """What was read so far."""
-
-    members: dict[str, Any] = field(default_factory=dict)
-    lengths: dict[str, int] = field(default_factory=dict)
-    names: list[str] = field(default_factory=list)
-    boxes: list[tuple[float, ...]] = field(default_factory=list)
-    cells: list[int] = field(default_factory=list)
-    notes: list[NoteGroup] = field(default_factory=list)
-
-    def take(self, stream: JsonStream, key: str) -> None:
-        if key == "tiles":
-            self._take_tiles(stream)
-        elif key == "notes":
-            self.notes = [_take_notes(stream, kind) for kind in stream.members()]
-        elif key in LISTED and stream.peek() == "{":
-            found = ((name, stream.value()) for name in stream.members())
-            self.members[key] = dict(self._count(key, found))
-        elif key in LISTED and stream.peek() == "[":
-            self.members[key] = list(self._count(key, stream.elements()))
-        else:
-            self.members[key] = stream.value()
-
-    def _count(self, key: str, values: Iterator[Any]) -> Iterator[Any]:
-        """Count all, give the first."""
-        self.lengths[key] = 0
-        for value in values:
-            self.lengths[key] += 1
-            if self.lengths[key] <= KEPT:
-                yield value
-
-    def finish(self) -> RunFacts:
-        table = TileTable(
-            tuple(self.names), np.array(self.boxes, np.float64).reshape(-1, 4), np.array(self.cells, np.int64)
-        )
-        return RunFacts(self.members, self.lengths, table, tuple(self.notes))
-
-    def _take_tiles(self, stream: JsonStream) -> None:
-        for name in stream.members():
-            tile = stream.value()
-            west, south, east, north = map(float, tile["box"])
-            self.names.append(name)
-            self.boxes.append((west, south, east, north))
-            self.cells.append(int(tile["counts"]["cells"]))
+def _read_first(path: Path, name: str, kind: str) -> tuple[dict[str, Any] | list[Any], int]:
+    """Read the first `KEPT` entries of an object or array, and count all."""
+    entries = iterate_members(path, name) if kind == "start_map" else iterate_elements(path, name)
+    first = list(islice(entries, KEPT))
+    return dict(first) if kind == "start_map" else first, len(first) + sum(1 for _ in entries)
 
 
-def _take_notes(stream: JsonStream, kind: str) -> NoteGroup:
-    count = 0
-    items: list[dict[str, Any]] = []
-    places: list[tuple[float, float]] = []
-    for key in stream.members():
-        if key == "items":
-            for item in stream.elements():
-                if len(items) < SHOWN:
-                    items.append({str(name): value for name, value in item.items()})
-                if len(places) < PLACES and "x" in item:
-                    places.append((float(item["x"]), float(item["y"])))
-        elif key == "count":
-            count = int(stream.value())
-        else:
-            stream.skip()
-    return NoteGroup(kind, count, items, np.array(places, np.float64).reshape(-1, 2))
+def _of_tile(tile: Any) -> tuple[tuple[float, ...], int]:
+    """Take the box of a tile (m) and its number of cells."""
+    west, south, east, north = map(float, tile["box"])
+    return (west, south, east, north), int(tile["counts"]["cells"])
+
+
+def _tabulate(tiles: list[tuple[str, tuple[float, ...], int]]) -> TileTable:
+    names, boxes, cells = zip(*tiles, strict=True) if tiles else ((), (), ())
+    return TileTable(names, np.array(boxes, np.float64).reshape(-1, 4), np.array(cells, np.int64))
+
+
+def _group(kind: str, found: Any) -> NoteGroup:
+    items = found.get("items", [])
+    places = [(float(item["x"]), float(item["y"])) for item in items if "x" in item][:PLACES]
+    shown = [dict(item) for item in items[:SHOWN]]
+    return NoteGroup(kind, int(found.get("count", 0)), shown, np.array(places, np.float64).reshape(-1, 2))

@@ -25,6 +25,8 @@ class Features:
         The numbers that the file, or its reader, gives them: rows of a Shapefile and of Parquet count from 0.
     broken : dict of int to str
         Why a geometry that is None cannot be read, by row; None in another row means that the file has none.
+    curved : frozenset of int
+        Rows whose arcs GDAL made segments of 4 degrees.
     """
 
     wkb: NDArray[np.object_]
@@ -32,6 +34,7 @@ class Features:
     warned: tuple[str, ...]
     fids: NDArray[np.int64]
     broken: dict[int, str]
+    curved: frozenset[int] = frozenset()
 
 
 def to_objects(items: list[Any]) -> NDArray[np.object_]:

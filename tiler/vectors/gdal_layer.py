@@ -1,7 +1,6 @@
 """A layer of a vector file opened by GDAL: which one, by which options, and what it says about itself (step 1.2).
 
-pyogrio is imported where it is used: few tasks need it, and it brings pyarrow, where that is there, whose memory
-has a thread of its own.
+pyogrio and pyarrow are imported where they are used: few tasks need them.
 """
 
 import json
@@ -46,10 +45,6 @@ class GdalLayer:
         As `pyogrio.read_info` gives it.
     driver : str
         Name of GDAL's driver for the file, ``""`` where that is not known.
-    geometry_name : str
-        Column of a GeoPackage with the geometries.
-    index : str
-        Table of a GeoPackage with the boxes of the features, ``""`` for none.
     chosen : bool
         Whether the layer was chosen among several.
     """
@@ -60,14 +55,17 @@ class GdalLayer:
     options: dict[str, str]
     info: dict[str, Any]
     driver: str
-    geometry_name: str
-    index: str
     chosen: bool
 
     @property
     def fid_name(self) -> str:
         """Column with the numbers of the features, ``""`` where the file has none."""
         return str(self.info["fid_column"])
+
+    @property
+    def geometry_name(self) -> str:
+        """Column with the geometries, ``""`` where the file has no name for it."""
+        return str(self.info["geometry_name"] or "")
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -130,9 +128,10 @@ def open_layer(path: Path, layer: str) -> GdalLayer:
         driver = str(info["driver"])
         if isinstance(source, bytes):
             driver = "GPKG" if _is_sqlite(path) else ""
-        column, index = _find_index(path, name) if driver == "GPKG" else ("", "")
     chosen = not layer and len(spatial) > 1
-    return GdalLayer(path, source, name, options, info, driver, column, index, chosen)
+    if isinstance(source, bytes):
+        options = {}  # of the driver of the file, not of the VRT
+    return GdalLayer(path, source, name, options, info, driver, chosen)
 
 
 def has_whole_ids(path: Path) -> bool:
@@ -206,17 +205,6 @@ def _read_info(path: Path, name: str, options: dict[str, str]) -> tuple[Path | b
 def _is_sqlite(path: Path) -> bool:
     with path.open("rb") as file:
         return file.read(15) == b"SQLite format 3"
-
-
-def _find_index(path: Path, name: str) -> tuple[str, str]:
-    """Name the geometry column of a layer of a GeoPackage, and its R-tree, if it has one."""
-    layer = "'" + name.replace("'", "''") + "'"
-    columns = ask_gpkg(path, f"SELECT column_name FROM gpkg_geometry_columns WHERE table_name = {layer}")
-    if not columns:
-        return "", ""
-    table = f"rtree_{name}_{columns[0]}"
-    text = table.replace("'", "''")
-    return columns[0], table if ask_gpkg(path, f"SELECT name FROM sqlite_master WHERE name = '{text}'") else ""
 
 
 def _choose(path: Path, spatial: list[str], asked: str) -> str:

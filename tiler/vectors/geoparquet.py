@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import pyproj
-import shapely
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from tiler.objects.places import source_of
 from tiler.vectors.features import Box, Features, to_objects
 from tiler.vectors.parquet_geometry import GeometryColumn, find_geometry, read_geometry
-from tiler.vectors.wkb import parse_wkb
 
 BATCH_BYTES = 2**30  # of the values of one column in a batch; 50,000 footprints take some 10 MB
 _SUFFIXES = {".parquet", ".geoparquet", ".pq"}
@@ -39,26 +37,15 @@ def is_parquet(path: Path) -> bool:
 def describe(path: Path) -> tuple[GeometryColumn, tuple[str, ...], int, Box | None]:
     """Read the metadata of a Parquet file with geometries.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
     Returns
     -------
-    GeometryColumn
-        The column with the geometries, and its CRS.
-    tuple of str
-        Names of the attributes.
-    int
-        Number of features.
-    tuple of 4 floats, or None
-        xmin, ymin, xmax, ymax as stated.
+    tuple
+        The column with the geometries, names of the attributes, number of features, and extent as stated or None.
 
     Raises
     ------
     InputError
-        If the file is damaged, has no geometries that are known, or if pyarrow is not installed.
+        If the file is damaged, or has no geometries that are known.
     """
     with _arrow_as_input_error(path):
         table, column = _open(path)
@@ -72,7 +59,7 @@ def describe(path: Path) -> tuple[GeometryColumn, tuple[str, ...], int, Box | No
 
 
 def scan(path: Path, columns: Sequence[str], box: Box | None, *, geometry: bool, batch: int) -> Iterator[Features]:
-    """Read the features whose bounding boxes meet a box, by batches; those without a known one too.
+    """Read the features of the groups of rows that may meet a box, by batches.
 
     Parameters
     ----------
@@ -83,7 +70,7 @@ def scan(path: Path, columns: Sequence[str], box: Box | None, *, geometry: bool,
     box : tuple of 4 floats, or None
         xmin, ymin, xmax, ymax in the file's CRS; None for all features.
     geometry : bool
-        False leaves the geometries out: None in every row; the box must be None then.
+        False leaves the geometries out: None in every row.
     batch : int
         Features in memory at once, beside those that are kept.
 
@@ -96,16 +83,12 @@ def scan(path: Path, columns: Sequence[str], box: Box | None, *, geometry: bool,
     ------
     InputError
         As `describe`.
-    ValueError
-        If a box is asked for without geometries.
 
     Notes
     -----
     Row groups are left out where the file has a bounding box column, and its statistics say that the group
     is away from the box.
     """
-    if box is not None and not geometry:
-        raise ValueError("a box needs the geometries")
     with _arrow_as_input_error(path):
         table, column = _open(path, columns)
         groups = [group for group in range(table.num_row_groups) if _near(table, group, column, box)]
@@ -122,12 +105,8 @@ def scan(path: Path, columns: Sequence[str], box: Box | None, *, geometry: bool,
             stored = (
                 read_geometry(part.column(column.name), column.encoding) if geometry else [None] * part.num_rows
             )
-            blobs = to_objects(stored)
-            if box is not None:
-                hits = np.flatnonzero(_may_meet(blobs, box))
-                blobs, fids, part = blobs[hits], fids[hits], part.take(hits)
             values = {field: to_objects(part.column(field).to_pylist()) for field in columns}
-        yield Features(blobs, values, (), fids, {})
+        yield Features(to_objects(stored), values, (), fids, {})
 
 
 def _rows_of(table: Any, groups: list[int]) -> NDArray[np.int64]:
@@ -135,14 +114,6 @@ def _rows_of(table: Any, groups: list[int]) -> NDArray[np.int64]:
     sizes = np.array([table.metadata.row_group(group).num_rows for group in range(table.num_row_groups)], np.int64)
     first = np.cumsum(sizes) - sizes
     return np.concatenate([np.empty(0, np.int64), *(first[group] + np.arange(sizes[group]) for group in groups)])
-
-
-def _may_meet(wkb: NDArray[np.object_], box: Box) -> NDArray[np.bool_]:
-    """Whether the bounding boxes of geometries meet a box; True too where one is unknown, or not finite."""
-    xmin, ymin, xmax, ymax = shapely.bounds(parse_wkb(wkb)).reshape(-1, 4).T
-    away: NDArray[np.bool_] = (xmin > box[2]) | (xmax < box[0]) | (ymin > box[3]) | (ymax < box[1])
-    stored = np.array([blob is not None for blob in wkb], np.bool_)
-    return stored & ~away
 
 
 def _near(table: Any, group: int, column: GeometryColumn, box: Box | None) -> bool:
@@ -180,12 +151,8 @@ def _check_expanded(path: Path, part: Any) -> None:
 
 
 def _open(path: Path, columns: Sequence[str] = ()) -> tuple[Any, GeometryColumn]:
-    try:
-        import pyarrow.parquet
-    except ImportError as error:
-        raise InputError(
-            f"{path}: Parquet needs pyarrow; pip install 'citystitch[parquet]', or convert the file to GPKG"
-        ) from error
+    import pyarrow.parquet
+
     table = pyarrow.parquet.ParquetFile(source_of(path))
     size, n_rows = path.stat().st_size, table.metadata.num_rows
     if n_rows > size:

@@ -203,7 +203,7 @@ def _by_name(path: Path, table: Any) -> GeometryColumn | None:
         return None
     part = next(table.iter_batches(_LOOKED_AT, columns=[name]), None)
     blobs = [] if part is None else [blob for blob in part.column(0).to_pylist() if blob is not None]
-    geometry = parse_wkb(np.array([*blobs, None], np.object_)[:-1])
+    geometry, _, _ = parse_wkb(np.array([*blobs, None], np.object_)[:-1])
     if blobs and all(shape is None for shape in geometry):
         return None
     sides = shapely.bounds(geometry).reshape(-1, 4)

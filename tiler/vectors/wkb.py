@@ -1,7 +1,6 @@
-"""Well-known binary from files, parsed only where its nesting cannot exhaust the stack (step 1.2)."""
+"""Well-known binary from files, parsed only where its sizes and its nesting can do no harm (step 1.2)."""
 
 import struct
-from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -11,71 +10,56 @@ from numpy.typing import NDArray
 DEEPEST = 8  # levels of collections; polygons of a multipolygon are two
 # A level takes 9 bytes, so that shorter blobs have less than 500 levels, which any stack holds.
 _SHORT = 4096  # bytes
-_POLYGON, _COLLECTIONS = 3, (4, 5, 6, 7)
-_LEAVES = (1, 2, 3)
+_POINT, _LINE, _POLYGON, _MULTIPOLYGON, _COLLECTION = 1, 2, 3, 6, 7
+_MULTI = (4, 5, _MULTIPOLYGON, _COLLECTION)
+_CURVES = range(8, 15)
+# What GEOS knows polyhedral surfaces, TINs and triangles as: the bytes behind their kind are the same.
+_SURFACES = {15: _MULTIPOLYGON, 16: _MULTIPOLYGON, 17: _POLYGON}
 
 
-class Header(NamedTuple):
-    """What stands before each geometry and each part of one.
-
-    Attributes
-    ----------
-    kind : int
-        Type without its flags: 1 point to 17 triangle.
-    order : str
-        ``"<"`` or ``">"``, as `struct` has it.
-    dimensions : int
-        Numbers of a vertex.
-    has_z : bool
-        Whether the third of them is Z.
-    stop : int
-        First byte behind the header.
-    """
-
-    kind: int
-    order: str
-    dimensions: int
-    has_z: bool
-    stop: int
-
-
-def read_header(blob: bytes, place: int) -> Header:
-    """Read the header of a geometry, ISO or EWKB; struct.error where the blob ends in it."""
-    order = "<" if blob[place : place + 1] == b"\x01" else ">"
-    (code,) = struct.unpack_from(order + "I", blob, place + 1)
-    place += 5
-    if code & 0x20000000:
-        place += 4
-    has_z, has_m = bool(code & 0x80000000), bool(code & 0x40000000)
-    code &= 0x0FFFFFFF
-    has_z, has_m = has_z or code // 1000 in (1, 3), has_m or code // 1000 in (2, 3)
-    return Header(code % 1000, order, 2 + has_z + has_m, has_z, place)
-
-
-def parse_wkb(wkb: NDArray[np.object_]) -> NDArray[np.object_]:
+def parse_wkb(wkb: NDArray[np.object_]) -> tuple[NDArray[np.object_], set[int], dict[int, str]]:
     """Parse geometries of unknown origin.
 
     Parameters
     ----------
     wkb : object, (n,)
-        Well-known binary, None where there is none.
+        Well-known binary, ISO or EWKB, None where there is none.
 
     Returns
     -------
-    object, (n,)
-        Geometries, rings closed; None where there is none, where it cannot be parsed or is a curve or surface (see
-        `tiler.vectors.wkb_shapes`), and where collections are nested deeper than `DEEPEST` in more than 4 kB.
+    geometry : object, (n,)
+        Geometries, rings closed; None where there is none, or where it cannot be parsed.
+    surfaces : set of int
+        Rows of polyhedral surfaces, TINs, triangles, and of collections that hold one: now polygons.
+    broken : dict of int to str
+        Why a geometry cannot be parsed, by row: it is damaged, a curve, or nested deeper than `DEEPEST`.
 
     References
     ----------
     OGC 06-103r4, section 8.2; the flags of EWKB as PostGIS writes them.
     """
-    flat = np.array([blob if blob is None or is_flat(blob) else None for blob in wkb], np.object_)
+    plain, surfaces, broken = wkb.copy(), set[int](), dict[int, str]()
+    for row, blob in enumerate(wkb):
+        try:
+            if blob is not None and not _is_harmless(blob):
+                plain[row], has_surface = _make_plain(blob)
+                surfaces |= {row} if has_surface else set()
+        except (struct.error, ValueError) as error:
+            plain[row], broken[row] = None, f"its geometry cannot be parsed: {error}"
     with np.errstate(invalid="ignore"):  # GEOS compares NaN coordinates
         try:
-            return np.asarray(shapely.from_wkb(flat, on_invalid="fix"), np.object_)
-        except NotImplementedError:  # one is a curve, and shapely gives none of them
-            return np.array([_parse_one(blob) for blob in flat], np.object_)
+            geometry = np.asarray(shapely.from_wkb(plain, on_invalid="fix"), np.object_)
+        except NotImplementedError:  # a multipolygon holds a curve, and shapely gives none of them
+            geometry = np.array([_parse_one(blob) for blob in plain], np.object_)
+    for row in np.flatnonzero(shapely.is_missing(geometry)).tolist():
+        if wkb[row] is not None:
+            broken.setdefault(row, "its geometry cannot be parsed")
+    return geometry, surfaces, broken
+
+
+def is_curve(blob: bytes | None) -> bool:
+    """Whether a geometry is a curve or has curves for its sides."""
+    return blob is not None and len(blob) >= 5 and _read_header(blob, 0)[0] in _CURVES
 
 
 def _parse_one(blob: bytes | None) -> shapely.Geometry | None:
@@ -85,50 +69,49 @@ def _parse_one(blob: bytes | None) -> shapely.Geometry | None:
         return None
 
 
-def is_flat(blob: bytes) -> bool:
-    """Whether a geometry can be parsed by recursion without harm.
-
-    Examples
-    --------
-    >>> is_flat(shapely.to_wkb(shapely.Point(0, 0)))
-    True
-    >>> is_flat(struct.pack("<BII", 1, 7, 1) * 1000)
-    False
-    """
-    if len(blob) < _SHORT:
-        return True
-    try:
-        kind = read_header(blob, 0).kind
-        return kind == _POLYGON or kind in _LEAVES or (kind in _COLLECTIONS and _walk(blob))
-    except struct.error:
-        return False
+def _is_harmless(blob: bytes) -> bool:
+    kind = _read_header(blob, 0)[0]
+    return kind <= _POLYGON or (kind <= _MULTIPOLYGON and len(blob) < _SHORT)
 
 
-def _walk(blob: bytes) -> bool:
-    """Walk through all parts; False where they nest too deep or have kinds without a known length."""
-    place, left = 0, [1]
+def _read_header(blob: bytes, place: int) -> tuple[int, int, str, int, int]:
+    """Read what stands before each part: kind, code, byte order of `struct`, numbers of a vertex, its end."""
+    order = "<" if blob[place : place + 1] == b"\x01" else ">"
+    (code,) = struct.unpack_from(order + "I", blob, place + 1)
+    has_z, has_m, number = bool(code & 0x80000000), bool(code & 0x40000000), code & 0x0FFFFFFF
+    has_z, has_m = has_z or number // 1000 in (1, 3), has_m or number // 1000 in (2, 3)
+    return number % 1000, code, order, 2 + has_z + has_m, place + (9 if code & 0x20000000 else 5)
+
+
+def _make_plain(blob: bytes) -> tuple[bytes, bool]:
+    """Walk through all parts, and name surfaces as GEOS knows them; an error at what does harm."""
+    plain, place, left, has_surface = bytearray(blob), 0, [1], False
     while left:
         if left[-1] == 0:
             left.pop()
             continue
         left[-1] -= 1
-        header = read_header(blob, place)
-        kind, order, width, place = header.kind, header.order, 8 * header.dimensions, header.stop
-        if kind == 1:
-            place += width
+        kind, code, order, width, stop = _read_header(blob, place)
+        if kind in _SURFACES:
+            struct.pack_into(order + "I", plain, place + 1, code - kind + _SURFACES[kind])
+            kind, has_surface = _SURFACES[kind], True
+        if kind == _POINT:
+            place = stop + 8 * width
             continue
-        (count,) = struct.unpack_from(order + "I", blob, place)
-        place += 4
-        if kind in _COLLECTIONS:
-            left.append(count)
-            if len(left) > DEEPEST:
-                return False
-        elif kind == 2:
-            place += count * width
+        (count,) = struct.unpack_from(order + "I", blob, stop)
+        place = stop + 4
+        if kind == _LINE:
+            place += 8 * width * count
         elif kind == _POLYGON:
             for _ in range(count):
                 (length,) = struct.unpack_from(order + "I", blob, place)
-                place += 4 + length * width
+                place += 4 + 8 * width * length
+        elif kind in _MULTI:
+            left.append(count)
         else:
-            return False
-    return place <= len(blob)
+            raise ValueError(f"a part of type {kind} is not known here")
+        if len(left) > DEEPEST:
+            raise ValueError(f"collections nest deeper than {DEEPEST} levels")
+    if place > len(blob):
+        raise ValueError(f"claims {place} bytes, has {len(blob)}")
+    return bytes(plain), has_surface

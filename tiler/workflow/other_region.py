@@ -3,18 +3,18 @@
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pyproj
 
 from pipeline.errors import CityError, ConfigError
+from tiler.citymodels.json_stream import read_members
 from tiler.engine.stage import Box
 from tiler.georeference.crs import same_crs
 from tiler.objects.places import absolute, in_bucket
 from tiler.planning.region import Region
 from tiler.words.plain_text import tell_box
 from tiler.workflow.out_folder import RUN_RECORD, STORE
-from tiler.workflow.run_folder import WRONG_FIELD, opened_json
+from tiler.workflow.run_folder import WRONG_FIELD
 
 COMMON = 0.5  # share of the larger region's area from which on other files are newer ones of the same region
 
@@ -58,16 +58,10 @@ def refuse_other_region(out: Path, region: Region, inputs: Sequence[str]) -> Non
 
 def _read_run(path: Path) -> tuple[Box, str, list[str]] | None:
     """Bounds without a pad, CRS and inputs of a finished run; None where there is none."""
-    found: dict[str, Any] = {}
     try:
         if not path.is_file():
             return None
-        with opened_json(path) as stream:
-            for key in stream.members():
-                if key in ("status", "region", "parameters"):
-                    found[key] = stream.value()
-                else:
-                    stream.skip()
+        found, _ = read_members(path, ("region", "parameters").__contains__)
         if found["status"] != "done":
             return None
         region, given = found["region"], found["parameters"]

@@ -1,11 +1,9 @@
 """What a run folder says about itself: its record, buildings, volume pieces."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from json import JSONDecodeError
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.mesh import Region, TetMesh
-from tiler.citymodels.json_stream import JsonStream, NoJsonError
+from tiler.citymodels.json_stream import iterate_members, read_members
 
 SCHEMA = 1  # of run.json
 RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")
@@ -132,8 +130,7 @@ def read_run_record(path: Path) -> RunRecord:
         raise InputError(f"{path}: region bounds {west, south, east, north} are no box; run again")
     if not 0 <= depth < math.inf:
         raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
-    tiles = record.get(TILES) or {}
-    return RunRecord(status, (west, south, east, north), top, counts, tiles, depth, core, rim, parts)
+    return RunRecord(status, (west, south, east, north), top, counts, record[TILES], depth, core, rim, parts)
 
 
 def _read_parts(found: Mapping[str, Any], n_cells: int) -> tuple[MeshPart, ...]:
@@ -227,27 +224,6 @@ def read_volume(path: Path, *, regions: bool = False) -> tuple[TetMesh, NDArray[
     return TetMesh(mesh.points.astype(np.float64, copy=False), cells.astype(np.int32)), region
 
 
-@contextmanager
-def opened_json(path: Path) -> Iterator[JsonStream]:
-    """Open a JSON file whose content is an object, to be read member by member.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is no JSON object, here or wherever it is read inside of the context.
-    """
-    try:
-        with path.open(encoding="utf-8") as file:
-            stream = JsonStream(file)
-            if stream.peek() not in ("{", ""):
-                raise InputError(f"{path}: is no JSON object; run again")
-            yield stream
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); run again") from error
-    except (JSONDecodeError, UnicodeDecodeError, NoJsonError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON ({error}); run again") from None
-
-
 def broken_field(path: Path, error: Exception) -> InputError:
     """Make the error of a file with a `WRONG_FIELD`."""
     return InputError(f"{path}: a field is missing or wrong ({error!r}); run again")
@@ -255,16 +231,8 @@ def broken_field(path: Path, error: Exception) -> InputError:
 
 def _read_members(path: Path, names: Collection[str]) -> dict[str, Any]:
     """Read some members of a JSON object; of tiles, their boxes (n, 4) by name."""
-    found: dict[str, Any] = {}
-    with opened_json(path) as stream:
-        for key in stream.members():
-            if key == TILES and stream.peek() == "{":
-                found[key] = {name: _box(stream.value()) for name in stream.members()}
-            elif key in names:
-                found[key] = stream.value()
-            else:
-                stream.skip()
-        stream.finish()
+    found, _ = read_members(path, names.__contains__)
+    found[TILES] = {name: _box(tile) for name, tile in iterate_members(path, TILES)}
     return found
 
 
