@@ -40,7 +40,8 @@ from tiler.check.check import check_run
 from tiler.config.config import Config, idle_parameters, make_config
 from tiler.footprints.footprint_sample import sample_footprints
 from tiler.pictures.picture_data import City
-from tiler.pictures.sizes_picture import draw_sizes, plan_edges
+from tiler.pictures.picture_parts import plan_edges
+from tiler.pictures.render import LEGEND, draw_sizes
 from tiler.planning.forecast import forecast_run
 from tiler.planning.plan import survey_inputs
 from tiler.stages.mesh import mesh_stages
@@ -262,8 +263,9 @@ def test_the_picture_shows_edges_from_above_by_length_and_tile(tmp_path: Path) -
     height = np.zeros((len(points), 1))
     city = City(np.hstack((points, height)), facets, marker, piece * 0 - 1, piece, ("4_7", "5_7"), np.zeros(3))
     np.testing.assert_allclose(plan_edges(city)[[0, -2]], np.array([1, 8]) * (2 + np.sqrt(2)) / 3)
-    image = draw_sizes(city, (320, 160 + 46)).astype(int)
-    assert image.shape == (206, 320, 3)
+    assert LEGEND == 0.1
+    image = draw_sizes(city, (320, 178)).astype(int)
+    assert image.shape == (178, 320, 3)
     # Odd and even column and row: the warm ramp's dark end, then the cool one's light end; the wall is black.
     west_colour, east_colour = (
         np.median(image[:150, 5:150], axis=(0, 1)),
@@ -273,8 +275,6 @@ def test_the_picture_shows_edges_from_above_by_length_and_tile(tmp_path: Path) -
     assert west_colour.max() < 120
     assert east_colour[2] > east_colour[0] > 200
     assert image[20:140, 159:161].max(axis=2).min(axis=1).max() < 60
-    with pytest.raises(ValueError, match="size 50 x 46 must have more than 46 rows"):
-        draw_sizes(city, (50, 46))
 
 
 def test_only_a_graded_mesh_depends_on_the_grading() -> None:

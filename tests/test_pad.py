@@ -452,7 +452,7 @@ def test_a_house_far_away_changes_no_tile_of_the_pad(tmp_path: Path) -> None:
 
 def test_the_command_line_takes_one_width_or_four(core: dict[str, Any], tmp_path: Path) -> None:
     words = ["plan", *core["pointcloud"], "--tile-size", "160", "--json", str(tmp_path / "plan.json")]
-    words += ["--picture", str(tmp_path / "plan.png"), "--bounds", *map(str, CORE)]
+    words += ["--picture", str(tmp_path / "plan.svg"), "--bounds", *map(str, CORE)]
     assert main([*words, "--pad", "70", "190", "2H", "0"]) == 0
     plan = json.loads((tmp_path / "plan.json").read_text())
     assert plan["region"]["bounds"] == list(WHOLE)

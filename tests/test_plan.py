@@ -1,11 +1,14 @@
 """The plan of a run, held against runs; and regions as large as a country."""
 
+import base64
 import json
 import subprocess
 import sys
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pyproj
@@ -15,20 +18,21 @@ from PIL import Image
 from rich.console import Console
 
 from pipeline.errors import ConfigError
-from stitch.grid import TileGrid, has_tile, make_grid, seam_keys, seam_line, tile_box, tile_keys, tiles_of_seam
+from stitch.grid import has_tile, make_grid, seam_keys, seam_line, tile_box, tile_keys, tiles_of_seam
 from tiler.cli import main as cli
 from tiler.config.config import Config, make_config
 from tiler.footprints.footprint_sample import FootprintSample, measure_detail, sample_footprints
 from tiler.georeference.establish import Georeference
 from tiler.georeference.frame import AS_IT_IS
 from tiler.interface.synth import write_city
-from tiler.pictures.plan_picture import ABSENT, HATCH, HOUSE, PRESENT, draw_plan
 from tiler.planning.context import absent_tiles, choose_tiles, make_layout, seam_name, tile_name
 from tiler.planning.forecast import Forecast, forecast_run, spread_points, warn_of_memory
 from tiler.planning.plan import Survey, survey_inputs
 from tiler.planning.plan_report import describe_plan, plan_run
 from tiler.planning.region import Region, check_region
 from tiler.pointclouds.clouds import CloudHeader
+from tiler.report.plan_map import draw_plan
+from tiler.report.svg_map import FootprintRaster
 from tiler.workflow.run import run
 
 CRS = "EPSG:3006"
@@ -187,8 +191,8 @@ def test_a_country_of_half_a_million_tiles(tmp_path: Path) -> None:
     assert not forecast.warnings
     plan = describe_plan(survey, None, forecast, config, 64e9)
     assert plan["tiles"]["absent"] == 235 * 235
-    draw_plan(survey, None, tmp_path / "plan.png")
-    assert (tmp_path / "plan.png").stat().st_size > 1000
+    draw_plan(survey, None, tmp_path / "plan.svg")
+    assert (tmp_path / "plan.svg").stat().st_size > 1000
 
 
 def test_more_tiles_to_a_side_than_ids_can_tell_are_refused() -> None:
@@ -298,12 +302,20 @@ def test_bad_input_is_told_as_a_run_does(
 
 def test_a_file_in_a_missing_folder_is_refused_at_once(city: Config, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no folder"):
-        plan_run(city, picture=tmp_path / "gone" / "plan.png", console=quiet())
+        plan_run(city, picture=tmp_path / "gone" / "plan.svg", console=quiet())
 
 
-def draw(survey: Survey, sample: FootprintSample | None, path: Path) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    draw_plan(survey, sample, path)
-    return np.asarray(Image.open(path))
+def test_the_picture_of_a_plan_is_svg_and_other_names_are_refused(city: Config, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"plan.png: the picture of a plan is SVG; name it plan.svg"):
+        plan_run(city, picture=tmp_path / "plan.png", console=quiet())
+    assert not list(tmp_path.iterdir())
+
+
+def boxes_of(root: ElementTree.Element, style: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Left, top, right and bottom of the rectangles of a class on the map, without the legend's."""
+    found = [each.attrib for each in root.iterfind(f".//{{*}}rect[@class='{style}']")]
+    sides = [[float(each.get(name, 0)) for name in ("x", "y", "width", "height")] for each in found]
+    return np.array([(x, y, x + width, y + height) for x, y, width, height in sides]).reshape(-1, 4)
 
 
 def test_the_picture_shows_tiles_absent_ones_and_houses_where_they_are(tmp_path: Path) -> None:
@@ -312,36 +324,48 @@ def test_the_picture_shows_tiles_absent_ones_and_houses_where_they_are(tmp_path:
     polygons = np.array([shapely.box(230, 230, 270, 270), yard])  # a house in the courtyard of another
     zero = np.zeros(2)
     sample = FootprintSample(2, True, polygons, shapely.bounds(polygons), shapely.area(polygons), zero, zero)
-    image = draw(survey, sample, tmp_path / "a.png")
+    draw_plan(survey, sample, tmp_path / "a.svg")
+    root = ElementTree.parse(tmp_path / "a.svg").getroot()
     scale = 1400 / 1500
+    tiles, files = boxes_of(root, "tile"), boxes_of(root, "file")
 
-    def at(x: float, y: float) -> tuple[int, ...]:
-        return tuple(image[int(60 + 1400 - y * scale), int(30 + x * scale)].tolist())
+    def is_tile(x: float, y: float) -> bool:
+        at = x * scale, 1400 - y * scale
+        return bool(((tiles[:, :2] < at) & (at < tiles[:, 2:])).all(axis=1).any())
 
-    assert at(630, 630) in (ABSENT, HATCH)
-    assert at(630, 130) == PRESENT
-    assert at(120, 120) == HOUSE
-    assert at(180, 180) == PRESENT
-    assert at(265, 235) == HOUSE
-    draw_plan(survey, sample, tmp_path / "b.png")
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert (is_tile(630, 630), is_tile(630, 130), is_tile(120, 120)) == (False, True, True)
+    covered = (tiles[:, 2] - tiles[:, 0]) * (tiles[:, 3] - tiles[:, 1])
+    assert covered.sum() == pytest.approx(200 * (100 * scale) ** 2, rel=1e-3)
+    assert len(files) == len(survey.clouds)
+    assert np.abs(files[0] - np.array([0, 1000, 500, 1500]) * scale).max() < 0.1
+    words = [each.text for each in root.iterfind(".//{*}text")]
+    assert {"200 tiles of 100 m, 25 absent; 8 files; 2 footprints", "0_0", "14_14", "200 m"} <= set(words)
+    (image,) = root.iterfind(".//{*}image")
+    png = base64.b64decode(image.attrib["href"].split(",")[1])
+    alpha = np.asarray(Image.open(BytesIO(png)).convert("RGBA"))
+    assert alpha.shape == (1400, 1400, 4)
+
+    def at(x: float, y: float) -> list[int]:
+        return list(alpha[int(1400 - y * scale), int(x * scale)].tolist())
+
+    assert at(120, 120) == at(265, 235) == [0xCD, 0x94, 0x80, 255]
+    assert at(180, 180)[3] == at(630, 130)[3] == 0
+    draw_plan(survey, sample, tmp_path / "b.svg")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
 
 
-def test_small_houses_are_dots(tmp_path: Path) -> None:
-    grid: TileGrid = country(15, 1000.0).grid
-    polygons = shapely.box(x := np.arange(200.0, 4000.0, 37.0), 2500.0, x + 8, 2508.0)
-    zero = np.zeros(len(polygons))
-    sample = FootprintSample(
-        len(polygons), True, polygons, shapely.bounds(polygons), shapely.area(polygons), zero, zero
-    )
-    empty = draw(country(15, 1000.0), None, tmp_path / "a.png")
-    dotted = draw(country(15, 1000.0), sample, tmp_path / "b.png")
-    changed = (empty != dotted).any(axis=2)
-    changed[:60] = False
-    rows = np.flatnonzero(changed.any(axis=1))
-    scale = 1400 / (grid.bounds[2] - grid.bounds[0])
-    assert np.abs(rows - (60 + 1400 - 2504 * scale)).max() <= 2
-    assert changed.sum() > 100
+def test_a_raster_has_the_area_of_small_footprints_and_leaves_holes_open() -> None:
+    ring = shapely.difference(shapely.box(5, 5, 30, 35), shapely.box(10, 10, 20, 20))
+    both = shapely.MultiPolygon([ring, shapely.box(33, 1, 39, 9)])
+    raster = FootprintRaster((0, 0, 40, 40), 40)
+    raster.add(np.array([both, shapely.box(-50, -50, 2, 2)]))
+    raster.add(np.array([], np.object_))
+    raster.add(np.array([shapely.Polygon(), shapely.box(36, 20, 36.5, 20.5), shapely.box(1, 1, 2, 2)]))
+    shares = raster.shares()[::-1]
+    x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
+    wanted = 255 * (shapely.contains_xy(both, x, y) | ((x < 2) & (y < 2)))
+    wanted[20, 36] = 64
+    assert np.array_equal(shares, wanted)
 
 
 def test_a_run_says_before_it_starts_which_tiles_may_not_fit(

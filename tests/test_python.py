@@ -210,7 +210,10 @@ def test_a_plan_is_that_of_the_command(
     ]
     assert "\x1b" not in repr(plan)
     assert plan.facts["tiles"]["present"] == 4
-    assert plan.picture().png.startswith(b"\x89PNG")
+    picture = plan.picture()
+    assert picture._repr_svg_() == picture.svg
+    assert picture.save(tmp_path / "plan.svg").read_text() == picture.svg
+    assert picture.svg.startswith("<svg")
 
 
 @pytest.mark.long

@@ -1,6 +1,8 @@
 """The pictures: not blank, the city in them, and framed; bad runs end in one message."""
 
+import os
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import pyvista
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -17,19 +18,20 @@ from PIL import Image
 from pipeline.errors import ConfigError, InputError, OutputError
 from pipeline.mesh import Boundary, Marker
 from tests.scene import PIECES, write_scene
+from tiler.cli.main import main
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
+from tiler.pictures import render
 from tiler.pictures.camera import fit_camera
 from tiler.pictures.picture_data import City, load_air, load_city
 from tiler.pictures.picture_parts import (
     TILE_COLOURS,
     _edge_style,
-    _skirt,
-    add_air,
-    add_houses,
+    height_colours,
     heights_above_ground,
+    make_skirt,
     tile_colours,
 )
-from tiler.pictures.render import SIZES, render_run
+from tiler.pictures.render import SIZES, draw_city, render_run
 
 SIDE = 240.0
 SIZE = (400, 250)
@@ -92,7 +94,7 @@ def test_a_picture_shows_the_city(pictures: dict[str, NDArray[np.int64]], what: 
     image = pictures[what]
     assert image.shape == (SIZE[1], SIZE[0], 3)
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 2000
-    assert warm(image).mean() > 0.02
+    assert warm(image).mean() > 0.018
     assert green(image).mean() > 0.005
 
 
@@ -172,7 +174,7 @@ def test_the_pieces_are_sewn_and_turned_towards_the_camera(run: Path) -> None:
 
 def test_the_skirt_hangs_from_the_rim_alone(run: Path) -> None:
     city = load_city(run)
-    skirt = _skirt(city)
+    skirt = make_skirt(city)
     assert np.allclose(np.abs(skirt.points[:, :2]).max(axis=1), SIDE / 2)
     assert skirt.points[:, 2].min() == pytest.approx(-0.015 * SIDE)
     assert skirt.area > 4 * SIDE * 0.015 * SIDE
@@ -257,26 +259,21 @@ def test_pieces_that_are_no_tiles_are_named(run: Path) -> None:
 
 def test_the_cut_keeps_whole_cells_of_the_northern_half(run: Path) -> None:
     city = load_city(run)
-    plotter = pyvista.Plotter(off_screen=True)
-    points = add_air(plotter, load_air(run, city.origin), SIZE)
-    plotter.close()
+    points = load_air(run, city.origin).points
     assert -12 < points[:, 1].min() < 0
     assert points[:, 1].max() == pytest.approx(SIDE / 2)
     assert np.ptp(points[:, 0]) == pytest.approx(SIDE)
 
 
-def test_faces_between_pieces_are_not_on_the_cut(run: Path) -> None:
-    """Cells are in one piece and the other in turn: the surface is that of all of them, and closed."""
+def test_the_air_is_that_of_all_pieces(run: Path) -> None:
+    """The surface of the cells of each piece is closed: it encloses what they have."""
     origin = load_city(run).origin
     air = load_air(run, origin)
     parts = [read_vtu(run / "mesh" / f"{name}.vtu").mesh for name in PIECES]
     corners = np.concatenate([part.points[part.cells] for part in parts]) - origin
     corners = corners[corners[..., 1].mean(axis=1) > 0]
-    faces = np.sort(np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 4), axis=1)
-    faces = np.concatenate([np.delete(faces, k, axis=1) for k in range(4)])
-    assert len(air.facets) == (np.unique(faces, axis=0, return_counts=True)[1] == 1).sum()
-    a, b, c = np.moveaxis(air.points[air.facets], 1, 0)
     volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])).sum() / 6
+    a, b, c = np.moveaxis(air.points[air.regular_faces], 1, 0)
     assert (a * np.cross(b, c)).sum() / 6 == pytest.approx(volume)
 
 
@@ -297,17 +294,37 @@ def test_heights_above_ground_are_those_of_the_building() -> None:
 
 def test_walls_are_pale_and_roofs_redder_with_height(run: Path) -> None:
     city = load_city(run)
-    plotter = pyvista.Plotter(off_screen=True)
-    add_houses(plotter, city, SIZE)
-    houses = plotter.meshes[0]
-    plotter.close()
-    marker = city.marker[city.marker != 1]
-    assert np.all(houses["rgb"][marker == 2] == [255, 250, 240])
-    height = heights_above_ground(city)[city.marker == 3]
+    rgb = height_colours(city)
+    assert np.all(rgb[city.marker == Marker.WALL] == [255, 250, 240])
+    roofs = city.marker == Marker.ROOF
+    height = heights_above_ground(city)[roofs]
     order = np.argsort(height)
-    red, blue = houses["rgb"][marker == 3][order][:, [0, 2]].astype(np.int64).T
+    red, blue = rgb[roofs][order][:, [0, 2]].astype(np.int64).T
     assert red[0] - red[-1] > 20
     assert np.all(np.diff(blue[height[order] < 26.6]) <= 0)
+
+
+def test_quality_has_its_colours_and_a_legend(run: Path) -> None:
+    city = load_city(run, quality=True)
+    good, bad = (
+        draw_city(
+            replace(city, quality=np.full(len(city.facets), ratio, np.float32)), SIZE, colours="quality"
+        ).astype(np.int64)
+        for ratio in (0.8, 0.2)
+    )
+    assert good[150, 200].min() > 150  # pale
+    assert bad[150, 200].max() < 110  # dark
+    legend = good[int(0.86 * SIZE[1]) :, int(0.68 * SIZE[0]) :]
+    assert np.array_equal(legend[10:], bad[int(0.86 * SIZE[1]) + 10 :, int(0.68 * SIZE[0]) :])
+    red, green, blue_ = np.moveaxis(legend, -1, 0)
+    assert ((red > green + 60) & (red > blue_ + 60)).mean() > 0.02
+
+
+def test_a_close_picture_shows_the_cells_of_the_middle(run: Path) -> None:
+    city = load_city(run)
+    air = load_air(run, city.origin)
+    far, near = (draw_city(city, SIZE, air=air, close=close).astype(np.int64) for close in (False, True))
+    assert blue(near).mean() > 1.2 * blue(far).mean()
 
 
 def test_edges_fade_and_vanish_as_triangles_get_small() -> None:
@@ -409,10 +426,40 @@ def test_a_boundary_without_ground_is_named(copy: Path, tmp_path: Path) -> None:
         render_run(copy, tmp_path / "out.png", size=SIZE)
 
 
-def test_without_pyvista_the_extra_is_named(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyvista_the_extra_is_named(
+    run: Path, small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(ConfigError, match=r"pip install citystitch\[pictures\]"):
-        render_run(run, tmp_path / "out.png")
+    for what in SIZES:
+        with pytest.raises(ConfigError, match=r"pip install citystitch\[pictures\]"):
+            render_run(run, tmp_path / "out.png", what=what)
+    assert main(["render", str(small_run), "-o", str(tmp_path / "out.png")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("probe", ["import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", ""])
+def test_where_vtk_would_crash_for_lack_of_opengl_what_to_install_is_told(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, probe: str
+) -> None:
+    monkeypatch.setattr(render, "_has_graphics", render._has_graphics.__wrapped__)
+    monkeypatch.setattr(render, "PROBE", probe)
+    if probe:
+        with pytest.raises(ConfigError, match=r"VTK finds none here: .* apt install libegl1"):
+            render_run(run, tmp_path / "out.png", size=(60, 40))
+    else:
+        render_run(run, tmp_path / "out.png", size=(60, 40))
+    assert (tmp_path / "out.png").exists() is not bool(probe)
+
+
+def test_a_picture_needs_no_display(run: Path, tmp_path: Path) -> None:
+    code = "from pathlib import Path; from tiler.pictures.render import render_run; import sys\n"
+    code += "render_run(Path(sys.argv[1]), Path(sys.argv[2]), size=(60, 40))"
+    environment = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
+    done = subprocess.run(
+        [sys.executable, "-c", code, run, tmp_path / "out.png"], env=environment, capture_output=True, check=True
+    )
+    assert (done.stdout, done.stderr) == (b"", b"")
+    assert pixels(tmp_path / "out.png").shape == (40, 60, 3)
 
 
 def test_a_folder_in_the_way_leaves_nothing_behind(run: Path, tmp_path: Path) -> None:

@@ -222,10 +222,16 @@ def _fail(*_: object) -> None:
     raise InputError("it is night")
 
 
-def test_without_pillow_the_page_says_so(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "PIL", None)
+@pytest.mark.parametrize(("lost", "remedy"), [("pyvista", "pip install citystitch[pictures]"), ("EGL", "libegl1")])
+def test_without_what_draws_the_page_says_so(
+    copy: Path, monkeypatch: pytest.MonkeyPatch, lost: str, remedy: str
+) -> None:
+    if lost == "pyvista":
+        monkeypatch.setitem(sys.modules, "pyvista", None)
+    else:
+        monkeypatch.setattr("tiler.pictures.render._has_graphics", lambda: False)
     page = read(write_report(copy))
-    assert [words for words in page.words if "pip install citystitch[pictures]" in words]
+    assert [words for words in page.words if remedy in words]
     assert not [tag for tag, _ in page.elements if tag == "img"]
 
 

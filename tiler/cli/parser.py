@@ -107,7 +107,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     )
     plan = command("plan", "tell what a run would do and take, without doing it")
     plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
-    plan.add_argument("--picture", type=Path, metavar="FILE.png", help="draw tiles, files and footprints")
+    plan.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw tiles, files and footprints")
     _add_inputs(plan)
     check = command("check", "prove from the written files that a mesh is right")
     check.add_argument("directory", type=place, metavar="DIR", help="folder of a run")

@@ -60,6 +60,31 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
+class VectorPicture:
+    """A map; a notebook shows it.
+
+    Attributes
+    ----------
+    svg : str
+        The SVG file.
+    """
+
+    svg: str
+
+    def __repr__(self) -> str:
+        return f"<VectorPicture, SVG of {len(self.svg):,} bytes>"
+
+    def _repr_svg_(self) -> str:
+        return self.svg
+
+    def save(self, path: Path | str) -> Path:
+        """Write the SVG file, whole or not at all; returns its path."""
+        with replacing(Path(path)) as part:
+            part.write_text(self.svg)
+        return Path(path)
+
+
+@dataclass(frozen=True, eq=False)
 class Building:
     """A building of the simplified city model, or a part of one.
 
@@ -248,7 +273,8 @@ class CityMesh:
         ValueError
             If there is no such picture.
         CityError
-            If pyvista is not installed, a file of the run is damaged, or the picture cannot be written.
+            If pyvista is not installed, VTK finds no OpenGL, a file of the run is damaged, or the picture cannot
+            be written.
         """
         from tiler.pictures.render import render_run
 

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from tiler.config.config import Config
-from tiler.interface.city_mesh import Picture
+from tiler.interface.city_mesh import VectorPicture
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,18 +31,18 @@ class RunPlan:
     def __repr__(self) -> str:
         return self.text.rstrip("\n")
 
-    def picture(self) -> Picture:
+    def picture(self) -> VectorPicture:
         """Draw tiles, files and footprints.
 
         Raises
         ------
         CityError
-            If an input is no longer as it was, or the extra ``pictures`` is not installed.
+            If an input is no longer as it was.
         """
         with TemporaryDirectory() as place:
-            path = Path(place) / "plan.png"
+            path = Path(place) / "plan.svg"
             _plan(self.config, path)
-            return Picture(path.read_bytes())
+            return VectorPicture(path.read_text())
 
 
 def plan_config(config: Config) -> RunPlan:

@@ -1,1 +1,1 @@
-"""Pictures of a run, drawn off-screen."""
+"""Pictures of a run, drawn off-screen by pyvista."""

@@ -2,15 +2,16 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.mesh import Marker, Region, TetMesh
+from pipeline.mesh import Marker, Region
 from stitch.grid import Key
 from tiler.mesh_files.facet_quality import measure_facets
-from tiler.mesh_files.vtk_files import TETRA, BoundaryPiece, VolumePiece, read_piece_paths, read_vtp, read_vtu
+from tiler.mesh_files.vtk_files import TETRA, BoundaryPiece, read_piece_paths, read_vtp, read_vtu
 from tiler.pictures.coarsening import Facets, coarsen, join_facets
 from tiler.planning.context import tile_key
 from tiler.workflow.run_folder import REGION
@@ -57,22 +58,6 @@ class City:
     origin: NDArray[np.float64]
     quality: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
     step: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Air:
-    """The surface of the cells behind a cut.
-
-    Attributes
-    ----------
-    points : float64, (n, 3)
-        Vertices (m) from the city's origin, each once.
-    facets : int64, (k, 3)
-        Triangles, all of them between the cells and what is not among them.
-    """
-
-    points: NDArray[np.float64]
-    facets: NDArray[np.int64]
 
 
 def find_middle(directory: Path, *, most: int = MOST_BYTES) -> frozenset[str] | None:
@@ -178,7 +163,7 @@ def load_city(
     )
 
 
-def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[str] | None = None) -> Air:
+def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[str] | None = None) -> Any:
     """Read the surface of the whole tetrahedra in the northern half, from ``mesh.pvtu``.
 
     Parameters
@@ -190,6 +175,11 @@ def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[st
     only : frozenset of str, optional
         Names of the pieces to read, all by default.
 
+    Returns
+    -------
+    pyvista.PolyData
+        Triangles (m) from `origin`, of each piece those that are not between two of its cells.
+
     Raises
     ------
     InputError
@@ -197,18 +187,22 @@ def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[st
 
     Notes
     -----
-    Memory holds one whole piece, and of all of them the surface: faces that two pieces share are not on it.
+    Memory holds one whole piece, and of all of them the surface.
     """
-    points, facets, n_points = [], [], 0
+    import pyvista
+
+    shells = []
     for path in _find_pieces(directory / VOLUME_INDEX, only):
-        shell = _find_shell(_take_air(read_vtu(path)), float(origin[1]))
-        points.append(shell.points)
-        facets.append(shell.facets + n_points)
-        n_points += len(shell.points)
-    if not n_points:
+        piece = read_vtu(path)
+        north = piece.mesh.points[piece.mesh.cells, 1].mean(axis=1) > origin[1]
+        if REGION in piece.cell_data:
+            north &= piece.cell_data[REGION] == Region.AIR
+        if north.any():
+            grid = pyvista.UnstructuredGrid({TETRA: piece.mesh.cells[north]}, piece.mesh.points - origin)
+            shells.append(grid.extract_surface(algorithm=None))
+    if not shells:
         raise InputError(f"{directory / VOLUME_INDEX}: has no cell north of y = {origin[1]:.1f} m; run again")
-    xyz, corners = sew(np.concatenate(points), np.concatenate(facets))
-    return Air(xyz - origin, corners[_find_single(corners)])
+    return shells[0].append_polydata(*shells[1:]) if shells[1:] else shells[0]
 
 
 def sew(points: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -259,30 +253,3 @@ def _take_shown(piece: BoundaryPiece, row: int, volume: Path | None) -> Facets:
         boundary.building[shown],
         ratio[shown],
     )
-
-
-def _take_air(piece: VolumePiece) -> TetMesh:
-    """Leave out the soil, if there is some."""
-    region = piece.cell_data.get(REGION)
-    return piece.mesh if region is None else TetMesh(piece.mesh.points, piece.mesh.cells[region == Region.AIR])
-
-
-def _find_shell(mesh: TetMesh, south: float) -> Air:
-    """Surface of the cells whose middle is north of a line."""
-    import pyvista
-
-    cells = mesh.cells[mesh.points[mesh.cells, 1].mean(axis=1) > south]
-    if len(cells) == 0:
-        return Air(np.empty((0, 3)), np.empty((0, 3), np.int64))
-    shell = pyvista.UnstructuredGrid({TETRA: cells}, mesh.points).extract_surface(algorithm=None)
-    return Air(np.asarray(shell.points, np.float64), np.asarray(shell.regular_faces, np.int64))
-
-
-def _find_single(facets: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which triangles there are once, whatever the order of their corners."""
-    corners = np.sort(facets, axis=1)
-    order = np.lexsort(corners.T)
-    same = np.all(corners[order[1:]] == corners[order[:-1]], axis=1)
-    single = np.ones(len(facets), np.bool_)
-    single[order[1:][same]] = single[order[:-1][same]] = False
-    return single

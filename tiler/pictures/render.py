@@ -1,20 +1,22 @@
-"""Pictures of a run's boundary and volume mesh, drawn off-screen (step 3.6)."""
+"""Pictures of a run's boundary, volume mesh and city model, drawn by VTK without a display (step 3.6)."""
 
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ConfigError
+from pipeline.mesh import Marker
 from tiler.pictures.camera import CUT_VIEW, MARGIN, SKY, VIEW, VIEW_ANGLE, fit_camera
-from tiler.pictures.painted_pictures import LEGEND, PAINTED, paint_blocks, paint_city
+from tiler.pictures.city_model_data import load_blocks
 from tiler.pictures.picture_data import City, find_middle, load_air, load_city
-from tiler.pictures.picture_parts import add_air, add_houses, add_terrain
-from tiler.pictures.plain_picture import PlainPlotter, has_graphics
-from tiler.pictures.sizes_picture import draw_sizes
+from tiler.pictures.picture_parts import add_air, add_city, add_sizes, plan_edges
 from tiler.store.atomic import replacing
 
 # Pictures, and their sizes (pixels) where nothing else is asked for.
@@ -28,8 +30,21 @@ SIZES = {
     "citymodel": (1600, 1000),
 }
 CELL_BY_CELL = ("mesh", "overview", "sizes")  # pictures that show each cell or triangle
+COLOURS = {"tiles": "tile", "quality": "quality"}
 # Length up to which one surface darkens another (m), in regions below 2 km.
 OCCLUSION_RADIUS = 20.0
+CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
+SAMPLES = 2  # pixels drawn along each pixel shown
+LEGEND = 0.1  # share of the picture of sizes that its legend takes
+LEAST_TRIANGLE = 3.0  # pixels that the middle triangle's edges need in the picture of sizes for lines to be drawn
+PROBE = """
+from vtkmodules.vtkRenderingCore import vtkRenderWindow
+import vtkmodules.vtkRenderingOpenGL2
+window = vtkRenderWindow()
+window.SetOffScreenRendering(1)
+window.Render()
+"""
+Image = NDArray[np.uint8]
 
 
 def render_run(
@@ -45,18 +60,18 @@ def render_run(
     Parameters
     ----------
     directory : Path
-        Output of a run: ``boundary.pvtp`` and, for ``"mesh"`` and ``"overview"``, ``mesh.pvtu``.
+        Output of a run: ``boundary.pvtp``, for ``"mesh"``, ``"overview"`` and ``"quality"`` ``mesh.pvtu`` too.
     output : Path
         The PNG file; it appears whole or not at all.
     what : str
-        ``"boundary"``: terrain and houses from the south-west. ``"mesh"``: the same, and behind a cut
+        ``"boundary"``: terrain and buildings from the south-west. ``"mesh"``: the same, and behind a cut
         through the middle the tetrahedra of the northern half. ``"overview"``: both side by side.
         ``"tiles"``: as ``"boundary"``, but coloured by tile: neighbours differ.
         ``"sizes"``: triangles from above, coloured by the length of their edges, and by tile.
         ``"quality"``: as ``"boundary"``, but coloured by the radius ratio of the cell behind each facet.
         ``"citymodel"``: the city model as blocks on its terrain, from the run's store.
     size : (int, int), optional
-        Width and height (pixels); 1600 x 1000, for the overview 2000 x 640, for the sizes 1000 x 1046.
+        Width and height (pixels), at least 2; `SIZES` by default.
     say : callable, optional
         Called with what is not drawn as it is, since the region is large.
 
@@ -65,7 +80,7 @@ def render_run(
     ValueError
         If `what` is none of these, or `size` is less than 2 x 2.
     ConfigError
-        If pyvista or, for ``"quality"`` and ``"citymodel"``, pillow is not installed.
+        If pyvista is not installed, or VTK finds no OpenGL.
     OutputError
         If the picture cannot be written.
     InputError
@@ -74,10 +89,8 @@ def render_run(
 
     Notes
     -----
-    The camera follows from the region alone, but VTK samples the shade between houses at random: two
-    pictures of one run differ by more than 3 of 255 grey levels in some 6 % of the pixels, so their bytes
-    differ. Where VTK has no OpenGL to draw with, the same is painted facet by facet (`plain_picture`).
-    ``"quality"`` and ``"citymodel"`` are painted without VTK (`paint`) and have the same bytes every time.
+    The camera follows from the region alone, but VTK samples the shade between buildings at random: two pictures
+    of one run differ in some pixels.
     Memory is bounded: facets beyond `picture_data.MOST_FACETS` are made coarser, and what is shown cell by
     cell, ``"mesh"``, ``"overview"`` and ``"sizes"``, is the middle of a larger region (`find_middle`).
     Edges fade out as triangles get small on the picture. Everything is moved to the origin first,
@@ -86,131 +99,172 @@ def render_run(
     if what not in SIZES:
         raise ValueError(f"picture {what!r} must be one of {', '.join(SIZES)}")
     columns, rows = size or SIZES[what]
-    least = LEGEND + 2 if what == "quality" else 2
-    if columns < 2 or rows < least:
-        raise ValueError(f"size {columns} x {rows} must be at least 2 x {least}")
-    if what in PAINTED:
-        _save(_paint(directory, what, (columns, rows), say), output)
-        return
-    pv = _pyvista()
-    left = columns // 2
-    panels = (("boundary", left), ("mesh", columns - left)) if what == "overview" else ((what, columns),)
-    # VTK says aloud that there is no display before it takes the way without one.
-    with pv.vtk_verbosity("off"):
-        middle = find_middle(directory) if what in CELL_BY_CELL else None
-        if middle is not None:
-            say(f"of this large region, {len(middle)} tiles around the middle are drawn")
-        city = load_city(directory, only=middle)
-        _tell_step(city, say)
-        if what == "sizes":
-            _save(draw_sizes(city, (columns, rows)), output)
-            return
-        images = [_draw(pv, directory, city, part, (width, rows)) for part, width in panels]
-    _save(np.hstack(images), output)
+    if columns < 2 or rows < 2:
+        raise ValueError(f"size {columns} x {rows} must be at least 2 x 2")
+    need_graphics()
+    image = _draw(directory, what, (columns, rows), say)
+    from PIL import Image as Pictures
+
+    with replacing(output) as part:
+        Pictures.fromarray(image).save(part, format="png", optimize=True)
 
 
-def _paint(directory: Path, what: str, size: tuple[int, int], say: Callable[[str], object]) -> NDArray[np.uint8]:
-    _need_pillow()
-    if what == "citymodel":
-        image, left_out = paint_blocks(directory, size)
-        if left_out:
-            say(left_out)
-        return image
-    city = load_city(directory, quality=True)
-    _tell_step(city, say)
-    return paint_city(city, size, quality=True)
-
-
-def _tell_step(city: City, say: Callable[[str], object]) -> None:
-    if city.step:
-        say(f"of this large region, vertices within {city.step:g} m are drawn as one")
-
-
-def _need_pillow() -> None:
+def need_graphics() -> None:
+    """Raise ConfigError if pyvista is not installed, or VTK cannot draw here."""
     try:
-        import PIL  # noqa: F401
-    except ImportError as error:
-        raise ConfigError("pictures need pillow: pip install citystitch[pictures]") from error
-
-
-def _pyvista() -> ModuleType:
-    try:
-        import pyvista
+        import pyvista  # noqa: F401
     except ImportError as error:
         raise ConfigError("pictures need pyvista: pip install citystitch[pictures]") from error
-    module: ModuleType = pyvista
-    return module
+    if not _has_graphics():
+        raise ConfigError(
+            "pictures need OpenGL, and VTK finds none here: install Mesa, which needs no graphics "
+            "card (Debian, Ubuntu: apt install libegl1 libgl1-mesa-dri; Fedora: dnf install mesa-libEGL; conda: mesalib)"
+        )
 
 
-def _draw(pv: ModuleType, directory: Path, city: City, what: str, size: tuple[int, int]) -> NDArray[np.uint8]:
-    if not has_graphics():
-        return _draw_plainly(directory, city, what, size)
-    plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
-    try:
+@cache
+def _has_graphics() -> bool:
+    """Tell whether VTK can draw here; asked in a process of its own, which VTK brings down where it cannot."""
+    done = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120, check=False)
+    return done.returncode == 0
+
+
+def draw_city(
+    city: City,
+    size: tuple[int, int],
+    *,
+    colours: str = "height",
+    edges: bool = True,
+    air: Any = None,
+    close: bool = False,
+) -> Image:
+    """Draw ground, walls and roofs from the south-west, and the air behind a cut.
+
+    Parameters
+    ----------
+    city : City
+        The boundary or the city model.
+    size : (int, int)
+        Width and height (pixels).
+    colours, edges
+        As for `picture_parts.add_city`.
+    air : pyvista.PolyData, optional
+        From `load_air`.
+    close : bool
+        Show no more than `CLOSE` of the cut, in its middle.
+
+    Returns
+    -------
+    uint8, (height, width, 3)
+        The picture.
+    """
+    with _plotter(size) as plotter:
         plotter.set_background(SKY[0], top=SKY[1])
-        shown = _add_parts(plotter, directory, city, what, size)
-        _light(pv, plotter)
-        _aim(plotter, *_camera(shown, what, size))
         extent = float(np.ptp(city.points[:, :2], axis=0).max())
-        plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=128)
-        plotter.enable_anti_aliasing("ssaa")
-        image: NDArray[np.uint8] = plotter.screenshot(return_img=True)
-    finally:
-        plotter.close()
+        zoom = max(1.0, extent / CLOSE) if close else 1.0
+        full = round(size[0] * zoom), round(size[1] * zoom)  # pixels that all of it would have
+        shown = add_city(plotter, city, full, colours=colours, edges=edges)
+        if air is not None:
+            add_air(plotter, air, full)
+            shown = np.vstack([shown, air.points])
+        if close:
+            half = min(CLOSE, float(np.ptp(shown[:, 0]))) / 2
+            low, top = shown[:, 2].min(), shown[:, 2].max()
+            shown = np.array([(i * half, j * half, z) for i in (-1, 1) for j in (-0.5, 0) for z in (low, top)])
+        _light(plotter)
+        azimuth, elevation = VIEW if air is None else CUT_VIEW
+        plotter.camera.view_angle = VIEW_ANGLE
+        plotter.camera.position, plotter.camera.focal_point = fit_camera(
+            shown,
+            azimuth=azimuth,
+            elevation=elevation,
+            view_angle=VIEW_ANGLE / MARGIN,
+            aspect=size[0] / size[1],
+        )
+        plotter.camera.up = (0.0, 0.0, 1.0)
+        plotter.reset_camera_clipping_range()
+        plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=64)
+        return _shoot(plotter)
+
+
+def draw_sizes(city: City, size: tuple[int, int]) -> Image:
+    """Draw ground and roofs from above, north upwards, coloured by the length of edges, with a legend under them.
+
+    Raises
+    ------
+    InputError
+        If a piece is not named after a tile.
+    """
+    low, high = city.points.min(axis=0), city.points.max(axis=0)
+    height = size[1] * (1 - LEGEND)  # pixels of the map
+    pixel = float(max((high - low)[0] / size[0], (high - low)[1] / height))
+    edges = float(np.median(plan_edges(city)[city.marker != Marker.WALL])) > LEAST_TRIANGLE * pixel
+    with _plotter(size) as plotter:
+        plotter.set_background("white")
+        add_sizes(plotter, city, edges=edges)
+        focal = (low + high) / 2 - [0, (size[1] - height) / 2 * pixel, 0]
+        plotter.camera.parallel_projection = True
+        plotter.camera.parallel_scale = size[1] / 2 * pixel
+        above = np.array([0.0, 0.0, high[2] - low[2] + 1])
+        plotter.camera.position, plotter.camera.focal_point = focal + above, focal
+        plotter.camera.up = (0.0, 1.0, 0.0)
+        plotter.reset_camera_clipping_range()
+        return _shoot(plotter)
+
+
+def _draw(directory: Path, what: str, size: tuple[int, int], say: Callable[[str], object]) -> Image:
+    if what == "citymodel":
+        blocks, n_buildings, n_shown = load_blocks(directory)
+        if n_shown < n_buildings:
+            say(f"the largest {n_shown:,} of {n_buildings:,} building parts are drawn")
+        return draw_city(blocks, size, edges=False)
+    middle = find_middle(directory) if what in CELL_BY_CELL else None
+    if middle is not None:
+        say(f"of this large region, {len(middle)} tiles around the middle are drawn")
+    city = load_city(directory, only=middle, quality=what == "quality")
+    if city.step:
+        say(f"of this large region, vertices within {city.step:g} m are drawn as one")
+    if what == "sizes":
+        return draw_sizes(city, size)
+    if what not in CELL_BY_CELL:
+        return draw_city(city, size, colours=COLOURS.get(what, "height"))
+    air = load_air(directory, city.origin, only=frozenset(city.names))
+    left = size[0] // 2 if what == "overview" else 0
+    cut = draw_city(city, (size[0] - left, size[1]), air=air)
+    return np.hstack([draw_city(city, (left, size[1])), cut]) if left else cut
+
+
+@contextmanager
+def _plotter(size: tuple[int, int]) -> Iterator[Any]:
+    import pyvista
+
+    # VTK says aloud that there is no display before it takes the way without one.
+    with pyvista.vtk_verbosity("off"):
+        window = [SAMPLES * pixels for pixels in size]
+        plotter = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
+        try:
+            yield plotter
+        finally:
+            plotter.close()
+
+
+def _shoot(plotter: Any) -> Image:
+    large = np.asarray(plotter.screenshot(return_img=True), np.float32)
+    rows, columns, channels = large.shape
+    small = large.reshape(rows // SAMPLES, SAMPLES, columns // SAMPLES, SAMPLES, channels).mean(axis=(1, 3))
+    image: Image = np.rint(small).astype(np.uint8)
     return image
 
 
-def _draw_plainly(directory: Path, city: City, what: str, size: tuple[int, int]) -> NDArray[np.uint8]:
-    plotter = PlainPlotter()
-    shown = _add_parts(plotter, directory, city, what, size)
-    position, focal = _camera(shown, what, size)
-    return plotter.paint(position, focal, view_angle=VIEW_ANGLE, size=size, sky=SKY)
-
-
-def _add_parts(plotter: Any, directory: Path, city: City, what: str, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Add what a picture shows; returns the points that it has to hold."""
-    by_tile = what == "tiles"
-    add_houses(plotter, city, size, by_tile=by_tile)
-    shown = [city.points, add_terrain(plotter, city, size, by_tile=by_tile)]
-    if what == "mesh":
-        shown.append(add_air(plotter, load_air(directory, city.origin, only=frozenset(city.names)), size))
-    return np.vstack(shown)
-
-
-def _light(pv: ModuleType, plotter: Any) -> None:
+def _light(plotter: Any) -> None:
     """Sun from the south-east, softer sky light from the west and from above."""
+    import pyvista
+
     for place, strength, colour in (
         ((0.55, -0.85, 1.0), 0.8, "#fff4e0"),
-        ((-1.0, -0.3, 0.5), 0.4, "#dfe9f5"),
+        ((-1.0, -0.3, 0.5), 0.55, "#dfe9f5"),
         ((0.0, 0.0, 1.0), 0.15, "#ffffff"),
     ):
-        light = pv.Light(position=place, focal_point=(0, 0, 0), color=colour, intensity=strength)
+        light = pyvista.Light(position=place, focal_point=(0, 0, 0), color=colour, intensity=strength)
         light.positional = False
         plotter.add_light(light)
-
-
-def _camera(
-    points: NDArray[np.float64], what: str, size: tuple[int, int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    azimuth, elevation = CUT_VIEW if what == "mesh" else VIEW
-    return fit_camera(
-        points,
-        azimuth=azimuth,
-        elevation=elevation,
-        view_angle=VIEW_ANGLE / MARGIN,
-        aspect=size[0] / size[1],
-    )
-
-
-def _aim(plotter: Any, position: NDArray[np.float64], focal: NDArray[np.float64]) -> None:
-    camera = plotter.camera
-    camera.view_angle = VIEW_ANGLE
-    camera.position, camera.focal_point, camera.up = position, focal, (0.0, 0.0, 1.0)
-    plotter.reset_camera_clipping_range()
-
-
-def _save(image: NDArray[np.uint8], output: Path) -> None:
-    from PIL import Image
-
-    with replacing(output) as part:
-        Image.fromarray(image).save(part, format="png", optimize=True)

@@ -43,7 +43,7 @@ def plan_run(
     json_file : Path, optional
         File to write the plan to.
     picture : Path, optional
-        PNG file to draw the plan to.
+        SVG file to draw the plan to.
     console : rich.console.Console, optional
         Where to print.
 
@@ -61,6 +61,8 @@ def plan_run(
     for path in (json_file, picture):
         if path is not None and not path.parent.is_dir():
             raise ConfigError(f"{path}: there is no folder {path.parent}; make it, or choose another")
+    if picture is not None and picture.suffix.lower() != ".svg":
+        raise ConfigError(f"{picture}: the picture of a plan is SVG; name it {picture.with_suffix('.svg').name}")
     survey = survey_inputs(config, say_nothing)
     sample = sample_footprints(config, survey.region, frame=survey.georeference.footprints)
     memory = None if config.on_cluster else machine_memory()
@@ -71,7 +73,7 @@ def plan_run(
         with replacing(json_file) as part:
             part.write_text(json.dumps(plan, indent=1) + "\n")
     if picture is not None:
-        from tiler.pictures.plan_picture import draw_plan
+        from tiler.report.plan_map import draw_plan
 
         draw_plan(survey, sample, picture)
     return plan

@@ -1,6 +1,5 @@
 """The numbers of the report: read from the store tile by tile, added up in arrays of fixed size."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,12 +8,11 @@ from numpy.typing import NDArray
 
 from pipeline.histograms import QUALITY_BINS, Histogram, merge_histograms
 from tiler.citymodels.tables import unpack_polygons
-from tiler.pictures.paint import fill_polygons
 from tiler.report.record import RunFacts
+from tiler.report.svg_map import FootprintRaster
 from tiler.store.store import Store
 
 MAP_PIXELS = 900  # of the longer side of the map of footprints
-MAP_SAMPLES = 2  # looked at along each of them
 HEIGHT_BIN, TERRAIN_BIN = 1.0, 0.1  # m
 NO_HISTOGRAM = np.empty(0, np.int64)
 
@@ -131,18 +129,13 @@ def collect_numbers(store: Store, facts: RunFacts) -> Numbers:
     return Numbers(quality, worst, buildings, terrain, draw_footprints(store, facts.bounds))
 
 
-def draw_footprints(store: Store, bounds: Sequence[float]) -> NDArray[np.uint8]:
+def draw_footprints(store: Store, bounds: tuple[float, float, float, float]) -> NDArray[np.uint8]:
     """Draw the clean footprints of all tiles, as `Numbers.footprints` has them."""
-    width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
-    step = max(width, height) / (MAP_PIXELS * MAP_SAMPLES)
-    rows, columns = (MAP_SAMPLES * max(1, round(side / step / MAP_SAMPLES)) for side in (height, width))
-    image = np.zeros((rows, columns), np.uint8)
+    raster = FootprintRaster(bounds, MAP_PIXELS)
     for name in store.names("houses"):
         arrays: dict[str, NDArray[Any]] = store.read("houses", name, names=("outline", "outline_start"))[0]
-        fill_polygons(image, unpack_polygons(arrays, "outline"), np.array(bounds[:2]), step)
-    shares = image.reshape(rows // MAP_SAMPLES, MAP_SAMPLES, columns // MAP_SAMPLES, MAP_SAMPLES).mean(axis=(1, 3))
-    found: NDArray[np.uint8] = np.rint(shares[::-1] * 255).astype(np.uint8)
-    return found
+        raster.add(unpack_polygons(arrays, "outline"))
+    return raster.shares()
 
 
 def _read_quality(store: Store, name: str) -> dict[str, Histogram]:

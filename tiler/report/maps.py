@@ -1,9 +1,6 @@
 """Maps of the region: tiles coloured by a value over the footprints, as SVG; of many tiles, blocks of some."""
 
-import base64
 import math
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +9,7 @@ from numpy.typing import NDArray
 
 from tiler.report.charts import wrap_svg
 from tiler.report.page import text
+from tiler.report.svg_map import draw_image, draw_scale_bar, encode_png
 
 SIDE = 900.0  # units of the longer side
 MOST_CELLS = 2_500  # rectangles of a map
@@ -149,7 +147,7 @@ def draw_map(
             f"M{(x - west) * scale:.1f} {(north - y) * scale:.1f}h0" for x, y in places[inside].tolist()
         )
         parts.append(f'<path class="{style}" d="{dots}"/>')
-    parts.append(_scale_bar(width, height, scale))
+    parts.append(draw_scale_bar(width, height, scale))
     chart = wrap_svg(title, (round(width, 1), round(height + FOOT, 1)), "".join(parts))
     covered = float(((mapped.box[:, 2:] - mapped.box[:, :2]).prod(axis=1)).sum()) if len(mapped.box) else 0.0
     kinds = {
@@ -187,48 +185,11 @@ def tell(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
-def encode_png(alpha: NDArray[np.uint8], grey: int = 70) -> bytes:
-    """Write a picture of one grey, as opaque as each pixel says, as PNG.
-
-    Parameters
-    ----------
-    alpha : uint8, (rows, columns)
-        Opacity, row 0 at the top.
-    grey : int
-        0 to 255.
-    """
-    rows, columns = alpha.shape
-    lines = np.zeros((rows, 1 + 2 * columns), np.uint8)
-    lines[:, 1::2] = np.where(alpha > 0, grey, 0)
-    lines[:, 2::2] = alpha
-    head = struct.pack(">IIBBBBB", columns, rows, 8, 4, 0, 0, 0)
-    content = b"\x89PNG\r\n\x1a\n"
-    for kind, data in ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b"")):
-        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    return content
-
-
 def _footprints(footprints: NDArray[np.uint8] | None, width: float, height: float) -> str:
     if footprints is None:
         return f'<use href="#{FOOTPRINTS}"/>'
-    data = base64.b64encode(encode_png(footprints)).decode()
-    return (
-        f'<image id="{FOOTPRINTS}" class="footprints" width="{width:.1f}" height="{height:.1f}" '
-        f'preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
-    )
-
-
-def _scale_bar(width: float, height: float, scale: float) -> str:
-    about = 0.3 * width / scale
-    power = 10.0 ** math.floor(math.log10(about))
-    length = max(step for step in (1.0, 2.0, 5.0) if step * power <= about) * power
-    words = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
-    end = 2 + length * scale
-    return (
-        f'<path class="scale" d="M2 {height + 8:.1f}v8H{end:.1f}v-8"/>'
-        f'<text x="{end + 8:.1f}" y="{height + 26:.1f}">{words}</text>'
-        f'<text x="{width - 4:.1f}" y="{height + 26:.1f}" text-anchor="end">north is up</text>'
-    )
+    attributes = f'id="{FOOTPRINTS}" class="footprints"'
+    return draw_image(encode_png(footprints), (width, height), attributes)
 
 
 def _legend(limits: tuple[float, float], unit: str, keys: Sequence[tuple[str, str]]) -> str:

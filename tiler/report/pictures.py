@@ -1,4 +1,4 @@
-"""Pictures of the mesh for the report: painted, compressed, and put into the page."""
+"""Pictures of the mesh for the report: drawn, compressed, and put into the page."""
 
 import base64
 from collections.abc import Iterator
@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.pictures.painted_pictures import light_city, paint_city, paint_cut
-from tiler.pictures.picture_data import find_middle, load_city
+from pipeline.errors import ConfigError
+from tiler.pictures.picture_data import find_middle, load_air, load_city
+from tiler.pictures.render import draw_city, need_graphics
 from tiler.report.page import figure, paragraph, text
 
 SIZE = (1120, 700)
 QUALITY = 84  # of JPEG
-MISSING = "There are no pictures: they need pillow (pip install citystitch[pictures])."
 
 
 def tell_pictures(directory: Path) -> Iterator[str]:
@@ -31,25 +31,25 @@ def tell_pictures(directory: Path) -> Iterator[str]:
         If a file of the run is missing or damaged.
     """
     try:
-        import PIL  # noqa: F401
-    except ImportError:
-        yield paragraph(MISSING, "bad")
+        need_graphics()
+    except ConfigError as error:
+        yield paragraph(f"There are no pictures: {error}.", "bad")
         return
     city = load_city(directory, quality=True)
-    lighting = light_city(city)
     coarse = f" Vertices within {city.step:g} m are drawn as one." if city.step else ""
     yield _embed(
-        paint_city(city, SIZE, lighting=lighting),
+        draw_city(city, SIZE),
         f"The boundary from the south-west: ground by height, roofs by height above ground.{coarse}",
     )
     middle = find_middle(directory)
-    if middle is None and not city.step:
-        image = paint_cut(directory, city, SIZE, lighting=lighting)
-    else:
-        image = paint_cut(directory, load_city(directory, only=middle), SIZE)
-    yield _embed(image, "The mesh in the middle of the region, cut open from west to east.")
+    part = city if middle is None and not city.step else load_city(directory, only=middle)
+    air = load_air(directory, part.origin, only=frozenset(part.names))
     yield _embed(
-        paint_city(city, SIZE, quality=True, lighting=lighting),
+        draw_city(part, SIZE, air=air, close=True),
+        "The mesh in the middle of the region, cut open from west to east.",
+    )
+    yield _embed(
+        draw_city(city, SIZE, colours="quality"),
         f"Radius ratio of the cell behind each facet of the boundary, the darker the worse.{coarse}",
     )
 
