@@ -17,7 +17,6 @@ WAITING = {
     "pipeline/kernel_library.py",
     "tiler/executors/fork_server.py",
     "tiler/executors/numba_registry.py",
-    "tiler/jobs/jobqueue.py",
     "tiler/store/zarr_files.py",
 }
 

@@ -22,7 +22,7 @@ from tiler.executors.importing import uncollected
 from tiler.executors.kept_memory import keep_memory, look_seldom
 from tiler.formats.export import FORMATS, refuse_strangers
 from tiler.interface.api import with_file
-from tiler.jobs.commands import describe_job, find_run, job_line
+from tiler.jobs.submission import describe_job, find_run, job_line
 from tiler.objects.places import place, refuse_bucket
 from tiler.words.plain_text import printable
 from tiler.words.std_streams import guard_streams
