@@ -1,4 +1,4 @@
-"""Workers that come and go with their jobs: tasks outlive them, and jobs without a worker are found."""
+"""Workers that come and go with their jobs: tasks outlive them, and jobs that are gone are replaced."""
 
 import asyncio
 import os
@@ -18,9 +18,9 @@ from tiler.engine.task import Task
 from tiler.engine.task_limits import Limits
 from tiler.executors.dask_executor import ClusterError
 from tiler.executors.dask_settings import ENVIRONMENT, METHOD, start_fork_server
-from tiler.jobs.jobqueue import LOSSES, SETTINGS, UNBORN, QueuedDask, _Jobs, read_worker_jobs
-from tiler.jobs.queues import QueueError
-from tiler.jobs.table import Cluster
+from tiler.jobs.cluster import QueueError
+from tiler.jobs.submission import read_worker_jobs
+from tiler.jobs.workers import FAILURES, LOSSES, SETTINGS, JobDask, WorkerJobs
 
 HERE: dict[str, Any] = {  # workers that begin quickly, and again as often as they end
     "distributed.deploy.lost-worker-timeout": "3650 days",
@@ -61,7 +61,7 @@ def retires_its_worker(task: Task) -> Facts:
 
 
 @contextmanager
-def queued(workers: int = 2, broken: str = "") -> Iterator[QueuedDask]:
+def queued(workers: int = 2, error: str = "") -> Iterator[JobDask]:
     """Make the executor over workers of this machine."""
     from dask import config
     from distributed import Client, LocalCluster
@@ -75,8 +75,8 @@ def queued(workers: int = 2, broken: str = "") -> Iterator[QueuedDask]:
         ) as cluster,
         Client(cluster) as client,
     ):  # fmt: skip
-        jobs: Any = SimpleNamespace(broken=broken)
-        yield QueuedDask(client, Cluster(), Limits(), cluster.scheduler, jobs)
+        jobs: Any = SimpleNamespace(error=error)
+        yield JobDask(client, 16, Limits(), cluster.scheduler, jobs)
 
 
 @pytest.mark.long
@@ -103,7 +103,7 @@ def test_a_task_on_a_retiring_worker_is_not_lost(tmp_path: Path) -> None:
 def test_workers_that_never_come_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tiler.executors.dask_executor.LOOK", 0.2)
     with (
-        queued(workers=0, broken="5 worker jobs in a row ended before their worker was there") as executor,
+        queued(workers=0, error="5 worker jobs in a row ended before their worker was there") as executor,
         pytest.raises(ClusterError, match="5 worker jobs in a row"),
     ):
         make(tmp_path, executor).run(Stage("dies", Scope.REGION, dies))
@@ -120,64 +120,85 @@ class FakeJob:
         self.closed = True
 
 
-class FakeQueue:
+class FakeSystem:
     """A batch system of which some jobs are alive."""
 
     def __init__(self) -> None:
         self.alive: set[str] = set()
         self.answers = True
 
-    def states(self, jobs: Sequence[str]) -> dict[str, str]:
+    def states(self) -> dict[str, str]:
         if not self.answers:
             raise QueueError("no answer")
-        return {job: "R" for job in jobs if job in self.alive}
+        return dict.fromkeys(self.alive, "R")
 
-    def is_alive(self, state: str | None) -> bool:
-        return state == "R"
+
+class FakeCluster:
+    """What the worker jobs see of a cluster of dask-jobqueue, whose scheduler wants three workers."""
+
+    def __init__(self) -> None:
+        self.workers: dict[str, FakeJob] = {}
+        self.observed: set[str] = set()
+        self.scheduler_comm = self
+        self.loop = SimpleNamespace(time=lambda: 1000.0)
+
+    async def scale_down(self, names: Sequence[str]) -> None:
+        for name in names:
+            await self.workers.pop(name).close()
+
+    async def adaptive_target(self, target_duration: float) -> int:
+        return 3
+
+
+def worker_jobs(tmp_path: Path, processes: int = 1) -> tuple[WorkerJobs, Any, FakeSystem]:
+    cluster, system = FakeCluster(), FakeSystem()
+    (tmp_path / "job").mkdir()
+    jobs = WorkerJobs(cluster, system, tmp_path / "job", processes, interval="0 s")  # type: ignore[arg-type]
+    return jobs, cluster, system
 
 
 def test_jobs_that_are_gone_are_given_up_and_others_kept(tmp_path: Path) -> None:
-    cluster, queue = SimpleNamespace(workers={}, observed=set(), _futures=set()), FakeQueue()
-    jobs: Any = _Jobs(cluster, queue, tmp_path)  # type: ignore[arg-type]
+    jobs, cluster, system = worker_jobs(tmp_path)
     waits, runs, gone, refused = FakeJob("1"), FakeJob("2"), FakeJob("3"), FakeJob(None)
     cluster.workers = {"C-1": waits, "C-2": runs, "C-3": gone, "C-4": refused}
-    cluster.observed, queue.alive = {"C-2-0", "C-30"}, {"1", "2"}
-
-    async def look(times: int) -> None:
-        for _ in range(times):
-            await jobs.look()
-        await asyncio.gather(*cluster._futures)
-
-    queue.answers = False
-    asyncio.run(look(3))
+    cluster.observed, system.alive = {"C-2-0", "C-30"}, {"1", "2"}
+    system.answers = False
+    for _ in range(3):
+        asyncio.run(jobs.look())
     assert len(cluster.workers) == 4  # nobody knows
-    queue.answers = True
-    asyncio.run(look(1))
+    system.answers = True
+    asyncio.run(jobs.look())
     assert len(cluster.workers) == 4  # a job may just have been submitted
-    cluster._futures.clear()
-    asyncio.run(look(1))
+    asyncio.run(jobs.look())
     assert cluster.workers == {"C-1": waits, "C-2": runs}
     assert gone.closed
-    assert read_worker_jobs(tmp_path) == ["1", "2", "3"]
-    assert jobs.broken == ""
+    assert read_worker_jobs(tmp_path) == {"1", "2", "3"}
+    asyncio.run(jobs.look())
+    assert read_worker_jobs(tmp_path) == {"1", "2"}
+    assert jobs.error == ""
 
 
-@pytest.mark.parametrize("born", [False, True])
-def test_only_jobs_without_a_worker_count_as_failures(born: bool, tmp_path: Path) -> None:
-    cluster, queue = SimpleNamespace(workers={}, observed=set(), _futures=set()), FakeQueue()
-    jobs: Any = _Jobs(cluster, queue, tmp_path)  # type: ignore[arg-type]
+@pytest.mark.parametrize("with_worker", [False, True])
+def test_only_jobs_without_a_worker_count_as_failures(with_worker: bool, tmp_path: Path) -> None:
+    jobs, cluster, system = worker_jobs(tmp_path)
 
     async def fail(number: int) -> None:
         cluster.workers = {"C-1": FakeJob(str(number))}
-        cluster.observed = {"C-1"} if born else set()
-        queue.alive = {str(number)}
+        cluster.observed = {"C-1"} if with_worker else set()
+        system.alive = {str(number)}
         await jobs.look()
-        cluster.observed, queue.alive = set(), set()
+        cluster.observed, system.alive = set(), set()
         await jobs.look()
         await jobs.look()
         assert cluster.workers == {}
 
-    for number in range(UNBORN):
-        assert jobs.broken == ""
+    for number in range(FAILURES):
+        assert jobs.error == ""
         asyncio.run(fail(number))
-    assert bool(jobs.broken) is not born
+    assert bool(jobs.error) is not with_worker
+
+
+@pytest.mark.parametrize(("processes", "workers"), [(1, 3), (2, 4), (5, 5)])
+def test_the_number_of_workers_is_one_of_whole_jobs(processes: int, workers: int, tmp_path: Path) -> None:
+    jobs, _, _ = worker_jobs(tmp_path, processes)
+    assert asyncio.run(jobs.target()) == workers

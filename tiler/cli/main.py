@@ -19,7 +19,7 @@ from tiler.cli.parser import EXPORT_OPTION, Handler, build_parser
 from tiler.config.config import Config, annotated_defaults, make_config
 from tiler.executors.dask_settings import GARBAGE, start_fork_server
 from tiler.interface.api import with_file
-from tiler.jobs.commands import describe_job, find_run, job_line
+from tiler.jobs.submission import describe_job, find_run, job_line
 from tiler.mesh_files.run_files import refuse_strangers
 from tiler.objects.places import place, refuse_bucket
 from tiler.words.plain_text import printable

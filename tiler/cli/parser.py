@@ -13,7 +13,7 @@ from tiler.config.domain_height import Height
 from tiler.executors.dask_settings import ANYWHERE
 from tiler.export.export import list_formats, load_format
 from tiler.interface.api import POSITIONAL
-from tiler.jobs.commands import add_job_commands
+from tiler.jobs.submission import add_job_commands
 from tiler.objects.places import place, refuse_bucket
 from tiler.words.did_you_mean import Parser
 

@@ -1,1 +1,1 @@
-"""Runs as jobs of a batch system: the cluster's table, submission, the controller, and workers as jobs."""
+"""Runs as jobs of a batch system: submission, the controller's job, and workers as further jobs."""

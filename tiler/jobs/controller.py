@@ -1,4 +1,4 @@
-"""What the job of a run's driver does: run, hand over to a next job before its time is up, know when to end."""
+"""The job of a run's driver: it runs the driver, and ends before its walltime; the next job goes on."""
 
 import signal
 import subprocess
@@ -6,22 +6,11 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
-from pipeline.errors import CityError
-from tiler.jobs.jobqueue import JOB
-from tiler.jobs.queues import QUEUES, STOP_SIGNAL, QueueError
-from tiler.jobs.submission import (
-    SCRIPT,
-    TABLE,
-    JobRecord,
-    count_results,
-    now,
-    read_record,
-    run_words,
-    write_record,
-)
-from tiler.jobs.table import Cluster, read_cluster
+from pipeline.errors import CityError, InputError
+from tiler.jobs.cluster import Cluster, QueueError, read_cluster
+from tiler.jobs.submission import DESCRIPTION, JOB, PARAMETERS, SCRIPT, change_record, is_cancelled, read_record
+from tiler.monitoring.status import read_status
 
 FINAL = {0: "done", 2: "wrong configuration", 3: "done but for parts"}  # exit codes after which none follows
 POLL = 1.0  # s
@@ -29,126 +18,104 @@ FAILED, STOPPED = 1, 130  # exit codes; a driver ends with the second where it w
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the job of the run in a folder; returns the exit code of the job.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        The folder; those of the process if not given.
-    """
-    (place,) = sys.argv[1:] if arguments is None else arguments
+    """Run the job of the run in a folder, which is the one argument; returns the exit code of the job."""
+    (folder,) = sys.argv[1:] if arguments is None else arguments
     try:
-        return Controller(Path(place)).run()
+        return run_job(Path(folder))
     except CityError as error:
         print(f"citystitch: {error}", file=sys.stderr)
         return error.exit_code
 
 
-class Controller:
-    """The job of a driver.
+def run_job(out: Path) -> int:
+    """Run to the end of the run, or of the time of this job; returns the exit code of the job.
 
-    The next job is submitted before the driver is asked to stop, to begin when this one has ended: a driver that
-    stops too slowly, and is killed, has its successor in the queue already.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the run.
+    The next job is submitted at once, to begin when this one has ended, for whatever reason; it is cancelled when
+    there is nothing left to do.
     """
+    folder = out / JOB
+    cluster = read_cluster(folder / DESCRIPTION)
+    end = time.monotonic() + cluster.controller.walltime - cluster.controller.margin
+    told: list[int] = []  # signals
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, _: told.append(number))
+    if is_cancelled(out) or not _makes_progress(out, cluster.controller.resubmissions):
+        return FAILED
+    _submit_next(out, cluster)
+    words = ["run", folder / PARAMETERS, "--out", out, "--cluster", folder / DESCRIPTION]
+    driver = subprocess.Popen([sys.executable, "-m", "tiler.cli.main", *map(str, words)])
+    reason = ""  # why the driver was asked to stop
+    while driver.poll() is None:
+        if not reason and (told or time.monotonic() >= end):
+            reason = "told" if told else "time"
+            if told:
+                _cancel_next(out, cluster)  # now: a system that kills this job soon must not begin the next one
+            driver.terminate()
+        time.sleep(POLL)
+    code = driver.returncode
+    if code in FINAL:
+        return _end(out, cluster, FINAL[code], code)
+    if is_cancelled(out) or (code == STOPPED and reason != "time"):
+        return _end(out, cluster, "cancelled", code)
+    _say("the time of this job is nearly up" if reason == "time" else f"the driver ended with {code}")
+    if not read_record(out).following and not _submit_next(out, cluster):
+        return _end(out, cluster, "failed", FAILED)
+    change_record(out, state="handed over")
+    return 0
 
-    def __init__(self, out: Path) -> None:
-        self._out = out
-        self._table: Cluster = read_cluster(out / JOB / TABLE)
-        record = read_record(out)
-        if record is None:
-            raise CityError(f"{out}: has no job; citystitch submit begins one")
-        self._record: JobRecord = record
-        self._queue = QUEUES[self._table.type]
-        self._warned = self._told_to_end = False
 
-    def run(self) -> int:
-        """Run to the end of the run, or of the time of this job."""
-        end = time.monotonic() + self._table.controller.walltime - self._table.controller.margin
-        for number in (getattr(signal, f"SIG{STOP_SIGNAL}"), signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._handle)
-        if self._is_cancelled() or not self._makes_progress():
-            return FAILED
-        driver = subprocess.Popen([sys.executable, "-m", "tiler.cli.main", *run_words(self._out)])
-        handed_over = False
-        while driver.poll() is None:
-            if self._told_to_end:
-                driver.terminate()
-                self._told_to_end = False
-            if not handed_over and (self._warned or time.monotonic() >= end):
-                _say("the time of this job is nearly up; the next one goes on")
-                handed_over = self._submit_next(after=True)
-                driver.terminate()
-                end = float("inf")
-            time.sleep(POLL)
-        return self._finish(driver.wait(), handed_over=handed_over)
-
-    def _finish(self, code: int, *, handed_over: bool) -> int:
-        if code in FINAL:
-            return self._end(FINAL[code], code, handed_over=handed_over)
-        if self._is_cancelled() or (code == STOPPED and not handed_over):
-            return self._end("cancelled", code, handed_over=handed_over)
-        if not handed_over:
-            _say(f"the driver ended with {code}")
-            if not self._submit_next(after=False):
-                return self._end("failed", FAILED, handed_over=False)
+def count_results(out: Path) -> int:
+    """Count the results of the run in a folder; 0 where none is known."""
+    try:
+        return sum(int(stage["done"]) for stage in read_status(out)["stages"].values())
+    except InputError:
         return 0
 
-    def _end(self, state: str, code: int, *, handed_over: bool) -> int:
-        if handed_over:
-            self._queue.cancel([self._record.job])
-        self._write(state=state)
-        _say(f"{state}; no job follows")
-        return code if code >= 0 else FAILED
 
-    def _makes_progress(self) -> bool:
-        """Count the jobs in a row that add nothing; tell whether there may be one more."""
-        results = count_results(self._out)
-        again = bool(self._record.earlier)
-        idle = self._record.idle + 1 if again and results <= self._record.best else 0
-        self._write(state="running", best=max(results, self._record.best), idle=idle)
-        bound = self._table.controller.resubmissions
-        if idle <= bound:
-            return True
-        _say(f"{idle} jobs in a row added no result, bound {bound}; look at their logs, then submit again")
-        self._write(state="given up")
-        return False
-
-    def _submit_next(self, *, after: bool) -> bool:
-        """Submit the next job, to begin after the end of this one or at once; tell whether that was done."""
-        if self._is_cancelled():
-            return False
-        this = self._record.job
-        try:
-            job = self._queue.submit(self._out / JOB / SCRIPT, after=this if after else "")
-        except QueueError as error:
-            _say(f"no next job: {error}")
-            return False
-        _say(f"the next job is {job}")
-        self._write(job=job, earlier=(*self._record.earlier, this), state="handed over")
+def _makes_progress(out: Path, bound: int) -> bool:
+    """Note that this job begins, and with how many results; tell whether one of the last jobs has added any."""
+    results = (*read_record(out).results, count_results(out))
+    change_record(out, state="running", results=results)
+    earlier, last = results[: -bound - 1], results[-bound - 1 :]
+    if not earlier or max(last) > max(earlier):
         return True
+    _say(f"{bound + 1} jobs in a row added no result, bound {bound}; look at their logs, then submit again")
+    change_record(out, state="given up")
+    return False
 
-    def _is_cancelled(self) -> bool:
-        record = read_record(self._out)
-        return record is not None and record.state == "cancelled"
 
-    def _write(self, **values: object) -> None:
-        self._record = self._record.change(**values)
-        write_record(self._out, self._record)
+def _submit_next(out: Path, cluster: Cluster) -> bool:
+    """Submit the next job, to begin after the end of this one; tell whether that was done."""
+    record = read_record(out)
+    try:
+        job = cluster.system.submit(out / JOB / SCRIPT, after=record.job)
+    except QueueError as error:
+        _say(f"no next job: {error}")
+        return False
+    change_record(out, jobs=(*record.jobs, job))
+    if is_cancelled(out):  # meanwhile
+        _cancel_next(out, cluster)
+        return False
+    _say(f"the next job is {job}")
+    return True
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if number in (signal.SIGTERM, signal.SIGINT):
-            self._told_to_end = True
-        else:
-            self._warned = True
+
+def _cancel_next(out: Path, cluster: Cluster) -> None:
+    record = read_record(out)
+    if record.following:
+        cluster.system.cancel([record.following])
+        change_record(out, jobs=record.jobs[:-1])
+
+
+def _end(out: Path, cluster: Cluster, state: str, code: int) -> int:
+    _cancel_next(out, cluster)
+    change_record(out, state=state)
+    _say(f"{state}; no job follows")
+    return code if code >= 0 else FAILED
 
 
 def _say(text: str) -> None:
-    print(f"citystitch: {now()}: {text}", flush=True)
+    print(f"citystitch: {time.strftime('%Y-%m-%d %H:%M:%S')}: {text}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,88 +1,88 @@
-"""A run as jobs of a batch system: its scripts, what its folder remembers of it, and how to ask for and end it."""
+"""A run as a job of a batch system: `citystitch submit | cancel | logs`, and what `status` tells of jobs."""
 
+import argparse
 import dataclasses
 import json
 import os
-import re
 import shlex
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError, InputError
-from tiler.config.config import Config, write_config
-from tiler.jobs.jobqueue import JOB, NANNY, begin_words, python_words, read_worker_jobs, worker_script
-from tiler.jobs.queues import QUEUES, STOP_SIGNAL, JobSize, Queue, QueueError
-from tiler.jobs.table import Cluster, read_cluster
-from tiler.objects.places import absolute
+from tiler.config.config import Config, make_config, write_config
+from tiler.jobs.cluster import SYSTEMS, Cluster, QueueError, read_cluster
+from tiler.objects.places import absolute, in_bucket, place
 from tiler.store.atomic import replacing
+from tiler.words.plain_text import printable
 
-RECORD, TABLE, PARAMETERS, SCRIPT = "job.json", "cluster.toml", "run.toml", "job.sh"
-LOGS = "logs"
+JOB = "job"  # folder in that of a run, with all that its jobs need and print
+RECORD, DESCRIPTION, PARAMETERS, SCRIPT, LOGS = "job.json", "cluster.toml", "run.toml", "job.sh", "logs"
+WORKER_JOBS = "workers.json"  # numbers of the worker jobs that wait or run
 CANCELLED = "cancelled"  # an empty file: whoever writes the record at that moment does not undo it
-NUMBER = re.compile(r"\d+(\[\])?(\.[\w.-]+)?")
-LIVING = ("submitted", "running", "handed over")  # how a job may stand that is not over
+NAME, WORKER_NAME = "citystitch", "citystitch-worker"  # of jobs
+EVERY = 1.0  # s between two looks at logs that are followed
+JOB_HELP = "number of a job, or folder of its run"
+
+Command = Callable[[str, Callable[[argparse.Namespace], int], str], argparse.ArgumentParser]
 
 
 @dataclass(frozen=True)
 class JobRecord:
-    """What the folder of a run remembers of its job.
+    """What the folder of a run remembers of its job."""
 
-    Attributes
-    ----------
-    type : str
-        Batch system.
-    job : str
-        Number of the job that was submitted last.
-    earlier : tuple of str
-        Those before it.
-    state : str
-        ``"submitted"``, ``"running"``, ``"handed over"``, ``"cancelled"``, or how it ended.
-    array : int
-        Number of elements; 0 for a controller with workers.
-    best : int
-        Results that were there when a controller last began.
-    idle : int
-        Controllers in a row that added none.
-    """
+    type: str  # batch system
+    jobs: tuple[str, ...]  # numbers of the jobs, one after the other
+    state: str = "submitted"  # "running", "handed over", "cancelled", or how it ended
+    results: tuple[int, ...] = ()  # how many there were when each of the jobs that have begun did so
 
-    type: str
-    job: str
-    earlier: tuple[str, ...] = ()
-    state: str = "submitted"
-    array: int = 0
-    best: int = 0
-    idle: int = 0
+    @property
+    def job(self) -> str:
+        """Number of the job that began last, or waits as the first one."""
+        return self.jobs[max(len(self.results) - 1, 0)]
 
-    def change(self, **values: Any) -> "JobRecord":
-        """Return it with other values."""
-        return dataclasses.replace(self, **values)
+    @property
+    def following(self) -> str:
+        """Number of the job that begins when that one has ended; empty for none."""
+        return "".join(self.jobs[max(len(self.results), 1) :])
 
 
-def submit(config: Config, *, array: int = 0, dry_run: bool = False) -> str:
-    """Submit a run as a job, with workers as further jobs, or as an array of jobs without them.
+def add_job_commands(command: Command, add_parameters: Callable[[argparse.ArgumentParser], None]) -> None:
+    """Add the commands; `add_parameters` adds point clouds and parameters of a run."""
+    submit = command("submit", _submit, "submit a run to a cluster's batch system: SLURM, PBS, SGE or LSF")
+    submit.add_argument("--dry-run", action="store_true", help="print the scripts, and submit nothing")
+    add_parameters(submit)
+    cancel = command("cancel", _cancel, "cancel the job of a run and its workers; what is done is kept")
+    cancel.add_argument("job", metavar="JOB", help=JOB_HELP)
+    logs = command("logs", _logs, "print what the jobs of a run have printed")
+    logs.add_argument("job", metavar="JOB", help=JOB_HELP)
+    logs.add_argument("--workers", action="store_true", help="those of workers too")
+    logs.add_argument("-f", "--follow", action="store_true", help="go on as long as there is more, until Ctrl-C")
 
-    Parameters
-    ----------
-    config : Config
-        Parameters of the run; ``cluster`` is the file that describes the cluster.
-    array : int
-        Number of elements of an array, each of which runs `citystitch join`; 0 for a controller with workers.
-    dry_run : bool
-        Write and submit nothing.
 
-    Returns
-    -------
-    str
-        What the user should read: the number of the job, or the scripts.
+def find_run(job: str) -> Path:
+    """Folder of a run, by itself or by the number of its job; InputError for an unknown number."""
+    number = job.partition(".")[0]
+    if Path(job).is_dir() or not number.isdigit():
+        return place(job)
+    try:
+        return Path((_folders() / number).read_text().strip())
+    except OSError as error:
+        raise InputError(
+            f"{job}: no job of yours that was submitted from this account; give the folder of its run"
+        ) from error
+
+
+def submit(config: Config, *, dry_run: bool = False) -> str:
+    """Submit a run as a job; returns what the user should read. A dry run writes nothing and returns the scripts.
 
     Raises
     ------
     ConfigError
-        If the description of the cluster is wrong, the folder has a job that is not over, or ``overwrite`` is
-        asked for: every job goes on with what the one before has left.
+        If the cluster's description is wrong, the folder has a job that is not over, or it is to be overwritten.
     QueueError
         If the batch system refuses the job.
     """
@@ -90,216 +90,169 @@ def submit(config: Config, *, array: int = 0, dry_run: bool = False) -> str:
         raise ConfigError("submit: no cluster is described; give --cluster FILE.toml, see deploy/slurm/slurm.toml")
     if config.overwrite:
         raise ConfigError("--overwrite: each job would begin anew; remove the folder, or give another --out")
-    table = read_cluster(Path(config.cluster))
-    out = Path(os.path.abspath(config.out))
-    folder = out / JOB
-    script = array_script(table, out, array) if array else controller_script(table, out)
+    cluster, out = read_cluster(Path(config.cluster)), Path(config.out).absolute()
+    script = controller_script(cluster, out)
     if dry_run:
-        scripts = {f"# {folder / SCRIPT}": script}
-        scripts |= {} if array else {"# a worker, as dask-jobqueue submits it": worker_script(table, folder)}
-        return "\n".join(f"{title}\n{text}" for title, text in scripts.items()).rstrip()
-    earlier = read_record(out)
-    if earlier is not None and _is_alive(earlier):
-        raise ConfigError(f"{out}: job {earlier.job} is not over; citystitch cancel {out}, or give another --out")
+        from tiler.jobs.workers import worker_script
+
+        worker = worker_script(cluster, out / JOB)
+        return f"# {out / JOB / SCRIPT}\n{script}\n# a worker, as dask-jobqueue submits it\n{worker}".rstrip()
+    if (out / JOB / RECORD).exists() and (living := living_jobs(read_record(out))):
+        raise ConfigError(f"{out}: job {living[0]} is not over; citystitch cancel {out}, or give another --out")
     _write_files(config, out, script)
-    job = QUEUES[table.type].submit(folder / SCRIPT)
-    write_record(out, JobRecord(table.type, job, array=array))
+    job = cluster.system.submit(out / JOB / SCRIPT)
+    write_record(out, JobRecord(cluster.type, (job,)))
     return f"job {job}; citystitch status {job} tells how far it is"
 
 
-def controller_script(table: Cluster, out: Path) -> str:
-    """Script of the job that runs the driver; the signal is ignored until the driver listens to it."""
-    size = JobSize(
-        "citystitch",
-        out / JOB / LOGS / "controller-{job}.log",
-        table.controller.walltime,
-        int(table.controller.memory * 2**30),
-        table.controller.cores,
-        table.controller.options,
-        warn=table.controller.margin,
-    )
-    command = f"exec {python_words(table)} -m tiler.jobs.controller {shlex.quote(str(out))}"
-    lines = [*QUEUES[table.type].header(table, size), "", f"trap '' {STOP_SIGNAL}", *begin_words(table), command]
-    return "\n".join(lines) + "\n"
+def controller_script(cluster: Cluster, out: Path) -> str:
+    """Script of the job that runs the driver."""
+    options = cluster.job_options(NAME, cluster.controller, out / JOB / LOGS)
+    job = cluster.system.cluster_class().job_cls(name=NAME, **options)
+    command = f"exec {cluster.command} -m tiler.jobs.controller {shlex.quote(str(out))}"
+    return "\n".join([job.shebang, "", job.job_header, *cluster.prologue, command]) + "\n"
 
 
-def array_script(table: Cluster, out: Path, n: int) -> str:
-    """Script of an array of jobs that share the tiles of a run through its folder alone."""
-    worker = table.worker
-    size = JobSize(
-        "citystitch",
-        out / JOB / LOGS / "member-{job}-{member}.log",
-        worker.walltime,
-        worker.processes * int(worker.memory * 2**30) + NANNY,
-        worker.processes,
-        worker.options,
-        warn=worker.margin,
-        array=n,
-    )
-    words = ["join", str(out / JOB / PARAMETERS), "--out", str(out)]
-    words += ["--workers", str(worker.processes), "--memory-limit", f"{worker.memory:g}"]
-    command = f"exec {python_words(table)} -m tiler.cli.main {shlex.join(words)}"
-    lines = [*QUEUES[table.type].header(table, size), "", *begin_words(table), command]
-    return "\n".join(lines) + "\n"
-
-
-def run_words(out: Path) -> list[str]:
-    """Words behind ``citystitch`` that run what was submitted."""
-    folder = out / JOB
-    return ["run", str(folder / PARAMETERS), "--out", str(out), "--cluster", str(folder / TABLE)]
-
-
-def find_folder(job: str) -> Path:
-    """Folder of a run, by itself or by the number of its job.
-
-    Raises
-    ------
-    InputError
-        If it is neither.
-    """
-    if Path(job).is_dir() or not NUMBER.fullmatch(job):
-        return Path(job)
-    try:
-        return Path((_places() / job).read_text().strip())
-    except OSError as error:
-        raise InputError(
-            f"{job}: no job of yours that was submitted from this account; give the folder of its run"
-        ) from error
-
-
-def read_record(out: Path) -> JobRecord | None:
-    """What a folder remembers of its job; None where there was none.
-
-    Raises
-    ------
-    InputError
-        If the file is damaged.
-    """
+def read_record(out: Path) -> JobRecord:
+    """What a folder remembers of its job; InputError where it has none, or a damaged file."""
     path = out / JOB / RECORD
     try:
         values = json.loads(path.read_bytes())
-        values["earlier"] = tuple(values["earlier"])
-        record = JobRecord(**values)
-        if record.type not in QUEUES:
+        record = JobRecord(**values | {name: tuple(values[name]) for name in ("jobs", "results")})
+        if record.type not in SYSTEMS or not record.job:
             raise ValueError(record.type)
-        if (path.parent / CANCELLED).exists():
-            record = record.change(state="cancelled")
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{out}: has no job; give the number of a job, or the folder of a run that was submitted"
+        ) from error
+    except (OSError, ValueError, TypeError, LookupError) as error:
         raise InputError(f"{path}: is damaged ({error!r}); remove it, and submit again") from error
-    return record
+    return dataclasses.replace(record, state="cancelled") if is_cancelled(out) else record
+
+
+def is_cancelled(out: Path) -> bool:
+    """Tell whether `cancel` was asked for."""
+    return (out / JOB / CANCELLED).exists()
 
 
 def write_record(out: Path, record: JobRecord) -> None:
     """Remember a job in its folder, and where that is by its number."""
     with replacing(out / JOB / RECORD, durable=True) as part:
         part.write_text(json.dumps(dataclasses.asdict(record), indent=1) + "\n")
-    places = _places()
-    places.mkdir(parents=True, exist_ok=True)
-    (places / record.job).write_text(f"{out}\n")
+    _folders().mkdir(parents=True, exist_ok=True)
+    (_folders() / record.jobs[-1]).write_text(f"{out}\n")
 
 
-def tell_job(out: Path) -> dict[str, Any] | None:
-    """Tell how the job of a run stands: its record, and ``queue``, the batch system's own word for its state."""
-    record = read_record(out)
-    if record is None:
+def change_record(out: Path, **values: Any) -> None:
+    """Change what a folder remembers of its job."""
+    write_record(out, dataclasses.replace(read_record(out), **values))
+
+
+def living_jobs(record: JobRecord) -> list[str]:
+    """Those jobs of a record that wait or run, the last one first."""
+    states = SYSTEMS[record.type].states()
+    return [job for job in reversed(record.jobs) if job in states]
+
+
+def describe_job(out: Path) -> dict[str, Any] | None:
+    """Tell how the job of a run stands: its record, its state in the ``queue``, ``workers``; None without one."""
+    if in_bucket(out) or not (out / JOB / RECORD).exists():
         return None
+    record = read_record(out)
+    told = dataclasses.asdict(record) | {"job": record.job}
     try:
-        queue = QUEUES[record.type].states([record.job]).get(record.job, "")
-        workers = _living(QUEUES[record.type], read_worker_jobs(out / JOB))
+        states = SYSTEMS[record.type].states()
     except QueueError as error:
-        return dataclasses.asdict(record) | {"queue": "", "workers": None, "error": str(error)}
-    return dataclasses.asdict(record) | {"queue": queue, "workers": len(workers)}
+        return told | {"queue": "", "workers": None, "error": str(error)}
+    return told | {"queue": states.get(record.job, ""), "workers": len(read_worker_jobs(out) & states.keys())}
+
+
+def job_line(job: dict[str, Any]) -> str:
+    """Write one line on a job, as `describe_job` tells it."""
+    error = job.get("error")
+    queue = f"its queue does not answer: {error}" if error else f"in the queue {job['queue'] or 'no more'}"
+    words = [f"job {job['job']} ({job['type']}): {job['state']}", queue]
+    words += [f"{job['workers']} worker jobs"] if job["workers"] else []
+    words += [f"of jobs {', '.join(job['jobs'])}"] if len(job["jobs"]) > 1 else []
+    return ", ".join(words)
 
 
 def cancel(out: Path) -> str:
-    """Cancel the job of a run, its workers, and the job that would follow it; returns what was done.
-
-    Raises
-    ------
-    InputError
-        If the run has no job.
-    """
+    """Cancel the job of a run, its workers, and the job that would follow it; returns what was done."""
     record = read_record(out)
-    if record is None:
-        raise InputError(f"{out}: has no job; give the number of a job, or the folder of a run that was submitted")
-    if not _is_alive(record):
+    jobs, system = living_jobs(record), SYSTEMS[record.type]
+    if not jobs:
         return f"job {record.job} is over already ({record.state})"
-    queue = QUEUES[record.type]
     (out / JOB / CANCELLED).touch()  # first: nothing is submitted any more
-    before = record.earlier[-1:] if record.state == "handed over" else ()
-    queue.cancel([record.job, *before])
-    queue.cancel(_living(queue, read_worker_jobs(out / JOB)))
+    system.cancel(jobs)
+    system.cancel(sorted(read_worker_jobs(out) & system.states().keys()))
     return f"job {record.job} is cancelled; what it has done is kept"
 
 
-def list_logs(out: Path, *, workers: bool = False) -> list[Path]:
-    """Files into which the jobs of a run print, the oldest first; those of workers too, if asked for.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
-    folder = out / JOB / LOGS
-    found = [path for path in folder.glob("*") if workers or not path.name.startswith("worker-")]
-    if not found:
-        raise InputError(f"{folder}: no job has printed anything yet; citystitch status {out} tells where it is")
-    return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
+def read_worker_jobs(out: Path) -> set[str]:
+    """Numbers of the worker jobs that were last known to wait or run."""
+    try:
+        return set(map(str, json.loads((out / JOB / WORKER_JOBS).read_bytes())))
+    except (OSError, ValueError, TypeError):
+        return set()
 
 
 def _write_files(config: Config, out: Path, script: str) -> None:
     """Keep what the jobs run: nothing that is changed afterwards changes them."""
     folder = out / JOB
+    clouds, footprints = tuple(map(absolute, config.pointcloud)), config.footprints and absolute(config.footprints)
+    kept = dataclasses.replace(config, pointcloud=clouds, footprints=footprints, cluster="", out="out")
+    text = write_config(kept, "the parameters of a submitted run")
     try:
         (folder / LOGS).mkdir(parents=True, exist_ok=True)
         (folder / CANCELLED).unlink(missing_ok=True)
-        shutil.copyfile(config.cluster, folder / TABLE)
-        given = dataclasses.replace(
-            config,
-            pointcloud=tuple(map(absolute, config.pointcloud)),
-            footprints=absolute(config.footprints) if config.footprints else "",
-            cluster="",
-            scheduler="",
-            out="out",
-        )
-        (folder / PARAMETERS).write_text(
-            write_config(given, "the parameters of a submitted run"), encoding="utf-8", errors="surrogateescape"
-        )
+        shutil.copyfile(config.cluster, folder / DESCRIPTION)
+        (folder / PARAMETERS).write_text(text, encoding="utf-8", errors="surrogateescape")
         (folder / SCRIPT).write_text(script)
-        (folder / SCRIPT).chmod(0o755)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written ({error.strerror}); give another --out") from error
 
 
-def _is_alive(record: JobRecord) -> bool:
-    if record.state not in LIVING:
-        return False
-    queue = QUEUES[record.type]
-    return queue.is_alive(queue.states([record.job]).get(record.job))
-
-
-def _living(queue: Queue, jobs: list[str]) -> list[str]:
-    states = queue.states(jobs) if jobs else {}
-    return [job for job in jobs if queue.is_alive(states.get(job))]
-
-
-def _places() -> Path:
-    """Folder that knows the folders of jobs by their numbers."""
+def _folders() -> Path:
+    """Folder that knows the folders of runs by the numbers of their jobs."""
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(state) / "citystitch" / "jobs"
+    return Path(state) / NAME / "jobs"
 
 
-def count_results(out: Path) -> int:
-    """Number of results that the run in a folder has told of; 0 where it has told of none."""
-    try:
-        stages = json.loads((out / "progress.json").read_bytes())["stages"].values()
-        return sum(int(stage["done"]) for stage in stages)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return 0
+def _submit(options: argparse.Namespace) -> int:
+    from tiler.interface.api import with_file
+    from tiler.planning.plan import check_sources
+
+    config = make_config(with_file(vars(options)))
+    if not options.dry_run:
+        check_sources(config)
+    print(submit(config, dry_run=options.dry_run))
+    return 0
 
 
-def now() -> str:
-    """Tell the time of day for a log."""
-    return time.strftime("%Y-%m-%d %H:%M:%S")
+def _cancel(options: argparse.Namespace) -> int:
+    print(printable(cancel(find_run(options.job))))
+    return 0
+
+
+def _logs(options: argparse.Namespace) -> int:
+    """Print the files into which the jobs of a run print, the oldest first, then what is added to them."""
+    out = find_run(options.job)
+    folder, printed = out / JOB / LOGS, dict[Path, int]()
+    while True:
+        paths = [path for path in folder.glob("*") if options.workers or not path.name.startswith(WORKER_NAME)]
+        if not paths:
+            raise InputError(f"{folder}: nothing is printed yet; citystitch status {out} tells where the job is")
+        for path in sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name)):
+            if path not in printed:
+                print(f"== {printable(str(path))}")
+            try:
+                text = path.read_text(errors="replace")
+            except OSError as error:
+                raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+            for line in text[printed.get(path, 0) :].splitlines():
+                print(printable(line), flush=True)
+            printed[path] = len(text)
+        if not options.follow:
+            return 0
+        time.sleep(EVERY)

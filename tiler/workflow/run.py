@@ -20,11 +20,12 @@ from tiler.engine.keys import code_versions
 from tiler.engine.stage import Stage
 from tiler.engine.stopping import stops
 from tiler.engine.task import peak_memory
-from tiler.engine.task_limits import TASKS, Limits, limit_workers, machine_memory
+from tiler.engine.task_limits import TASKS, limit_workers, machine_memory
 from tiler.executors.dask_settings import ANYWHERE
 from tiler.executors.executor import Executor, serial
 from tiler.executors.kernels import prepare
-from tiler.jobs.table import read_cluster
+from tiler.jobs.cluster import read_cluster
+from tiler.jobs.submission import JOB
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
 from tiler.monitoring.progress import Announce
 from tiler.monitoring.watchers import Listener, Watcher, Watchers
@@ -340,11 +341,11 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
     if means.cluster is not None:
         yield means.cluster
     elif config.cluster:
-        from tiler.jobs.jobqueue import JOB, job_queue
+        from tiler.jobs.workers import worker_jobs
 
-        table, folder = read_cluster(Path(config.cluster)), Path(config.out).absolute() / JOB
-        with job_queue(
-            table, folder, Limits(config.time_limit), dashboard=means.dashboard or ANYWHERE, say=say
+        cluster, folder = read_cluster(Path(config.cluster)), Path(config.out).absolute() / JOB
+        with worker_jobs(
+            cluster, folder, config.time_limit, dashboard=means.dashboard or ANYWHERE, say=say
         ) as executor:
             yield executor
     elif config.workers:
