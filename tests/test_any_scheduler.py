@@ -1,6 +1,7 @@
 """Somebody's scheduler: workers of other versions or on another disk are refused, before a run and in it."""
 
 import dataclasses
+import functools
 import json
 import os
 import shutil
@@ -23,12 +24,13 @@ from tests.test_run import hashes
 from tiler.config.config import Config
 from tiler.engine.stage import Facts, Scope, Stage
 from tiler.engine.task import Task
-from tiler.executors import worker_requirements
+from tiler.executors import dask_executor, worker_requirements
 from tiler.executors.remote_cluster import connect
 from tiler.executors.versions import LIBRARIES, MISSING, NATIVE, tell_versions
 from tiler.executors.worker_requirements import (
     PROBE,
     ClusterMismatchError,
+    Mismatch,
     Requirements,
     UnansweredError,
     check_cluster,
@@ -166,17 +168,20 @@ def test_a_task_is_refused_by_a_worker_that_joins_late(
     client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Requirements are looked at once for a run, in the worker; the run ends, whatever its policy."""
+
+    @functools.cache
+    def find_other(requirements: Requirements) -> Mismatch | None:
+        with monkeypatch.context() as patch:
+            patch.setattr(worker_requirements, "own_versions", lambda: other_versions(numpy="0.1"))
+            return find_mismatch(requirements)
+
     with connect(client.scheduler.address) as executor:
         make(tmp_path / "good", executor).run(Stage("a", Scope.TILE, nothing))
-    monkeypatch.setattr(worker_requirements, "own_versions", lambda: other_versions(numpy="0.1"))
-    find_mismatch.cache_clear()
-    try:
-        with connect(client.scheduler.address, requirements=Requirements("another")) as executor:
-            engine = make(tmp_path / "bad", executor, layout=grid_layout(2))
-            with pytest.raises(ClusterMismatchError) as caught:
-                engine.run(Stage("a", Scope.TILE, nothing))
-    finally:
-        find_mismatch.cache_clear()
+    monkeypatch.setattr(dask_executor, "find_mismatch", find_other)
+    with connect(client.scheduler.address, requirements=Requirements("another")) as executor:
+        engine = make(tmp_path / "bad", executor, layout=grid_layout(2))
+        with pytest.raises(ClusterMismatchError) as caught:
+            engine.run(Stage("a", Scope.TILE, nothing))
     first, line, last = caught.value.lines
     assert "a worker has joined that cannot take tasks of this run; all that was done is kept" in first
     assert line.startswith("numpy: ")
