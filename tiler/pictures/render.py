@@ -117,8 +117,8 @@ def need_graphics() -> None:
         raise ConfigError("pictures need pyvista: pip install citystitch[pictures]") from error
     if not _has_graphics():
         raise ConfigError(
-            "pictures need OpenGL, and VTK finds none here: install Mesa, which needs no graphics "
-            "card (Debian, Ubuntu: apt install libegl1 libgl1-mesa-dri; Fedora: dnf install mesa-libEGL; conda: mesalib)"
+            "pictures need OpenGL, and VTK finds none here: install Mesa, which needs no graphics card (Debian, "
+            "Ubuntu: apt install libegl1 libgl1-mesa-dri; Fedora: dnf install mesa-libEGL; conda: mesalib)"
         )
 
 
