@@ -43,7 +43,7 @@ def find_shortest(
     kept = usable[edges].all(axis=1)
     ends = np.concatenate((edges[kept], edges[kept, ::-1])).T
     graph = coo_array((np.tile(cost[kept], 2), tuple(ends)), shape=(len(usable),) * 2).tocsr()
-    distance = dijkstra(graph, indices=start)
+    distance = dijkstra(graph, indices=[start])[0]
     if np.isinf(distance[end]):
         return np.empty(0, np.int64)
     path = [end]

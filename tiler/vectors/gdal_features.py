@@ -182,8 +182,9 @@ def _read_straight(layer: GdalLayer, fids: NDArray[np.int64]) -> NDArray[np.obje
 
     with gdal_as_input_error(layer.path, []):
         wkb = pyogrio.raw.read(layer.source, layer=layer.name, columns=[], fids=fids, **layer.options)[2]
-    empty = shapely.is_empty(parse_wkb(wkb)[0])
-    return np.where(empty, None, wkb)
+    kept: NDArray[np.object_] = wkb.copy()
+    kept[shapely.is_empty(parse_wkb(wkb)[0])] = None
+    return kept
 
 
 def _fids_with_geometry(layer: GdalLayer, fids: NDArray[np.int64]) -> NDArray[np.int64]:
