@@ -18,7 +18,6 @@ WAITING = {
     "tiler/executors/fork_server.py",
     "tiler/executors/numba_registry.py",
     "tiler/jobs/jobqueue.py",
-    "tiler/store/zarr_files.py",
 }
 
 
