@@ -19,7 +19,7 @@ COMPOSING = {"pipeline.tile", "pipeline.simplify"}
 HOMES = {
     "dask": ("tiler/",),
     "distributed": ("tiler/",),
-    "zarr": ("tiler/store/zarr_files.py",),
+    "zarr": ("tiler/store/",),
     "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py"),
     "laspy": ("tiler/",),
     "pyogrio": ("tiler/",),

@@ -25,7 +25,7 @@ from tiler.engine.task import Failure, Record, Task
 from tiler.executors.executor import Executor, Serial
 from tiler.executors.local_cluster import local
 from tiler.executors.remote_cluster import connect
-from tiler.store.stated_files import state_files
+from tiler.store.checksums import state_files
 from tiler.store.store import Store
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -174,7 +174,7 @@ def test_any_executor_and_any_order_give_the_same_bytes(
     serial_run: Engine, one_worker: Executor, two_workers: Executor, tmp_path: Path
 ) -> None:
     expected = contents(serial_run.store.path)
-    assert len(expected) == 3 + 9 + 12 + 9 + 1 + 2 * 12  # groups, and twelve zarr arrays of one chunk each
+    assert len(expected) == 3 + 9 + 12 + 9 + 1  # a file a result
     executors = {"one": one_worker, "two": two_workers}
     executors |= {f"shuffled{k}": Shuffled(k) for k in range(3)}
     for name, executor in executors.items():
@@ -397,24 +397,28 @@ def test_a_moved_file_is_the_same_file(serial_run: Engine, tmp_path: Path) -> No
 def test_a_deleted_or_damaged_result_runs_again_alone(serial_run: Engine, tmp_path: Path) -> None:
     store = tmp_path / "store.zarr"
     shutil.copytree(serial_run.store.path, store)
-    shutil.rmtree(store / "seam" / "x1.1")
-    metadata = store / "plane" / "0.0" / "zarr.json"
-    metadata.write_bytes(metadata.read_bytes()[:-30])
+    (store / "seam" / "x1.1.zip").unlink()
+    plane = store / "plane" / "0.0.zip"
+    plane.write_bytes(plane.read_bytes()[:-30])
     again = run_all(make(tmp_path))
     assert rerun(again) == {("seam", "x1.1"), ("plane", "0.0")}
     assert contents(store) == contents(serial_run.store.path)
 
 
-@pytest.mark.parametrize("lost", ["terrain/1.1/z/c", "terrain/1.1/z/c/0", "plane/0.0/zarr.json"])
-def test_what_is_damaged_is_computed_again_and_told(serial_run: Engine, tmp_path: Path, lost: str) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
+@pytest.mark.parametrize("item", [("terrain", "1.1"), ("plane", "0.0")])
+def test_what_is_damaged_is_computed_again_and_told(
+    serial_run: Engine, tmp_path: Path, item: tuple[str, str], share: float
+) -> None:
     store = tmp_path / "store.zarr"
     shutil.copytree(serial_run.store.path, store)
-    path = store / lost
-    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    path = store / item[0] / f"{item[1]}.zip"
+    data = bytearray(path.read_bytes())
+    data[int(share * len(data))] ^= 4
+    path.write_bytes(data)
     again = run_all(make(tmp_path))
-    stage, name, rest = lost.split("/", maxsplit=2)
-    assert rerun(again) == {(stage, name)}
-    assert again.records[stage, name].damage.startswith(rest)
+    assert rerun(again) == {item}
+    assert again.records[item].damage == f"{item[1]}.zip its checksum differs"
     assert contents(store) == contents(serial_run.store.path)
     assert not any(record.damage for record in run_all(make(tmp_path)).records.values())
 
@@ -730,7 +734,10 @@ def many(task: Task) -> Facts:
 
 
 def loses(task: Task) -> Facts:
-    shutil.rmtree(task.store.folder("source", "1.1") / "z" / "c")
+    file = task.store.file("source", "1.1")
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
     return {"n": len(list(task.read("source")))}
 
 

@@ -86,7 +86,7 @@ def sides(seam: str) -> tuple[str, ...]:
 def forget(out: Path, items: dict[str, str]) -> None:
     """Take results out of a finished run, so that they are computed again."""
     for stage, name in items.items():
-        shutil.rmtree(out / "store.zarr" / stage / name)
+        (out / "store.zarr" / stage / f"{name}.zip").unlink()
 
 
 def lost_tiles(items: dict[str, str]) -> dict[str, str]:

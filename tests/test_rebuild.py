@@ -107,11 +107,11 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Town:
 
 
 def results(out: Path) -> dict[tuple[str, str], tuple[int, int]]:
-    """Which folder on the disk every result is, and since when: another one when it was computed again."""
+    """Which file on the disk every result is, and since when: another one when it was computed again."""
     store, found = Store(out / "store.zarr"), {}
     for stage in store.stages():
         for name in store.names(stage):
-            state = store.folder(stage, name).stat()
+            state = store.file(stage, name).stat()
             found[stage, name] = state.st_ino, state.st_ctime_ns
     return found
 

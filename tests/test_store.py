@@ -1,24 +1,27 @@
 """The store: whole or not at all, any plain array, every damage found, the same bytes for the same result."""
 
 import json
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
+import zarr
 from numpy.typing import NDArray
+from zarr.storage import ZipStore
 
 from pipeline.errors import InputError, OutputError
-from tiler.store.packing import CHUNK_BYTES, CHUNK_HEAD, INLINE_BYTES, PACKED_BYTES, SQUARE, verified_chunks
+from tests.result_parts import parts, write_parts
+from tiler.store.result_file import CHUNK_BYTES
+from tiler.store.result_writer import SMALL_BYTES, SQUARE
 from tiler.store.store import Store
 
 RNG = np.random.default_rng(7)
 N_CHUNK = CHUNK_BYTES // 24  # rows of three float64 in a chunk
 BIG = RNG.normal(size=(2 * N_CHUNK + 5, 3))  # three chunks, the last one short
 DTYPES = ["f8", "f4", "i8", "i4", "u1", "?", "<U7"]
-SIZES = [0, 1, 3, PACKED_BYTES]  # in rows: inline, and an array of its own
+SIZES = [0, 1, 3, SMALL_BYTES + 1]  # in rows: in the form of numpy, and in that of zarr
 
 
 @pytest.fixture
@@ -32,10 +35,6 @@ def contents(path: Path) -> dict[str, bytes]:
 
 def sample(dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
     return RNG.integers(-3, 100, shape).astype(dtype)
-
-
-def chunk_files(store: Store, array: str) -> list[Path]:
-    return sorted(p for p in (store.path / "s" / "n" / array / "c").rglob("*") if p.is_file())
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -54,7 +53,7 @@ def test_every_type_comes_back_as_it_was(store: Store, dtype: str, n_rows: int) 
 
 def test_bits_come_back_as_they_were(store: Store) -> None:
     odd = np.array([-0.0, np.nan, np.inf, 5e-324])
-    negative_zeros = np.full(PACKED_BYTES, -0.0)
+    negative_zeros = np.full(SMALL_BYTES, -0.0)
     store.write("s", "n", {"odd": odd, "zeros": negative_zeros, "single": np.float64(2.5)})
     arrays, _ = store.read("s", "n")
     assert arrays["odd"].tobytes() == odd.tobytes()
@@ -72,20 +71,27 @@ def test_views_and_foreign_byte_order_are_stored_by_value(store: Store) -> None:
     np.testing.assert_array_equal(arrays["big_endian"], grid)
 
 
-@pytest.mark.parametrize("n_small", [10, 400, 3000])
-def test_small_arrays_share_one(store: Store, n_small: int) -> None:
-    arrays: dict[str, Any] = {f"a{k}": np.arange(n_small) + k for k in range(5)}
-    store.write("s", "n", arrays)
-    n_files = len(contents(store.path))
-    assert n_files == (1 if 40 * n_small <= INLINE_BYTES else 3)
-    read, _ = store.read("s", "n", names=["a3"])
-    assert list(read) == ["a3"]
-    np.testing.assert_array_equal(read["a3"], arrays["a3"])
+def test_a_result_is_one_file_that_numpy_and_zarr_read(store: Store) -> None:
+    arrays: dict[str, Any] = {f"a{k}": np.arange(400) + k for k in range(50)}
+    with store.writer("s", "n") as writer:
+        writer.put(**arrays, big=BIG)
+        writer.put_rasters(z=BIG[:1000, :2] @ np.ones((2, 900)))
+        writer.commit({"facts": {"n": 3}})
+    (file,) = contents(store.path)
+    assert file == "s/n.zip"
+    with np.load(store.path / file) as found:
+        np.testing.assert_array_equal(found["a3"], arrays["a3"])
+    group = zarr.open_group(ZipStore(store.path / file, mode="r"), mode="r")
+    assert group.attrs["facts"] == {"n": 3}
+    np.testing.assert_array_equal(group["big"][:], BIG)  # type: ignore[index]
+    assert group["z"].chunks == (SQUARE, SQUARE)  # type: ignore[union-attr]
+    assert len(parts(store.path / file)) == 1 + 50 + (1 + 3) + (1 + 4 * 3)
 
 
 def test_only_named_arrays_are_read(store: Store) -> None:
     store.write("s", "n", {"big": BIG, "small": np.arange(3)})
-    shutil.rmtree(store.path / "s" / "n" / "big" / "c")
+    file = store.file("s", "n")
+    write_parts(file, {name: data for name, data in parts(file).items() if "/c/" not in name})
     assert list(store.read("s", "n", names=["small"])[0]) == ["small"]
     assert store.read("s", "n", names=[])[0] == {}
     with pytest.raises(ValueError, match="no array huge, it has: big, small"):
@@ -141,18 +147,19 @@ def test_ranges_are_read_at_once_and_chunks_once(
     numbers = np.arange(len(BIG), dtype=np.uint8)
     store.write("s", "n", {"big": BIG, "numbers": numbers, "few": BIG[:9]})
     rows = np.concatenate([np.empty(0, int), *(np.arange(*pair) for pair in ranges)])
-    checked: list[int] = []
+    read: list[str] = []
+    original = ZipFile.read
 
-    def watch(rows: NDArray[Any], chunk: int, expected: list[int]) -> Iterator[int]:
-        checked.extend(expected)
-        return verified_chunks(rows, chunk, expected)
+    def watch(self: ZipFile, name: Any, pwd: Any = None) -> bytes:
+        read.append(name)
+        return original(self, name, pwd)
 
-    monkeypatch.setattr("tiler.store.result_reader.verified_chunks", watch)
+    monkeypatch.setattr(ZipFile, "read", watch)
     found = store.read_ranges("s", "n", ["numbers", "big"], ranges)
     assert list(found) == ["big", "numbers"]
     assert found["big"].tobytes() == BIG[rows].tobytes()
     assert found["numbers"].tolist() == numbers[rows].tolist()
-    assert len(checked) == len(set(checked))
+    assert len(read) == len(set(read))
     assert store.read_ranges("s", "n", ["few"], [(0, 2), (5, 8)])["few"].tolist() == BIG[[0, 1, 5, 6, 7]].tolist()
     with pytest.raises(ValueError, match="rows"):
         store.read_ranges("s", "n", ["few"], [(0, 10)])
@@ -189,28 +196,17 @@ def test_windows_of_a_raster(store: Store, dtype: str, shape: tuple[int, int]) -
 def test_a_window_reads_its_own_chunks_alone(store: Store) -> None:
     raster = RNG.normal(size=(3 * SQUARE, 3 * SQUARE - 7))
     write_raster(store, raster)
-    files = chunk_files(store, "z")
-    assert [path.relative_to(path.parents[1]).as_posix() for path in files] == [
-        f"{j}/{i}" for j in range(3) for i in range(3)
-    ]
-    for path in files:
-        if path.parts[-2:] != ("1", "2"):
-            path.write_bytes(b"not read")
+    found = parts(store.file("s", "n"))
+    assert sorted(name for name in found if "/c/" in name) == [f"z/c/{j}/{i}" for j in range(3) for i in range(3)]
+    for name in found:
+        if "/c/" in name and name != "z/c/1/2":
+            found[name] = b"not read"
+    write_parts(store.file("s", "n"), found)
     window = (SQUARE, 2 * SQUARE), (2 * SQUARE, 3 * SQUARE - 7)
     assert np.array_equal(store.read_window("s", "n", "z", *window), raster[slice(*window[0]), slice(*window[1])])
     for (top, bottom), (left, right) in [((SQUARE - 1, SQUARE + 1), window[1]), (window[0], (5, 2 * SQUARE + 1))]:
         with pytest.raises(InputError, match=r"stage s, n: z in .* is damaged"):
             store.read_window("s", "n", "z", (top, bottom), (left, right))
-
-
-def test_chunks_of_a_raster_in_each_others_place_are_found(store: Store) -> None:
-    write_raster(store, RNG.normal(size=(2 * SQUARE, 2 * SQUARE)))
-    one, other = chunk_files(store, "z")[1:3]
-    data = one.read_bytes(), other.read_bytes()
-    one.write_bytes(data[1])
-    other.write_bytes(data[0])
-    with pytest.raises(InputError, match="checksum differs in chunk 0/1"):
-        store.read("s", "n")
 
 
 def test_what_is_no_raster_or_beyond_it(store: Store) -> None:
@@ -233,48 +229,78 @@ def test_what_is_no_raster_or_beyond_it(store: Store) -> None:
 def test_a_damaged_chunk_is_found_where_it_is_read_and_only_there(store: Store) -> None:
     ends = [(0, 1), (N_CHUNK, N_CHUNK + 1), (2 * N_CHUNK, len(BIG))]
     store.write("s", "n", {"big": BIG})
-    for chunk, file in enumerate(chunk_files(store, "big")):
-        whole = file.read_bytes()
-        # In the rows: of the short chunk the zeros behind them are not unpacked (`shorten_chunk`).
-        k = int.from_bytes(whole[CHUNK_HEAD : CHUNK_HEAD + 4], "little") + 8
-        for damage in (None, b"", whole[:-9], whole[:k] + bytes([whole[k] ^ 1]) + whole[k + 1 :]):
-            file.unlink() if damage is None else file.write_bytes(damage)
+    file = store.file("s", "n")
+    whole, found = file.read_bytes(), parts(file)
+    for chunk in range(3):
+        name = f"big/c/{chunk}/0"
+        begin = whole.index(found[name])
+        flipped = bytearray(whole)
+        flipped[begin + int(RNG.integers(len(found[name])))] ^= 1
+        write_parts(file, {key: data for key, data in found.items() if key != name})
+        with pytest.raises(InputError, match="2 files for the 3 chunks"):
+            store.read_rows("s", "n", "big", 0, 1)
+        damages = [bytes(flipped)]
+        for part in (b"", found[name][:-9]):  # under right checksums
+            write_parts(file, found | {name: part})
+            damages.append(file.read_bytes())
+        for damage in damages:
+            file.write_bytes(damage)
             for other, (start, stop) in enumerate(ends):
                 if other == chunk:
                     with pytest.raises(InputError, match=r"stage s, n: big in .* is damaged"):
                         store.read_rows("s", "n", "big", start, stop)
                 else:
                     store.read_rows("s", "n", "big", start, stop)
-        with pytest.raises(InputError, match="big"):
-            store.read("s", "n")
-        file.write_bytes(whole)
+            with pytest.raises(InputError, match="big"):
+                store.read("s", "n")
+    file.write_bytes(whole)
     np.testing.assert_array_equal(store.read("s", "n")[0]["big"], BIG)
 
 
-def test_damaged_attributes_are_found(store: Store) -> None:
-    store.write("s", "n", {"small": np.arange(5)}, height=3.5)
-    file = store.path / "s" / "n" / "zarr.json"
-    whole = file.read_text()
-    for damage in (whole[:-20], "", whole.replace("3.5", "3.6"), whole.replace('"base64": "A', '"base64": "B')):
-        assert damage != whole
-        file.write_text(damage)
-        with pytest.raises(InputError, match=r"stage s, n: attributes .*damaged"):
-            store.attributes("s", "n")
-    file.write_text(whole)
-    assert store.attributes("s", "n") == {"height": 3.5}
+@pytest.mark.parametrize("seed", range(3))
+def test_no_changed_byte_is_read_as_another_value(store: Store, seed: int) -> None:
+    """Each is found by the checksum of the file; a read gives the values that were written, or an error."""
+    rng = np.random.default_rng(seed)
+    arrays = {"big": np.arange(50_000.0), "few": np.arange(9), "text": np.array(["a", "bc"])}
+    store.write("s", "n", arrays, height=3.5)
+    file = store.file("s", "n")
+    whole = file.read_bytes()
+    assert store.find_damage("s", "n") == ""
+    ends = len(whole) - 1 - rng.integers(0, 2000, 150)  # the list of files, the comment
+    for place in [*ends.tolist(), *rng.integers(0, len(whole), 50).tolist()]:
+        data = bytearray(whole)
+        data[place] ^= int(rng.integers(1, 256))
+        file.write_bytes(data)
+        assert store.find_damage("s", "n") == "its checksum differs"
+        try:
+            found, attributes = store.read("s", "n", names=arrays)
+        except (InputError, ValueError):
+            continue
+        assert attributes == {"height": 3.5}
+        assert all(found[name].tobytes() == values.tobytes() for name, values in arrays.items())
+    for size in rng.integers(0, len(whole), 20).tolist():
+        for rest in (whole[:size], whole[:size] + bytes(len(whole) - size)):
+            file.write_bytes(rest)
+            assert store.find_damage("s", "n") == "its checksum differs"
+            with pytest.raises(InputError, match="is damaged"):
+                store.read("s", "n")
+    file.unlink()
+    assert store.find_damage("s", "n") == "is not there"
 
 
 def test_an_array_that_is_gone_or_changed_its_shape_is_found(store: Store) -> None:
     store.write("s", "n", {"big": BIG})
-    file = store.path / "s" / "n" / "big" / "zarr.json"
-    metadata = json.loads(file.read_text())
-    metadata["shape"][0] -= 1
-    file.write_text(json.dumps(metadata))
-    with pytest.raises(InputError, match="shape"):
+    file = store.file("s", "n")
+    found = parts(file)
+    metadata = json.loads(found["big/zarr.json"])
+    metadata["shape"][0] -= N_CHUNK
+    write_parts(file, found | {"big/zarr.json": json.dumps(metadata).encode()})
+    with pytest.raises(InputError, match="3 files for the 2 chunks"):
         store.read("s", "n")
-    shutil.rmtree(file.parent)
-    with pytest.raises(InputError, match="big"):
-        store.read("s", "n")
+    del found["big/zarr.json"]
+    write_parts(file, found)
+    with pytest.raises(ValueError, match="no array big, it has: none"):
+        store.read("s", "n", names=["big"])
 
 
 def test_what_is_not_there(store: Store) -> None:
@@ -306,7 +332,7 @@ def test_an_error_keeps_the_earlier_result_and_a_commit_replaces_it(store: Store
     assert contents(store.path) == before
     store.write("s", "n", {"a": np.arange(4)})
     assert list(store.read("s", "n")[0]) == ["a"]
-    assert [p.name for p in (store.path / "s").iterdir()] == ["n"]
+    assert [p.name for p in (store.path / "s").iterdir()] == ["n.zip"]
 
 
 def test_two_writers_of_one_result(store: Store) -> None:
@@ -316,7 +342,7 @@ def test_two_writers_of_one_result(store: Store) -> None:
         first.commit()
         second.commit()
     assert store.read("s", "n")[0]["a"].tolist() == [0, 1, 2]
-    assert [p.name for p in (store.path / "s").iterdir()] == ["n"]
+    assert [p.name for p in (store.path / "s").iterdir()] == ["n.zip"]
 
 
 def test_what_killed_writers_left_is_swept(store: Store) -> None:
@@ -324,7 +350,7 @@ def test_what_killed_writers_left_is_swept(store: Store) -> None:
     writer = store.writer("s", "m").__enter__()
     writer.put(big=BIG)
     store.sweep("s")
-    assert [p.name for p in (store.path / "s").iterdir()] == ["n"]
+    assert [p.name for p in (store.path / "s").iterdir()] == ["n.zip"]
 
 
 def test_the_order_of_arrays_and_attributes_does_not_show(store: Store) -> None:
@@ -341,7 +367,8 @@ def test_wrong_arguments(store: Store) -> None:
             ("a", np.arange(3), "twice"),
             ("o", np.array([None]), "cannot be stored"),
             ("z", np.array([1j]), "cannot be stored"),
-            ("_packed", np.arange(3), "letters"),
+            ("_a", np.arange(3), "letters"),
+            ("a/b", np.arange(3), "letters"),
         ]:
             with pytest.raises(ValueError, match=message):
                 writer.put(**{name: values})
@@ -352,7 +379,7 @@ def test_wrong_arguments(store: Store) -> None:
         with pytest.raises(ValueError, match="twice"):
             writer.append(a=np.arange(3))
         with pytest.raises(ValueError, match="may not be named"):
-            writer.commit({"checksum": 1})
+            writer.commit({"digest": "1"})
         for bad in (float("nan"), {1, 2}, np.arange(3)):
             with pytest.raises(ValueError, match="plain JSON"):
                 writer.commit({"x": bad})

@@ -11,13 +11,13 @@ import pytest
 
 from pipeline.errors import ConfigError, InputError
 from tests.campaigns import keep_outcome, rounds
+from tests.result_parts import parts, write_parts
 from tests.test_run import hashes
 from tests.towns import Town, make_town
 from tiler.cli.main import main
-from tiler.store.audit import audit_run
+from tiler.store.audit import Entry, audit_run, read_manifest
 from tiler.store.checksums import seal
 from tiler.store.folder_lock import only_run
-from tiler.store.manifest import Entry, read_manifest
 from tiler.store.store import Store
 from tiler.workflow.run import run
 
@@ -72,17 +72,15 @@ KINDS = {
     "manifest": "store.zarr/manifest.jsonl",
     "volume": "mesh/*.vtu",
     "boundary": "boundary/*.vtp",
-    "chunk": "store.zarr/*/*/*/c/**/*",
-    "array": "store.zarr/*/*/*/zarr.json",
-    "attributes": "store.zarr/*/*/zarr.json",
+    "result": "store.zarr/*/*.zip",
 }
 
 
 def result_of(path: str) -> str:
     """The artefact that is made anew for a file: the result that it is of, or that states it."""
     parts = path.split("/")
-    if parts[0] == "store.zarr" and len(parts) > 3:
-        return "/".join(parts[:3])
+    if parts[0] == "store.zarr" and len(parts) == 3:
+        return path.removesuffix(".zip")
     if parts[0] in ("mesh", "boundary"):
         return f"store.zarr/pieces/{Path(path).stem}"
     return {f"{model}.city.json": f"store.zarr/{model}/region" for model in ("citymodel", "citymodel-full")}.get(
@@ -104,7 +102,7 @@ def test_a_sound_run_is_told_to_be_so(
 ) -> None:
     assert main(["check", str(town.out), "--store"]) == 0
     (line,) = capsys.readouterr().out.splitlines()
-    n = sum(1 for _ in (town.out / "store.zarr").glob("*/*/zarr.json"))
+    n = sum(1 for _ in (town.out / "store.zarr").glob("*/*.zip"))
     assert re.search(rf": {n} results and 12 files beside the store, [\d.]+ MB: every byte is as it was", line)
     size = sum(path.stat().st_size for path in town.out.rglob("*") if path.is_file())
     others = ("run.json", "progress.json", "events.jsonl", "config.toml", "store.zarr/manifest.jsonl")
@@ -141,18 +139,18 @@ def test_the_manifest_is_named_and_made_anew(town: Town, tmp_path: Path) -> None
     for damage in (change_digit, *DAMAGES):
         out = town.copy(tmp_path / damage.__name__)
         damage(out / KINDS["manifest"], rng)
-        chunk = choose(out, KINDS["chunk"], set(), rng)
-        flip(out / chunk, rng)
-        assert audit(out) == (False, sorted([KINDS["manifest"], chunk]))
+        result = choose(out, KINDS["result"], set(), rng)
+        flip(out / result, rng)
+        assert audit(out) == (False, sorted([KINDS["manifest"], result]))
     record = run(town.config(out))
     found = {item["subject"]: item["detail"] for item in record["notes"][NOTE]["items"]}
-    assert found.keys() == {KINDS["manifest"], result_of(chunk)}
+    assert found.keys() == {KINDS["manifest"], result_of(result)}
     assert found[KINDS["manifest"]] == "is not there; made anew"
     assert hashes(out) == hashes(town.out)
 
 
 LOSSES = {
-    "a result": (["store.zarr/columns/0_0"], None),
+    "a result": (["store.zarr/columns/0_0.zip"], None),
     "a stage": (["store.zarr/terrain"], ["store.zarr/terrain/*"]),
     "all pieces": (["mesh", "boundary"], ["mesh/*", "boundary/*"]),
 }
@@ -165,7 +163,7 @@ def test_what_is_gone_is_named_and_made_anew(town: Town, tmp_path: Path, name: s
     expected = [path.relative_to(town.out).as_posix() for p in patterns or lost for path in town.out.glob(p)]
     out = town.copy(tmp_path / "out")
     for path in lost:
-        shutil.rmtree(out / path)
+        (out / path).unlink() if path.endswith(".zip") else shutil.rmtree(out / path)
     assert audit(out) == (False, sorted(expected))
     record = run(town.config(out))
     items = record["notes"][NOTE]["items"]
@@ -175,15 +173,15 @@ def test_what_is_gone_is_named_and_made_anew(town: Town, tmp_path: Path, name: s
 
 def test_strange_files_are_named_and_removed(town: Town, tmp_path: Path) -> None:
     out = town.copy(tmp_path / "out")
-    stage = sorted((out / "store.zarr" / "columns").iterdir())[0].relative_to(out).as_posix()
-    strange = ["mesh/9_9.vtu", "mesh/.9_9.12.3.part.vtu", "boundary/9_9.vtp", "store.zarr/x.txt", f"{stage}/x.txt"]
+    strange = ["mesh/9_9.vtu", "mesh/.9_9.12.3.part.vtu", "boundary/9_9.vtp", "store.zarr/x.txt"]
     strange += ["store.zarr/columns/.9_9.partial", "store.zarr/columns/x.txt", "store.zarr/model/.x"]
+    strange += ["store.zarr/columns/9_9.zip"]
     for path in strange:
         (out / path).write_text("x")
-    (out / "store.zarr" / "columns" / "9_9").mkdir()
+    (out / "store.zarr" / "columns" / "8_8").mkdir()
     (out / "store.zarr" / "strange" / "9_9").mkdir(parents=True)
     (out / "picture.png").write_text("a picture of the user's own")
-    folders = ["store.zarr/columns/9_9", "store.zarr/strange"]
+    folders = ["store.zarr/columns/8_8", "store.zarr/strange"]
     assert audit(out) == (False, sorted(strange + folders))
     run(town.config(out))
     (out / "picture.png").unlink()
@@ -199,7 +197,7 @@ def test_an_unfinished_run_is_gone_on_with_where_it_is_sound(town: Town, tmp_pat
     shutil.rmtree(out / "store.zarr" / "columns")
     (out / "store.zarr" / "manifest.jsonl").unlink()
     taken: set[str] = set()
-    chosen = sorted(choose(out, KINDS[kind], taken, rng) for kind in ("chunk", "array", "volume", "city model"))
+    chosen = sorted(choose(out, KINDS[kind], taken, rng) for kind in ("result", "result", "volume", "city model"))
     for path in chosen:
         flip(out / path, rng)
     assert audit(out) == (False, chosen)
@@ -235,17 +233,16 @@ def test_a_result_that_was_exchanged_is_named(town: Town, tmp_path: Path) -> Non
     out = town.copy(tmp_path / "out")
     store = Store(out / "store.zarr")
     one, other = store.names("terrain")[:2]
-    shutil.rmtree(store.folder("terrain", one))
-    shutil.copytree(store.folder("terrain", other), store.folder("terrain", one))
-    assert audit(out) == (False, [f"store.zarr/terrain/{one}/zarr.json"])
+    shutil.copyfile(store.file("terrain", other), store.file("terrain", one))
+    assert audit(out) == (False, [f"store.zarr/terrain/{one}.zip"])
 
     out = town.copy(tmp_path / "forged")
-    group = out / "store.zarr" / "terrain" / one / "zarr.json"
+    file = out / "store.zarr" / "terrain" / f"{one}.zip"
     _, digest = Store(out / "store.zarr").describe("terrain", one)
-    forged = re.sub(rb'"checksum": "\w+"', b'"checksum": "00000000"', group.read_bytes(), count=1)
-    group.write_bytes(seal(forged.replace(digest.encode(), b"0" * 32)))
+    found = parts(file)
+    write_parts(file, found | {"zarr.json": found["zarr.json"].replace(digest.encode(), b"0" * 32)})
     (out / "run.json").write_bytes(seal(b'{"status": "failed", "checksum": "00000000"}'))
-    assert audit(out) == (False, [f"store.zarr/terrain/{one}"])
+    assert audit(out) == (False, [f"store.zarr/terrain/{one}.zip"])
 
 
 def test_the_manifest_lists_all_results_and_their_digests(town: Town) -> None:

@@ -16,7 +16,7 @@ import pyproj
 import pytest
 import shapely
 
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, InputError
 from tests.bad_input import (
     BOUNDS,
     HOUSE,
@@ -31,9 +31,9 @@ from tests.bad_input import (
     write_houses,
     write_parquet,
 )
+from tests.result_parts import parts, write_parts
 from tiler.objects.requests import trust_addresses
 from tiler.pointclouds import ingest
-from tiler.store.checksums import seal
 from tiler.store.store import Store
 from tiler.workflow.out_folder import refuse_inputs_within
 
@@ -599,104 +599,94 @@ def test_inputs_are_found_among_the_results_whichever_way_both_are_named(tmp_pat
 # Results of someone else
 
 
-def hostile_attributes(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """Change what a result says of itself, under a right checksum."""
-    document = json.loads((folder / "zarr.json").read_text())
-    change(document["attributes"]["arrays"])
-    document["attributes"]["checksum"] = "0" * 8
-    (folder / "zarr.json").write_bytes(seal(json.dumps(document).encode()))
+ROWS = np.zeros((20_000, 3))
 
 
-STORES: list[tuple[str, dict[str, Any], str]] = [
-    ("rows", {"shape": [10**15, 3]}, "checksums for 1000000000000000 rows"),
-    ("columns", {"shape": [20_000, 10**15]}, "chunks of"),
-    ("no numbers", {"shape": ["a"]}, "shape"),
-    ("less than none", {"shape": [-1]}, "shape"),
-    ("axes", {"shape": [1] * 100}, "shape"),
-    ("objects", {"dtype": "|O"}, "type '|O'"),
-    ("records", {"dtype": "f8,f8"}, "type 'f8,f8'"),
-    ("long text", {"dtype": "<U99999999"}, "type"),
-    ("chunk", {"chunk": 10**12}, "chunks of 1000000000000 rows"),
-    ("no chunk", {"chunk": 0}, "chunks of 0 rows"),
-    ("checksums", {"crc": []}, "0 checksums"),
+def npy(shape: str, dtype: str = "'<f8'") -> bytes:
+    """An array of numpy's format that claims another shape or type than the bytes of `ROWS` have."""
+    head = f"{{'descr': {dtype}, 'fortran_order': False, 'shape': {shape}}}".ljust(117).encode() + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + ROWS.tobytes()
+
+
+SMALL: list[tuple[str, bytes, str]] = [
+    ("rows", npy("(1000000000000000, 3)"), "buffer is too small"),
+    ("columns", npy("(20000, 1000000000000000)"), "too"),
+    ("no numbers", npy("('a',)"), "shape is not valid"),
+    ("less than none", npy("(-1,)"), "an array of (-1,)"),
+    ("axes", npy(f"({'1, ' * 20})"), "an array of (1, 1,"),
+    ("objects", npy("(3,)", "'|O'"), "an array of (3,) object"),
+    ("records", npy("(3,)", "[('a', '<f8')]"), "an array of"),
+    ("a call", npy("(3,)", "print(1)"), "malformed node"),
+    ("cut", npy("(3,)")[:40], "array header"),
+    ("nothing", b"", "magic"),
 ]
 
 
-RASTERS: list[tuple[dict[str, Any], str]] = [
-    ({"columns": 0}, "chunks of 0 columns"),
-    ({"columns": 10**12}, "chunks of 1000000000000 columns"),
-    ({"columns": "1"}, "chunks of 1 columns"),
-    ({"columns": 700}, "9 checksums"),
-    ({"chunk": 10**9}, "chunks of 1000000000 rows"),
-    ({"shape": [10**9, 700]}, "9 checksums for 1000000000 rows"),
-    ({"shape": [600]}, "columns"),
-]
-
-
-@pytest.mark.parametrize(("change", "message"), RASTERS)
-def test_a_raster_is_not_believed(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+@pytest.mark.parametrize(("data", "message"), [case[1:] for case in SMALL], ids=[case[0] for case in SMALL])
+def test_a_small_array_is_not_believed(tmp_path: Path, data: bytes, message: str) -> None:
     store = Store(tmp_path / "store.zarr")
-    with store.writer("s", "n") as writer:
-        writer.put_rasters(a=np.zeros((600, 700)))
-        writer.commit()
-    hostile_attributes(store.folder("s", "n"), lambda table: table["a"].update(change))
-    with pytest.raises(Exception, match="is damaged") as caught:
-        store.read_window("s", "n", "a", (0, 2), (0, 2))
-    assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(("change", "message"), [case[1:] for case in STORES], ids=[case[0] for case in STORES])
-def test_a_store_is_not_believed(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    store = Store(tmp_path / "store.zarr")
-    store.write("s", "n", {"a": np.zeros((20_000, 3))})
-    hostile_attributes(store.folder("s", "n"), lambda table: table["a"].update(change))
+    store.write("s", "n", {"a": ROWS[:3]})
+    file = store.file("s", "n")
+    write_parts(file, parts(file) | {"a.npy": data})
     with pytest.raises(Exception, match="is damaged") as caught:
         store.read("s", "n")
     assert message in str(caught.value)
 
 
-def claim_chunk(folder: Path) -> None:
-    """Let a chunk claim that it unpacks to 4 GB."""
-    path = folder / "c" / "0" / "0"
-    content = path.read_bytes()
-    path.write_bytes(content[:4] + struct.pack("<I", 2**32 - 1) + content[8:])
+def test_a_compressed_file_in_a_result_is_refused(tmp_path: Path) -> None:
+    store = Store(tmp_path / "store.zarr")
+    store.write("s", "n", {"a": ROWS[:3]})
+    found = parts(store.file("s", "n"))
+    with zipfile.ZipFile(store.file("s", "n"), "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in (found | {"a.npy": bytes(10**7)}).items():
+            archive.writestr(name, data)
+    with pytest.raises(InputError, match="a compressed file in the zip"):
+        store.read("s", "n")
 
 
-def other_zarr(**change: Any) -> Damage:
-    def damage(folder: Path) -> None:
-        document = json.loads((folder / "zarr.json").read_text())
-        (folder / "zarr.json").write_text(json.dumps(document | change))
-
-    return damage
+def grid(*chunk: int) -> dict[str, Any]:
+    return {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}}}
 
 
-CHUNKS: list[tuple[str, Damage, str]] = [
-    ("a chunk of 4 GB", claim_chunk, "a chunk claims 4294967295 bytes instead of 480000"),
-    ("a cut head", written(b"\2\1\x21\x08", "c/0/0"), "is not compressed by Blosc"),
-    ("not Blosc", written(b"hello world, and more", "c/0/0"), "is not compressed by Blosc"),
-    ("no chunk", lambda folder: (folder / "c" / "0" / "0").unlink(), "No such file"),
-    ("another type", other_zarr(data_type="complex128", fill_value=[0, 0]), "of complex128"),
-    (
-        "other codecs",
-        other_zarr(codecs=[{"name": "bytes", "configuration": {"endian": "little"}}]),
-        "by bytes",
-    ),
-    (
-        "large chunks",
-        other_zarr(chunk_grid={"name": "regular", "configuration": {"chunk_shape": [10**12, 3]}}),
-        "chunks (1000000000000, 3)",
-    ),
+LARGE: list[tuple[str, dict[str, Any], str]] = [
+    ("rows", {"shape": [10**15, 3]}, "1 files for the 50000000000 chunks"),
+    ("columns", {"shape": [20_000, 10**15]}, "1 files for"),
+    ("less than none", {"shape": [-1, 3]}, "is damaged"),
+    ("another type", {"data_type": "complex128", "fill_value": [0, 0]}, "an array of (20000, 3) complex128"),
+    ("other codecs", {"codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]}, "codecs BytesCodec"),
+    ("large chunks", grid(10**12, 3), "chunks of 1000000000000 rows"),
+    ("wide chunks", grid(20_000, 10**12), "chunks of 20000 rows"),
+    ("no chunks", grid(0, 3), "is damaged"),
 ]
 
 
-@pytest.mark.parametrize(("damage", "message"), [case[1:] for case in CHUNKS], ids=[case[0] for case in CHUNKS])
-def test_chunks_are_not_believed(tmp_path: Path, damage: Damage, message: str) -> None:
+@pytest.mark.parametrize(("change", "message"), [case[1:] for case in LARGE], ids=[case[0] for case in LARGE])
+def test_a_large_array_is_not_believed(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     store = Store(tmp_path / "store.zarr")
-    store.write("s", "n", {"a": np.zeros((20_000, 3))})
-    damage(store.folder("s", "n") / "a")
+    store.write("s", "n", {"a": ROWS})
+    file = store.file("s", "n")
+    document = json.loads(parts(file)["a/zarr.json"])
+    write_parts(file, parts(file) | {"a/zarr.json": json.dumps(document | change).encode()})
     with pytest.raises(Exception, match="is damaged") as caught:
         store.read_rows("s", "n", "a", 0, 5)
     assert message in str(caught.value)
+
+
+CHUNKS: list[tuple[str, bytes]] = [
+    ("a cut head", b"\2\1\x21\x08"),
+    ("not Blosc", b"hello world, and more"),
+    ("4 GB", b"\2\1\x21\x08" + struct.pack("<III", 2**32 - 1, 2**18, 100) + bytes(84)),
+]
+
+
+@pytest.mark.parametrize("data", [case[1] for case in CHUNKS], ids=[case[0] for case in CHUNKS])
+def test_chunks_are_not_believed(tmp_path: Path, data: bytes) -> None:
+    store = Store(tmp_path / "store.zarr")
+    store.write("s", "n", {"a": ROWS})
+    file = store.file("s", "n")
+    write_parts(file, parts(file) | {"a/c/0/0": data})
+    with pytest.raises(Exception, match=r"is damaged .*does not unpack to 480000 bytes"):
+        store.read_rows("s", "n", "a", 0, 5)
 
 
 def test_files_of_a_run_from_someone_else(city: Path, tmp_path: Path, capsys: Capture) -> None:

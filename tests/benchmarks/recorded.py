@@ -126,8 +126,7 @@ def _is_inner(engine: Engine, found: Record) -> bool:
 
 
 def _describe(engine: Engine, seconds: float, found: Record) -> Recorded:
-    folder = Store(engine.store.path).folder(found.stage, found.name)
-    files = [path for path in folder.rglob("*") if path.is_file()]
+    file = Store(engine.store.path).file(found.stage, found.name)
     written = found.facts.get("files", {})
     facts = dict(found.facts)
     if facts.get("extent") and found.name in engine.layout.tiles:
@@ -136,8 +135,8 @@ def _describe(engine: Engine, seconds: float, found: Record) -> Recorded:
     sizes = [entry[0] if isinstance(entry, list) else entry["size"] for entry in written.values()]
     return Recorded(
         seconds,
-        sum(path.stat().st_size for path in files),
-        len(files),
+        file.stat().st_size,
+        1,
         sum(sizes),
         len(sizes),
         facts,

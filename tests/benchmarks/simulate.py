@@ -26,7 +26,7 @@ from tiler.executors.executor import Executor
 from tiler.executors.local_cluster import local
 from tiler.monitoring.progress import RunProgress
 from tiler.planning.plan import Plan, make_plan
-from tiler.store.manifest import find_remade, write_manifest
+from tiler.store.audit import find_remade, write_manifest
 from tiler.workflow.failed_tiles import HolesError, Missing, find_missing, leave_holes
 from tiler.workflow.out_folder import MANIFEST_PATH, STORE
 from tiler.workflow.own_stages import OwnStages, list_stages

@@ -13,7 +13,7 @@ from typing import Any
 from pipeline.notes import count_notes
 from tiler.engine.stage import Facts
 from tiler.engine.task import Record, notes_from_json
-from tiler.store.stated_files import FILES
+from tiler.store.checksums import FILES
 from tiler.store.store import Store
 
 # Facts that reads go by, see `tiler.engine.stage.Read`.

@@ -20,8 +20,8 @@ from tiler.engine.stage import Box, Facts, Scope
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.objects.requests import trust_addresses
 from tiler.objects.results import files_for
+from tiler.store.checksums import FILES, check_files, find_changed_files
 from tiler.store.result_writer import Writer, plain_json
-from tiler.store.stated_files import FILES, check_files, find_changed_files
 from tiler.store.store import Store
 
 APART = ("key",)  # attributes of a result that are no content
@@ -316,25 +316,21 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
 def _take_earlier(task: Task) -> Record | str:
     """Give the record of the committed result, or say what is wrong with it: nothing if it is of another key."""
     stage, name, store = task.stage, task.name, task.store
-    if not store.folder(stage, name).exists():
+    if not store.has(stage, name):
         return ""
+    file = store.file(stage, name).name
     try:
         attributes, digest = store.describe(stage, name)
-    except CityError:
-        return _tell_damage(store.find_damage(stage, name))
+    except CityError as error:
+        return f"{file} {store.find_damage(stage, name) or error}"
     if attributes.get("key") != task.key:
         return ""
     facts = attributes["facts"]
-    damage = store.find_damage(stage, name) | find_changed_files(task.folder, facts.get(FILES, {}))
-    if damage:
-        return _tell_damage(damage)
+    damage = {file: store.find_damage(stage, name)} | find_changed_files(task.folder, facts.get(FILES, {}))
+    if found := [f"{path} {what}" for path, what in damage.items() if what]:
+        return found[0] + (f", and {len(found) - 1} more" if found[1:] else "")
     notes = count_notes(notes_from_json(attributes["notes"]))
     return Record(stage, name, task.key, digest, facts, notes, reused=True)
-
-
-def _tell_damage(damage: Mapping[str, str]) -> str:
-    (path, what), *more = damage.items()
-    return f"{path} {what}" + (f", and {len(more)} more" if more else "")
 
 
 def read_notes(store: Store, stage: str, name: str) -> list[Note]:

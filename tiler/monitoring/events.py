@@ -16,7 +16,7 @@ from tiler.engine.stage import Box, Facts, Layout, Scope
 from tiler.engine.task import Record
 from tiler.monitoring.watchers import Item, RunStart, Watcher, tell_command
 from tiler.store.atomic import replacing
-from tiler.store.stated_files import FILES
+from tiler.store.checksums import FILES
 
 EVERY = 1.0  # s between two writes
 CHUNK = 1000  # tiles or seams a line

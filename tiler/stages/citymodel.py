@@ -22,7 +22,7 @@ from tiler.citymodels.tables import (
 )
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
-from tiler.store.stated_files import FILES, state_files
+from tiler.store.checksums import FILES, state_files
 
 FULL_CITY_MODEL = "citymodel-full.city.json"
 CITY_MODEL = "citymodel.city.json"

@@ -43,8 +43,8 @@ from tiler.planning.context import find_owned, seam_name, tile_key, tile_name
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.left_out import read_polygons
 from tiler.stages.readers import read_bands, read_buildings, read_terrain
+from tiler.store.checksums import FILES, state_files
 from tiler.store.results import COLUMN_ARRAYS, unpack_columns
-from tiler.store.stated_files import FILES, state_files
 from tiler.workflow.run_folder import REGION
 
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")

@@ -31,7 +31,7 @@ from tiler.engine.task import Task
 from tiler.footprints.footprint_index import FootprintRows, join_footprints, select_footprints
 from tiler.pointclouds.cells import select_cells
 from tiler.pointclouds.ingest import CELL
-from tiler.store.packing import CHUNK_BYTES
+from tiler.store.result_file import CHUNK_BYTES
 
 CHUNK_ROWS = CHUNK_BYTES // 12  # of coordinates in the store, three units of 4 bytes each
 BAND = 3 * CHUNK_ROWS  # rows of points that are read at a time, 1.05 million

@@ -17,17 +17,9 @@ from tiler.objects.places import in_bucket
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Give a path beside `path` to write to; the file takes its place when all went well.
 
-    Parameters
-    ----------
-    path : Path
-        The file; an object is put whole, from a file in the temporary folder.
-    durable : bool
-        Wait until the disk has it: after a loss of power `path` is the old file or the new one, both whole.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written; then `path` is not there, or is the old file.
+    With `durable`, wait until the disk has it: after a loss of power `path` is the old file or the new one, both
+    whole. An object is put whole, from a file in the temporary folder. OutputError if the file cannot be written;
+    then `path` is not there, or is the old file.
     """
     if in_bucket(path):
         part = Path(tempfile.gettempdir()) / f"citystitch-{uuid.uuid4().hex}.part{path.suffix}"
@@ -79,10 +71,7 @@ def _sync(path: Path) -> None:
 def replacing_folder(path: Path) -> Iterator[Path]:
     """Give an empty folder beside `path` to write to; it takes its place when all went well.
 
-    Raises
-    ------
-    OutputError
-        If the folder cannot be written; then `path` is not there, or is the old folder.
+    OutputError if the folder cannot be written; then `path` is not there, or is the old folder.
     """
     stem = f".{path.name}.{uuid.uuid4().hex}"
     part, old = path.with_name(f"{stem}.part"), path.with_name(f"{stem}.old")

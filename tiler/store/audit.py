@@ -1,4 +1,4 @@
-"""`citystitch check --store`: hold every artefact of a run folder against its checksum."""
+"""What a finished run has made (its manifest), and `citystitch check --store`, which compares all of it."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -8,16 +8,81 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import CityError, InputError
+from tiler.engine.records import Records
 from tiler.engine.task import APART
-from tiler.store.checksums import is_sealed
+from tiler.store.atomic import replacing
+from tiler.store.checksums import FILES, GONE, TAIL, find_change, find_file_damage, is_sealed, seal_file
 from tiler.store.folder_lock import is_held
-from tiler.store.manifest import Entry, read_manifest
-from tiler.store.stated_files import FILES, GONE, tell_change
-from tiler.store.store import Store
-from tiler.store.zarr_files import GROUP
+from tiler.store.store import SUFFIX, Store
 from tiler.workflow.out_folder import INDEXES, MANIFEST_PATH, PIECES, RUN_RECORD, STORE
 
 STRAY = "is not of this run"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A result as the manifest states it: stage and name, key and digest, and its files beside the store.
+
+    Of these, size (bytes) and CRC-32 by path below the run's folder.
+    """
+
+    stage: str
+    name: str
+    key: str
+    digest: str
+    files: Mapping[str, Any]
+
+
+def write_manifest(path: Path, records: Records, files: Mapping[str, Any]) -> None:
+    """Write the manifest: a line of JSON a result, by stage and name, at last the files that none states.
+
+    These are as `tiler.store.checksums.state_files` gives them. No clock and no place is in the manifest: the same
+    input gives the same bytes. It appears whole or not at all, and ends as `seal_file` leaves it.
+    """
+    with replacing(path, durable=True) as part:
+        with part.open("wb") as file:
+            for stage, name in sorted(records):
+                key, _ = records.made(stage, name)
+                entry = [stage, name, key, records.digest(stage, name), records.files(stage, name)]
+                file.write(json.dumps(entry, sort_keys=True).encode() + b"\n")
+            file.write(json.dumps({FILES: files}).encode() + b"\n" + b"0" * TAIL)
+        seal_file(part)
+
+
+def read_manifest(path: Path) -> Iterator[Entry | Mapping[str, Any]]:
+    """Read a manifest line by line: entries, at last the files that no result states.
+
+    InputError if it is not there or damaged, before the first entry.
+    """
+    if damage := find_file_damage(path):
+        raise InputError(f"{path}: {damage}; run again")
+    try:
+        with path.open("rb") as file:
+            for content in map(json.loads, file):
+                if isinstance(content, dict):
+                    yield content[FILES]
+                    return
+                yield Entry(*content)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run again") from None
+
+
+def find_remade(path: Path, records: Records) -> dict[tuple[str, str], str]:
+    """Find the results of a finished run that the next one computed again with the same key, and say why.
+
+    Without a manifest only those that were there and damaged.
+    """
+    found = records.damage
+    lost: dict[tuple[str, str], str] = {}
+    try:
+        for entry in read_manifest(path):
+            if isinstance(entry, Entry):
+                item = entry.stage, entry.name
+                if item in records and item not in found and records.made(*item) == (entry.key, True):
+                    lost[item] = "was not there"
+    except InputError:
+        lost = {}
+    return dict(sorted((found | lost).items()))
 
 
 @dataclass(frozen=True)
@@ -46,20 +111,13 @@ class Audit:
     ----------
     finished : bool
         Whether the run was finished, so that what is missing is known.
-    n_results, n_files : int
-        Results and files beside the store that were looked at.
-    n_bytes : int
-        Size of these files, and of the files of these results.
+    n_results, n_files, n_bytes : int
+        Results and files beside the store that were read, and the size of all of them.
 
     Raises
     ------
     InputError
         If the folder is not that of a run.
-
-    Notes
-    -----
-    One file is read at a time, a megabyte or a chunk of it; the names of one stage's results and the paths of the
-    pieces are held.
     """
 
     def __init__(self, directory: Path, *, deep: bool = True) -> None:
@@ -108,11 +166,13 @@ class Audit:
                 yield from self._check_files(entry.files)
             for name in self._store.names(stage):
                 if name not in names:
-                    yield Damage(f"{STORE}/{stage}/{name}", STRAY)
+                    yield Damage(f"{STORE}/{stage}/{name}{SUFFIX}", STRAY)
         for stage in self._store.stages():
             if stage not in stages:
                 yield Damage(f"{STORE}/{stage}", STRAY)
         for path in self._store.find_strays():
+            if path.parent.name not in stages and path.parent != self._store.path:
+                continue  # in a stage that was named
             yield Damage(path.relative_to(self.directory).as_posix(), STRAY)
         if self._is_listed:
             for folder, suffix in PIECES.items():
@@ -138,37 +198,30 @@ class Audit:
             return Entry(stage, name, "", "", {})
 
     def _check_result(self, entry: Entry) -> Iterator[Damage]:
+        """Check the bytes of a result, then what the manifest and its own digest say of it."""
         self.n_results += 1
-        folder = self._store.folder(entry.stage, entry.name)
-        self.n_bytes += sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-        place = f"{STORE}/{entry.stage}/{entry.name}"
+        place = f"{STORE}/{entry.stage}/{entry.name}{SUFFIX}"
         damage = self._store.find_damage(entry.stage, entry.name)
-        if not folder.exists():
-            yield Damage(place, GONE)
+        if damage != GONE:
+            self.n_bytes += self._store.file(entry.stage, entry.name).stat().st_size
+        if damage:
+            yield Damage(place, damage)
             return
-        for path, what in damage.items():
-            yield Damage(f"{place}/{path}", what)
-        if not damage:
-            yield from self._check_content(entry, place)
-
-    def _check_content(self, entry: Entry, place: str) -> Iterator[Damage]:
-        """Check a result whose files are as they were written against what the manifest and its digest say."""
-        attributes, digest = self._store.describe(entry.stage, entry.name)
-        if (attributes.get("key"), digest) != (entry.key, entry.digest):
-            yield Damage(f"{place}/{GROUP}", "has another key or digest than the run that was finished")
-        elif self.deep:
-            try:
+        try:
+            attributes, digest = self._store.describe(entry.stage, entry.name)
+            if (attributes.get("key"), digest) != (entry.key, entry.digest):
+                yield Damage(place, "has another key or digest than the run that was finished")
+            elif self.deep:
                 computed = self._store.compute_digest(entry.stage, entry.name, apart=APART)
-            except InputError as error:
-                yield Damage(place, _reason(error, self._store.folder(entry.stage, entry.name)))
-                return
-            if computed != digest:
-                yield Damage(place, f"its content has the digest {computed}, stated is {digest}")
+                if computed != digest:
+                    yield Damage(place, f"its content has the digest {computed}, stated is {digest}")
+        except InputError as error:
+            yield Damage(place, _reason(error, self._store.file(entry.stage, entry.name)))
 
     def _check_files(self, files: Mapping[str, Any]) -> Iterator[Damage]:
         for path, stated in sorted(files.items()):
             self.n_files += 1
-            change = tell_change(self.directory / path, stated)
+            change = find_change(self.directory / path, stated)
             if change:
                 yield Damage(path, change)
             if change != GONE:
@@ -176,23 +229,14 @@ class Audit:
 
 
 def read_sealed_record(path: Path) -> tuple[dict[str, Any], str]:
-    """Read ``run.json``, and say what is wrong with it: nothing if it is as it was written.
-
-    Returns
-    -------
-    dict
-        What it holds, empty where that is no JSON object.
-    str
-        What is wrong.
-    """
+    """Read ``run.json``, empty if it is no JSON object, and say what is wrong with it: nothing if it is sound."""
     try:
         text = path.read_bytes()
+        record = json.loads(text)
     except FileNotFoundError:
         return {}, GONE
     except OSError as error:
         return {}, f"cannot be read ({error.strerror})"
-    try:
-        record = json.loads(text)
     except (ValueError, RecursionError) as error:
         return {}, f"is no JSON ({error})"
     if not isinstance(record, dict):
@@ -201,14 +245,7 @@ def read_sealed_record(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def audit_run(directory: Path, tell: Callable[[str], None]) -> bool:
-    """Audit a run folder, and tell it line by line.
-
-    Parameters
-    ----------
-    directory : Path
-        The folder of a run.
-    tell : callable
-        Called with a line for each damaged artefact, and with one at the end.
+    """Audit a run folder: call `tell` with a line for each damaged artefact, and with one at the end.
 
     Returns
     -------
@@ -229,10 +266,9 @@ def audit_run(directory: Path, tell: Callable[[str], None]) -> bool:
     seen = f"{audit.n_results} results and {audit.n_files} files beside the store, {audit.n_bytes / 1e6:.1f} MB"
     if not audit.finished:
         seen += ", of a run that is not finished: what is missing is not known"
+    verdict = "every byte is as it was written"
     if n_damaged:
         verdict = f"{n_damaged} damaged; give the command of the run again: it makes these anew, and no more"
-    else:
-        verdict = "every byte is as it was written"
     tell(f"{directory}: {seen}: {verdict}")
     return not n_damaged
 

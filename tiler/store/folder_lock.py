@@ -30,29 +30,18 @@ NEXT = "wait for its end, or give another --out"
 class Owner:
     """Who holds a folder.
 
-    Attributes
-    ----------
-    host : str
-        Name of the machine.
-    place : str
-        Boot and process namespace in which `pid` means something; empty where the system does not tell.
-    pid : int
-        Process.
-    began : str
-        When the process began, in ticks after the boot, since pids come again; empty where nobody tells.
-    token : str
-        Never met again.
+    `place` and `began` are empty where the system does not tell them; `token` is never met again.
     """
 
     host: str
-    place: str
+    place: str  # boot and namespace of processes, within which `pid` means something
     pid: int
-    began: str
+    began: str  # ticks after the boot, since process numbers come again
     token: str
 
 
 @contextmanager
-def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator[Callable[[], None]]:
+def only_run(folder: Path, say: Callable[[str], None] = say_nothing) -> Iterator[Callable[[], None]]:
     """Hold a folder for one run at a time; the hold ends with the process, however it ends.
 
     Parameters
@@ -83,21 +72,24 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
     if in_bucket(folder):
         from tiler.objects.lease import only_run_in_bucket
 
-        with only_run_in_bucket(folder, say or say_nothing) as lease:
+        with only_run_in_bucket(folder, say) as lease:
             yield lease.check
         return
     path = folder / LOCK
-    file, locked = _take(path, say or say_nothing)
+    file, locked = _take(path, say)
+    stop = threading.Event()
+    beat = threading.Thread(target=_beat, args=(file, stop), daemon=True)
     try:
-        stop = threading.Event()
-        beat = threading.Thread(target=_beat, args=(file, stop), daemon=True)
         beat.start()
         try:
-            yield _hold
+            yield lambda: None
         finally:
             stop.set()
             beat.join()
-            _give_back(path, file, locked=locked)
+            owner = _read_owner(path)
+            if _is_at(path, file) and (locked or owner is None or owner.pid == os.getpid()):
+                with suppress(OSError):
+                    path.unlink()
     finally:
         os.close(file)
 
@@ -117,11 +109,9 @@ def is_held(folder: Path) -> bool:
         raise InputError(f"{path}: cannot be read ({error.strerror}); remove it if no run is at work") from error
     try:
         state = _ask(file, fcntl.LOCK_SH)
-        if state == "held":
-            return True
         owner = _read_owner(path)
-        if owner is None:
-            return False
+        if state == "held" or owner is None:
+            return state == "held"
         known = is_alive(owner) if state == "none" or _is_elsewhere(owner) else False
         return time.time() - os.fstat(file).st_mtime < SILENCE if known is None else known
     finally:
@@ -131,11 +121,12 @@ def is_held(folder: Path) -> bool:
 def _take(path: Path, say: Callable[[str], None]) -> tuple[int, bool]:
     """Take the lock file: its descriptor, and whether the system has locked it."""
     while True:
-        file = _open(path)
+        file = -1
         try:
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
             state = _ask_often(file)
             if state == "held":
-                raise ConfigError(f"{path.parent}: {BUSY}{_name(_read_owner(path))}; {NEXT}")
+                raise _busy(path, _read_owner(path))
             # Its holder removes the file at the end: the lock may be on one that is gone.
             if not _is_at(path, file):
                 os.close(file)
@@ -149,37 +140,31 @@ def _take(path: Path, say: Callable[[str], None]) -> tuple[int, bool]:
                     f"{path.name} alone"
                 )
             _write_owner(path, file, locked=state == "locked")
-        except OSError as error:
-            os.close(file)
-            raise _refused(path, error) from error
-        except BaseException:
-            os.close(file)
-            raise
-        return file, state == "locked"
+            return file, state == "locked"
+        except BaseException as error:
+            if file >= 0:
+                os.close(file)
+            if not isinstance(error, OSError):
+                raise
+            if error.errno == errno.ELOOP:
+                raise ConfigError(f"{path}: is a symbolic link; remove it") from error
+            raise OutputError(
+                f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
+            ) from error
 
 
-def _open(path: Path) -> int:
-    try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise ConfigError(f"{path}: is a symbolic link; remove it") from error
-        raise _refused(path, error) from error
-
-
-def _refused(path: Path, error: OSError) -> OutputError:
-    return OutputError(f"{path}: cannot be written ({error.strerror}); free space or choose another folder")
+def _busy(path: Path, owner: Owner | None) -> ConfigError:
+    name = f" ({tell_owner(owner)})" if owner is not None else ""
+    return ConfigError(f"{path.parent}: {BUSY}{name}; {NEXT}")
 
 
 def _ask_often(file: int) -> str:
     """Ask for the lock more than once: whoever asks for the status holds it for a blink."""
-    for k in range(ASKED):
-        state = _ask(file, fcntl.LOCK_EX)
-        if state != "held":
-            break
-        if k + 1 < ASKED:
-            time.sleep(0.05)
-    return state
+    for _ in range(ASKED - 1):
+        if (state := _ask(file, fcntl.LOCK_EX)) != "held":
+            return state
+        time.sleep(0.05)
+    return _ask(file, fcntl.LOCK_EX)
 
 
 def _ask(file: int, lock: int) -> str:
@@ -192,26 +177,22 @@ def _ask(file: int, lock: int) -> str:
 
 
 def _wait_for_death(path: Path, owner: Owner, say: Callable[[str], None], *, locked: bool) -> None:
-    """Return when the owner that a lock file names is dead; ConfigError if it lives."""
+    """Return when the owner that a lock file names is dead; ConfigError if it lives.
+
+    One elsewhere is listened to for a heartbeat; no clocks are compared, which may differ between machines.
+    """
     if locked and not _is_elsewhere(owner):
         return  # the system would have refused the lock
     alive = is_alive(owner)
     if alive is None:
         say(f"{path.parent}: {tell_owner(owner)} was at work there; listening for {SILENCE:g} s whether it is")
-        alive = _hears(path, owner)
+        first, end = _touched(path), time.monotonic() + SILENCE
+        while not alive and time.monotonic() < end:
+            time.sleep(min(1.0, SILENCE / 10))
+            alive = _touched(path) != first or _read_owner(path) != owner
     if alive:
-        raise ConfigError(f"{path.parent}: {BUSY}{_name(owner)}; {NEXT}")
+        raise _busy(path, owner)
     say(f"{path.parent}: taken over from {tell_owner(owner)}, which is dead")
-
-
-def _hears(path: Path, owner: Owner) -> bool:
-    """Listen for a heartbeat; no clocks are compared, which may differ between machines."""
-    first, end = _touched(path), time.monotonic() + SILENCE
-    while time.monotonic() < end:
-        time.sleep(min(1.0, SILENCE / 10))
-        if _touched(path) != first or _read_owner(path) != owner:
-            return True
-    return False
 
 
 def _touched(path: Path) -> int:
@@ -225,22 +206,12 @@ def _touched(path: Path) -> int:
 def _write_owner(path: Path, file: int, *, locked: bool) -> None:
     """Write who holds the folder; without locks, make sure that nobody else did so at the same moment."""
     owner = this_process()
-    text = json.dumps(asdict(owner)).encode() + b"\n"
     os.ftruncate(file, 0)
-    os.pwrite(file, text, 0)
-    if locked:
-        return
-    time.sleep(min(1.0, SILENCE / 10))
-    found = _read_owner(path)
-    if found != owner:
-        raise ConfigError(f"{path.parent}: {BUSY}{_name(found)}; {NEXT}")
-
-
-def _give_back(path: Path, file: int, *, locked: bool) -> None:
-    owner = _read_owner(path)
-    if _is_at(path, file) and (locked or owner is None or owner.pid == os.getpid()):
-        with suppress(OSError):
-            path.unlink()
+    os.pwrite(file, json.dumps(asdict(owner)).encode() + b"\n", 0)
+    if not locked:
+        time.sleep(min(1.0, SILENCE / 10))
+        if (found := _read_owner(path)) != owner:
+            raise _busy(path, found)
 
 
 def _beat(file: int, stop: threading.Event) -> None:
@@ -267,17 +238,9 @@ def _read_owner(path: Path) -> Owner | None:
         return None
 
 
-def _name(owner: Owner | None) -> str:
-    return f" ({tell_owner(owner)})" if owner is not None else ""
-
-
 def tell_owner(owner: Owner) -> str:
     """Say who has a folder."""
     return f"process {owner.pid} on {owner.host}"
-
-
-def _hold() -> None:
-    """Do nothing: the system holds the lock."""
 
 
 def this_process() -> Owner:

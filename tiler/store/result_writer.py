@@ -1,47 +1,33 @@
-"""One result of the store on its way there: see `tiler.store.store` for what it is made of."""
+"""One result on its way into the store: see `tiler.store.result_file` for what its file is made of."""
 
-import base64
-import errno
 import json
-import os
 import shutil
 import tempfile
 import uuid
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
+from zipfile import ZipFile, ZipInfo
 
+import numpy as np
 from blake3 import blake3
-from deflate import crc32
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import OutputError
 from tiler.objects.places import in_bucket
-from tiler.store.checksums import seal
-from tiler.store.packing import (
-    INLINE_BYTES,
-    PACKED_BYTES,
-    SQUARE,
-    RowBuffer,
-    Table,
-    check_name,
-    checksums,
-    pack,
-    plain_array,
-    raw_bytes,
-    rows_per_chunk,
-    square_checksums,
-)
-from tiler.store.result_reader import PACKED, RESERVED
-from tiler.store.zarr_files import GROUP, ChunkForm, describe_group
+from tiler.store.atomic import replacing
+from tiler.store.checksums import TAIL, seal_file
+from tiler.store.result_file import GROUP, KINDS, NPY, rows_per_chunk
 
 if TYPE_CHECKING:
-    from tiler.objects.path import ObjectPath
+    import zarr
 
-PARTIAL = ".partial"
+SMALL_BYTES = 256 * 2**10  # zarr takes as long for a larger array as numpy for ten of these
+SQUARE = 320  # rows and columns of a raster's chunks: a neighbour mostly reads a strip
 DIGEST_BYTES = 16  # of the 32 that BLAKE3 gives
+DIGEST = "digest"  # the attribute of the store's own
 
 
 class Writer:
@@ -52,92 +38,75 @@ class Writer:
 
     Parameters
     ----------
-    folder : Path
+    path : Path
         Where the result will be.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._scratch = (
-            Path(tempfile.gettempdir()) / f"citystitch-{uuid.uuid4().hex}" if in_bucket(folder) else None
-        )
-        self._partial = (self._scratch or folder.parent) / f".{folder.name}.{uuid.uuid4().hex}{PARTIAL}"
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        beside = Path(tempfile.gettempdir()) if in_bucket(path) else path.parent
+        self._chunks = beside / f".{path.stem}.{uuid.uuid4().hex}.partial"  # what zarr writes of large arrays
         self._small: dict[str, NDArray[Any]] = {}
-        self._buffers: dict[str, RowBuffer] = {}
-        self._table: Table = {}
+        self._large: dict[str, zarr.Array[Any]] = {}
+        self._begun: dict[str, list[NDArray[Any]]] = {}  # appended rows that make no whole chunk yet
         self._hashes: dict[str, blake3] = {}
-        self._files: dict[str, list[int]] = {}  # size and CRC-32 by path
-        self._folders: set[Path] = set()
 
     def __enter__(self) -> Self:
         with self._disk():
-            self._partial.mkdir(parents=True)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        shutil.rmtree(self._scratch or self._partial, ignore_errors=True)
+        shutil.rmtree(self._chunks, ignore_errors=True)
 
     def put(self, **arrays: ArrayLike) -> None:
         """Write whole arrays, each name once.
 
-        Raises
-        ------
-        ValueError
-            If a name came before, or an array is of a type that cannot be stored (objects, complex numbers).
-        OutputError
-            If the disk refuses.
+        ValueError if a name came before, or for objects and complex numbers; OutputError if the disk refuses.
         """
         for name, values in arrays.items():
             self._put(name, self._take(name, values))
 
     def put_rasters(self, **rasters: ArrayLike) -> None:
-        """Write whole arrays of rows and columns, each name once, in square chunks, to read windows of them.
-
-        Raises
-        ------
-        ValueError
-            As from `put`, or if an array has not two axes.
-        OutputError
-            If the disk refuses.
-        """
+        """Write arrays of rows and columns, in square chunks to read windows of them; errors as from `put`."""
         for name, values in rasters.items():
-            raster = self._take(name, values)
+            raster = plain_array(name, values)
             if raster.ndim != 2 or raster.dtype.kind == "U":
                 raise ValueError(f"array {name}: {raster.dtype} {raster.shape} is no raster")
-            self._put(name, raster, square=True)
+            self._put(name, self._take(name, raster), square=True)
 
     def append(self, **arrays: ArrayLike) -> None:
-        """Append rows to arrays, which grow chunk by chunk on disk: about 4 MB of each are held in memory.
+        """Append rows to arrays, which grow chunk by chunk on disk; errors as from `put`.
 
-        Raises
-        ------
-        ValueError
-            If the rows differ in type or shape from those before, or the array was put.
-        OutputError
-            If the disk refuses.
+        About 4 MB of each are held in memory, of strings all. All rows have one type and width, else ValueError.
         """
         for name, values in arrays.items():
-            check_name(name)
             rows = plain_array(name, values)
             if rows.ndim == 0:
                 raise ValueError(f"array {name}: a single value has no rows to append")
-            if name not in self._buffers:
-                if name in self._small or name in self._table:
-                    raise ValueError(f"array {name} is written twice")
-                self._buffers[name] = RowBuffer(name, rows)
-            chunks = self._buffers[name].add(rows)
-            self._hash(name, rows)
-            for whole in chunks:
-                self._extend(name, whole)
+            if name not in self._begun:
+                self._take(name, rows[:0])
+                self._begun[name] = [rows[:0].copy()]
+            begun = self._begun[name]
+            if rows.dtype != begun[0].dtype or rows.shape[1:] != begun[0].shape[1:]:
+                raise ValueError(
+                    f"array {name}: rows of {rows.dtype} {rows.shape[1:]} appended to rows of {begun[0].dtype} "
+                    f"{begun[0].shape[1:]}; give all pieces one type and width"
+                )
+            self._hashes[name].update(raw_bytes(rows).data)
+            begun.append(rows.copy())
+            chunk = rows_per_chunk(rows)
+            if rows.dtype.kind != "U" and (count := sum(map(len, begun))) >= chunk:
+                joined, whole = np.concatenate(begun), count // chunk * chunk
+                self._extend(name, joined[:whole])
+                self._begun[name] = [joined[whole:].copy()]
 
     def discard(self) -> None:
         """Forget all arrays that were written so far."""
-        for name in self._table:
-            shutil.rmtree(self._partial / name, ignore_errors=True)
-        self._small, self._buffers, self._table, self._hashes = {}, {}, {}, {}
-        self._files, self._folders = {}, set()
+        shutil.rmtree(self._chunks, ignore_errors=True)
+        self._small, self._large, self._begun, self._hashes = {}, {}, {}, {}
 
     def commit(self, attributes: Mapping[str, Any] | None = None, *, apart: Collection[str] = ()) -> str:
         """Make the result visible, in place of an earlier one.
@@ -158,124 +127,88 @@ class Writer:
         Raises
         ------
         ValueError
-            If the attributes are no plain JSON, or use a name of `RESERVED`.
+            If the attributes are no plain JSON, or use the name `DIGEST`.
         OutputError
             If the disk refuses.
         """
         kept = plain_json(dict(attributes or {}))
-        if set(kept) & set(RESERVED):
-            raise ValueError(f"attributes may not be named {' or '.join(RESERVED)}")
-        for name, buffer in sorted(self._buffers.items()):
-            rest = buffer.rest()
-            if name not in self._table:
+        if DIGEST in kept:
+            raise ValueError(f"attributes may not be named {DIGEST}")
+        for name, begun in self._begun.items():
+            rest = np.concatenate(begun)
+            if name not in self._large:
                 self._put(name, rest)
             elif len(rest):
                 self._extend(name, rest)
-        if self._small:
-            packed, table = pack(self._small)
-            if len(packed) <= INLINE_BYTES:
-                self._table[PACKED] = {"base64": base64.b64encode(packed.data).decode()}
-            else:
-                self._create(PACKED, packed)
-            self._table |= table
-        digest = self._digest({name: value for name, value in kept.items() if name not in apart})
-        kept["digest"] = digest
-        kept["arrays"] = plain_json(self._table)
-        with self._disk():
-            for name, entry in self._table.items():
-                if "crc" in entry:
-                    self._write(f"{name}/{GROUP}", ChunkForm.of(entry).describe())
-            files = dict(sorted(self._files.items(), key=lambda one: one[0].split("/")))
-            kept |= {"files": files, "checksum": "0" * 8}
-            self._write(GROUP, seal(describe_group(dict(sorted(kept.items())))))
-            self._replace()
+        written: dict[str, Any] = {**self._small, **self._large}
+        arrays = [
+            [name, array.dtype.str, list(array.shape), self._hashes[name].hexdigest(DIGEST_BYTES)]
+            for name, array in sorted(written.items())
+        ]
+        digest = hash_content(arrays, {name: value for name, value in kept.items() if name not in apart})
+        group = {"attributes": dict(sorted((kept | {DIGEST: digest}).items()))}
+        text = json.dumps(group | {"zarr_format": 3, "node_type": "group"}).encode()
+        with self._disk(), replacing(self._path) as part:
+            self._write_zip(part, text)
         return digest
 
+    def _write_zip(self, part: Path, group: bytes) -> None:
+        """Write the file: parts in the order of their names, without the time."""
+        chunks = {path.relative_to(self._chunks).as_posix() for path in self._chunks.rglob("*") if path.is_file()}
+        with ZipFile(part, "w") as file:
+            file.comment = b"0" * TAIL
+            for name in sorted({GROUP, *chunks, *(name + NPY for name in self._small)}):
+                with file.open(ZipInfo(name), "w") as entry:
+                    if name == GROUP:
+                        entry.write(group)
+                    elif name in chunks:
+                        entry.write((self._chunks / name).read_bytes())
+                    else:
+                        array = self._small[name.removesuffix(NPY)]
+                        np.lib.format.write_array(entry, array, version=(1, 0), allow_pickle=False)
+        seal_file(part)
+
     def _take(self, name: str, values: ArrayLike) -> NDArray[Any]:
-        """Check a whole array and hash it."""
-        check_name(name)
-        if name in self._small or name in self._table or name in self._buffers:
+        """Check a whole array and hash it: how rows were cut does not show in the hash."""
+        if not name.isidentifier() or not name.isascii() or name[0] == "_":
+            raise ValueError(f"array name {name!r}: letters, digits and underscores only, a letter first")
+        if name in self._hashes:
             raise ValueError(f"array {name} is written twice")
         array = plain_array(name, values)
-        self._hash(name, array)
+        self._hashes[name] = blake3(raw_bytes(array).data)
         return array
 
-    def _hash(self, name: str, rows: NDArray[Any]) -> None:
-        """Hash the bytes of an array as they come: how rows were cut does not show in them."""
-        if name not in self._hashes:
-            self._hashes[name] = blake3()
-        self._hashes[name].update(raw_bytes(rows).data)
-
-    def _digest(self, attributes: Mapping[str, Any]) -> str:
-        arrays = [
-            [name, self._table[name]["dtype"], self._table[name]["shape"], found.hexdigest(DIGEST_BYTES)]
-            for name, found in sorted(self._hashes.items())
-        ]
-        return hash_content(arrays, attributes)
-
     def _put(self, name: str, array: NDArray[Any], *, square: bool = False) -> None:
-        if array.nbytes <= PACKED_BYTES or array.ndim == 0:
+        if array.nbytes <= SMALL_BYTES or array.ndim == 0 or array.dtype.kind == "U":
             self._small[name] = array.copy()
+        elif square:
+            self._create(name, array, (min(len(array), SQUARE), min(array.shape[1], SQUARE)))
         else:
-            self._create(name, array, square=square)
-
-    def _create(self, name: str, array: NDArray[Any], *, square: bool = False) -> None:
-        chunk, *further = (max(n, 1) for n in array.shape)
-        entry: dict[str, Any] = {"dtype": array.dtype.str, "shape": list(array.shape)}
-        if square:
-            chunk, further = min(chunk, SQUARE), [min(further[0], SQUARE)]
-            entry |= {"chunk": chunk, "columns": further[0], "crc": square_checksums(array)}
-        else:
-            chunk = min(chunk, rows_per_chunk(array))
-            entry |= {"chunk": chunk, "crc": checksums(array, chunk)}
-        self._table[name] = entry
-        self._compress(name, array)
+            self._create(name, array, (min(len(array), rows_per_chunk(array)), *array.shape[1:]))
 
     def _extend(self, name: str, rows: NDArray[Any]) -> None:
         """Add rows to an array on disk that ends with a whole chunk."""
-        if name not in self._table:
-            self._create(name, rows)
+        if name not in self._large:
+            self._create(name, rows, (rows_per_chunk(rows), *rows.shape[1:]))
             return
-        entry = self._table[name]
-        first = len(entry["crc"])
-        entry["shape"][0] += len(rows)
-        entry["crc"] += checksums(rows, entry["chunk"])
-        self._compress(name, rows, first)
-
-    def _compress(self, name: str, values: NDArray[Any], first: int = 0) -> None:
-        """Write the chunks of an array, or of further rows of it."""
         with self._disk():
-            for file, data in ChunkForm.of(self._table[name]).compress(values, first):
-                self._write(f"{name}/{file}", data)
+            self._large[name].append(rows)
 
-    def _write(self, file: str, data: bytes) -> None:
-        path = self._partial / file
-        if path.parent not in self._folders:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._folders.add(path.parent)
-        path.write_bytes(data)
-        self._files[file] = [len(data), crc32(data)]
+    def _create(self, name: str, array: NDArray[Any], chunks: tuple[int, ...]) -> None:
+        import zarr
+        from zarr.codecs import BloscCodec
 
-    def _replace(self) -> None:
-        """Rename into place; another writer of the same result may do so at the same moment."""
-        if in_bucket(self._folder):
-            from tiler.objects.results import publish
-
-            publish(self._partial, self._folder, GROUP)
-            return
-        old = self._partial.with_name(f".{self._folder.name}.{uuid.uuid4().hex}{PARTIAL}")
-        while True:
-            try:
-                os.replace(self._partial, self._folder)
-                return
-            except OSError as error:
-                if error.errno not in {errno.ENOTEMPTY, errno.EEXIST}:
-                    raise
-            try:
-                os.replace(self._folder, old)
-            except FileNotFoundError:
-                continue
-            delete(old)
+        with self._disk():
+            self._large[name] = zarr.create_array(
+                self._chunks,
+                name=name,
+                data=array,
+                chunks=chunks,
+                # Bytes of numbers apart, then LZ4: three times as fast as zarr's default, a tenth larger.
+                compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
+                zarr_format=3,
+                config={"write_empty_chunks": True},
+            )
 
     @contextmanager
     def _disk(self) -> Iterator[None]:
@@ -283,18 +216,30 @@ class Writer:
             yield
         except OSError as error:
             raise OutputError(
-                f"{self._folder}: cannot be written ({error}); free space there or choose another folder"
+                f"{self._path}: cannot be written ({error}); free space there or choose another folder"
             ) from error
 
 
-def plain_json(value: Any) -> Any:
-    """Bring a value into plain JSON (tuples become lists) with sorted keys.
+def plain_array(name: str, values: ArrayLike) -> NDArray[Any]:
+    """Bring an array into the form that is stored: contiguous, little-endian, of a fixed size.
 
-    Raises
-    ------
-    ValueError
-        If it holds NaN, infinity, or anything but dicts, lists, strings, numbers, booleans and None.
+    Booleans, integers, floats of at most 8 bytes and strings (``<U``) can be; ValueError for others.
     """
+    array = np.asarray(values)
+    kind, size = array.dtype.kind, array.dtype.itemsize
+    if kind not in KINDS or (kind == "f" and size > 8):
+        raise ValueError(f"array {name}: {array.dtype} cannot be stored; give booleans, numbers or <U strings")
+    dtype = array.dtype.newbyteorder("<") if size else np.dtype("<U1")
+    return np.ascontiguousarray(array, dtype=dtype).reshape(array.shape)
+
+
+def raw_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
+    """View a plain array as its bytes, (n_bytes,)."""
+    return array.reshape(-1).view(np.uint8)
+
+
+def plain_json(value: Any) -> Any:
+    """Bring a value into plain JSON (tuples become lists) with sorted keys; ValueError if it is none."""
     try:
         return json.loads(json.dumps(value, sort_keys=True, allow_nan=False))
     except (TypeError, ValueError) as error:
@@ -305,21 +250,3 @@ def hash_content(arrays: list[list[Any]], attributes: Mapping[str, Any]) -> str:
     """Make the digest of a result: name, type, shape and hash of each array, and the attributes that count."""
     text = json.dumps([arrays, attributes], sort_keys=True)
     return blake3(text.encode()).hexdigest(DIGEST_BYTES)
-
-
-def delete(path: Path) -> None:
-    """Delete a folder or a file, as far as that can be done."""
-    if in_bucket(path):
-        withdraw(path)
-    elif path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with suppress(OSError):
-            path.unlink()
-
-
-def withdraw(path: "ObjectPath") -> None:
-    """Delete the objects of a result or a stage, those that make it visible first."""
-    from tiler.objects.path import delete_below
-
-    delete_below(path, GROUP)

@@ -36,11 +36,9 @@ from tiler.planning.padded_layout import pad_plan
 from tiler.planning.plan import Plan, check_sources, make_plan
 from tiler.report.kept_report import give_back_report
 from tiler.store.atomic import replacing, sync_meanwhile
-from tiler.store.audit import Audit
-from tiler.store.checksums import seal
+from tiler.store.audit import Audit, find_remade, write_manifest
+from tiler.store.checksums import seal, state_files
 from tiler.store.folder_lock import only_run
-from tiler.store.manifest import find_remade, write_manifest
-from tiler.store.stated_files import state_files
 from tiler.workflow.empty_run import EmptyMeshError, is_empty
 from tiler.workflow.failed_tiles import (
     HolesError,

@@ -56,7 +56,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
         alone = config_alone(config, whole, tile)
     out = Path(alone.out)
     out.mkdir(parents=True, exist_ok=True)
-    with only_run(out, say):
+    with only_run(out, say or say_nothing):
         plan = make_plan(alone, say or say_nothing)
         for folder in PIECES:
             (out / folder).mkdir(exist_ok=True)
