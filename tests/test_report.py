@@ -230,7 +230,7 @@ def test_without_what_draws_the_page_says_so(
     if lost == "pyvista":
         monkeypatch.setitem(sys.modules, "pyvista", None)
     else:
-        monkeypatch.setattr("tiler.pictures.render._has_graphics", lambda: False)
+        monkeypatch.setattr("tiler.pictures.render.has_graphics", lambda: False)
     page = read(write_report(copy))
     assert [words for words in page.words if remedy in words]
     assert not [tag for tag, _ in page.elements if tag == "img"]

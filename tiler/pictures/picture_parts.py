@@ -131,7 +131,8 @@ def add_city(
             surface.cell_data["shown"] = shown[part]
             surface = surface.clean()
             actor = plotter.add_mesh(surface, scalars="shown", smooth_shading=smooth, **painted, **MATT, **lines)
-            actor.mapper.resolve = "polygon_offset"  # outlines are in front of what they are on
+            if actor is not None:  # None without OpenGL, where no lines are drawn
+                actor.mapper.resolve = "polygon_offset"  # outlines are in front of what they are on
     if 0 < built.sum() <= OUTLINE_FACETS:
         outlines = surface.extract_feature_edges(feature_angle=25, manifold_edges=False)
         plotter.add_mesh(outlines, color=LINE_COLOUR, line_width=2.0, opacity=0.8)

@@ -1,10 +1,7 @@
 """Pictures of a run's boundary, volume mesh and city model, drawn by VTK without a display (step 3.6)."""
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +14,7 @@ from tiler.pictures.camera import CUT_VIEW, MARGIN, SKY, VIEW, VIEW_ANGLE, fit_c
 from tiler.pictures.city_model_data import load_blocks
 from tiler.pictures.picture_data import City, find_middle, load_air, load_city
 from tiler.pictures.picture_parts import add_air, add_city, add_sizes, plan_edges
+from tiler.pictures.plain_picture import PlainPlotter, has_graphics
 from tiler.store.atomic import replacing
 
 # Pictures, and their sizes (pixels) where nothing else is asked for.
@@ -37,13 +35,11 @@ CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
 SAMPLES = 2  # pixels drawn along each pixel shown
 LEGEND = 0.1  # share of the picture of sizes that its legend takes
 LEAST_TRIANGLE = 3.0  # pixels that the middle triangle's edges need in the picture of sizes for lines to be drawn
-PROBE = """
-from vtkmodules.vtkRenderingCore import vtkRenderWindow
-import vtkmodules.vtkRenderingOpenGL2
-window = vtkRenderWindow()
-window.SetOffScreenRendering(1)
-window.Render()
-"""
+NEED_GRAPHICS = ("quality", "sizes")  # pictures with a legend
+NO_GRAPHICS = (
+    "VTK finds no OpenGL; Mesa needs no graphics card (Debian, Ubuntu: apt install libegl1 libgl1-mesa-dri; "
+    "Fedora: dnf install mesa-libEGL; conda: mesalib)"
+)
 Image = NDArray[np.uint8]
 
 
@@ -80,7 +76,7 @@ def render_run(
     ValueError
         If `what` is none of these, or `size` is less than 2 x 2.
     ConfigError
-        If pyvista is not installed, or VTK finds no OpenGL.
+        If pyvista is not installed; for ``"quality"`` and ``"sizes"``, if VTK finds no OpenGL.
     OutputError
         If the picture cannot be written.
     InputError
@@ -101,7 +97,11 @@ def render_run(
     columns, rows = size or SIZES[what]
     if columns < 2 or rows < 2:
         raise ValueError(f"size {columns} x {rows} must be at least 2 x 2")
-    need_graphics()
+    need_pictures()
+    if not has_graphics():
+        if what in NEED_GRAPHICS:
+            raise ConfigError(f"picture {what}: {NO_GRAPHICS}")
+        say(f"the picture is plain: {NO_GRAPHICS}")
     image = _draw(directory, what, (columns, rows), say)
     from PIL import Image as Pictures
 
@@ -109,24 +109,19 @@ def render_run(
         Pictures.fromarray(image).save(part, format="png", optimize=True)
 
 
-def need_graphics() -> None:
-    """Raise ConfigError if pyvista is not installed, or VTK cannot draw here."""
+def need_pictures() -> None:
+    """Raise ConfigError if pyvista is not installed."""
     try:
         import pyvista  # noqa: F401
     except ImportError as error:
         raise ConfigError("pictures need pyvista: pip install citystitch[pictures]") from error
-    if not _has_graphics():
-        raise ConfigError(
-            "pictures need OpenGL, and VTK finds none here: install Mesa, which needs no graphics card (Debian, "
-            "Ubuntu: apt install libegl1 libgl1-mesa-dri; Fedora: dnf install mesa-libEGL; conda: mesalib)"
-        )
 
 
-@cache
-def _has_graphics() -> bool:
-    """Tell whether VTK can draw here; asked in a process of its own, which VTK brings down where it cannot."""
-    done = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120, check=False)
-    return done.returncode == 0
+def need_graphics() -> None:
+    """Raise ConfigError if pyvista is not installed, or VTK finds no OpenGL."""
+    need_pictures()
+    if not has_graphics():
+        raise ConfigError(NO_GRAPHICS)
 
 
 def draw_city(
@@ -158,6 +153,8 @@ def draw_city(
     uint8, (height, width, 3)
         The picture.
     """
+    if not has_graphics():
+        return _draw_plainly(city, size, colours=colours, edges=edges, air=air)
     with _plotter(size) as plotter:
         plotter.set_background(SKY[0], top=SKY[1])
         extent = float(np.ptp(city.points[:, :2], axis=0).max())
@@ -185,6 +182,21 @@ def draw_city(
         plotter.reset_camera_clipping_range()
         plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=64)
         return _shoot(plotter)
+
+
+def _draw_plainly(city: City, size: tuple[int, int], *, colours: str, edges: bool, air: Any) -> Image:
+    """Paint the same without OpenGL, all of a cut."""
+    plotter = PlainPlotter()
+    shown = add_city(plotter, city, size, colours=colours, edges=edges)
+    if air is not None:
+        add_air(plotter, air, size)
+        shown = np.vstack([shown, air.points])
+    azimuth, elevation = VIEW if air is None else CUT_VIEW
+    aspect = size[0] / size[1]
+    position, focal = fit_camera(
+        shown, azimuth=azimuth, elevation=elevation, view_angle=VIEW_ANGLE / MARGIN, aspect=aspect
+    )
+    return plotter.paint(position, focal, view_angle=VIEW_ANGLE, size=size, sky=SKY)
 
 
 def draw_sizes(city: City, size: tuple[int, int]) -> Image:
