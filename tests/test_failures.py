@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -14,8 +15,9 @@ from tests.test_engine import contents, grid_layout, make, nothing, seen, told
 from tiler.engine.engine import Engine, StoppedError
 from tiler.engine.failures import Policy
 from tiler.engine.stage import Facts, Read, Scope, Stage
-from tiler.engine.task import Record, Task
+from tiler.engine.task import Failure, Record, Task
 from tiler.engine.task_limits import TASKS, Limits
+from tiler.executors.dask_executor import refuse_round, run_packed
 from tiler.executors.executor import Executor, Serial
 from tiler.executors.local_cluster import local
 
@@ -46,6 +48,11 @@ def no_geometry(_: Task) -> None:
 
 def full_disk(_: Task) -> None:
     raise OutputError("disk full")
+
+
+def slow(_: Task) -> Facts:
+    time.sleep(0.5)
+    return {}
 
 
 def leaves_its_time(task: Task) -> Facts:
@@ -220,3 +227,24 @@ def test_a_stop_keeps_what_ran(where: str, workers: Executor, tmp_path: Path) ->
     again = make(tmp_path, layout=layout)
     again.run(A, B)
     assert sum(record.reused for record in again.records.of("a")) == n_done
+
+
+def test_a_worker_begins_no_task_of_a_round_that_was_dropped() -> None:
+    refuse_round("dropped")
+    given: dict[str, Any] = {"seconds": 0.0, "requirements": None}
+    assert run_packed(b"no pickle", in_round="dropped", **given) is None
+    outcome = run_packed(b"no pickle", in_round="another", **given)
+    assert isinstance(outcome, Failure)
+    assert "cannot be read by a worker" in str(outcome.error)
+
+
+def test_what_is_dropped_ends_or_never_begins(workers: Executor, tmp_path: Path) -> None:
+    """What runs is waited for, what waits does not begin, and the executor takes tasks again."""
+    engine = make(tmp_path, workers, layout=grid_layout(6))
+    with pytest.raises(OutputError):
+        engine.run(faulty(replace(A, name="slow", function=slow), t0_0=full_disk))
+    n_done = len(engine.store.names("slow"))
+    time.sleep(1.0)
+    assert len(engine.store.names("slow")) == n_done < 36
+    engine.run(B, A)
+    assert len(engine.store.names("b")) == 36
