@@ -79,8 +79,8 @@ class Slurm:
         return done.stdout
 
     def states(self) -> dict[str, str]:
-        """State of each job that is known still, by its number (elements of an array have their own)."""
-        rows = self.ask("squeue", "--noheader", "--array", "--states=all", "--format=%i %T").splitlines()
+        """State of each job that is known still, by its number."""
+        rows = self.ask("squeue", "--noheader", "--states=all", "--format=%i %T").splitlines()
         return dict(row.split() for row in rows)
 
     def jobs_on(self, node: str) -> list[str]:

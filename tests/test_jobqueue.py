@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import signal
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -9,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 
 from pipeline.errors import CityError
@@ -18,6 +20,7 @@ from tiler.engine.task import Task
 from tiler.engine.task_limits import Limits
 from tiler.executors.dask_executor import ClusterError
 from tiler.executors.dask_settings import ENVIRONMENT, METHOD, start_fork_server
+from tiler.jobs import workers
 from tiler.jobs.cluster import QueueError
 from tiler.jobs.submission import read_worker_jobs
 from tiler.jobs.workers import FAILURES, LOSSES, SETTINGS, JobDask, WorkerJobs
@@ -61,7 +64,7 @@ def retires_its_worker(task: Task) -> Facts:
 
 
 @contextmanager
-def queued(workers: int = 2, error: str = "") -> Iterator[JobDask]:
+def queued(n: int = 2, error: str = "") -> Iterator[JobDask]:
     """Make the executor over workers of this machine."""
     from dask import config
     from distributed import Client, LocalCluster
@@ -70,7 +73,7 @@ def queued(workers: int = 2, error: str = "") -> Iterator[JobDask]:
     with (
         config.set(dict(SETTINGS) | HERE),
         LocalCluster(
-            n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
+            n_workers=n, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
             silence_logs="CRITICAL",
         ) as cluster,
         Client(cluster) as client,
@@ -103,7 +106,7 @@ def test_a_task_on_a_retiring_worker_is_not_lost(tmp_path: Path) -> None:
 def test_workers_that_never_come_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tiler.executors.dask_executor.LOOK", 0.2)
     with (
-        queued(workers=0, error="5 worker jobs in a row ended before their worker was there") as executor,
+        queued(n=0, error="5 worker jobs in a row ended before their worker was there") as executor,
         pytest.raises(ClusterError, match="5 worker jobs in a row"),
     ):
         make(tmp_path, executor).run(Stage("dies", Scope.REGION, dies))
@@ -198,7 +201,40 @@ def test_only_jobs_without_a_worker_count_as_failures(with_worker: bool, tmp_pat
     assert bool(jobs.error) is not with_worker
 
 
-@pytest.mark.parametrize(("processes", "workers"), [(1, 3), (2, 4), (5, 5)])
-def test_the_number_of_workers_is_one_of_whole_jobs(processes: int, workers: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("processes", "number"), [(1, 3), (2, 4), (5, 5)])
+def test_the_number_of_workers_is_one_of_whole_jobs(processes: int, number: int, tmp_path: Path) -> None:
     jobs, _, _ = worker_jobs(tmp_path, processes)
-    assert asyncio.run(jobs.target()) == workers
+    assert asyncio.run(jobs.target()) == number
+
+
+class Processes:
+    """A batch system whose jobs are processes of this machine."""
+
+    def states(self) -> dict[str, str]:
+        return {str(one.pid): one.status() for one in psutil.process_iter() if one.status() != "zombie"}
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # dask-jobqueue leaves processes
+def test_a_job_of_two_workers_that_is_gone_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from dask_jobqueue.local import LocalCluster
+    from distributed import Client
+
+    monkeypatch.setattr(workers, "ASK", 0.5)
+    with (
+        LocalCluster(
+            cores=2, processes=2, memory="2 GiB", local_directory=str(tmp_path), name="citystitch-worker",
+            scheduler_options={"dashboard_address": "127.0.0.1:0", "host": "127.0.0.1"}, silence_logs="critical",
+        ) as cluster,
+        Client(cluster) as client,
+    ):  # fmt: skip
+        options = {"minimum_jobs": 1, "maximum_jobs": 1, "interval": "0.2 s", "worker_key": workers._name_job}
+        jobs = cluster.adapt(Adaptive=WorkerJobs, system=Processes(), folder=tmp_path, processes=2, **options)
+        client.wait_for_workers(2, timeout=120)
+        (first,) = [job.job_id for job in cluster.workers.values()]
+        os.kill(int(first), signal.SIGKILL)
+        end = time.monotonic() + 120
+        while first in [job.job_id for job in cluster.workers.values()] or len(client.nthreads()) != 2:
+            assert time.monotonic() < end
+            time.sleep(0.2)
+        assert jobs.error == ""

@@ -161,12 +161,12 @@ def test_lost_nodes_and_walltimes_cost_nothing(
 ) -> None:
     """Two runs at a time, as they mostly sleep.
 
-    Of the first all workers end after a minute, one is cancelled from outside, and the node of another goes down.
+    Of the first all workers retire after 45 s, one is cancelled from outside, and the node of another goes down.
     The second has controllers of two minutes and needs more.
     """
     n, lossy, lasting = sum(city.stages().values()), tmp_path / "lossy", tmp_path / "lasting"
-    minute = {"worker": "00:01:00", "rest": 15, "stagger": 5}
-    submit(slurm, city, lossy, **minute, slow=slow(tmp_path, 0.8))
+    brief = {"worker": "00:01:30", "rest": 40, "stagger": 5}  # a busy machine starts and ends them slowly
+    submit(slurm, city, lossy, **brief, slow=slow(tmp_path, 0.8))
     first = submit(slurm, village, lasting, controller="00:02:00", margin=20, workers=1, slow=slow(tmp_path, 1.4))
 
     def wait_for_results(share: float) -> None:

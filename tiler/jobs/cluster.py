@@ -154,41 +154,26 @@ class BatchSystem:
         return {found["job"]: found["state"] for found in re.finditer(self.row, text, re.MULTILINE)}
 
 
+# fmt: off
 SYSTEMS: Mapping[str, BatchSystem] = {
     "slurm": BatchSystem(
-        "SLURMCluster",
-        "account",
-        ("--output={log}-%j.log", "--no-requeue"),
-        ("--dependency=afterany:{job}",),
-        "squeue --noheader --me --format=%A=%T",
-        r"^(?P<job>\d+)=(?P<state>\w+)$",
+        "SLURMCluster", "account", ("--output={log}-%j.log", "--no-requeue"), ("--dependency=afterany:{job}",),
+        "squeue --noheader --me --format=%A=%T", r"^(?P<job>\d+)=(?P<state>\w+)$",
     ),
     "pbs": BatchSystem(
-        "PBSCluster",
-        "account",
-        ("-j oe", "-o {logs}/", "-r n"),
-        ("-W", "depend=afterany:{job}"),
-        "qstat -u {user}",
-        r"^(?P<job>\d+)\S* .* (?P<state>[A-Z]) +\S+ *$",
+        "PBSCluster", "account", ("-j oe", "-o {logs}/", "-r n"), ("-W", "depend=afterany:{job}"),
+        "qstat -u {user}", r"^(?P<job>\d+)\S* .* (?P<state>[A-Z]) +\S+ *$",
     ),
-    "sge": BatchSystem(
-        "SGECluster",
-        "project",
-        ("-S /bin/bash", "-o {logs}/", "-r n"),
-        ("-hold_jid", "{job}"),
-        "qstat -u {user}",
-        r"^ *(?P<job>\d+) +\S+ +\S+ +\S+ +(?P<state>[^E\s]+) ",  # one with an E waits for its administrator
+    "sge": BatchSystem(  # a job with an E in its state waits for its administrator
+        "SGECluster", "project", ("-S /bin/bash", "-o {logs}/", "-r n"), ("-hold_jid", "{job}"),
+        "qstat -u {user}", r"^ *(?P<job>\d+) +\S+ +\S+ +\S+ +(?P<state>[^E\s]+) ",
     ),
     "lsf": BatchSystem(
-        "LSFCluster",
-        "project",
-        ("-o {log}-%J.log", "-rn"),
-        ("-w", "ended({job})"),
-        'bjobs -noheader -o "jobid stat"',
-        r"^(?P<job>\d+) +(?P<state>\w+)",
-        seconds=False,
+        "LSFCluster", "project", ("-o {log}-%J.log", "-rn"), ("-w", "ended({job})"),
+        'bjobs -noheader -o "jobid stat"', r"^(?P<job>\d+) +(?P<state>\w+)", seconds=False,
     ),
 }
+# fmt: on
 
 
 def read_cluster(path: Path) -> Cluster:
