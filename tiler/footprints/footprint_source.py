@@ -237,7 +237,7 @@ def _tell(findings: list[Finding], source: FootprintSource, features: Features, 
         if source.frame.changes_plan and np.isfinite(place).all():
             place = to_region(source.frame, place[None])[0]
         detail = f"feature {features.fids[finding.row]}: {finding.detail}"
-        notes.append(Note(finding.kind, names[finding.row], *place.tolist(), detail))
+        notes.append(Note(finding.kind, names[finding.row], float(place[0]), float(place[1]), detail))
     return notes
 
 
@@ -273,4 +273,4 @@ def _notes(kind: str, geometry: NDArray[np.object_], details: list[str], subject
     boxes = shapely.bounds(geometry).reshape(-1, 4)
     places = ((boxes[:, :2] + boxes[:, 2:]) / 2).tolist()
     told = zip(subjects.tolist(), places, details, strict=True)
-    return [Note(kind, name, *place, detail) for name, place, detail in told]
+    return [Note(kind, name, x, y, detail) for name, (x, y), detail in told]
