@@ -237,8 +237,7 @@ def _tell(findings: list[Finding], source: FootprintSource, features: Features, 
         if source.frame.changes_plan and np.isfinite(place).all():
             place = to_region(source.frame, place[None])[0]
         detail = f"feature {features.fids[finding.row]}: {finding.detail}"
-        x, y = place.tolist()
-        notes.append(Note(finding.kind, names[finding.row], x, y, detail))
+        notes.append(Note(finding.kind, names[finding.row], float(place[0]), float(place[1]), detail))
     return notes
 
 

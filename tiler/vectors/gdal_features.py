@@ -181,10 +181,11 @@ def _read_straight(layer: GdalLayer, fids: NDArray[np.int64]) -> NDArray[np.obje
     import pyogrio
 
     with gdal_as_input_error(layer.path, []):
-        wkb = pyogrio.raw.read(layer.source, layer=layer.name, columns=[], fids=fids, **layer.options)[2]
-    kept: NDArray[np.object_] = wkb.copy()
-    kept[shapely.is_empty(parse_wkb(wkb)[0])] = None
-    return kept
+        wkb: NDArray[np.object_] = pyogrio.raw.read(
+            layer.source, layer=layer.name, columns=[], fids=fids, **layer.options
+        )[2]
+    wkb[shapely.is_empty(parse_wkb(wkb)[0])] = None
+    return wkb
 
 
 def _fids_with_geometry(layer: GdalLayer, fids: NDArray[np.int64]) -> NDArray[np.int64]:

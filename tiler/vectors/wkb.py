@@ -44,7 +44,9 @@ def parse_wkb(wkb: NDArray[np.object_]) -> tuple[NDArray[np.object_], set[int], 
             if blob is not None and not _is_harmless(blob):
                 plain[row], has_surface = _make_plain(blob)
                 surfaces |= {row} if has_surface else set()
-        except (struct.error, ValueError) as error:
+        except struct.error:
+            plain[row], broken[row] = None, "its geometry cannot be parsed: it is cut off"
+        except ValueError as error:
             plain[row], broken[row] = None, f"its geometry cannot be parsed: {error}"
     with np.errstate(invalid="ignore"):  # GEOS compares NaN coordinates
         try:
