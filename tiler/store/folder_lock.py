@@ -41,7 +41,7 @@ class Owner:
 
 
 @contextmanager
-def only_run(folder: Path, say: Callable[[str], None] = say_nothing) -> Iterator[Callable[[], None]]:
+def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator[Callable[[], None]]:
     """Hold a folder for one run at a time; the hold ends with the process, however it ends.
 
     Parameters
@@ -69,6 +69,7 @@ def only_run(folder: Path, say: Callable[[str], None] = say_nothing) -> Iterator
     some know none: so the file also names its owner and is touched every `BEAT` seconds. An owner on this machine
     is asked for by its process, any other is listened to for `SILENCE` seconds.
     """
+    say = say or say_nothing
     if in_bucket(folder):
         from tiler.objects.lease import only_run_in_bucket
 

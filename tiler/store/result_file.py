@@ -31,6 +31,7 @@ NPY = ".npy"
 CHUNK_BYTES = 4 * 2**20  # about what one read or write of a large array moves
 MOST_ROW = 2**30  # bytes; the longest row of a terrain has some 10^5
 MOST_AXES = 8
+MANY_CHUNKS = {"codec_pipeline.batch_size": 1000}  # of an array are handed to zarr's threads at once
 KINDS = "biufU"  # of numbers, booleans and strings
 BLOSC_SIZES = (4, 12)  # bytes of a chunk that begin its sizes, unpacked and packed, which Blosc takes as true
 
@@ -173,7 +174,8 @@ class ResultFile:
             from zarr.storage import MemoryStore
 
             parts = self._parts[name] = {GROUP: _buffer(self._zip.read(f"{name}/{GROUP}"))}
-            array = zarr.open_array(MemoryStore(parts), mode="r", zarr_format=3)
+            with zarr.config.set(MANY_CHUNKS):
+                array = zarr.open_array(MemoryStore(parts), mode="r", zarr_format=3)
             _check_array(array, sum(file.startswith(f"{name}/c/") for file in self._files))
             self._opened[name] = array
             return array

@@ -19,12 +19,13 @@ from pipeline.errors import OutputError
 from tiler.objects.places import in_bucket
 from tiler.store.atomic import replacing
 from tiler.store.checksums import TAIL, seal_file
-from tiler.store.result_file import GROUP, KINDS, NPY, rows_per_chunk
+from tiler.store.result_file import GROUP, KINDS, MANY_CHUNKS, NPY, rows_per_chunk
 
 if TYPE_CHECKING:
     import zarr
+    from zarr.abc.buffer import Buffer
 
-SMALL_BYTES = 256 * 2**10  # zarr takes as long for a larger array as numpy for ten of these
+SMALL_BYTES = 512 * 2**10  # zarr takes longer to open and read a smaller array than numpy
 SQUARE = 320  # rows and columns of a raster's chunks: a neighbour mostly reads a strip
 DIGEST_BYTES = 16  # of the 32 that BLAKE3 gives
 DIGEST = "digest"  # the attribute of the store's own
@@ -45,7 +46,8 @@ class Writer:
     def __init__(self, path: Path) -> None:
         self._path = path
         beside = Path(tempfile.gettempdir()) if in_bucket(path) else path.parent
-        self._chunks = beside / f".{path.stem}.{uuid.uuid4().hex}.partial"  # what zarr writes of large arrays
+        self._chunks = beside / f".{path.stem}.{uuid.uuid4().hex}.partial"  # of arrays that grow
+        self._parts: dict[str, Buffer] = {}  # what zarr has written
         self._small: dict[str, NDArray[Any]] = {}
         self._large: dict[str, zarr.Array[Any]] = {}
         self._begun: dict[str, list[NDArray[Any]]] = {}  # appended rows that make no whole chunk yet
@@ -106,7 +108,7 @@ class Writer:
     def discard(self) -> None:
         """Forget all arrays that were written so far."""
         shutil.rmtree(self._chunks, ignore_errors=True)
-        self._small, self._large, self._begun, self._hashes = {}, {}, {}, {}
+        self._parts, self._small, self._large, self._begun, self._hashes = {}, {}, {}, {}, {}
 
     def commit(self, attributes: Mapping[str, Any] | None = None, *, apart: Collection[str] = ()) -> str:
         """Make the result visible, in place of an earlier one.
@@ -154,15 +156,17 @@ class Writer:
 
     def _write_zip(self, part: Path, group: bytes) -> None:
         """Write the file: parts in the order of their names, without the time."""
-        chunks = {path.relative_to(self._chunks).as_posix() for path in self._chunks.rglob("*") if path.is_file()}
+        kept = {path.relative_to(self._chunks).as_posix() for path in self._chunks.rglob("*") if path.is_file()}
         with ZipFile(part, "w") as file:
             file.comment = b"0" * TAIL
-            for name in sorted({GROUP, *chunks, *(name + NPY for name in self._small)}):
+            for name in sorted({GROUP, *kept, *self._parts, *(name + NPY for name in self._small)}):
                 with file.open(ZipInfo(name), "w") as entry:
                     if name == GROUP:
                         entry.write(group)
-                    elif name in chunks:
+                    elif name in kept:
                         entry.write((self._chunks / name).read_bytes())
+                    elif name in self._parts:
+                        entry.write(self._parts[name].to_bytes())
                     else:
                         array = self._small[name.removesuffix(NPY)]
                         np.lib.format.write_array(entry, array, version=(1, 0), allow_pickle=False)
@@ -187,20 +191,24 @@ class Writer:
             self._create(name, array, (min(len(array), rows_per_chunk(array)), *array.shape[1:]))
 
     def _extend(self, name: str, rows: NDArray[Any]) -> None:
-        """Add rows to an array on disk that ends with a whole chunk."""
+        """Add rows to an array that ends with a whole chunk; chunks of arrays that grow go to the disk at once."""
         if name not in self._large:
             self._create(name, rows, (rows_per_chunk(rows), *rows.shape[1:]))
-            return
-        with self._disk():
+        else:
             self._large[name].append(rows)
+        with self._disk():
+            for key in [key for key in self._parts if key.startswith(f"{name}/c/")]:
+                (self._chunks / key).parent.mkdir(parents=True, exist_ok=True)
+                (self._chunks / key).write_bytes(self._parts.pop(key).to_bytes())
 
     def _create(self, name: str, array: NDArray[Any], chunks: tuple[int, ...]) -> None:
         import zarr
         from zarr.codecs import BloscCodec
+        from zarr.storage import MemoryStore
 
-        with self._disk():
+        with zarr.config.set(MANY_CHUNKS):
             self._large[name] = zarr.create_array(
-                self._chunks,
+                MemoryStore(self._parts),
                 name=name,
                 data=array,
                 chunks=chunks,

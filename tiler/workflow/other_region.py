@@ -12,6 +12,7 @@ from tiler.engine.stage import Box
 from tiler.georeference.crs import same_crs
 from tiler.objects.places import absolute, in_bucket
 from tiler.planning.region import Region
+from tiler.store.store import SUFFIX
 from tiler.words.plain_text import tell_box
 from tiler.workflow.out_folder import RUN_RECORD, STORE
 from tiler.workflow.run_folder import WRONG_FIELD
@@ -121,6 +122,6 @@ def remove_folders(made: Sequence[Path]) -> None:
 
 def remove_if_useless(made: Sequence[Path]) -> None:
     """Remove what a failed run has written where no point cloud was read: a next run would save nothing by it."""
-    if made and not any(made[0].glob(f"{STORE}/points/*/")):
+    if made and not any(made[0].glob(f"{STORE}/points/*{SUFFIX}")):
         shutil.rmtree(made[0], ignore_errors=True)
         remove_folders(made)
