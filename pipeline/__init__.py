@@ -1,1 +1,1 @@
-"""The DTCC Builder algorithm, one step a room: pure functions on arrays, one tile, one process."""
+"""The DTCC Builder algorithm, in packages by its steps: pure functions on arrays, one tile, one process."""

@@ -5,11 +5,11 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.citymodel import CityModel, number_ids
-from pipeline.classes import BUILDING, GROUND
-from pipeline.heights import highest_wall_ground
-from pipeline.pointcloud import PointCloud
-from pipeline.terrain import Dtm
+from pipeline.city_model.heights import highest_wall_ground
+from pipeline.data.citymodel import CityModel, number_ids
+from pipeline.data.classes import BUILDING, GROUND
+from pipeline.data.pointcloud import PointCloud
+from pipeline.points_terrain.terrain import Dtm
 
 Bounds = tuple[float, float, float, float]
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import pyproj
 
-from pipeline.citymodel import Footprints
-from pipeline.notes import Note
+from pipeline.data.citymodel import Footprints
+from pipeline.data.notes import Note
 from tiler.engine.stage import Box
 from tiler.footprints.footprint_index import join_footprints, scan_footprints
 from tiler.georeference.crs import horizontal_crs

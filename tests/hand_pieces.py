@@ -6,7 +6,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker
+from pipeline.data.mesh import Marker
 from tiler.mesh_files.mesh_pieces import MeshPiece
 
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]

@@ -11,8 +11,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.citymodel import CityModel, number_ids
-from pipeline.mesh import Boundary, Marker, TetMesh
+from pipeline.data.citymodel import CityModel, number_ids
+from pipeline.data.mesh import Boundary, Marker, TetMesh
 from tiler.citymodels.cityjson import write_city_model
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
 

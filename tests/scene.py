@@ -9,7 +9,7 @@ import triangle
 from numpy.typing import NDArray
 from shapely.affinity import rotate, translate
 
-from pipeline.mesh import Boundary, TetMesh
+from pipeline.data.mesh import Boundary, TetMesh
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
 
 # Far from zero, as in a national CRS: single precision has steps of 0.03 m here.

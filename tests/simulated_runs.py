@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stitch.grid import Key, SeamKey
+from stitch.tiling.grid import Key, SeamKey
 from tiler.planning.context import seam_name, tile_name
 
 TILE_STAGES = ("ground", "terrain", "houses", "model", "columns", "pieces")

@@ -10,31 +10,31 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
-from pipeline.city import CityOptions
-from pipeline.citymodel import CityModel
-from pipeline.columns import expand_cells
-from pipeline.groups import adjacent_houses
-from pipeline.heights import highest_wall_ground, raise_low_roofs
-from pipeline.layered import LayeredOptions, choose_layers, mesh_layers, terrain_reach
-from pipeline.mesh import ColumnMesh, TetMesh
-from pipeline.nodes import Levels
-from pipeline.plane import signed_areas
-from pipeline.pointcloud import PointCloud
-from pipeline.simplify import simplify_city
-from pipeline.sizes import SizeField, SizeRule, size_field
-from pipeline.spacing import SpacingLimits, domain_top, top_reach
-from pipeline.terrain import Dtm, compute_dtm, sample_dtm
-from pipeline.tile import build_city
-from stitch.conformity import compute_cell_volumes, pair_cell_faces, pair_edges
-from stitch.corners import Corner, place_corner
-from stitch.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile, tile_keys
-from stitch.layered_seams import fill_corner_layers, fill_seam_layers
-from stitch.patches import mesh_patch
-from stitch.seam_columns import fill_corner, fill_seam, tile_columns
-from stitch.seams import Seam, trace_seam
-from stitch.tiles import mesh_tile, sizes_halo, tile_halo
-from stitch.walls import cut_walls
+from pipeline.city_model.city import CityOptions
+from pipeline.city_model.groups import adjacent_houses
+from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
+from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
+from pipeline.columns.columns import expand_cells
+from pipeline.columns.layered import LayeredOptions, choose_layers, mesh_layers, terrain_reach
+from pipeline.columns.nodes import Levels
+from pipeline.columns.spacing import SpacingLimits, domain_top, top_reach
+from pipeline.columns.tile import build_city
+from pipeline.data.citymodel import CityModel
+from pipeline.data.mesh import ColumnMesh, TetMesh
+from pipeline.data.pointcloud import PointCloud
+from pipeline.plane_mesh.plane import signed_areas
+from pipeline.plane_mesh.sizes import SizeField, SizeRule, size_field
+from pipeline.points_terrain.terrain import Dtm, compute_dtm, sample_dtm
+from pipeline.simplification.simplify import simplify_city
+from stitch.pieces.conformity import compute_cell_volumes, pair_cell_faces, pair_edges
+from stitch.seams.layered_seams import fill_corner_layers, fill_seam_layers
+from stitch.seams.seam_columns import fill_corner, fill_seam, tile_columns
+from stitch.seams.seams import Seam, trace_seam
+from stitch.seams.tiles import mesh_tile, sizes_halo, tile_halo
+from stitch.tiling.corners import Corner, place_corner
+from stitch.tiling.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile, tile_keys
+from stitch.tiling.patches import mesh_patch
+from stitch.tiling.walls import cut_walls
 from tests.cities import Bounds, city_of, crowded_blocks, hilly_dtm
 from tests.footprint_reading import read_footprints
 from tests.whole_clouds import read_points

@@ -7,12 +7,12 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.citymodel import CityModel
-from pipeline.columns import expand_cells, extract_boundary
-from pipeline.mesh import ColumnMesh, Marker
-from pipeline.plane import signed_areas
-from pipeline.terrain import Dtm, sample_dtm
-from stitch.conformity import compute_cell_volumes, match_facets, pair_cell_faces, pair_edges
+from pipeline.columns.columns import expand_cells, extract_boundary
+from pipeline.data.citymodel import CityModel
+from pipeline.data.mesh import ColumnMesh, Marker
+from pipeline.plane_mesh.plane import signed_areas
+from pipeline.points_terrain.terrain import Dtm, sample_dtm
+from stitch.pieces.conformity import compute_cell_volumes, match_facets, pair_cell_faces, pair_edges
 from tests.cities import Bounds, city_of
 
 # Boxes (west, south, east, north) and roofs (m). Walls are noded where another house's wall ends on them.

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.raster import Dtm, NodeWindow
-from pipeline.slab import lift_places
-from pipeline.terrain import cut_terrain
-from stitch.grid import Bounds, Key, ends_of_seam
+from pipeline.data.errors import InputError
+from pipeline.points_terrain.raster import Dtm, NodeWindow
+from pipeline.points_terrain.terrain import cut_terrain
+from pipeline.smoothing.ground_smoothing import lift_places
+from stitch.tiling.grid import Bounds, Key, ends_of_seam
 from tests.cities import crowded_blocks, hilly_dtm
 from tests.tiles import make_town, run_of, write_town
 from tiler.check.check import check_run

@@ -7,9 +7,19 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.columns import expand_cells
-from stitch.conformity import compute_cell_volumes, pair_cell_faces, pair_edges
-from stitch.grid import Key, SeamKey, TileGrid, has_tile, is_border, make_grid, seam_keys, tile_box, tile_keys
+from pipeline.columns.columns import expand_cells
+from stitch.pieces.conformity import compute_cell_volumes, pair_cell_faces, pair_edges
+from stitch.tiling.grid import (
+    Key,
+    SeamKey,
+    TileGrid,
+    has_tile,
+    is_border,
+    make_grid,
+    seam_keys,
+    tile_box,
+    tile_keys,
+)
 from tests.cities import Bounds
 from tests.stitching import OPTIONS, Scene, glue, mesh_all, prove_seams, random_scene, select_houses
 

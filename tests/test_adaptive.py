@@ -8,17 +8,12 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.adaptive import AdaptiveOptions, AdaptiveReport, fill_columns, mesh_adaptive
-from pipeline.citymodel import CityModel
-from pipeline.columns import expand_cells, extract_boundary, lowest_gap
-from pipeline.edges import plane_edges, sort_triangles, triangle_neighbours
-from pipeline.errors import GeometryError
-from pipeline.heights import highest_wall_ground, raise_low_roofs
-from pipeline.improve_columns import ColumnSurvey, improve_columns, split_columns
-from pipeline.improve_plane import improve_plane
-from pipeline.levels import fill_levels, stagger_columns
-from pipeline.mesh import ColumnMesh, Marker, MergeOrder, PlaneMesh, TetMesh
-from pipeline.nodes import (
+from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
+from pipeline.columns.adaptive import AdaptiveOptions, AdaptiveReport, fill_columns, mesh_adaptive
+from pipeline.columns.columns import expand_cells, extract_boundary, lowest_gap
+from pipeline.columns.improve_columns import ColumnSurvey, improve_columns, split_columns
+from pipeline.columns.levels import fill_levels, stagger_columns
+from pipeline.columns.nodes import (
     GROUND_SURFACE,
     TOP_SURFACE,
     Levels,
@@ -28,11 +23,16 @@ from pipeline.nodes import (
     take_columns,
     triangle_surfaces,
 )
-from pipeline.plane import mesh_plane, signed_areas
-from pipeline.quality import measure_cells, quality_percentiles
-from pipeline.spacing import SpacingLimits, domain_top, mean_edges, top_reach, vertical_spacing
-from pipeline.terrain import HEIGHT_UNIT, Dtm, sample_dtm
-from stitch.conformity import pair_cell_faces, pair_edges
+from pipeline.columns.spacing import SpacingLimits, domain_top, mean_edges, top_reach, vertical_spacing
+from pipeline.data.citymodel import CityModel
+from pipeline.data.errors import GeometryError
+from pipeline.data.mesh import ColumnMesh, Marker, MergeOrder, PlaneMesh, TetMesh
+from pipeline.plane_mesh.edges import plane_edges, sort_triangles, triangle_neighbours
+from pipeline.plane_mesh.improve_plane import improve_plane
+from pipeline.plane_mesh.plane import mesh_plane, signed_areas
+from pipeline.points_terrain.terrain import HEIGHT_UNIT, Dtm, sample_dtm
+from pipeline.quality.quality import measure_cells, quality_percentiles
+from stitch.pieces.conformity import pair_cell_faces, pair_edges
 from tests.cities import Bounds, city_of, crowded_blocks, hilly_dtm, tilted_dtm
 from tests.terraces import prove_conforming, prove_volume, prove_walls, terrace_town
 
@@ -544,7 +544,7 @@ def test_levels_searched_an_area_at_a_time_get_about_as_good_as_all_together(
     survey = ColumnSurvey(mesh, free, flat_cells=False)
     searched = int((survey.bad & free).sum())
     before, (together, _) = survey.cost, survey.search(step)
-    monkeypatch.setattr("pipeline.improve_columns.MOST_LEVELS", most)
+    monkeypatch.setattr("pipeline.columns.improve_columns.MOST_LEVELS", most)
     z, moved = survey.search(step)
     assert searched > most
     assert not np.array_equal(z, together)

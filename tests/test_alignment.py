@@ -9,7 +9,7 @@ import pyogrio
 import pytest
 import shapely
 
-from pipeline.alignment import LEAST_HOUSES, REACH, best_shift, describe_shift, score_shifts
+from pipeline.points_terrain.alignment import LEAST_HOUSES, REACH, best_shift, describe_shift, score_shifts
 from tiler.config.config import make_config
 from tiler.interface.synth import write_city
 from tiler.workflow.run import run

@@ -22,7 +22,7 @@ def test_inner_items_have_others_all_around_and_count_by_their_median(tmp_path: 
 def test_compiled_code_counts_for_the_function_that_calls_it() -> None:
     run = "thread (1): MainThread;_run (/home/site/tiler/workflow/run.py:221)"
     task = f"{run};run_task (/home/site/tiler/engine/task.py:293)"
-    cut = f"{task};make_seam (/home/site/tiler/stages/mesh.py:9);cut_walls (/home/site/stitch/walls.py:97)"
+    cut = f"{task};make_seam (/home/site/tiler/stages/mesh.py:9);cut_walls (/home/site/stitch/tiling/walls.py:97)"
     lines = [
         f"{cut} 2",
         f"{cut};_compile_for_args (numba/core/dispatcher.py:400) 30",
@@ -32,7 +32,7 @@ def test_compiled_code_counts_for_the_function_that_calls_it() -> None:
     ]
 
     assert count_samples(lines) == {
-        "stitch/walls.py: cut_walls": 32,
+        "stitch/tiling/walls.py: cut_walls": 32,
         "tiler/stages/mesh.py: make_seam": 500,
         "driver: outside of tasks": 6000,
     }

@@ -12,8 +12,8 @@ import shapely
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.citymodel import CityModel, number_ids
-from pipeline.errors import InputError
+from pipeline.data.citymodel import CityModel, number_ids
+from pipeline.data.errors import InputError
 from tiler.check.check import _in_order
 from tiler.citymodels import building_index, json_stream
 from tiler.citymodels.building_index import index_buildings

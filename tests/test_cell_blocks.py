@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.cell_blocks import (
+from pipeline.columns.cell_blocks import (
     UNUSED,
     CellBlocks,
     QualityMeter,
     UsedPoints,
     number_used,
 )
-from pipeline.columns import count_cells, expand_cells, find_used_points
-from pipeline.histograms import quality_histograms
-from pipeline.mesh import ColumnMesh, MergeOrder, PlaneMesh, TetMesh
-from pipeline.plane import mesh_plane
-from pipeline.quality import measure_cells
-from stitch.conformity import compute_cell_volumes
+from pipeline.columns.columns import count_cells, expand_cells, find_used_points
+from pipeline.data.mesh import ColumnMesh, MergeOrder, PlaneMesh, TetMesh
+from pipeline.plane_mesh.plane import mesh_plane
+from pipeline.quality.histograms import quality_histograms
+from pipeline.quality.quality import measure_cells
+from stitch.pieces.conformity import compute_cell_volumes
 from tests.cities import city_of
 from tiler.mesh_files.vtk_files import Rows, Values, read_vtu, write_vtu, write_vtu_blocks
 

@@ -13,10 +13,10 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.mesh import Boundary, Marker, TetMesh
-from stitch.conformity import pair_cell_faces
-from stitch.frontier import Settled
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Boundary, Marker, TetMesh
+from stitch.pieces.conformity import pair_cell_faces
+from stitch.pieces.frontier import Settled
 from tests.meshes import (
     CORNER,
     HOUSES,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.citymodel import CityModel, number_ids
-from pipeline.errors import InputError
-from pipeline.point_fidelity import HouseFidelity
+from pipeline.data.citymodel import CityModel, number_ids
+from pipeline.data.errors import InputError
+from pipeline.quality.point_fidelity import HouseFidelity
 from tests.cityjson_rules import file_faults, solid_faults
 from tiler.citymodels import cityjson
 from tiler.citymodels.cityjson import read_city_model

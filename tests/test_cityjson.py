@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.affinity import rotate, translate
 
-from pipeline.citymodel import CityModel, number_ids
-from pipeline.errors import ConfigError, InputError, OutputError
-from pipeline.notes import Note
-from pipeline.solids import build_solids
+from pipeline.city_model.solids import build_solids
+from pipeline.data.citymodel import CityModel, number_ids
+from pipeline.data.errors import ConfigError, InputError, OutputError
+from pipeline.data.notes import Note
 from tests.cityjson_rules import area_vector, broken, file_faults, solid_faults, volume
 from tiler.citymodels import cityjson
 from tiler.citymodels.cityjson import read_city_model, write_city_blocks, write_city_model

@@ -9,7 +9,7 @@ import pyproj
 import pytest
 from numpy.typing import ArrayLike
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tests.whole_clouds import read_points
 from tiler.pointclouds import las_chunks
 from tiler.pointclouds.clouds import find_clouds, read_header

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from stitch.grid import Key
+from stitch.tiling.grid import Key
 from tiler.citymodels.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.engine.stage import Scope
 from tiler.engine.task import Declared, Failure, Record, Task, run_task

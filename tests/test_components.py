@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.components import join_pairs
+from pipeline.geometry.components import join_pairs
 
 
 @settings(max_examples=60, deadline=None)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError
-from stitch.least import LEAST_TILE
+from pipeline.data.errors import ConfigError
+from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.cli.main import make_parser
 from tiler.config.config import Config, annotated_defaults, load_config, make_config
 from tiler.interface.api import with_file

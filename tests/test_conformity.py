@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from stitch.conformity import (
+from stitch.pieces.conformity import (
     compute_cell_volumes,
     compute_facet_areas,
     find_duplicate_points,

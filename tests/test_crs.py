@@ -6,7 +6,7 @@ import math
 import pyproj
 import pytest
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.georeference.crs import (
     crs_name,
     horizontal_crs,

@@ -5,10 +5,10 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.cuts import cut_along, cut_best
-from pipeline.lines import Line, rank_lines
-from pipeline.outlines import open_outline
-from pipeline.segments import distances_to_segments
+from pipeline.city_model.cuts import cut_along, cut_best
+from pipeline.city_model.lines import Line, rank_lines
+from pipeline.geometry.outlines import open_outline
+from pipeline.geometry.segments import distances_to_segments
 
 Array = NDArray[np.float64]
 

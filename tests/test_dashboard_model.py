@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tests.simulated_runs import simulate, write_events
 from tiler.dashboard.answer import _tell_step, tell
 from tiler.dashboard.codes import STATES, State

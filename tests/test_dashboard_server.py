@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tests.simulated_runs import simulate, write_events
 from tiler.cli.main import main
 from tiler.config.config import make_config

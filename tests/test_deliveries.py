@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import CityError, InputError
+from pipeline.data.errors import CityError, InputError
 from tests.deliveries import HOUSES, Delivery, forget_chunk_size, ground, house_of, write_delivery
 from tiler.config.config import make_config
 from tiler.workflow.run import run

@@ -10,7 +10,7 @@ import pyproj
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import CityError
+from pipeline.data.errors import CityError
 from tests.deliveries import FEET, SURVEY_FEET, Delivery
 from tests.test_deliveries import ASPRS, NO_ROOFS, assert_right, run_delivery
 

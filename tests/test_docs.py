@@ -111,7 +111,10 @@ def test_pages_link_to_what_is_there_and_load_nothing_from_outside(site: Path, p
 @pytest.mark.timeout(1500)
 def test_the_reference_has_the_docstrings(site: Path, pages: dict[str, Anchors]) -> None:
     assert {f"tiler.{name}" for name in tiler.__all__} <= pages["reference/python.html"].ids
-    assert "pipeline.trim.first_levels" in pages["reference/modules/pipeline.trim.html"].ids
+    assert (
+        "pipeline.columns.trim_layers.first_levels"
+        in pages["reference/modules/pipeline.columns.trim_layers.html"].ids
+    )
     parameters = (site / "reference" / "parameters.html").read_text()
     assert "mesh_size" in parameters
     assert "target edge length h" in parameters

@@ -11,8 +11,8 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError, InputError
-from stitch.grid import Bounds
+from pipeline.data.errors import ConfigError, InputError
+from stitch.tiling.grid import Bounds
 from tests.cities import crowded_blocks
 from tests.test_tiles import SIZE, TILE, around, prove, prove_local
 from tests.tiles import Town, hash_files, make_town, write_town

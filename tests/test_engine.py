@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import CityError, GeometryError, InputError
-from pipeline.notes import Note
+from pipeline.data.errors import CityError, GeometryError, InputError
+from pipeline.data.notes import Note
 from tiler.engine.engine import Engine
 from tiler.engine.keys import item_key, stage_digest
 from tiler.engine.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import CityError, ConfigError, InputError, OutputError
+from pipeline.data.errors import CityError, ConfigError, InputError, OutputError
 from tests.towns import Town, make_town
 from tiler.cli.main import make_parser
 from tiler.config.config import make_config

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tiler.cli.main import main
 from tiler.config.config import make_config
 from tiler.export.export import export_run, list_formats, load_format

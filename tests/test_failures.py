@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import GeometryError, OutputError
+from pipeline.data.errors import GeometryError, OutputError
 from tests.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
 from tests.test_engine import contents, grid_layout, make, nothing, seen, told
 from tiler.engine.engine import Engine, StoppedError

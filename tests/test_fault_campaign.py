@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import CityError
-from stitch.grid import tiles_of_seam
+from pipeline.data.errors import CityError
+from stitch.tiling.grid import tiles_of_seam
 from tests.campaigns import keep_outcome, rounds
 from tests.faults import hangs, hangs_in_c, injected, is_killed, raises, segfaults, swallows_memory
 from tests.sparse_city import SparseCity, make_city

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import ConfigError, InputError, OutputError
+from pipeline.data.errors import ConfigError, InputError, OutputError
 from tiler.store import folder_lock
 from tiler.store.folder_lock import LOCK, Owner, is_held, only_run
 

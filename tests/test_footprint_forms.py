@@ -16,9 +16,9 @@ import pyproj
 import pytest
 import shapely
 
-from pipeline.citymodel import Footprints, make_ids
-from pipeline.errors import ConfigError, InputError
-from pipeline.notes import Note, count_notes
+from pipeline.data.citymodel import Footprints, make_ids
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.notes import Note, count_notes
 from tests.footprint_files import BOX, RD, OsmTown, X, Y, blob, chain, face, square, write_gpkg, write_table
 from tests.footprint_reading import read_footprints
 from tiler.vectors import gdal_features

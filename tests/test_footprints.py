@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.citymodel import Footprints
-from pipeline.footprints import clean_footprints
-from pipeline.notes import Note, count_notes
-from pipeline.rings import compute_sharpest_corners, make_canonical
+from pipeline.city_model.footprints import clean_footprints
+from pipeline.data.citymodel import Footprints
+from pipeline.data.notes import Note, count_notes
+from pipeline.geometry.rings import compute_sharpest_corners, make_canonical
 
 HOUSE = shapely.box(0, 0, 10, 8)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker
+from pipeline.data.mesh import Marker
 from tests.programs import mesh_is_ok, run_foam
 from tests.test_formats_cgns import corners_of, read_with_vtk
 from tests.test_formats_glb import read_document, turned, validate

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import OutputError
-from pipeline.mesh import Marker
+from pipeline.data.errors import OutputError
+from pipeline.data.mesh import Marker
 from tests.hand_pieces import box_pieces
 from tests.programs import run_program
 from tiler.cli.main import main

@@ -11,8 +11,8 @@ import pyogrio
 import pytest
 import shapely
 
-from pipeline.citymodel import CityModel
-from pipeline.errors import CityError, InputError, OutputError
+from pipeline.data.citymodel import CityModel
+from pipeline.data.errors import CityError, InputError, OutputError
 from tests.cityjson_rules import file_faults, solid_faults
 from tiler.citymodels.cityjson import read_city_model, write_city_model
 from tiler.cli.main import main

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.mesh import Marker
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Marker
 from tests.hand_pieces import HandPieces, box_pieces
 from tests.programs import run_program
 from tests.test_formats_surfaces import Facets, facets_of, open_edges, rows_of

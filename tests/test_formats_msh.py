@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker
+from pipeline.data.mesh import Marker
 from tests.programs import mesh_is_ok, read_check, run_foam, run_program
 from tiler.cli.main import main
 from tiler.export.export import export_run

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError, InputError, OutputError
-from pipeline.mesh import Marker
-from stitch import cell_faces
-from stitch.cell_faces import find_cell_faces
+from pipeline.data.errors import ConfigError, InputError, OutputError
+from pipeline.data.mesh import Marker
+from stitch.pieces import cell_faces
+from stitch.pieces.cell_faces import find_cell_faces
 from tests.foam_reader import (
     PolyMesh,
     read_field,

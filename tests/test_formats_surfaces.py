@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import CityError
-from pipeline.mesh import Boundary, Marker
+from pipeline.data.errors import CityError
+from pipeline.data.mesh import Boundary, Marker
 from tests.hand_pieces import HandPieces, box_pieces
 from tiler.cli.main import main
 from tiler.export.export import export_run

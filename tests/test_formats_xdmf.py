@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tests.programs import MPI, PACKAGES, run_program
 from tiler.cli.main import main
 from tiler.export.export import export_run

@@ -9,7 +9,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError, InputError
 from tiler.georeference import cloud_crs
 from tiler.georeference.cloud_crs import Asked
 from tiler.georeference.establish import FOOTPRINTS, Georeference, establish_georeference, find_inexact

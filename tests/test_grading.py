@@ -9,15 +9,15 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError
-from pipeline.mesh import Marker, PlaneMesh
-from pipeline.plane import mesh_plane
-from pipeline.quality import measure_cells
-from pipeline.sizes import SizeField, SizeRule, local_sizes, size_field, wall_distances
-from pipeline.spacing import mean_edges
-from stitch.corners import place_corner
-from stitch.grid import Key, TileGrid, make_grid
-from stitch.walls import cut_walls
+from pipeline.columns.spacing import mean_edges
+from pipeline.data.errors import ConfigError
+from pipeline.data.mesh import Marker, PlaneMesh
+from pipeline.plane_mesh.plane import mesh_plane
+from pipeline.plane_mesh.sizes import SizeField, SizeRule, local_sizes, size_field, wall_distances
+from pipeline.quality.quality import measure_cells
+from stitch.tiling.corners import place_corner
+from stitch.tiling.grid import Key, TileGrid, make_grid
+from stitch.tiling.walls import cut_walls
 from tests.cities import Bounds, city_of, crowded_blocks, hilly_dtm
 from tests.stitching import (
     LAYERED,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.ground_check import compare_ground, is_upside_down
+from pipeline.points_terrain.ground_check import compare_ground, is_upside_down
 
 Heights = tuple[float, float]  # mean and standard deviation (m)
 CELLS, N = 4, 1000

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.classes import GROUND, LOW_NOISE, UNCLASSIFIED
-from pipeline.ground_filter import FILTER_REACH, GAP, classify_ground
-from pipeline.pointcloud import PointCloud
+from pipeline.data.classes import GROUND, LOW_NOISE, UNCLASSIFIED
+from pipeline.data.pointcloud import PointCloud
+from pipeline.points_terrain.ground_filter import FILTER_REACH, GAP, classify_ground
 
 
 def test_terrain_is_ground_and_what_stands_on_it_is_not() -> None:

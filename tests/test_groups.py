@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.groups import adjacent_houses, group_roofs
+from pipeline.city_model.groups import adjacent_houses, group_roofs
 
 Array = NDArray[np.float64]
 NO_PAIRS = np.empty((0, 2), np.int64)

@@ -9,20 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.adaptive import mesh_adaptive
-from pipeline.citymodel import CityModel
-from pipeline.columns import lowest_gap
-from pipeline.growth import Growth, count_steps, full_height, height_of_steps, layer_levels, movable_height
-from pipeline.heights import highest_wall_ground, raise_low_roofs
-from pipeline.layered import count_layers, mesh_layers
-from pipeline.levels import fill_levels
-from pipeline.mesh import ColumnMesh, PlaneMesh
-from pipeline.nodes import no_seam, place_nodes, take_columns, triangle_surfaces
-from pipeline.plane import mesh_plane
-from pipeline.spacing import mean_edges, vertical_spacing
-from pipeline.terrain import Dtm, sample_dtm
-from pipeline.trim import count_removed_layers
-from stitch.grid import make_grid, tile_keys
+from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
+from pipeline.columns.adaptive import mesh_adaptive
+from pipeline.columns.columns import lowest_gap
+from pipeline.columns.growth import Growth, count_steps, full_height, height_of_steps, layer_levels, movable_height
+from pipeline.columns.layered import count_layers, mesh_layers
+from pipeline.columns.levels import fill_levels
+from pipeline.columns.nodes import no_seam, place_nodes, take_columns, triangle_surfaces
+from pipeline.columns.spacing import mean_edges, vertical_spacing
+from pipeline.columns.trim_layers import count_removed_layers
+from pipeline.data.citymodel import CityModel
+from pipeline.data.mesh import ColumnMesh, PlaneMesh
+from pipeline.plane_mesh.plane import mesh_plane
+from pipeline.points_terrain.terrain import Dtm, sample_dtm
+from stitch.tiling.grid import make_grid, tile_keys
 from tests.cities import city_of, crowded_blocks, hilly_dtm
 from tests.stitching import LAYERED, OPTIONS, mesh_all, prove_seams, random_scene
 from tests.terraces import prove_conforming

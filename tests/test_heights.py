@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.building_points import (
+from pipeline.city_model.building_points import (
     BuildingPoints,
     extract_building_points,
     has_building_class,
@@ -12,8 +12,7 @@ from pipeline.building_points import (
     reach_of_points,
     remove_outliers,
 )
-from pipeline.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
-from pipeline.heights import (
+from pipeline.city_model.heights import (
     ROOF_SOURCES,
     Heights,
     compute_building_heights,
@@ -21,7 +20,8 @@ from pipeline.heights import (
     percentile_by_group,
     raise_low_roofs,
 )
-from pipeline.pointcloud import PointCloud
+from pipeline.data.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
+from pipeline.data.pointcloud import PointCloud
 from tests.cities import cloud_over, tilted_dtm
 
 HOUSE = shapely.box(10, 10, 20, 20)

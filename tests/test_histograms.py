@@ -8,9 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.building_facts import fidelity_table
-from pipeline.classes import BUILDING, GROUND, WATER
-from pipeline.histograms import (
+from pipeline.data.classes import BUILDING, GROUND, WATER
+from pipeline.data.mesh import TetMesh
+from pipeline.data.pointcloud import PointCloud
+from pipeline.quality.building_facts import fidelity_table
+from pipeline.quality.histograms import (
     QUALITY_BINS,
     Histogram,
     count_values,
@@ -19,8 +21,7 @@ from pipeline.histograms import (
     percentile,
     quality_histograms,
 )
-from pipeline.mesh import TetMesh
-from pipeline.point_fidelity import (
+from pipeline.quality.point_fidelity import (
     KINDS,
     FidelitySums,
     conclude_fidelity,
@@ -29,9 +30,8 @@ from pipeline.point_fidelity import (
     merge_fidelity,
     sum_fidelity,
 )
-from pipeline.pointcloud import PointCloud
-from pipeline.quality import PERCENTILES, Quality, measure_cells, quality_percentiles
-from pipeline.residuals import Residuals, conclude, merge_residuals, sum_residuals, summarise
+from pipeline.quality.quality import PERCENTILES, Quality, measure_cells, quality_percentiles
+from pipeline.quality.residuals import Residuals, conclude, merge_residuals, sum_residuals, summarise
 from tests.cities import city_of, random_blocks, tilted_dtm
 
 

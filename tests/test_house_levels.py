@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.building_points import extract_building_points
-from pipeline.citymodel import Footprints
-from pipeline.classes import BUILDING, GROUND
-from pipeline.house_levels import HouseParts, LevelOptions, split_levels
-from pipeline.houses import divide_houses
-from pipeline.pointcloud import PointCloud
-from pipeline.raster import Dtm
-from pipeline.rings import make_canonical
-from pipeline.roof_points import locate_roof_points, make_roof_points
-from pipeline.tile import build_city
+from pipeline.city_model.building_points import extract_building_points
+from pipeline.city_model.house_levels import HouseParts, LevelOptions, split_levels
+from pipeline.city_model.houses import divide_houses
+from pipeline.city_model.roof_points import locate_roof_points, make_roof_points
+from pipeline.columns.tile import build_city
+from pipeline.data.citymodel import Footprints
+from pipeline.data.classes import BUILDING, GROUND
+from pipeline.data.pointcloud import PointCloud
+from pipeline.geometry.rings import make_canonical
+from pipeline.points_terrain.raster import Dtm
 from tests import test_tile
 
 Array = NDArray[np.float64]
@@ -144,7 +144,7 @@ def test_flat_sloping_and_noisy_roofs_stay_whole(roof: Roof) -> None:
 
 
 def test_a_shed_roof_would_be_cut_by_medians_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.regions.MIN_NEAR", 10**9)
+    monkeypatch.setattr("pipeline.city_model.regions.MIN_NEAR", 10**9)
     assert len(split(HOUSE, shed)) > 1
 
 

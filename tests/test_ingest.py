@@ -14,11 +14,11 @@ import pyproj
 import pytest
 import shapely
 
-from pipeline.citymodel import Footprints, make_ids
-from pipeline.errors import InputError
-from pipeline.las_points import cut_units
-from pipeline.notes import Note, count_notes
-from pipeline.pointcloud import PointCloud
+from pipeline.data.citymodel import Footprints, make_ids
+from pipeline.data.errors import InputError
+from pipeline.data.notes import Note, count_notes
+from pipeline.data.pointcloud import PointCloud
+from pipeline.points_terrain.las_points import cut_units
 from tests.footprint_reading import read_footprints
 from tests.test_clouds import EVERYWHERE, ORIGIN, patch, write_cloud
 from tests.test_vectors import RD, square, write, write_parquet

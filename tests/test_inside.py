@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.group_order import sort_points, sort_values
-from pipeline.inside import (
+from pipeline.geometry.group_order import sort_points, sort_values
+from pipeline.geometry.inside import (
     INDEX_CELL,
     are_covered,
     are_inside,

@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 import pytest
 
-from pipeline.errors import CityError
+from pipeline.data.errors import CityError
 from tests.test_engine import make
 from tiler.engine.stage import Facts, Scope, Stage
 from tiler.engine.task import Task

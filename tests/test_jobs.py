@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError, InputError
 from tests.sparse_city import ROOT
 from tests.test_deploy import program
 from tiler.cli.main import main

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from pipeline import quality
+from pipeline.quality import quality
 from tests.sparse_city import SparseCity, make_city
 from tiler.cli.main import main
 from tiler.engine.engine import StoppedError
@@ -22,7 +22,7 @@ from tiler.workflow.run import run
 
 ROOT = Path(__file__).parents[1]
 ONE = """
-from pipeline.kernel import kernel
+from pipeline.data.kernel import kernel
 
 
 @kernel(error_model="numpy")

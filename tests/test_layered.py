@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.citymodel import CityModel
-from pipeline.columns import count_cells, expand_cells, extract_boundary, lowest_gap
-from pipeline.edges import plane_edges
-from pipeline.errors import GeometryError, SolverError
-from pipeline.fem import solve_laplace, stiffness_matrix
-from pipeline.groups import adjacent_houses
-from pipeline.heights import highest_wall_ground, raise_low_roofs
-from pipeline.layered import LayeredOptions, Smoother, layer_mesh, mesh_layers
-from pipeline.mesh import ColumnMesh, Marker, PlaneMesh, TetMesh
-from pipeline.neighbours import join_equal_roofs, part_neighbours
-from pipeline.plane import mesh_plane, signed_areas
-from pipeline.relax import relax_columns
-from pipeline.repair import repair_columns
-from pipeline.slab import smooth_slab
-from pipeline.stencil import assemble_stencil
-from pipeline.terrain import Dtm, sample_dtm
-from pipeline.trim import count_removed_layers, first_kept, first_levels
+from pipeline.city_model.groups import adjacent_houses
+from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
+from pipeline.columns.columns import count_cells, expand_cells, extract_boundary, lowest_gap
+from pipeline.columns.layered import LayeredOptions, Smoother, layer_mesh, mesh_layers
+from pipeline.columns.neighbours import join_equal_roofs, part_neighbours
+from pipeline.columns.trim_layers import count_removed_layers, first_kept, first_levels
+from pipeline.data.citymodel import CityModel
+from pipeline.data.errors import GeometryError, SolverError
+from pipeline.data.mesh import ColumnMesh, Marker, PlaneMesh, TetMesh
+from pipeline.plane_mesh.edges import plane_edges
+from pipeline.plane_mesh.plane import mesh_plane, signed_areas
+from pipeline.points_terrain.terrain import Dtm, sample_dtm
+from pipeline.smoothing.column_smoothing import relax_columns
+from pipeline.smoothing.fem import solve_laplace, stiffness_matrix
+from pipeline.smoothing.ground_smoothing import smooth_slab
+from pipeline.smoothing.repair import repair_columns
+from pipeline.smoothing.stencil import assemble_stencil
 from tests.cities import Bounds, city_of, hilly_dtm, random_blocks, random_city, tilted_dtm
 from tests.terraces import prove_conforming, prove_volume, prove_walls, terrace_town
 
@@ -254,11 +254,11 @@ def test_a_tolerance_below_rounding_ends_where_rounds_gain_nothing() -> None:
 
 
 def test_a_solver_that_does_not_converge_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.relax.MAX_ITERATIONS", 2)
+    monkeypatch.setattr("pipeline.smoothing.column_smoothing.MAX_ITERATIONS", 2)
     city, dtm, _ = random_city(BOUNDS, 10, seed=1)
     with pytest.raises(SolverError, match=r"step 3\.5: residual .* after 2 iterations"):
         mesh_of(city, dtm, dataclasses.replace(OPTIONS, tolerance=1e-9))
-    monkeypatch.setattr("pipeline.fem.MAX_ITERATIONS", 1)
+    monkeypatch.setattr("pipeline.smoothing.fem.MAX_ITERATIONS", 1)
     with pytest.raises(SolverError, match=r"step 3\.3: relative residual"):
         mesh_of(city, dtm, dataclasses.replace(OPTIONS, smoother="fem"))
 

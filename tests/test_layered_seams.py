@@ -9,21 +9,28 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.columns import expand_cells
-from pipeline.groups import adjacent_houses
-from pipeline.heights import highest_wall_ground
-from pipeline.layered import LayeredOptions, choose_layers, fill_layers, mesh_layers, terrain_reach
-from pipeline.nodes import SeamColumns, take_columns
-from pipeline.plane import mesh_plane
-from pipeline.quality import measure_cells
-from pipeline.slab import SlabShape, _find_levels, lift_places, slab_reach, slab_window, smooth_slab
-from pipeline.terrain import Dtm
-from stitch.corners import place_corner
-from stitch.grid import Key, SeamKey, is_border, make_grid, seam_keys
-from stitch.layered_seams import fill_corner_layers
-from stitch.patches import mesh_patch
-from stitch.seams import find_vertices
-from stitch.walls import cut_walls
+from pipeline.city_model.groups import adjacent_houses
+from pipeline.city_model.heights import highest_wall_ground
+from pipeline.columns.columns import expand_cells
+from pipeline.columns.layered import LayeredOptions, choose_layers, fill_layers, mesh_layers, terrain_reach
+from pipeline.columns.nodes import SeamColumns, take_columns
+from pipeline.plane_mesh.plane import mesh_plane
+from pipeline.points_terrain.terrain import Dtm
+from pipeline.quality.quality import measure_cells
+from pipeline.smoothing.ground_smoothing import (
+    SlabShape,
+    _find_levels,
+    lift_places,
+    slab_reach,
+    slab_window,
+    smooth_slab,
+)
+from stitch.seams.layered_seams import fill_corner_layers
+from stitch.seams.seams import find_vertices
+from stitch.tiling.corners import place_corner
+from stitch.tiling.grid import Key, SeamKey, is_border, make_grid, seam_keys
+from stitch.tiling.patches import mesh_patch
+from stitch.tiling.walls import cut_walls
 from tests.cities import Bounds, city_of, hilly_dtm, tilted_dtm
 from tests.stitching import (
     LAYERED,
@@ -233,8 +240,8 @@ def test_sums_for_a_few_nodes_give_what_the_transform_gives(box: Bounds, monkeyp
         return smooth_slab(dtm, xy, bounds, domain_height=60.0, n_layers=12, grid_spacing=10.0)
 
     with monkeypatch.context() as patch:
-        patch.setattr("pipeline.slab._sum_modes", None)
-        patch.setattr("pipeline.slab.SUMS", 0.0)
+        patch.setattr("pipeline.smoothing.ground_smoothing._sum_modes", None)
+        patch.setattr("pipeline.smoothing.ground_smoothing.SUMS", 0.0)
         transformed = smooth()
     with monkeypatch.context() as patch:
         patch.setattr("scipy.fft.idctn", None)

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely import Polygon, box
 
-from pipeline.citymodel import Footprints, make_ids
-from pipeline.clearance import has_clearance, is_sound, make_sound
-from pipeline.errors import GeometryError
-from pipeline.footprints import clean_footprints
-from pipeline.merge import MergedFootprints, merge_footprints
-from pipeline.patches import merge_polygons, project_vertices
-from pipeline.rings import make_canonical
+from pipeline.city_model.footprints import clean_footprints
+from pipeline.data.citymodel import Footprints, make_ids
+from pipeline.data.errors import GeometryError
+from pipeline.geometry.clearance import has_clearance, is_sound, make_sound
+from pipeline.geometry.rings import make_canonical
+from pipeline.simplification.merge import MergedFootprints, merge_footprints
+from pipeline.simplification.patches import merge_polygons, project_vertices
 
 CLEARANCE, MIN_HOLE_AREA, FLOOR, TOLERANCE = 1.0, 10.0, 0.1, 0.01
 
@@ -259,7 +259,7 @@ def test_an_unsound_polygon_is_repaired_close_to_what_it_was(name: str) -> None:
 def test_the_last_rungs_are_the_hull_and_a_box(
     name: str, bounds: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.clearance.BUFFER_RADII", ())
+    monkeypatch.setattr("pipeline.geometry.clearance.BUFFER_RADII", ())
     sound, rung = make_sound(UNSOUND[name][0], FLOOR)
     assert rung == "repaired-hull"
     assert is_sound(np.array([sound]), FLOOR)[0]

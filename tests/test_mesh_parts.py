@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.mesh import Marker
-from stitch.conformity import pair_cell_faces
+from pipeline.data.mesh import Marker
+from stitch.pieces.conformity import pair_cell_faces
 from tests.bad_input import call, write_cloud, write_houses
 from tests.cities import cloud_over
 from tiler.check.check import check_run

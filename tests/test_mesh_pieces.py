@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.mesh import Marker
-from stitch.conformity import pair_cell_faces
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Marker
+from stitch.pieces.conformity import pair_cell_faces
 from tiler.config.config import make_config
 from tiler.interface.synth import write_city
 from tiler.mesh_files.mesh_pieces import open_pieces

@@ -10,15 +10,15 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.citymodel import Footprints
-from pipeline.clearance import is_sound
-from pipeline.columns import lowest_gap
-from pipeline.footprints import clean_footprints
-from pipeline.heights import highest_wall_ground
-from pipeline.layered import LayeredOptions, mesh_layers
-from pipeline.merge import MergedFootprints, merge_footprints
-from pipeline.notes import Note
-from pipeline.plane import mesh_plane
+from pipeline.city_model.footprints import clean_footprints
+from pipeline.city_model.heights import highest_wall_ground
+from pipeline.columns.columns import lowest_gap
+from pipeline.columns.layered import LayeredOptions, mesh_layers
+from pipeline.data.citymodel import Footprints
+from pipeline.data.notes import Note
+from pipeline.geometry.clearance import is_sound
+from pipeline.plane_mesh.plane import mesh_plane
+from pipeline.simplification.merge import MergedFootprints, merge_footprints
 from tests.cities import city_of, hilly_dtm
 
 MIN_AREA, TOLERANCE, CLEARANCE, MIN_HOLE_AREA, FLOOR = 5.0, 0.01, 1.0, 10.0, 0.1

@@ -12,7 +12,7 @@ import pytest
 from distributed import LocalCluster
 from distributed.security import Security
 
-from pipeline.errors import CityError, ConfigError
+from pipeline.data.errors import CityError, ConfigError
 from tests.namespaces import Host, certificates, dask_command, hosts
 from tests.sparse_city import ROOT, SparseCity, children, count_results, make_city, start
 from tests.test_run import hashes

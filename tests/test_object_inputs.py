@@ -10,7 +10,7 @@ import pyogrio
 import pytest
 import shapely
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tests.footprint_reading import read_footprint_crs, read_footprints
 from tests.object_servers import FileServer, file_server
 from tests.test_ingest import write_copc

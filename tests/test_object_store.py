@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError, InputError, OutputError
+from pipeline.data.errors import ConfigError, InputError, OutputError
 from tests.flaky_proxy import FlakyProxy, flaky_proxy
 from tests.object_servers import BUCKET, S3Server, environment, s3_server
 from tests.test_run import hashes

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tests.bad_input import QUICK, call, write_city, write_cloud
 from tests.cities import cloud_over
 from tests.tiles import hash_files

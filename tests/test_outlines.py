@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.outlines import deal_out, open_outline
+from pipeline.geometry.outlines import deal_out, open_outline
 
 COURT = shapely.Polygon(shapely.box(0, 0, 9, 9).exterior, [shapely.box(3, 3, 6, 6).exterior])
 

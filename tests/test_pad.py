@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.approach import approach_terrain, border_nodes, make_border
-from pipeline.errors import ConfigError, InputError
-from pipeline.raster import NodeWindow, cut_nodes, window_of
-from pipeline.sizes import SizeRule, local_sizes, size_field_around
-from stitch.grid import Key, has_tile, make_grid, tile_box, tile_keys
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.plane_mesh.sizes import SizeRule, local_sizes, size_field_around
+from pipeline.points_terrain.approach import approach_terrain, border_nodes, make_border
+from pipeline.points_terrain.raster import NodeWindow, cut_nodes, window_of
+from stitch.tiling.grid import Key, has_tile, make_grid, tile_box, tile_keys
 from tests.cities import crowded_blocks
 from tests.faults import injected, raises
 from tests.programs import mesh_is_ok, read_check, run_foam

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.mesh import Boundary, Marker
-from pipeline.quality import measure_cells
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Boundary, Marker
+from pipeline.quality.quality import measure_cells
 from tests.scene import PIECES, write_scene
 from tiler.mesh_files.facet_quality import measure_facets
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp

@@ -13,16 +13,14 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.adaptive import mesh_adaptive
-from pipeline.columns import expand_cells, extract_boundary, find_used_points, split_boundary
-from pipeline.errors import GeometryError, InputError, OutputError
-from pipeline.mesh import Boundary, Marker, SeamEdges, TetMesh
-from pipeline.plane import mesh_plane
-from stitch.conformity import match_facets, pair_cell_faces, pair_edges, pair_faces
-from stitch.facets import label_beyond
-from stitch.frontier import find_edges_below
-from stitch.grid import Key, SeamKey, corner_keys, make_grid, seam_keys, tile_keys
-from stitch.numbering import (
+from pipeline.columns.adaptive import mesh_adaptive
+from pipeline.columns.columns import expand_cells, extract_boundary, find_used_points, split_boundary
+from pipeline.data.errors import GeometryError, InputError, OutputError
+from pipeline.data.mesh import Boundary, Marker, SeamEdges, TetMesh
+from pipeline.plane_mesh.plane import mesh_plane
+from stitch.pieces.conformity import match_facets, pair_cell_faces, pair_edges, pair_faces
+from stitch.pieces.frontier import find_edges_below
+from stitch.pieces.numbering import (
     LOCAL_BITS,
     MOST_TILES,
     collect_ids,
@@ -33,6 +31,8 @@ from stitch.numbering import (
     seam_part,
     tile_part,
 )
+from stitch.seams.facets import label_beyond
+from stitch.tiling.grid import Key, SeamKey, corner_keys, make_grid, seam_keys, tile_keys
 from tests.cities import Bounds, hilly_dtm, tilted_dtm
 from tests.stitching import OPTIONS, Scene, glue, random_scene, scene_of
 from tests.terraces import terrace_town

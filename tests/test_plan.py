@@ -17,8 +17,8 @@ import shapely
 from PIL import Image
 from rich.console import Console
 
-from pipeline.errors import ConfigError
-from stitch.grid import has_tile, make_grid, seam_keys, seam_line, tile_box, tile_keys, tiles_of_seam
+from pipeline.data.errors import ConfigError
+from stitch.tiling.grid import has_tile, make_grid, seam_keys, seam_line, tile_box, tile_keys, tiles_of_seam
 from tiler.cli import main as cli
 from tiler.config.config import Config, make_config
 from tiler.footprints.footprint_sample import FootprintSample, measure_detail, sample_footprints

@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from shapely import Polygon, box
 
-import pipeline.graph
-import pipeline.shaping
-import pipeline.snap
-from pipeline.cells import draw_cells
-from pipeline.errors import GeometryError
-from pipeline.fidelity import FARTHEST, measure_simplification
-from pipeline.graph import WallGraph, find_near, make_graph, node_walls, trace_faces
-from pipeline.labels import Territories
-from pipeline.planar import COUNTS, PlanarCity, find_clusters, simplify_planar
-from pipeline.snap import node_crossings, straighten
+import pipeline.simplification.graph
+import pipeline.simplification.shaping
+import pipeline.simplification.snap
+from pipeline.data.errors import GeometryError
+from pipeline.simplification.fidelity import FARTHEST, measure_simplification
+from pipeline.simplification.graph import WallGraph, find_near, make_graph, node_walls, trace_faces
+from pipeline.simplification.labels import Territories
+from pipeline.simplification.planar import COUNTS, PlanarCity, find_clusters, simplify_planar
+from pipeline.simplification.snap import node_crossings, straighten
+from pipeline.simplification.square_cells import draw_cells
 
 EPS, MIN_AREA, MIN_COURTYARD = 0.5, 5.0, 5.0
 
@@ -238,7 +238,7 @@ def test_clusters_whose_results_come_too_close_are_taken_together() -> None:
 
 @pytest.mark.parametrize("manifold", [False, True])
 def test_walls_that_do_not_settle_are_drawn_with_cells(manifold: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline.snap, "MAX_ROUNDS", 0)
+    monkeypatch.setattr(pipeline.simplification.snap, "MAX_ROUNDS", 0)
     houses = [box(0, 0, 7.7, 10.1), box(7.7, 0.2, 15, 10), Polygon([(15, 10), (21, 12), (17, 19)])]
     city = simplify(*houses, box(40, 0, 50, 10), manifold=manifold)
     assert set(city.method) == {"cells"}
@@ -251,13 +251,13 @@ def test_walls_that_do_not_settle_are_drawn_with_cells(manifold: bool, monkeypat
 
 
 def test_a_cluster_that_fails_is_tried_with_a_wider_clearance_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    settle = pipeline.snap.settle
+    settle = pipeline.simplification.snap.settle
 
     def fail(graph: WallGraph, *, clearance: float, chain_tolerance: float) -> object:
         settled, restless, counts = settle(graph, clearance=clearance, chain_tolerance=chain_tolerance)
         return settled, np.unique(graph.cluster[graph.xy[:, 0] < 20000]) if clearance == 500 else restless, counts
 
-    monkeypatch.setattr(pipeline.shaping, "settle", fail)
+    monkeypatch.setattr(pipeline.simplification.shaping, "settle", fail)
     city = simplify(box(0, 0, 4, 4), box(4.4, 0, 9, 4), box(30, 0, 40, 4))
     assert city.method == ("snapped-wider", "snapped-wider", "snapped")
     assert (city.counts["snapped"], city.counts["snapped-wider"], city.counts["cells"]) == (1, 1, 0)
@@ -273,7 +273,7 @@ def test_the_check_believes_no_round(other: Polygon, monkeypatch: pytest.MonkeyP
         assert clearance > chain_tolerance
         return graph, np.zeros(0, np.int64), Counter({"rounds": 1})
 
-    monkeypatch.setattr(pipeline.shaping, "settle", claim)
+    monkeypatch.setattr(pipeline.simplification.shaping, "settle", claim)
     city = simplify(box(0, 0, 4, 4), other, box(30, 0, 40, 4))
     assert city.counts["cells"] == city.counts["snapped"] == 1
     assert_promises(city, EPS)
@@ -302,7 +302,7 @@ def test_walls_of_houses_that_stand_alone_are_noded_as_all_others(monkeypatch: p
     cluster = rng.integers(0, len(polygons), len(polygons))
     found = node_walls(polygons, cluster)
     monkeypatch.setattr(
-        pipeline.graph, "round_corners", lambda walls, grid: (walls, np.zeros(len(walls), np.bool_))
+        pipeline.simplification.graph, "round_corners", lambda walls, grid: (walls, np.zeros(len(walls), np.bool_))
     )
     expected = node_walls(polygons, cluster)
     for name in ("xy", "cluster", "edges", "slack"):

@@ -10,11 +10,11 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Polygon, affinity, box
 
-from pipeline.citymodel import Footprints
-from pipeline.fidelity import measure_simplification
-from pipeline.footprints import clean_footprints
-from pipeline.planar import PlanarCity, simplify_planar
-from pipeline.plane import mesh_plane
+from pipeline.city_model.footprints import clean_footprints
+from pipeline.data.citymodel import Footprints
+from pipeline.plane_mesh.plane import mesh_plane
+from pipeline.simplification.fidelity import measure_simplification
+from pipeline.simplification.planar import PlanarCity, simplify_planar
 from tests.test_planar import assert_promises, blobs
 
 MIN_AREA, TOLERANCE, MIN_COURTYARD = 5.0, 0.01, 5.0

@@ -5,10 +5,10 @@ import pytest
 import shapely
 from shapely import affinity
 
-from pipeline import plane as plane_room
-from pipeline.errors import GeometryError
-from pipeline.mesh import PlaneMesh
-from pipeline.plane import collect_graph, mesh_plane, plane_graph, signed_areas, triangulate_plane
+from pipeline.data.errors import GeometryError
+from pipeline.data.mesh import PlaneMesh
+from pipeline.plane_mesh import plane as plane_room
+from pipeline.plane_mesh.plane import collect_graph, mesh_plane, plane_graph, signed_areas, triangulate_plane
 from tests.cities import city_of, crowded_blocks, random_blocks
 
 BOUNDS = (318000.0, 6399000.0, 318200.0, 6399150.0)

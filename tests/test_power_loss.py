@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tests.campaigns import keep_outcome, rounds
 from tests.test_run import hashes
 from tests.towns import Town, make_town

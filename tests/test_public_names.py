@@ -137,7 +137,7 @@ def test_each_way_to_a_private_name_is_found(code: str) -> None:
 @pytest.mark.parametrize(
     "code",
     [
-        "from pipeline.mesh import _own",
+        "from pipeline.data.mesh import _own",
         "class Mine:\n    def keep(self):\n        self._own = 1\n    def show(self):\n        return self._own",
         "def f(row):\n    return row._asdict()",
         "import numpy as np\nnp.__version__",

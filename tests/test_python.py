@@ -12,7 +12,7 @@ import pytest
 import shapely
 
 import tiler
-from pipeline.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError, InputError
 from tiler.citymodels.building_index import index_buildings
 from tiler.cli.main import main
 from tiler.interface.city_mesh import CityMesh

@@ -7,8 +7,8 @@ from vtkmodules.vtkCommonCore import vtkPoints
 from vtkmodules.vtkCommonDataModel import VTK_TETRA, vtkUnstructuredGrid
 from vtkmodules.vtkFiltersVerdict import vtkMeshQuality
 
-from pipeline.mesh import TetMesh
-from pipeline.quality import AT_ONCE, measure_cells, quality_percentiles
+from pipeline.data.mesh import TetMesh
+from pipeline.quality.quality import AT_ONCE, measure_cells, quality_percentiles
 
 
 def tet(*corners: tuple[float, float, float]) -> TetMesh:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import CityError, ConfigError
-from pipeline.mesh import Marker
+from pipeline.data.errors import CityError, ConfigError
+from pipeline.data.mesh import Marker
 from tests.faults import Faults, injected, raises, segfaults
 from tests.test_resume import Town
 from tests.test_run import hashes

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
-from pipeline.inside import are_covered, cover_polygons
+from pipeline.data.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
+from pipeline.geometry.inside import are_covered, cover_polygons
 from tests.tiles import make_town, run_of, write_town
 from tiler.stages.readers import read_bands, read_cloud
 from tiler.store.store import Store

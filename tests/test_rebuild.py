@@ -17,8 +17,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.errors import ConfigError
-from stitch.grid import tiles_of_seam
+from pipeline.data.errors import ConfigError
+from stitch.tiling.grid import tiles_of_seam
 from tests.campaigns import keep_outcome
 from tests.test_run import hashes
 from tiler.check.check import check_run

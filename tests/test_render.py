@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.errors import ConfigError, InputError, OutputError
-from pipeline.mesh import Boundary, Marker
+from pipeline.data.errors import ConfigError, InputError, OutputError
+from pipeline.data.mesh import Boundary, Marker
 from tests.scene import PIECES, write_scene
 from tiler.cli.main import main
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.errors import InputError
-from pipeline.heights import ROOF_SOURCES
+from pipeline.city_model.heights import ROOF_SOURCES
+from pipeline.data.errors import InputError
 from tests.tiles import hash_files
 from tiler.cli.main import main
 from tiler.report import write_report

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.columns import expand_cells
-from pipeline.histograms import quality_histograms
-from pipeline.mesh import ColumnMesh, PlaneMesh
-from pipeline.quality import Quality, measure_cells
-from pipeline.residuals import conclude
-from pipeline.surface_points import measure_surface
+from pipeline.columns.columns import expand_cells
+from pipeline.data.mesh import ColumnMesh, PlaneMesh
+from pipeline.plane_mesh.surface_points import measure_surface
+from pipeline.quality.histograms import quality_histograms
+from pipeline.quality.quality import Quality, measure_cells
+from pipeline.quality.residuals import conclude
 from tiler.report import samples
 from tiler.report.samples import NEAR, Samples, measure_samples
 from tiler.store.results import read_columns

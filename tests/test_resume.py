@@ -12,7 +12,7 @@ import pytest
 import shapely
 from shapely import affinity
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tests.test_run import hashes
 from tiler.check.check import check_run
 from tiler.config.config import Config, make_config

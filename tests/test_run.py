@@ -15,9 +15,9 @@ import pyogrio
 import pytest
 import shapely
 
-from pipeline.classes import BUILDING, GROUND
-from pipeline.columns import expand_cells
-from pipeline.errors import CityError
+from pipeline.columns.columns import expand_cells
+from pipeline.data.classes import BUILDING, GROUND
+from pipeline.data.errors import CityError
 from tests.campaigns import keep_outcome, rounds
 from tests.cities import Bounds, cloud_over
 from tiler.check.check import check_run

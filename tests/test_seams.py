@@ -10,18 +10,18 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.adaptive import mesh_adaptive
-from pipeline.columns import expand_cells
-from pipeline.errors import GeometryError
-from pipeline.plane import mesh_plane
-from pipeline.quality import measure_cells
-from stitch import paths
-from stitch.corners import place_corner
-from stitch.grid import Key, SeamKey, is_border, make_grid, seam_keys, tile_keys
-from stitch.seams import find_vertices, trace_seam
-from stitch.strips import CORRIDOR, Strip, improve_around, mesh_strip
-from stitch.tiles import areas_within
-from stitch.walls import cut_walls, split_walls
+from pipeline.columns.adaptive import mesh_adaptive
+from pipeline.columns.columns import expand_cells
+from pipeline.data.errors import GeometryError
+from pipeline.plane_mesh.plane import mesh_plane
+from pipeline.quality.quality import measure_cells
+from stitch.seams.seams import find_vertices, trace_seam
+from stitch.seams.tiles import areas_within
+from stitch.tiling import paths
+from stitch.tiling.corners import place_corner
+from stitch.tiling.grid import Key, SeamKey, is_border, make_grid, seam_keys, tile_keys
+from stitch.tiling.strips import CORRIDOR, Strip, improve_around, mesh_strip
+from stitch.tiling.walls import cut_walls, split_walls
 from tests.cities import Bounds, crowded_blocks, tilted_dtm
 from tests.stitching import (
     OPTIONS,
@@ -197,7 +197,7 @@ def test_no_place_is_given_up_that_could_be_the_clearest(seed: int, monkeypatch:
     walls = cut_walls(polygons, mesh_size=10.0)
     keys = [Key(i, j) for i in range(4) for j in range(4)]
     quick = [place_corner(NINE, key, polygons, walls, mesh_size=10.0) for key in keys]
-    monkeypatch.setattr("stitch.corners._find_best", lambda walls, xy, *_: np.arange(len(xy)))
+    monkeypatch.setattr("stitch.tiling.corners._find_best", lambda walls, xy, *_: np.arange(len(xy)))
     for key, corner in zip(keys, quick, strict=True):
         thorough = place_corner(NINE, key, polygons, walls, mesh_size=10.0)
         assert corner.xy.tobytes() == thorough.xy.tobytes()

@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline import lines, segments
-from pipeline.lines import MIN_GAIN, _sum_pairwise
-from pipeline.segments import (
+from pipeline.city_model import lines
+from pipeline.city_model.lines import MIN_GAIN, _sum_pairwise
+from pipeline.geometry import segments
+from pipeline.geometry.segments import (
     BLUNT,
     ON_EDGE,
     add_places,

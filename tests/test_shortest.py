@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from stitch.shortest import find_shortest
+from stitch.tiling.shortest import find_shortest
 
 
 def all_usable(n: int) -> NDArray[np.bool_]:

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.adaptive import AdaptiveOptions
-from pipeline.building_facts import describe_buildings, measure_model
-from pipeline.building_points import BuildingPoints, take_building_points
-from pipeline.city import City
-from pipeline.citymodel import Footprints
-from pipeline.clusters import Shapes
-from pipeline.columns import expand_cells, extract_boundary
-from pipeline.heights import Heights
-from pipeline.layered import LayeredOptions
-from pipeline.mesh import Marker
-from pipeline.notes import count_notes
-from pipeline.pointcloud import PointCloud
-from pipeline.simplify import _settle_clusters, settle_roofs, simplify_city
-from pipeline.spacing import SpacingLimits
-from pipeline.tile import build_city, mesh_city
+from pipeline.city_model.building_points import BuildingPoints, take_building_points
+from pipeline.city_model.city import City
+from pipeline.city_model.heights import Heights
+from pipeline.columns.adaptive import AdaptiveOptions
+from pipeline.columns.columns import expand_cells, extract_boundary
+from pipeline.columns.layered import LayeredOptions
+from pipeline.columns.spacing import SpacingLimits
+from pipeline.columns.tile import build_city, mesh_city
+from pipeline.data.citymodel import Footprints
+from pipeline.data.mesh import Marker
+from pipeline.data.notes import count_notes
+from pipeline.data.pointcloud import PointCloud
+from pipeline.quality.building_facts import describe_buildings, measure_model
+from pipeline.simplification.house_clusters import Shapes
+from pipeline.simplification.simplify import _settle_clusters, settle_roofs, simplify_city
 from tests.cities import cloud_over, tilted_dtm
 from tests.test_tile import BOUNDS, LAYERS, OPTIONS, footprints_of
 

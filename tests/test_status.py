@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import CityError, ConfigError, InputError
+from pipeline.data.errors import CityError, ConfigError, InputError
 from tests.test_run import hashes
 from tests.towns import Town, make_town
 from tiler.cli.main import main, make_parser

@@ -11,7 +11,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.storage import ZipStore
 
-from pipeline.errors import InputError, OutputError
+from pipeline.data.errors import InputError, OutputError
 from tests.result_parts import parts, write_parts
 from tiler.store.result_file import CHUNK_BYTES
 from tiler.store.result_writer import SMALL_BYTES, SQUARE

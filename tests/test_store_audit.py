@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError, InputError
 from tests.campaigns import keep_outcome, rounds
 from tests.result_parts import parts, write_parts
 from tests.test_run import hashes

@@ -13,8 +13,8 @@ import pyproj
 import pytest
 import shapely
 
-from pipeline.errors import ConfigError
-from pipeline.synthetic import ORIGIN, SyntheticCity, city_points, make_city, terrain_height
+from pipeline.data.errors import ConfigError
+from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, make_city, terrain_height
 from tests.footprint_reading import read_footprint_crs, read_footprints
 from tests.whole_clouds import read_points
 from tiler.georeference.cloud_crs import Asked

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.building_points import BuildingPoints
-from pipeline.house_levels import HouseParts
-from pipeline.houses import Houses, join_houses, take_houses
-from pipeline.point_fidelity import HouseFidelity
+from pipeline.city_model.building_points import BuildingPoints
+from pipeline.city_model.house_levels import HouseParts
+from pipeline.city_model.houses import Houses, join_houses, take_houses
+from pipeline.quality.point_fidelity import HouseFidelity
 from tests.cities import city_of, crowded_blocks
 from tiler.citymodels.tables import (
     ARRAYS_TO_RAISE,

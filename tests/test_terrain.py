@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.classes import BUILDING, GROUND, WATER
-from pipeline.errors import InputError
-from pipeline.las_points import UnitPoints
-from pipeline.pointcloud import PointCloud
-from pipeline.raster import (
+from pipeline.data.classes import BUILDING, GROUND, WATER
+from pipeline.data.errors import InputError
+from pipeline.data.pointcloud import PointCloud
+from pipeline.points_terrain.las_points import UnitPoints
+from pipeline.points_terrain.raster import (
     HEIGHT_UNIT,
     NodeWindow,
     cut_nodes,
@@ -22,8 +22,16 @@ from pipeline.raster import (
     node_window,
     window_of,
 )
-from pipeline.terrain import Dtm, bin_ground, bin_nodes, bin_units, compute_dtm, fill_dtm, sample_dtm
-from pipeline.terrain_fill import (
+from pipeline.points_terrain.terrain import (
+    Dtm,
+    bin_ground,
+    bin_nodes,
+    bin_units,
+    compute_dtm,
+    fill_dtm,
+    sample_dtm,
+)
+from pipeline.points_terrain.terrain_fill import (
     COARSE,
     DEEPER,
     FILL_RINGS,

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.city import City, CityOptions
-from pipeline.citymodel import Footprints, make_ids, number_ids
-from pipeline.columns import expand_cells, lowest_gap
-from pipeline.errors import InputError
-from pipeline.layered import LayeredOptions
-from pipeline.notes import count_notes
-from pipeline.simplify import simplify_city
-from pipeline.tile import build_city, mesh_city
+from pipeline.city_model.city import City, CityOptions
+from pipeline.columns.columns import expand_cells, lowest_gap
+from pipeline.columns.layered import LayeredOptions
+from pipeline.columns.tile import build_city, mesh_city
+from pipeline.data.citymodel import Footprints, make_ids, number_ids
+from pipeline.data.errors import InputError
+from pipeline.data.notes import count_notes
+from pipeline.simplification.simplify import simplify_city
 from tests.cities import Bounds, cloud_over, tilted_dtm
 
 BOUNDS: Bounds = (1000.0, 2000.0, 1100.0, 2100.0)

@@ -10,9 +10,9 @@ import pytest
 import shapely
 from shapely import affinity
 
-from pipeline.mesh import Marker
-from stitch.grid import Bounds
-from stitch.tiles import tile_halo
+from pipeline.data.mesh import Marker
+from stitch.seams.tiles import tile_halo
+from stitch.tiling.grid import Bounds
 from tests.campaigns import keep_outcome, rounds
 from tests.cities import crowded_blocks
 from tests.tiles import (

@@ -12,12 +12,10 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.cell_blocks import UsedPoints, number_used
-from pipeline.errors import ConfigError, InputError
-from pipeline.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
-from pipeline.nodes import GROUND_SURFACE, TOP_SURFACE, Levels, SeamColumns, no_seam
-from pipeline.spacing import SpacingLimits
-from pipeline.underground import (
+from pipeline.columns.cell_blocks import UsedPoints, number_used
+from pipeline.columns.nodes import GROUND_SURFACE, TOP_SURFACE, Levels, SeamColumns, no_seam
+from pipeline.columns.spacing import SpacingLimits
+from pipeline.columns.underground import (
     SoilMesh,
     SoilOptions,
     add_soil,
@@ -30,7 +28,9 @@ from pipeline.underground import (
     soil_tops,
     split_regions,
 )
-from stitch.conformity import compute_cell_volumes, pair_cell_faces
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
+from stitch.pieces.conformity import compute_cell_volumes, pair_cell_faces
 from tests.cities import Bounds, crowded_blocks
 from tests.test_tiles import prove_local, put_beside
 from tests.tiles import hash_files, make_town, run_of, write_town

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError, InputError
-from pipeline.mesh import Marker, Region
-from stitch.conformity import compute_cell_volumes, pair_edges
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.mesh import Marker, Region
+from stitch.pieces.conformity import compute_cell_volumes, pair_edges
 from tests.foam_reader import PolyMesh, read_poly_mesh, read_zones
 from tests.hand_pieces import HandPieces
 from tests.programs import mesh_is_ok, read_check, run_foam, run_program

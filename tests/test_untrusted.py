@@ -16,7 +16,7 @@ import pyproj
 import pytest
 import shapely
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError, InputError
 from tests.bad_input import (
     BOUNDS,
     HOUSE,

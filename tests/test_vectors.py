@@ -11,9 +11,9 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.citymodel import Footprints, make_ids
-from pipeline.errors import ConfigError, InputError
-from pipeline.notes import Note, count_notes
+from pipeline.data.citymodel import Footprints, make_ids
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.notes import Note, count_notes
 from tests.footprint_reading import read_footprint_crs, read_footprints
 
 RD = pyproj.CRS("EPSG:28992")

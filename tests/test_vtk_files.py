@@ -18,8 +18,8 @@ from vtkmodules.vtkIOXML import (
     vtkXMLUnstructuredGridReader,
 )
 
-from pipeline.errors import InputError, OutputError
-from pipeline.mesh import Boundary, TetMesh
+from pipeline.data.errors import InputError, OutputError
+from pipeline.data.mesh import Boundary, TetMesh
 from tests.meshes import TinyCity, make_city, split_city
 from tiler.mesh_files import vtk_files, vtk_xml
 from tiler.mesh_files.vtk_files import (

@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.adaptive import AdaptiveOptions
-from pipeline.cell_blocks import CellBlocks, UsedPoints, number_used
-from pipeline.columns import find_used_points, split_boundary
-from pipeline.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
-from pipeline.terrain import Dtm, sample_dtm
-from stitch.facets import Side, find_seam_edges
-from stitch.grid import Key, SeamKey, TileGrid, seams_of_tile
-from stitch.numbering import (
+from pipeline.columns.adaptive import AdaptiveOptions
+from pipeline.columns.cell_blocks import CellBlocks, UsedPoints, number_used
+from pipeline.columns.columns import find_used_points, split_boundary
+from pipeline.data.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
+from pipeline.points_terrain.terrain import Dtm, sample_dtm
+from stitch.pieces.numbering import (
     count_all_points,
     count_by_part,
     first_id,
@@ -23,8 +21,10 @@ from stitch.numbering import (
     seam_ids,
     tile_part,
 )
-from stitch.seam_columns import tile_columns
-from stitch.seams import find_vertices
+from stitch.seams.facets import Side, find_seam_edges
+from stitch.seams.seam_columns import tile_columns
+from stitch.seams.seams import find_vertices
+from stitch.tiling.grid import Key, SeamKey, TileGrid, seams_of_tile
 from tests.stitching import OPTIONS, Scene, Tile, clip_scene, mesh_all
 from tiler.citymodels.cityjson import write_city_model
 from tiler.mesh_files.merged import VERTEX_ID

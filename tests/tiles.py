@@ -17,8 +17,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.classes import BUILDING, GROUND
-from stitch.grid import Bounds
+from pipeline.data.classes import BUILDING, GROUND
+from stitch.tiling.grid import Bounds
 from tiler.config.config import Config, make_config
 from tiler.config.step_options import derived_parameters
 from tiler.engine.engine import Engine

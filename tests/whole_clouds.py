@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.pointcloud import PointCloud
+from pipeline.data.pointcloud import PointCloud
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.objects.places import as_place
 from tiler.pointclouds.cells import Box

@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipeline.errors import CityError
+    from pipeline.data.errors import CityError
     from tiler.interface.api import mesh, plan, write_city
     from tiler.interface.api import open_folder as open
     from tiler.interface.city_mesh import Building, CityMesh, Picture
@@ -35,7 +35,7 @@ __all__ = [
 # module would take its place.
 _PLACES = {
     "Building": ("tiler.interface.city_mesh", "Building"),
-    "CityError": ("pipeline.errors", "CityError"),
+    "CityError": ("pipeline.data.errors", "CityError"),
     "CityMesh": ("tiler.interface.city_mesh", "CityMesh"),
     "MeshPiece": ("tiler.mesh_files.mesh_pieces", "MeshPiece"),
     "Picture": ("tiler.interface.city_mesh", "Picture"),

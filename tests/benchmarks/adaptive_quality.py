@@ -10,13 +10,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
-from pipeline.columns import expand_cells
-from pipeline.heights import highest_wall_ground, raise_low_roofs
-from pipeline.plane import mesh_plane
-from pipeline.quality import measure_cells
-from pipeline.spacing import SpacingLimits
-from pipeline.terrain import Dtm, sample_dtm
+from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
+from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
+from pipeline.columns.columns import expand_cells
+from pipeline.columns.spacing import SpacingLimits
+from pipeline.plane_mesh.plane import mesh_plane
+from pipeline.points_terrain.terrain import Dtm, sample_dtm
+from pipeline.quality.quality import measure_cells
 from tests.cities import city_of, crowded_blocks
 
 SIZE, BUILDINGS = 1000.0, 500  # m, number

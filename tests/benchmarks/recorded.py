@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from stitch.grid import Key
+from stitch.tiling.grid import Key
 from tiler.config.config import Config
 from tiler.engine.engine import Engine
 from tiler.engine.stage import Box, Facts, Scope

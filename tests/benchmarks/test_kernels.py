@@ -12,17 +12,17 @@ import pytest
 from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
-from pipeline.citymodel import CityModel
-from pipeline.columns import expand_cells
-from pipeline.inside import find_inside
-from pipeline.layered import LayeredOptions, mesh_layers
-from pipeline.mesh import PlaneMesh
-from pipeline.plane import mesh_plane
-from pipeline.quality import measure_cells
-from pipeline.slab import lift_places, smooth_slab
-from pipeline.spacing import SpacingLimits
-from pipeline.terrain import Dtm
+from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
+from pipeline.columns.columns import expand_cells
+from pipeline.columns.layered import LayeredOptions, mesh_layers
+from pipeline.columns.spacing import SpacingLimits
+from pipeline.data.citymodel import CityModel
+from pipeline.data.mesh import PlaneMesh
+from pipeline.geometry.inside import find_inside
+from pipeline.plane_mesh.plane import mesh_plane
+from pipeline.points_terrain.terrain import Dtm
+from pipeline.quality.quality import measure_cells
+from pipeline.smoothing.ground_smoothing import lift_places, smooth_slab
 from tests.cities import Bounds, random_city
 from tiler.mesh_files.vtk_xml import compress_block
 

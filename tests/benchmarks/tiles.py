@@ -12,8 +12,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.columns import expand_cells
-from pipeline.quality import Quality, measure_cells
+from pipeline.columns.columns import expand_cells
+from pipeline.quality.quality import Quality, measure_cells
 from tests.benchmarks.runs import citystitch
 from tiler.store.results import read_columns
 from tiler.store.store import Store

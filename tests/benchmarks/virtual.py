@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import CityError
+from pipeline.data.errors import CityError
 from tests.benchmarks.recorded import choose, draw, make_facts
 from tiler.engine.stage import Box, Facts, Layout, Scope
 from tiler.engine.task import Failure, Record, Task, run_task

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.errors import InputError
-from pipeline.mesh import Marker
-from stitch.frontier import Settled, add_rim, close_frontier, start_frontier
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Marker
+from stitch.pieces.frontier import Settled, add_rim, close_frontier, start_frontier
 from tiler.check import city_proofs, pad_proofs, proofs, soil_proofs
 from tiler.check.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
 from tiler.check.proofs import Dtm, Fault, Finding, Proof, Vertices
@@ -96,8 +96,8 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
     Notes
     -----
     Pieces are read one after the other, along the long side of the region: memory holds one piece with the
-    buildings and the terrain around it, what waits for a neighbour on the frontier (`stitch.frontier`), besides
-    some 100 bytes a building and 500 a piece.
+    buildings and the terrain around it, what waits for a neighbour on the frontier (`stitch.pieces.frontier`),
+    besides some 100 bytes a building and 500 a piece.
     """
     record = read_run_record(directory / RUN_RECORD)
     solids = SolidProofs()

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Boundary, Marker, Region, TetMesh
-from stitch import conformity
-from stitch.frontier import Rim, as_places, find_border, find_edges_below, find_outline
+from pipeline.data.mesh import Boundary, Marker, Region, TetMesh
+from stitch.pieces import conformity
+from stitch.pieces.frontier import Rim, as_places, find_border, find_edges_below, find_outline
 from tiler.check import proofs
 from tiler.check.proofs import Bounds, Fault, Finding, Mask, Surface, Vertices
 from tiler.check.soil_proofs import check_between

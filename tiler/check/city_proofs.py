@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker
+from pipeline.data.mesh import Marker
 from tiler.check.proofs import (
     HEIGHT_TOLERANCE,
     N_PLACES,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.mesh import Marker
+from pipeline.data.mesh import Marker
 from tiler.check.proofs import (
     HEIGHT_TOLERANCE,
     SIDE_TOLERANCE,

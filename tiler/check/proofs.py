@@ -10,9 +10,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Boundary, Marker, TetMesh
-from stitch import conformity
-from stitch.frontier import Settled, find_edges_below
+from pipeline.data.mesh import Boundary, Marker, TetMesh
+from stitch.pieces import conformity
+from stitch.pieces.frontier import Settled, find_edges_below
 from tiler.workflow.run_folder import RunRecord
 
 HEIGHT_TOLERANCE = 1e-6  # m, of a height against the DTM or the city model

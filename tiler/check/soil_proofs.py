@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker
-from stitch import conformity
-from stitch.frontier import as_places
+from pipeline.data.mesh import Marker
+from stitch.pieces import conformity
+from stitch.pieces.frontier import as_places
 from tiler.check.proofs import (
     HEIGHT_TOLERANCE,
     RELATIVE_TOLERANCE,

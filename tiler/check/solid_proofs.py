@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.check.proofs import N_PLACES, Fault, Proof, Vertices
 from tiler.citymodels.building_index import Vertices as ModelVertices
 from tiler.citymodels.building_index import check_indices

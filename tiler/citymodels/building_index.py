@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError, OutputError
+from pipeline.data.errors import InputError, OutputError
 from tiler.citymodels.json_stream import iterate_elements, iterate_members, read_members
 from tiler.workflow.run_folder import WRONG_FIELD, Buildings, broken_field
 

@@ -16,10 +16,10 @@ import shapely
 from numpy.typing import NDArray
 from pyproj.exceptions import CRSError
 
-from pipeline.citymodel import CityModel
-from pipeline.errors import ConfigError, InputError
-from pipeline.notes import Note
-from pipeline.solids import Solids, build_solids
+from pipeline.city_model.solids import Solids, build_solids
+from pipeline.data.citymodel import CityModel
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.notes import Note
 from tiler.store.atomic import replacing
 
 # Coordinates are whole multiples of this length (m).
@@ -66,8 +66,8 @@ def write_city_model(
     Returns
     -------
     tuple of Note
-        Those of `pipeline.solids.build_solids`: a building whose footprint is lost has no geometry in the
-        file, a flat one has no solid. ``crs-without-epsg``: the file names no reference system.
+        Those of `pipeline.city_model.solids.build_solids`: a building whose footprint is lost has no geometry in
+        the file, a flat one has no solid. ``crs-without-epsg``: the file names no reference system.
 
     Raises
     ------

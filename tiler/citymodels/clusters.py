@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.grid import Key
+from stitch.tiling.grid import Key
 
 
 def pack_clusters(

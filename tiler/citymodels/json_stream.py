@@ -7,7 +7,7 @@ from typing import Any, BinaryIO
 
 import ijson
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 
 DEEPEST = 100  # levels: ours have ten at most
 BUFFER = 1 << 18  # bytes that are read at once

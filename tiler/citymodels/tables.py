@@ -9,12 +9,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_points import BuildingPoints
-from pipeline.city import City
-from pipeline.citymodel import CityModel, Prisms
-from pipeline.house_levels import HouseParts
-from pipeline.houses import Houses
-from pipeline.point_fidelity import HouseFidelity
+from pipeline.city_model.building_points import BuildingPoints
+from pipeline.city_model.city import City
+from pipeline.city_model.house_levels import HouseParts
+from pipeline.city_model.houses import Houses
+from pipeline.data.citymodel import CityModel, Prisms
+from pipeline.quality.point_fidelity import HouseFidelity
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import CityError, ConfigError
+from pipeline.data.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
 from tiler.cli.parser import EXPORT_OPTION, Handler, build_parser
 from tiler.config.config import Config, annotated_defaults, make_config

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.config.config import Config
 from tiler.config.domain_height import Height
 from tiler.executors.dask_settings import ANYWHERE

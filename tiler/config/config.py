@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from pipeline.classes import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
-from pipeline.errors import ConfigError
-from stitch.least import LEAST_TILE
+from pipeline.data.classes import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
+from pipeline.data.errors import ConfigError
+from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.config.domain_height import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
 from tiler.config.pad_widths import check_widths
 from tiler.config.tile_size import LEAST_SIDE, choose_tile_size

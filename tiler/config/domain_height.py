@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 
 MULTIPLE = re.compile(r"([0-9]*\.?[0-9]+)\s*[hH]")
 EXPECTED_TALLEST = 20.0  # m; the tallest building where a forecast needs one before there is a city model

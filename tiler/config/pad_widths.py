@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.config.domain_height import Height, height_in_metres
 
 SIDES = ("west", "east", "south", "north")

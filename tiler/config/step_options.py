@@ -2,14 +2,14 @@
 
 from typing import Any
 
-from pipeline.adaptive import AdaptiveOptions
-from pipeline.city import CityOptions
-from pipeline.growth import Growth, count_steps
-from pipeline.layered import LayeredOptions
-from pipeline.sizes import SizeRule
-from pipeline.spacing import SpacingLimits
-from pipeline.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
-from pipeline.underground import SoilOptions
+from pipeline.city_model.city import CityOptions
+from pipeline.columns.adaptive import AdaptiveOptions
+from pipeline.columns.growth import Growth, count_steps
+from pipeline.columns.layered import LayeredOptions
+from pipeline.columns.spacing import SpacingLimits
+from pipeline.columns.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
+from pipeline.columns.underground import SoilOptions
+from pipeline.plane_mesh.sizes import SizeRule
 from tiler.config.config import Config
 from tiler.config.domain_height import Domain
 from tiler.engine.task import Declared

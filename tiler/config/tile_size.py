@@ -2,7 +2,7 @@
 
 import math
 
-from stitch.least import LEAST_TILE
+from stitch.tiling.smallest_tile import LEAST_TILE
 
 LEAST_SIDE = 10.0  # m
 LARGE_SIDE = 1250.0  # m; for meshes of the size below, and coarser ones

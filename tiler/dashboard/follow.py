@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import CityError, InputError
+from pipeline.data.errors import CityError, InputError
 from tiler.dashboard.model import RunModel
 from tiler.store.folder_lock import is_held
 from tiler.workflow.out_folder import EVENTS, RUN_RECORD

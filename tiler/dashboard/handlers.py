@@ -11,7 +11,7 @@ from typing import Any
 
 from tornado.web import HTTPError, RequestHandler
 
-from pipeline.errors import CityError
+from pipeline.data.errors import CityError
 from tiler.dashboard.answer import tell
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.map_view import Box, Question

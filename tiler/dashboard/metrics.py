@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import CityError
+from pipeline.data.errors import CityError
 from tiler.dashboard.codes import STATES, State
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.items import Items

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.metrics import Collector
 from tiler.executors.dask_settings import ANYWHERE

@@ -16,7 +16,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import CityError
+from pipeline.data.errors import CityError
 from tiler.engine.absent_tiles import Gaps
 from tiler.engine.failures import Policy, SetAside, ends_the_run, tell_reason, tries
 from tiler.engine.keys import declared_values, file_identity, item_key, stage_digest

@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pipeline.errors import CityError, ConfigError, OutputError
+from pipeline.data.errors import CityError, ConfigError, OutputError
 from tiler.engine.stage import Scope
 from tiler.engine.task import Failure
 from tiler.engine.task_limits import WorkerError

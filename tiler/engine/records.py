@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pipeline.notes import count_notes
+from pipeline.data.notes import count_notes
 from tiler.engine.stage import Facts
 from tiler.engine.task import Record, notes_from_json
 from tiler.store.checksums import FILES

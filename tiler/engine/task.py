@@ -14,8 +14,8 @@ from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import CityError
-from pipeline.notes import Note, count_notes
+from pipeline.data.errors import CityError
+from pipeline.data.notes import Note, count_notes
 from tiler.engine.stage import Box, Facts, Scope
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.objects.requests import trust_addresses

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
-from pipeline.errors import CityError, OutputError
+from pipeline.data.errors import CityError, OutputError
 from tiler.config.config import Config
 from tiler.engine.stage import Facts
 from tiler.engine.task import Failure, Record, Task, run_task

@@ -8,7 +8,7 @@ from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
-from pipeline.errors import CityError
+from pipeline.data.errors import CityError
 from tiler.engine.task import Failure, Task
 from tiler.engine.task_limits import Limits, WorkerError, run_guarded, tell_death, tell_memory
 from tiler.executors.executor import LEAST_TASKS, TASKS_PER_WORKER, Function, Outcome

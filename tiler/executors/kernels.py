@@ -17,7 +17,7 @@ from typing import Any
 import numba
 from llvmlite import binding
 
-from pipeline import growth
+from pipeline.columns import growth
 from tiler.engine.keys import code_versions
 
 BLOCK = Path(__file__).parents[1] / "demo_block"

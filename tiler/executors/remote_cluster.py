@@ -10,7 +10,7 @@ from dask.utils import parse_timedelta
 from distributed import Client
 from distributed.utils import silence_logging_cmgr
 
-from pipeline.errors import CityError
+from pipeline.data.errors import CityError
 from tiler.config.config import Config
 from tiler.engine.task_limits import Limits
 from tiler.executors.dask_executor import DaskExecutor

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import CityError, ConfigError
+from pipeline.data.errors import CityError, ConfigError
 
 CONNECT = 30.0  # s for a connection, and for its first word
 SILENT = 3.0  # s without a word, after which a scheduler may be one that waits for TLS

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.executors import versions
 from tiler.executors.versions import TRANSPORT, digest_versions, tell_versions
 from tiler.store.atomic import replacing

@@ -12,7 +12,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler import formats
 from tiler.mesh_files.run_files import (
     BOUNDARY_INDEX,

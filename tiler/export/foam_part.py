@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.cell_faces import CellFaces
+from stitch.pieces.cell_faces import CellFaces
 from tiler.export.foam_files import FoamFaces, FoamList, foam_header
 from tiler.export.foam_patches import (
     GROUND_ZONE,

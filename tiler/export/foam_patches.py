@@ -9,7 +9,7 @@ from typing import BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker, Region
+from pipeline.data.mesh import Marker, Region
 from tiler.export.foam_files import foam_header
 from tiler.export.region_faces import FacetSets, Ints
 
@@ -73,7 +73,7 @@ def patch_keys(marker: NDArray[np.int32], building: NDArray[np.int64], *, by_bui
     Parameters
     ----------
     marker : int32, (f,)
-        `pipeline.mesh.Marker` of each facet.
+        `pipeline.data.mesh.Marker` of each facet.
     building : int64, (f,)
         Number of its building, -1 where there is none.
     by_building : bool

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.mesh import Marker, Region
-from stitch.cell_faces import CellFaces, find_cell_faces
-from stitch.conformity import group_rows
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Marker, Region
+from stitch.pieces.cell_faces import CellFaces, find_cell_faces
+from stitch.pieces.conformity import group_rows
 from tiler.export.pieces import Pieces
 from tiler.mesh_files.mesh_pieces import MeshPiece
 

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.export.foam_patches import PATCHES, patch_keys
 from tiler.export.rows import blocks_of
 from tiler.mesh_files.merged import VERTEX_ID, number_piece
@@ -31,7 +31,7 @@ class SurfacePiece(Protocol):
 
     @property
     def marker(self) -> NDArray[np.int32]:
-        """`pipeline.mesh.Marker` of each facet."""
+        """`pipeline.data.mesh.Marker` of each facet."""
 
     @property
     def building(self) -> NDArray[np.int64]:

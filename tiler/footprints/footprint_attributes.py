@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.vectors.features import Features
 from tiler.vectors.gdal_layer import list_some
 from tiler.vectors.layers import Layer

@@ -10,8 +10,8 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.citymodel import Footprints
-from pipeline.notes import Note
+from pipeline.data.citymodel import Footprints
+from pipeline.data.notes import Note
 from tiler.footprints.footprint_source import FootprintSource, count_notes_of, make_footprints, open_source
 from tiler.footprints.repeated_ids import find_repeated_ids
 from tiler.georeference.frame import Frame

@@ -11,9 +11,9 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.citymodel import Footprints, make_ids
-from pipeline.errors import InputError
-from pipeline.notes import Note
+from pipeline.data.citymodel import Footprints, make_ids
+from pipeline.data.errors import InputError
+from pipeline.data.notes import Note
 from tiler.footprints.footprint_attributes import (
     explain_repeated,
     find_attribute,

@@ -22,7 +22,7 @@ _LINEAR = (shapely.GeometryType.LINESTRING, shapely.GeometryType.LINEARRING)
 
 @dataclass(frozen=True)
 class Finding:
-    """What was done to a geometry, or why it is left out: one of a `pipeline.notes.Note` in the making.
+    """What was done to a geometry, or why it is left out: one of a `pipeline.data.notes.Note` in the making.
 
     Attributes
     ----------

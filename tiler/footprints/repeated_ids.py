@@ -4,7 +4,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.citymodel import make_ids
+from pipeline.data.citymodel import make_ids
 from tiler.footprints.footprint_attributes import id_columns, read_ids
 from tiler.footprints.plan_outlines import outline_all
 from tiler.vectors.layers import BATCH, Layer, scan_layer

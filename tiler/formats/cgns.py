@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
 from tiler.export.pieces import Pieces

@@ -8,7 +8,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.citymodels.building_index import Vertices, has_parts, read_objects, spool_vertices
 from tiler.export.export import Format
 from tiler.mesh_files.run_files import RunFiles

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.mesh import Marker
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Marker
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import FIRST_BUILDING, PATCHES, building_name, facets_by_key, is_house
 from tiler.export.surface import (

@@ -13,7 +13,7 @@ import pyogrio
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tiler.citymodels.building_index import has_parts, read_building, read_objects, spool_vertices
 from tiler.export.export import Format
 from tiler.formats.cityjsonseq import CITY_MODEL

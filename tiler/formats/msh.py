@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker, Region
+from pipeline.data.mesh import Marker, Region
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
 from tiler.export.pieces import Pieces

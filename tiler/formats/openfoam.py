@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from pipeline.errors import CityError, ConfigError, InputError
+from pipeline.data.errors import CityError, ConfigError, InputError
 from tiler.export.export import EXPORT_RECORD, LARGEST_PART, Format
 from tiler.export.foam_case import INLET, OUTLET, write_system, write_wind_case
 from tiler.export.foam_files import LABEL_LIMIT

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.export.export import LARGEST_PART, Format
 from tiler.export.foam_patches import patch_of_key
 from tiler.export.surface import Surface, SurfaceSurvey, open_surface, place_vertices, survey_surface

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tiler.export.export import LARGEST_PART, Format
 from tiler.export.pieces import Pieces
 from tiler.export.rows import blocks_of

@@ -7,8 +7,8 @@ from typing import Any
 
 import pyproj
 
-from pipeline.errors import ConfigError, InputError
-from pipeline.notes import Note
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.notes import Note
 from tiler.georeference.crs import crs_name, horizontal_crs, is_on_its_place, is_one, parse_crs, utm_crs
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.georeference.las_crs import height_unit_of

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pyproj
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 
 _ALIKE = 20  # confidence (%) above which PROJ names a candidate, which is then compared in full
 SAME_PLACE = 0.1  # m; CRSs between which a region moves by less are one

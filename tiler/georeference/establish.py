@@ -7,8 +7,8 @@ from typing import Any
 
 import pyproj
 
-from pipeline.errors import InputError
-from pipeline.notes import Note
+from pipeline.data.errors import InputError
+from pipeline.data.notes import Note
 from tiler.georeference.cloud_crs import (
     Asked,
     CloudGroup,

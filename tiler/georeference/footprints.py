@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pyproj
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.georeference.crs import crs_name, crs_text, is_one
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.georeference.metric import MetricCrs, find_metric

@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.config.config import Config, check_reach, load_config, make_config
 from tiler.objects.places import refuse_bucket
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import CityError, ConfigError
+from pipeline.data.errors import CityError, ConfigError
 from tiler.export.export import export_run
 from tiler.mesh_files.run_files import RUN_RECORD, find_files
 from tiler.store.atomic import replacing

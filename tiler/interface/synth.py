@@ -13,9 +13,9 @@ import pyogrio
 import pyproj
 import shapely
 
-from pipeline.errors import ConfigError
-from pipeline.pointcloud import PointCloud
-from pipeline.synthetic import ORIGIN, SyntheticCity, city_points, make_city
+from pipeline.data.errors import ConfigError
+from pipeline.data.pointcloud import PointCloud
+from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, make_city
 
 CRS = "EPSG:3006"
 DENSITY = 1.5  # points/m2
@@ -64,7 +64,7 @@ def write_city(
     directory : Path
         Folder to write to; made if it is missing.
     size, buildings, density, relief, seed
-        See `pipeline.synthetic.make_city`.
+        See `pipeline.points_terrain.synthetic.make_city`.
 
     Returns
     -------

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
-from pipeline.errors import CityError, ConfigError
+from pipeline.data.errors import CityError, ConfigError
 
 WALLTIME = re.compile(r"(?:(\d+)-)?(\d{1,3}):([0-5]\d):([0-5]\d)")
 TEMPLATE = "see deploy/slurm/slurm.toml"

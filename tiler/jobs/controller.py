@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.errors import CityError, InputError
+from pipeline.data.errors import CityError, InputError
 from tiler.jobs.cluster import Cluster, QueueError, read_cluster
 from tiler.jobs.submission import DESCRIPTION, JOB, PARAMETERS, SCRIPT, change_record, is_cancelled, read_record
 from tiler.monitoring.status import read_status

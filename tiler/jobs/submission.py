@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError, InputError
 from tiler.config.config import Config, make_config, write_config
 from tiler.jobs.cluster import SYSTEMS, Cluster, QueueError, read_cluster
 from tiler.objects.places import absolute, in_bucket, place

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import TetMesh
-from pipeline.quality import measure_cells
+from pipeline.data.mesh import TetMesh
+from pipeline.quality.quality import measure_cells
 from tiler.mesh_files.vtk_files import BoundaryPiece
 
 

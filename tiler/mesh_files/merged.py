@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError, OutputError
-from pipeline.mesh import TetMesh
-from pipeline.quality import measure_cells
-from stitch.numbering import Numbering, collect_ids, number_without_gaps
+from pipeline.data.errors import InputError, OutputError
+from pipeline.data.mesh import TetMesh
+from pipeline.quality.quality import measure_cells
+from stitch.pieces.numbering import Numbering, collect_ids, number_without_gaps
 from tiler.mesh_files.vtk_files import stream_offsets, stream_types
 from tiler.mesh_files.vtk_xml import (
     Sections,
@@ -28,7 +28,7 @@ from tiler.mesh_files.vtk_xml import (
     write_data_file,
 )
 
-VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide ids, see `stitch.numbering`
+VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide ids, see `stitch.pieces.numbering`
 TILE = "tile"  # cell array on request: which tile a cell is of, counted from 0 by name
 RADIUS_RATIO = "radius_ratio"  # cell array on request
 CHUNK = 1 << 20  # vertices that are moved at once
@@ -57,7 +57,7 @@ def write_merged_volume(path: Path, pieces: Sequence[Path], *, scalars: bool = F
     pieces : sequence of at least one Path
         VTU pieces (`write_vtu`) with the int64 point array `VERTEX_ID`: each id for one place.
     scalars : bool
-        Add cell arrays to colour by: `TILE`, and `RADIUS_RATIO` as `pipeline.quality` measures it.
+        Add cell arrays to colour by: `TILE`, and `RADIUS_RATIO` as `pipeline.quality.quality` measures it.
 
     Raises
     ------

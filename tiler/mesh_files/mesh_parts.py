@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns import count_by_triangle
-from pipeline.components import join_pairs
-from pipeline.mesh import ColumnMesh
-from pipeline.notes import Note
+from pipeline.columns.columns import count_by_triangle
+from pipeline.data.mesh import ColumnMesh
+from pipeline.data.notes import Note
+from pipeline.geometry.components import join_pairs
 
 MESH_IN_PARTS = "mesh-in-parts"  # kind of the note
 LISTED_PARTS = 20  # that the record lists, largest first

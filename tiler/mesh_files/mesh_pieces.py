@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.mesh import Marker, Region
-from stitch.numbering import Numbering
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Marker, Region
+from stitch.pieces.numbering import Numbering
 from tiler.mesh_files.merged import VERTEX_ID, number_piece, read_numbering
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource, find_files
 from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
@@ -36,14 +36,14 @@ class MeshPiece:
         Facets of the region's boundary, as rows of `points`, counter-clockwise seen from outside; faces that it
         shares with another tile are not among them. With soil, the ground is there although it is inside.
     marker : int32, (f,)
-        `pipeline.mesh.Marker` of each facet.
+        `pipeline.data.mesh.Marker` of each facet.
     building : int64, (f,)
         Number of each facet's building, -1 where there is none.
     ids : int64, (n,)
         Number of each point over the whole region, 0 to ``n_points - 1`` of `MeshPieces`. A point that several
         tiles have is bitwise the same in all of them, and has one number.
     region : int8, (m,), or None
-        `pipeline.mesh.Region` of each cell; None where all is air.
+        `pipeline.data.mesh.Region` of each cell; None where all is air.
     """
 
     name: str

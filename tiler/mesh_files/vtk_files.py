@@ -13,8 +13,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.mesh import Boundary, TetMesh
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Boundary, TetMesh
 from tiler.mesh_files.vtk_xml import (
     INDEX_BYTES,
     THOROUGH,

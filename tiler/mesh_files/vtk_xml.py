@@ -19,7 +19,7 @@ import numpy as np
 from deflate import zlib_compress
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.objects.places import read_at_most
 from tiler.store.atomic import replacing
 

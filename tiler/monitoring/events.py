@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ConfigError, InputError, OutputError
+from pipeline.data.errors import ConfigError, InputError, OutputError
 from tiler.engine.stage import Box, Facts, Layout, Scope
 from tiler.engine.task import Record
 from tiler.monitoring.watchers import Item, RunStart, Watcher, tell_command

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.monitoring.terminal import next_commands
 from tiler.store.folder_lock import is_held
 from tiler.words.note_words import say_notes

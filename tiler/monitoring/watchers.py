@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from stitch.grid import tiles_of_seam
+from stitch.tiling.grid import tiles_of_seam
 from tiler.engine.stage import Box, Layout, Scope
 from tiler.engine.task import Record
 from tiler.planning.context import seam_key, tile_name

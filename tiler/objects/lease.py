@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-from pipeline.errors import ConfigError, OutputError
+from pipeline.data.errors import ConfigError, OutputError
 from tiler.objects.path import ObjectPath
 from tiler.objects.requests import ChangedError
 from tiler.store import folder_lock

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePath
 from typing import BinaryIO, Protocol, Self, TypeGuard, cast
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.objects.path import ObjectPath, delete_below
 
 PATIENCE = 600.0  # s that a request is repeated for where nothing sound answers

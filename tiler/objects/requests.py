@@ -13,7 +13,7 @@ from datetime import timedelta
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pipeline.errors import ConfigError, OutputError
+from pipeline.data.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from obstore.store import HTTPStore, S3Store

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.objects.path import ObjectPath
 from tiler.objects.places import identify, in_bucket
 

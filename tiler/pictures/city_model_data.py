@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker
+from pipeline.data.mesh import Marker
 from tiler.citymodels.tables import unpack_polygons
 from tiler.pictures.picture_data import City, sew
 from tiler.store.results import StoredTerrain

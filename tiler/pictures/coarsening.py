@@ -19,7 +19,7 @@ class Facets:
     corners : int64, (k, 3)
         Rows of `points`.
     marker, piece : int32, (k,)
-        `pipeline.mesh.Marker`, and row of the piece that each is of.
+        `pipeline.data.mesh.Marker`, and row of the piece that each is of.
     building : int64, (k,)
         Number of the building, -1 on the ground.
     quality : float32, (k,)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.mesh import Marker, Region
-from stitch.grid import Key
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Marker, Region
+from stitch.tiling.grid import Key
 from tiler.mesh_files.facet_quality import measure_facets
 from tiler.mesh_files.vtk_files import TETRA, BoundaryPiece, read_piece_paths, read_vtp, read_vtu
 from tiler.pictures.coarsening import Facets, coarsen, join_facets

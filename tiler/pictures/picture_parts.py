@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import Marker
+from pipeline.data.mesh import Marker
 from tiler.pictures.picture_data import City, read_key
 
 # Edges are drawn while a triangle has this many pixels in the mean, strongest from four times as many.

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError
-from pipeline.mesh import Marker
+from pipeline.data.errors import ConfigError
+from pipeline.data.mesh import Marker
 from tiler.pictures.camera import CUT_VIEW, MARGIN, SKY, VIEW, VIEW_ANGLE, fit_camera
 from tiler.pictures.city_model_data import load_blocks
 from tiler.pictures.picture_data import City, find_middle, load_air, load_city

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from stitch.grid import (
+from stitch.tiling.grid import (
     Bounds,
     Key,
     SeamKey,

@@ -7,9 +7,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.sizes import SizeField, local_sizes, size_field_around
-from stitch.grid import Bounds, TileGrid, seams_present, tiles_present
-from stitch.least import LEAST_TILE
+from pipeline.plane_mesh.sizes import SizeField, local_sizes, size_field_around
+from stitch.tiling.grid import Bounds, TileGrid, seams_present, tiles_present
+from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.config.config import Config
 from tiler.config.step_options import expected_levels, size_rule
 from tiler.engine.stage import Scope

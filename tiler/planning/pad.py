@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.grid import Bounds, TileGrid, make_grid, tiles_present
+from stitch.tiling.grid import Bounds, TileGrid, make_grid, tiles_present
 from tiler.planning.context import SHARED
 
 

@@ -3,8 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from pipeline.errors import InputError
-from stitch.grid import Bounds
+from pipeline.data.errors import InputError
+from stitch.tiling.grid import Bounds
 from tiler.config.config import Config
 from tiler.config.domain_height import Domain
 from tiler.engine.engine import Engine

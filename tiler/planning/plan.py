@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
-from pipeline.errors import ConfigError, InputError
-from pipeline.notes import Note
-from stitch.grid import TileGrid, make_grid, tiles_present
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.notes import Note
+from stitch.tiling.grid import TileGrid, make_grid, tiles_present
 from tiler.config.config import Config, idle_parameters
 from tiler.engine.stage import FileItem, Layout
 from tiler.georeference.cloud_crs import Asked

@@ -10,8 +10,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.errors import ConfigError
-from stitch.grid import TileGrid, seams_present, tiles_present
+from pipeline.data.errors import ConfigError
+from stitch.tiling.grid import TileGrid, seams_present, tiles_present
 from tiler.config.config import Config
 from tiler.engine.task_limits import machine_memory
 from tiler.footprints.footprint_sample import FootprintSample, sample_footprints

@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.errors import ConfigError, InputError
-from stitch.grid import TileGrid
-from stitch.least import LEAST_TILE
-from stitch.numbering import MOST_TILES
+from pipeline.data.errors import ConfigError, InputError
+from stitch.pieces.numbering import MOST_TILES
+from stitch.tiling.grid import TileGrid
+from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.config.config import Config
 from tiler.config.domain_height import EXPECTED_TALLEST
 from tiler.config.pad_widths import check_widths, widths_in_metres

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.georeference.las_crs import read_las_crs
 from tiler.objects.places import as_place, is_url, place

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.las_points import KEPT, REASONS, Triple, count_values, judge_points
+from pipeline.data.errors import InputError
+from pipeline.points_terrain.las_points import KEPT, REASONS, Triple, count_values, judge_points
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.objects.places import as_place
 from tiler.pointclouds.cells import Box, order_by_cell

@@ -12,9 +12,9 @@ from laspy.copc import CopcInfoVlr, HierarchyPage
 from laspy.vlrs.known import LasZipVlr
 from numpy.typing import NDArray
 
-from pipeline.classes import GROUND, KEY_POINT
-from pipeline.errors import InputError
-from pipeline.las_points import Triple, find_coordinates
+from pipeline.data.classes import GROUND, KEY_POINT
+from pipeline.data.errors import InputError
+from pipeline.points_terrain.las_points import Triple, find_coordinates
 from tiler.georeference.frame import AS_IT_IS, STEP, Frame, box_to_file, box_to_region, origin_of, to_region
 from tiler.objects.places import source_of
 from tiler.pointclouds.las_header import AGAIN, Box3, box_of_header, has_void_box, laspy_as_input_error

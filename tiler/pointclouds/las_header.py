@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 import laspy
 
-from pipeline.errors import InputError, OutputError
+from pipeline.data.errors import InputError, OutputError
 
 COORDINATE_LIMIT = 1e8  # m; beyond it no projected CRS has coordinates
 SCALE_LIMIT = 100.0  # units of the file for one step of the stored integers

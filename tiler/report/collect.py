@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.histograms import QUALITY_BINS, Histogram, merge_histograms
+from pipeline.quality.histograms import QUALITY_BINS, Histogram, merge_histograms
 from tiler.citymodels.tables import unpack_polygons
 from tiler.report.record import RunFacts
 from tiler.report.svg_map import FootprintRaster
@@ -24,7 +24,7 @@ class Numbers:
     Attributes
     ----------
     quality : dict of str to Histogram
-        Each measure over all cells (`pipeline.histograms.QUALITY_BINS`); empty without pieces.
+        Each measure over all cells (`pipeline.quality.histograms.QUALITY_BINS`); empty without pieces.
     worst : float64, (n,)
         Least radius ratio of each tile of `RunFacts.tiles`; NaN where the store does not tell.
     buildings, terrain : Bins

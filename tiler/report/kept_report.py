@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tiler.store.atomic import replacing
 from tiler.workflow.out_folder import EARLIER_REPORT, REPORT
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ConfigError
+from pipeline.data.errors import ConfigError
 from tiler.pictures.picture_data import find_middle, load_air, load_city
 from tiler.pictures.render import draw_city, need_graphics
 from tiler.report.page import figure, paragraph, text

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.citymodels.json_stream import iterate_elements, iterate_members, read_members
 from tiler.workflow.out_folder import RUN_RECORD
 from tiler.workflow.run_folder import SCHEMA, WRONG_FIELD, broken_field

@@ -10,13 +10,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.classes import BUILDING, GROUND, WATER
-from pipeline.columns import expand_cells
-from pipeline.histograms import Histogram, merge_histograms, quality_histograms
-from pipeline.mesh import ColumnMesh, PlaneMesh
-from pipeline.quality import measure_cells
-from pipeline.residuals import ResidualSums, merge_residuals, sum_residuals
-from pipeline.surface_points import NOWHERE, measure_surface
+from pipeline.columns.columns import expand_cells
+from pipeline.data.classes import BUILDING, GROUND, WATER
+from pipeline.data.mesh import ColumnMesh, PlaneMesh
+from pipeline.plane_mesh.surface_points import NOWHERE, measure_surface
+from pipeline.quality.histograms import Histogram, merge_histograms, quality_histograms
+from pipeline.quality.quality import measure_cells
+from pipeline.quality.residuals import ResidualSums, merge_residuals, sum_residuals
 from tiler.engine.stage import Box, Scope
 from tiler.engine.task import Task
 from tiler.pointclouds.ingest import CELL

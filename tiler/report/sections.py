@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.histograms import Histogram, percentile
-from pipeline.point_fidelity import KINDS
-from pipeline.residuals import ResidualSums, conclude
-from stitch.grid import make_grid, tile_box
+from pipeline.quality.histograms import Histogram, percentile
+from pipeline.quality.point_fidelity import KINDS
+from pipeline.quality.residuals import ResidualSums, conclude
+from stitch.tiling.grid import make_grid, tile_box
 from tiler.config.config import Config
 from tiler.mesh_files.mesh_parts import tell_parts
 from tiler.monitoring.progress import command_line

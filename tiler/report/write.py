@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError, InputError
 from tiler.report import sections
 from tiler.report.collect import collect_numbers
 from tiler.report.page import Page, paragraph

@@ -7,11 +7,20 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.alignment import LEAST_HOUSES, REACH, SIDE, STEP, TOLD, best_shift, describe_shift, score_shifts
-from pipeline.classes import BUILDING, GROUND
-from pipeline.errors import InputError
-from pipeline.inside import cover_polygons
-from pipeline.notes import Note
+from pipeline.data.classes import BUILDING, GROUND
+from pipeline.data.errors import InputError
+from pipeline.data.notes import Note
+from pipeline.geometry.inside import cover_polygons
+from pipeline.points_terrain.alignment import (
+    LEAST_HOUSES,
+    REACH,
+    SIDE,
+    STEP,
+    TOLD,
+    best_shift,
+    describe_shift,
+    score_shifts,
+)
 from tiler.config.config import Config
 from tiler.engine.records import Records
 from tiler.engine.stage import REGION_ITEM, Box, Facts, Read, Scope, Stage

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.approach import Border, approach_terrain, border_nodes, make_border
-from pipeline.raster import NodeWindow, cut_nodes, grow_window, node_window, window_of
+from pipeline.points_terrain.approach import Border, approach_terrain, border_nodes, make_border
+from pipeline.points_terrain.raster import NodeWindow, cut_nodes, grow_window, node_window, window_of
 from tiler.config.config import Config
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task

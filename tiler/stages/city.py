@@ -7,24 +7,31 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.adaptive import AdaptiveOptions
-from pipeline.building_points import reach_of_points
-from pipeline.citymodel import Footprints
-from pipeline.classes import BUILDING, GROUND, WATER
-from pipeline.clusters import Shapes, find_close, join_shapes, keep_shapes, leave_out, shape_clusters
-from pipeline.components import join_pairs
-from pipeline.groups import adjacent_houses
-from pipeline.houses import Houses, divide_houses, join_houses, take_houses
-from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
-from pipeline.notes import Note
-from pipeline.point_fidelity import measure_houses
-from pipeline.raster import Dtm, window_of
-from pipeline.roof_points import add_roof_points, keep_roof_points, locate_roof_points
-from pipeline.simplify import raise_buildings
-from pipeline.terrain import cut_terrain
-from pipeline.tile import measure_city, prepare_footprints
-from pipeline.unmarked_roofs import MAY_BE_ROOF
-from stitch.grid import Key
+from pipeline.city_model.building_points import reach_of_points
+from pipeline.city_model.groups import adjacent_houses
+from pipeline.city_model.houses import Houses, divide_houses, join_houses, take_houses
+from pipeline.city_model.roof_points import add_roof_points, keep_roof_points, locate_roof_points
+from pipeline.city_model.unmarked_roofs import MAY_BE_ROOF
+from pipeline.columns.adaptive import AdaptiveOptions
+from pipeline.columns.layered import LayeredOptions, choose_layers, terrain_reach
+from pipeline.columns.tile import measure_city, prepare_footprints
+from pipeline.data.citymodel import Footprints
+from pipeline.data.classes import BUILDING, GROUND, WATER
+from pipeline.data.notes import Note
+from pipeline.geometry.components import join_pairs
+from pipeline.points_terrain.raster import Dtm, window_of
+from pipeline.points_terrain.terrain import cut_terrain
+from pipeline.quality.point_fidelity import measure_houses
+from pipeline.simplification.house_clusters import (
+    Shapes,
+    find_close,
+    join_shapes,
+    keep_shapes,
+    leave_out,
+    shape_clusters,
+)
+from pipeline.simplification.simplify import raise_buildings
+from stitch.tiling.grid import Key
 from tiler.citymodels.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.citymodels.tables import (
     ARRAYS_TO_RAISE,

@@ -8,9 +8,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_facts import tell_buildings
-from pipeline.citymodel import CityModel, number_ids
-from pipeline.errors import InputError
+from pipeline.data.citymodel import CityModel, number_ids
+from pipeline.data.errors import InputError
+from pipeline.quality.building_facts import tell_buildings
 from tiler.citymodels.cityjson import Attributes, write_city_blocks
 from tiler.citymodels.tables import (
     BUILDING_ARRAYS,
@@ -63,7 +63,7 @@ def house_cells(model: CityModel) -> NDArray[np.int64]:
 
     Examples
     --------
-    >>> from pipeline.citymodel import CityModel
+    >>> from pipeline.data.citymodel import CityModel
     >>> ids, one = np.array(["a-2", "a-1", "b"]), np.ones(3)
     >>> boxes = shapely.box([9, 1020, 3000], [0, 0, 5], [10, 1030, 3010], [5, 5, 9])
     >>> house_cells(CityModel(boxes, ids, one, one, one, ((),) * 3, np.array(["a", "a", "b"]))).tolist()

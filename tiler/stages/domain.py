@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import shapely
 
-from pipeline.groups import adjacent_houses
-from pipeline.layered import LayeredOptions, choose_layers, terrain_reach
-from pipeline.notes import Note
+from pipeline.city_model.groups import adjacent_houses
+from pipeline.columns.layered import LayeredOptions, choose_layers, terrain_reach
+from pipeline.data.notes import Note
 from tiler.citymodels.tables import unpack_buildings, unpack_polygons
 from tiler.config.config import Config
 from tiler.config.domain_height import GUIDELINE, Domain, height_in_metres, is_low

@@ -6,15 +6,22 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city import find_places
-from pipeline.citymodel import Footprints
-from pipeline.classes import BUILDING
-from pipeline.inside import cover_polygons
-from pipeline.notes import Note
-from pipeline.pointcloud import PointCloud
-from pipeline.raster import Dtm
-from pipeline.roof_points import RoofPoints, add_roof_points, keep_roof_points
-from pipeline.unmarked_roofs import MAY_BE_ROOF, PLANTS, UnmarkedRoofs, are_roofs, find_bare, locate_unmarked
+from pipeline.city_model.city import find_places
+from pipeline.city_model.roof_points import RoofPoints, add_roof_points, keep_roof_points
+from pipeline.city_model.unmarked_roofs import (
+    MAY_BE_ROOF,
+    PLANTS,
+    UnmarkedRoofs,
+    are_roofs,
+    find_bare,
+    locate_unmarked,
+)
+from pipeline.data.citymodel import Footprints
+from pipeline.data.classes import BUILDING
+from pipeline.data.notes import Note
+from pipeline.data.pointcloud import PointCloud
+from pipeline.geometry.inside import cover_polygons
+from pipeline.points_terrain.raster import Dtm
 from tiler.engine.stage import Box
 from tiler.engine.task import Task
 from tiler.stages.readers import grow, read_cloud

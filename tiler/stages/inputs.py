@@ -8,15 +8,15 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.alignment import REACH
-from pipeline.classes import GROUND, KEY_POINT, WATER
-from pipeline.errors import InputError
-from pipeline.ground_check import LEAST_STEP, compare_ground, is_upside_down
-from pipeline.notes import Note
-from pipeline.pointcloud import rename_classes
-from pipeline.raster import Dtm, NodeWindow, grow_window, node_window
-from pipeline.terrain import bin_nodes, bin_units
-from pipeline.terrain_fill import (
+from pipeline.data.classes import GROUND, KEY_POINT, WATER
+from pipeline.data.errors import InputError
+from pipeline.data.notes import Note
+from pipeline.data.pointcloud import rename_classes
+from pipeline.points_terrain.alignment import REACH
+from pipeline.points_terrain.ground_check import LEAST_STEP, compare_ground, is_upside_down
+from pipeline.points_terrain.raster import Dtm, NodeWindow, grow_window, node_window
+from pipeline.points_terrain.terrain import bin_nodes, bin_units
+from pipeline.points_terrain.terrain_fill import (
     FILL_RINGS,
     CoarseSums,
     FloodedDtm,
@@ -28,7 +28,7 @@ from pipeline.terrain_fill import (
     flood_terrain,
     merge_coarse,
 )
-from stitch.grid import Key, has_tile
+from stitch.tiling.grid import Key, has_tile
 from tiler.citymodels.tables import pack_polygons
 from tiler.config.config import Config
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage
@@ -98,7 +98,7 @@ def fill_stage() -> Stage:
 
 def halo_of_points(config: Config, reach: float) -> float:
     """How far around a tile files are read for points within `reach` (m)."""
-    from pipeline.ground_filter import FILTER_REACH
+    from pipeline.points_terrain.ground_filter import FILTER_REACH
 
     return reach + (FILTER_REACH if config.ground_filter else 0.0)
 

@@ -7,28 +7,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.adaptive import AdaptiveOptions, mesh_adaptive
-from pipeline.columns import count_cells, lowest_gap
-from pipeline.errors import GeometryError
-from pipeline.layered import mesh_layers
-from pipeline.mesh import ColumnMesh, PlaneMesh, SeamEdges
-from pipeline.nodes import Levels
-from pipeline.notes import Note
-from pipeline.raster import Dtm, sample_dtm, window_of
-from pipeline.sizes import SizeField
-from pipeline.terrain import cut_terrain
-from pipeline.underground import SoilOptions
-from stitch.corners import Corner, place_corner
-from stitch.facets import Side, find_seam_edges
-from stitch.grid import Bounds, Key, SeamKey, ends_of_seam, is_pinched, seams_of_tile
-from stitch.layered_seams import fill_corner_layers, fill_seam_layers
-from stitch.numbering import corner_part, first_id, seam_ids
-from stitch.patches import mesh_patch
-from stitch.seam_columns import fill_corner, fill_seam, tile_columns
-from stitch.seams import SURROUNDINGS, Seam, find_vertices, trace_seam
-from stitch.soil_columns import fill_corner_soil, fill_seam_soil, join_seam
-from stitch.tiles import Sides, mesh_tile
-from stitch.walls import cut_walls
+from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
+from pipeline.columns.columns import count_cells, lowest_gap
+from pipeline.columns.layered import mesh_layers
+from pipeline.columns.nodes import Levels
+from pipeline.columns.underground import SoilOptions
+from pipeline.data.errors import GeometryError
+from pipeline.data.mesh import ColumnMesh, PlaneMesh, SeamEdges
+from pipeline.data.notes import Note
+from pipeline.plane_mesh.sizes import SizeField
+from pipeline.points_terrain.raster import Dtm, sample_dtm, window_of
+from pipeline.points_terrain.terrain import cut_terrain
+from stitch.pieces.numbering import corner_part, first_id, seam_ids
+from stitch.seams.facets import Side, find_seam_edges
+from stitch.seams.layered_seams import fill_corner_layers, fill_seam_layers
+from stitch.seams.seam_columns import fill_corner, fill_seam, tile_columns
+from stitch.seams.seams import SURROUNDINGS, Seam, find_vertices, trace_seam
+from stitch.seams.soil_columns import fill_corner_soil, fill_seam_soil, join_seam
+from stitch.seams.tiles import Sides, mesh_tile
+from stitch.tiling.corners import Corner, place_corner
+from stitch.tiling.grid import Bounds, Key, SeamKey, ends_of_seam, is_pinched, seams_of_tile
+from stitch.tiling.patches import mesh_patch
+from stitch.tiling.walls import cut_walls
 from tiler.citymodels.tables import NearBuildings
 from tiler.config.config import Config
 from tiler.config.domain_height import Domain

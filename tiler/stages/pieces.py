@@ -8,19 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.building_facts import fidelity_table
-from pipeline.cell_blocks import CellBlocks, QualityMeter, UsedPoints, number_used
-from pipeline.classes import BUILDING, GROUND, WATER
-from pipeline.columns import find_used_points, split_boundary
-from pipeline.errors import GeometryError
-from pipeline.histograms import (
+from pipeline.columns.cell_blocks import CellBlocks, QualityMeter, UsedPoints, number_used
+from pipeline.columns.columns import find_used_points, split_boundary
+from pipeline.columns.underground import SoilMesh, expand_regions, find_used, split_regions
+from pipeline.data.classes import BUILDING, GROUND, WATER
+from pipeline.data.errors import GeometryError
+from pipeline.data.mesh import ColumnMesh, SeamEdges
+from pipeline.quality.building_facts import fidelity_table
+from pipeline.quality.histograms import (
     QUALITY_BINS,
     Histogram,
     histogram_percentiles,
     merge_histograms,
 )
-from pipeline.mesh import ColumnMesh, SeamEdges
-from pipeline.point_fidelity import (
+from pipeline.quality.point_fidelity import (
     KINDS,
     FidelitySums,
     conclude_fidelity,
@@ -28,10 +29,16 @@ from pipeline.point_fidelity import (
     merge_fidelity,
     sum_fidelity,
 )
-from pipeline.residuals import HISTOGRAM_LIMITS, ResidualSums
-from pipeline.underground import SoilMesh, expand_regions, find_used, split_regions
-from stitch.grid import Key, seams_of_tile
-from stitch.numbering import PartCounts, count_all_points, count_by_part, first_id, number_columns, tile_part
+from pipeline.quality.residuals import HISTOGRAM_LIMITS, ResidualSums
+from stitch.pieces.numbering import (
+    PartCounts,
+    count_all_points,
+    count_by_part,
+    first_id,
+    number_columns,
+    tile_part,
+)
+from stitch.tiling.grid import Key, seams_of_tile
 from tiler.citymodels.tables import unpack_polygons
 from tiler.config.config import Config
 from tiler.engine.stage import Facts, Read, Scope, Stage

@@ -9,22 +9,22 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.building_points import NEVER_ROOF
-from pipeline.citymodel import Footprints
-from pipeline.classes import BUILDING
-from pipeline.ground_filter import FILTER_REACH, classify_above, find_terrain
-from pipeline.inside import Cover, are_covered
-from pipeline.las_points import LEFT_OUT, Triple, UnitPoints, cut_units
-from pipeline.pointcloud import PointCloud
-from pipeline.raster import (
+from pipeline.city_model.building_points import NEVER_ROOF
+from pipeline.data.citymodel import Footprints
+from pipeline.data.classes import BUILDING
+from pipeline.data.pointcloud import PointCloud
+from pipeline.geometry.inside import Cover, are_covered
+from pipeline.points_terrain.ground_filter import FILTER_REACH, classify_above, find_terrain
+from pipeline.points_terrain.las_points import LEFT_OUT, Triple, UnitPoints, cut_units
+from pipeline.points_terrain.raster import (
     Dtm,
     NodeWindow,
     grow_window,
     join_dtm,
     node_window,
 )
-from pipeline.terrain import cut_terrain, join_terrain
-from stitch.grid import Bounds
+from pipeline.points_terrain.terrain import cut_terrain, join_terrain
+from stitch.tiling.grid import Bounds
 from tiler.citymodels.tables import NEAR_ARRAYS, NearBuildings, join_near, take_near, unpack_polygons
 from tiler.engine.stage import Box
 from tiler.engine.task import Task

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import ColumnMesh, PlaneMesh
-from pipeline.nodes import Levels
-from stitch.seams import Seam
+from pipeline.columns.nodes import Levels
+from pipeline.data.mesh import ColumnMesh, PlaneMesh
+from stitch.seams.seams import Seam
 from tiler.engine.task import Result
 
 NO_PLANE = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mesh import ColumnMesh, SeamEdges
-from pipeline.nodes import Levels, SeamColumns, join_levels, take_columns
-from pipeline.notes import Note
-from pipeline.sizes import SizeField
-from pipeline.underground import SoilOptions, add_soil, count_soil_cells
+from pipeline.columns.nodes import Levels, SeamColumns, join_levels, take_columns
+from pipeline.columns.underground import SoilOptions, add_soil, count_soil_cells
+from pipeline.data.mesh import ColumnMesh, SeamEdges
+from pipeline.data.notes import Note
+from pipeline.plane_mesh.sizes import SizeField
 from tiler.engine.task import Result, Task
 
 

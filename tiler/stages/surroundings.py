@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.adaptive import AdaptiveOptions
-from pipeline.layered import terrain_reach
-from pipeline.raster import Dtm
-from pipeline.sizes import SizeField, size_field, size_field_around
-from pipeline.spacing import top_reach
-from pipeline.terrain import cut_terrain
-from stitch.grid import Key, nominal_corner
-from stitch.tiles import sizes_halo, tile_halo
+from pipeline.columns.adaptive import AdaptiveOptions
+from pipeline.columns.layered import terrain_reach
+from pipeline.columns.spacing import top_reach
+from pipeline.plane_mesh.sizes import SizeField, size_field, size_field_around
+from pipeline.points_terrain.raster import Dtm
+from pipeline.points_terrain.terrain import cut_terrain
+from stitch.seams.tiles import sizes_halo, tile_halo
+from stitch.tiling.grid import Key, nominal_corner
 from tiler.citymodels.tables import NearBuildings
 from tiler.config.domain_height import Domain
 from tiler.config.step_options import mesh_options, size_rule

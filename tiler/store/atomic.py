@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tiler.objects.places import in_bucket
 
 

@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import CityError, InputError
+from pipeline.data.errors import CityError, InputError
 from tiler.engine.records import Records
 from tiler.engine.task import APART
 from tiler.store.atomic import replacing

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pipeline.errors import ConfigError, InputError, OutputError
+from pipeline.data.errors import ConfigError, InputError, OutputError
 from tiler.objects.places import in_bucket
 from tiler.words.plain_text import say_nothing
 

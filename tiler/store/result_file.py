@@ -19,7 +19,7 @@ from zipfile import ZIP_STORED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError, OutputError
+from pipeline.data.errors import InputError, OutputError
 from tiler.store.checksums import open_binary
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import numpy as np
 from blake3 import blake3
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tiler.objects.places import in_bucket
 from tiler.store.atomic import replacing
 from tiler.store.checksums import TAIL, seal_file

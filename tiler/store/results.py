@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.mesh import ColumnMesh, PlaneMesh
-from pipeline.raster import Dtm, NodeWindow, grow_window, node_window, sample_dtm
-from pipeline.terrain import cut_terrain, join_terrain
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import ColumnMesh, PlaneMesh
+from pipeline.points_terrain.raster import Dtm, NodeWindow, grow_window, node_window, sample_dtm
+from pipeline.points_terrain.terrain import cut_terrain, join_terrain
 from tiler.store.store import Store
 
 COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom")

@@ -10,7 +10,7 @@ from typing import Any
 from blake3 import blake3
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tiler.objects.places import in_bucket
 from tiler.store.checksums import find_file_damage
 from tiler.store.result_file import ResultFile

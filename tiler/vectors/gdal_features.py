@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.vectors.features import Box, Features, decode_text, to_objects
 from tiler.vectors.gdal_layer import GdalLayer, ask_gpkg, gdal_as_input_error, quote
 from tiler.vectors.shapefile import is_null_shape, is_shapefile

@@ -15,7 +15,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError, InputError
 from tiler.vectors.features import Box
 from tiler.vectors.shapefile import check_complete, find_wide_columns, is_shapefile
 from tiler.vectors.vector_forms import check_form

@@ -9,7 +9,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.objects.places import source_of
 from tiler.vectors.features import Box, Features, to_objects
 from tiler.vectors.parquet_geometry import GeometryColumn, find_geometry, read_geometry

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pyproj
 
-from pipeline.errors import ConfigError, InputError
-from pipeline.notes import Note
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.notes import Note
 from tiler.objects.places import is_missing
 from tiler.objects.results import local_copy
 from tiler.vectors import geoparquet

@@ -14,8 +14,8 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.notes import Note
+from pipeline.data.errors import InputError
+from pipeline.data.notes import Note
 from tiler.vectors.wkb import parse_wkb
 
 LONGITUDE_LATITUDE = "OGC:CRS84"  # what GeoParquet and Parquet take where a file says nothing

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 
 # Digits that a column of whole numbers may have and still be read as int64 by itself; GDAL takes wider ones for
 # floats, which keep 15 to 17 digits.

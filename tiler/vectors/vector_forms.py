@@ -9,7 +9,7 @@ import re
 import stat
 from pathlib import Path
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 
 _HEAD = 65_536  # bytes that are looked at; GDAL looks for these marks in fewer
 # Marks by which GDAL's drivers recognise a file that points elsewhere, lower case.

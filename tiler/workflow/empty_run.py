@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pyproj
 
-from pipeline.errors import CityError, InputError
-from pipeline.notes import Note, count_notes
+from pipeline.data.errors import CityError, InputError
+from pipeline.data.notes import Note, count_notes
 from tiler.config.config import Config
 from tiler.georeference.crs import is_on_its_place
 from tiler.objects.places import place

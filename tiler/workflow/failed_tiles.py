@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import CityError, ConfigError
-from stitch.grid import Bounds, Key
+from pipeline.data.errors import CityError, ConfigError
+from stitch.tiling.grid import Bounds, Key
 from tiler.config.config import Config, write_config
 from tiler.engine.engine import Engine
 from tiler.engine.failures import SetAside

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
-from pipeline.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError, InputError
 from tiler.objects.path import ObjectPath
 from tiler.objects.places import in_bucket, place
 from tiler.objects.results import copy_object

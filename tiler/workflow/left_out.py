@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.notes import Note
+from pipeline.data.notes import Note
 from tiler.engine.engine import Engine
 from tiler.engine.stage import REGION_ITEM
 from tiler.stages.left_out import LEFT_OUT

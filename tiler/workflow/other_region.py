@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pyproj
 
-from pipeline.errors import CityError, ConfigError
+from pipeline.data.errors import CityError, ConfigError
 from tiler.citymodels.json_stream import read_members
 from tiler.engine.stage import Box
 from tiler.georeference.crs import same_crs

@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ConfigError, OutputError
+from pipeline.data.errors import ConfigError, OutputError
 from tiler.engine.task_limits import TASKS
 from tiler.executors.worker_requirements import PROBE
 from tiler.objects.places import Place, find_within, in_bucket, remove

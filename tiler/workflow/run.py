@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import CityError, OutputError
+from pipeline.data.errors import CityError, OutputError
 from tiler.config.config import Config
 from tiler.dashboard.server import read_address, watched
 from tiler.engine.engine import StoppedError

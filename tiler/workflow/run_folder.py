@@ -11,8 +11,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.errors import InputError
-from pipeline.mesh import Region, TetMesh
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Region, TetMesh
 from tiler.citymodels.json_stream import iterate_members, read_members
 
 SCHEMA = 1  # of run.json
@@ -182,7 +182,7 @@ def read_volume(path: Path, *, regions: bool = False) -> tuple[TetMesh, NDArray[
     TetMesh
         The mesh.
     int8, (n_cells,)
-        `pipeline.mesh.Region` of each cell: all air if they need not tell.
+        `pipeline.data.mesh.Region` of each cell: all air if they need not tell.
 
     Raises
     ------

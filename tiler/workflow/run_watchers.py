@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from pipeline.errors import OutputError
+from pipeline.data.errors import OutputError
 from tiler.config.config import Config
 from tiler.engine.task import Record
 from tiler.monitoring.events import EventLog, begin_file

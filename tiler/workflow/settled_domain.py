@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from pipeline.errors import InputError
+from pipeline.data.errors import InputError
 from tiler.config.config import Config, check_height
 from tiler.config.domain_height import Domain, settle
 from tiler.config.step_options import needs_region

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from stitch.grid import seams_of_tile
+from stitch.tiling.grid import seams_of_tile
 from tiler.config.config import Config
 from tiler.executors.executor import serial
 from tiler.objects.places import refuse_bucket

@@ -5,9 +5,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.clusters import add_counts
-from pipeline.notes import Note, count_notes
-from pipeline.terrain_fill import RIM as FAR_NODES
+from pipeline.data.notes import Note, count_notes
+from pipeline.points_terrain.terrain_fill import RIM as FAR_NODES
+from pipeline.simplification.house_clusters import add_counts
 from tiler.config.config import Config
 from tiler.config.domain_height import settle
 from tiler.engine.engine import Engine

@@ -1,0 +1,150 @@
+"""Houses on their way through step 2: divided in parts, each with its points (after steps 1.6 and 2.0)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.city_model.building_points import (
+    BuildingPoints,
+    extract_building_points,
+    has_building_class,
+    join_building_points,
+    take_building_points,
+)
+from pipeline.city_model.city import City, CityOptions
+from pipeline.city_model.house_levels import HouseParts, LevelOptions, split_levels
+from pipeline.city_model.roof_points import (
+    RoofPoints,
+    add_roof_points,
+    locate_roof_points,
+    make_roof_points,
+    no_roof_points,
+)
+from pipeline.data.pointcloud import PointCloud
+from pipeline.geometry.inside import find_inside
+
+
+@dataclass(frozen=True, eq=False)
+class Houses:
+    """Houses before simplification, and the parts that they were divided in.
+
+    Attributes
+    ----------
+    ids : str, (h,)
+        Ids of the houses.
+    polygons : object, (h,)
+        Their outlines (m).
+    given_height : float64, (h,)
+        Height above ground (m) from an attribute, NaN where none.
+    parts : HouseParts
+        Parts of all houses; a house that is not divided is its only part.
+    points : BuildingPoints
+        Roof and ground points of each part.
+    """
+
+    ids: NDArray[np.str_]
+    polygons: NDArray[np.object_]
+    given_height: NDArray[np.float64]
+    parts: HouseParts
+    points: BuildingPoints
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def divide_houses(
+    city: City,
+    cloud: PointCloud,
+    options: CityOptions,
+    *,
+    building_class: bool | None = None,
+    roofs: RoofPoints | None = None,
+    unmarked: NDArray[np.bool_] | None = None,
+) -> Houses:
+    """Divide houses where their roofs step (step 2.0, ours); with other options, take each as one part.
+
+    Parameters
+    ----------
+    city : City
+        Result of `build_city`.
+    cloud : PointCloud
+        Points of all houses and `ground_margin` around them.
+    options : CityOptions
+        Parameters.
+    building_class : bool, optional
+        Whether the cloud marks buildings; by default, whether it has a point of that class.
+    roofs : RoofPoints, optional
+        Roof points of the houses, where they are known.
+    unmarked : bool, (h,), optional
+        Houses whose roof points are those of `roofs` alone, whatever class they have in the cloud.
+    """
+    model = city.model
+    marks = has_building_class(cloud) if building_class is None else building_class
+    parts, points = HouseParts(model.polygons, np.arange(len(model))), city.points
+    if options.split_levels and options.simplify == "clearance" and len(model):
+        if roofs is None:
+            roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
+        parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
+        divided = np.flatnonzero(np.bincount(parts.house)[parts.house] > 1)
+        roof = None
+        if unmarked is not None and unmarked.any():
+            roof = _deal_out_roofs(
+                cloud, HouseParts(parts.polygons[divided], parts.house[divided]), roofs, unmarked
+            )
+        found = extract_building_points(
+            cloud, parts.polygons[divided], margin=options.ground_margin, building_class=marks, roof=roof
+        )
+        rows = parts.house.copy()  # a house that is not divided keeps its points
+        rows[divided] = len(model) + np.arange(len(divided))
+        points = take_building_points(join_building_points([points, found]), rows)
+    return Houses(model.ids, model.polygons, city.given_height, parts, points)
+
+
+def _deal_out_roofs(
+    cloud: PointCloud, parts: HouseParts, roofs: RoofPoints, unmarked: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Roof points of parts: of class 6 inside, and for unmarked houses those of the house inside."""
+    mine = unmarked[parts.house]
+    marked = locate_roof_points(cloud, parts.polygons[~mine], building_class=True)
+    owner = np.repeat(np.arange(len(unmarked)), np.diff(roofs.start))
+    part, point = find_inside(roofs.xyz, parts.polygons[mine], among=unmarked[owner])
+    own = parts.house[mine][part] == owner[point]
+    start = np.concatenate(([0], np.cumsum(np.bincount(part[own], minlength=int(mine.sum())))))
+    found = add_roof_points(no_roof_points(len(mine)), np.flatnonzero(~mine), marked)
+    found = add_roof_points(found, np.flatnonzero(mine), make_roof_points(start, roofs.xyz[point[own]]))
+    return found.start, found.z
+
+
+def take_houses(houses: Houses, rows: NDArray[np.int64]) -> Houses:
+    """Take some houses, in the order of `rows`, int64 (k,), none of them twice."""
+    parts = houses.parts
+    number = np.full(len(houses), -1)
+    number[rows] = np.arange(len(rows))
+    mine = np.flatnonzero(number[parts.house] >= 0)
+    mine = mine[np.argsort(number[parts.house[mine]], kind="stable")]
+    return Houses(
+        houses.ids[rows],
+        houses.polygons[rows],
+        houses.given_height[rows],
+        HouseParts(parts.polygons[mine], number[parts.house[mine]]),
+        take_building_points(houses.points, mine),
+    )
+
+
+def join_houses(several: Sequence[Houses]) -> Houses:
+    """Put the houses of several tiles one after the other; none gives none."""
+    first = np.cumsum([0, *(len(houses) for houses in several)])
+    shift = [houses.parts.house + begin for houses, begin in zip(several, first, strict=False)]
+    nothing = np.empty(0)
+    return Houses(
+        np.concatenate([nothing.astype(np.str_), *(houses.ids for houses in several)]),
+        np.concatenate([nothing.astype(object), *(houses.polygons for houses in several)]),
+        np.concatenate([nothing, *(houses.given_height for houses in several)]),
+        HouseParts(
+            np.concatenate([nothing.astype(object), *(houses.parts.polygons for houses in several)]),
+            np.concatenate([nothing.astype(np.int64), *shift]),
+        ),
+        join_building_points([houses.points for houses in several]),
+    )

@@ -1,0 +1,307 @@
+"""Soil: columns below the ground over the same plane mesh, for volumes below ground (beyond the paper).
+
+A column of soil ends in the ground node of the air above it, or, where there is none since houses stand all
+around, in a node of its own at the terrain. From there it goes down to a given depth. Columns of soil and air are
+kept as one, numbered from below, so that all that is said of points goes for both; the soil is merged into cells
+by the air's rule, so its faces match without exchange too.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.columns.cell_blocks import CellBlocks
+from pipeline.columns.columns import Bounds, find_used_points, split_boundary
+from pipeline.columns.levels import stagger_columns
+from pipeline.columns.nodes import GROUND_SURFACE, Levels, SeamColumns, join_levels, take_columns
+from pipeline.columns.spacing import SpacingLimits, mean_edges, vertical_spacing
+from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges
+from pipeline.plane_mesh.edges import plane_edges
+from pipeline.plane_mesh.sizes import SizeField, local_sizes
+
+
+@dataclass(frozen=True)
+class SoilOptions:
+    """Parameters of the soil.
+
+    Attributes
+    ----------
+    depth : float
+        Depth of the domain's bottom below the terrain (m).
+    mesh_size : float
+        Mesh size of the plane mesh (m).
+    limits : SpacingLimits
+        Limits of the vertical spacing: also the least distance of the soil from a roof above it.
+    stagger : float
+        By how much neighbouring columns are shifted against each other: 0 for none, 1 for thirds of a step.
+    """
+
+    depth: float
+    mesh_size: float
+    limits: SpacingLimits
+    stagger: float
+
+
+@dataclass(frozen=True, eq=False)
+class SoilMesh:
+    """Columns of air with the soil below them.
+
+    Attributes
+    ----------
+    columns : ColumnMesh
+        The air's mesh; its columns begin at the soil's bottom, and `ColumnMesh.bottom` counts from there.
+    top : int32, (n,)
+        Level of each column in which its soil ends.
+    """
+
+    columns: ColumnMesh
+    top: NDArray[np.int32]
+
+
+def soil_tops(
+    lowest: NDArray[np.float64],
+    grounded: NDArray[np.bool_],
+    terrain: NDArray[np.float64],
+    options: SoilOptions,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Find where the soil of each column ends.
+
+    Parameters
+    ----------
+    lowest : float64, (n,)
+        Lowest level of the column of air (m).
+    grounded : bool, (n,)
+        Whether that is the ground.
+    terrain : float64, (n,)
+        Terrain (m).
+    options : SoilOptions
+        Parameters.
+
+    Returns
+    -------
+    float64, (n,)
+        Heights (m): of the ground's own node, bit for bit, or of the terrain inside a house.
+    bool, (n,)
+        Where the terrain inside a house reaches its roof and was lowered: to the least spacing below it.
+    """
+    most = lowest - options.limits.least * options.mesh_size
+    lowered = ~grounded & (terrain > most)
+    return np.where(grounded, lowest, np.minimum(terrain, most)), lowered
+
+
+def fill_soil(
+    plane: PlaneMesh,
+    vertex: NDArray[np.int32],
+    top: NDArray[np.float64],
+    options: SoilOptions,
+    *,
+    sizes: SizeField | None = None,
+) -> Levels:
+    """Space the levels of soil evenly, as widely as those of the air over open ground.
+
+    Parameters
+    ----------
+    plane : PlaneMesh
+        A plane mesh, of which spacing and shift of each column are taken.
+    vertex : int32, (k,)
+        Vertices whose columns are wanted.
+    top : float64, (k,)
+        Where the soil ends in each (m).
+    options : SoilOptions
+        Parameters.
+    sizes : SizeField, optional
+        Sizes in the plane, where they are graded.
+
+    Returns
+    -------
+    Levels
+        ``k`` columns from `depth` below their tops up to these; their levels stand for no surface.
+
+    Notes
+    -----
+    Steps that grow downwards save cells where triangles are small, but make slivers of these: up to twice as wide
+    saves 40 % of the soil under the centre of Amsterdam, and the worst radius ratio falls from 0.17 to 0.08.
+    """
+    local = local_sizes(sizes, plane.xy, mesh_size=options.mesh_size)
+    spacing = vertical_spacing(mean_edges(plane), local, options.limits)[vertex]
+    shift = np.zeros(len(plane.xy))
+    if options.stagger:
+        shift = options.stagger * stagger_columns(len(plane.xy), plane_edges(plane.triangles)[0])
+    steps = np.maximum(np.floor(options.depth / spacing + 0.5), 1).astype(np.int64)
+    start = np.concatenate(([0], np.cumsum(steps + 1))).astype(np.int64)
+    column = np.repeat(np.arange(len(vertex)), steps + 1)
+    level = np.arange(start[-1]) - start[column]
+    bottom = top - options.depth
+    z = bottom[column] + (level + shift[vertex][column]) * (options.depth / steps)[column]
+    z[start[:-1]], z[start[1:] - 1] = bottom, top
+    return Levels(start, z, np.full(len(z), np.nan))
+
+
+def is_grounded(levels: Levels) -> NDArray[np.bool_]:
+    """Tell in which of a seam's columns of air the lowest level is the ground, bool (n,)."""
+    grounded: NDArray[np.bool_] = levels.surface[levels.start[:-1]] == GROUND_SURFACE
+    return grounded
+
+
+def join_soil(soil: Levels, air: Levels, grounded: NDArray[np.bool_]) -> Levels:
+    """Put columns of air on those of soil.
+
+    Parameters
+    ----------
+    soil, air : Levels
+        ``n`` columns each.
+    grounded : bool, (n,)
+        Whether the last level of soil and the first of air are one.
+
+    Raises
+    ------
+    ValueError
+        If they should be one, but have different heights.
+    """
+    below = np.diff(soil.start) - grounded
+    if (soil.z[soil.start[1:] - 1][grounded] != air.z[air.start[:-1]][grounded]).any():
+        raise ValueError("the soil of a column does not end at the ground of its air")
+    start = np.concatenate(([0], np.cumsum(below + np.diff(air.start)))).astype(np.int64)
+    z, surface = np.empty(start[-1]), np.empty(start[-1])
+    for part, first, count in ((soil, start[:-1], below), (air, start[:-1] + below, np.diff(air.start))):
+        begin = np.concatenate(([0], np.cumsum(count)))
+        within = np.arange(begin[-1]) - np.repeat(begin[:-1], count)
+        here, there = within + np.repeat(first, count), within + np.repeat(part.start[:-1], count)
+        z[here], surface[here] = part.z[there], part.surface[there]
+    return Levels(start, z, surface)
+
+
+def add_soil(
+    mesh: ColumnMesh,
+    terrain: NDArray[np.float64],
+    air: SeamColumns,
+    soil: SeamColumns,
+    options: SoilOptions,
+    *,
+    sizes: SizeField | None = None,
+) -> tuple[SoilMesh, NDArray[np.int32], NDArray[np.int64]]:
+    """Put the columns of a tile's air on columns of soil.
+
+    Parameters
+    ----------
+    mesh : ColumnMesh
+        The air.
+    terrain : float64, (n,)
+        Terrain at each vertex (m).
+    air, soil : SeamColumns
+        Columns that are given by seams, of the same vertices: they stay bit for bit.
+    options : SoilOptions
+        Parameters.
+    sizes : SizeField, optional
+        Sizes in the plane, where they are graded.
+
+    Returns
+    -------
+    SoilMesh
+        Both.
+    int32, (n,)
+        By how much each level of the air's columns moved up in them.
+    int64, (k,)
+        Vertices inside houses where the terrain reaches the roof, and was lowered.
+    """
+    plane, n = mesh.plane, len(mesh.plane.xy)
+    grounded = np.zeros(n, np.bool_)
+    grounded[plane.triangles[plane.building < 0]] = True
+    grounded[air.vertex] = is_grounded(air.levels)
+    top, lowered = soil_tops(mesh.z[mesh.z_start[:-1]], grounded, terrain, options)
+    own = fill_soil(plane, np.arange(n, dtype=np.int32), top, options, sizes=sizes)
+    row = np.arange(n, dtype=np.int32)
+    row[soil.vertex] = n + np.arange(len(soil.vertex), dtype=np.int32)
+    levels = take_columns(join_levels([own, soil.levels]), row)
+    whole = join_soil(levels, Levels(mesh.z_start, mesh.z, np.full(len(mesh.z), np.nan)), grounded)
+    raised = (np.diff(levels.start) - grounded).astype(np.int32)
+    columns = ColumnMesh(plane, whole.start, whole.z, mesh.bottom + raised[plane.triangles], mesh.order)
+    return SoilMesh(columns, (np.diff(levels.start) - 1).astype(np.int32)), raised, np.flatnonzero(lowered)
+
+
+def count_soil_cells(mesh: SoilMesh) -> int:
+    """Count the tetrahedra of the soil."""
+    return int(mesh.top[mesh.columns.plane.triangles].sum())
+
+
+def expand_regions(mesh: SoilMesh) -> tuple[CellBlocks, NDArray[np.int8]]:
+    """Tell the tetrahedra of positive volume that air and soil stand for.
+
+    Parameters
+    ----------
+    mesh : SoilMesh
+        The tile's mesh.
+
+    Returns
+    -------
+    CellBlocks
+        The air's cells, then the soil's, each triangle by triangle; corners are levels of `SoilMesh.columns`.
+    int8, (m,)
+        `Region` of each cell.
+    """
+    soil, rows = _take_soil(mesh)
+    cells, n_soil = CellBlocks([(mesh.columns, None), (soil, rows)]), count_soil_cells(mesh)
+    region = np.repeat(np.array([Region.AIR, Region.SOIL], np.int8), [cells.n_cells - n_soil, n_soil])
+    return cells, region
+
+
+def find_used(mesh: SoilMesh) -> NDArray[np.bool_]:
+    """Tell which levels of a mesh with soil belong to a cell, bool (n_levels,)."""
+    used = find_used_points(mesh.columns)
+    used[_take_soil(mesh)[1]] = True
+    return used
+
+
+def split_regions(
+    mesh: SoilMesh, numbers: NDArray[np.int64], bounds: Bounds, seams: SeamEdges
+) -> tuple[Boundary, NDArray[np.int32]]:
+    """Extract the boundary of one tile's air and soil, and the ground between them.
+
+    Parameters
+    ----------
+    mesh : SoilMesh
+        The tile's mesh.
+    numbers, bounds, seams
+        As in `split_boundary`; levels are those of `SoilMesh.columns`.
+
+    Returns
+    -------
+    Boundary
+        That of the air, then that of the soil: bottom, foundations and sides. The ground is there once, and points
+        out of the air; all else is the boundary of both.
+    int32, (s, 3)
+        The other facets over seams, as from `split_boundary`.
+    """
+    boundary, shared = split_boundary(mesh.columns, numbers, bounds, seams)
+    soil, rows = _take_soil(mesh)
+    k = len(seams.vertices)
+    at_bottom = SeamEdges(seams.vertices, np.zeros((k, 2), np.int32), np.full(k, -1), seams.missing)
+    below, shared_below = split_boundary(soil, np.empty(0, np.int64), bounds, at_bottom)
+    building = mesh.columns.plane.building
+    ceiling = np.flatnonzero(below.marker == Marker.TOP)
+    marker, owner = below.marker.copy(), below.building.copy()
+    marker[marker == Marker.GROUND] = Marker.BOTTOM
+    marker[ceiling] = Marker.FOUNDATION
+    owner[ceiling] = np.where(building >= 0, np.append(numbers, -1)[building], -1)
+    kept = np.ones(len(marker), np.bool_)
+    kept[ceiling[building < 0]] = False
+    return (
+        Boundary(
+            np.concatenate((boundary.facets, rows[below.facets[kept]])),
+            np.concatenate((boundary.marker, marker[kept])),
+            np.concatenate((boundary.building, owner[kept])),
+        ),
+        np.concatenate((shared, rows[shared_below])),
+    )
+
+
+def _take_soil(mesh: SoilMesh) -> tuple[ColumnMesh, NDArray[np.int32]]:
+    """Take the soil alone, as a mesh on open ground; also the row of each of its points in the whole."""
+    columns, plane = mesh.columns, mesh.columns.plane
+    count = mesh.top.astype(np.int64) + 1
+    start = np.concatenate(([0], np.cumsum(count))).astype(np.int64)
+    rows = np.arange(start[-1]) + np.repeat(columns.z_start[:-1] - start[:-1], count)
+    ground = PlaneMesh(plane.xy, plane.triangles, np.full(len(plane.triangles), -1, np.int32))
+    bottom = np.zeros(plane.triangles.shape, np.int32)
+    return ColumnMesh(ground, start, columns.z[rows], bottom, "heights"), rows.astype(np.int32)

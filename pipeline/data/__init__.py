@@ -1,0 +1,1 @@
+"""What the steps pass to each other: points, city model, meshes, notes, errors."""

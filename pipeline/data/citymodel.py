@@ -1,0 +1,133 @@
+"""The LoD1.2 city model: footprints, and buildings as prisms between two heights."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.data.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Building footprints, one polygon a row.
+
+    Attributes
+    ----------
+    polygons : object, (n,)
+        shapely Polygons in the region's CRS (m), without Z, courtyards as holes.
+    ids : str, (n,)
+        Region-wide building id: the input's own, else made from the geometry.
+    given_height : float64, (n,)
+        Height above ground (m) from an attribute of the input; NaN where there is none.
+    """
+
+    polygons: NDArray[np.object_]
+    ids: NDArray[np.str_]
+    given_height: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Prisms:
+    """Buildings, or parts of them, as prisms ``polygon x [ground, roof]``: what a mesh is made around.
+
+    Attributes
+    ----------
+    polygons : object, (n,)
+        shapely Polygons in the region's CRS (m): oriented (shell counter-clockwise), without Z.
+    ids : str, (n,)
+        Ids of the rows, each once; a merged building has the id of its largest member.
+    numbers : int64, (n,)
+        The same ids as numbers below 2**53, for formats without strings; see `number_ids`.
+    ground, roof : float64, (n,)
+        Absolute ground and roof height (m).
+    """
+
+    polygons: NDArray[np.object_]
+    ids: NDArray[np.str_]
+    numbers: NDArray[np.int64]
+    ground: NDArray[np.float64]
+    roof: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.polygons)
+
+
+@dataclass(frozen=True, eq=False)
+class CityModel(Prisms):
+    """Buildings with what they were made of (paper, section 4.2).
+
+    A house of several heights has a row for each part; all others have one row.
+
+    Attributes
+    ----------
+    polygons, ids, numbers, ground, roof
+        As of `Prisms`.
+    members : tuple of n tuples of str
+        Ids of the input footprints that each building was made of, ascending, itself included.
+    house : str, (n,)
+        Id of the building that the row is a part of; the row's own id where it is the whole.
+    """
+
+    members: tuple[tuple[str, ...], ...]
+    house: NDArray[np.str_]
+
+
+def number_ids(ids: NDArray[np.str_]) -> NDArray[np.int64]:
+    """Give each building id a number that depends on that id alone.
+
+    Parameters
+    ----------
+    ids : str, (n,)
+        Building ids.
+
+    Returns
+    -------
+    int64, (n,)
+        The id itself where it is a decimal number below 2**53, else 52 bits of its BLAKE2b hash.
+
+    Raises
+    ------
+    InputError
+        If two different ids get the same number.
+
+    Examples
+    --------
+    >>> number_ids(np.array(["0363100012078463"]))
+    array([363100012078463])
+    """
+    numbers = np.fromiter((_number(str(name)) for name in ids), np.int64, len(ids))
+    order = np.lexsort((ids, numbers))
+    clash = np.flatnonzero((np.diff(numbers[order]) == 0) & (ids[order][1:] != ids[order][:-1]))
+    if len(clash):
+        one, two = ids[order][clash[0]], ids[order][clash[0] + 1]
+        raise InputError(
+            f"building ids {str(one)!r} and {str(two)!r} both have the number {numbers[order][clash[0]]}; "
+            "rename one, or name another --id-attribute"
+        )
+    return numbers
+
+
+def make_ids(polygons: NDArray[np.object_]) -> NDArray[np.str_]:
+    """Make ids from geometry alone: equal polygons get equal ids, whatever file, row or start vertex.
+
+    Parameters
+    ----------
+    polygons : object, (n,)
+        shapely Polygons.
+
+    Returns
+    -------
+    str, (n,)
+        ``"g"`` and 13 hexadecimal digits.
+    """
+    blobs = shapely.to_wkb(shapely.normalize(shapely.force_2d(polygons)), byte_order=1)
+    return np.array(["g" + hashlib.blake2b(blob, digest_size=7).hexdigest()[:13] for blob in blobs], dtype=np.str_)
+
+
+def _number(name: str) -> int:
+    if name.isascii() and name.isdigit() and int(name) < 2**53:
+        return int(name)
+    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest()) >> 12

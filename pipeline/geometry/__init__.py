@@ -1,0 +1,1 @@
+"""Polygons, segments and points in the plane: rings, holes, what lies inside, what is connected."""

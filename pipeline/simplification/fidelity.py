@@ -1,0 +1,119 @@
+"""How faithful a planar city model is: area errors, lost houses, clearance, touching corners (step 2.1)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.simplification.graph import MILLIMETRES, WallGraph, find_close, find_crossings, find_near, make_graph
+
+# Clearances above this (m) are not measured: walls are as good as apart.
+FARTHEST = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fidelity:
+    """What a simplification did to the houses.
+
+    Attributes
+    ----------
+    house_error : float64, (n,)
+        Area of each house's symmetric difference with its original (m²); the whole area if it is lost.
+    area_error : float
+        Sum of `house_error` over the sum of the original areas; 0 without houses.
+    lost : tuple of int
+        Indices of the originals without a face.
+    min_clearance : float
+        Least distance of two vertices, or of a vertex and a foreign wall, among all walls (m), 0 if walls cross;
+        `FARTHEST` if that is less.
+    corner_touches : int
+        Vertices in which houses touch without a common wall.
+    n_walls : int
+        Walls, each counted once.
+    sharpest : float
+        Least angle between two walls (degrees), 180 without walls.
+    """
+
+    house_error: NDArray[np.float64]
+    area_error: float
+    lost: tuple[int, ...]
+    min_clearance: float
+    corner_touches: int
+    n_walls: int
+    sharpest: float
+
+
+def measure_simplification(
+    originals: NDArray[np.object_], polygons: NDArray[np.object_], house: NDArray[np.int64]
+) -> Fidelity:
+    """Measure a simplified city against the footprints that it was made of, from its polygons alone.
+
+    Parameters
+    ----------
+    originals : object, (n,)
+        shapely Polygons (m).
+    polygons : object, (k,)
+        Their simplification: faces that share walls vertex by vertex (m).
+    house : int64, (k,)
+        Row of the original that each belongs to.
+
+    Examples
+    --------
+    >>> from pipeline.simplification.planar import simplify_planar
+    >>> pair = np.array([shapely.box(0, 0, 4, 4), shapely.box(4.4, 0, 9, 4)])
+    >>> city = simplify_planar(pair, clearance=0.5, min_area=5.0, min_courtyard_area=5.0)
+    >>> found = measure_simplification(pair, city.polygons, city.house)
+    >>> found.house_error.round(3).tolist(), found.min_clearance, found.n_walls
+    ([1.6, 0.0], 4.0, 7)
+    """
+    area = shapely.area(originals)
+    kept = shapely.area(shapely.intersection(polygons, originals[house]))
+    change = shapely.area(polygons) - 2 * kept
+    error = area + np.bincount(house, change, len(originals))
+    walls, outer = _collect_walls(polygons)
+    ends = np.bincount(walls.edges[outer].reshape(-1), minlength=len(walls.xy))
+    return Fidelity(
+        house_error=error,
+        area_error=float(error.sum() / area.sum()) if len(area) else 0.0,
+        lost=tuple(np.setdiff1d(np.arange(len(originals)), house).tolist()),
+        min_clearance=_measure_clearance(walls) / MILLIMETRES,
+        corner_touches=int((ends > 2).sum()),
+        n_walls=len(walls.edges),
+        sharpest=_find_sharpest(walls),
+    )
+
+
+def _collect_walls(polygons: NDArray[np.object_]) -> tuple[WallGraph, NDArray[np.bool_]]:
+    """Collect the walls of all polygons, each once; tell which belong to one polygon only."""
+    xy, ring = shapely.get_coordinates(shapely.get_rings(polygons), return_index=True)
+    start = np.flatnonzero(ring[1:] == ring[:-1])
+    rows = np.column_stack((start, start + 1))
+    grid = np.rint(xy * MILLIMETRES)
+    walls = make_graph(grid, np.zeros(len(xy), np.int64), rows, np.zeros(len(rows)))
+    number = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
+    code = np.sort(number[rows], axis=1) @ np.array([len(walls.xy), 1])
+    _, uses = np.unique(code, return_counts=True)
+    return walls, uses == 1
+
+
+def _measure_clearance(walls: WallGraph) -> float:
+    far = FARTHEST * MILLIMETRES
+    if len(find_crossings(walls)[0]):
+        return 0.0
+    _, to_walls = find_close(walls, far)
+    _, apart = find_near(walls, far)
+    return float(min(to_walls.min(initial=far), apart.min(initial=far)))
+
+
+def _find_sharpest(walls: WallGraph) -> float:
+    vertex, head = walls.edges.T.reshape(-1), walls.edges[:, ::-1].T.reshape(-1)
+    way = walls.xy[head] - walls.xy[vertex]
+    bearing = np.degrees(np.arctan2(way[:, 1], way[:, 0]))
+    order = np.lexsort((bearing, vertex))
+    vertex, bearing = vertex[order], bearing[order]
+    first, count = np.unique(vertex, return_index=True, return_counts=True)[1:]
+    after = np.roll(np.arange(len(vertex)), -1)
+    after[first + count - 1] = first
+    turn = (bearing[after] - bearing) % 360
+    return float(np.minimum(turn, 360 - turn).min(initial=180.0))

@@ -1,0 +1,313 @@
+"""Step 2 composed: the city model simplified, the paper's way or as a planar city model."""
+
+from collections.abc import Set
+from dataclasses import replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.city_model.building_points import merge_building_points, take_building_points
+from pipeline.city_model.city import (
+    City,
+    CityOptions,
+    Trace,
+    assemble_city,
+    find_places,
+    measure_heights,
+    no_trace,
+    note_heights,
+)
+from pipeline.city_model.groups import adjacent_houses, group_roofs
+from pipeline.city_model.heights import Heights, highest_wall_ground, raise_low_roofs
+from pipeline.city_model.houses import Houses, divide_houses
+from pipeline.data.citymodel import Footprints
+from pipeline.data.notes import Note
+from pipeline.data.pointcloud import PointCloud
+from pipeline.points_terrain.terrain import Dtm
+from pipeline.simplification.fidelity import Fidelity, measure_simplification
+from pipeline.simplification.house_clusters import Shapes, simplify_houses
+
+COVERED = 0.5  # a house without a face is not lost if others cover this part of it
+CHANGED = 0.3  # of a house's area: an outline that gained and lost more is told
+SETTLE_ROUNDS = 20  # of grouping roofs and raising them over terrain, in turn
+
+
+def simplify_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions, trace: Trace = no_trace) -> City:
+    """Simplify the city model so that it can be meshed (steps 2.1 to 2.3), in memory.
+
+    Parameters
+    ----------
+    city : City
+        Result of `build_city`.
+    cloud : PointCloud
+        Points of the houses and `ground_margin` around them.
+    dtm : Dtm
+        Terrain.
+    options : CityOptions
+        Parameters; `simplify` chooses the way.
+    trace : callable, optional
+        Context manager around each step.
+
+    Notes
+    -----
+    The tiles of a region take the same steps, cluster by cluster, and get the same model.
+    """
+    with trace("2.0 split levels"):
+        houses = divide_houses(city, cloud, options)
+    with trace("2.1 simplify"):
+        shapes = simplify_houses(houses.parts, houses.polygons, options)
+    simple = raise_buildings(houses, shapes, dtm, options, reserved=set(city.model.ids.tolist()), trace=trace)
+    return replace(simple, notes=(*city.notes, *simple.notes), counts={**city.counts, **simple.counts})
+
+
+def raise_buildings(
+    houses: Houses,
+    shapes: Shapes,
+    dtm: Dtm,
+    options: CityOptions,
+    *,
+    reserved: Set[str],
+    trace: Trace = no_trace,
+) -> City:
+    """Give the buildings of whole clusters their ids and heights (step 2.3).
+
+    Parameters
+    ----------
+    houses : Houses
+        The houses of these clusters.
+    shapes : Shapes
+        The clusters simplified; members are rows of the houses' parts.
+    dtm : Dtm
+        Terrain.
+    options : CityOptions
+        Parameters.
+    reserved : set of str
+        Ids that no part of a house may get: at least those of all houses that look like one of a part.
+    trace : callable, optional
+        Context manager around each step.
+
+    Notes
+    -----
+    What comes out of a cluster depends on its houses and the terrain at their walls alone.
+    """
+    with trace("2.3 building heights"):
+        if options.simplify == "paper":
+            return _raise_merged(houses, shapes, dtm, options)
+        return _raise_planar(houses, shapes, dtm, options, reserved)
+
+
+def settle_roofs(
+    roof: NDArray[np.float64],
+    area: NDArray[np.float64],
+    wall_ground: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    *,
+    key: NDArray[np.str_],
+    threshold: float,
+    clearance: float,
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Group neighbours of nearly equal height under one roof, all of them clear of the terrain.
+
+    Parameters
+    ----------
+    roof, area, wall_ground : float64, (b,)
+        Roof heights (m), areas (m²), highest terrain at the walls (m).
+    pairs : int64, (p, 2)
+        Adjacent houses.
+    key : str, (b,)
+        Unique ids.
+    threshold : float
+        Least difference of roofs that meet (m).
+    clearance : float
+        Least height of a roof above the highest terrain at the walls of its group (m).
+
+    Returns
+    -------
+    roof : float64, (b,)
+        Heights (m), the same bits in a group.
+    group : int32, (b,)
+        Group of each house.
+
+    Notes
+    -----
+    Raising a group may bring it close to a neighbour, and grouping may lower a house: both are done in turn,
+    a group never coming apart again, until nothing changes. That ends, as each round joins groups; after the
+    last one allowed every roof is raised, whatever its neighbours.
+    """
+    floor = wall_ground + clearance
+    roof = np.maximum(roof, floor)
+    for _ in range(SETTLE_ROUNDS):
+        roof, group = group_roofs(roof, area, pairs, key=key, threshold=threshold)
+        highest = np.full(len(roof), -np.inf)
+        np.maximum.at(highest, group, floor)
+        needed = highest[group]
+        if (roof >= needed).all():
+            break
+        roof = np.maximum(roof, needed)
+    return roof, group
+
+
+def _raise_planar(houses: Houses, shapes: Shapes, dtm: Dtm, options: CityOptions, reserved: Set[str]) -> City:
+    """Every house keeps its own faces, points and height; neighbours of nearly equal height get one roof."""
+    row = houses.parts.house[shapes.member]
+    ids = _name_parts(houses.ids, row, reserved)
+    footprints = Footprints(shapes.polygons, ids, houses.given_height[row])
+    points = take_building_points(houses.points, shapes.member)
+    heights = measure_heights(points, shapes.polygons, dtm, footprints.given_height, options)
+    wall_ground = highest_wall_ground(shapes.polygons, dtm)
+    roof, group = _settle_clusters(shapes, heights, wall_ground, ids, options)
+    members = tuple((str(houses.ids[k]),) for k in row)
+    city = assemble_city(
+        footprints, points, heights, members, wall_ground, roof=roof, house=houses.ids[row], group=group
+    )
+    outline = measure_simplification(houses.polygons, shapes.polygons, row)
+    raised = wall_ground + options.roof_clearance > heights.roof
+    notes = (
+        *note_heights("building", footprints, heights),
+        *_note_raised(footprints, heights, roof, raised),
+        *_note_outlines(houses, shapes.polygons, row, outline.house_error),
+        *_note_closed(houses, houses.parts.house[shapes.closed[:, 0]]),
+    )
+    counts = {**shapes.counts, **_count(houses, city)}
+    return replace(city, notes=notes, counts=counts, outline=_describe_outline(outline, houses))
+
+
+def _settle_clusters(
+    shapes: Shapes, heights: Heights, wall_ground: NDArray[np.float64], ids: NDArray[np.str_], options: CityOptions
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Settle the roofs of each cluster by themselves; groups are numbered through."""
+    area = shapely.area(shapes.polygons)
+    roof = np.maximum(heights.roof, wall_ground + options.roof_clearance)  # of a building that is alone
+    group = np.zeros(len(ids), np.int32)
+    order = np.argsort(shapes.cluster, kind="stable")
+    cluster, start, count = np.unique(shapes.cluster[order], return_index=True, return_counts=True)
+    pairs = adjacent_houses(shapes.polygons)
+    pairs = pairs[np.argsort(shapes.cluster[pairs[:, 0]], kind="stable")]
+    pair_start = np.searchsorted(shapes.cluster[pairs[:, 0]], [cluster, cluster + 1])
+    number, n_groups = np.empty(len(order), np.int64), np.ones(len(cluster), np.int32)
+    for k in np.flatnonzero(count > 1):
+        rows = order[start[k] : start[k] + count[k]]
+        number[rows] = np.arange(len(rows))
+        roof[rows], group[rows] = settle_roofs(
+            heights.roof[rows],
+            area[rows],
+            wall_ground[rows],
+            number[pairs[slice(*pair_start[:, k])]],
+            key=ids[rows],
+            threshold=options.roof_group,
+            clearance=options.roof_clearance,
+        )
+        n_groups[k] = group[rows].max() + 1
+    group[order] += np.repeat(np.cumsum(n_groups) - n_groups, count).astype(np.int32)
+    return roof, group
+
+
+def _name_parts(ids: NDArray[np.str_], row: NDArray[np.int64], reserved: Set[str]) -> NDArray[np.str_]:
+    """Ids of faces; those of a house of several are numbered, reserved names left out."""
+    count = np.bincount(row, minlength=len(ids))
+    seen = np.zeros(len(ids), np.int64)
+    names = []
+    for k in row.tolist():
+        seen[k] += 1
+        name = str(ids[k])
+        part = name if count[k] == 1 else f"{name}-part{seen[k]}"
+        while count[k] > 1 and part in reserved:
+            part += "-"
+        names.append(part)
+    return np.array(names, dtype=np.str_)
+
+
+def _note_outlines(
+    houses: Houses, built: NDArray[np.object_], row: NDArray[np.int64], error: NDArray[np.float64]
+) -> list[Note]:
+    """Tell of the houses that have no face any more, and of those whose outline changed much."""
+    polygons = houses.polygons
+    area = shapely.area(polygons)
+    gone = np.ones(len(houses), np.bool_)
+    gone[row] = False
+    footprints = Footprints(polygons, houses.ids, area)
+    tree = shapely.STRtree(built)
+    notes = []
+    for k, place in find_places(footprints, gone):
+        over = built[tree.query(polygons[k], predicate="intersects")]
+        covered = float(shapely.area(shapely.intersection(over, polygons[k])).sum())
+        if covered >= COVERED * area[k]:
+            notes.append(Note("building-covered-by-others", *place, f"{covered:.1f} of {area[k]:.1f} m2"))
+        else:
+            notes.append(Note("building-lost", *place, f"{area[k]:.1f} m², no room at this clearance"))
+    changed = ~gone & (error > CHANGED * area)
+    for k, place in find_places(footprints, changed):
+        notes.append(Note("building-outline-changed", *place, f"by {error[k]:.1f} m2 of {area[k]:.1f} m2"))
+    return notes
+
+
+def _note_closed(houses: Houses, rows: NDArray[np.int64]) -> list[Note]:
+    """Tell of the houses that were simplified by their closed outline."""
+    chosen = np.zeros(len(houses), np.bool_)
+    chosen[rows] = True
+    places = find_places(Footprints(houses.polygons, houses.ids, houses.given_height), chosen)
+    return [
+        Note("building-outline-closed", *place, "its walls are closer than the clearance") for _, place in places
+    ]
+
+
+def _note_raised(
+    footprints: Footprints, heights: Heights, roof: NDArray[np.float64], raised: NDArray[np.bool_]
+) -> list[Note]:
+    """Tell of the roofs that terrain forced up."""
+    return [
+        Note("building-roof-raised", *place, f"{heights.roof[row]:.2f} m raised to {roof[row]:.2f} m over terrain")
+        for row, place in find_places(footprints, raised)
+    ]
+
+
+def _count(houses: Houses, city: City) -> dict[str, int]:
+    moved = np.abs(city.model.roof - city.measured_roof)
+    return {
+        "houses split": int((np.bincount(houses.parts.house, minlength=1) > 1).sum()),
+        "roof groups": len(np.unique(city.group)),
+        "roofs moved by more than 1 m": int((moved > 1).sum()),
+    }
+
+
+def _describe_outline(found: Fidelity, houses: Houses) -> dict[str, float]:
+    """Area errors with their sums, so that those of several tiles can be joined."""
+    values = {
+        "area_error": found.area_error,
+        "min_clearance": found.min_clearance,
+        "sharpest": found.sharpest,
+        "area": float(shapely.area(houses.polygons).sum()),
+        "changed_area": float(found.house_error.sum()),
+    }
+    return {name: round(value, 6) for name, value in values.items() if np.isfinite(value)}
+
+
+def _raise_merged(houses: Houses, shapes: Shapes, dtm: Dtm, options: CityOptions) -> City:
+    """Heights of merged buildings (paper, step 2.3).
+
+    A merged building has the id of its largest member, ties to the smaller id; its points are those of all
+    members, its given height the members' mean, weighted by area.
+    """
+    members = tuple(np.split(shapes.member, shapes.member_start[1:-1])) if len(shapes) else ()
+    area = shapely.area(houses.polygons)
+    leader = np.array([_leader(group, area, houses.ids) for group in members], np.int64)
+    given = np.array([_mean_height(houses.given_height[group], area[group]) for group in members])
+    footprints = Footprints(shapes.polygons, houses.ids[leader], given.reshape(-1))
+    points = merge_building_points(houses.points, members)
+    heights = measure_heights(points, shapes.polygons, dtm, footprints.given_height, options)
+    wall_ground = highest_wall_ground(shapes.polygons, dtm)
+    roof, raised = raise_low_roofs(heights.roof, wall_ground, clearance=options.roof_clearance)
+    names = tuple(tuple(sorted(houses.ids[group].tolist())) for group in members)
+    city = assemble_city(footprints, points, heights, names, wall_ground, roof=roof)
+    notes = (*note_heights("building", footprints, heights), *_note_raised(footprints, heights, roof, raised))
+    return replace(city, notes=notes, counts=shapes.counts)
+
+
+def _leader(group: NDArray[np.int64], area: NDArray[np.float64], ids: NDArray[np.str_]) -> int:
+    return int(min(group, key=lambda row: (-area[row], str(ids[row]))))
+
+
+def _mean_height(given: NDArray[np.float64], area: NDArray[np.float64]) -> float:
+    known = ~np.isnan(given)
+    return float(np.average(given[known], weights=area[known])) if known.any() else float("nan")

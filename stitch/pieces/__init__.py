@@ -1,0 +1,1 @@
+"""The pieces of tiles as one mesh: numbers of points, faces of cells, conformity."""

@@ -1,0 +1,414 @@
+"""Conformity: what makes tetrahedra and triangles one watertight mesh, as checks on arrays (step 3.6).
+
+A facet is written with its vertices counter-clockwise seen from outside the cell. Two cells meet properly
+in a face when they list its vertices in opposite orders.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data.kernel import kernel
+from pipeline.geometry.components import join_pairs
+
+# The faces of a cell of positive volume, counter-clockwise seen from outside.
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int8)
+# A cell counts as flat when its volume is below this part of the cube of its longest edge.
+FLAT = 1e-12
+
+INTERIOR, EXTERIOR, SAME_SIDE, SHARED = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, eq=False)
+class FacePairs:
+    """How faces meet.
+
+    Attributes
+    ----------
+    exterior : int32, (k, 3)
+        Faces that occur once, oriented outwards, in the order of the input.
+    same_side : int32, (s, 3)
+        Faces that occur twice in the same orientation: two cells overlap, or one is inverted.
+    shared : int32, (t, 3)
+        Faces that occur three times or more, one row for each occurrence.
+    row : int64, (k,)
+        The face of the input, or the cell, that each exterior face is of.
+    part : int32, (m,)
+        Of cells: the part of each, from 0. Cells of one part hang together by faces of two cells. Of loose faces
+        none.
+    """
+
+    exterior: NDArray[np.int32]
+    same_side: NDArray[np.int32]
+    shared: NDArray[np.int32]
+    row: NDArray[np.int64]
+    part: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePairs:
+    """How the edges of a triangle surface meet.
+
+    Attributes
+    ----------
+    open : int32, (k, 2)
+        Edges that facets do not use equally often in both directions: the surface has a hole or a
+        facet is turned over.
+    non_manifold : int32, (m, 2)
+        Matched edges of more than two facets, as where two buildings touch in a corner: allowed.
+    """
+
+    open: NDArray[np.int32]
+    non_manifold: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Faces of one surface against those of another, as row numbers.
+
+    Attributes
+    ----------
+    missing : int64, (k,)
+        Rows of the first that the second lacks.
+    extra : int64, (k,)
+        Rows of the second that the first lacks.
+    flipped : int64, (k,)
+        Rows of the second that are in the first in the other orientation.
+    duplicate : int64, (k,)
+        Rows of the second that repeat an earlier row, in either orientation.
+    """
+
+    missing: NDArray[np.int64]
+    extra: NDArray[np.int64]
+    flipped: NDArray[np.int64]
+    duplicate: NDArray[np.int64]
+
+
+def pair_cell_faces(cells: NDArray[np.int32], n_points: int) -> FacePairs:
+    """Find for every face of the cells whether one, two or more cells have it.
+
+    Parameters
+    ----------
+    cells : int32, (m, 4)
+        Tetrahedra, indices below `n_points`.
+    n_points : int
+        Number of points.
+
+    Returns
+    -------
+    FacePairs
+        Exterior and faulty faces.
+
+    Notes
+    -----
+    Faces are dealt out by their smallest vertex and sorted there: linear in the cells, some 160 bytes each.
+
+    Examples
+    --------
+    Two cells on the face 1, 2, 3 have six exterior faces:
+
+    >>> pairs = pair_cell_faces(np.array([[0, 1, 2, 3], [1, 2, 3, 4]], np.int32), 5)
+    >>> len(pairs.exterior), len(pairs.same_side), len(pairs.shared)
+    (6, 0, 0)
+    """
+    state, beyond = _face_states(np.ascontiguousarray(cells), n_points)
+    face = np.flatnonzero(beyond >= 0)
+    name = join_pairs(len(cells), np.column_stack(((face // 4).astype(np.int32), beyond[face])))
+    _, part = np.unique(name, return_inverse=True)
+    chosen = [np.flatnonzero(state == kind) for kind in (EXTERIOR, SAME_SIDE, SHARED)]
+    exterior, same_side, shared = (cells[i // 4][np.arange(len(i))[:, None], FACES[i % 4]] for i in chosen)
+    return FacePairs(exterior, same_side, shared, chosen[0] // 4, part.astype(np.int32))
+
+
+def pair_faces(facets: NDArray[np.int32]) -> FacePairs:
+    """Do as `pair_cell_faces` for loose faces: the exterior faces of all pieces of a mesh.
+
+    Parameters
+    ----------
+    facets : int32, (k, 3)
+        Oriented faces.
+
+    Returns
+    -------
+    FacePairs
+        Faces of two pieces that meet properly are gone.
+    """
+    even = _is_even(facets)
+    group, n_groups = group_rows(np.sort(facets, axis=1))
+    count = np.bincount(group, minlength=n_groups)[group]
+    n_even = np.bincount(group, even, n_groups)[group]
+    same_side, shared = facets[(count == 2) & (n_even != 1)], facets[count > 2]
+    return FacePairs(facets[count == 1], same_side, shared, np.flatnonzero(count == 1), np.empty(0, np.int32))
+
+
+def pair_edges(facets: NDArray[np.int32]) -> EdgePairs:
+    """Find whether a triangle surface is closed and oriented.
+
+    Parameters
+    ----------
+    facets : int32, (k, 3)
+        Oriented triangles.
+
+    Returns
+    -------
+    EdgePairs
+        Edges that are not matched, and those of more than two facets, each once.
+
+    Examples
+    --------
+    >>> tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+    >>> len(pair_edges(tetrahedron).open), pair_edges(tetrahedron[1:]).open.tolist()
+    (0, [[0, 1], [0, 2], [1, 2]])
+    """
+    start, end = facets.ravel(), np.roll(facets, -1, axis=1).ravel()
+    edges = np.column_stack([np.minimum(start, end), np.maximum(start, end)])
+    group, n_groups = group_rows(edges)
+    count = np.bincount(group, minlength=n_groups)
+    forward = np.bincount(group, start < end, n_groups)
+    first = _first_of_group(group, n_groups)
+    is_open = 2 * forward != count
+    return EdgePairs(edges[first[is_open]], edges[first[~is_open & (count > 2)]])
+
+
+def match_facets(first: NDArray[np.int32], second: NDArray[np.int32]) -> Matched:
+    """Compare two sets of oriented faces on the same vertices.
+
+    Parameters
+    ----------
+    first : int32, (k, 3)
+        What must be there, each face once.
+    second : int32, (n, 3)
+        What is there.
+
+    Returns
+    -------
+    Matched
+        All rows of `second` that have a fault and all rows of `first` without a partner.
+    """
+    both = np.concatenate([first, second])
+    group, n_groups = group_rows(np.sort(both, axis=1))
+    in_first, in_second = group[: len(first)], group[len(first) :]
+    row_in_first = np.full(n_groups, -1)
+    row_in_first[in_first] = np.arange(len(first))
+    row_in_second = _first_of_group(in_second, n_groups)
+    partner = row_in_first[in_second]
+    turned = _is_even(first)[partner] != _is_even(second) if len(first) else np.zeros(len(second), np.bool_)
+    return Matched(
+        missing=np.flatnonzero(row_in_second[in_first] < 0),
+        extra=np.flatnonzero(partner < 0),
+        flipped=np.flatnonzero((partner >= 0) & turned),
+        duplicate=np.flatnonzero(row_in_second[in_second] != np.arange(len(second))),
+    )
+
+
+def group_rows(rows: NDArray[np.generic]) -> tuple[NDArray[np.int64], int]:
+    """Number the distinct rows of an array, in ascending order of the rows.
+
+    Parameters
+    ----------
+    rows : any dtype with an order, (n, k)
+        Rows; two rows are the same when all their numbers are equal, so -0.0 is 0.0 and NaN nothing.
+
+    Returns
+    -------
+    group : int64, (n,)
+        Number of each row's group.
+    n_groups : int
+        Number of groups.
+
+    Examples
+    --------
+    >>> group_rows(np.array([[2, 1], [0, 5], [2, 1]]))
+    (array([1, 0, 1]), 2)
+    """
+    order = np.lexsort(rows.T[::-1])
+    changes = np.ones(len(rows), np.bool_)
+    ordered = rows[order]
+    changes[1:] = np.any(ordered[1:] != ordered[:-1], axis=1)
+    group = np.empty(len(rows), np.int64)
+    group[order] = np.cumsum(changes) - 1
+    return group, int(changes.sum())
+
+
+def find_duplicate_points(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Find the points whose three coordinates equal those of an earlier point.
+
+    Parameters
+    ----------
+    points : float64, (n, 3)
+        Points (m).
+
+    Returns
+    -------
+    int64, (k,)
+        Their indices, ascending.
+    """
+    group, n_groups = group_rows(points)
+    return np.flatnonzero(_first_of_group(group, n_groups)[group] != np.arange(len(points)))
+
+
+def find_unused_points(rows: NDArray[np.int32], n_points: int) -> NDArray[np.int64]:
+    """Find the points that no cell or facet uses.
+
+    Parameters
+    ----------
+    rows : int32, (m, k)
+        Vertex indices of cells or facets.
+    n_points : int
+        Number of points.
+
+    Returns
+    -------
+    int64, (n,)
+        Their indices, ascending.
+    """
+    used = np.zeros(n_points, np.bool_)
+    used[rows.ravel()] = True
+    return np.flatnonzero(~used)
+
+
+def compute_cell_volumes(
+    points: NDArray[np.float64], cells: NDArray[np.int32]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Compute the signed volume of every cell, and whether it is flat.
+
+    Parameters
+    ----------
+    points : float64, (n, 3)
+        Points (m).
+    cells : int32, (m, 4)
+        Tetrahedra.
+
+    Returns
+    -------
+    volume : float64, (m,)
+        Signed volume (m³), negative for an inverted cell, NaN if a coordinate is.
+    flat : bool, (m,)
+        True where the absolute volume is at most `FLAT` times the cube of the longest edge.
+    """
+    return _cell_volumes(np.ascontiguousarray(points), np.ascontiguousarray(cells), FLAT)  # type: ignore[no-any-return]
+
+
+def compute_facet_areas(
+    points: NDArray[np.float64], facets: NDArray[np.int32]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Compute the signed plan area of every facet, and the volume between it and height zero.
+
+    Parameters
+    ----------
+    points : float64, (n, 3)
+        Points (m).
+    facets : int32, (k, 3)
+        Oriented triangles.
+
+    Returns
+    -------
+    area : float64, (k,)
+        Area of its projection on the plane (m²): positive facing up, negative facing down.
+    volume : float64, (k,)
+        That area times the mean height of the vertices (m³); over a closed surface they add up to the
+        volume inside.
+    """
+    a, b, c = (points[facets[:, k]] for k in range(3))
+    u, v = b[:, :2] - a[:, :2], c[:, :2] - a[:, :2]
+    area = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
+    return area, area * (a[:, 2] + b[:, 2] + c[:, 2]) / 3
+
+
+def _first_of_group(group: NDArray[np.int64], n_groups: int) -> NDArray[np.int64]:
+    """Return the first row of each group, -1 for an empty one."""
+    first = np.full(n_groups, -1)
+    first[group[::-1]] = np.arange(len(group))[::-1]
+    return first
+
+
+def _is_even(facets: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Tell whether a rotation brings a row into ascending order (True), or only a swap (False)."""
+    a, b, c = facets.T
+    ascents = (a < b).astype(np.int8) + (b < c) + (c < a)
+    even: NDArray[np.bool_] = ascents == 2
+    return even
+
+
+@kernel
+def _ordered_face(cells, i, k):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the vertices of a face in ascending order, and 1 if a rotation suffices for that."""
+    a, b, c = cells[i, FACES[k, 0]], cells[i, FACES[k, 1]], cells[i, FACES[k, 2]]
+    even = np.int64(a < b) + np.int64(b < c) + np.int64(c < a) == 2
+    low, high = min(a, b, c), max(a, b, c)
+    middle = np.int64(a) + np.int64(b) + np.int64(c) - low - high
+    return low, middle, high, np.int64(even)
+
+
+@kernel
+def _face_states(cells, n_points):  # type: ignore[no-untyped-def]  # noqa: PLR0912  # pragma: no cover
+    """Mark each of the 4 m faces as interior, exterior, same-side or shared.
+
+    Of the two faces that meet, one gets the cell of the other; all others get -1.
+    """
+    n_faces = 4 * len(cells)
+    start = np.zeros(n_points + 1, np.int64)
+    for i in range(len(cells)):
+        for k in range(4):
+            start[_ordered_face(cells, i, k)[0] + 1] += 1
+    for p in range(n_points):
+        start[p + 1] += start[p]
+    place = start[:-1].copy()
+    key = np.empty(n_faces, np.int64)
+    face = np.empty(n_faces, np.int64)
+    for i in range(len(cells)):
+        for k in range(4):
+            low, middle, high, even = _ordered_face(cells, i, k)
+            # Both vertices are below 2**31: the key has 31 + 31 + 1 bits.
+            key[place[low]] = (np.int64(middle) << 32) | (np.int64(high) << 1) | even
+            face[place[low]] = 4 * i + k
+            place[low] += 1
+    state = np.zeros(n_faces, np.uint8)
+    beyond = np.full(n_faces, -1, np.int32)
+    for p in range(n_points):
+        keys, faces = key[start[p] : start[p + 1]], face[start[p] : start[p + 1]]
+        order = np.argsort(keys)
+        i = 0
+        while i < len(order):
+            j = i + 1
+            while j < len(order) and keys[order[j]] >> 1 == keys[order[i]] >> 1:
+                j += 1
+            kind = INTERIOR
+            if j - i == 1:
+                kind = EXTERIOR
+            elif j - i > 2:
+                kind = SHARED
+            elif keys[order[i]] == keys[order[i + 1]]:
+                kind = SAME_SIDE
+            for at in range(i, j):
+                state[faces[order[at]]] = kind
+            if j - i == 2:
+                beyond[faces[order[i]]] = faces[order[i + 1]] // 4
+            i = j
+    return state, beyond
+
+
+@kernel
+def _cell_volumes(points, cells, flat_below):  # type: ignore[no-untyped-def]  # pragma: no cover
+    volume = np.empty(len(cells))
+    flat = np.empty(len(cells), np.bool_)
+    edge = np.empty((3, 3))
+    for i in range(len(cells)):
+        longest = 0.0
+        for k in range(3):
+            for axis in range(3):
+                edge[k, axis] = points[cells[i, k + 1], axis] - points[cells[i, 0], axis]
+        a, b, c = edge
+        for k in range(3):
+            one, two = edge[k], edge[(k + 1) % 3]
+            own = one[0] ** 2 + one[1] ** 2 + one[2] ** 2
+            other = (one[0] - two[0]) ** 2 + (one[1] - two[1]) ** 2 + (one[2] - two[2]) ** 2
+            longest = max(longest, own, other)
+        volume[i] = (
+            a[0] * (b[1] * c[2] - b[2] * c[1])
+            - a[1] * (b[0] * c[2] - b[2] * c[0])
+            + a[2] * (b[0] * c[1] - b[1] * c[0])
+        ) / 6
+        flat[i] = not abs(volume[i]) > flat_below * longest**1.5
+    return volume, flat
