@@ -34,7 +34,7 @@ def write_sparse(folder: Path, *, files: int, gone: list[tuple[int, int]], seed:
 def corner_columns(out: Path) -> dict[Key, list[bytes]]:
     """Column of each corner, from all seams that end there."""
     store, found = Store(out / "store.zarr"), defaultdict(list)
-    for name in sorted(path.name for path in (out / "store.zarr" / "seams").iterdir()):
+    for name in sorted(store.names("seams")):
         arrays, attributes = store.read("seams", name)
         ends = ends_of_seam(seam_key(name))
         if not attributes["facts"]["border"]:

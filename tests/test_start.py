@@ -33,7 +33,11 @@ def test_a_run_imports_what_it_needs_alone() -> None:
 
 
 def test_the_tasks_of_a_run_import_nothing_more(tmp_path: Path) -> None:
-    assert set(find_imported_by_a_run(tmp_path, (*DASK, *UNNEEDED), workers=0)) <= {*BY_NUMBA, "zarr"}
+    assert set(find_imported_by_a_run(tmp_path, (*DASK, *UNNEEDED), workers=0)) <= {
+        *BY_NUMBA,
+        "scipy.sparse",
+        "zarr",
+    }
 
 
 def test_help_imports_no_numba() -> None:

@@ -95,7 +95,7 @@ def test_geoparquet(tmp_path: Path) -> None:
     assert same_shapes(footprints.polygons, [square(20, 5), square(5, 5)])
     assert not shapely.has_z(footprints.polygons).any()
     np.testing.assert_array_equal(footprints.given_height, [np.nan, 3.5])
-    assert count_notes(notes) == {"footprint-height-missing": 1}
+    assert count_notes(notes) == {"footprint-height-missing": 1, "footprints-without-geometry": 1}
 
 
 def test_geoparquet_says_nothing_unknown_or_nonsense(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from pipeline.data.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
 from tiler.cli.parser import EXPORT_OPTION, Handler, build_parser
 from tiler.config.config import Config, annotated_defaults, make_config
-from tiler.executors.dask_settings import GARBAGE, start_fork_server
 from tiler.interface.api import with_file
 from tiler.jobs.submission import describe_job, find_run, job_line
 from tiler.mesh_files.run_files import refuse_strangers
@@ -126,6 +125,8 @@ def _run_config(
     dashboard: str | None = None,
     report: bool = False,
 ) -> int:
+    from tiler.executors.dask_settings import GARBAGE, start_fork_server
+
     if config.workers and not config.on_cluster:
         start_fork_server()
     gc.set_threshold(GARBAGE)

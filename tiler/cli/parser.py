@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.data.errors import ConfigError
-from tiler.config.config import Config
+from tiler.config.config import ANYWHERE, Config
 from tiler.config.domain_height import Height
-from tiler.executors.dask_settings import ANYWHERE
 from tiler.export.export import list_formats, load_format
 from tiler.interface.api import POSITIONAL
 from tiler.jobs.submission import add_job_commands

@@ -25,6 +25,7 @@ MAX_CONFIG_BYTES = 1_000_000
 MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
 MAX_INT = 2**53
 UNSET = ""
+ANYWHERE = "127.0.0.1:0"  # a free port of this machine, for this machine
 PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is given for the open
 NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver

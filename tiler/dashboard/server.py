@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import ConfigError
+from tiler.config.config import ANYWHERE
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.metrics import Collector
-from tiler.executors.dask_settings import ANYWHERE
 
 PREFIX = "/citystitch"
 MOST_BODY = 0  # bytes of a body that is taken: nobody has anything to send

@@ -45,7 +45,6 @@ BOTH: Mapping[str, Any] = {
     "distributed.admin.system-monitor.interval": "2s",
     "distributed.admin.tick.interval": "500ms",
 }
-ANYWHERE = "127.0.0.1:0"  # a free port of this machine, for this machine
 GARBAGE = 10_000  # new objects after which Python looks for cycles, of which tasks leave next to none
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 # A dead process shows by its closed connection, so a worker that is silent because its task holds the interpreter

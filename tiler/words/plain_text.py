@@ -2,7 +2,8 @@
 
 import hashlib
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 # Unicode categories that move a cursor, hide or reorder text, or cannot be written as UTF-8: control, format,
 # surrogate, line and paragraph separators. A terminal obeys the first, a reader is misled by the second.
@@ -73,3 +74,18 @@ def tell_box(box: Sequence[float]) -> str:
     """
     west, south, east, north = (f"{value:.10g}" for value in box)
     return f"{west} to {east}, {south} to {north}"
+
+
+def replace_surrogates(value: Any) -> Any:
+    r"""Write bytes of paths that are no text as escapes, in whatever JSON has: not every JSON parser takes them.
+
+    Examples
+    --------
+    >>> replace_surrogates({"out": ["a" + chr(0xDCC3), 1]})
+    {'out': ['a\\udcc3', 1]}
+    """
+    if isinstance(value, str):
+        return value.encode(errors="backslashreplace").decode()
+    if isinstance(value, Mapping):
+        return {name: replace_surrogates(one) for name, one in value.items()}
+    return [replace_surrogates(one) for one in value] if isinstance(value, (list, tuple)) else value

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import CityError, OutputError
-from tiler.config.config import Config
+from tiler.config.config import ANYWHERE, Config
 from tiler.dashboard.server import read_address, watched
 from tiler.engine.engine import StoppedError
 from tiler.engine.keys import code_versions
@@ -21,7 +21,6 @@ from tiler.engine.stage import Stage
 from tiler.engine.stopping import stops
 from tiler.engine.task import peak_memory
 from tiler.engine.task_limits import TASKS, limit_workers, machine_memory
-from tiler.executors.dask_settings import ANYWHERE
 from tiler.executors.executor import Executor, serial
 from tiler.executors.kernels import prepare
 from tiler.jobs.cluster import read_cluster
@@ -39,6 +38,7 @@ from tiler.store.atomic import replacing, sync_meanwhile
 from tiler.store.audit import Audit, find_remade, write_manifest
 from tiler.store.checksums import seal, state_files
 from tiler.store.folder_lock import only_run
+from tiler.words.plain_text import replace_surrogates
 from tiler.workflow.empty_run import EmptyMeshError, is_empty
 from tiler.workflow.failed_tiles import (
     HolesError,
@@ -387,4 +387,5 @@ def tell_error(error: BaseException) -> str:
 
 def _write_record(out: Path, record: dict[str, Any], *, durable: bool = True) -> None:
     with replacing(out / RUN_RECORD, durable=durable) as part:
-        part.write_bytes(seal(json.dumps(record, indent=1, default=str).encode() + b"\n"))
+        text = json.dumps(replace_surrogates(record), indent=1, default=str)
+        part.write_bytes(seal(text.encode() + b"\n"))
