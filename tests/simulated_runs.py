@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stitch.tiling.grid import Key, SeamKey
-from tiler.planning.context import seam_name, tile_name
+from tiler.engine.run_context import seam_name, tile_name
 
 TILE_STAGES = ("ground", "terrain", "houses", "model", "columns", "pieces")
 SIDE = 500.0  # m

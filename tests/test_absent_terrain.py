@@ -16,7 +16,7 @@ from stitch.tiling.grid import Bounds, Key, ends_of_seam
 from tests.cities import crowded_blocks, hilly_dtm
 from tests.tiles import make_town, run_of, write_town
 from tiler.check.check import check_run
-from tiler.planning.context import seam_key
+from tiler.engine.run_context import seam_key
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
 

@@ -28,7 +28,6 @@ from tiler.executors import dask_executor, worker_requirements
 from tiler.executors.remote_cluster import connect
 from tiler.executors.versions import LIBRARIES, MISSING, NATIVE, tell_versions
 from tiler.executors.worker_requirements import (
-    PROBE,
     ClusterMismatchError,
     Mismatch,
     Requirements,
@@ -41,6 +40,7 @@ from tiler.executors.worker_requirements import (
     own_requirements,
     require_files,
 )
+from tiler.store.out_folder import PROBE
 from tiler.workflow.run import use_absolute_paths
 
 

@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.errors import InputError
 from tiler.check.check import _in_order
-from tiler.citymodels import building_index, json_stream
+from tiler.citymodels import building_index
 from tiler.citymodels.building_index import index_buildings
 from tiler.citymodels.cityjson import write_city_blocks
-from tiler.citymodels.json_stream import iterate_elements, iterate_members, read_members
-from tiler.workflow.run_folder import RunRecord
+from tiler.store import json_stream
+from tiler.store.json_stream import iterate_elements, iterate_members, read_members
+from tiler.store.run_folder import RunRecord
 
 INTEGERS = st.integers(-(2**62), 2**62)
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=5)

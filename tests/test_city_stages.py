@@ -18,10 +18,11 @@ from tiler.citymodels import cityjson
 from tiler.citymodels.cityjson import read_city_model
 from tiler.citymodels.tables import Buildings, no_buildings, pack_buildings, take_buildings
 from tiler.engine.engine import Engine
+from tiler.engine.executor import Serial
 from tiler.engine.stage import Box, Facts, Layout, Scope, Stage
 from tiler.engine.task import Task
-from tiler.executors.executor import Serial
-from tiler.stages.citymodel import CITY_MODEL, city_model_stages, house_cells
+from tiler.stages.citymodel import city_model_stages, house_cells
+from tiler.store.out_folder import CITY_MODEL
 from tiler.store.store import Store
 
 SIDE = 5000.0  # m

@@ -7,11 +7,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from tiler.config.declared import Declared
 
 from stitch.tiling.grid import Key
 from tiler.citymodels.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.engine.stage import Scope
-from tiler.engine.task import Declared, Failure, Record, Task, run_task
+from tiler.engine.task import Failure, Record, Task, run_task
 from tiler.stages.city import list_members
 from tiler.store.result_file import rows_per_chunk
 from tiler.store.store import Store

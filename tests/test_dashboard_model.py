@@ -17,8 +17,8 @@ from tiler.dashboard.map_view import MOST_SHOWN, Question, tell_map
 from tiler.dashboard.metrics import families, write_text
 from tiler.dashboard.model import TILE, RunModel
 from tiler.dashboard.series import MOST, Series
+from tiler.store.out_folder import EVENTS
 from tiler.words.stage_groups import group_stages
-from tiler.workflow.out_folder import EVENTS
 
 
 def fold(*events: object) -> RunModel:

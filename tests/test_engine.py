@@ -19,10 +19,10 @@ import pytest
 from pipeline.data.errors import CityError, GeometryError, InputError
 from pipeline.data.notes import Note
 from tiler.engine.engine import Engine
+from tiler.engine.executor import Executor, Serial
 from tiler.engine.keys import item_key, stage_digest
 from tiler.engine.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
 from tiler.engine.task import Failure, Record, Task
-from tiler.executors.executor import Executor, Serial
 from tiler.executors.local_cluster import local
 from tiler.executors.remote_cluster import connect
 from tiler.store.checksums import state_files

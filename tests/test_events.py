@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiler.config.config_file import with_file
 
 from pipeline.data.errors import CityError, ConfigError, InputError, OutputError
 from tests.towns import Town, make_town
@@ -19,7 +20,6 @@ from tiler.cli.main import make_parser
 from tiler.config.config import make_config
 from tiler.engine.stage import Facts, Scope
 from tiler.engine.task import Record
-from tiler.interface.api import with_file
 from tiler.monitoring.events import EventLog, begin_file, numbers, open_log, read_events
 from tiler.monitoring.watchers import RunStart, Watcher, Watchers, tell_command
 from tiler.workflow.run import run

@@ -13,13 +13,14 @@ from pipeline.data.errors import GeometryError, OutputError
 from tests.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
 from tests.test_engine import contents, grid_layout, make, nothing, seen, told
 from tiler.engine.engine import Engine, StoppedError
+from tiler.engine.executor import Executor, Serial
 from tiler.engine.failures import Policy
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Failure, Record, Task
-from tiler.engine.task_limits import TASKS, Limits
+from tiler.engine.task_limits import Limits
 from tiler.executors.dask_executor import refuse_round, run_packed
-from tiler.executors.executor import Executor, Serial
 from tiler.executors.local_cluster import local
+from tiler.store.out_folder import TASKS
 
 A = Stage("a", Scope.TILE, nothing)
 B = Stage("b", Scope.TILE, seen, (Read("a", 1.0),))

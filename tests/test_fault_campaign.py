@@ -21,9 +21,9 @@ from tests.faults import hangs, hangs_in_c, injected, is_killed, raises, segfaul
 from tests.sparse_city import SparseCity, make_city
 from tests.test_run import hashes
 from tiler.check.check import check_run
+from tiler.engine.run_context import seam_key, tile_name
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
-from tiler.planning.context import seam_key, tile_name
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
 from tiler.words.stage_groups import title_of_stage

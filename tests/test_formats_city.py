@@ -18,8 +18,9 @@ from tiler.citymodels.cityjson import read_city_model, write_city_model
 from tiler.cli.main import main
 from tiler.export.export import export_run
 from tiler.formats import gpkg
-from tiler.formats.cityjsonseq import CITY_MODEL, write_cityjsonseq
+from tiler.formats.cityjsonseq import write_cityjsonseq
 from tiler.formats.gpkg import write_gpkg
+from tiler.store.out_folder import CITY_MODEL
 
 SUFFIX = {"cityjsonseq": "jsonl", "gpkg": "gpkg"}
 

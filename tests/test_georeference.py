@@ -10,12 +10,12 @@ import pyproj
 import pytest
 
 from pipeline.data.errors import ConfigError, InputError
-from tiler.georeference import cloud_crs
-from tiler.georeference.cloud_crs import Asked
-from tiler.georeference.establish import FOOTPRINTS, Georeference, establish_georeference, find_inexact
 from tiler.georeference.frame import AS_IT_IS, Frame, box_to_file, box_to_region, to_region
 from tiler.georeference.metric import find_metric
 from tiler.georeference.operation import find_operation
+from tiler.planning import cloud_crs
+from tiler.planning.cloud_crs import Asked
+from tiler.planning.establish_georeference import FOOTPRINTS, Georeference, establish_georeference, find_inexact
 from tiler.pointclouds.clouds import CloudHeader
 
 RD = pyproj.CRS("EPSG:28992")

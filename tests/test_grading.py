@@ -38,10 +38,10 @@ from tests.stitching import (
 from tests.tiles import column_arrays, hash_files, make_town, run_of, write_town
 from tiler.check.check import check_run
 from tiler.config.config import Config, idle_parameters, make_config
-from tiler.footprints.footprint_sample import sample_footprints
 from tiler.pictures.picture_data import City
 from tiler.pictures.picture_parts import plan_edges
 from tiler.pictures.render import LEGEND, draw_sizes
+from tiler.planning.footprint_sample import sample_footprints
 from tiler.planning.forecast import forecast_run
 from tiler.planning.plan import survey_inputs
 from tiler.stages.mesh import mesh_stages

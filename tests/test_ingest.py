@@ -26,8 +26,8 @@ from tests.whole_clouds import read_points
 from tiler.citymodels.tables import unpack_polygons
 from tiler.config.config import Config
 from tiler.engine.engine import Engine
+from tiler.engine.executor import Serial
 from tiler.engine.stage import Layout
-from tiler.executors.executor import Serial
 from tiler.footprints.footprint_index import (
     FOOTPRINT_CELL,
     FootprintBlock,

@@ -11,8 +11,8 @@ from tests.bad_input import write_cloud, write_houses
 from tests.cities import cloud_over
 from tiler.cli.main import main
 from tiler.config.config import Config, make_config
+from tiler.report.left_out import tell_left_out
 from tiler.stages.domain import LOW_DOMAIN
-from tiler.workflow.left_out import tell_left_out
 from tiler.workflow.run import run
 
 WEST, SOUTH = 318_000.0, 6_399_000.0

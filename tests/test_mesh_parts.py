@@ -23,8 +23,8 @@ from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.run_files import find_files, take_largest_part
 from tiler.report import write_report
 from tiler.store.results import StoredTerrain
+from tiler.store.run_folder import read_run_record
 from tiler.workflow.run import run
-from tiler.workflow.run_folder import read_run_record
 
 Capture = pytest.CaptureFixture[str]
 WEST, SOUTH, TILE = 318_000.0, 6_399_000.0, 60.0

@@ -24,18 +24,18 @@ from tiler.check.check import check_run
 from tiler.cli.main import main
 from tiler.config.config import Config, check_height, load_config, make_config
 from tiler.config.pad_widths import widths_in_metres
+from tiler.engine.run_context import absent_tiles, choose_tiles
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.export.export import export_run
 from tiler.mesh_files.vtk_files import read_vtu
-from tiler.planning.context import absent_tiles, choose_tiles
 from tiler.planning.pad import pad_bounds, pad_grid
-from tiler.planning.plan_report import plan_run
 from tiler.planning.region import find_pad
+from tiler.report.plan_report import plan_run
+from tiler.stages.own_stages import list_stages
 from tiler.stages.surroundings import find_sizes
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
-from tiler.workflow.own_stages import list_stages
 from tiler.workflow.run import run
 from tiler.workflow.single_tile import run_alone
 

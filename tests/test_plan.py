@@ -21,17 +21,17 @@ from pipeline.data.errors import ConfigError
 from stitch.tiling.grid import has_tile, make_grid, seam_keys, seam_line, tile_box, tile_keys, tiles_of_seam
 from tiler.cli import main as cli
 from tiler.config.config import Config, make_config
-from tiler.footprints.footprint_sample import FootprintSample, measure_detail, sample_footprints
-from tiler.georeference.establish import Georeference
+from tiler.engine.run_context import absent_tiles, choose_tiles, make_layout, seam_name, tile_name
 from tiler.georeference.frame import AS_IT_IS
 from tiler.interface.synth import write_city
-from tiler.planning.context import absent_tiles, choose_tiles, make_layout, seam_name, tile_name
+from tiler.planning.establish_georeference import Georeference
+from tiler.planning.footprint_sample import FootprintSample, measure_detail, sample_footprints
 from tiler.planning.forecast import Forecast, forecast_run, spread_points, warn_of_memory
 from tiler.planning.plan import Survey, survey_inputs
-from tiler.planning.plan_report import describe_plan, plan_run
 from tiler.planning.region import Region, check_region
 from tiler.pointclouds.clouds import CloudHeader
 from tiler.report.plan_map import draw_plan
+from tiler.report.plan_report import describe_plan, plan_run
 from tiler.report.svg_map import FootprintRaster
 from tiler.workflow.run import run
 

@@ -21,7 +21,7 @@ from tiler.cli.main import main
 from tiler.config.config import load_config, make_config, write_config
 from tiler.pointclouds.clouds import find_clouds, read_header
 from tiler.pointclouds.ingest import read_cells
-from tiler.workflow.failed_tiles import command_alone
+from tiler.store.out_folder import command_alone
 
 N = 130_000  # more than two chunks of LAZ, which have 50,000 points
 VERSIONS = dict.fromkeys((0, 1), "1.1") | dict.fromkeys((2, 3), "1.2") | dict.fromkeys((4, 5), "1.3")

@@ -14,7 +14,7 @@ from tests.campaigns import keep_outcome, rounds
 from tests.test_run import hashes
 from tests.towns import Town, make_town
 from tiler.store.atomic import replacing
-from tiler.workflow.out_folder import MANIFEST_PATH, RUN_RECORD
+from tiler.store.out_folder import MANIFEST_PATH, RUN_RECORD
 from tiler.workflow.run import run
 
 SYNCED = {RUN_RECORD, MANIFEST_PATH}  # these the disk has before anything goes on

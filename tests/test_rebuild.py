@@ -23,8 +23,8 @@ from tests.campaigns import keep_outcome
 from tests.test_run import hashes
 from tiler.check.check import check_run
 from tiler.config.config import Config, make_config
+from tiler.engine.run_context import seam_key, tile_key
 from tiler.interface.synth import write_city
-from tiler.planning.context import seam_key, tile_key
 from tiler.store.folder_lock import only_run
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store

@@ -14,7 +14,7 @@ DASK = ("dask", "distributed")
 SCIPY = tuple(f"scipy.{part}" for part in ("fft", "io", "linalg", "ndimage", "sparse", "spatial", "special"))
 UNNEEDED = ("meshio", "numpy.testing", "pyamg", "zarr", *SCIPY)
 BY_NUMBA = {"numpy.testing", "scipy.linalg"}  # imported at the first kernel, as numba asks scipy for BLAS
-RUN = ("tiler.workflow.run", "tiler.monitoring.terminal", "tiler.workflow.own_stages")
+RUN = ("tiler.workflow.run", "tiler.monitoring.terminal", "tiler.stages.own_stages")
 BY_NUMBA = {"numpy.testing", "scipy.linalg"}  # imported where the first kernel is called
 
 

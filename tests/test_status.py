@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiler.config.config_file import with_file
 
 from pipeline.data.errors import CityError, ConfigError, InputError
 from tests.test_run import hashes
@@ -24,7 +25,6 @@ from tests.towns import Town, make_town
 from tiler.cli.main import main, make_parser
 from tiler.config.config import make_config
 from tiler.engine.task import Record
-from tiler.interface.api import with_file
 from tiler.monitoring.progress import RunProgress, command_line
 from tiler.monitoring.status import read_status
 from tiler.store.folder_lock import LOCK, is_held, only_run

@@ -15,10 +15,10 @@ from tests.result_parts import parts, write_parts
 from tests.test_run import hashes
 from tests.towns import Town, make_town
 from tiler.cli.main import main
-from tiler.store.audit import Entry, audit_run, read_manifest
 from tiler.store.checksums import seal
 from tiler.store.folder_lock import only_run
 from tiler.store.store import Store
+from tiler.workflow.audit import Entry, audit_run, read_manifest
 from tiler.workflow.run import run
 
 SEEDS = [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in rounds(range(2, 6), range(6, 20)))]

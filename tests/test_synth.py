@@ -17,9 +17,9 @@ from pipeline.data.errors import ConfigError
 from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, make_city, terrain_height
 from tests.footprint_reading import read_footprint_crs, read_footprints
 from tests.whole_clouds import read_points
-from tiler.georeference.cloud_crs import Asked
-from tiler.georeference.establish import establish_georeference
 from tiler.interface.synth import SynthFiles, write_city
+from tiler.planning.cloud_crs import Asked
+from tiler.planning.establish_georeference import establish_georeference
 from tiler.pointclouds.clouds import find_clouds, read_header
 
 SWEREF = pyproj.CRS("EPSG:3006")

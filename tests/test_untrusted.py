@@ -34,8 +34,8 @@ from tests.bad_input import (
 from tests.result_parts import parts, write_parts
 from tiler.objects.requests import trust_addresses
 from tiler.pointclouds import ingest
+from tiler.store.out_folder import refuse_inputs_within
 from tiler.store.store import Store
-from tiler.workflow.out_folder import refuse_inputs_within
 
 Capture = pytest.CaptureFixture[str]
 Damage = Callable[[Path], None]

@@ -22,10 +22,10 @@ from stitch.tiling.grid import Bounds
 from tiler.config.config import Config, make_config
 from tiler.config.step_options import derived_parameters
 from tiler.engine.engine import Engine
+from tiler.engine.executor import serial
+from tiler.engine.run_context import RunContext, pack_tiles
 from tiler.engine.stage import REGION_ITEM
-from tiler.executors.executor import serial
 from tiler.objects.places import identify
-from tiler.planning.context import RunContext, pack_tiles
 from tiler.planning.plan import Plan, make_plan
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.mesh import mesh_stages

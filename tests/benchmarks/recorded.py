@@ -11,13 +11,13 @@ from typing import Any
 from stitch.tiling.grid import Key
 from tiler.config.config import Config
 from tiler.engine.engine import Engine
+from tiler.engine.executor import serial
+from tiler.engine.run_context import tile_key, tile_name
 from tiler.engine.stage import Box, Facts, Scope
 from tiler.engine.task import Record
-from tiler.executors.executor import serial
-from tiler.planning.context import tile_key, tile_name
 from tiler.planning.plan import make_plan
+from tiler.stages.own_stages import OwnStages
 from tiler.store.store import Store
-from tiler.workflow.own_stages import OwnStages
 from tiler.workflow.stage_sequence import make_engine, run_stages
 
 PATH = Path(__file__).with_name("recorded.json")

@@ -20,16 +20,16 @@ from tests.benchmarks.recorded import record
 from tests.benchmarks.virtual import StandInStore, VirtualWorkers, instant
 from tiler.config.config import Config, make_config
 from tiler.engine.engine import Engine, StoppedError
+from tiler.engine.executor import Executor
 from tiler.engine.records import Records
 from tiler.engine.task import Record
-from tiler.executors.executor import Executor
 from tiler.executors.local_cluster import local
 from tiler.monitoring.progress import RunProgress
 from tiler.planning.plan import Plan, make_plan
-from tiler.store.audit import find_remade, write_manifest
+from tiler.stages.own_stages import OwnStages, list_stages
+from tiler.store.out_folder import MANIFEST_PATH, STORE
+from tiler.workflow.audit import find_remade, write_manifest
 from tiler.workflow.failed_tiles import HolesError, Missing, find_missing, leave_holes
-from tiler.workflow.out_folder import MANIFEST_PATH, STORE
-from tiler.workflow.own_stages import OwnStages, list_stages
 from tiler.workflow.stage_sequence import make_engine, run_stages
 from tiler.workflow.summary import summarise_run
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from pipeline.data.errors import CityError
 from tests.benchmarks.recorded import choose, draw, make_facts
+from tiler.engine.executor import LEAST_TASKS, TASKS_PER_WORKER, Function
 from tiler.engine.stage import Box, Facts, Layout, Scope
 from tiler.engine.task import Failure, Record, Task, run_task
-from tiler.executors.executor import LEAST_TASKS, TASKS_PER_WORKER, Function
 from tiler.store.store import Store
 
 VERIFIED = 1e9  # bytes/s; how fast an earlier result is held against its checksums

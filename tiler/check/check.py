@@ -19,9 +19,8 @@ from tiler.check.solid_proofs import SolidProofs
 from tiler.citymodels.building_index import BuildingIndex, index_buildings
 from tiler.mesh_files.mesh_parts import tell_parts
 from tiler.mesh_files.vtk_files import read_piece_paths
-from tiler.stages.citymodel import CITY_MODEL
-from tiler.workflow.out_folder import RUN_RECORD, STORE
-from tiler.workflow.run_folder import PARTS, RunRecord, read_run_record
+from tiler.store.out_folder import CITY_MODEL, RUN_RECORD, STORE
+from tiler.store.run_folder import PARTS, RunRecord, read_run_record
 
 VOLUME_INDEX = "mesh.pvtu"
 BOUNDARY_INDEX = "boundary.pvtp"

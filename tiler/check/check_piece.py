@@ -13,7 +13,7 @@ from tiler.check import proofs
 from tiler.check.proofs import Bounds, Fault, Finding, Mask, Surface, Vertices
 from tiler.check.soil_proofs import check_between
 from tiler.mesh_files.vtk_files import BoundaryPiece, read_vtp
-from tiler.workflow.run_folder import read_volume
+from tiler.store.run_folder import read_volume
 
 # Kinds of points over the rim, each counted once: any, of the ground, of the top.
 ANY, GROUND, TOP = range(3)

@@ -24,7 +24,7 @@ from tiler.check.proofs import (
     measure_plan_widths,
 )
 from tiler.citymodels.building_index import BuildingIndex
-from tiler.workflow.run_folder import Buildings
+from tiler.store.run_folder import Buildings
 
 LOADED = 4096  # footprints that are measured at once
 BELOW = (Marker.BOTTOM, Marker.FOUNDATION)  # markers that only a run with soil has

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.data.mesh import Boundary, Marker, TetMesh
 from stitch.pieces import conformity
 from stitch.pieces.frontier import Settled, find_edges_below
-from tiler.workflow.run_folder import RunRecord
+from tiler.store.run_folder import RunRecord
 
 HEIGHT_TOLERANCE = 1e-6  # m, of a height against the DTM or the city model
 SIDE_TOLERANCE = 1e-6  # m, of a vertex against its side of the box, and of a wall against the vertical

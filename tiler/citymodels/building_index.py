@@ -14,8 +14,8 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError, OutputError
-from tiler.citymodels.json_stream import iterate_elements, iterate_members, read_members
-from tiler.workflow.run_folder import WRONG_FIELD, Buildings, broken_field
+from tiler.store.json_stream import iterate_elements, iterate_members, read_members
+from tiler.store.run_folder import WRONG_FIELD, Buildings, broken_field
 
 CITYJSON = "2.0"
 MAX_NUMBER = 2**53  # of a building

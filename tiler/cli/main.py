@@ -17,7 +17,7 @@ from pipeline.data.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
 from tiler.cli.parser import EXPORT_OPTION, Handler, build_parser
 from tiler.config.config import Config, annotated_defaults, make_config
-from tiler.interface.api import with_file
+from tiler.config.config_file import with_file
 from tiler.jobs.submission import describe_job, find_run, job_line
 from tiler.mesh_files.run_files import refuse_strangers
 from tiler.objects.places import place, refuse_bucket
@@ -132,7 +132,7 @@ def _run_config(
     gc.set_threshold(GARBAGE)
     from tiler.monitoring.events import EventLog, open_log
     from tiler.monitoring.terminal import make_views, print_last_line, print_summary
-    from tiler.workflow.out_folder import refuse_result
+    from tiler.store.out_folder import refuse_result
     from tiler.workflow.run import run
 
     if report:
@@ -154,7 +154,7 @@ def _run_config(
 
 
 def _plan(options: argparse.Namespace) -> int:
-    from tiler.planning.plan_report import plan_run
+    from tiler.report.plan_report import plan_run
 
     config = make_config(with_file(vars(options)))
     plan_run(config, json_file=options.json_file, picture=options.picture)
@@ -163,7 +163,7 @@ def _plan(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> int:
     if options.store:
-        from tiler.store.audit import audit_run
+        from tiler.workflow.audit import audit_run
 
         return 0 if audit_run(options.directory, print) else EXIT_FAILED
     refuse_bucket(options.directory, "check without --store")
@@ -184,7 +184,7 @@ def _status(options: argparse.Namespace) -> int:
     from rich.console import Console
 
     from tiler.monitoring.status import print_status, read_status
-    from tiler.workflow.out_folder import PROGRESS
+    from tiler.store.out_folder import PROGRESS
 
     directory = find_run(options.job)
     job = describe_job(directory)

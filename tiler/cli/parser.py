@@ -9,9 +9,9 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.data.errors import ConfigError
 from tiler.config.config import ANYWHERE, Config
+from tiler.config.config_file import POSITIONAL
 from tiler.config.domain_height import Height
 from tiler.export.export import list_formats, load_format
-from tiler.interface.api import POSITIONAL
 from tiler.jobs.submission import add_job_commands
 from tiler.objects.places import place, refuse_bucket
 from tiler.words.did_you_mean import Parser

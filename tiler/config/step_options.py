@@ -11,8 +11,8 @@ from pipeline.columns.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFI
 from pipeline.columns.underground import SoilOptions
 from pipeline.plane_mesh.sizes import SizeRule
 from tiler.config.config import Config
+from tiler.config.declared import Declared
 from tiler.config.domain_height import Domain
-from tiler.engine.task import Declared
 
 # Parameters of the city model; two are raised by what the mesh needs, see `derived_parameters`.
 CITY_PARAMETERS = (

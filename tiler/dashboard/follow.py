@@ -11,7 +11,7 @@ from typing import Any
 from pipeline.data.errors import CityError, InputError
 from tiler.dashboard.model import RunModel
 from tiler.store.folder_lock import is_held
-from tiler.workflow.out_folder import EVENTS, RUN_RECORD
+from tiler.store.out_folder import EVENTS, RUN_RECORD
 
 CHUNK = 2**20  # bytes that are read at once
 LONGEST = 2**24  # bytes of a line; a longer one is no event

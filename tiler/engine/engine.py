@@ -1,7 +1,7 @@
 """The engine: runs stages over the items of a layout, each result once, and skips what is there already.
 
 The driver decides what may run and keeps small records; functions, arrays and files are the workers'. Nothing here
-knows Dask: see `tiler.executors.executor`.
+knows Dask: see `tiler.engine.executor`.
 """
 
 import heapq
@@ -17,12 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import CityError
+from tiler.config.declared import Declared
 from tiler.engine.absent_tiles import Gaps
+from tiler.engine.executor import Executor
 from tiler.engine.failures import Policy, SetAside, ends_the_run, tell_reason, tries
 from tiler.engine.keys import declared_values, file_identity, item_key, stage_digest
 from tiler.engine.records import Records
 from tiler.engine.stage import Box, Layout, Scope, Stage
-from tiler.engine.task import Declared, Failure, Record, Task
+from tiler.engine.task import Failure, Record, Task
 from tiler.engine.task_graph import (
     Items,
     Refs,
@@ -37,7 +39,6 @@ from tiler.engine.task_graph import (
     readers,
     reads_everything,
 )
-from tiler.executors.executor import Executor
 from tiler.store.store import Store
 from tiler.words.stage_groups import place_of_item
 
@@ -99,7 +100,7 @@ class Engine:
     context : object, optional
         Given to every task as it is; small and picklable.
     executor : Executor
-        Where tasks run, see `tiler.executors.executor`.
+        Where tasks run, see `tiler.engine.executor`.
     window : int, optional
         Largest number of tasks in flight; what the executor wants by default.
     folder : Path, optional

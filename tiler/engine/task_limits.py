@@ -19,8 +19,8 @@ from tiler.config.config import Config
 from tiler.engine.stage import Facts
 from tiler.engine.task import Failure, Record, Task, run_task
 from tiler.objects.places import local_folder
+from tiler.store.out_folder import TASKS
 
-TASKS = ".tasks"  # folder beside the store, with a file for every task that runs
 TIMEOUT = "Timeout ("  # how the fault handler begins at the time limit
 TRIM_AT = 400 * 2**20  # bytes that a worker holds before a task when it gives back what it does not use
 REFUSE_AT, KILL_AT = 0.9, 0.95  # of the limit: no more is given; a process is ended whose memory was not counted

@@ -9,9 +9,9 @@ from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
 from pipeline.data.errors import CityError
+from tiler.engine.executor import LEAST_TASKS, TASKS_PER_WORKER, Function, Outcome
 from tiler.engine.task import Failure, Task
 from tiler.engine.task_limits import Limits, WorkerError, run_guarded, tell_death, tell_memory
-from tiler.executors.executor import LEAST_TASKS, TASKS_PER_WORKER, Function, Outcome
 from tiler.executors.worker_requirements import (
     ClusterMismatchError,
     Mismatch,

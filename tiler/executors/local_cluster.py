@@ -12,10 +12,10 @@ from dask import config
 from distributed import Client, LocalCluster, WorkerPlugin
 
 from tiler.config.config import ANYWHERE
+from tiler.engine.executor import Executor
 from tiler.engine.task_limits import REFUSE_AT, Limits, limit_memory, share_memory
 from tiler.executors.dask_executor import DaskExecutor
 from tiler.executors.dask_settings import GARBAGE, LOCAL, start_fork_server
-from tiler.executors.executor import Executor
 
 
 class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no types

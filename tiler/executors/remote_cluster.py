@@ -12,9 +12,9 @@ from distributed.utils import silence_logging_cmgr
 
 from pipeline.data.errors import CityError
 from tiler.config.config import Config
+from tiler.engine.executor import Executor
 from tiler.engine.task_limits import Limits
 from tiler.executors.dask_executor import DaskExecutor
-from tiler.executors.executor import Executor
 from tiler.executors.transport import NO_FILES, TlsFiles, check_answer, make_security
 from tiler.executors.worker_requirements import Requirements, check_cluster, own_requirements, require_files
 from tiler.objects.places import is_url

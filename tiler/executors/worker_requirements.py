@@ -20,8 +20,8 @@ from pipeline.data.errors import ConfigError
 from tiler.executors import versions
 from tiler.executors.versions import TRANSPORT, digest_versions, tell_versions
 from tiler.store.atomic import replacing
+from tiler.store.out_folder import PROBE
 
-PROBE = ".cluster.json"  # in the folder of a run, as long as its tasks are on a cluster
 GRACE = 5.0  # s for a shared folder to show a new file
 INPUTS = 20  # files of the inputs that each worker looks for
 ANSWER, LATE_ANSWER = 60.0, 5.0  # s that workers may take to answer, before a run and in it

@@ -25,7 +25,7 @@ from tiler.formats.xdmf import as_output_error
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
 from tiler.store.atomic import replacing
-from tiler.workflow.run_folder import read_crs
+from tiler.store.run_folder import read_crs
 
 VERSION = 3.3  # of CGNS, the first in which all that is written has today's meaning
 TRIANGLE, TETRAHEDRON = 5, 10  # TRI_3 and TETRA_4 among CGNS's types of elements

@@ -13,9 +13,8 @@ from tiler.citymodels.building_index import Vertices, has_parts, read_objects, s
 from tiler.export.export import Format
 from tiler.mesh_files.run_files import RunFiles
 from tiler.store.atomic import replacing
-from tiler.workflow.run_folder import WRONG_FIELD, broken_field
-
-CITY_MODEL = "citymodel.city.json"  # of a run: the one that was meshed
+from tiler.store.out_folder import CITY_MODEL
+from tiler.store.run_folder import WRONG_FIELD, broken_field
 
 
 def export_cityjsonseq(output: Path, directory: Path) -> None:

@@ -26,7 +26,7 @@ from tiler.export.surface import (
 )
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
 from tiler.store.atomic import replacing
-from tiler.workflow.run_folder import read_crs
+from tiler.store.run_folder import read_crs
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 VERTICES, INDICES = 34962, 34963  # targets of buffer views

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from pipeline.data.errors import OutputError
 from tiler.citymodels.building_index import has_parts, read_building, read_objects, spool_vertices
 from tiler.export.export import Format
-from tiler.formats.cityjsonseq import CITY_MODEL
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles
 from tiler.store.atomic import replacing
-from tiler.workflow.run_folder import read_crs
+from tiler.store.out_folder import CITY_MODEL
+from tiler.store.run_folder import read_crs
 
 LAYER = "buildings"
 BATCH = 5000  # rows that are written at once

@@ -1,12 +1,12 @@
 """Words of messages about CRSs: units, directions, commands."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import pyproj
 
 from tiler.georeference.crs import crs_name
 from tiler.georeference.metric import MetricCrs
-from tiler.pointclouds.clouds import CloudHeader
 
 Box = tuple[float, float, float, float]
 
@@ -33,12 +33,12 @@ def box_words(box: Sequence[float]) -> str:
     return " ".join(f"{value:.6g}" for value in box)
 
 
-def pdal_command(cloud: CloudHeader, crs: pyproj.CRS, target: str | None) -> str:
+def pdal_command(cloud: Path, crs: pyproj.CRS, target: str | None) -> str:
     """Give the command of PDAL that reprojects a cloud."""
-    name = cloud.path.name.split(".")[0]
+    name = cloud.name.split(".")[0]
     source = f" --filters.reprojection.in_srs={crs_name(crs)}" if crs.to_authority() else ""
     return (
-        f'pdal translate "{cloud.path}" "{cloud.path.with_name(f"{name}_metric.laz")}" reprojection{source} '
+        f'pdal translate "{cloud}" "{cloud.with_name(f"{name}_metric.laz")}" reprojection{source} '
         f"--filters.reprojection.out_srs={target or 'EPSG:<a projected CRS in metres>'}"
     )
 

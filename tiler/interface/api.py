@@ -1,6 +1,5 @@
 """The Python interface, as `import tiler` gives it: the command line calls the same functions."""
 
-import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
@@ -8,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.data.errors import ConfigError
-from tiler.config.config import Config, check_reach, load_config, make_config
+from tiler.config.config import Config, make_config
+from tiler.config.config_file import PARAMETERS, POSITIONAL, with_file
 from tiler.objects.places import refuse_bucket
 
 if TYPE_CHECKING:
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from tiler.interface.synth import SynthFiles
 
 Source = str | Path
-POSITIONAL = "pointcloud"
-PARAMETERS = tuple(entry.name for entry in dataclasses.fields(Config))
 
 
 def mesh(
@@ -161,32 +159,6 @@ def write_city(folder: Source, *, size: float = 1000.0, buildings: int = 500, **
     from tiler.interface.synth import write_city as write
 
     return write(Path(folder), size=size, buildings=buildings, **options)
-
-
-def with_file(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Put the parameters of a configuration file below those that are given.
-
-    Parameters
-    ----------
-    options : mapping
-        With ``pointcloud``, a list of sources, one of which may be a configuration file. What is no parameter of a
-        run is passed over.
-
-    Raises
-    ------
-    ConfigError
-        If several configuration files are given, or one cannot be read or asks for what it may not.
-    """
-    values = {name: value for name, value in options.items() if name in PARAMETERS}
-    sources: list[str] = values.pop(POSITIONAL)
-    files = [source for source in sources if source.lower().endswith(".toml")]
-    if len(files) > 1:
-        raise ConfigError(f"{len(files)} configuration files given ({', '.join(files)}); give one")
-    clouds = [source for source in sources if source not in files]
-    given = load_config(Path(files[0])) if files else {}
-    if files:
-        check_reach(Path(files[0]), {name: value for name, value in given.items() if name not in values})
-    return given | ({POSITIONAL: clouds} if clouds else {}) | values
 
 
 def _check_script(workers: int) -> None:

@@ -343,7 +343,7 @@ class CityMesh:
             If the city model is missing or damaged.
         """
         from tiler.citymodels.building_index import has_parts, read_building, read_objects, spool_vertices
-        from tiler.formats.cityjsonseq import CITY_MODEL
+        from tiler.store.out_folder import CITY_MODEL
 
         model = self.folder / CITY_MODEL
         with TemporaryFile() as spool:

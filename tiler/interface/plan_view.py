@@ -46,7 +46,7 @@ class RunPlan:
 
 
 def plan_config(config: Config) -> RunPlan:
-    """Plan a run from headers alone; parameters and errors as for `tiler.planning.plan_report.plan_run`."""
+    """Plan a run from headers alone; parameters and errors as for `tiler.report.plan_report.plan_run`."""
     facts, text = _plan(config, None)
     return RunPlan(config, facts, text)
 
@@ -54,7 +54,7 @@ def plan_config(config: Config) -> RunPlan:
 def _plan(config: Config, picture: Path | None) -> tuple[dict[str, Any], str]:
     from rich.console import Console
 
-    from tiler.planning.plan_report import WIDTH, plan_run
+    from tiler.report.plan_report import WIDTH, plan_run
 
     text = StringIO()
     # Rich would write colours, or to the notebook itself.

@@ -14,6 +14,8 @@ from typing import Any, ClassVar, get_type_hints
 
 from pipeline.data.errors import CityError, ConfigError
 
+LOGS, WORKER_JOBS = "logs", "workers.json"  # in the folder of a job; the numbers of worker jobs that wait or run
+WORKER_NAME = "citystitch-worker"  # of jobs
 WALLTIME = re.compile(r"(?:(\d+)-)?(\d{1,3}):([0-5]\d):([0-5]\d)")
 TEMPLATE = "see deploy/slurm/slurm.toml"
 LEAST_TIME = 30.0  # s that a job must have between its start and the time at which it ends by itself

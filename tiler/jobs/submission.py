@@ -14,16 +14,15 @@ from typing import Any
 
 from pipeline.data.errors import ConfigError, InputError
 from tiler.config.config import Config, make_config, write_config
-from tiler.jobs.cluster import SYSTEMS, Cluster, QueueError, read_cluster
+from tiler.jobs.cluster import LOGS, SYSTEMS, WORKER_JOBS, WORKER_NAME, Cluster, QueueError, read_cluster
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.store.atomic import replacing
 from tiler.words.plain_text import printable
 
 JOB = "job"  # folder in that of a run, with all that its jobs need and print
-RECORD, DESCRIPTION, PARAMETERS, SCRIPT, LOGS = "job.json", "cluster.toml", "run.toml", "job.sh", "logs"
-WORKER_JOBS = "workers.json"  # numbers of the worker jobs that wait or run
+RECORD, DESCRIPTION, PARAMETERS, SCRIPT = "job.json", "cluster.toml", "run.toml", "job.sh"
 CANCELLED = "cancelled"  # an empty file: whoever writes the record at that moment does not undo it
-NAME, WORKER_NAME = "citystitch", "citystitch-worker"  # of jobs
+NAME = "citystitch"  # of jobs
 EVERY = 1.0  # s between two looks at logs that are followed
 JOB_HELP = "number of a job, or folder of its run"
 
@@ -220,7 +219,7 @@ def _folders() -> Path:
 
 
 def _submit(options: argparse.Namespace) -> int:
-    from tiler.interface.api import with_file
+    from tiler.config.config_file import with_file
     from tiler.planning.plan import check_sources
 
     config = make_config(with_file(vars(options)))

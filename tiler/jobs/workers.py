@@ -11,14 +11,13 @@ from typing import Any
 from dask import config
 from distributed import Adaptive, Client
 
+from tiler.engine.executor import Executor
 from tiler.engine.task import Failure, Task
 from tiler.engine.task_limits import REFUSE_AT, Limits
 from tiler.executors.dask_executor import ClusterError, DaskExecutor
 from tiler.executors.dask_settings import BOTH, ENVIRONMENT, SCHEDULER, WORKER, as_variables
-from tiler.executors.executor import Executor
 from tiler.executors.local_cluster import WorkerSetup
-from tiler.jobs.cluster import BatchSystem, Cluster, QueueError
-from tiler.jobs.submission import LOGS, WORKER_JOBS, WORKER_NAME
+from tiler.jobs.cluster import LOGS, WORKER_JOBS, WORKER_NAME, BatchSystem, Cluster, QueueError
 from tiler.store.atomic import replacing
 
 LOSSES = 3  # how often a task may be lost with its node or job before it is blamed

@@ -15,7 +15,7 @@ from stitch.pieces.numbering import Numbering
 from tiler.mesh_files.merged import VERTEX_ID, number_piece, read_numbering
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource, find_files
 from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
-from tiler.workflow.run_folder import REGION, read_run_record
+from tiler.store.run_folder import REGION, read_run_record
 
 SIDE = 1e-6  # m; how far from a side of the region a facet on it may be
 

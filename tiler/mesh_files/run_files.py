@@ -52,7 +52,7 @@ def find_files(directory: Path) -> RunFiles:
         If the folder holds no finished run, or a file of it is missing or damaged.
     """
     from tiler.mesh_files.vtk_files import read_piece_paths
-    from tiler.workflow.run_folder import read_run_record
+    from tiler.store.run_folder import read_run_record
 
     refuse_strangers(directory)
     record = directory / RUN_RECORD
@@ -85,7 +85,7 @@ def take_largest_part(files: RunFiles) -> RunFiles:
     ConfigError
         If a tile has cells of this part and of another one.
     """
-    from tiler.workflow.run_folder import read_run_record
+    from tiler.store.run_folder import read_run_record
 
     record = files.directory / RUN_RECORD
     found = read_run_record(record)

@@ -17,7 +17,7 @@ from tiler.engine.stage import Scope
 from tiler.engine.task import Record
 from tiler.monitoring.watchers import Item, Watcher
 from tiler.store.atomic import replacing
-from tiler.workflow.out_folder import PROGRESS
+from tiler.store.out_folder import PROGRESS
 
 SCHEMA = 1  # of progress.json
 EVERY = 2.0  # s between two writes of it

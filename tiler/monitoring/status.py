@@ -14,9 +14,9 @@ from rich.table import Table
 from pipeline.data.errors import InputError
 from tiler.monitoring.terminal import next_commands
 from tiler.store.folder_lock import is_held
+from tiler.store.out_folder import PROGRESS, RUN_RECORD
 from tiler.words.note_words import say_notes
 from tiler.words.stage_groups import group_stages, title_of_stage
-from tiler.workflow.out_folder import PROGRESS, RUN_RECORD
 
 LISTED_ITEMS = 10  # items in hand that the table lists
 COUNTS = ("total", "done", "reused", "running", "failed")

@@ -14,10 +14,10 @@ from tiler.monitoring.plain_view import PlainView, QuietView
 from tiler.monitoring.tally import Tally
 from tiler.monitoring.watchers import Watcher
 from tiler.objects.places import Place, in_bucket
+from tiler.store.run_folder import PARTS
 from tiler.words.note_words import say_notes
 from tiler.words.plain_text import printable
 from tiler.words.stage_groups import title_of_stage
-from tiler.workflow.run_folder import PARTS
 
 LISTED_NOTES = 12  # kinds of notes that the summary shows; run.json has all
 LISTED_MISSING = 20  # tiles and other failures that it shows, likewise

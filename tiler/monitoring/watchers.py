@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stitch.tiling.grid import tiles_of_seam
+from tiler.engine.run_context import seam_key, tile_name
 from tiler.engine.stage import Box, Layout, Scope
 from tiler.engine.task import Record
-from tiler.planning.context import seam_key, tile_name
-from tiler.workflow.failed_tiles import command_alone
+from tiler.store.out_folder import command_alone
 
 Item = tuple[str, str]  # stage and name
 

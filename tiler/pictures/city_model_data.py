@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pipeline.data.mesh import Marker
 from tiler.citymodels.tables import unpack_polygons
 from tiler.pictures.picture_data import City, sew
+from tiler.store.out_folder import RUN_RECORD, STORE
 from tiler.store.results import StoredTerrain
+from tiler.store.run_folder import read_run_record
 from tiler.store.store import Store
-from tiler.workflow.out_folder import RUN_RECORD, STORE
-from tiler.workflow.run_folder import read_run_record
 
 DEEP = 3.0  # m that walls reach below the ground, which is not level
 TERRAIN_NODES = 450  # along the longer side of the terrain

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker, Region
 from stitch.tiling.grid import Key
+from tiler.engine.run_context import tile_key
 from tiler.mesh_files.facet_quality import measure_facets
 from tiler.mesh_files.vtk_files import TETRA, BoundaryPiece, read_piece_paths, read_vtp, read_vtu
 from tiler.pictures.coarsening import Facets, coarsen, join_facets
-from tiler.planning.context import tile_key
-from tiler.workflow.run_folder import REGION
+from tiler.store.run_folder import REGION
 
 BOUNDARY_INDEX, VOLUME_INDEX = "boundary.pvtp", "mesh.pvtu"
 SHOWN = (Marker.GROUND, Marker.WALL, Marker.ROOF)

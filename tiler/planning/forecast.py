@@ -13,10 +13,10 @@ from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.config.config import Config
 from tiler.config.step_options import expected_levels, size_rule
 from tiler.engine.stage import Scope
-from tiler.footprints.footprint_sample import FootprintSample
+from tiler.planning.footprint_sample import FootprintSample
 from tiler.planning.plan import Survey
 from tiler.pointclouds.clouds import CloudHeader
-from tiler.workflow.own_stages import list_stages, stages_of_pad
+from tiler.stages.own_stages import list_stages, stages_of_pad
 
 # Measured on synthetic cities and Amsterdam with mesh sizes of 4 to 20 m: see docs/plan.md.
 TRIANGLES = 3.07  # on open ground, in one squared mesh size

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch.tiling.grid import Bounds, TileGrid, make_grid, tiles_present
-from tiler.planning.context import SHARED
+from tiler.engine.run_context import SHARED
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,14 @@ from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
 from stitch.tiling.grid import TileGrid, make_grid, tiles_present
 from tiler.config.config import Config, idle_parameters
+from tiler.engine.run_context import choose_tiles, make_layout, tile_key
 from tiler.engine.stage import FileItem, Layout
-from tiler.georeference.cloud_crs import Asked
 from tiler.georeference.crs import crs_text
-from tiler.georeference.establish import FOOTPRINTS, Georeference, establish_georeference, find_inexact
 from tiler.georeference.operation import Operation
 from tiler.objects.places import identify, place
 from tiler.objects.requests import trust_addresses
-from tiler.planning.context import choose_tiles, make_layout, tile_key
+from tiler.planning.cloud_crs import Asked
+from tiler.planning.establish_georeference import FOOTPRINTS, Georeference, establish_georeference, find_inexact
 from tiler.planning.region import (
     Region,
     check_points,

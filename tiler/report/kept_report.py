@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pipeline.data.errors import OutputError
 from tiler.store.atomic import replacing
-from tiler.workflow.out_folder import EARLIER_REPORT, REPORT
+from tiler.store.out_folder import EARLIER_REPORT, REPORT
 
 OLD = (
     '<p class="bad" role="note">This report is old: it tells of an earlier run in this folder, and the mesh was '

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from stitch.tiling.grid import tiles_present
-from tiler.footprints.footprint_sample import FootprintSample
+from tiler.planning.footprint_sample import FootprintSample
 from tiler.planning.plan import Survey
 from tiler.report.svg_map import FootprintRaster, draw_image, draw_scale_bar, encode_png
 from tiler.store.atomic import replacing

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from tiler.citymodels.json_stream import iterate_elements, iterate_members, read_members
-from tiler.workflow.out_folder import RUN_RECORD
-from tiler.workflow.run_folder import SCHEMA, WRONG_FIELD, broken_field
+from tiler.store.json_stream import iterate_elements, iterate_members, read_members
+from tiler.store.out_folder import RUN_RECORD
+from tiler.store.run_folder import SCHEMA, WRONG_FIELD, broken_field
 
 SHOWN = 50  # notes of a kind that the report lists
 PLACES = 300  # notes of a kind that its map shows

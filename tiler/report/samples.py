@@ -21,9 +21,9 @@ from tiler.engine.stage import Box, Scope
 from tiler.engine.task import Task
 from tiler.pointclouds.ingest import CELL
 from tiler.stages.readers import read_cloud
+from tiler.store.out_folder import STORE
 from tiler.store.results import COLUMN_ARRAYS, unpack_columns
 from tiler.store.store import Store
-from tiler.workflow.out_folder import STORE
 
 MOST_TILES = 32  # that are looked at
 NEAR = 20.0  # m from a seam

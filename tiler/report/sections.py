@@ -12,21 +12,21 @@ from pipeline.quality.point_fidelity import KINDS
 from pipeline.quality.residuals import ResidualSums, conclude
 from stitch.tiling.grid import make_grid, tile_box
 from tiler.config.config import Config
+from tiler.engine.run_context import tile_key
 from tiler.mesh_files.mesh_parts import tell_parts
 from tiler.monitoring.progress import command_line
-from tiler.planning.context import tile_key
 from tiler.report.charts import Series, draw_bars, draw_gantt, draw_histogram, rebin
 from tiler.report.collect import Bins, Numbers
+from tiler.report.left_out import tell_left_out
 from tiler.report.maps import draw_map, gather_tiles
 from tiler.report.page import figure, figures, folded, heading, number, paragraph, table, text
 from tiler.report.record import PLACES, SHOWN, NoteGroup, RunFacts
 from tiler.report.samples import NEAR, Samples
 from tiler.report.timeline import Timeline
+from tiler.store.run_folder import PARTS, WRONG_FIELD
 from tiler.words.note_words import GROUPS, group_of, say_notes
 from tiler.words.plain_text import tell_box
 from tiler.words.stage_groups import group_stages, title_of_stage
-from tiler.workflow.left_out import tell_left_out
-from tiler.workflow.run_folder import PARTS, WRONG_FIELD
 
 PERCENTILES = (0, 0.1, 1, 5, 50, 95, 100)
 

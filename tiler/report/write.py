@@ -11,9 +11,9 @@ from tiler.report.record import RunFacts, read_run_facts
 from tiler.report.samples import measure_samples
 from tiler.report.timeline import read_timeline
 from tiler.store.atomic import replacing
+from tiler.store.out_folder import EVENTS, REPORT, RUN_RECORD, STORE
+from tiler.store.run_folder import WRONG_FIELD, broken_field
 from tiler.store.store import Store
-from tiler.workflow.out_folder import EVENTS, REPORT, RUN_RECORD, STORE
-from tiler.workflow.run_folder import WRONG_FIELD, broken_field
 
 
 def write_report(directory: Path) -> Path:

@@ -23,13 +23,13 @@ from pipeline.points_terrain.alignment import (
 )
 from tiler.config.config import Config
 from tiler.engine.records import Records
+from tiler.engine.run_context import find_owned
 from tiler.engine.stage import REGION_ITEM, Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Task
-from tiler.planning.context import find_owned
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.readers import grow, read_cloud, read_outlines, read_own_outlines
+from tiler.store.out_folder import STORE
 from tiler.store.store import Store
-from tiler.workflow.out_folder import STORE
 
 SAMPLE = 24  # footprints of a tile that are looked at
 LEAST_AREA, MOST_AREA = 20.0, 4000.0  # m2, of such a footprint

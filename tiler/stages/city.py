@@ -46,13 +46,13 @@ from tiler.citymodels.tables import (
 )
 from tiler.config.config import Config
 from tiler.config.step_options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
+from tiler.engine.run_context import find_owned, region_around, tile_key
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Result, Task
-from tiler.planning.context import find_owned, region_around, tile_key
 from tiler.stages.house_points import add_unmarked, extent_of, find_surfaces, points_near
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.readers import grow, read_known_terrain, read_own_outlines
-from tiler.workflow.run_folder import PARTS
+from tiler.store.run_folder import PARTS
 
 TERRAIN = ("dtm_spacing", "ground_filter")
 

@@ -23,9 +23,8 @@ from tiler.citymodels.tables import (
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.store.checksums import FILES, state_files
+from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL
 
-FULL_CITY_MODEL = "citymodel-full.city.json"
-CITY_MODEL = "citymodel.city.json"
 CELL = 1024.0  # side of the cells that buildings are sorted by (m), in the CRS
 
 

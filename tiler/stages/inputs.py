@@ -31,12 +31,12 @@ from pipeline.points_terrain.terrain_fill import (
 from stitch.tiling.grid import Key, has_tile
 from tiler.citymodels.tables import pack_polygons
 from tiler.config.config import Config
+from tiler.engine.run_context import tile_key
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.footprints.footprint_index import scan_footprints
 from tiler.georeference.frame import Frame
 from tiler.objects.places import place
-from tiler.planning.context import tile_key
 from tiler.pointclouds.ingest import CELL, KEY_POINTS, read_cells
 from tiler.stages.readers import clip, grow, join_rasters, read_bands, read_outlines, read_units
 

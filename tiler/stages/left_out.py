@@ -19,9 +19,9 @@ from pipeline.points_terrain.terrain import cut_terrain
 from tiler.citymodels.tables import pack_polygons, unpack_polygons
 from tiler.config.config import Config
 from tiler.config.step_options import CITY_PARAMETERS, city_options
+from tiler.engine.run_context import find_owned, region_around
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Task
-from tiler.planning.context import find_owned, region_around
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.readers import grow, read_cloud, read_known_terrain
 

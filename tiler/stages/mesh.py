@@ -42,9 +42,9 @@ from tiler.config.step_options import (
     plane_options,
     soil_options,
 )
+from tiler.engine.run_context import seam_key, seam_name, tile_key
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
-from tiler.planning.context import seam_key, seam_name, tile_key
 from tiler.stages.approach import terrain_stage
 from tiler.stages.city import chooses_layers_later
 from tiler.stages.seam_tables import pack_columns, pack_seam, unpack_levels, unpack_pinched, unpack_seam

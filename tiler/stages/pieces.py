@@ -41,18 +41,18 @@ from stitch.pieces.numbering import (
 from stitch.tiling.grid import Key, seams_of_tile
 from tiler.citymodels.tables import unpack_polygons
 from tiler.config.config import Config
+from tiler.engine.run_context import find_owned, seam_name, tile_key, tile_name
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Result, Task
 from tiler.mesh_files.merged import VERTEX_ID
 from tiler.mesh_files.mesh_parts import find_tile_parts, join_tiles, read_tile_parts
 from tiler.mesh_files.vtk_files import Rows, Values, write_vtp_blocks, write_vtu_blocks
-from tiler.planning.context import find_owned, seam_name, tile_key, tile_name
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.left_out import read_polygons
 from tiler.stages.readers import read_bands, read_buildings, read_terrain
 from tiler.store.checksums import FILES, state_files
 from tiler.store.results import COLUMN_ARRAYS, unpack_columns
-from tiler.workflow.run_folder import REGION
+from tiler.store.run_folder import REGION
 
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
 ID_ARRAYS = ("shared", "shared_id")

@@ -71,7 +71,7 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
     """
     say = say or say_nothing
     if in_bucket(folder):
-        from tiler.objects.lease import only_run_in_bucket
+        from tiler.store.lease import only_run_in_bucket
 
         with only_run_in_bucket(folder, say) as lease:
             yield lease.check
@@ -98,7 +98,7 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
 def is_held(folder: Path) -> bool:
     """Tell whether a run is at work in a folder; InputError if its lock file cannot be read."""
     if in_bucket(folder):
-        from tiler.objects.lease import is_held_in_bucket
+        from tiler.store.lease import is_held_in_bucket
 
         return is_held_in_bucket(folder)
     path = folder / LOCK

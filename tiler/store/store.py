@@ -16,7 +16,7 @@ from tiler.store.checksums import find_file_damage
 from tiler.store.result_file import ResultFile
 from tiler.store.result_writer import DIGEST_BYTES, Writer, hash_content, raw_bytes
 
-MANIFEST = "manifest.jsonl"  # the only file beside the stages, see `tiler.store.audit`
+MANIFEST = "manifest.jsonl"  # the only file beside the stages, see `tiler.workflow.audit`
 SUFFIX = ".zip"
 
 

@@ -1,7 +1,6 @@
 """What a run does about items that were set aside: which tiles go missing, and how to look into one alone."""
 
 import dataclasses
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +12,14 @@ from stitch.tiling.grid import Bounds, Key
 from tiler.config.config import Config, write_config
 from tiler.engine.engine import Engine
 from tiler.engine.failures import SetAside
+from tiler.engine.run_context import SHARED, tile_key, tile_name
 from tiler.engine.stage import Box, Scope
 from tiler.objects.places import absolute
-from tiler.planning.context import SHARED, tile_key, tile_name
 from tiler.planning.plan import Plan, leave_out
 from tiler.store.atomic import replacing
+from tiler.store.out_folder import CONFIG, command_alone
 from tiler.words.stage_groups import place_of_item
 
-CONFIG = "config.toml"  # in the folder of a run: its parameters
 ONLY = "only"  # folder below a run's, for tiles that are run alone
 AROUND = 2  # tiles on every side that a tile alone is run with, for clusters of houses and terrain
 
@@ -111,11 +110,6 @@ def describe_missing(missing: Missing, out: Path) -> dict[str, Any]:
         },
         "set_aside": [one.as_json() for one in missing.others],
     }
-
-
-def command_alone(out: Path, tile: str) -> str:
-    """The command that runs one tile alone."""
-    return shlex.join(["citystitch", "run", str(out / CONFIG), "--only", tile, "--traceback"])
 
 
 def save_config(config: Config, out: Path) -> None:

@@ -8,9 +8,9 @@ from tiler.objects.path import ObjectPath
 from tiler.objects.places import in_bucket, place
 from tiler.objects.results import copy_object
 from tiler.store.atomic import replacing
-from tiler.store.audit import Audit
 from tiler.store.folder_lock import LOCK, is_held, only_run
-from tiler.workflow.out_folder import check_folder
+from tiler.store.out_folder import check_folder
+from tiler.workflow.audit import Audit
 
 
 def fetch_run(source: str, folder: Path, tell: Callable[[str], None]) -> bool:

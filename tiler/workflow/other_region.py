@@ -7,15 +7,15 @@ from pathlib import Path
 import pyproj
 
 from pipeline.data.errors import CityError, ConfigError
-from tiler.citymodels.json_stream import read_members
 from tiler.engine.stage import Box
 from tiler.georeference.crs import same_crs
 from tiler.objects.places import absolute, in_bucket
 from tiler.planning.region import Region
+from tiler.store.json_stream import read_members
+from tiler.store.out_folder import RUN_RECORD, STORE
+from tiler.store.run_folder import WRONG_FIELD
 from tiler.store.store import SUFFIX
 from tiler.words.plain_text import tell_box
-from tiler.workflow.out_folder import RUN_RECORD, STORE
-from tiler.workflow.run_folder import WRONG_FIELD
 
 COMMON = 0.5  # share of the larger region's area from which on other files are newer ones of the same region
 

@@ -16,12 +16,12 @@ from pipeline.data.errors import CityError, OutputError
 from tiler.config.config import ANYWHERE, Config
 from tiler.dashboard.server import read_address, watched
 from tiler.engine.engine import StoppedError
+from tiler.engine.executor import Executor, serial
 from tiler.engine.keys import code_versions
 from tiler.engine.stage import Stage
 from tiler.engine.stopping import stops
 from tiler.engine.task import peak_memory
-from tiler.engine.task_limits import TASKS, limit_workers, machine_memory
-from tiler.executors.executor import Executor, serial
+from tiler.engine.task_limits import limit_workers, machine_memory
 from tiler.executors.kernels import prepare
 from tiler.jobs.cluster import read_cluster
 from tiler.jobs.submission import JOB
@@ -31,14 +31,25 @@ from tiler.monitoring.watchers import Listener, Watcher, Watchers
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.planning.forecast import warn_of_memory
 from tiler.planning.pad import Pad
-from tiler.planning.padded_layout import pad_plan
 from tiler.planning.plan import Plan, check_sources, make_plan
 from tiler.report.kept_report import give_back_report
+from tiler.stages.own_stages import OwnStages, check_own, run_own_stages
 from tiler.store.atomic import replacing, sync_meanwhile
-from tiler.store.audit import Audit, find_remade, write_manifest
 from tiler.store.checksums import seal, state_files
 from tiler.store.folder_lock import only_run
+from tiler.store.out_folder import (
+    INDEXES,
+    MANIFEST_PATH,
+    RUN_RECORD,
+    STORE,
+    TASKS,
+    check_folder,
+    clear_folder,
+    refuse_inputs_within,
+    remove_strangers,
+)
 from tiler.words.plain_text import replace_surrogates
+from tiler.workflow.audit import Audit, find_remade, write_manifest
 from tiler.workflow.empty_run import EmptyMeshError, is_empty
 from tiler.workflow.failed_tiles import (
     HolesError,
@@ -53,17 +64,7 @@ from tiler.workflow.other_region import (
     remove_folders,
     remove_if_useless,
 )
-from tiler.workflow.out_folder import (
-    INDEXES,
-    MANIFEST_PATH,
-    RUN_RECORD,
-    STORE,
-    check_folder,
-    clear_folder,
-    refuse_inputs_within,
-    remove_strangers,
-)
-from tiler.workflow.own_stages import OwnStages, check_own, run_own_stages
+from tiler.workflow.padded_layout import pad_plan
 from tiler.workflow.run_watchers import LeaseWatch, begin_watching
 from tiler.workflow.stage_sequence import make_engine, run_stages
 from tiler.workflow.summary import describe_tasks, summarise_run

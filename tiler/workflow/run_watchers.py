@@ -8,16 +8,16 @@ from pathlib import Path
 
 from pipeline.data.errors import OutputError
 from tiler.config.config import Config
+from tiler.engine.run_context import make_layout
 from tiler.engine.task import Record
 from tiler.monitoring.events import EventLog, begin_file
 from tiler.monitoring.progress import Announce, RunProgress, command_line
 from tiler.monitoring.watchers import RunStart, Watcher, Watchers
-from tiler.planning.context import make_layout
 from tiler.planning.plan import Plan
 from tiler.planning.region import foresee_pad
+from tiler.stages.own_stages import OwnStages, list_stages, stages_of_pad
 from tiler.store.atomic import replacing
-from tiler.workflow.out_folder import EVENTS
-from tiler.workflow.own_stages import OwnStages, list_stages, stages_of_pad
+from tiler.store.out_folder import EVENTS
 
 NOT_ALONE = ("fit",)  # stages of tiles and seams that `tiler.workflow.single_tile.run_alone` does without
 PUT_EVERY = 60.0  # s between two puts of the events of a run in a bucket

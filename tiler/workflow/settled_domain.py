@@ -10,12 +10,12 @@ from tiler.config.step_options import needs_region
 from tiler.engine.engine import Engine
 from tiler.engine.stage import REGION_ITEM
 from tiler.planning.pad import Pad
-from tiler.planning.padded_layout import lay_pad
 from tiler.planning.region import find_pad
 from tiler.stages.domain import domain_stages, layer_stages
+from tiler.store.out_folder import STORE
 from tiler.store.store import Store
 from tiler.workflow.failed_tiles import stop_at_holes
-from tiler.workflow.out_folder import STORE
+from tiler.workflow.padded_layout import lay_pad
 
 
 def settle_domain(engine: Engine, config: Config) -> Domain:

@@ -5,19 +5,19 @@ from pathlib import Path
 
 from stitch.tiling.grid import seams_of_tile
 from tiler.config.config import Config
-from tiler.executors.executor import serial
+from tiler.engine.executor import serial
+from tiler.engine.run_context import seam_name, tile_key
 from tiler.objects.places import refuse_bucket
-from tiler.planning.context import seam_name, tile_key
-from tiler.planning.padded_layout import plan_alone
 from tiler.planning.plan import check_sources, make_plan
 from tiler.stages.alignment import shift_of_run
 from tiler.stages.mesh import mesh_stages
+from tiler.stages.own_stages import OwnStages
 from tiler.stages.pieces import piece_stages
 from tiler.store.folder_lock import only_run
+from tiler.store.out_folder import PIECES
 from tiler.words.plain_text import say_nothing
 from tiler.workflow.failed_tiles import config_alone
-from tiler.workflow.out_folder import PIECES
-from tiler.workflow.own_stages import OwnStages
+from tiler.workflow.padded_layout import plan_alone
 from tiler.workflow.settled_domain import domain_of_run, take_domain
 from tiler.workflow.stage_sequence import make_engine, run_city_stages
 

@@ -7,26 +7,25 @@ from types import SimpleNamespace
 from tiler.config.config import Config
 from tiler.config.step_options import derived_parameters
 from tiler.engine.engine import Engine, Progress
+from tiler.engine.executor import Executor
 from tiler.engine.failures import Policy
+from tiler.engine.run_context import RunContext, pack_tiles
 from tiler.engine.stage import REGION_ITEM
-from tiler.executors.executor import Executor
 from tiler.objects.places import identify, place
-from tiler.planning.context import RunContext, pack_tiles
-from tiler.planning.padded_layout import CORE_STAGE
 from tiler.planning.plan import Plan
 from tiler.stages.alignment import alignment_stages, shift_of
 from tiler.stages.city import first_round, house_stage, later_round, member_stage, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.inputs import fill_stage, input_stages, lake_stage
 from tiler.stages.mesh import mesh_stages
+from tiler.stages.own_stages import CORE_STAGE, OwnStages
 from tiler.stages.pieces import fit_stage, piece_stages
+from tiler.store.out_folder import (
+    STORE,
+)
 from tiler.workflow.failed_tiles import (
     stop_at_holes,
 )
-from tiler.workflow.out_folder import (
-    STORE,
-)
-from tiler.workflow.own_stages import OwnStages
 from tiler.workflow.settled_domain import settle_domain
 
 

@@ -11,20 +11,20 @@ from pipeline.simplification.house_clusters import add_counts
 from tiler.config.config import Config
 from tiler.config.domain_height import settle
 from tiler.engine.engine import Engine
+from tiler.engine.run_context import absent_tiles, tile_name
 from tiler.engine.stage import REGION_ITEM, Facts
 from tiler.engine.task import read_notes
-from tiler.georeference.establish import FOOTPRINTS
 from tiler.mesh_files.mesh_parts import MESH_IN_PARTS, describe_parts, note_parts
 from tiler.objects.places import place
-from tiler.planning.context import absent_tiles, tile_name
-from tiler.planning.padded_layout import CORE_STAGE
+from tiler.planning.establish_georeference import FOOTPRINTS
 from tiler.planning.plan import Plan
+from tiler.report.left_out import describe_left_out, tell_left_out
 from tiler.stages.alignment import describe_alignment
 from tiler.stages.approach import RIM
 from tiler.stages.domain import LOW_DOMAIN
+from tiler.stages.own_stages import CORE_STAGE
 from tiler.workflow.empty_run import explain_empty, is_empty
 from tiler.workflow.failed_tiles import Missing, describe_missing
-from tiler.workflow.left_out import describe_left_out, tell_left_out
 
 EXIT_DONE, EXIT_INCOMPLETE = 0, 3
 # Notes of these kinds say that something is missing which the input has: the exit code tells.

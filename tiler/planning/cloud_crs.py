@@ -142,7 +142,7 @@ def choose_plan(
         raise InputError(
             f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}; reproject the cloud to a "
             "projected "
-            f"CRS: {pdal_command(group.first, stated, None)}"
+            f"CRS: {pdal_command(group.first.path, stated, None)}"
         )
     metric = find_metric(stated)
     if metric is None:
@@ -150,7 +150,7 @@ def choose_plan(
         raise InputError(
             f"{group.first.path}: its CRS, {crs_name(stated)}, has axes to the {directions_of(stated)}, and no "
             "register "
-            f"has it with axes east and north; reproject the cloud: {pdal_command(group.first, stated, zone)}"
+            f"has it with axes east and north; reproject the cloud: {pdal_command(group.first.path, stated, zone)}"
         )
     if wish is None or asked.reproject or is_one(metric.crs, wish[1].crs, metric_box(group, metric)):
         return PlanCrs(stated, _with_unit(group, stated, metric, told))
@@ -199,7 +199,7 @@ def _choose_for_degrees(
         f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}, and cells need metres; give "
         "--reproject"
         f"{f' --crs {target}' if target else ''}, or reproject this and every cloud like it: "
-        f"{pdal_command(group.first, stated, target)}"
+        f"{pdal_command(group.first.path, stated, target)}"
     )
 
 
@@ -306,7 +306,7 @@ def _assume_degrees(
     raise InputError(
         f"{group.first.path}: {states}, and its coordinates, {box_words(group.box)}, look like degrees, where "
         f"cells need metres; give --reproject{f' --crs {target}' if target else ''} if they are WGS 84, or "
-        f"reproject it: {pdal_command(group.first, wgs84, target)}"
+        f"reproject it: {pdal_command(group.first.path, wgs84, target)}"
     )
 
 

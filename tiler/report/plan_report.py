@@ -14,10 +14,10 @@ from pipeline.data.errors import ConfigError
 from stitch.tiling.grid import TileGrid, seams_present, tiles_present
 from tiler.config.config import Config
 from tiler.engine.task_limits import machine_memory
-from tiler.footprints.footprint_sample import FootprintSample, sample_footprints
 from tiler.georeference.units import unit_name
 from tiler.monitoring.terminal import plain
 from tiler.planning import forecast as rates
+from tiler.planning.footprint_sample import FootprintSample, sample_footprints
 from tiler.planning.forecast import CELLS_A_POINT, Forecast, forecast_run
 from tiler.planning.plan import Survey, check_sources, survey_inputs
 from tiler.store.atomic import replacing

@@ -13,8 +13,8 @@ from tiler.engine.task import APART
 from tiler.store.atomic import replacing
 from tiler.store.checksums import FILES, GONE, TAIL, find_change, find_file_damage, is_sealed, seal_file
 from tiler.store.folder_lock import is_held
+from tiler.store.out_folder import INDEXES, MANIFEST_PATH, PIECES, RUN_RECORD, STORE
 from tiler.store.store import SUFFIX, Store
-from tiler.workflow.out_folder import INDEXES, MANIFEST_PATH, PIECES, RUN_RECORD, STORE
 
 STRAY = "is not of this run"
 

@@ -8,18 +8,16 @@ from stitch.tiling.grid import Bounds
 from tiler.config.config import Config
 from tiler.config.domain_height import Domain
 from tiler.engine.engine import Engine
+from tiler.engine.run_context import make_layout, pack_tiles
 from tiler.engine.stage import REGION_ITEM
-from tiler.planning.context import make_layout, pack_tiles
 from tiler.planning.pad import Pad, pad_grid
 from tiler.planning.plan import Plan
 from tiler.planning.region import find_pad
 from tiler.stages.approach import RIM, approach_stages, known_rim
 from tiler.stages.domain import layer_stages
+from tiler.store.out_folder import STORE
 from tiler.store.store import Store
 from tiler.workflow.failed_tiles import as_error, bounds_around, config_alone, stop_at_holes
-from tiler.workflow.out_folder import STORE
-
-CORE_STAGE = "model"  # one that has the items of the region without its pad
 
 
 def lay_pad(engine: Engine, config: Config, domain: Domain, pad: Pad, rim_store: Path | None = None) -> None:

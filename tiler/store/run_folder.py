@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Region, TetMesh
-from tiler.citymodels.json_stream import iterate_members, read_members
+from tiler.store.json_stream import iterate_members, read_members
 
 SCHEMA = 1  # of run.json
 RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")

@@ -10,7 +10,6 @@ from tiler.config.domain_height import Domain
 from tiler.config.step_options import derived_parameters
 from tiler.engine.engine import Engine
 from tiler.engine.stage import Stage
-from tiler.planning.padded_layout import CORE_STAGE
 from tiler.stages.alignment import alignment_stages
 from tiler.stages.approach import approach_stages
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
@@ -19,6 +18,8 @@ from tiler.stages.domain import domain_stages, layer_stages
 from tiler.stages.inputs import fill_stage, input_stages, lake_stage
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import fit_stage, piece_stages
+
+CORE_STAGE = "model"  # one that has the items of the region without its pad
 
 
 @dataclass(frozen=True)

@@ -2,28 +2,30 @@
 
 import json
 import os
+import shlex
 from collections.abc import Collection, Iterable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import ConfigError, OutputError
-from tiler.engine.task_limits import TASKS
-from tiler.executors.worker_requirements import PROBE
 from tiler.objects.places import Place, find_within, in_bucket, remove
-from tiler.stages.citymodel import CITY_MODEL, FULL_CITY_MODEL
 from tiler.store.store import MANIFEST
 
 # What a run writes, and all that --overwrite removes; the record is replaced.
 INDEXES = ("mesh.pvtu", "boundary.pvtp")
 PIECES = {"mesh": ".vtu", "boundary": ".vtp"}
+CITY_MODEL, FULL_CITY_MODEL = "citymodel.city.json", "citymodel-full.city.json"  # that was meshed, and before
+CONFIG = "config.toml"  # parameters of the run
+TASKS = ".tasks"  # folder beside the store, with a file for every task that runs
+PROBE = ".cluster.json"  # as long as the tasks of a run are on a cluster
 RUN_RECORD, PROGRESS, EVENTS, STORE = "run.json", "progress.json", "events.jsonl", "store.zarr"
 MANIFEST_PATH = f"{STORE}/{MANIFEST}"
 REPORT = "report.html"
 EARLIER_REPORT = ".report.earlier.html"  # set aside while a run is at work: see `tiler.report.kept_report`
 STALE = (*INDEXES, REPORT)  # what an earlier run said of all of its mesh
 RESULTS = (
-    *(RUN_RECORD, PROGRESS, EVENTS, REPORT, EARLIER_REPORT, "config.toml", CITY_MODEL, FULL_CITY_MODEL),
+    *(RUN_RECORD, PROGRESS, EVENTS, REPORT, EARLIER_REPORT, CONFIG, CITY_MODEL, FULL_CITY_MODEL),
     *(*INDEXES, *PIECES, STORE, TASKS, "only"),
 )
 # A file on its way to its place, of a writer that was killed: see `tiler.store.atomic`.
@@ -209,3 +211,8 @@ def _read_object(path: Place) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+def command_alone(out: Path, tile: str) -> str:
+    """The command that runs one tile alone."""
+    return shlex.join(["citystitch", "run", str(out / CONFIG), "--only", tile, "--traceback"])

@@ -9,19 +9,6 @@ import pyproj
 
 from pipeline.data.errors import InputError
 from pipeline.data.notes import Note
-from tiler.georeference.cloud_crs import (
-    Asked,
-    CloudGroup,
-    PlanCrs,
-    Told,
-    box_around,
-    choose_fallback,
-    choose_height_unit,
-    choose_plan,
-    group_box,
-    group_clouds,
-    read_wish,
-)
 from tiler.georeference.crs import (
     SAME_PLACE,
     crs_name,
@@ -39,6 +26,19 @@ from tiler.georeference.metric import LIKELY, MetricCrs, find_metric
 from tiler.georeference.operation import Operation, find_operation
 from tiler.georeference.units import unit_name
 from tiler.georeference.words import axes_words, boxes_meet
+from tiler.planning.cloud_crs import (
+    Asked,
+    CloudGroup,
+    PlanCrs,
+    Told,
+    box_around,
+    choose_fallback,
+    choose_height_unit,
+    choose_plan,
+    group_box,
+    group_clouds,
+    read_wish,
+)
 from tiler.pointclouds.clouds import CloudHeader
 
 FOOTPRINTS = "the footprints"  # subject of their operation
