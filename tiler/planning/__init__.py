@@ -1,1 +1,1 @@
-"""The plan of a run from headers alone: region, tiles, files, forecast."""
+"""The plan of a run from headers alone: CRS, region, tiles, files, forecast."""

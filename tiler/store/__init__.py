@@ -1,1 +1,1 @@
-"""Results on a disk or in a bucket: arrays, checksums, audit, lock."""
+"""The folder of a run: results, checksums, lock, names of files, record."""
