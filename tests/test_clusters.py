@@ -7,10 +7,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tiler.config.declared import Declared
 
 from stitch.tiling.grid import Key
 from tiler.citymodels.clusters import pack_clusters, place_in_grid, unpack_clusters
+from tiler.config.declared import Declared
 from tiler.engine.stage import Scope
 from tiler.engine.task import Failure, Record, Task, run_task
 from tiler.stages.city import list_members

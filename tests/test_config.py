@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiler.config.config_file import with_file
 
 from pipeline.data.errors import ConfigError
 from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.cli.main import make_parser
 from tiler.config.config import Config, annotated_defaults, load_config, make_config
+from tiler.config.config_file import with_file
 from tiler.interface.synth import write_city
 from tiler.planning.plan import survey_inputs
 

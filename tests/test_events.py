@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tiler.config.config_file import with_file
 
 from pipeline.data.errors import CityError, ConfigError, InputError, OutputError
 from tests.towns import Town, make_town
 from tiler.cli.main import make_parser
 from tiler.config.config import make_config
+from tiler.config.config_file import with_file
 from tiler.engine.stage import Facts, Scope
 from tiler.engine.task import Record
 from tiler.monitoring.events import EventLog, begin_file, numbers, open_log, read_events

@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tiler.config.config_file import with_file
 
 from pipeline.data.errors import CityError, ConfigError, InputError
 from tests.test_run import hashes
 from tests.towns import Town, make_town
 from tiler.cli.main import main, make_parser
 from tiler.config.config import make_config
+from tiler.config.config_file import with_file
 from tiler.engine.task import Record
 from tiler.monitoring.progress import RunProgress, command_line
 from tiler.monitoring.status import read_status
