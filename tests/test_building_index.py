@@ -57,6 +57,7 @@ def test_what_is_no_json_is_an_error_wherever_it_breaks(tmp_path: Path) -> None:
     text = '{"a": [1, {"x": [2]}], "b": {"c": 3.5, "d": "e"}, "f": -4}'
     path = tmp_path / "a.json"
     broken = [text[:end] for end in range(len(text))]
+    broken += [text.replace('"e"', '"\\udcc3"')]  # a byte of a path that is no text, which yajl does not take
     broken += [text + "}", text.replace(":", ";"), text.replace('"b"', "7"), text.replace("],", "] ]")]
     for content in (*broken, "[1]", "3", text.replace("3.5", "NaN"), text.replace("2", "[" * 200 + "]" * 200)):
         path.write_text(content)

@@ -78,6 +78,6 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
             yield file
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); run again") from error
-    except ijson.JSONError as error:
+    except (ijson.JSONError, UnicodeDecodeError) as error:
         reason = str(error).split("\n", maxsplit=1)[0]
         raise InputError(f"{path}: is no JSON ({reason}); run again") from None
