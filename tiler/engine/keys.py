@@ -26,6 +26,7 @@ CODE = (
     "pyamg",
     "laspy",
     "lazrs",
+    "pyarrow",
     "pyogrio",
     "pyproj",
     "deflate",

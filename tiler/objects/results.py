@@ -17,34 +17,6 @@ PREFIX = "citystitch-"  # of temporary folders
 READ_BYTES = 1 << 23  # of one request
 
 
-def publish(folder: Path, target: ObjectPath, last: str) -> None:
-    """Put the files of a folder; one that names the others and their checksums is the last.
-
-    Parameters
-    ----------
-    folder : Path
-        Files of a result, on a disk.
-    target : ObjectPath
-        Where the result will be.
-    last : str
-        The file that is last: whoever finds it, finds all others.
-
-    Notes
-    -----
-    An earlier result of other bytes is taken away first, by the same file: a writer that is killed leaves no
-    result, never parts of two. Two writers of the same bytes do not disturb each other.
-    """
-    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
-    there = target.list_sizes()
-    if last in there and (target / last).read_bytes() != files[last].read_bytes():
-        (target / last).unlink()
-    target.delete([target / name for name in sorted(there.keys() - files.keys())])
-    for name, path in files.items():
-        if name != last:
-            (target / name).put_file(path)
-    (target / last).put_file(files[last])
-
-
 @contextmanager
 def files_for(target: Path) -> Iterator[Path]:
     """Give a folder to write files into: that of a disk itself, of a bucket an empty one, whose files are put.

@@ -169,15 +169,8 @@ def draw_city(
             low, top = shown[:, 2].min(), shown[:, 2].max()
             shown = np.array([(i * half, j * half, z) for i in (-1, 1) for j in (-0.5, 0) for z in (low, top)])
         _light(plotter)
-        azimuth, elevation = VIEW if air is None else CUT_VIEW
         plotter.camera.view_angle = VIEW_ANGLE
-        plotter.camera.position, plotter.camera.focal_point = fit_camera(
-            shown,
-            azimuth=azimuth,
-            elevation=elevation,
-            view_angle=VIEW_ANGLE / MARGIN,
-            aspect=size[0] / size[1],
-        )
+        plotter.camera.position, plotter.camera.focal_point = _aim(shown, size, cut=air is not None)
         plotter.camera.up = (0.0, 0.0, 1.0)
         plotter.reset_camera_clipping_range()
         plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=64)
@@ -191,12 +184,16 @@ def _draw_plainly(city: City, size: tuple[int, int], *, colours: str, edges: boo
     if air is not None:
         add_air(plotter, air, size)
         shown = np.vstack([shown, air.points])
-    azimuth, elevation = VIEW if air is None else CUT_VIEW
-    aspect = size[0] / size[1]
-    position, focal = fit_camera(
-        shown, azimuth=azimuth, elevation=elevation, view_angle=VIEW_ANGLE / MARGIN, aspect=aspect
-    )
-    return plotter.paint(position, focal, view_angle=VIEW_ANGLE, size=size, sky=SKY)
+    return plotter.paint(*_aim(shown, size, cut=air is not None), view_angle=VIEW_ANGLE, size=size, sky=SKY)
+
+
+def _aim(
+    shown: NDArray[np.float64], size: tuple[int, int], *, cut: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Place of the camera, and the point that it looks at, so that the picture holds all that is shown."""
+    azimuth, elevation = CUT_VIEW if cut else VIEW
+    aspect, view_angle = size[0] / size[1], VIEW_ANGLE / MARGIN
+    return fit_camera(shown, azimuth=azimuth, elevation=elevation, view_angle=view_angle, aspect=aspect)
 
 
 def draw_sizes(city: City, size: tuple[int, int]) -> Image:
