@@ -26,7 +26,7 @@ from tiler.engine.stage import Facts, Scope, Stage
 from tiler.engine.task import Task
 from tiler.executors import dask_executor, worker_requirements
 from tiler.executors.remote_cluster import connect
-from tiler.executors.versions import LIBRARIES, MISSING, NATIVE, tell_versions
+from tiler.executors.versions import LIBRARIES, MISSING, NATIVE, describe_versions
 from tiler.executors.worker_requirements import (
     ClusterMismatchError,
     Mismatch,
@@ -57,11 +57,11 @@ def client() -> Iterator[Client]:
 
 
 def other_versions(**others: str) -> dict[str, str]:
-    return tell_versions() | others
+    return describe_versions() | others
 
 
 def test_all_that_computes_is_told() -> None:
-    found = tell_versions()
+    found = describe_versions()
     assert found.keys() == {"python", "citystitch", "dask", "distributed", *LIBRARIES, *NATIVE}
     assert MISSING not in found.values()
     assert found["python"] == f"{sys.version_info[0]}.{sys.version_info[1]}"
@@ -70,13 +70,13 @@ def test_all_that_computes_is_told() -> None:
 def test_every_library_of_the_keys_is_compared() -> None:
     from tiler.engine.keys import CODE
 
-    assert set(CODE) <= tell_versions().keys()
+    assert set(CODE) <= describe_versions().keys()
 
 
 def test_citystitch_counts_by_its_sources(tmp_path: Path) -> None:
     for package in ("pipeline", "stitch", "tiler"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    words = "from tiler.executors.versions import tell_versions; print(tell_versions(())['citystitch'])"
+    words = "from tiler.executors.versions import describe_versions; print(describe_versions(())['citystitch'])"
 
     def ask() -> str:
         command = [sys.executable, "-c", words]
@@ -84,10 +84,10 @@ def test_citystitch_counts_by_its_sources(tmp_path: Path) -> None:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, cwd=tmp_path)
         return done.stdout.strip()
 
-    assert ask() == tell_versions(())["citystitch"]
+    assert ask() == describe_versions(())["citystitch"]
     with (tmp_path / "stitch" / "grid.py").open("a") as file:
         file.write("# a word more\n")
-    assert ask() != tell_versions(())["citystitch"]
+    assert ask() != describe_versions(())["citystitch"]
 
 
 def test_differences_are_a_line_each() -> None:
@@ -121,7 +121,7 @@ def test_other_versions_are_refused(client: Client, monkeypatch: pytest.MonkeyPa
     first, *lines, last = caught.value.lines
     assert first == "tcp://a:1: this cluster cannot take the tasks of this run, and nothing was written"
     assert last.startswith("install the same versions there")
-    there = tell_versions()
+    there = describe_versions()
     assert len(lines) == 3
     assert lines[0] == f"distributed: 1.0 here, {there['distributed']} there (scheduler tcp://a:1)"
     assert lines[1].startswith(f"distributed: 1.0 here, {there['distributed']} there (inproc://")

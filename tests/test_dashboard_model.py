@@ -10,10 +10,10 @@ import pytest
 
 from pipeline.data.errors import InputError
 from tests.simulated_runs import simulate, write_events
-from tiler.dashboard.answer import _tell_step, tell
+from tiler.dashboard.answer import _describe_step, tell
 from tiler.dashboard.codes import STATES, State
 from tiler.dashboard.follow import Follower
-from tiler.dashboard.map_view import MOST_SHOWN, Question, tell_map
+from tiler.dashboard.map_view import MOST_SHOWN, Question, describe_map
 from tiler.dashboard.metrics import families, write_text
 from tiler.dashboard.model import TILE, RunModel
 from tiler.dashboard.series import MOST, Series
@@ -114,7 +114,7 @@ def test_facts_of_tiles_are_values_to_colour_by() -> None:
     model = begun(
         item("done", "houses", "1_0", facts={"cells": 7, "worst_ratio": 0.3, "name": "x", "much": 1e999})
     )
-    found = tell_map(model, "r", Question(value="cells"))
+    found = describe_map(model, "r", Question(value="cells"))
     assert found["rows"] == [[0, State.WAITING, None], [1, State.BEGUN, 7.0]]
     assert found["range"] == [7.0, 7.0]
     assert sorted(model.items[TILE].facts) == ["cells", "worst_ratio"]
@@ -122,19 +122,19 @@ def test_facts_of_tiles_are_values_to_colour_by() -> None:
 
 def test_the_map_tells_what_changed_and_nothing_else() -> None:
     model = begun()
-    first = tell_map(model, "r", Question())
+    first = describe_map(model, "r", Question())
     assert first["whole"]
     assert first["boxes"] == [[0, 0, 10, 10], [10, 0, 20, 10]]
     since = model.version + 1
     model.fold(item("done", "houses", "1_0"))
-    later = tell_map(model, "r", Question(since=since, key=first["key"]))
+    later = describe_map(model, "r", Question(since=since, key=first["key"]))
     assert not later["whole"]
     assert later["rows"] == [[1, State.BEGUN, None]]
     model.fold({"event": "planned", "stage": "late", "scope": "tile", "total": 2})
-    assert tell_map(model, "r", Question(since=model.version + 1, key=first["key"]))["whole"], (
+    assert describe_map(model, "r", Question(since=model.version + 1, key=first["key"]))["whole"], (
         "done is done no more"
     )
-    assert tell_map(model, "another", Question(since=since, key=first["key"]))["whole"]
+    assert describe_map(model, "another", Question(since=since, key=first["key"]))["whole"]
 
 
 @pytest.mark.parametrize("n", [10, MOST_SHOWN, MOST_SHOWN + 1, 20_000])
@@ -148,7 +148,7 @@ def test_a_map_of_any_size_counts_every_tile_once(n: int) -> None:
         {"event": "tiles", "tiles": rows}, {"event": "planned", "stage": "p", "scope": "tile", "total": n},
         item("failed", "p", "3"), *[item("done", "p", str(k), facts={"worst": k}) for k in range(4, n, 2)],
     )  # fmt: skip
-    found = tell_map(model, "r", Question(value="worst"))
+    found = describe_map(model, "r", Question(value="worst"))
     assert len(found["rows"]) <= MOST_SHOWN
     expected = [0] * len(State)
     expected[State.FAILED], expected[State.DONE] = 1, len(range(4, n, 2))
@@ -159,7 +159,7 @@ def test_a_map_of_any_size_counts_every_tile_once(n: int) -> None:
         assert np.sum([row[3] for row in found["rows"]], axis=0).tolist() == expected
         assert [row[1] for row in found["rows"]].count(State.FAILED) == 1
         assert min(row[2] for row in found["rows"] if row[2] is not None) == 4.0, "the worst tile, not the mean"
-        near = tell_map(model, "r", Question(view=(0.0, 0.0, 90.0, 90.0)))
+        near = describe_map(model, "r", Question(view=(0.0, 0.0, 90.0, 90.0)))
         assert near["level"] == 1
         assert len(near["rows"]) == 100
     else:
@@ -269,7 +269,7 @@ def test_stages_are_told_as_steps() -> None:
         item("done", "shapes-0", "0_0", seconds=2.0, total=2),
         item("done", "canopy", "0_0", seconds=3.0, total=1),
     )
-    steps = {name: _tell_step(model, name, names) for name, names in group_stages(model.stages).items()}
+    steps = {name: _describe_step(model, name, names) for name, names in group_stages(model.stages).items()}
     assert {"simplification", "canopy"} <= set(steps)
     assert not {"near-0", "shapes-0"} & set(steps)
     assert (steps["simplification"]["done"], steps["simplification"]["seconds"]) == (2, 3.0)

@@ -21,7 +21,7 @@ from tiler.config.config_file import with_file
 from tiler.engine.stage import Facts, Scope
 from tiler.engine.task import Record
 from tiler.monitoring.events import EventLog, begin_file, numbers, open_log, read_events
-from tiler.monitoring.watchers import RunStart, Watcher, Watchers, tell_command
+from tiler.monitoring.watchers import RunStart, Watcher, Watchers, describe_command
 from tiler.workflow.run import run
 
 BOX = (0.0, 0.0, 10.0, 10.0)
@@ -136,10 +136,10 @@ def test_many_tiles_are_told_in_chunks(tmp_path: Path) -> None:
     ],
 )
 def test_the_command_shows_the_failure(tmp_path: Path, stage: str, scope: Scope, name: str, ends: str) -> None:
-    command = tell_command(start_of(tmp_path), stage, scope, name)
+    command = describe_command(start_of(tmp_path), stage, scope, name)
     assert command.endswith(ends)
     assert make_parser().parse_args(command.split()[1:]).traceback
-    assert (tell_command(start_of(tmp_path, command=""), "fit", Scope.TILE, "1_0")) == ""
+    assert (describe_command(start_of(tmp_path, command=""), "fit", Scope.TILE, "1_0")) == ""
 
 
 def test_numbers_are_finite_and_tell_something() -> None:

@@ -11,7 +11,7 @@ from tests.bad_input import write_cloud, write_houses
 from tests.cities import cloud_over
 from tiler.cli.main import main
 from tiler.config.config import Config, make_config
-from tiler.report.left_out import tell_left_out
+from tiler.report.left_out import report_left_out
 from tiler.stages.domain import LOW_DOMAIN
 from tiler.workflow.run import run
 
@@ -109,7 +109,9 @@ def test_the_terminal_tells_what_is_left_out(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_nothing_is_told_where_all_is_in_the_mesh() -> None:
-    assert tell_left_out({"footprints": 0, "area (m2)": 0.0, "building points": 0, "of building points": 9}) == []
+    assert (
+        report_left_out({"footprints": 0, "area (m2)": 0.0, "building points": 0, "of building points": 9}) == []
+    )
 
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "amsterdam"

@@ -76,7 +76,7 @@ def fragment(task: Task) -> Facts:
     return {"resident": resident_memory()}
 
 
-def tell_memory_now(task: Task) -> Facts:
+def describe_memory_now(task: Task) -> Facts:
     return {"resident": resident_memory()}
 
 
@@ -84,7 +84,7 @@ def test_a_worker_that_holds_much_gives_it_back_before_the_next_task(tmp_path: P
     with local(1, Limits(memory=2 * 2**30)) as executor:
         engine = make(tmp_path, executor, layout=grid_layout())
         engine.run(Stage("fragments", Scope.REGION, fragment))
-        engine.run(Stage("tells", Scope.REGION, tell_memory_now))
+        engine.run(Stage("tells", Scope.REGION, describe_memory_now))
     facts = {stage: record.facts["resident"] for (stage, _), record in engine.records.items()}
     assert facts["fragments"] > 1.5 * TRIM_AT
     assert facts["tells"] < 0.75 * TRIM_AT

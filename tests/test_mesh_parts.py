@@ -18,7 +18,7 @@ from tests.cities import cloud_over
 from tiler.check.check import check_run
 from tiler.config.config import make_config
 from tiler.export.export import export_run
-from tiler.mesh_files.mesh_parts import TileParts, join_tiles, label_triangles, tell_parts
+from tiler.mesh_files.mesh_parts import TileParts, join_tiles, label_triangles, report_parts
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.run_files import find_files, take_largest_part
 from tiler.report import write_report
@@ -75,7 +75,7 @@ def test_the_check_counts_the_same_parts_from_the_files(islands: Path) -> None:
     assert report.facts["parts"] == 2
     record = json.loads((islands / "run.json").read_text())
     (remark,) = report.remarks
-    assert remark == tell_parts([part["cells"] for part in record["parts"]["largest"]])
+    assert remark == report_parts([part["cells"] for part in record["parts"]["largest"]])
     assert report.lines()[-2] == f"NOTE  {remark}"
     assert report.lines()[-1].endswith("everything is proved, but see the note")
 

@@ -54,7 +54,7 @@ from tiler.cli.main import main
 main({[*words, "--workers", str(workers), "--tile-size", "150", "--quiet"]})
 print("imported:", *(name for name in {names} if name in sys.modules))
 """
-    told = tell_in_fresh_process(code).splitlines()[-1]
+    told = run_in_fresh_process(code).splitlines()[-1]
     assert (tmp_path / "out" / "run.json").exists()
     return told.removeprefix("imported:").split()
 
@@ -63,11 +63,11 @@ def test_the_memory_of_this_machine_is_what_dask_finds() -> None:
     assert machine_memory() == memory_limit()
 
 
-def tell_in_fresh_process(code: str) -> str:
+def run_in_fresh_process(code: str) -> str:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
 
 
 def test_the_command_looks_for_garbage_seldom() -> None:
     nowhere = "main(['run', 'no/such.laz', '--workers', '0'])"
     told = f"import gc; from tiler.cli.main import main; {nowhere}; print(gc.get_threshold()[0])"
-    assert tell_in_fresh_process(told) == str(GARBAGE)
+    assert run_in_fresh_process(told) == str(GARBAGE)

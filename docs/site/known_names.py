@@ -51,7 +51,7 @@ def settle_names(app: Sphinx, doctree: Any) -> None:
                 node["reftarget"] = f"{meant.__module__}.{meant.__qualname__}"
 
 
-def tell_unknown(app: Sphinx, env: Any, node: Any, contnode: Any) -> None:
+def describe_unknown(app: Sphinx, env: Any, node: Any, contnode: Any) -> None:
     """Warn of a name of ours that leads nowhere; those that no page describes are left as text."""
     target = node.get("reftarget", "")
     if target.split(".")[0] in PACKAGES and "." in target and not exists(target):
@@ -61,5 +61,5 @@ def tell_unknown(app: Sphinx, env: Any, node: Any, contnode: Any) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Look at all names once they are read, and at those that Sphinx does not find."""
     app.connect("doctree-read", settle_names)
-    app.connect("missing-reference", tell_unknown)
+    app.connect("missing-reference", describe_unknown)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -36,10 +36,10 @@ def describe_buildings(cloud: PointCloud, city: City) -> dict[str, Sequence[obje
     model = city.model
     points = locate_roof_points(cloud, model.polygons, building_class=has_building_class(cloud))
     fidelity = measure_houses(points, model.polygons, model.roof)
-    return tell_buildings(model, city.roof_source, city.measured_roof, fidelity)
+    return report_buildings(model, city.roof_source, city.measured_roof, fidelity)
 
 
-def tell_buildings(
+def report_buildings(
     model: CityModel,
     roof_source: NDArray[np.int8],
     measured_roof: NDArray[np.float64],

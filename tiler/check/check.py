@@ -17,7 +17,7 @@ from tiler.check.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_ve
 from tiler.check.proofs import Dtm, Fault, Finding, Proof, Vertices
 from tiler.check.solid_proofs import SolidProofs
 from tiler.citymodels.building_index import BuildingIndex, index_buildings
-from tiler.mesh_files.mesh_parts import tell_parts
+from tiler.mesh_files.mesh_parts import report_parts
 from tiler.mesh_files.vtk_files import read_piece_paths
 from tiler.store.out_folder import CITY_MODEL, RUN_RECORD, STORE
 from tiler.store.run_folder import PARTS, RunRecord, read_run_record
@@ -115,7 +115,7 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
         claims, facts = _conclude(sums, len(files), record, index)
         claims += (solids.prove(),)
         parts = sums.count_parts()
-        remarks = (tell_parts(parts),) if len(parts) > 1 else ()
+        remarks = (report_parts(parts),) if len(parts) > 1 else ()
         return CheckReport(directory, claims, {**facts, "parts": len(parts)}, remarks)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from tiler.dashboard.codes import State
 from tiler.dashboard.follow import Follower
-from tiler.dashboard.map_view import Question, tell_map
+from tiler.dashboard.map_view import Question, describe_map
 from tiler.dashboard.model import SEAM, TILE, RunModel
 from tiler.monitoring.tally import StageTally, estimate_share, estimate_time
 from tiler.words.note_words import say_notes
@@ -37,29 +37,29 @@ def tell(follower: Follower, question: Question) -> dict[str, Any]:
     with follower.lock:
         follower.advance()
         model = follower.model
-        found = tell_map(model, follower.run, question)
+        found = describe_map(model, follower.run, question)
         fresh = found["whole"]
         since = 0 if fresh else question.since
         answer: dict[str, Any] = {
             "run": follower.run,
             "version": model.version + 1,
             "read": round(follower.share, 4),
-            "head": tell_head(model, alive=alive),
-            "stages": [_tell_step(model, step, names) for step, names in group_stages(model.stages).items()],
-            "at_work": _tell_at_work(model, alive=alive),
+            "head": describe_head(model, alive=alive),
+            "stages": [_describe_step(model, step, names) for step, names in group_stages(model.stages).items()],
+            "at_work": _describe_at_work(model, alive=alive),
             "series": {"width": model.series.width, "rows": model.series.rows()},
             "values": list_values(model),
             "n_failures": model.n_failures,
             "map": found,
         }
         if fresh or any(one.version >= since for one in model.failures):
-            answer["failures"] = _tell_failures(model)
+            answer["failures"] = _describe_failures(model)
         if fresh or any(version >= since for _, _, version in model.messages):
             answer["messages"] = [[round(t, 1), text] for t, text, _ in model.messages]
     return answer
 
 
-def tell_head(model: RunModel, *, alive: bool) -> dict[str, Any]:
+def describe_head(model: RunModel, *, alive: bool) -> dict[str, Any]:
     """Tell what run it is, how it stands, and how long it may take still (s), None where nobody knows."""
     status = model.standing(alive=alive)
     taken = {name: model.head.get(name) for name in ("error", "command", "bounds", "crs", "tile_size", "workers")}
@@ -102,7 +102,7 @@ def _tally(model: RunModel) -> dict[str, StageTally]:
     }
 
 
-def _tell_step(model: RunModel, step: str, names: Iterable[str]) -> dict[str, Any]:
+def _describe_step(model: RunModel, step: str, names: Iterable[str]) -> dict[str, Any]:
     """Add up the stages of a step (`tiler.words.stage_groups`)."""
     stages = [model.stages[name] for name in names]
     counts = sum((stage.counts for stage in stages), Counter[int]())
@@ -123,7 +123,7 @@ def _tell_step(model: RunModel, step: str, names: Iterable[str]) -> dict[str, An
     }
 
 
-def _tell_at_work(model: RunModel, *, alive: bool) -> list[list[Any]]:
+def _describe_at_work(model: RunModel, *, alive: bool) -> list[list[Any]]:
     """List what runs, longest first."""
     now = time.time() if alive else model.last
     running = [(item, since) for item, since in model.at_work.items() if item not in model.queued]
@@ -131,7 +131,7 @@ def _tell_at_work(model: RunModel, *, alive: bool) -> list[list[Any]]:
     return [[title_of_stage(stage), name, round(max(now - since, 0.0), 1)] for (stage, name), since in longest]
 
 
-def _tell_failures(model: RunModel) -> list[dict[str, Any]]:
+def _describe_failures(model: RunModel) -> list[dict[str, Any]]:
     last: Iterable[Any] = list(model.failures)[-SHOWN_FAILURES:]
     return [
         {

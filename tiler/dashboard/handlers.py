@@ -15,7 +15,7 @@ from pipeline.data.errors import CityError
 from tiler.dashboard.answer import tell
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.map_view import Box, Question
-from tiler.dashboard.metrics import CONTENT_TYPE, tell_metrics, write_text
+from tiler.dashboard.metrics import CONTENT_TYPE, describe_metrics, write_text
 from tiler.dashboard.server import PREFIX
 
 HERE = Path(__file__).parent
@@ -132,7 +132,7 @@ class Metrics(Base):
     async def get(self) -> None:
         """Send all metrics."""
         try:
-            await self.reply(lambda: (write_text(tell_metrics(self.follower)), CONTENT_TYPE))
+            await self.reply(lambda: (write_text(describe_metrics(self.follower)), CONTENT_TYPE))
         except CityError as error:
             raise HTTPError(503, reason="the run cannot be read") from error
 

@@ -44,7 +44,7 @@ class Question:
     key: str = ""
 
 
-def tell_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
+def describe_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
     """Tell a map.
 
     Parameters
@@ -92,7 +92,7 @@ def tell_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
     }
     if part.level == 1:
         rows, names = _rows(codes, values, changed >= since), [tiles.names[k] for k in part.inside.tolist()]
-        answer |= _tell_seams(model.items[SEAM], question, since, whole=whole)
+        answer |= _describe_seams(model.items[SEAM], question, since, whole=whole)
     else:
         names = []
         counts = tally(codes, part.group, len(part.first))
@@ -105,7 +105,7 @@ def tell_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
     return answer | {"rows": rows}
 
 
-def _tell_seams(seams: Items, question: Question, since: int, *, whole: bool) -> dict[str, Any]:
+def _describe_seams(seams: Items, question: Question, since: int, *, whole: bool) -> dict[str, Any]:
     boxes = seams.boxes()
     inside = _find_inside(boxes, question.view)
     if question.stage and not seams.members(question.stage):

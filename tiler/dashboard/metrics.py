@@ -107,7 +107,7 @@ def families(model: RunModel, *, alive: bool, share: float = 1.0) -> list[Family
     return found
 
 
-def tell_metrics(follower: Follower) -> list[Family]:
+def describe_metrics(follower: Follower) -> list[Family]:
     """Read what is new of a run, and give its metrics; InputError as of `Follower.advance`."""
     alive = follower.alive()
     with follower.lock:
@@ -155,7 +155,7 @@ class Collector:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         try:
-            metrics = tell_metrics(self._follower)
+            metrics = describe_metrics(self._follower)
         except CityError:
             return
         for one in metrics:

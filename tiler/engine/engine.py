@@ -20,7 +20,7 @@ from pipeline.data.errors import CityError
 from tiler.config.declared import Declared
 from tiler.engine.absent_tiles import Gaps
 from tiler.engine.executor import Executor
-from tiler.engine.failures import Policy, SetAside, ends_the_run, tell_reason, tries
+from tiler.engine.failures import Policy, SetAside, describe_reason, ends_the_run, tries
 from tiler.engine.keys import declared_values, file_identity, item_key, stage_digest
 from tiler.engine.records import Records
 from tiler.engine.stage import Box, Layout, Scope, Stage
@@ -225,7 +225,7 @@ class Engine:
         self.layout, self.context = layout, context
         self._gaps = Gaps(layout.absent)
 
-    def tell_layout(self) -> None:
+    def describe_layout(self) -> None:
         """Tell a `Watch` the items of the layout, where they are not those that the run began with."""
         if self._watch is not None:
             self._watch.laid_out(self.layout)
@@ -525,20 +525,20 @@ class _Run:
             return
         if ends_the_run(failure, stage.scope, engine._policy):
             if engine._watch is not None:
-                engine._watch.failed(stage.name, task.name, tell_reason(failure.error))
+                engine._watch.failed(stage.name, task.name, describe_reason(failure.error))
             raise _named(failure.error, stage, task.name)
         engine.set_aside[stage.name, task.name] = SetAside(
             stage.name,
             task.name,
             stage.scope,
             failure.kind,
-            tell_reason(failure.error),
+            describe_reason(failure.error),
             failure.trace,
             self.tried[ticket],
             task.refs,
             task.file,
         )
-        self._lose(ticket, task.name, tell_reason(failure.error))
+        self._lose(ticket, task.name, describe_reason(failure.error))
 
     def _lose(self, ticket: int, name: str, reason: str, needs: Item | None = None) -> None:
         """Go on without an item."""

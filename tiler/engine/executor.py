@@ -7,7 +7,7 @@ from typing import Protocol
 
 from tiler.engine.stage import Facts
 from tiler.engine.task import Failure, Record, Task, run_task
-from tiler.engine.task_limits import Limits, tell_memory
+from tiler.engine.task_limits import Limits, describe_memory
 
 Function = Callable[[Task], Facts]
 Outcome = Record | Failure
@@ -51,7 +51,7 @@ class Serial:
         ticket, function, task = self._queue.popleft()
         outcome = run_task(function, task)
         if isinstance(outcome, Failure) and outcome.kind == "memory":
-            outcome = tell_memory(outcome, Limits())
+            outcome = describe_memory(outcome, Limits())
         return ticket, outcome
 
     def drop_waiting(self) -> set[int]:

@@ -86,7 +86,7 @@ def ends_the_run(failure: Failure, scope: Scope, policy: Policy) -> bool:
     return not policy.set_aside or scope is Scope.REGION or isinstance(failure.error, (OutputError, ConfigError))
 
 
-def tell_reason(error: Exception) -> str:
+def describe_reason(error: Exception) -> str:
     """An error as one line: its type too, where its message was not written for users."""
     text = " ".join(str(error).split())
     return text if isinstance(error, CityError) else f"{type(error).__name__}: {text}"

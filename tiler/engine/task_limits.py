@@ -97,7 +97,7 @@ def _watched(path: Path, file: TextIO, seconds: float) -> Iterator[None]:
         path.unlink()
 
 
-def tell_death(task: Task, limits: Limits) -> Failure | None:
+def describe_death(task: Task, limits: Limits) -> Failure | None:
     """Tell from its file how a task ended whose process died; None if it had not begun.
 
     The file goes.
@@ -121,7 +121,7 @@ def tell_death(task: Task, limits: Limits) -> Failure | None:
     return Failure(WorkerError(words), "", "killed")
 
 
-def tell_memory(failure: Failure, limits: Limits) -> Failure:
+def describe_memory(failure: Failure, limits: Limits) -> Failure:
     """Put the limit and the way out into the error of a task that was refused memory."""
     bound = f"the limit of a worker, {limits.memory / 2**30:.2f} GiB" if limits.memory else "what the machine has"
     return Failure(

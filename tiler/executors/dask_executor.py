@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from pipeline.data.errors import CityError
 from tiler.engine.executor import LEAST_TASKS, TASKS_PER_WORKER, Function, Outcome
 from tiler.engine.task import Failure, Task
-from tiler.engine.task_limits import Limits, WorkerError, run_guarded, tell_death, tell_memory
+from tiler.engine.task_limits import Limits, WorkerError, describe_death, describe_memory, run_guarded
 from tiler.executors.worker_requirements import (
     ClusterMismatchError,
     Mismatch,
@@ -204,11 +204,11 @@ class DaskExecutor:
 
         match found:
             case Failure(kind="memory"):
-                return tell_memory(found, self._limits)
+                return describe_memory(found, self._limits)
             case Mismatch():
                 return Failure(found.as_error(self._address))
             case KilledWorker():
-                death = tell_death(given.task, self._limits)
+                death = describe_death(given.task, self._limits)
                 if death is not None and self._forgives(given.task, death):
                     return None
                 return death or self._bystander(given.ticket)

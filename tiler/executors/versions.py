@@ -26,7 +26,7 @@ NATIVE = {  # libraries within those, by the module and the attribute that tell
 }
 
 
-def tell_versions(only: "tuple[str, ...] | None" = None) -> "dict[str, str]":
+def describe_versions(only: "tuple[str, ...] | None" = None) -> "dict[str, str]":
     """Versions by name, in this process; `MISSING` for what is not installed.
 
     Parameters
@@ -39,9 +39,9 @@ def tell_versions(only: "tuple[str, ...] | None" = None) -> "dict[str, str]":
     Of Python major and minor version count. Of citystitch the sources count, as 8 hexadecimal digits of a hash:
     two states between two releases have one version.
     """
-    found = {"python": f"{sys.version_info[0]}.{sys.version_info[1]}", "citystitch": _tell_ours()}
+    found = {"python": f"{sys.version_info[0]}.{sys.version_info[1]}", "citystitch": _describe_ours()}
     for name in (*TRANSPORT, *LIBRARIES) if only is None else only:
-        found[name] = _tell_library(name)
+        found[name] = _describe_library(name)
     for name, (module, attribute) in NATIVE.items() if only is None else ():
         try:
             found[name] = str(getattr(importlib.import_module(module), attribute))
@@ -55,14 +55,14 @@ def digest_versions(versions: "dict[str, str]") -> str:
     return hashlib.blake2b(json.dumps(versions, sort_keys=True).encode(), digest_size=8).hexdigest()
 
 
-def _tell_library(name: str) -> str:
+def _describe_library(name: str) -> str:
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return MISSING
 
 
-def _tell_ours() -> str:
+def _describe_ours() -> str:
     """A hash of the sources of citystitch, installed or not."""
     hashed = hashlib.blake2b(digest_size=4)
     for package in OURS:

@@ -18,7 +18,7 @@ from typing import Any
 
 from pipeline.data.errors import ConfigError
 from tiler.executors import versions
-from tiler.executors.versions import TRANSPORT, digest_versions, tell_versions
+from tiler.executors.versions import TRANSPORT, describe_versions, digest_versions
 from tiler.store.atomic import replacing
 from tiler.store.out_folder import PROBE
 
@@ -27,7 +27,7 @@ INPUTS = 20  # files of the inputs that each worker looks for
 ANSWER, LATE_ANSWER = 60.0, 5.0  # s that workers may take to answer, before a run and in it
 NAMED = 3  # workers that are named in a line; the others are counted
 # Runs the text of `tiler.executors.versions` where there may be no citystitch.
-ASK_VERSIONS = "exec(source, scope := {}) or scope['tell_versions'](only)"
+ASK_VERSIONS = "exec(source, scope := {}) or scope['describe_versions'](only)"
 EARLY = "this cluster cannot take the tasks of this run, and nothing was written"
 LATE = "a worker has joined that cannot take tasks of this run; all that was done is kept"
 ADVICE = (
@@ -100,7 +100,7 @@ class Mismatch:
 @functools.cache
 def own_versions() -> Versions:
     """Versions of this process, as they were when it was asked first: what is installed may change meanwhile."""
-    return tell_versions()
+    return describe_versions()
 
 
 def own_requirements() -> Requirements:

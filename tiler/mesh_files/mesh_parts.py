@@ -182,14 +182,14 @@ def describe_parts(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"n": len(parts)} | ({"largest": list(parts[:LISTED_PARTS])} if len(parts) > 1 else {})
 
 
-def tell_parts(cells: Sequence[int], n: int | None = None) -> str:
+def report_parts(cells: Sequence[int], n: int | None = None) -> str:
     """Write in how many parts a mesh is, given the cells of the largest, and their number where there are more.
 
     Examples
     --------
-    >>> tell_parts([700])
+    >>> report_parts([700])
     'the mesh is one part: all cells hang together by faces'
-    >>> tell_parts([2000, 700, 10])
+    >>> report_parts([2000, 700, 10])
     'the mesh is 3 parts that share no face: of 2,000, 700 and 10 cells'
     """
     n = len(cells) if n is None else n
@@ -203,7 +203,7 @@ def note_parts(parts: Sequence[Mapping[str, Any]]) -> list[Note]:
     """Make the note on a mesh in several parts; none where it is one."""
     if len(parts) <= 1:
         return []
-    told = tell_parts([part["cells"] for part in parts])
+    told = report_parts([part["cells"] for part in parts])
     tiles = parts[1]["tiles"]
     smaller = f"tiles of the second one: {', '.join(tiles[:3])}{' and more' if len(tiles) > 3 else ''}"
     move = "no flow passes between them: close the gap, mesh them apart by --bounds, or export --largest-part"

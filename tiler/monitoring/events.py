@@ -14,7 +14,7 @@ from typing import Any
 from pipeline.data.errors import ConfigError, InputError, OutputError
 from tiler.engine.stage import Box, Facts, Layout, Scope
 from tiler.engine.task import Record
-from tiler.monitoring.watchers import Item, RunStart, Watcher, tell_command
+from tiler.monitoring.watchers import Item, RunStart, Watcher, describe_command
 from tiler.store.atomic import replacing
 from tiler.store.checksums import FILES
 
@@ -79,14 +79,14 @@ class EventLog(Watcher):
     def begin(self, start: RunStart) -> None:
         """Write what the run is, its tiles and seams, and the stages that it will have."""
         self._start = start
-        self._tell_run("running", "")
-        self._tell_boxes(start.tiles, start.seams)
+        self._describe_run("running", "")
+        self._describe_boxes(start.tiles, start.seams)
         for stage, (scope, total) in start.expected.items():
             self.planned(stage, scope, total)
 
     def laid_out(self, layout: Layout) -> None:
         """Write the tiles and seams of another layout; those that were there keep their boxes."""
-        self._tell_boxes(layout.tiles, layout.seams)
+        self._describe_boxes(layout.tiles, layout.seams)
 
     def planned(self, stage: str, scope: Scope, total: int) -> None:
         """Write how many items a stage has."""
@@ -116,7 +116,7 @@ class EventLog(Watcher):
         """Write that an item failed, or is not run."""
         command = ""
         if needs is None and self._start is not None:
-            command = tell_command(self._start, stage, self._scopes[stage], name)
+            command = describe_command(self._start, stage, self._scopes[stage], name)
         self._add("failed", stage=stage, name=name, reason=reason, command=command)
 
     def say(self, text: str) -> None:
@@ -130,19 +130,19 @@ class EventLog(Watcher):
             self._thread.join()
         try:
             self._error = None  # tried once more
-            self._tell_run(status, error)
+            self._describe_run(status, error)
             self._write()
             self._raise()
         finally:
             os.close(self._file)
 
-    def _tell_boxes(self, tiles: Mapping[str, Box], seams: Mapping[str, Box]) -> None:
+    def _describe_boxes(self, tiles: Mapping[str, Box], seams: Mapping[str, Box]) -> None:
         for kind, boxes in (("tiles", tiles), ("seams", seams)):
             places = ((name, *box) for name, box in boxes.items())
             while chunk := list(islice(places, CHUNK)):
                 self._add(kind, **{kind: chunk})
 
-    def _tell_run(self, status: str, error: str) -> None:
+    def _describe_run(self, status: str, error: str) -> None:
         start = self._start
         known: dict[str, Any] = {}
         if start is not None:

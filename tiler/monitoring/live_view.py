@@ -12,7 +12,7 @@ from rich.text import Text
 from tiler.engine.stage import Scope
 from tiler.engine.task import Record
 from tiler.monitoring.plain_view import Line, Lines
-from tiler.monitoring.tally import StageTally, Tally, tell_duration
+from tiler.monitoring.tally import StageTally, Tally, format_duration
 from tiler.monitoring.watchers import Item, RunStart, Watcher
 from tiler.words.note_words import say_notes
 from tiler.words.plain_text import printable
@@ -137,7 +137,9 @@ def draw(tally: Tally, width: int, height: int, *, plain: bool = False) -> Text:
 
 
 def _draw_stage(tally: Tally, name: str, state: StageTally, width: int, *, plain: bool) -> Text:
-    words = f" {f'{state.done:,}/{state.total:,}':>13} {_tell_rate(tally.rate(state)):>9} {_tell_mean(state):>13}"
+    words = (
+        f" {f'{state.done:,}/{state.total:,}':>13} {_format_rate(tally.rate(state)):>9} {_format_mean(state):>13}"
+    )
     more = f"  {state.running:,} in hand" if width >= WIDE else ""
     more += f"  {state.failed:,} failed" if state.failed else ""
     share = state.done / state.total if state.total else 0.0
@@ -155,7 +157,7 @@ def _draw_all(tally: Tally, width: int, *, plain: bool) -> Text:
     elif finished == len(groups):
         when = "writing it down"
     else:
-        when = "" if left is None else f"~ {tell_duration(left)} left"
+        when = "" if left is None else f"~ {format_duration(left)} left"
     row = _bar("all", share, width, plain=plain)
     row.stylize("bold", 0, NAME)
     return row.append(f" {share:4.0%} {when:>15}  {finished:,} of {len(groups):,} steps")
@@ -189,13 +191,13 @@ def _bar(name: str, share: float, width: int, *, plain: bool) -> Text:
     return row.append((PLAIN_EMPTY if plain else EMPTY) * (length - done), "dim")
 
 
-def _tell_rate(rate: float) -> str:
+def _format_rate(rate: float) -> str:
     if not rate:
         return ""
     return f"{rate:,.1f}/s" if rate >= 1 else f"{60 * rate:.1f}/min"
 
 
-def _tell_mean(state: StageTally) -> str:
+def _format_mean(state: StageTally) -> str:
     ran = state.done - state.reused
     return f"{state.seconds / ran:,.2f} s each" if ran > 0 else ""
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from tiler.engine.stage import Scope
 from tiler.engine.task import Record
-from tiler.monitoring.tally import StageTally, Tally, tell_duration
+from tiler.monitoring.tally import StageTally, Tally, format_duration
 from tiler.monitoring.watchers import Item, RunStart, Watcher
 from tiler.words.note_words import say_notes
 from tiler.words.plain_text import printable
@@ -58,14 +58,14 @@ class Lines(Watcher):
             notes = "".join(f", {say_notes(kind, n)}" for kind, n in record.notes.items())
             self._put(Line(f"    {title_of_stage(stage)} {record.name}  {what}{notes}"))
         if done == total:
-            self._tell_group(group_of_stage(stage))
+            self._describe_group(group_of_stage(stage))
 
-    def _tell_group(self, group: str) -> None:
+    def _describe_group(self, group: str) -> None:
         """Tell a group when nothing of it is left."""
         state = self._tally.groups()[group]
         if not state.left and group not in self._told:
             self._told.add(group)
-            self._put(Line(tell_group(group, state)))
+            self._put(Line(describe_group(group, state)))
 
     def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
         """Tell a failure; an item that is not run because of it only where each item is told."""
@@ -112,7 +112,7 @@ class PlainView(Watcher):
         self._lines(stage, done, total, record)
         if done < total and time.monotonic() - self._printed >= self._every:
             left = self._tally.time_left()
-            words = f", ~ {tell_duration(left)} left" if left is not None else ""
+            words = f", ~ {format_duration(left)} left" if left is not None else ""
             group = group_of_stage(stage)
             state = self._tally.groups()[group]
             self._print(Line(f"  {group}: {state.done:,} of {state.total:,} tasks{words}"))
@@ -141,13 +141,15 @@ class QuietView(Watcher):
         self._lines.failed(stage, name, reason, needs)
 
 
-def tell_group(group: str, state: StageTally) -> str:
+def describe_group(group: str, state: StageTally) -> str:
     """Write a finished group of stages, and number and time of its tasks.
 
     Examples
     --------
-    >>> tell_group("terrain", StageTally(37, done=37, seconds=1.5)), tell_group("points", StageTally(1, done=1))
-    ('  terrain          37 tasks      1.50 s', '  points            1 task       0.00 s')
+    >>> describe_group("terrain", StageTally(37, done=37, seconds=1.5))
+    '  terrain          37 tasks      1.50 s'
+    >>> describe_group("points", StageTally(1, done=1))
+    '  points            1 task       0.00 s'
     """
     tasks = "task " if state.total == 1 else "tasks"
     failed = f"  {state.failed:,} failed" if state.failed else ""

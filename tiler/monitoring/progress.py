@@ -90,7 +90,7 @@ class RunProgress(Watcher):
             "directory": os.getcwd(),
             "command": command_line(config) if command is None else command,
             "parameters": dataclasses.asdict(config),
-            "started": tell_time(self._started),
+            "started": format_time(self._started),
         }
         self.write("running")
 
@@ -150,13 +150,13 @@ class RunProgress(Watcher):
         in_hand = sorted(self._in_hand.items(), key=lambda item: item[1])
         running = Counter(stage for stage, _ in self._in_hand)
         content = self._head | {
-            "updated": tell_time(time.time()),
+            "updated": format_time(time.time()),
             "status": status,
             "error": error,
             "stages": {name: _tell(stage, running[name]) for name, stage in self.stages.items()},
             "n_running": len(in_hand),
             "running": [
-                {"stage": stage, "name": name, "since": tell_time(since)}
+                {"stage": stage, "name": name, "since": format_time(since)}
                 for (stage, name), since in in_hand[:LISTED]
             ],
             "notes": dict(sorted(self._notes.items())),
@@ -178,12 +178,12 @@ def _tell(stage: StageProgress, running: int) -> dict[str, Any]:
     return {name: value for name, value in told.items() if value is not None}
 
 
-def tell_time(seconds: float) -> str:
+def format_time(seconds: float) -> str:
     """Write a time, in seconds since 1970, as ISO 8601 in UTC.
 
     Examples
     --------
-    >>> tell_time(0.0)
+    >>> format_time(0.0)
     '1970-01-01T00:00:00+00:00'
     """
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")

@@ -240,12 +240,12 @@ def share_of(stage: str) -> float:
     return SHARES.get(stage.rstrip("0123456789"), SMALL_SHARE)
 
 
-def tell_duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Write a time in the words of an estimate.
 
     Examples
     --------
-    >>> [tell_duration(seconds) for seconds in (0.2, 42.0, 100.0, 4000.0, 200000.0)]
+    >>> [format_duration(seconds) for seconds in (0.2, 42.0, 100.0, 4000.0, 200000.0)]
     ['1 s', '42 s', '2 min', '1 h 7 min', '2 d 7 h']
     """
     minutes = round(seconds / 60)

@@ -63,7 +63,7 @@ def print_summary(record: dict[str, Any], out: Path, *, console: Console | None 
     console = console or Console(highlight=False)
     counts = record["counts"]
     console.print(
-        f"[bold]{counts['cells']:,}[/] cells, {counts['points']:,} points, {tell_buildings(counts)} "
+        f"[bold]{counts['cells']:,}[/] cells, {counts['points']:,} points, {report_buildings(counts)} "
         f"in {record['seconds_total']:.1f} s, peak memory {record['peak_memory_bytes'] / 2**20:.0f} MiB"
     )
     _print_quality(record, console)
@@ -80,12 +80,12 @@ def print_summary(record: dict[str, Any], out: Path, *, console: Console | None 
         console.print(f"{'     ' if k else 'next:'} {plain(shlex.join(words))}", soft_wrap=True)
 
 
-def tell_buildings(counts: Mapping[str, int]) -> str:
+def report_buildings(counts: Mapping[str, int]) -> str:
     """Write how many buildings a mesh has, and their parts where these are more.
 
     Examples
     --------
-    >>> tell_buildings({"buildings": 1036, "building parts": 1531}), tell_buildings({"buildings": 1})
+    >>> report_buildings({"buildings": 1036, "building parts": 1531}), report_buildings({"buildings": 1})
     ('1,036 buildings (1,531 parts)', '1 building')
     """
     n, parts = counts["buildings"], counts.get(PARTS, counts["buildings"])

@@ -168,7 +168,7 @@ class Watchers(Watcher):
                 stack.callback(watcher.end, status, error)
 
 
-def tell_command(start: RunStart, stage: str, scope: Scope, name: str) -> str:
+def describe_command(start: RunStart, stage: str, scope: Scope, name: str) -> str:
     """Give the command that shows an item's failure: that of a tile alone, else of the whole run, if it has one.
 
     Parameters

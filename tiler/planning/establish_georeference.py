@@ -135,7 +135,7 @@ def establish_georeference(
     region = box_around([cloud.bounds for cloud in placed.values()])
     frame, operation = _place_footprints(footprints, extent, crs, region, plans, groups, placed, told)
     operations |= {} if operation is None else {FOOTPRINTS: operation}
-    _tell_stray(list(placed.values()), crs, told)
+    _describe_stray(list(placed.values()), crs, told)
     record = {
         "crs": crs_name(crs),
         "scale of the projection": round(scale, 6),
@@ -297,7 +297,7 @@ def _place_footprints(
     return footprint_frame(flat, crs, box, told.say)
 
 
-def _tell_stray(clouds: Sequence[CloudHeader], crs: pyproj.CRS, told: Told) -> None:
+def _describe_stray(clouds: Sequence[CloudHeader], crs: pyproj.CRS, told: Told) -> None:
     stray = [cloud for cloud in clouds if not is_on_its_place(cloud.bounds, crs)]
     if stray:
         more = f" and {len(stray) - 1} more point clouds lie" if len(stray) > 1 else " lies"

@@ -67,12 +67,12 @@ def find_reason(building: str, notes: Sequence[Note]) -> str:
     return "less than half of it is under buildings of the mesh"
 
 
-def tell_left_out(found: Mapping[str, Any]) -> list[str]:
+def report_left_out(found: Mapping[str, Any]) -> list[str]:
     """Write it in sentences; none where all is in the mesh.
 
     Examples
     --------
-    >>> tell_left_out({"footprints": 1, "area (m2)": 412.3, "building points": 1200, "of building points": 4800,
+    >>> report_left_out({"footprints": 1, "area (m2)": 412.3, "building points": 1200, "of building points": 4800,
     ...     "in left-out footprints": 1150, "beside footprints": 50,
     ...     "tallest": {"id": "a", "height (m)": 53.83, "x": 1.0, "y": 2.0, "reason": "it crosses the border"}})
     ... # doctest: +NORMALIZE_WHITESPACE

@@ -17,7 +17,7 @@ SIZE = (1120, 700)
 QUALITY = 84  # of JPEG
 
 
-def tell_pictures(directory: Path) -> Iterator[str]:
+def describe_pictures(directory: Path) -> Iterator[str]:
     """Show the city, the mesh cut open, and the quality of cells at the boundary.
 
     Parameters

@@ -13,11 +13,11 @@ from pipeline.quality.residuals import ResidualSums, conclude
 from stitch.tiling.grid import make_grid, tile_box
 from tiler.config.config import Config
 from tiler.engine.run_context import tile_key
-from tiler.mesh_files.mesh_parts import tell_parts
+from tiler.mesh_files.mesh_parts import report_parts
 from tiler.monitoring.progress import command_line
 from tiler.report.charts import Series, draw_bars, draw_gantt, draw_histogram, rebin
 from tiler.report.collect import Bins, Numbers
-from tiler.report.left_out import tell_left_out
+from tiler.report.left_out import report_left_out
 from tiler.report.maps import draw_map, gather_tiles
 from tiler.report.page import figure, figures, folded, heading, number, paragraph, table, text
 from tiler.report.record import PLACES, SHOWN, NoteGroup, RunFacts
@@ -25,7 +25,7 @@ from tiler.report.samples import NEAR, Samples
 from tiler.report.timeline import Timeline
 from tiler.store.run_folder import PARTS, WRONG_FIELD
 from tiler.words.note_words import GROUPS, group_of, say_notes
-from tiler.words.plain_text import tell_box
+from tiler.words.plain_text import format_box
 from tiler.words.stage_groups import group_stages, title_of_stage
 
 PERCENTILES = (0, 0.1, 1, 5, 50, 95, 100)
@@ -67,7 +67,7 @@ SURFACES = {
 }
 
 
-def tell_summary(facts: RunFacts) -> Iterator[str]:
+def describe_summary(facts: RunFacts) -> Iterator[str]:
     """Say how the run ended, and its key figures."""
     members = facts.members
     status, counts, bounds = members["status"], members.get("counts", {}), facts.bounds
@@ -77,9 +77,9 @@ def tell_summary(facts: RunFacts) -> Iterator[str]:
         yield paragraph("The mesh is whole but for parts that are listed below (exit code 3).", "bad")
     else:
         yield paragraph("The mesh is whole: every tile was meshed.")
-    lost = tell_left_out(members.get("left_out") or {})
+    lost = report_left_out(members.get("left_out") or {})
     if members.get("parts", {}).get("n", 1) > 1:
-        yield paragraph(f"{_tell_parts(members['parts'])}: no flow passes between them.", "bad")
+        yield paragraph(f"{_describe_parts(members['parts'])}: no flow passes between them.", "bad")
     if lost:
         yield heading("Buildings that are not in the mesh")
         yield _bullets(lost)
@@ -104,7 +104,7 @@ def tell_summary(facts: RunFacts) -> Iterator[str]:
         yield _bullets(messages)
 
 
-def tell_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -> Iterator[str]:
+def describe_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -> Iterator[str]:
     """Show the tiles over the footprints, by quality, cells, and time where it is known."""
     tiles, members, bounds = facts.tiles, facts.members, facts.bounds
     assert bounds is not None
@@ -112,7 +112,7 @@ def tell_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -> It
     size = float(region["tile_size"])
     missing = list(_find_missing(facts))
     yield paragraph(
-        f"Region {tell_box(bounds)} in {region['crs']}, tiles of {size:g} m: "
+        f"Region {format_box(bounds)} in {region['crs']}, tiles of {size:g} m: "
         f"{len(tiles.names):,} meshed, {len(region.get('absent', ())):,} absent, "
         f"{facts.lengths.get('missing', 0):,} missing."
     )
@@ -153,7 +153,7 @@ def tell_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -> It
     yield f'<div class="pair">{"".join(maps)}</div>'
 
 
-def tell_quality(facts: RunFacts, numbers: Numbers, samples: Samples) -> Iterator[str]:
+def describe_quality(facts: RunFacts, numbers: Numbers, samples: Samples) -> Iterator[str]:
     """Show percentiles and histograms of the quality of cells: of all, and of those near seams."""
     head = ["percentile", *(f"{p:g}" for p in PERCENTILES)]
     near = f"cells within {NEAR:g} m of seams"
@@ -179,7 +179,7 @@ def tell_quality(facts: RunFacts, numbers: Numbers, samples: Samples) -> Iterato
     yield f'<div class="pair">{"".join(charts)}</div>'
 
 
-def tell_heights(facts: RunFacts, numbers: Numbers) -> Iterator[str]:
+def format_heights(facts: RunFacts, numbers: Numbers) -> Iterator[str]:
     """Show heights of buildings and terrain."""
     if domain := facts.members.get("domain"):
         names = {"height (m)": "height of the domain (m)"}
@@ -202,7 +202,7 @@ def tell_heights(facts: RunFacts, numbers: Numbers) -> Iterator[str]:
     yield f'<div class="pair">{"".join(charts)}</div>'
 
 
-def tell_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
+def describe_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
     """Show how far points are from the mesh and from the city model, and outlines from the footprints."""
     rows = [
         [words, number(samples.points[kind].n), *_residuals(samples.points[kind])]
@@ -235,7 +235,7 @@ def tell_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
         yield figures(names)
 
 
-def tell_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:
+def format_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:
     """Show where the time went: by stage, and when each stage worked."""
     members = facts.members
     seconds: dict[str, float] = members.get("seconds", {})
@@ -262,7 +262,7 @@ def tell_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:
     ran, reused, finished = (members.get(name, {}) for name in ("ran", "reused", "finished"))
     details = [
         [
-            _tell_step(name),
+            _describe_step(name),
             number(ran.get(name)),
             number(reused.get(name)),
             number(value, 2),
@@ -274,7 +274,7 @@ def tell_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:
     yield folded("All steps in detail", table("Steps", head, details))
 
 
-def tell_notes(facts: RunFacts) -> Iterator[str]:
+def describe_notes(facts: RunFacts) -> Iterator[str]:
     """List what failed, was dropped, repaired or defaulted."""
     members, lengths = facts.members, facts.lengths
     if missing := members.get("missing"):
@@ -307,7 +307,7 @@ def tell_notes(facts: RunFacts) -> Iterator[str]:
         yield from (_list_notes(notes) for notes in sorted(kinds, key=lambda notes: (-notes.count, notes.kind)))
 
 
-def tell_parameters(facts: RunFacts) -> Iterator[str]:
+def report_parameters(facts: RunFacts) -> Iterator[str]:
     """List parameters, those that are not the default's first, and versions."""
     given: dict[str, Any] = facts.members.get("parameters", {})
     changed: list[list[str]] = []
@@ -316,7 +316,7 @@ def tell_parameters(facts: RunFacts) -> Iterator[str]:
         if entry.name not in given:
             continue
         value, data = _as_tuple(given[entry.name]), entry.metadata
-        row = [entry.name, _tell_value(value), data["unit"], data["text"]]
+        row = [entry.name, _format_value(value), data["unit"], data["text"]]
         (others if value == entry.default else changed).append(row)
     head = ("parameter", "value", "unit", "meaning")
     yield table("Parameters that differ from their defaults", head, changed, numbers=9)
@@ -354,7 +354,7 @@ def _residuals(sums: ResidualSums) -> list[str]:
     return [number(value) for value in values]
 
 
-def _tell_step(name: str) -> str:
+def _describe_step(name: str) -> str:
     """Name a stage, or a step of one as ``"houses: 2.0 split levels"``, in words of its group."""
     stage, colon, step = name.partition(":")
     return f"{title_of_stage(stage)}{colon}{step}"
@@ -372,8 +372,8 @@ def _thinned(samples: Samples) -> str:
     return f" (a sample: {samples.n_points:,} of the {samples.all_points:,} points there, evenly chosen)"
 
 
-def _tell_parts(parts: dict[str, Any]) -> str:
-    told = tell_parts([part["cells"] for part in parts["largest"]], parts["n"])
+def _describe_parts(parts: dict[str, Any]) -> str:
+    told = report_parts([part["cells"] for part in parts["largest"]], parts["n"])
     return told[:1].upper() + told[1:]
 
 
@@ -414,5 +414,5 @@ def _as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _tell_value(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)

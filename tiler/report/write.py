@@ -6,7 +6,7 @@ from pipeline.data.errors import ConfigError, InputError
 from tiler.report import sections
 from tiler.report.collect import collect_numbers
 from tiler.report.page import Page, paragraph
-from tiler.report.pictures import tell_pictures
+from tiler.report.pictures import describe_pictures
 from tiler.report.record import RunFacts, read_run_facts
 from tiler.report.samples import measure_samples
 from tiler.report.timeline import read_timeline
@@ -58,7 +58,7 @@ def write_report(directory: Path) -> Path:
 def _fill(directory: Path, facts: RunFacts) -> Page:
     timeline = read_timeline(directory / EVENTS, frozenset(facts.tiles.names))
     page = Page(f"citystitch: {directory.resolve().name}")
-    page.section("summary", "Summary", sections.tell_summary(facts))
+    page.section("summary", "Summary", sections.describe_summary(facts))
     if facts.members["status"] == "done":
         if not (directory / STORE).is_dir():
             raise InputError(f"{directory / STORE}: is missing; run again")
@@ -66,13 +66,13 @@ def _fill(directory: Path, facts: RunFacts) -> Page:
         assert facts.bounds is not None  # as of every run that is done
         filtered = bool(facts.members["parameters"]["ground_filter"])
         samples = measure_samples(directory, facts.bounds, ground_filter=filtered)
-        page.section("pictures", "Pictures", tell_pictures(directory))
-        page.section("map", "Map", sections.tell_map(facts, numbers, timeline))
-        page.section("quality", "Quality of cells", sections.tell_quality(facts, numbers, samples))
-        page.section("heights", "Heights", sections.tell_heights(facts, numbers))
-        page.section("fidelity", "Fidelity to the input", sections.tell_fidelity(facts, samples))
-    page.section("time", "Time", sections.tell_time(facts, timeline))
-    page.section("notes", "Dropped, repaired, defaulted", sections.tell_notes(facts))
-    page.section("parameters", "Parameters and versions", sections.tell_parameters(facts))
+        page.section("pictures", "Pictures", describe_pictures(directory))
+        page.section("map", "Map", sections.describe_map(facts, numbers, timeline))
+        page.section("quality", "Quality of cells", sections.describe_quality(facts, numbers, samples))
+        page.section("heights", "Heights", sections.format_heights(facts, numbers))
+        page.section("fidelity", "Fidelity to the input", sections.describe_fidelity(facts, samples))
+    page.section("time", "Time", sections.format_time(facts, timeline))
+    page.section("notes", "Dropped, repaired, defaulted", sections.describe_notes(facts))
+    page.section("parameters", "Parameters and versions", sections.report_parameters(facts))
     page.lead = paragraph("What one run made, how good it is, what was left out, and where the time went.", "soft")
     return page

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.errors import InputError
-from pipeline.quality.building_facts import tell_buildings
+from pipeline.quality.building_facts import report_buildings
 from tiler.citymodels.cityjson import Attributes, write_city_blocks
 from tiler.citymodels.tables import (
     BUILDING_ARRAYS,
@@ -188,7 +188,7 @@ def _by_cell(task: Task, stage: str, prefix: str, survey: _Survey) -> Iterator[B
 
 
 def _tell(buildings: Buildings) -> Attributes:
-    told: dict[str, Sequence[object]] = tell_buildings(
+    told: dict[str, Sequence[object]] = report_buildings(
         buildings.model, buildings.roof_source, buildings.measured_roof, buildings.fidelity
     )
     return told

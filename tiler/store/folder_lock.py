@@ -155,7 +155,7 @@ def _take(path: Path, say: Callable[[str], None]) -> tuple[int, bool]:
 
 
 def _busy(path: Path, owner: Owner | None) -> ConfigError:
-    name = f" ({tell_owner(owner)})" if owner is not None else ""
+    name = f" ({describe_owner(owner)})" if owner is not None else ""
     return ConfigError(f"{path.parent}: {BUSY}{name}; {NEXT}")
 
 
@@ -186,14 +186,14 @@ def _wait_for_death(path: Path, owner: Owner, say: Callable[[str], None], *, loc
         return  # the system would have refused the lock
     alive = is_alive(owner)
     if alive is None:
-        say(f"{path.parent}: {tell_owner(owner)} was at work there; listening for {SILENCE:g} s whether it is")
+        say(f"{path.parent}: {describe_owner(owner)} was at work there; listening for {SILENCE:g} s whether it is")
         first, end = _touched(path), time.monotonic() + SILENCE
         while not alive and time.monotonic() < end:
             time.sleep(min(1.0, SILENCE / 10))
             alive = _touched(path) != first or _read_owner(path) != owner
     if alive:
         raise _busy(path, owner)
-    say(f"{path.parent}: taken over from {tell_owner(owner)}, which is dead")
+    say(f"{path.parent}: taken over from {describe_owner(owner)}, which is dead")
 
 
 def _touched(path: Path) -> int:
@@ -239,7 +239,7 @@ def _read_owner(path: Path) -> Owner | None:
         return None
 
 
-def tell_owner(owner: Owner) -> str:
+def describe_owner(owner: Owner) -> str:
     """Say who has a folder."""
     return f"process {owner.pid} on {owner.host}"
 

@@ -98,7 +98,7 @@ def _take(path: ObjectPath, owner: Owner, say: Callable[[str], None]) -> str:
     while True:
         found = _read(path)
         if found is not None:
-            name = f" ({folder_lock.tell_owner(found[0])})" if found[0] is not None else ""
+            name = f" ({folder_lock.describe_owner(found[0])})" if found[0] is not None else ""
             if _lives(path, *found, say=say):
                 raise ConfigError(f"{path.parent}: {BUSY}{name}; {NEXT}")
             say(f"{path.parent}: taken over from{name or ' a run'}, which is dead")

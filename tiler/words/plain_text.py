@@ -64,12 +64,12 @@ def _escape(sign: str) -> str:
     return sign.encode("unicode_escape", errors="surrogatepass").decode("ascii")
 
 
-def tell_box(box: Sequence[float]) -> str:
+def format_box(box: Sequence[float]) -> str:
     """Write a box as its ranges of x and y, without a comma within a number.
 
     Examples
     --------
-    >>> tell_box((120000.0, 487200.5, 120624.0, 487786.0))
+    >>> format_box((120000.0, 487200.5, 120624.0, 487786.0))
     '120000 to 120624, 487200.5 to 487786'
     """
     west, south, east, north = (f"{value:.10g}" for value in box)

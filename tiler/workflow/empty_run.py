@@ -14,7 +14,7 @@ from tiler.planning.region import Region
 from tiler.vectors.features import Box
 from tiler.vectors.layers import Layer, describe_layer
 from tiler.words.note_words import is_drop, say_notes
-from tiler.words.plain_text import printable, tell_box
+from tiler.words.plain_text import format_box, printable
 
 DEGREES = "EPSG:4326"
 # What was assumed of the coordinates, and may be wrong.
@@ -50,7 +50,7 @@ def explain_empty(config: Config, region: Region, counts: dict[str, int], notes:
         layer = describe_layer(place(config.footprints), config.layer)
     except CityError:  # it was read before; what it says now does not matter
         layer = None
-    seen = _tell_number(layer, within, tell_box(region.bounds), _short(region.crs))
+    seen = _format_number(layer, within, format_box(region.bounds), _short(region.crs))
     dropped = "; ".join(say_notes(kind, n) for kind, n in count_notes(notes).items() if is_drop(kind))
     told = [seen, dropped]
     if within:
@@ -62,7 +62,7 @@ def explain_empty(config: Config, region: Region, counts: dict[str, int], notes:
     return f"no building was meshed. {config.footprints} has {'. '.join(part for part in told if part)}"
 
 
-def _tell_number(layer: Layer | None, within: int, box: str, crs: str) -> str:
+def _format_number(layer: Layer | None, within: int, box: str, crs: str) -> str:
     number = "footprints"
     if layer is not None and layer.n_features >= 0:
         number = "1 feature" if layer.n_features == 1 else f"{layer.n_features:,} features"
@@ -87,7 +87,7 @@ def find_place(layer: Layer, region: Region) -> str:
     if layer.extent is None or not np.isfinite(layer.extent).all():
         return f"The file does not say where they lie: {UNKNOWN}"
     crs = "no CRS stated" if layer.crs is None else _short(layer.crs.to_string())
-    told = f"They lie in {tell_box(layer.extent)} ({crs})"
+    told = f"They lie in {format_box(layer.extent)} ({crs})"
     own = layer.crs or pyproj.CRS.from_user_input(region.crs)
     if _meets(layer.extent, own, region):
         return f"{told}: none that can be read meets the region"
@@ -98,7 +98,7 @@ def find_place(layer: Layer, region: Region) -> str:
             if (degrees and not _are_degrees(extent)) or not (degrees or exchanged):
                 continue
             if _meets(extent, pyproj.CRS.from_user_input(stated), region):
-                return f"{told}. {_tell_move(exchanged=exchanged, degrees=degrees and not own.is_geographic)}"
+                return f"{told}. {_describe_move(exchanged=exchanged, degrees=degrees and not own.is_geographic)}"
     code = own.to_authority()
     if code and own.is_projected and _overlap(layer.extent, region.bounds) and is_on_its_place(layer.extent, own):
         return (
@@ -108,7 +108,7 @@ def find_place(layer: Layer, region: Region) -> str:
     return f"{told}: {UNKNOWN}"
 
 
-def _tell_move(*, exchanged: bool, degrees: bool) -> str:
+def _describe_move(*, exchanged: bool, degrees: bool) -> str:
     if degrees and exchanged:
         return (
             "Taken as degrees, latitude first, they lie in the region: exchange x and y in the file "

@@ -15,7 +15,7 @@ from tiler.store.json_stream import read_members
 from tiler.store.out_folder import RUN_RECORD, STORE
 from tiler.store.run_folder import WRONG_FIELD
 from tiler.store.store import SUFFIX
-from tiler.words.plain_text import tell_box
+from tiler.words.plain_text import format_box
 
 COMMON = 0.5  # share of the larger region's area from which on other files are newer ones of the same region
 
@@ -54,7 +54,7 @@ def refuse_other_region(out: Path, region: Region, inputs: Sequence[str]) -> Non
             if share <= 0
             else f"have {100 * share:.0f} % of their area and no file in common"
         )
-        raise ConfigError(f"{holds}: {tell_box(bounds)} there and {tell_box(region.bounds)} now {how}; {move}")
+        raise ConfigError(f"{holds}: {format_box(bounds)} there and {format_box(region.bounds)} now {how}; {move}")
 
 
 def _read_run(path: Path) -> tuple[Box, str, list[str]] | None:

@@ -168,7 +168,7 @@ def run(
                     raise
     except BaseException as error:
         with suppress(OutputError):  # told already where the run has begun; else what it failed by counts
-            told.end("failed", tell_error(error))
+            told.end("failed", describe_error(error))
         remove_folders(made)
         raise
 
@@ -218,7 +218,7 @@ def _run(
         record |= {"status": "stopped", "error": str(error)}
         raise
     except BaseException as error:
-        record |= {"status": "failed", "error": tell_error(error)}
+        record |= {"status": "failed", "error": describe_error(error)}
         raise
     finally:
         record["seconds_total"] = round(time.perf_counter() - start, 3)
@@ -381,7 +381,7 @@ def _foresee(plan: Plan, config: Config) -> list[str]:
     return [] if config.on_cluster else warn_of_memory(plan.survey, config, memory=machine_memory())
 
 
-def tell_error(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """What an error that ends a run is, for its record."""
     return str(error) if isinstance(error, CityError) else f"{type(error).__name__}: {error}"
 

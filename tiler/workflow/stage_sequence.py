@@ -47,7 +47,7 @@ def run_stages(engine: Engine, config: Config) -> int:
         of_model = [*alignment_stages(config), *of_model]
     meshed = [*mesh_stages(config, domain), *piece_stages()]
     if config.padded:
-        engine.tell_layout()
+        engine.describe_layout()
         both = engine.layout, engine.context
         engine.lay_out(*engine.laid_out(CORE_STAGE))
         engine.run(*of_model)

@@ -18,7 +18,7 @@ from tiler.mesh_files.mesh_parts import MESH_IN_PARTS, describe_parts, note_part
 from tiler.objects.places import place
 from tiler.planning.establish_georeference import FOOTPRINTS
 from tiler.planning.plan import Plan
-from tiler.report.left_out import describe_left_out, tell_left_out
+from tiler.report.left_out import describe_left_out, report_left_out
 from tiler.stages.alignment import describe_alignment
 from tiler.stages.approach import RIM
 from tiler.stages.domain import LOW_DOMAIN
@@ -125,9 +125,9 @@ def summarise_run(
         "messages": [
             *plan.messages,
             *words,
-            *_tell_damage(damage),
-            *_tell_notes(notes),
-            *tell_left_out(left_out),
+            *_describe_damage(damage),
+            *_describe_notes(notes),
+            *report_left_out(left_out),
         ],
         "unreadable": unreadable,
         "notes": group_notes(notes),
@@ -151,7 +151,7 @@ def describe_tasks(tasks: Mapping[str, int]) -> str:
     return f"{tasks['ran']:,} of {tasks['all']:,} tasks ran, {tasks['all'] - tasks['ran']:,} results were there"
 
 
-def _tell_damage(damage: Mapping[str, str]) -> list[str]:
+def _describe_damage(damage: Mapping[str, str]) -> list[str]:
     if not damage:
         return []
     return [f"{len(damage)} damaged or missing artefacts of an earlier run were made anew: {DAMAGED} in the notes"]
@@ -171,7 +171,7 @@ def _note_far_terrain(counts: Mapping[str, int], config: Config) -> list[Note]:
     return [Note(FAR_TERRAIN, detail=detail)]
 
 
-def _tell_notes(notes: Sequence[Note]) -> list[str]:
+def _describe_notes(notes: Sequence[Note]) -> list[str]:
     """Notes that a user should read whatever else there is."""
     return [note.detail for note in notes if note.kind in (MESH_IN_PARTS, FAR_TERRAIN, LOW_DOMAIN)]
 
