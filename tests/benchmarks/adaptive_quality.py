@@ -17,7 +17,7 @@ from pipeline.columns.spacing import SpacingLimits
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 from pipeline.quality.quality import measure_cells
-from tests.cities import city_of, crowded_blocks
+from tests.helpers.cities import city_of, crowded_blocks
 
 SIZE, BUILDINGS = 1000.0, 500  # m, number
 PERCENTILES = (0, 0.1, 1, 5, 50)

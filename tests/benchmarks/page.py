@@ -14,8 +14,8 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
-from tests.simulated_runs import simulate, write_events
-from tests.test_dashboard_page import run_browser
+from tests.helpers.simulated_runs import simulate, write_events
+from tests.tiler.dashboard.test_dashboard_page import run_browser
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.server import serve
 

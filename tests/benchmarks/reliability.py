@@ -1,8 +1,8 @@
 """`make reliability`: run the campaigns, and write their tables into docs/reliability.md between markers.
 
 A campaign is tests that are marked `long` and write their outcomes as JSON into the folder that the environment
-variable ``CITYSTITCH_RELIABILITY`` names, which has them run all their rounds, too (`tests.campaigns`). Another
-one is an entry of `CAMPAIGNS`: the tests, and a function that makes lines of Markdown of its JSON.
+variable ``CITYSTITCH_RELIABILITY`` names, which has them run all their rounds, too (`tests.helpers.campaigns`).
+Another one is an entry of `CAMPAIGNS`: the tests, and a function that makes lines of Markdown of its JSON.
 ``--from FOLDER`` writes the tables of outcomes that are there already.
 """
 
@@ -124,18 +124,18 @@ def cities_table(record: Any) -> list[str]:
 
 # By the name of the JSON file and of the markers.
 CAMPAIGNS: dict[str, tuple[tuple[str, ...], Callable[[Any], list[str]]]] = {
-    "kills": (("tests/test_kill_campaign.py",), kills_table),
-    "faults": (("tests/test_fault_campaign.py",), faults_table),
-    "damage": (("tests/test_store_audit.py", "tests/test_power_loss.py"), damage_table),
-    "rebuild": (("tests/test_rebuild.py",), rebuild_table),
+    "kills": (("tests/runs/test_kill_campaign.py",), kills_table),
+    "faults": (("tests/runs/test_fault_campaign.py",), faults_table),
+    "damage": (("tests/tiler/store/test_store_audit.py", "tests/tiler/store/test_power_loss.py"), damage_table),
+    "rebuild": (("tests/runs/test_rebuild.py",), rebuild_table),
     "cities": (
         (
-            "tests/test_tiles.py::test_random_tiled_cities_are_meshed_and_proved",
-            "tests/test_run.py::test_random_cities_are_meshed_and_proved",
+            "tests/runs/test_tiled_runs.py::test_random_tiled_cities_are_meshed_and_proved",
+            "tests/runs/test_run.py::test_random_cities_are_meshed_and_proved",
         ),
         cities_table,
     ),
-    "fuzz-input": (("tests/test_fuzz_input.py",), fuzz_table),
+    "fuzz-input": (("tests/runs/test_fuzz_input.py",), fuzz_table),
 }
 
 

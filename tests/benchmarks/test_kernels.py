@@ -23,7 +23,7 @@ from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.points_terrain.terrain import Dtm
 from pipeline.quality.quality import measure_cells
 from pipeline.smoothing.ground_smoothing import lift_places, smooth_slab
-from tests.cities import Bounds, random_city
+from tests.helpers.cities import Bounds, random_city
 from tiler.mesh_files.vtk_xml import compress_block
 
 BOUNDS: Bounds = (0.0, 0.0, 600.0, 600.0)

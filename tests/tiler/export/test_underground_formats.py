@@ -1,0 +1,296 @@
+"""Exports of a mesh with soil: two regions that share the ground, read by programs that are not ours."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.mesh import Marker, Region
+from stitch.pieces.conformity import compute_cell_volumes, pair_edges
+from tests.helpers.foam_reader import PolyMesh, read_poly_mesh, read_zones
+from tests.helpers.hand_pieces import HandPieces
+from tests.helpers.programs import mesh_is_ok, read_check, run_foam, run_program
+from tests.tiler.export.test_formats_openfoam import MESH, assert_in_order, volumes_of
+from tiler.cli.main import main
+from tiler.config.config import make_config
+from tiler.export.export import export_run, list_formats, load_format
+from tiler.export.foam_patches import PATCHES
+from tiler.formats.openfoam import write_openfoam
+from tiler.interface.synth import write_city
+from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
+from tiler.mesh_files.vtk_files import read_vtu, write_vtu
+from tiler.workflow.run import run
+
+DEPTH = 20.0
+
+
+@pytest.fixture(scope="module")
+def soil_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished run of a synthetic city with soil on four tiles, not to be changed."""
+    folder = tmp_path_factory.mktemp("soil")
+    files = write_city(folder / "city", size=300, buildings=15, density=1.0)
+    given: dict[str, Any] = {"pointcloud": [str(path) for path in files.clouds]}
+    given |= {"footprints": str(files.footprints)}
+    given |= {"out": str(folder / "out"), "tile_size": 150.0, "domain_height": 60.0, "underground": DEPTH}
+    run(make_config(given))
+    return folder / "out"
+
+
+def parts_of(folder: Path) -> list[MeshPiece]:
+    pieces = open_pieces(folder)
+    return [pieces.read(k) for k in range(len(pieces.names))]
+
+
+def counts_of(folder: Path) -> dict[str, int]:
+    found: dict[str, int] = json.loads((folder / "run.json").read_text())["counts"]
+    return found
+
+
+def marked(parts: list[MeshPiece]) -> dict[str, int]:
+    """Facets by name, but for the ground, which is inside."""
+    marker = np.concatenate([part.marker for part in parts])
+    return {PATCHES[Marker(m)]: int((marker == m).sum()) for m in np.unique(marker) if m != Marker.GROUND}
+
+
+def places(points: NDArray[np.float64], rows: NDArray[np.integer]) -> list[list[float]]:
+    """Middles of faces or cells, sorted, to compare sets of them."""
+    middle = np.sort(points[rows], axis=1).mean(axis=1).round(6)
+    found: list[list[float]] = middle[np.lexsort(middle.T)].tolist()
+    return found
+
+
+def read_cell_zones(path: Path) -> dict[str, NDArray[np.int64]]:
+    text = path.read_text()
+    body = text[text.index("}") + 1 :]
+    pattern = r"(\w+)\s*\{\s*type cellZone;\s*cellLabels List<label>\s*(\d+)\s*\(([\s\d]*)\)\s*;\s*\}"
+    zones = {name: np.array(labels.split(), np.int64) for name, _, labels in re.findall(pattern, body)}
+    assert [len(zones[name]) for name in zones] == [int(n) for _, n, _ in re.findall(pattern, body)]
+    count = re.match(r"\s*(\d+)", body)
+    assert count
+    assert int(count[1]) == len(zones)
+    return zones
+
+
+def region_volumes(parts: list[MeshPiece]) -> dict[str, float]:
+    sums = {region.name.lower(): 0.0 for region in Region}
+    for part in parts:
+        assert part.region is not None
+        volume = compute_cell_volumes(part.points, part.cells)[0]
+        for region in Region:
+            sums[region.name.lower()] += float(volume[part.region == region].sum())
+    return sums
+
+
+# OpenFOAM.
+
+
+def assert_zones(folder: Path, mesh: PolyMesh) -> int:
+    """Cells of the zones are all cells, and the ground's faces those between them; returns how many these are."""
+    cells = read_cell_zones(folder / "cellZones")
+    assert list(cells) == ["air", "soil"]
+    assert np.array_equal(np.sort(np.concatenate(list(cells.values()))), np.arange(mesh.n_cells))
+    soil = np.zeros(mesh.n_cells, np.bool_)
+    soil[cells["soil"]] = True
+    between = np.flatnonzero(soil[mesh.owner[: len(mesh.neighbour)]] != soil[mesh.neighbour])
+    ground = read_zones(folder / "faceZones")["ground"]
+    assert np.array_equal(np.sort(ground), between)
+    # The face zone is not turned: its normals, out of the owners, all point down, out of the air.
+    assert not soil[mesh.owner[ground]].any()
+    return len(ground)
+
+
+def test_openfoam_has_the_ground_inside_and_a_zone_a_region(soil_run: Path, tmp_path: Path) -> None:
+    export_run(soil_run, tmp_path / "case", name="openfoam")
+    folder, parts = tmp_path / "case" / MESH, parts_of(soil_run)
+    mesh = read_poly_mesh(folder)
+    assert_in_order(mesh)
+    volume = volumes_of(mesh)
+    assert (volume > 0).all()
+    for name, cells in read_cell_zones(folder / "cellZones").items():
+        assert volume[cells].sum() == pytest.approx(region_volumes(parts)[name], rel=1e-9)
+    assert {name: patch.n for name, patch in mesh.patches.items()} == marked(parts)
+    assert mesh.patches["foundations"].kind == "wall"
+    assert mesh.patches["bottom"].kind == "patch"
+    ground = read_zones(folder / "faceZones")["ground"]
+    assert assert_zones(folder, mesh) == sum(int((part.marker == Marker.GROUND).sum()) for part in parts)
+    expected = [part.ids[part.facets[part.marker == Marker.GROUND]] for part in parts]
+    assert places(mesh.points, mesh.faces[ground]) == places(mesh.points, np.concatenate(expected))
+
+
+def test_parts_have_their_share_of_the_zones(soil_run: Path, tmp_path: Path) -> None:
+    export_run(soil_run, tmp_path / "case", name="openfoam", options={"parts": 3, "buildings": "zones"})
+    folders = [tmp_path / "case" / f"processor{k}" / MESH for k in range(3)]
+    found = [assert_zones(folder, read_poly_mesh(folder)) for folder in folders]
+    assert sum(found) == sum(int((part.marker == Marker.GROUND).sum()) for part in parts_of(soil_run))
+    zones = [list(read_zones(folder / "faceZones")) for folder in folders]
+    assert zones[0] == zones[1] == zones[2]
+    assert len(zones[0]) == counts_of(soil_run)["building parts"] + 1
+
+
+def test_wind_does_not_blow_through_soil(
+    soil_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["export", str(soil_run), "--format", "openfoam", "--case", "wind", "-o", str(tmp_path / "case")]
+    assert main(words) == 2
+    assert "--case wind: the mesh has soil to 20 m below ground" in capsys.readouterr().err
+    assert not (tmp_path / "case").exists()
+
+
+def test_cgns_refuses_soil(soil_run: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="the mesh has soil"):
+        export_run(soil_run, tmp_path / "city.cgns", name="cgns")
+    assert not list(tmp_path.iterdir())
+
+
+def test_ground_that_is_not_between_the_regions_is_refused(soil_run: Path, tmp_path: Path) -> None:
+    parts = parts_of(soil_run)
+    region = parts[0].region
+    assert region is not None
+    wrong = region.copy()
+    wrong[np.flatnonzero(region == Region.SOIL)[0]] = Region.AIR
+    for bad in (wrong, 1 - region):
+        pieces = HandPieces(
+            tuple(part.name for part in parts),
+            open_pieces(soil_run).n_points,
+            [replace(parts[0], region=bad), *parts[1:]],
+        )
+        folder = tmp_path / str(int(bad.sum()))
+        folder.mkdir()
+        with pytest.raises(InputError, match="its ground is not what air and soil share"):
+            write_openfoam(folder, pieces)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1200)
+def test_check_mesh_is_content_with_two_regions(soil_run: Path, tmp_path: Path) -> None:
+    parts = parts_of(soil_run)
+    for number in (None, 2):
+        case = tmp_path / str(number)
+        export_run(soil_run, case, name="openfoam", options={} if number is None else {"parts": number})
+        text = run_foam("checkMesh", case, parts=number)
+        assert mesh_is_ok(text), text[-3000:]
+        found = read_check(text)
+        assert found["regions"] == 1
+        assert found["cells"] == found["tetrahedra"] == counts_of(soil_run)["cells"]
+        assert {name[6:]: n for name, n in found.items() if name.startswith("patch ")} == marked(parts)
+        zones = dict(re.findall(r"^    (air|soil|ground) +(\d+) ", text, re.MULTILINE))
+        cells = np.concatenate([part.region for part in parts if part.region is not None])
+        ground = sum(int((part.marker == Marker.GROUND).sum()) for part in parts)
+        assert zones == {"air": str((cells == 0).sum()), "soil": str((cells == 1).sum()), "ground": str(ground)}
+
+
+# Gmsh and XDMF.
+
+
+@pytest.mark.parametrize("name", ["msh", "msh2"])
+def test_meshio_reads_two_volumes(soil_run: Path, tmp_path: Path, name: str) -> None:
+    export_run(soil_run, tmp_path / "a.msh", name=name)
+    mesh, parts = meshio.read(tmp_path / "a.msh"), parts_of(soil_run)
+    assert {mesh.field_data[volume][0]: mesh.field_data[volume][1] for volume in ("air", "soil")} == {10: 3, 20: 3}
+    assert tuple(mesh.field_data["bottom"]) == (Marker.BOTTOM, 2)
+    assert tuple(mesh.field_data["foundations"]) == (Marker.FOUNDATION, 2)
+    cells: dict[int, list[Any]] = {10: [], 20: []}
+    for block, physical in zip(mesh.cells, mesh.cell_data["gmsh:physical"], strict=True):
+        if block.type == "tetra":
+            for group in np.unique(physical).tolist():
+                cells[group].append(block.data[physical == group])
+    for region, group in ((Region.AIR, 10), (Region.SOIL, 20)):
+        expected = np.concatenate([part.ids[part.cells[part.region == region]] for part in parts])
+        assert np.array_equal(np.concatenate(cells[group]), expected)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["msh", "msh2"])
+def test_gmsh_has_no_complaints_of_soil(soil_run: Path, tmp_path: Path, name: str) -> None:
+    export_run(soil_run, tmp_path / "a.msh", name=name)
+    text = run_program(["gmsh", "-check", str(tmp_path / "a.msh")], tmp_path)
+    assert "Done checking mesh coherence" in text
+    assert not re.findall(r"^(?:Warning|Error)", text, re.MULTILINE)
+
+
+@pytest.mark.long
+def test_gmsh_to_foam_makes_the_zones(soil_run: Path, tmp_path: Path) -> None:
+    export_run(soil_run, tmp_path / "case", name="openfoam")
+    export_run(soil_run, tmp_path / "b.msh", name="msh2")
+    expected = read_check(run_foam("checkMesh", tmp_path / "case"))
+    run_foam("gmshToFoam", tmp_path / "case", str(tmp_path / "b.msh"))
+    text = run_foam("checkMesh", tmp_path / "case")
+    assert mesh_is_ok(text)
+    found = read_check(text)
+    assert found.pop("patch ground") == 0
+    assert found == expected
+    assert re.search(r"^    ground +\d+", text, re.MULTILINE)
+
+
+def test_xdmf_has_the_region_of_each_cell(soil_run: Path, tmp_path: Path) -> None:
+    export_run(soil_run, tmp_path / "a.xdmf", name="xdmf")
+    with h5py.File(tmp_path / "a.h5") as file:
+        region, cells = file["region"][()], file["cells"][()]
+    parts = parts_of(soil_run)
+    assert np.array_equal(region, np.concatenate([part.region for part in parts if part.region is not None]))
+    assert np.array_equal(cells, np.concatenate([part.ids[part.cells] for part in parts]))
+    text = (tmp_path / "a.xdmf").read_text()
+    assert text.count('<Attribute Name="region" AttributeType="Scalar" Center="Cell">') == 1
+
+
+@pytest.mark.long
+def test_dolfinx_reads_the_regions(soil_run: Path, tmp_path: Path) -> None:
+    export_run(soil_run, tmp_path / "a.xdmf", name="xdmf")
+    script = """
+import json
+from dolfinx.io import XDMFFile
+from mpi4py import MPI
+with XDMFFile(MPI.COMM_WORLD, "a.xdmf", "r") as file:
+    mesh = file.read_mesh(name="mesh")
+    tags = file.read_meshtags(mesh, name="mesh")
+print(json.dumps([tags.dim, int((tags.values == 0).sum()), int((tags.values == 1).sum())]))
+"""
+    (tmp_path / "read.py").write_text(script)
+    text = run_program(["/usr/bin/python3", "read.py"], tmp_path)
+    region = np.concatenate([part.region for part in parts_of(soil_run) if part.region is not None])
+    assert json.loads(text.strip().splitlines()[-1]) == [3, int((region == 0).sum()), int((region == 1).sum())]
+
+
+# Surfaces, and all formats.
+
+
+def test_a_surface_without_its_ground_is_closed(soil_run: Path, tmp_path: Path) -> None:
+    export_run(soil_run, tmp_path / "a.obj", name="obj")
+    groups: dict[str, list[list[int]]] = {}
+    name = ""
+    for line in (tmp_path / "a.obj").read_text().splitlines():
+        kind, *words = line.split()
+        if kind == "g":
+            name = words[0]
+        elif kind == "f":
+            groups.setdefault(name, []).append([int(word) for word in words])
+    assert {name: len(rows) for name, rows in groups.items() if name != "ground"} == marked(parts_of(soil_run))
+    outer = np.array([row for name, rows in groups.items() if name != "ground" for row in rows], np.int32)
+    assert len(pair_edges(outer).open) == 0
+    assert len(pair_edges(np.concatenate((outer, np.array(groups["ground"], np.int32)))).open) > 0
+
+
+@pytest.mark.parametrize("name", sorted({*list_formats()} - {"cgns"}))
+def test_every_other_format_takes_a_mesh_with_soil(soil_run: Path, tmp_path: Path, name: str) -> None:
+    target = tmp_path / f"a{load_format(name).suffix}"
+    export_run(soil_run, target, name=name)
+    assert target.exists()
+
+
+def test_a_piece_without_its_regions_is_refused(soil_run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(soil_run, out, ignore=shutil.ignore_patterns("store.zarr"))
+    path = sorted((out / "mesh").iterdir())[0]
+    piece = read_vtu(path)
+    write_vtu(path, piece.mesh, point_data=piece.point_data)
+    with pytest.raises(InputError, match="has no cell array 'region'"):
+        export_run(out, tmp_path / "a.msh", name="msh")
