@@ -8,38 +8,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.classes import (
-    BRIDGE_DECK,
-    BUILDING,
-    GROUND,
-    HIGH_NOISE,
-    HIGH_VEGETATION,
-    KEY_POINT,
-    LOW_NOISE,
-    LOW_VEGETATION,
-    MEDIUM_VEGETATION,
-    OVERHEAD,
-    RAIL,
-    ROAD,
-    SEA,
-    TRANSMISSION_TOWER,
-    WATER,
-    WIRE_CONDUCTOR,
-    WIRE_CONNECTOR,
-    WIRE_GUARD,
-)
+from pipeline.data.classes import BUILDING, GROUND, NEVER_ROOF, WATER
 from pipeline.data.kernel import kernel
 from pipeline.data.pointcloud import PointCloud
 from pipeline.geometry.group_order import sort_values
 from pipeline.geometry.inside import are_inside, find_inside
 
-# Where a cloud has no building class, a point of any class but these may lie on a roof. Class 20 is ignored ground
-# to LAS 1.4, but all that is not ground, buildings above all, to North Rhine-Westphalia.
-NEVER_ROOF = (
-    *(GROUND, LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION, LOW_NOISE, KEY_POINT, WATER, RAIL, ROAD),
-    *(WIRE_GUARD, WIRE_CONDUCTOR, TRANSMISSION_TOWER, WIRE_CONNECTOR, BRIDGE_DECK, HIGH_NOISE, OVERHEAD),
-    *SEA,
-)
 OUTLIER_DEVIATIONS = 2.0  # paper, step 1.5
 FINE_OUTLINE = 2000  # vertices; only the largest of real houses have so many
 

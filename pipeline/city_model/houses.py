@@ -14,16 +14,16 @@ from pipeline.city_model.building_points import (
     take_building_points,
 )
 from pipeline.city_model.city import City, CityOptions
-from pipeline.city_model.house_levels import HouseParts, LevelOptions, split_levels
-from pipeline.city_model.roof_points import (
+from pipeline.data.pointcloud import PointCloud
+from pipeline.geometry.inside import find_inside
+from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
+from pipeline.roofs.roof_points import (
     RoofPoints,
     add_roof_points,
     locate_roof_points,
     make_roof_points,
     no_roof_points,
 )
-from pipeline.data.pointcloud import PointCloud
-from pipeline.geometry.inside import find_inside
 
 
 @dataclass(frozen=True, eq=False)

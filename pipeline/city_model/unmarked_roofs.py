@@ -6,12 +6,19 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.building_points import NEVER_ROOF
-from pipeline.city_model.roof_points import RoofPoints, make_roof_points
-from pipeline.data.classes import BUILDING, GROUND, HIGH_VEGETATION, LOW_VEGETATION, MEDIUM_VEGETATION, WATER
+from pipeline.data.classes import (
+    BUILDING,
+    GROUND,
+    HIGH_VEGETATION,
+    LOW_VEGETATION,
+    MEDIUM_VEGETATION,
+    NEVER_ROOF,
+    WATER,
+)
 from pipeline.data.pointcloud import N_CLASSES, PointCloud
 from pipeline.geometry.inside import are_inside, find_inside
 from pipeline.points_terrain.raster import Dtm, sample_dtm
+from pipeline.roofs.roof_points import RoofPoints, make_roof_points
 
 # Classes in which the roof of a house may be that has too few points of class 6.
 MAY_BE_ROOF = tuple(number for number in range(N_CLASSES) if number not in (BUILDING, *NEVER_ROOF))

@@ -18,7 +18,6 @@ from pipeline.city_model.city import (
 )
 from pipeline.city_model.footprints import clean_footprints
 from pipeline.city_model.heights import highest_wall_ground
-from pipeline.city_model.roof_points import RoofPoints
 from pipeline.columns.adaptive import AdaptiveOptions, AdaptiveReport, mesh_adaptive
 from pipeline.columns.layered import LayeredOptions, LayeredReport, mesh_layers
 from pipeline.data.citymodel import Footprints
@@ -27,6 +26,7 @@ from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.points_terrain.terrain import Dtm
+from pipeline.roofs.roof_points import RoofPoints
 
 # Plane meshes: the paper's, and ours, which Triangle refines again and vertices are moved in.
 PAPER_ANGLE = 25.0  # degrees

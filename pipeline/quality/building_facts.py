@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from pipeline.city_model.building_points import has_building_class
 from pipeline.city_model.city import City
 from pipeline.city_model.heights import ROOF_SOURCES
-from pipeline.city_model.roof_points import locate_roof_points
 from pipeline.data.citymodel import CityModel
 from pipeline.data.pointcloud import PointCloud
 from pipeline.points_terrain.terrain import Dtm
 from pipeline.quality.point_fidelity import KINDS, HouseFidelity, PointFidelity, measure_fidelity, measure_houses
+from pipeline.roofs.roof_points import locate_roof_points
 
 MOVED = 0.005  # m; a roof that moved less is told as it was measured
 

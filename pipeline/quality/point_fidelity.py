@@ -7,7 +7,6 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.roof_points import RoofPoints, select_roof
 from pipeline.data.classes import GROUND, WATER
 from pipeline.data.kernel import kernel
 from pipeline.data.pointcloud import PointCloud
@@ -24,6 +23,7 @@ from pipeline.geometry.inside import (
 )
 from pipeline.points_terrain.raster import Dtm, measure_over
 from pipeline.quality.residuals import Residuals, ResidualSums, conclude, merge_residuals, sum_residuals, summarise
+from pipeline.roofs.roof_points import RoofPoints, select_roof
 
 __all__ = [
     "KINDS",

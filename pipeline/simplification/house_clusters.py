@@ -14,8 +14,8 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.city import CityOptions
-from pipeline.city_model.house_levels import HouseParts
 from pipeline.geometry.components import join_pairs
+from pipeline.roofs.house_levels import HouseParts
 from pipeline.simplification.graph import MILLIMETRES
 from pipeline.simplification.merge import merge_footprints
 from pipeline.simplification.planar import PlanarCity, shape_planar

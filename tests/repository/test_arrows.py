@@ -95,6 +95,7 @@ ORDER = {
         "data",
         "geometry",
         "points_terrain",
+        "roofs",
         "city_model",
         "simplification",
         "plane_mesh",

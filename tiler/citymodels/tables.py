@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import BuildingPoints
 from pipeline.city_model.city import City
-from pipeline.city_model.house_levels import HouseParts
 from pipeline.city_model.houses import Houses
 from pipeline.data.citymodel import CityModel, Prisms
 from pipeline.quality.point_fidelity import HouseFidelity
+from pipeline.roofs.house_levels import HouseParts
 
 Arrays = dict[str, NDArray[Any]]
 

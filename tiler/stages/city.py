@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from pipeline.city_model.building_points import reach_of_points
 from pipeline.city_model.groups import adjacent_houses
 from pipeline.city_model.houses import Houses, divide_houses, join_houses, take_houses
-from pipeline.city_model.roof_points import add_roof_points, keep_roof_points, locate_roof_points
 from pipeline.city_model.unmarked_roofs import MAY_BE_ROOF
 from pipeline.columns.adaptive import AdaptiveOptions
 from pipeline.columns.layered import LayeredOptions, choose_layers, terrain_reach
@@ -22,6 +21,7 @@ from pipeline.geometry.components import join_pairs
 from pipeline.points_terrain.raster import Dtm, window_of
 from pipeline.points_terrain.terrain import cut_terrain
 from pipeline.quality.point_fidelity import measure_houses
+from pipeline.roofs.roof_points import add_roof_points, keep_roof_points, locate_roof_points
 from pipeline.simplification.house_clusters import (
     Shapes,
     find_close,

@@ -7,7 +7,6 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.city import find_places
-from pipeline.city_model.roof_points import RoofPoints, add_roof_points, keep_roof_points
 from pipeline.city_model.unmarked_roofs import (
     MAY_BE_ROOF,
     PLANTS,
@@ -22,6 +21,7 @@ from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
 from pipeline.geometry.inside import cover_polygons
 from pipeline.points_terrain.raster import Dtm
+from pipeline.roofs.roof_points import RoofPoints, add_roof_points, keep_roof_points
 from tiler.engine.stage import Box
 from tiler.engine.task import Task
 from tiler.stages.readers import grow, read_cloud

@@ -8,7 +8,6 @@ from pipeline.city_model.building_points import reach_of_points
 from pipeline.city_model.city import City, CityOptions, measure_heights
 from pipeline.city_model.footprints import clean_footprints
 from pipeline.city_model.houses import divide_houses
-from pipeline.city_model.roof_points import locate_roof_points
 from pipeline.columns.tile import measure_city
 from pipeline.data.citymodel import Footprints
 from pipeline.data.classes import BUILDING, GROUND, WATER
@@ -16,6 +15,7 @@ from pipeline.data.pointcloud import PointCloud
 from pipeline.geometry.inside import cover_polygons
 from pipeline.points_terrain.raster import Dtm, window_of
 from pipeline.points_terrain.terrain import cut_terrain
+from pipeline.roofs.roof_points import locate_roof_points
 from tiler.citymodels.tables import pack_polygons, unpack_polygons
 from tiler.config.config import Config
 from tiler.config.step_options import CITY_PARAMETERS, city_options

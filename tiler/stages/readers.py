@@ -9,9 +9,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.building_points import NEVER_ROOF
 from pipeline.data.citymodel import Footprints
-from pipeline.data.classes import BUILDING
+from pipeline.data.classes import BUILDING, NEVER_ROOF
 from pipeline.data.pointcloud import PointCloud
 from pipeline.geometry.inside import Cover, are_covered
 from pipeline.points_terrain.ground_filter import FILTER_REACH, classify_above, find_terrain

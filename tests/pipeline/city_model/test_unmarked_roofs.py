@@ -10,11 +10,11 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.roof_points import RoofPoints, locate_roof_points
 from pipeline.city_model.unmarked_roofs import MAY_BE_ROOF, are_roofs, find_bare, locate_unmarked
 from pipeline.data.classes import BUILDING, GROUND, UNCLASSIFIED
 from pipeline.data.pointcloud import PointCloud, rename_classes
 from pipeline.points_terrain.terrain import compute_dtm
+from pipeline.roofs.roof_points import RoofPoints, locate_roof_points
 from tests.helpers.cities import tilted_dtm
 
 Array = NDArray[np.float64]

@@ -11,8 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.city_model import lines
-from pipeline.city_model.lines import MIN_GAIN, _sum_pairwise
 from pipeline.geometry import segments
 from pipeline.geometry.segments import (
     BLUNT,
@@ -23,6 +21,8 @@ from pipeline.geometry.segments import (
     insert_corners,
     place_walls,
 )
+from pipeline.roofs import lines
+from pipeline.roofs.lines import MIN_GAIN, _sum_pairwise
 
 Array = NDArray[np.float64]
 SEEDS = st.integers(0, 10**6)

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from pipeline.city_model.building_points import extract_building_points
 from pipeline.city_model.footprints import clean_footprints
 from pipeline.city_model.heights import percentile_by_group
-from pipeline.city_model.house_levels import LevelOptions, split_levels
-from pipeline.city_model.roof_points import locate_roof_points, make_roof_points
 from pipeline.data.citymodel import Footprints
 from pipeline.data.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from pipeline.data.pointcloud import PointCloud
 from pipeline.geometry.inside import find_inside
 from pipeline.quality.point_fidelity import Residuals, measure_fidelity, measure_houses, summarise
+from pipeline.roofs.house_levels import LevelOptions, split_levels
+from pipeline.roofs.roof_points import locate_roof_points, make_roof_points
 from tests.helpers.cities import tilted_dtm
 from tests.helpers.whole_clouds import read_points
 from tiler.pointclouds.clouds import find_clouds

@@ -5,9 +5,9 @@ import pytest
 import shapely
 
 from pipeline.city_model.building_points import BuildingPoints
-from pipeline.city_model.house_levels import HouseParts
 from pipeline.city_model.houses import Houses, join_houses, take_houses
 from pipeline.quality.point_fidelity import HouseFidelity
+from pipeline.roofs.house_levels import HouseParts
 from tests.helpers.cities import city_of, crowded_blocks
 from tiler.citymodels.tables import (
     ARRAYS_TO_RAISE,

@@ -7,14 +7,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.cuts import cut_best
-from pipeline.city_model.lines import sum_squares
-from pipeline.city_model.regions import join_cells
-from pipeline.city_model.roof_points import RoofPoints
 from pipeline.geometry.group_order import sort_points
 from pipeline.geometry.outlines import Outline, deal_out, open_outline
 from pipeline.geometry.rings import make_canonical
 from pipeline.geometry.segments import add_places
+from pipeline.roofs.cuts import cut_best
+from pipeline.roofs.lines import sum_squares
+from pipeline.roofs.regions import join_cells
+from pipeline.roofs.roof_points import RoofPoints
 
 SPREAD = 0.3  # m², a cell stays whole if its squares are less than this for each point of its house
 STRAIGHT = 1e-3  # m, square root of the area of the triangle at a vertex that is dropped as straight

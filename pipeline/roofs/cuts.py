@@ -4,9 +4,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.lines import Line, rank_lines
 from pipeline.geometry.outlines import Outline
 from pipeline.geometry.segments import divide_edges, place_walls
+from pipeline.roofs.lines import Line, rank_lines
 
 AREA_TOLERANCE = 1e-5  # m²; what the pieces of a polygon may lack by rounding
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.city_model.regions import MIN_NEAR, STEP_REACH, join_cells
 from pipeline.geometry.outlines import deal_out
+from pipeline.roofs.regions import MIN_NEAR, STEP_REACH, join_cells
 
 Array = NDArray[np.float64]
 STEP, AREA, POINTS = 2.5, 15.0, 6

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.city_model.building_points import extract_building_points
-from pipeline.city_model.house_levels import HouseParts, LevelOptions, split_levels
 from pipeline.city_model.houses import divide_houses
-from pipeline.city_model.roof_points import locate_roof_points, make_roof_points
 from pipeline.columns.tile import build_city
 from pipeline.data.citymodel import Footprints
 from pipeline.data.classes import BUILDING, GROUND
 from pipeline.data.pointcloud import PointCloud
 from pipeline.geometry.rings import make_canonical
 from pipeline.points_terrain.raster import Dtm
+from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
+from pipeline.roofs.roof_points import locate_roof_points, make_roof_points
 from tests.pipeline.columns import test_tile
 
 Array = NDArray[np.float64]
@@ -144,7 +144,7 @@ def test_flat_sloping_and_noisy_roofs_stay_whole(roof: Roof) -> None:
 
 
 def test_a_shed_roof_would_be_cut_by_medians_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.city_model.regions.MIN_NEAR", 10**9)
+    monkeypatch.setattr("pipeline.roofs.regions.MIN_NEAR", 10**9)
     assert len(split(HOUSE, shed)) > 1
 
 

@@ -5,10 +5,10 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.cuts import cut_along, cut_best
-from pipeline.city_model.lines import Line, rank_lines
 from pipeline.geometry.outlines import open_outline
 from pipeline.geometry.segments import distances_to_segments
+from pipeline.roofs.cuts import cut_along, cut_best
+from pipeline.roofs.lines import Line, rank_lines
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.city_model.building_points import NEVER_ROOF
-from pipeline.data.classes import BUILDING
+from pipeline.data.classes import BUILDING, NEVER_ROOF
 from pipeline.data.pointcloud import PointCloud
 from pipeline.geometry.group_order import sort_values
 from pipeline.geometry.inside import find_inside

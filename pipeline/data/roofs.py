@@ -1,0 +1,98 @@
+"""Roofs as planes between two heights: one kind of roof for all building parts, flat ones included."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Where the roof of a building comes from: planes found in its points, a family of roofs fitted to them (gable,
+# hip, ...), the straight skeleton of its outline, or one height.
+ROOF_METHODS = ("planes", "family", "skeleton", "flat")
+
+
+@dataclass(frozen=True, eq=False)
+class Roofs:
+    """Roofs of ``n`` building parts: at (x, y) each is ``a (x - x0) + b (y - y0) + c``, kept between two heights.
+
+    Attributes
+    ----------
+    plane : float64, (n, 3)
+        Slopes ``a`` and ``b`` eastwards and northwards (m per m), and the height ``c`` at the origin (m).
+    origin : float64, (n, 2)
+        The origin ``x0, y0`` of each plane in the region's CRS: whole metres near the part.
+    limits : float64, (n, 2)
+        Lowest and highest height of each roof (m); both are ``c`` where a roof is flat.
+    """
+
+    plane: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    limits: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.plane)
+
+
+def flat_roofs(height: NDArray[np.float64]) -> Roofs:
+    """Flat roofs of given heights (m), float64 (n,); NaN stays NaN.
+
+    Examples
+    --------
+    >>> roof_heights(flat_roofs(np.array([12.5])), np.array([0, 0]), np.array([[3.0, 4.0], [5.0, 9.0]])).tolist()
+    [12.5, 12.5]
+    """
+    nothing = np.zeros(len(height))
+    return Roofs(
+        np.column_stack((nothing, nothing, height)),
+        np.zeros((len(height), 2)),
+        np.column_stack((height, height)),
+    )
+
+
+def roof_heights(roofs: Roofs, row: NDArray[np.int64], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heights of roofs at places.
+
+    Parameters
+    ----------
+    roofs : Roofs
+        Roofs.
+    row : int64, (k,)
+        The roof that is wanted at each place.
+    xy : float64, (k, 2)
+        The places in the region's CRS (m).
+
+    Returns
+    -------
+    float64, (k,)
+        Heights (m).
+
+    Examples
+    --------
+    >>> shed = Roofs(np.array([[0.5, 0.0, 10.0]]), np.array([[100.0, 0.0]]), np.array([[9.0, 12.0]]))
+    >>> roof_heights(shed, np.array([0, 0, 0]), np.array([[100.0, 7.0], [102.0, 0.0], [110.0, 0.0]])).tolist()
+    [10.0, 11.0, 12.0]
+    """
+    a, b, c = roofs.plane[row].T
+    x, y = (xy - roofs.origin[row]).T
+    low, high = roofs.limits[row].T
+    return np.minimum(np.maximum(a * x + b * y + c, low), high)
+
+
+def is_flat(roofs: Roofs) -> NDArray[np.bool_]:
+    """Tell which roofs have one height, bool (n,)."""
+    level: NDArray[np.bool_] = (roofs.plane[:, :2] == 0).all(axis=1)
+    return level | (roofs.limits[:, 0] == roofs.limits[:, 1])
+
+
+def take_roofs(roofs: Roofs, rows: NDArray[np.int64]) -> Roofs:
+    """Take some roofs in the order of `rows`, int64 (k,)."""
+    return Roofs(roofs.plane[rows], roofs.origin[rows], roofs.limits[rows])
+
+
+def join_roofs(several: Sequence[Roofs]) -> Roofs:
+    """Put roofs one after the other; none gives none."""
+    return Roofs(
+        np.concatenate([np.empty((0, 3)), *(roofs.plane for roofs in several)]),
+        np.concatenate([np.empty((0, 2)), *(roofs.origin for roofs in several)]),
+        np.concatenate([np.empty((0, 2)), *(roofs.limits for roofs in several)]),
+    )
