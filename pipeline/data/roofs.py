@@ -75,13 +75,15 @@ def roof_heights(roofs: Roofs, row: NDArray[np.int64], xy: NDArray[np.float64]) 
     a, b, c = roofs.plane[row].T
     x, y = (xy - roofs.origin[row]).T
     low, high = roofs.limits[row].T
-    return np.minimum(np.maximum(a * x + b * y + c, low), high)
+    height: NDArray[np.float64] = np.minimum(np.maximum(a * x + b * y + c, low), high)
+    return height
 
 
 def is_flat(roofs: Roofs) -> NDArray[np.bool_]:
     """Tell which roofs have one height, bool (n,)."""
     level: NDArray[np.bool_] = (roofs.plane[:, :2] == 0).all(axis=1)
-    return level | (roofs.limits[:, 0] == roofs.limits[:, 1])
+    level |= roofs.limits[:, 0] == roofs.limits[:, 1]
+    return level
 
 
 def take_roofs(roofs: Roofs, rows: NDArray[np.int64]) -> Roofs:
