@@ -13,6 +13,7 @@ from pipeline.city_model.building_points import BuildingPoints, take_building_po
 from pipeline.city_model.heights import ROOF_SOURCES, Heights, compute_building_heights
 from pipeline.data.citymodel import CityModel, Footprints, number_ids
 from pipeline.data.notes import Note
+from pipeline.data.roofs import Roofs, flat_roofs, take_roofs
 from pipeline.points_terrain.terrain import Dtm
 
 Bounds = tuple[float, float, float, float]
@@ -113,7 +114,7 @@ def assemble_city(
     members: tuple[tuple[str, ...], ...],
     wall_ground: NDArray[np.float64],
     *,
-    roof: NDArray[np.float64] | None = None,
+    roofs: Roofs | None = None,
     house: NDArray[np.str_] | None = None,
     group: NDArray[np.int32] | None = None,
 ) -> City:
@@ -128,7 +129,7 @@ def assemble_city(
         ids,
         number_ids(ids),
         heights.ground[kept],
-        (heights.roof if roof is None else roof)[kept],
+        take_roofs(flat_roofs(heights.roof) if roofs is None else roofs, kept),
         tuple(members[row] for row in kept),
         ids if house is None else house[kept],
     )

@@ -80,7 +80,9 @@ def build_solids(model: CityModel, origin: NDArray[np.float64], *, grid: float) 
     --------
     >>> one = np.ones(1)
     >>> square = np.array([shapely.box(0, 0, 2, 2)])
-    >>> model = CityModel(square, np.array(["a"]), np.array([1]), 0 * one, 3 * one, (("a",),), np.array(["a"]))
+    >>> model = CityModel(
+    ...     square, np.array(["a"]), np.array([1]), 0 * one, flat_roofs(3 * one), (("a",),), np.array(["a"])
+    ... )
     >>> solids, _ = build_solids(model, np.zeros(3), grid=1.0)
     >>> len(solids.vertices), len(solids.walls)
     (8, 4)

@@ -5,7 +5,7 @@ between them, about as widely as its plane edges are long; columns are merged by
 What a column holds depends on its neighbourhood in the plane mesh and on the terrain within `top_reach`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,17 +13,31 @@ from numpy.typing import NDArray
 from pipeline.columns.growth import Growth, movable_height
 from pipeline.columns.improve_columns import improve_columns
 from pipeline.columns.levels import fill_levels, stagger_columns
-from pipeline.columns.neighbours import check_groups
-from pipeline.columns.nodes import Levels, Nodes, SeamColumns, no_seam, place_nodes, triangle_surfaces
+from pipeline.columns.nodes import (
+    FREE,
+    GROUND_LEVEL,
+    ROOF_LEVEL,
+    Levels,
+    NodeMoves,
+    Nodes,
+    SeamColumns,
+    collect_surfaces,
+    no_seam,
+    place_nodes,
+)
+from pipeline.columns.order_keys import set_order_keys, wall_gates
 from pipeline.columns.spacing import SpacingLimits, domain_top, mean_edges, vertical_spacing
 from pipeline.columns.trim_layers import check_headroom
+from pipeline.columns.weld import Weld
 from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import ColumnMesh, PlaneMesh
+from pipeline.data.roofs import Roofs, roof_heights
 from pipeline.plane_mesh.edges import plane_edges
 from pipeline.plane_mesh.sizes import SizeField, local_sizes
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 
 HEADROOM = 0.5  # of the largest spacing: least air between a roof and the domain's top
+MOVED = 1e-9  # m; a roof that a node is closer to than this is exact
 
 
 @dataclass(frozen=True)
@@ -46,6 +60,8 @@ class AdaptiveOptions:
         How the vertical spacing grows from the ground up to the limits; None: it is the same at all heights.
     top : float or None
         Absolute height of the domain's top (m) if it is flat; None: it follows the smoothed terrain.
+    weld : Weld or None
+        How roofs that meet at a vertex are joined and parted; None: only roofs of one height are joined.
     """
 
     mesh_size: float
@@ -55,6 +71,7 @@ class AdaptiveOptions:
     passes: int
     growth: Growth | None = None
     top: float | None = None
+    weld: Weld | None = None
 
 
 @dataclass(frozen=True)
@@ -68,9 +85,17 @@ class AdaptiveReport:
     shared_columns : int
         Columns that touch two roofs or more.
     moved_nodes : int
-        Roofs that stand higher in a column than they should, for the sake of the least spacing.
+        Roofs that stand higher or lower in a column than they should: joined with others or parted from them.
     largest_move : float
         By how much at most (m).
+    joined_for_order : int
+        Roofs that were joined at one end of an edge, since they change order along it.
+    crossed_edges : int
+        Edges along which two roofs still change order, both ends being those of seams.
+    keyed_levels : int
+        Levels with an order key of their own.
+    passed_edges : int
+        Ends of tops of walls that the merge of columns still passes by.
     improved_levels : int
         Levels that the last passes moved.
     worst_ratio : (float, float)
@@ -82,6 +107,10 @@ class AdaptiveReport:
     shared_columns: int
     moved_nodes: int
     largest_move: float
+    joined_for_order: int
+    crossed_edges: int
+    keyed_levels: int
+    passed_edges: int
     improved_levels: int
     worst_ratio: tuple[float, float]
 
@@ -89,8 +118,7 @@ class AdaptiveReport:
 def mesh_adaptive(
     plane: PlaneMesh,
     dtm: Dtm,
-    roof: NDArray[np.float64],
-    group: NDArray[np.int32],
+    roofs: Roofs,
     ids: NDArray[np.str_],
     options: AdaptiveOptions,
     *,
@@ -105,11 +133,9 @@ def mesh_adaptive(
         Plane mesh with walls and party walls as edges.
     dtm : Dtm
         Terrain, as far beyond the plane mesh as `top_reach` says.
-    roof : float64, (b,)
-        Absolute roof height (m) of each building, row by row those of `PlaneMesh.building`. For exact roofs,
-        those that meet in a vertex are equal or `limits.least` mesh sizes apart, and as much above the terrain.
-    group : int32, (b,)
-        Buildings of one group have one roof: the same height, and no wall between them.
+    roofs : Roofs
+        Roof of each building, row by row those of `PlaneMesh.building`. Where two of them meet in a vertex at less
+        than the least step of `AdaptiveOptions.weld`, both are moved there. All others are exact.
     ids : str, (b,)
         Building ids, for messages.
     options : AdaptiveOptions
@@ -125,30 +151,36 @@ def mesh_adaptive(
     GeometryError
         If a building or the terrain reaches the top of the domain.
     ValueError
-        If a group has two heights, or the seam lacks a roof that the mesh has there.
+        If the seam lacks a roof that the mesh has there.
     """
-    check_groups(roof, group)
     seam = no_seam() if seam is None else seam
-    levels, bottom, moves = _fill_columns(plane, dtm, roof, ids, options, seam, sizes)
+    levels, bottom, moves = _fill_columns(plane, dtm, roofs, ids, options, seam, sizes)
     mesh = ColumnMesh(plane, levels.start, levels.z, bottom, "heights")
-    free = np.isnan(levels.surface)
+    free = levels.kind == FREE
     count, n_shared = np.diff(levels.start), _count_shared(levels)
-    free &= ~np.repeat(np.isin(np.arange(len(plane.xy)), seam.vertex), count)
+    given = np.zeros(len(plane.xy), np.bool_)
+    given[seam.vertex] = True
+    free &= ~np.repeat(given, count)
     size = local_sizes(sizes, plane.xy, mesh_size=options.mesh_size)
     spacing = vertical_spacing(mean_edges(plane), size, options.limits)
     if options.growth is not None:
         lowest = sample_dtm(dtm, plane.xy) + movable_height(spacing, options.growth)
         free &= levels.z > np.repeat(lowest, count)
-    del levels  # its surfaces are as large as its heights
+    del levels  # its kinds are of no use any more
     mesh, worst, improved = improve_columns(
         mesh, free, spacing, passes=options.passes, flat_cells=options.growth is not None
     )
+    mesh, passed = _key_columns(mesh, seam, given)
     report = AdaptiveReport(
         n_columns=len(plane.xy),
         n_levels=len(mesh.z),
         shared_columns=n_shared,
-        moved_nodes=int((moves > 0).sum()),
-        largest_move=float(moves.max(initial=0.0)),
+        moved_nodes=int((np.abs(moves.distance) > MOVED).sum()),
+        largest_move=float(np.abs(moves.distance).max(initial=0.0)),
+        joined_for_order=moves.joined_for_order,
+        crossed_edges=moves.crossed,
+        keyed_levels=0 if mesh.key is None else int((mesh.key != mesh.z).sum()),
+        passed_edges=passed,
         improved_levels=improved,
         worst_ratio=worst,
     )
@@ -158,28 +190,36 @@ def mesh_adaptive(
 def fill_columns(
     plane: PlaneMesh,
     dtm: Dtm,
-    roof: NDArray[np.float64],
+    roofs: Roofs,
     ids: NDArray[np.str_],
     options: AdaptiveOptions,
     *,
     sizes: SizeField | None = None,
-) -> Levels:
+) -> tuple[Levels, NDArray[np.int32]]:
     """Fill the columns of a plane mesh, as a seam's are from the mesh of its strip.
 
     Parameters and errors as in `mesh_adaptive`.
+
+    Returns
+    -------
+    Levels
+        The columns, with the surfaces that they touch.
+    int32, (m, 3)
+        For each corner of a triangle, the level of its column where its cells begin.
     """
-    return _fill_columns(plane, dtm, roof, ids, options, no_seam(), sizes)[0]
+    levels, bottom, _ = _fill_columns(plane, dtm, roofs, ids, options, no_seam(), sizes)
+    return replace(levels, surfaces=collect_surfaces(plane, bottom)), bottom
 
 
 def _fill_columns(
     plane: PlaneMesh,
     dtm: Dtm,
-    roof: NDArray[np.float64],
+    roofs: Roofs,
     ids: NDArray[np.str_],
     options: AdaptiveOptions,
     seam: SeamColumns,
     sizes: SizeField | None,
-) -> tuple[Levels, NDArray[np.int32], NDArray[np.float64]]:
+) -> tuple[Levels, NDArray[np.int32], NodeMoves]:
     """Levels, where cells begin in them, and how far each node was moved (m)."""
     size, limits = options.mesh_size, options.limits
     if options.top is None:
@@ -187,19 +227,44 @@ def _fill_columns(
     else:
         top = np.full(len(plane.xy), options.top)
     air = HEADROOM * limits.most * size
-    check_headroom(top, plane, roof, ids, domain_height=options.domain_height, air=air)
+    check_headroom(top, plane, highest_roofs(plane, roofs), ids, domain_height=options.domain_height, air=air)
     local = local_sizes(sizes, plane.xy, mesh_size=size)
     spacing = vertical_spacing(mean_edges(plane), local, limits)
     shift = np.zeros(len(plane.xy))
     if options.stagger:
         shift = options.stagger * stagger_columns(len(plane.xy), plane_edges(plane.triangles)[0])
-    surface = triangle_surfaces(plane, roof)
     least_gap = np.full(len(plane.xy), limits.least * size)
     ground = sample_dtm(dtm, plane.xy)
-    nodes, moves = place_nodes(plane, surface, ground, seam, least_gap=least_gap)
+    nodes, moves = place_nodes(plane, roofs, ground, seam, spacing=spacing, least_gap=least_gap, weld=options.weld)
     _check_top(plane, nodes, top, least_gap, options.domain_height)
     levels, bottom = fill_levels(nodes, top, spacing, shift, seam, ground=ground, growth=options.growth)
     return levels, bottom, moves
+
+
+def highest_roofs(plane: PlaneMesh, roofs: Roofs) -> NDArray[np.float64]:
+    """Highest place of each roof over the vertices of a plane mesh (m), (b,); -inf where it has none.
+
+    Parameters
+    ----------
+    plane : PlaneMesh
+        Plane mesh.
+    roofs : Roofs
+        Roof of each of its buildings.
+    """
+    inside = plane.building >= 0
+    building = np.repeat(plane.building[inside].astype(np.int64), 3)
+    highest = np.full(len(roofs), -np.inf)
+    np.maximum.at(highest, building, roof_heights(roofs, building, plane.xy[plane.triangles[inside].ravel()]))
+    return highest
+
+
+def _key_columns(mesh: ColumnMesh, seam: SeamColumns, given: NDArray[np.bool_]) -> tuple[ColumnMesh, int]:
+    """Give the columns order keys, but for those of seams, which have theirs; edges between these were seen to."""
+    key = mesh.z.copy()
+    place = np.repeat(mesh.z_start[seam.vertex], np.diff(seam.levels.start))
+    within = np.arange(len(seam.levels.z)) - np.repeat(seam.levels.start[:-1], np.diff(seam.levels.start))
+    key[place + within] = seam.levels.key
+    return set_order_keys(mesh, key, given, wall_gates(mesh))
 
 
 def _check_top(
@@ -220,5 +285,6 @@ def _check_top(
 
 
 def _count_shared(levels: Levels) -> int:
-    column = np.searchsorted(levels.start, np.flatnonzero(np.isfinite(levels.surface)), side="right")
+    surface = (levels.kind == GROUND_LEVEL) | (levels.kind == ROOF_LEVEL)
+    column = np.searchsorted(levels.start, np.flatnonzero(surface), side="right")
     return int((np.bincount(column) > 1).sum())

@@ -3,7 +3,7 @@
 In each triangle the segments of its three columns are merged from below, one tetrahedron a step, in the
 mesh's order (`ColumnMesh.order`). For columns of equal counts, "levels" is the paper's equations 1-3. Either
 order compares two columns by what these two are, so the faces over an edge are the same from both of its
-triangles: the mesh conforms.
+triangles: the mesh conforms. Beside steep tops of walls, keys take the place of heights (`order_keys`).
 """
 
 import numpy as np
@@ -64,7 +64,7 @@ def merge_columns(mesh: ColumnMesh, part: slice, clockwise: NDArray[np.bool_], n
     """
     cells = np.empty((n_cells, 4), np.int32)
     triangles, by_height = mesh.plane.triangles[part], mesh.order == "heights"
-    _merge_columns(triangles, mesh.bottom[part], mesh.z_start, mesh.z, by_height, clockwise[part], cells)
+    _merge_columns(triangles, mesh.bottom[part], mesh.z_start, mesh.merge_keys, by_height, clockwise[part], cells)
     return cells
 
 
@@ -216,7 +216,7 @@ def _upright_facets(
     start, end = plane.xy[ends[:, 0]], plane.xy[ends[:, 1]]
     along, across = end - start, opposite - start
     air_left = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0] > 0
-    sides = (low, high, until, column_end, mesh.z, mesh.order == "heights", air_left, on_seam)
+    sides = (low, high, until, column_end, mesh.merge_keys, mesh.order == "heights", air_left, on_seam)
     count = np.empty(len(ends), np.int64)
     _merge_edges(*sides, count, np.empty((0, 3), np.int32), np.empty(0, np.bool_))
     facets, shared = np.empty((count.sum(), 3), np.int32), np.empty(count.sum(), np.bool_)
@@ -262,12 +262,12 @@ def _side_marker(start: NDArray[np.float64], end: NDArray[np.float64], bounds: B
 
 
 @kernel(inline="always")
-def _comes_first(z: NDArray[np.float64], by_height: bool, i: int, end_i: int, j: int, end_j: int) -> bool:
+def _comes_first(key: NDArray[np.float64], by_height: bool, i: int, end_i: int, j: int, end_j: int) -> bool:
     """Whether a column's segment over level i is merged before the one over j of a later vertex's column."""
     if i == end_i or j == end_j:
         return i < end_i
     if by_height:
-        return bool(z[i] + z[i + 1] < z[j] + z[j + 1])
+        return bool(key[i] + key[i + 1] < key[j] + key[j + 1])
     return end_i - i > end_j - j
 
 
@@ -276,7 +276,7 @@ def merge_triangle(
     triangle: NDArray[np.int32],
     bottom: NDArray[np.int32],
     z_start: NDArray[np.int64],
-    z: NDArray[np.float64],
+    key: NDArray[np.float64],
     by_height: bool,
     clockwise: bool,
     cells: NDArray[np.int32],
@@ -296,14 +296,14 @@ def merge_triangle(
         cells[cell, 0] = a
         cells[cell, 1] = c if clockwise else b
         cells[cell, 2] = b if clockwise else c
-        if _comes_first(z, by_height, a, end_a, b, end_b):
-            if _comes_first(z, by_height, a, end_a, c, end_c):
+        if _comes_first(key, by_height, a, end_a, b, end_b):
+            if _comes_first(key, by_height, a, end_a, c, end_c):
                 a += 1
                 cells[cell, 3] = a
             else:
                 c += 1
                 cells[cell, 3] = c
-        elif _comes_first(z, by_height, b, end_b, c, end_c):
+        elif _comes_first(key, by_height, b, end_b, c, end_c):
             b += 1
             cells[cell, 3] = b
         else:
@@ -318,7 +318,7 @@ def _merge_columns(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
     z_start: NDArray[np.int64],
-    z: NDArray[np.float64],
+    key: NDArray[np.float64],
     by_height: bool,
     clockwise: NDArray[np.bool_],
     cells: NDArray[np.int32],
@@ -326,7 +326,7 @@ def _merge_columns(
     cell = 0
     for t in range(len(triangles)):
         first = cell
-        cell = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, first)
+        cell = merge_triangle(triangles[t], bottom[t], z_start, key, by_height, clockwise[t], cells, first)
         for k in range(first, cell):
             a, b, c = cells[k, 0], cells[k, 1], cells[k, 2]
             below = cells[k, 3] - 1
@@ -342,7 +342,7 @@ def _merge_edges(
     high: NDArray[np.int64],
     until: NDArray[np.int64],
     column_end: NDArray[np.int64],
-    z: NDArray[np.float64],
+    key: NDArray[np.float64],
     by_height: bool,
     air_left: NDArray[np.bool_],
     on_seam: NDArray[np.bool_],
@@ -364,7 +364,7 @@ def _merge_edges(
         i, j = min(low[e, 0], high[e, 0]), min(low[e, 1], high[e, 1])
         begin = facet
         while i < until[e, 0] or j < until[e, 1]:
-            rising = _comes_first(z, by_height, i, column_end[e, 0], j, column_end[e, 1])
+            rising = _comes_first(key, by_height, i, column_end[e, 0], j, column_end[e, 1])
             in_low = i >= low[e, 0] if rising else j >= low[e, 1]
             in_high = i >= high[e, 0] if rising else j >= high[e, 1]
             low_i, low_j = max(i, low[e, 0]), max(j, low[e, 1])

@@ -5,7 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns.nodes import GROUND_SURFACE, TOP_SURFACE, Levels, SeamColumns
+from pipeline.columns.nodes import (
+    FREE,
+    GROUND_LEVEL,
+    ROOF_LEVEL,
+    TOP_LEVEL,
+    Levels,
+    SeamColumns,
+    collect_surfaces,
+    find_surface_levels,
+)
 from pipeline.columns.trim_layers import first_kept
 from pipeline.data.mesh import PlaneMesh
 
@@ -18,8 +27,8 @@ class GivenLevels:
     ----------
     kept : int32, (n,)
         First level of each column that a cell uses; in a seam's column, one on either side.
-    surface : float64, (n, l)
-        What a level stands for, as in `Levels`, without the top; NaN for most.
+    kind : int8, (n, l)
+        What a level is, as in `Levels`, without the top; `FREE` for most.
     stays : bool, (n, l)
         Levels whose height is given: those that stand for something, and all of a seam's.
     z : float64, (n, l)
@@ -27,7 +36,7 @@ class GivenLevels:
     """
 
     kept: NDArray[np.int32]
-    surface: NDArray[np.float64]
+    kind: NDArray[np.int8]
     stays: NDArray[np.bool_]
     z: NDArray[np.float64]
 
@@ -69,34 +78,39 @@ def find_given_levels(
     """
     n = len(plane.xy)
     kept = first_kept(plane, first)
-    surface = np.full((n, n_layers + 1), np.nan)
-    surface[kept == 0, 0] = GROUND_SURFACE
+    kind = np.zeros((n, n_layers + 1), np.int8)
+    kind[kept == 0, 0] = GROUND_LEVEL
     inside = plane.building >= 0
     vertex, level = plane.triangles[inside].ravel(), np.repeat(first[inside], 3)
     height = np.repeat(roof[plane.building[inside]], 3)
-    surface[vertex, level] = height
-    if (surface[vertex, level] != height).any():
+    kind[vertex, level] = ROOF_LEVEL
+    z = np.full((n, n_layers + 1), np.nan)
+    z[kept == 0, 0] = ground[kept == 0]
+    z[vertex, level] = height
+    if (z[vertex, level] != height).any():
         raise ValueError("two roofs of different heights that meet share a layer; choose layers by all that touch")
-    z = np.where(surface == GROUND_SURFACE, ground[:, None], surface)
     if top is not None:
         z[:, -1] = top
     column, place = _seam_places(seam, n_layers)
-    given = np.full((n, n_layers + 1), np.nan)
-    given[column, place] = np.where(seam.levels.surface == TOP_SURFACE, np.nan, seam.levels.surface)
-    own = surface[seam.vertex]
-    if (~np.isnan(own) & (own != given[seam.vertex])).any():
-        raise ValueError("a triangle at a seam stands on a level that the seam's columns lack")
-    surface[seam.vertex] = given[seam.vertex]
+    _check_seam(plane, first, seam, n_layers)
+    kind[seam.vertex] = FREE
+    kind[column, place] = np.where(seam.levels.kind == TOP_LEVEL, FREE, seam.levels.kind)
     kept[seam.vertex] = (n_layers + 1 - np.diff(seam.levels.start)).astype(np.int32)
     z[column, place] = seam.levels.z
-    return GivenLevels(kept, surface, ~np.isnan(z), z)
+    return GivenLevels(kept, kind, ~np.isnan(z), z)
 
 
-def take_used_levels(given: GivenLevels, z: NDArray[np.float64]) -> Levels:
+def take_used_levels(
+    plane: PlaneMesh, first: NDArray[np.int32], given: GivenLevels, z: NDArray[np.float64]
+) -> Levels:
     """Drop the levels that no cell uses.
 
     Parameters
     ----------
+    plane : PlaneMesh
+        Plane mesh.
+    first : int32, (m,)
+        First level of the cells over each triangle.
     given : GivenLevels
         What was given.
     z : float64, (n, l)
@@ -104,10 +118,23 @@ def take_used_levels(given: GivenLevels, z: NDArray[np.float64]) -> Levels:
     """
     levels = z.shape[1]
     used = np.arange(levels) >= given.kept[:, None]
-    surface = given.surface.copy()
-    surface[:, -1] = TOP_SURFACE
+    kind = given.kind.copy()
+    kind[:, -1] = TOP_LEVEL
     start = np.concatenate(([0], np.cumsum(levels - given.kept))).astype(np.int64)
-    return Levels(start, z[used], surface[used])
+    bottom = first[:, None] - given.kept[plane.triangles]
+    return Levels(start, z[used], kind[used], z[used], collect_surfaces(plane, bottom.astype(np.int32)))
+
+
+def _check_seam(plane: PlaneMesh, first: NDArray[np.int32], seam: SeamColumns, n_layers: int) -> None:
+    """Refuse a triangle at a seam whose cells begin at a level that does not stand for its surface there."""
+    row = np.full(len(plane.xy), -1, np.int64)
+    row[seam.vertex] = np.arange(len(seam.vertex))
+    triangle, corner = np.nonzero(row[plane.triangles] >= 0)
+    column = row[plane.triangles[triangle, corner]]
+    found = find_surface_levels(seam.levels, column, plane.building[triangle].astype(np.int64))
+    dropped = n_layers + 1 - np.diff(seam.levels.start)
+    if ((found < 0) | (found + dropped[column] != first[triangle])).any():
+        raise ValueError("a triangle at a seam stands on a level that the seam's columns lack")
 
 
 def _seam_places(seam: SeamColumns, n_layers: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -301,7 +301,7 @@ def fill_layers(
     """
     seam = no_seam() if seam is None else seam
     z, given, _ = _settle(plane, dtm, roof, ids, removed, bounds, options, seam)
-    return take_used_levels(given, z)
+    return take_used_levels(plane, first_levels(plane, removed), given, z)
 
 
 def _settle(

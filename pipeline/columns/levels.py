@@ -1,10 +1,12 @@
 """The levels between the nodes of a column: evenly spaced, shifted against the neighbours (our steps 3.2-3.4)."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.columns.growth import Growth, count_steps, height_of_steps, stagger_weight
-from pipeline.columns.nodes import TOP_SURFACE, Levels, Nodes, SeamColumns
+from pipeline.columns.nodes import TOP_LEVEL, Levels, Nodes, SeamColumns, bare_levels
 from pipeline.data.kernel import kernel
 
 N_PHASES = 3
@@ -44,7 +46,7 @@ def fill_levels(
     Returns
     -------
     Levels
-        The columns.
+        The columns, without their surfaces.
     int32, (m, 3)
         For each corner of a triangle, the level of its column where its cells begin.
     """
@@ -55,14 +57,14 @@ def fill_levels(
     first, ratio = (growth.first, growth.ratio) if growth else (0.0, 1.0)
     law = (base, first, ratio)
     steps, start = _count_levels(nodes.start, nodes.z, top, spacing, *law, given, seam.levels.start)
-    z, surface = np.empty(start[-1]), np.full(start[-1], np.nan)
-    level = np.empty(len(nodes.z), np.int64)
+    z, kind = np.empty(start[-1]), np.zeros(start[-1], np.int8)
+    level = nodes.level.copy()
     _fill(
-        nodes.start, nodes.surface, nodes.z, top, spacing, *law, shift, steps,
-        given, seam.levels.start, seam.levels.z, seam.levels.surface,
-        start, z, surface, level,
+        nodes.start, nodes.kind, nodes.z, top, spacing, *law, shift, steps,
+        given, seam.levels.start, seam.levels.z, seam.levels.kind,
+        start, z, kind, level,
     )  # fmt: skip
-    return Levels(start, z, surface), level[nodes.of_corner].astype(np.int32)
+    return replace(bare_levels(start, z), kind=kind), level[nodes.of_corner]
 
 
 def stagger_columns(n: int, edges: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -129,7 +131,7 @@ def _count_levels(
 @kernel
 def _fill(
     node_start: NDArray[np.int64],
-    node_surface: NDArray[np.float64],
+    node_kind: NDArray[np.int8],
     node_z: NDArray[np.float64],
     top: NDArray[np.float64],
     spacing: NDArray[np.float64],
@@ -141,21 +143,18 @@ def _fill(
     given: NDArray[np.int64],
     seam_start: NDArray[np.int64],
     seam_z: NDArray[np.float64],
-    seam_surface: NDArray[np.float64],
+    seam_kind: NDArray[np.int8],
     start: NDArray[np.int64],
     z: NDArray[np.float64],
-    surface: NDArray[np.float64],
-    level: NDArray[np.int64],
+    kind: NDArray[np.int8],
+    level: NDArray[np.int32],
 ) -> None:
     for i in range(len(top)):
         if given[i] >= 0:
-            row, node = seam_start[given[i]], node_start[i]
+            row = seam_start[given[i]]
             for k in range(start[i + 1] - start[i]):
                 z[start[i] + k] = seam_z[row + k]
-                surface[start[i] + k] = seam_surface[row + k]
-                if node < node_start[i + 1] and seam_surface[row + k] == node_surface[node]:
-                    level[node] = k
-                    node += 1
+                kind[start[i] + k] = seam_kind[row + k]
             continue
         at = start[i]
         for node in range(node_start[i], node_start[i + 1]):
@@ -164,7 +163,7 @@ def _fill(
             above = node_z[node + 1] if node + 1 < node_start[i + 1] else top[i]
             step = (above - below) / steps[node]
             z[at] = below
-            surface[at] = node_surface[node]
+            kind[at] = node_kind[node]
             if first > 0:
                 low = count_steps(below - base[i], spacing[i], first, ratio)
                 part = (count_steps(above - base[i], spacing[i], first, ratio) - low) / steps[node]
@@ -177,7 +176,7 @@ def _fill(
                     z[at + k] = below + (k + shift[i]) * step
             at += steps[node]
         z[at] = top[i]
-        surface[at] = TOP_SURFACE
+        kind[at] = TOP_LEVEL
 
 
 @kernel

@@ -189,7 +189,7 @@ def mesh_city(
     report: LayeredReport | AdaptiveReport
     with trace("3.2-3.5 columns"):
         if isinstance(options, AdaptiveOptions):
-            columns, report = mesh_adaptive(plane, dtm, city.model.roof, city.group, city.model.ids, options)
+            columns, report = mesh_adaptive(plane, dtm, city.model.roofs, city.model.ids, options)
         else:
             columns, report = mesh_layers(
                 plane, dtm, city.model, city.wall_ground, bounds, options, group=city.group

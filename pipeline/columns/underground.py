@@ -6,7 +6,7 @@ kept as one, numbered from below, so that all that is said of points goes for bo
 by the air's rule, so its faces match without exchange too.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from pipeline.columns.cell_blocks import CellBlocks
 from pipeline.columns.columns import Bounds, find_used_points, split_boundary
 from pipeline.columns.levels import stagger_columns
-from pipeline.columns.nodes import GROUND_SURFACE, Levels, SeamColumns, join_levels, take_columns
+from pipeline.columns.nodes import (
+    GROUND_LEVEL,
+    Levels,
+    SeamColumns,
+    bare_levels,
+    join_levels,
+    take_columns,
+)
 from pipeline.columns.spacing import SpacingLimits, mean_edges, vertical_spacing
 from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges
 from pipeline.plane_mesh.edges import plane_edges
@@ -135,12 +142,12 @@ def fill_soil(
     bottom = top - options.depth
     z = bottom[column] + (level + shift[vertex][column]) * (options.depth / steps)[column]
     z[start[:-1]], z[start[1:] - 1] = bottom, top
-    return Levels(start, z, np.full(len(z), np.nan))
+    return bare_levels(start, z)
 
 
 def is_grounded(levels: Levels) -> NDArray[np.bool_]:
     """Tell in which of a seam's columns of air the lowest level is the ground, bool (n,)."""
-    grounded: NDArray[np.bool_] = levels.surface[levels.start[:-1]] == GROUND_SURFACE
+    grounded: NDArray[np.bool_] = levels.kind[levels.start[:-1]] == GROUND_LEVEL
     return grounded
 
 
@@ -163,13 +170,14 @@ def join_soil(soil: Levels, air: Levels, grounded: NDArray[np.bool_]) -> Levels:
     if (soil.z[soil.start[1:] - 1][grounded] != air.z[air.start[:-1]][grounded]).any():
         raise ValueError("the soil of a column does not end at the ground of its air")
     start = np.concatenate(([0], np.cumsum(below + np.diff(air.start)))).astype(np.int64)
-    z, surface = np.empty(start[-1]), np.empty(start[-1])
+    z, key, kind = np.empty(start[-1]), np.empty(start[-1]), np.empty(start[-1], np.int8)
     for part, first, count in ((soil, start[:-1], below), (air, start[:-1] + below, np.diff(air.start))):
         begin = np.concatenate(([0], np.cumsum(count)))
         within = np.arange(begin[-1]) - np.repeat(begin[:-1], count)
         here, there = within + np.repeat(first, count), within + np.repeat(part.start[:-1], count)
-        z[here], surface[here] = part.z[there], part.surface[there]
-    return Levels(start, z, surface)
+        z[here], key[here], kind[here] = part.z[there], part.key[there], part.kind[there]
+    raised = replace(air.surfaces, level=air.surfaces.level + np.repeat(below, np.diff(air.surfaces.start)))
+    return Levels(start, z, kind, key, replace(raised, level=raised.level.astype(np.int32)))
 
 
 def add_soil(
@@ -214,9 +222,10 @@ def add_soil(
     row = np.arange(n, dtype=np.int32)
     row[soil.vertex] = n + np.arange(len(soil.vertex), dtype=np.int32)
     levels = take_columns(join_levels([own, soil.levels]), row)
-    whole = join_soil(levels, Levels(mesh.z_start, mesh.z, np.full(len(mesh.z), np.nan)), grounded)
+    whole = join_soil(levels, replace(bare_levels(mesh.z_start, mesh.z), key=mesh.merge_keys), grounded)
     raised = (np.diff(levels.start) - grounded).astype(np.int32)
-    columns = ColumnMesh(plane, whole.start, whole.z, mesh.bottom + raised[plane.triangles], mesh.order)
+    key = None if mesh.key is None else whole.key
+    columns = ColumnMesh(plane, whole.start, whole.z, mesh.bottom + raised[plane.triangles], mesh.order, key)
     return SoilMesh(columns, (np.diff(levels.start) - 1).astype(np.int32)), raised, np.flatnonzero(lowered)
 
 

@@ -1,13 +1,16 @@
-"""The LoD1.2 city model: footprints, and buildings as prisms between two heights."""
+"""The city model: footprints, and buildings as prisms between the ground and a roof."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
+from pipeline.data.roofs import Roofs, highest_roofs, join_roofs, take_roofs
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +34,7 @@ class Footprints:
 
 @dataclass(frozen=True, eq=False)
 class Prisms:
-    """Buildings, or parts of them, as prisms ``polygon x [ground, roof]``: what a mesh is made around.
+    """Buildings, or parts of them, as prisms from the ground to a roof: what a mesh is made around.
 
     Attributes
     ----------
@@ -41,18 +44,25 @@ class Prisms:
         Ids of the rows, each once; a merged building has the id of its largest member.
     numbers : int64, (n,)
         The same ids as numbers below 2**53, for formats without strings; see `number_ids`.
-    ground, roof : float64, (n,)
-        Absolute ground and roof height (m).
+    ground : float64, (n,)
+        Absolute ground height (m).
+    roofs : Roofs
+        Roofs, absolute heights (m).
     """
 
     polygons: NDArray[np.object_]
     ids: NDArray[np.str_]
     numbers: NDArray[np.int64]
     ground: NDArray[np.float64]
-    roof: NDArray[np.float64]
+    roofs: Roofs
 
     def __len__(self) -> int:
         return len(self.polygons)
+
+    @property
+    def roof(self) -> NDArray[np.float64]:
+        """Highest place of each roof (m), float64 (n,)."""
+        return highest_roofs(self.roofs, self.polygons)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +73,7 @@ class CityModel(Prisms):
 
     Attributes
     ----------
-    polygons, ids, numbers, ground, roof
+    polygons, ids, numbers, ground, roofs
         As of `Prisms`.
     members : tuple of n tuples of str
         Ids of the input footprints that each building was made of, ascending, itself included.
@@ -73,6 +83,33 @@ class CityModel(Prisms):
 
     members: tuple[tuple[str, ...], ...]
     house: NDArray[np.str_]
+
+
+def take_model(model: CityModel, rows: NDArray[np.integer[Any]] | slice) -> CityModel:
+    """Take some buildings, in the order of the rows."""
+    chosen = np.arange(len(model))[rows]
+    return CityModel(
+        model.polygons[chosen],
+        model.ids[chosen],
+        model.numbers[chosen],
+        model.ground[chosen],
+        take_roofs(model.roofs, chosen),
+        tuple(model.members[row] for row in chosen.tolist()),
+        model.house[chosen],
+    )
+
+
+def join_models(models: Sequence[CityModel]) -> CityModel:
+    """Put the buildings of one or more models one after the other."""
+    return CityModel(
+        np.concatenate([model.polygons for model in models]),
+        np.concatenate([model.ids for model in models]),
+        np.concatenate([model.numbers for model in models]),
+        np.concatenate([model.ground for model in models]),
+        join_roofs([model.roofs for model in models]),
+        tuple(names for model in models for names in model.members),
+        np.concatenate([model.house for model in models]),
+    )
 
 
 def number_ids(ids: NDArray[np.str_]) -> NDArray[np.int64]:

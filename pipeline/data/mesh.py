@@ -73,6 +73,9 @@ class ColumnMesh:
         Which column's next segment comes first where columns are merged into cells: the one with the most
         segments left above it (the paper's equations 1-3), or the one whose middle is lowest. Ties go to
         the highest vertex. Either order is that of two columns alone, so any cells that it makes conform.
+    key : float64, (z_start[-1],), optional
+        What takes the place of heights in the order "heights", ascending in every column: beside steep tops of
+        walls it differs from them. By default it is `z`.
     """
 
     plane: PlaneMesh
@@ -80,6 +83,12 @@ class ColumnMesh:
     z: NDArray[np.float64]
     bottom: NDArray[np.int32]
     order: MergeOrder = "levels"
+    key: NDArray[np.float64] | None = None
+
+    @property
+    def merge_keys(self) -> NDArray[np.float64]:
+        """Keys by which columns are merged: `key`, or the heights."""
+        return self.z if self.key is None else self.key
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 # Where the roof of a building comes from: planes found in its points, a family of roofs fitted to them (gable,
@@ -77,6 +78,17 @@ def roof_heights(roofs: Roofs, row: NDArray[np.int64], xy: NDArray[np.float64]) 
     low, high = roofs.limits[row].T
     height: NDArray[np.float64] = np.minimum(np.maximum(a * x + b * y + c, low), high)
     return height
+
+
+def highest_roofs(roofs: Roofs, polygons: NDArray[np.object_]) -> NDArray[np.float64]:
+    """Highest place of each roof over its polygon (m), float64 (n,)."""
+    highest = roofs.limits[:, 1].copy()
+    sloped = np.flatnonzero(~is_flat(roofs))
+    if len(sloped):
+        xy, index = shapely.get_coordinates(polygons[sloped], return_index=True)
+        first = np.flatnonzero(np.diff(index, prepend=-1))
+        highest[sloped] = np.maximum.reduceat(roof_heights(roofs, sloped[index], xy), first)
+    return highest
 
 
 def is_flat(roofs: Roofs) -> NDArray[np.bool_]:

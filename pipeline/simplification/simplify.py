@@ -24,6 +24,7 @@ from pipeline.city_model.houses import Houses, divide_houses
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roofs import flat_roofs
 from pipeline.points_terrain.terrain import Dtm
 from pipeline.simplification.fidelity import Fidelity, measure_simplification
 from pipeline.simplification.house_clusters import Shapes, simplify_houses
@@ -159,7 +160,14 @@ def _raise_planar(houses: Houses, shapes: Shapes, dtm: Dtm, options: CityOptions
     roof, group = _settle_clusters(shapes, heights, wall_ground, ids, options)
     members = tuple((str(houses.ids[k]),) for k in row)
     city = assemble_city(
-        footprints, points, heights, members, wall_ground, roof=roof, house=houses.ids[row], group=group
+        footprints,
+        points,
+        heights,
+        members,
+        wall_ground,
+        roofs=flat_roofs(roof),
+        house=houses.ids[row],
+        group=group,
     )
     outline = measure_simplification(houses.polygons, shapes.polygons, row)
     raised = wall_ground + options.roof_clearance > heights.roof
@@ -299,7 +307,7 @@ def _raise_merged(houses: Houses, shapes: Shapes, dtm: Dtm, options: CityOptions
     wall_ground = highest_wall_ground(shapes.polygons, dtm)
     roof, raised = raise_low_roofs(heights.roof, wall_ground, clearance=options.roof_clearance)
     names = tuple(tuple(sorted(houses.ids[group].tolist())) for group in members)
-    city = assemble_city(footprints, points, heights, names, wall_ground, roof=roof)
+    city = assemble_city(footprints, points, heights, names, wall_ground, roofs=flat_roofs(roof))
     notes = (*note_heights("building", footprints, heights), *_note_raised(footprints, heights, roof, raised))
     return replace(city, notes=notes, counts=shapes.counts)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns.nodes import GROUND_SURFACE, SeamColumns
+from pipeline.columns.nodes import SeamColumns, find_surface_levels
 from pipeline.data.mesh import PlaneMesh, SeamEdges
 from pipeline.plane_mesh.edges import plane_edges
 from stitch.seams.seams import Seam, find_vertices
@@ -83,7 +83,6 @@ def find_seam_edges(
     plane: PlaneMesh,
     sides: Sequence[Side],
     columns: SeamColumns,
-    roof: NDArray[np.float64],
     numbers: NDArray[np.int64],
 ) -> SeamEdges:
     """Find a tile's seams among its edges, and where the cells beyond them begin.
@@ -96,10 +95,8 @@ def find_seam_edges(
         Its seams within the region, each with the side that the tile is on.
     columns : SeamColumns
         Their columns (`tile_columns`).
-    roof : float64, (b,)
-        Roof heights (m) of the city model that the seams were found with.
     numbers : int64, (b,)
-        Numbers of its buildings.
+        Numbers of the buildings of the city model that the seams were found with.
 
     Returns
     -------
@@ -113,29 +110,29 @@ def find_seam_edges(
 
     Notes
     -----
-    A column of a seam tells for each level which ground or roof it stands for, so heights are not searched for:
-    also a roof that stands higher in a column than it should is found.
+    A column of a seam tells at which level which ground or roof is, so heights are not searched for: also a roof
+    that stands higher or lower in a column than it should is found.
     """
-    vertices, surface, building, missing = [], [], [], []
+    vertices, rows, missing = [], [], []
     for side in sides:
         row = label_beyond(side.seam, left=side.left)
         at = find_vertices(plane.xy, side.seam.xy)
         vertices.append(np.sort(np.stack((at[:-1], at[1:]), axis=1), axis=1))
-        surface.append(np.append(roof, GROUND_SURFACE)[row])
-        building.append(np.append(numbers, -1)[row])
+        rows.append(row.astype(np.int64))
         missing.append(np.full(len(row), side.missing))
     ends = np.concatenate([np.empty((0, 2), np.int32), *vertices])
-    bottom = find_levels(columns, ends, np.concatenate([np.empty(0), *surface]))
+    building = np.concatenate([np.empty(0, np.int64), *rows])
+    bottom = find_levels(columns, ends, building)
     return SeamEdges(
         ends,
         bottom,
-        np.concatenate([np.empty(0, np.int64), *building]),
+        np.append(numbers, -1)[building],
         np.concatenate([np.empty(0, np.bool_), *missing]),
     )
 
 
 def find_levels(
-    columns: SeamColumns, vertices: NDArray[np.int32], surface: NDArray[np.float64]
+    columns: SeamColumns, vertices: NDArray[np.int32], building: NDArray[np.int64]
 ) -> NDArray[np.int32]:
     """Find the level that stands for the ground or a roof in given columns.
 
@@ -145,8 +142,8 @@ def find_levels(
         The columns.
     vertices : int32, (k, 2)
         Vertices that have such a column.
-    surface : float64, (k,)
-        The roof's height (m), or `GROUND_SURFACE`.
+    building : int64, (k,)
+        Row of the building whose roof it is, -1 for the ground.
 
     Returns
     -------
@@ -158,15 +155,9 @@ def find_levels(
     ValueError
         If a vertex has no given column, or its column no such level.
     """
-    wanted = np.repeat(surface, 2)
     order = np.argsort(columns.vertex)
     row = order[np.searchsorted(columns.vertex, vertices.ravel(), sorter=order).clip(max=max(len(order) - 1, 0))]
-    start, count = columns.levels.start[row], np.diff(columns.levels.start)[row]
-    level = np.full(len(row), -1, np.int32)
-    for k in range(int(count.max(initial=0))):
-        there = k < count
-        there[there] = columns.levels.surface[start[there] + k] == wanted[there]
-        level[there] = k
+    level = find_surface_levels(columns.levels, row, np.repeat(building, 2))
     if (columns.vertex[row] != vertices.ravel()).any() or (level < 0).any():
         raise ValueError("a column of a seam lacks a level for the ground or roof beyond the seam")
     return level.reshape(-1, 2)

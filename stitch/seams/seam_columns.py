@@ -1,13 +1,16 @@
 """Columns of seams and corners from seam data alone (steps 3.2 to 3.4, adaptive), and a tile's share of them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.columns.adaptive import AdaptiveOptions, fill_columns
 from pipeline.columns.nodes import Levels, SeamColumns, join_levels, take_columns
-from pipeline.data.mesh import PlaneMesh
+from pipeline.columns.order_keys import set_order_keys, wall_gates
+from pipeline.data.mesh import ColumnMesh, PlaneMesh
+from pipeline.data.roofs import Roofs
 from pipeline.plane_mesh.plane import order_plane
 from pipeline.plane_mesh.sizes import SizeField
 from pipeline.points_terrain.terrain import Dtm
@@ -18,7 +21,7 @@ from stitch.tiling.corners import Corner
 def fill_corner(
     corner: Corner,
     dtm: Dtm,
-    roof: NDArray[np.float64],
+    roofs: Roofs,
     ids: NDArray[np.str_],
     options: AdaptiveOptions,
     *,
@@ -32,7 +35,7 @@ def fill_corner(
         A corner of two tiles or more. No wall is as close to it as the tips of its first edges.
     dtm : Dtm
         Terrain as far beyond these as `top_reach` says.
-    roof, ids, options, sizes
+    roofs, ids, options, sizes
         As in `mesh_adaptive`.
 
     Returns
@@ -41,7 +44,7 @@ def fill_corner(
         One column, with a spacing that follows the length of the first edges.
     """
     fan = mesh_fan(corner)
-    levels = fill_columns(fan, dtm, roof, ids, options, sizes=sizes)
+    levels, _ = fill_columns(fan, dtm, roofs, ids, options, sizes=sizes)
     return take_columns(levels, find_vertices(fan.xy, corner.xy[None]))
 
 
@@ -49,7 +52,7 @@ def fill_seam(
     seam: Seam,
     ends: tuple[Levels, Levels],
     dtm: Dtm,
-    roof: NDArray[np.float64],
+    roofs: Roofs,
     ids: NDArray[np.str_],
     options: AdaptiveOptions,
     *,
@@ -65,16 +68,32 @@ def fill_seam(
         Columns of its first and last corner.
     dtm : Dtm
         Terrain as far beyond its triangles as `top_reach` says.
-    roof, ids, options, sizes
+    roofs, ids, options, sizes
         As in `mesh_adaptive`.
 
     Returns
     -------
     Levels
         A column for each vertex, with a level for every roof on either side.
+
+    Notes
+    -----
+    Order keys are set for the edges of the seam itself. Those of edges that lead away from it are for the tiles,
+    which move their own columns alone.
     """
-    levels = fill_columns(seam.ring, dtm, roof, ids, options, sizes=sizes)
-    return join_levels([ends[0], take_columns(levels, seam.vertex[1:-1]), ends[1]])
+    levels, bottom = fill_columns(seam.ring, dtm, roofs, ids, options, sizes=sizes)
+    mesh = ColumnMesh(seam.ring, levels.start, levels.z, bottom, "heights")
+    given = np.ones(len(seam.ring.xy), np.bool_)
+    given[seam.vertex[1:-1]] = False
+    gates = wall_gates(mesh)
+    column = np.searchsorted(levels.start, gates[:, :, 0], side="right") - 1
+    along = np.full(len(seam.ring.xy), -1)
+    along[seam.vertex] = np.arange(len(seam.vertex))
+    at = along[column]
+    mine = gates[(at >= 0).all(axis=1) & (np.abs(at[:, 0] - at[:, 1]) == 1)]
+    mesh, _ = set_order_keys(mesh, levels.z, given, mine)
+    keyed = replace(levels, key=mesh.merge_keys)
+    return join_levels([ends[0], take_columns(keyed, seam.vertex[1:-1]), ends[1]])
 
 
 def tile_columns(plane: PlaneMesh, seams: Sequence[tuple[Seam, Levels]]) -> SeamColumns:

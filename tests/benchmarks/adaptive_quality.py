@@ -14,6 +14,7 @@ from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
 from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
 from pipeline.columns.columns import expand_cells
 from pipeline.columns.spacing import SpacingLimits
+from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 from pipeline.quality.quality import measure_cells
@@ -63,7 +64,7 @@ def run(relief: float, mesh_size: float, seed: int, *, size: float = SIZE, build
     )
     begin = time.perf_counter()
     plane, _ = mesh_plane(bounds, city.polygons, mesh_size=mesh_size, min_angle=28, refinements=1, passes=4)
-    mesh, _ = mesh_adaptive(plane, dtm, roof, np.arange(buildings, dtype=np.int32), city.ids, options)
+    mesh, _ = mesh_adaptive(plane, dtm, flat_roofs(roof), city.ids, options)
     seconds = time.perf_counter() - begin
     quality = measure_cells(expand_cells(mesh))
     n = len(quality.radius_ratio)

@@ -67,8 +67,8 @@ def test_plane_mesh(benchmark: BenchmarkFixture, scene: Scene) -> None:
 
 
 def test_adaptive_columns(benchmark: BenchmarkFixture, scene: Scene) -> None:
-    city, group = scene.city, np.arange(len(scene.city), dtype=np.int32)
-    mesh, _ = benchmark(mesh_adaptive, scene.plane, scene.dtm, city.roof, group, city.ids, ADAPTIVE)
+    city = scene.city
+    mesh, _ = benchmark(mesh_adaptive, scene.plane, scene.dtm, city.roofs, city.ids, ADAPTIVE)
     benchmark.extra_info["cells"] = n_cells = len(expand_cells(mesh).cells)
     assert n_cells > len(scene.plane.triangles)
 

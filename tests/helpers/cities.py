@@ -9,6 +9,7 @@ from pipeline.city_model.heights import highest_wall_ground
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.classes import BUILDING, GROUND
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roofs import flat_roofs
 from pipeline.points_terrain.terrain import Dtm
 
 Bounds = tuple[float, float, float, float]
@@ -42,7 +43,7 @@ def city_of(polygons: list[shapely.Polygon], roofs: list[float], *, ground: floa
         ids,
         number_ids(ids),
         np.full(len(polygons), ground),
-        np.array(roofs, dtype=np.float64),
+        flat_roofs(np.array(roofs, dtype=np.float64)),
         tuple((str(name),) for name in ids),
         ids,
     )

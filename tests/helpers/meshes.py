@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.mesh import Boundary, Marker, TetMesh
+from pipeline.data.roofs import flat_roofs
 from tiler.citymodels.cityjson import write_city_model
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
 
@@ -175,7 +176,9 @@ def _make_model(houses: Mapping[str, tuple[tuple[Square, ...], int]], dtm: Plane
     ids = np.array(list(houses), np.str_)
     ground = np.array([dtm.sample(shapely.get_coordinates(polygon)).min() for polygon in polygons])
     roof = np.array([LEVELS[level - 1] for _, level in houses.values()])
-    return CityModel(polygons, ids, number_ids(ids), ground, roof, tuple((str(name),) for name in ids), ids)
+    return CityModel(
+        polygons, ids, number_ids(ids), ground, flat_roofs(roof), tuple((str(name),) for name in ids), ids
+    )
 
 
 def _box_of(square: Square) -> Any:

@@ -19,9 +19,10 @@ from pipeline.columns.layered import LayeredOptions, choose_layers, mesh_layers,
 from pipeline.columns.nodes import Levels
 from pipeline.columns.spacing import SpacingLimits, domain_top, top_reach
 from pipeline.columns.tile import build_city
-from pipeline.data.citymodel import CityModel
+from pipeline.data.citymodel import CityModel, take_model
 from pipeline.data.mesh import ColumnMesh, TetMesh
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.plane import signed_areas
 from pipeline.plane_mesh.sizes import SizeField, SizeRule, size_field
 from pipeline.points_terrain.terrain import Dtm, compute_dtm, sample_dtm
@@ -75,7 +76,7 @@ def scene_of(polygons: Sequence[shapely.Polygon], roofs: Sequence[float], dtm: D
     model = city_of(list(polygons), [0.0] * len(polygons))
     wall_ground = highest_wall_ground(model.polygons, dtm)
     roof, _ = raise_low_roofs(wall_ground + np.array(roofs), wall_ground, clearance=2.0)
-    return Scene(replace(model, roof=roof), np.arange(len(model), dtype=np.int32), dtm)
+    return Scene(replace(model, roofs=flat_roofs(roof)), np.arange(len(model), dtype=np.int32), dtm)
 
 
 def random_scene(bounds: Bounds, n: int, *, seed: int, relief: float = 0.0) -> Scene:
@@ -117,15 +118,7 @@ def select_houses(scene: Scene, chosen: NDArray[np.integer]) -> Scene:
     """Take some houses, in any order."""
     model = scene.model
     return Scene(
-        CityModel(
-            model.polygons[chosen],
-            model.ids[chosen],
-            model.numbers[chosen],
-            model.ground[chosen],
-            model.roof[chosen],
-            tuple(model.members[row] for row in chosen.tolist()),
-            model.house[chosen],
-        ),
+        take_model(model, chosen),
         scene.group[chosen],
         scene.dtm,
     )
@@ -226,9 +219,7 @@ def mesh_alone(
     assert complete
     given = tile_columns(plane, [(seams[key], columns[key]) for key in columns])
     if isinstance(options, AdaptiveOptions):
-        mesh, _ = mesh_adaptive(
-            plane, near.dtm, model.roof, near.group, model.ids, options, seam=given, sizes=sizes
-        )
+        mesh, _ = mesh_adaptive(plane, near.dtm, model.roofs, model.ids, options, seam=given, sizes=sizes)
     else:
         none = np.empty(0)
         mesh, _ = mesh_layers(plane, near.dtm, model, none, grid.bounds, options, removed=removed, seam=given)
@@ -257,8 +248,9 @@ def _seam_levels(
     """Columns of a seam, those of its corners first."""
     dtm, roof, ids = near.dtm, near.model.roof, near.model.ids
     if isinstance(options, AdaptiveOptions):
-        start, end = (fill_corner(corner, dtm, roof, ids, options, sizes=sizes) for corner in ends)
-        return fill_seam(seam, (start, end), dtm, roof, ids, options, sizes=sizes)
+        roofs = near.model.roofs
+        start, end = (fill_corner(corner, dtm, roofs, ids, options, sizes=sizes) for corner in ends)
+        return fill_seam(seam, (start, end), dtm, roofs, ids, options, sizes=sizes)
     assert removed is not None
     start, end = (
         fill_corner_layers(

@@ -67,7 +67,7 @@ def seam_edges(city: City, key: Key, missing: Collection[SeamKey] = ()) -> SeamE
     inner = [seam for seam in seams_of_tile(key) if seam in tile.columns]
     sides = [Side(tile.seams[seam], seam in (south, east), seam in missing) for seam in inner]
     columns = tile_columns(tile.mesh.plane, [(tile.seams[seam], tile.columns[seam]) for seam in inner])
-    return find_seam_edges(tile.mesh.plane, sides, columns, near.roof, near.numbers)
+    return find_seam_edges(tile.mesh.plane, sides, columns, near.numbers)
 
 
 def split_all(city: City, gone: Collection[Key] = ()) -> dict[Key, Split]:

@@ -14,6 +14,7 @@ from pipeline.city_model.heights import highest_wall_ground
 from pipeline.columns.columns import expand_cells
 from pipeline.columns.layered import LayeredOptions, choose_layers, fill_layers, mesh_layers, terrain_reach
 from pipeline.columns.nodes import SeamColumns, take_columns
+from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.points_terrain.terrain import Dtm
 from pipeline.quality.quality import measure_cells
@@ -115,7 +116,7 @@ def test_steep_terrain_is_repaired_on_seams_too() -> None:
 def test_a_tile_is_the_same_alone_and_in_a_larger_region() -> None:
     bounds, inner = (0.0, 0.0, 700.0, 700.0), (140.0, 140.0, 560.0, 560.0)
     scene = random_scene(bounds, 300, seed=3, relief=15.0)
-    scene = replace(scene, model=replace(scene.model, roof=np.minimum(scene.model.roof, 14.0)))
+    scene = replace(scene, model=replace(scene.model, roofs=flat_roofs(np.minimum(scene.model.roof, 14.0))))
     crossing = shapely.intersects(scene.model.polygons, shapely.box(*inner).exterior)
     scene = select_houses(scene, np.flatnonzero(~crossing))
     within = np.flatnonzero(shapely.within(scene.model.polygons, shapely.box(*inner)))
@@ -369,6 +370,6 @@ def test_wrong_seams_and_layers_are_refused() -> None:
     # A vertex in a house has no level for the ground.
     inside = int(np.flatnonzero((plane.xy == (30, 20)).all(axis=1))[0])
     lifted = SeamColumns(np.array([inside], np.int32), take_columns(levels, np.array([inside], np.int32)))
-    lifted.levels.surface[0] = np.nan
+    lifted.levels.surfaces.building[0] = 7
     with pytest.raises(ValueError, match="lack"):
         mesh(lifted)

@@ -182,7 +182,7 @@ def test_where_a_tile_is_missing_its_seams_are_marked(crowded: City) -> None:
 def test_of_one_tile_the_boundary_is_all_there_is() -> None:
     scene = random_scene(SQUARE, 60, seed=1)
     plane, _ = mesh_plane(SQUARE, scene.model.polygons, mesh_size=20.0, min_angle=28, refinements=1, passes=1)
-    mesh, _ = mesh_adaptive(plane, scene.dtm, scene.model.roof, scene.group, scene.model.ids, OPTIONS)
+    mesh, _ = mesh_adaptive(plane, scene.dtm, scene.model.roofs, scene.model.ids, OPTIONS)
     none = SeamEdges(
         np.empty((0, 2), np.int32), np.empty((0, 2), np.int32), np.empty(0, np.int64), np.empty(0, bool)
     )

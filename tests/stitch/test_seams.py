@@ -148,7 +148,7 @@ def test_seams_cost_little_quality() -> None:
     grid = make_grid(bounds, tile_size=200.0, mesh_size=10.0)
     tiled = measure_cells(glue([tile.mesh for tile in mesh_all(scene, grid).values()])).radius_ratio
     plane, _ = mesh_plane(bounds, model.polygons, mesh_size=10.0, min_angle=28, refinements=1, passes=4)
-    whole = expand_cells(mesh_adaptive(plane, scene.dtm, model.roof, scene.group, model.ids, OPTIONS)[0])
+    whole = expand_cells(mesh_adaptive(plane, scene.dtm, model.roofs, model.ids, OPTIONS)[0])
     untiled = measure_cells(whole).radius_ratio
     ratio = np.percentile(tiled, (0, 0.1, 1, 5, 50)) / np.percentile(untiled, (0, 0.1, 1, 5, 50))
     assert ratio[0] > 0.5

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from pyproj.exceptions import CRSError
 
 from pipeline.city_model.solids import Solids, build_solids
-from pipeline.data.citymodel import CityModel
+from pipeline.data.citymodel import CityModel, join_models, take_model
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
+from pipeline.data.roofs import flat_roofs
 from tiler.store.atomic import replacing
 
 # Coordinates are whole multiples of this length (m).
@@ -282,30 +283,14 @@ def _join_blocks(blocks: Sequence[tuple[CityModel, Attributes]]) -> tuple[CityMo
         for name, column in columns.items():
             if len(column) != len(model):
                 raise ValueError(f"attribute {name!r} has {len(column)} values for {len(model)} buildings")
-    joined = CityModel(
-        polygons=np.concatenate([model.polygons for model in models]),
-        ids=np.concatenate([model.ids for model in models]),
-        numbers=np.concatenate([model.numbers for model in models]),
-        ground=np.concatenate([model.ground for model in models]),
-        roof=np.concatenate([model.roof for model in models]),
-        members=tuple(names for model in models for names in model.members),
-        house=np.concatenate([model.house for model in models]),
-    )
-    return joined, {name: [value for _, columns in blocks for value in columns[name]] for name in names}
+    return join_models(models), {
+        name: [value for _, columns in blocks for value in columns[name]] for name in names
+    }
 
 
 def _take_rows(block: tuple[CityModel, Attributes], rows: slice) -> tuple[CityModel, Attributes]:
     model, columns = block
-    taken = CityModel(
-        model.polygons[rows],
-        model.ids[rows],
-        model.numbers[rows],
-        model.ground[rows],
-        model.roof[rows],
-        model.members[rows],
-        model.house[rows],
-    )
-    return taken, {name: column[rows] for name, column in columns.items()}
+    return take_model(model, rows), {name: column[rows] for name, column in columns.items()}
 
 
 def _object_text(name: str, house: str, attributes: str, geometry: str) -> str:
@@ -413,7 +398,7 @@ def _parse(document: dict[str, Any]) -> CityModel:
         ids=np.array(list(objects), dtype=np.str_),
         numbers=np.array([row["number"] for row in rows], dtype=np.int64),
         ground=np.array([row["ground_height"] for row in rows], dtype=np.float64),
-        roof=np.array([row["roof_height"] for row in rows], dtype=np.float64),
+        roofs=flat_roofs(np.array([row["roof_height"] for row in rows], dtype=np.float64)),
         members=tuple(tuple(row["members"]) for row in rows),
         house=np.array([item.get("parents", [name])[0] for name, item in objects.items()], dtype=np.str_),
     )

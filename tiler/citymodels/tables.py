@@ -13,6 +13,7 @@ from pipeline.city_model.building_points import BuildingPoints
 from pipeline.city_model.city import City
 from pipeline.city_model.houses import Houses
 from pipeline.data.citymodel import CityModel, Prisms
+from pipeline.data.roofs import Roofs, join_roofs, take_roofs
 from pipeline.quality.point_fidelity import HouseFidelity
 from pipeline.roofs.house_levels import HouseParts
 
@@ -96,6 +97,19 @@ def unpack_polygons(
     return polygons
 
 
+ROOF_ARRAYS = ("roof_plane", "roof_origin", "roof_limits")
+
+
+def pack_roofs(roofs: Roofs) -> Arrays:
+    """Write roofs as arrays."""
+    return dict(zip(ROOF_ARRAYS, (roofs.plane, roofs.origin, roofs.limits), strict=True))
+
+
+def unpack_roofs(arrays: Arrays) -> Roofs:
+    """Read what `pack_roofs` wrote."""
+    return Roofs(*(arrays[name] for name in ROOF_ARRAYS))
+
+
 def pack_houses(houses: Houses) -> Arrays:
     """Write houses, their parts and the points of these as arrays."""
     return {
@@ -158,6 +172,7 @@ def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
         "house": model.house,
         "ground": model.ground,
         "roof": model.roof,
+        **pack_roofs(model.roofs),
         "member": np.array(members, dtype=np.str_),
         "member_start": np.cumsum([0, *(len(names) for names in model.members)], dtype=np.int64),
         "roof_source": buildings.roof_source,
@@ -174,7 +189,8 @@ def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
 
 
 BUILDING_ARRAYS = (
-    *("polygon", "polygon_start", "id", "number", "house", "ground", "roof", "member", "member_start"),
+    *("polygon", "polygon_start", "id", "number", "house", "ground", "member", "member_start"),
+    *ROOF_ARRAYS,
     *("roof_source", "measured_roof", "wall_ground", "group", "layers"),
     *("fidelity_points", "fidelity_rmse", "fidelity_bias", "fidelity_coverage"),
 )
@@ -189,7 +205,7 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
         arrays["id"],
         arrays["number"],
         arrays["ground"],
-        arrays["roof"],
+        unpack_roofs(arrays),
         tuple(tuple(names[a:b]) for a, b in pairwise(start)),
         arrays["house"],
     )
@@ -206,7 +222,8 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
 
 
 NEAR_ARRAYS = (
-    *("polygon", "polygon_start", "extents", "id", "number", "ground", "roof"),
+    *("polygon", "polygon_start", "extents", "id", "number", "ground"),
+    *ROOF_ARRAYS,
     *("wall_ground", "group", "layers"),
 )
 
@@ -234,10 +251,14 @@ def take_near(arrays: Arrays, box: shapely.Polygon, layers: NDArray[np.int32] | 
     polygons = unpack_polygons(arrays, "polygon", rows)
     meet = shapely.intersects(box, polygons)
     rows, polygons = rows[meet], polygons[meet]
-    columns = (arrays[name][rows] for name in ("id", "number", "ground", "roof"))
+    ids, numbers, ground = (arrays[name][rows] for name in ("id", "number", "ground"))
+    roofs = take_roofs(unpack_roofs(arrays), rows)
     layers = arrays["layers"] if layers is None else layers
     return NearBuildings(
-        Prisms(polygons, *columns), arrays["wall_ground"][rows], arrays["group"][rows], layers[rows]
+        Prisms(polygons, ids, numbers, ground, roofs),
+        arrays["wall_ground"][rows],
+        arrays["group"][rows],
+        layers[rows],
     )
 
 
@@ -257,7 +278,7 @@ def take_buildings(buildings: Rows, rows: NDArray[np.integer[Any]]) -> Rows:
 def no_buildings() -> Buildings:
     """Make an empty city model."""
     text, number, rows = np.empty(0, np.str_), np.empty(0), np.empty(0, np.int64)
-    model = CityModel(np.empty(0, object), text, rows, number, number, (), text)
+    model = CityModel(np.empty(0, object), text, rows, number, join_roofs([]), (), text)
     layers = np.empty(0, np.int32)
     fidelity = HouseFidelity(rows, number, number, number)
     return Buildings(model, np.empty(0, np.int8), number, number, rows, layers, fidelity)

@@ -115,7 +115,7 @@ def _measure_near(mesh: ColumnMesh, edges: NDArray[np.int32]) -> dict[str, Histo
     centres = shapely.STRtree(shapely.points(plane.xy[plane.triangles].mean(axis=1)))
     rows = np.unique(centres.query(seams, predicate="dwithin", distance=NEAR)[1])
     part = PlaneMesh(plane.xy, plane.triangles[rows], plane.building[rows])
-    cells = expand_cells(ColumnMesh(part, mesh.z_start, mesh.z, mesh.bottom[rows], mesh.order))
+    cells = expand_cells(ColumnMesh(part, mesh.z_start, mesh.z, mesh.bottom[rows], mesh.order, mesh.key))
     return quality_histograms(measure_cells(cells))
 
 

@@ -14,11 +14,13 @@ from pipeline.quality.building_facts import report_buildings
 from tiler.citymodels.cityjson import Attributes, write_city_blocks
 from tiler.citymodels.tables import (
     BUILDING_ARRAYS,
+    ROOF_ARRAYS,
     Buildings,
     join_buildings,
     take_buildings,
     unpack_buildings,
     unpack_polygons,
+    unpack_roofs,
 )
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
@@ -65,7 +67,8 @@ def house_cells(model: CityModel) -> NDArray[np.int64]:
     >>> from pipeline.data.citymodel import CityModel
     >>> ids, one = np.array(["a-2", "a-1", "b"]), np.ones(3)
     >>> boxes = shapely.box([9, 1020, 3000], [0, 0, 5], [10, 1030, 3010], [5, 5, 9])
-    >>> house_cells(CityModel(boxes, ids, one, one, one, ((),) * 3, np.array(["a", "a", "b"]))).tolist()
+    >>> roofs = flat_roofs(one)
+    >>> house_cells(CityModel(boxes, ids, one, one, roofs, ((),) * 3, np.array(["a", "a", "b"]))).tolist()
     [[0, 1], [0, 1], [0, 2]]
     """
     order = np.argsort(model.ids, kind="stable")
@@ -110,7 +113,8 @@ def _write(task: Task, stage: str, prefix: str, file: str) -> Facts:
 
 def _survey(task: Task, stage: str, prefix: str) -> _Survey:
     """Look at all tiles, one after the other."""
-    wanted = [prefix + name for name in ("polygon", "polygon_start", "id", "number", "house", "ground", "roof")]
+    arrays = ("polygon", "polygon_start", "id", "number", "house", "ground", *ROOF_ARRAYS)
+    wanted = [prefix + name for name in arrays]
     names = task.refs[stage]
     cells, tiles = [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
     numbers, of = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
@@ -144,7 +148,7 @@ def _outlines(arrays: dict[str, NDArray[Any]], prefix: str) -> CityModel:
     own = {name.removeprefix(prefix): values for name, values in arrays.items()}
     polygons, ids = unpack_polygons(own, "polygon"), own["id"]
     members: tuple[tuple[str, ...], ...] = ((),) * len(ids)
-    return CityModel(polygons, ids, own["number"], own["ground"], own["roof"], members, own["house"])
+    return CityModel(polygons, ids, own["number"], own["ground"], unpack_roofs(own), members, own["house"])
 
 
 def _check_numbers(task: Task, stage: str, prefix: str, survey: _Survey) -> None:

@@ -47,7 +47,14 @@ from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.stages.approach import terrain_stage
 from tiler.stages.city import chooses_layers_later
-from tiler.stages.seam_tables import pack_columns, pack_seam, unpack_levels, unpack_pinched, unpack_seam
+from tiler.stages.seam_tables import (
+    pack_columns,
+    pack_levels,
+    pack_seam,
+    unpack_levels,
+    unpack_pinched,
+    unpack_seam,
+)
 from tiler.stages.soil import lay_soil, unpack_pinched_soil, unpack_soil
 from tiler.stages.surroundings import find_sizes, halos, read_surroundings, terrain_around, terrain_halo
 
@@ -68,7 +75,7 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     seams, columns = (
         (make_seam_with_soil, make_columns_with_soil) if config.underground else (make_seam, make_columns)
     )
-    version = 6 if config.mesher == "layered" else 4
+    version = 7 if config.mesher == "layered" else 5
     return [
         Stage("seams", Scope.SEAM, seams, tuple(reads), parameters, version=version),
         Stage("columns", Scope.TILE, columns, (*reads, Read("seams", beside=True)), parameters, version=version),
@@ -132,7 +139,7 @@ def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
         )
         terrain = cut_terrain(dtm, window_of(dtm))
         levels = _fill(seam, (first, last), terrain, buildings, sizes, task)
-    task.put(level_start=levels.start, level_z=levels.z, level_surface=levels.surface)
+    task.put(**pack_levels(levels, buildings.model.numbers, "level"))
     if soil is not None:
         with task.step("soil of seams"):
             low, high = (
@@ -159,13 +166,13 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
             _four(sides), model.polygons, walls, mesh_size=given.mesh_size, sizes=sizes, **plane_options(given)
         )
     inner = [k for k, seam in enumerate(sides) if not seam.border]
-    given_columns = [(sides[k], unpack_levels(found[names[k]].arrays)) for k in inner]
-    pinched = [part for k, name in enumerate(names) for part in unpack_pinched(sides[k], found[name])]
+    given_columns = [(sides[k], unpack_levels(found[names[k]].arrays, model.numbers, "level")) for k in inner]
+    pinched = [
+        part for k, name in enumerate(names) for part in unpack_pinched(sides[k], found[name], model.numbers)
+    ]
     seam_columns = tile_columns(plane, [*given_columns, *pinched])
     # A tile is on the left of its southern and its eastern seam.
-    edges = find_seam_edges(
-        plane, [Side(sides[k], left=k < 2) for k in inner], seam_columns, model.roof, model.numbers
-    )
+    edges = find_seam_edges(plane, [Side(sides[k], left=k < 2) for k in inner], seam_columns, model.numbers)
     with task.step("3.2-3.5 columns"):
         terrain = cut_terrain(dtm, window_of(dtm))
         columns, report = _mesh(plane, terrain, buildings, options, seam_columns, sizes, task)
@@ -232,7 +239,7 @@ def _fill_corner(
     options, model = mesh_options(given), buildings.model
     dtm = terrain_around(key, dtm, task)
     if isinstance(options, AdaptiveOptions):
-        return fill_corner(corner, dtm, model.roof, model.ids, options, sizes=sizes)
+        return fill_corner(corner, dtm, model.roofs, model.ids, options, sizes=sizes)
     angle = plane_options(given)["min_angle"]
     patch = mesh_patch(
         corner, model.polygons, walls, bounds, mesh_size=given.mesh_size, min_angle=angle, sizes=sizes
@@ -251,7 +258,7 @@ def _fill(
     """Columns of a seam within the region, of the mesher that is chosen."""
     options, model = mesh_options(task.parameters), buildings.model
     if isinstance(options, AdaptiveOptions):
-        return fill_seam(seam, ends, dtm, model.roof, model.ids, options, sizes=sizes)
+        return fill_seam(seam, ends, dtm, model.roofs, model.ids, options, sizes=sizes)
     bounds = task.context.bounds
     return fill_seam_layers(seam, ends, dtm, model.roof, model.ids, buildings.layers, bounds, options)
 
@@ -271,7 +278,7 @@ def _fill_pinched(
     for k, (corner, place) in enumerate(zip(ends_of_seam(key), ends, strict=True)):
         if is_pinched(task.context.grid, corner):
             levels = _fill_corner(place, corner, dtm, buildings, walls, sizes, task)
-            task.put(**{f"end{k}_start": levels.start, f"end{k}_z": levels.z, f"end{k}_surface": levels.surface})
+            task.put(**pack_levels(levels, buildings.model.numbers, f"end{k}"))
             if soil is not None:
                 below = fill_corner_soil(place, levels, terrain_around(corner, dtm, task), soil, sizes=sizes)
                 task.put(**{f"end{k}_soil_start": below.start, f"end{k}_soil_z": below.z})
@@ -289,9 +296,9 @@ def _mesh(
     task: Task,
 ) -> tuple[ColumnMesh, Any]:
     model = buildings.model
-    group: NDArray[np.int32] = np.unique(buildings.group, return_inverse=True)[1].reshape(-1).astype(np.int32)
     if isinstance(options, AdaptiveOptions):
-        return mesh_adaptive(plane, dtm, model.roof, group, model.ids, options, seam=seam, sizes=sizes)
+        return mesh_adaptive(plane, dtm, model.roofs, model.ids, options, seam=seam, sizes=sizes)
+    group: NDArray[np.int32] = np.unique(buildings.group, return_inverse=True)[1].reshape(-1).astype(np.int32)
     return mesh_layers(
         plane,
         dtm,

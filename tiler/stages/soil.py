@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns.nodes import Levels, SeamColumns, join_levels, take_columns
+from pipeline.columns.nodes import Levels, SeamColumns, bare_levels, join_levels, take_columns
 from pipeline.columns.underground import SoilOptions, add_soil, count_soil_cells
 from pipeline.data.mesh import ColumnMesh, SeamEdges
 from pipeline.data.notes import Note
@@ -17,14 +17,15 @@ from tiler.engine.task import Result, Task
 
 def unpack_soil(arrays: dict[str, NDArray[Any]]) -> Levels:
     """Read the columns of soil of a seam within the region."""
-    return _levels(arrays["soil_start"], arrays["soil_z"])
+    return bare_levels(arrays["soil_start"], arrays["soil_z"])
 
 
 def unpack_pinched_soil(result: Result) -> list[Levels]:
     """Read the columns of soil of the ends of a border in which two tiles meet alone, as `unpack_pinched` does."""
     arrays = result.arrays
     return [
-        _levels(arrays[f"end{k}_soil_start"], arrays[f"end{k}_soil_z"]) for k in result.facts.get("pinched", [])
+        bare_levels(arrays[f"end{k}_soil_start"], arrays[f"end{k}_soil_z"])
+        for k in result.facts.get("pinched", [])
     ]
 
 
@@ -81,7 +82,3 @@ def lay_soil(
     task.put(soil=mesh.top)
     moved = replace(edges, bottom=edges.bottom + raised[edges.vertices])
     return mesh.columns, moved, count_soil_cells(mesh)
-
-
-def _levels(start: NDArray[np.int64], z: NDArray[np.float64]) -> Levels:
-    return Levels(start, z, np.full(len(z), np.nan))

@@ -13,7 +13,7 @@ from pipeline.points_terrain.raster import Dtm, NodeWindow, grow_window, node_wi
 from pipeline.points_terrain.terrain import cut_terrain, join_terrain
 from tiler.store.store import Store
 
-COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom")
+COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom", "key")
 APPROACH = "approach"
 KEPT_CHUNKS = 9  # tiles of terrain that stay in memory
 
@@ -38,7 +38,8 @@ def unpack_columns(arrays: Mapping[str, NDArray[Any]], order: Any) -> tuple[Colu
     outside = int(len(numbers) > 0 and numbers[0] < 0)
     rows: NDArray[np.int32] = (row.reshape(-1) - outside).astype(np.int32)
     plane = PlaneMesh(arrays["xy"], arrays["triangles"], rows)
-    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], order), numbers[outside:]
+    key = arrays["key"] if len(arrays["key"]) else None
+    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], order, key), numbers[outside:]
 
 
 class StoredTerrain:

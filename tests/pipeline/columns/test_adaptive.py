@@ -14,19 +14,24 @@ from pipeline.columns.columns import expand_cells, extract_boundary, lowest_gap
 from pipeline.columns.improve_columns import ColumnSurvey, improve_columns, split_columns
 from pipeline.columns.levels import fill_levels, stagger_columns
 from pipeline.columns.nodes import (
-    GROUND_SURFACE,
-    TOP_SURFACE,
+    FREE,
+    GROUND_LEVEL,
+    ON_GROUND,
+    ROOF_LEVEL,
+    TOP_LEVEL,
     Levels,
     SeamColumns,
+    Surfaces,
+    collect_surfaces,
     no_seam,
     place_nodes,
     take_columns,
-    triangle_surfaces,
 )
 from pipeline.columns.spacing import SpacingLimits, domain_top, mean_edges, top_reach, vertical_spacing
 from pipeline.data.citymodel import CityModel
 from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import ColumnMesh, Marker, MergeOrder, PlaneMesh, TetMesh
+from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.edges import plane_edges, sort_triangles, triangle_neighbours
 from pipeline.plane_mesh.improve_plane import improve_plane
 from pipeline.plane_mesh.plane import mesh_plane, signed_areas
@@ -43,22 +48,16 @@ TRIANGLE = PlaneMesh(
 )
 
 
-def own_groups(city: CityModel) -> NDArray[np.int32]:
-    return np.arange(len(city), dtype=np.int32)
-
-
 def mesh_of(
     city: CityModel,
     dtm: Dtm,
     bounds: Bounds,
     options: AdaptiveOptions = OPTIONS,
-    group: NDArray[np.int32] | None = None,
 ) -> tuple[ColumnMesh, AdaptiveReport]:
     plane, _ = mesh_plane(
         bounds, city.polygons, mesh_size=options.mesh_size, min_angle=28, refinements=1, passes=4
     )
-    group = own_groups(city) if group is None else group
-    return mesh_adaptive(plane, dtm, city.roof, group, city.ids, options)
+    return mesh_adaptive(plane, dtm, city.roofs, city.ids, options)
 
 
 def city_on(dtm: Dtm, bounds: Bounds, n: int, *, seed: int, clearance: float = 2.0) -> CityModel:
@@ -68,7 +67,7 @@ def city_on(dtm: Dtm, bounds: Bounds, n: int, *, seed: int, clearance: float = 2
     centres = shapely.get_coordinates(shapely.centroid(city.polygons))
     roof = sample_dtm(dtm, centres) + np.random.default_rng(seed).uniform(5, 40, n)
     roof, _ = raise_low_roofs(roof, highest_wall_ground(city.polygons, dtm), clearance=clearance)
-    return dataclasses.replace(city, roof=roof)
+    return dataclasses.replace(city, roofs=flat_roofs(roof))
 
 
 @pytest.mark.parametrize("stagger", [0.0, 0.8])
@@ -77,7 +76,7 @@ def test_terraces_conform_and_every_wall_is_the_higher_houses(stagger: float, pa
     town = terrace_town(ground=3.0)
     dtm = tilted_dtm(town.bounds, height=3.0)
     options = dataclasses.replace(OPTIONS, stagger=stagger, passes=passes)
-    mesh, report = mesh_of(town.model, dtm, town.bounds, options, town.group)
+    mesh, report = mesh_of(town.model, dtm, town.bounds, options)
     assert prove_conforming(mesh, town.model.numbers) > 0  # the corner touches
     prove_volume(mesh, town.model, dtm)
     prove_walls(mesh, town, 3.0)
@@ -88,7 +87,7 @@ def test_terraces_conform_and_every_wall_is_the_higher_houses(stagger: float, pa
 def test_terraces_on_a_slope_keep_ground_and_roofs_bit_for_bit() -> None:
     town = terrace_town(ground=8.0)
     dtm = hilly_dtm(town.bounds, relief=6.0, length=20.0)
-    mesh, _ = mesh_of(town.model, dtm, town.bounds, group=town.group)
+    mesh, _ = mesh_of(town.model, dtm, town.bounds)
     prove_conforming(mesh, town.model.numbers)
     prove_volume(mesh, town.model, dtm)
     cells, boundary = expand_cells(mesh), extract_boundary(mesh, town.model.numbers)
@@ -103,7 +102,7 @@ def test_a_wall_between_equal_roofs_does_not_exist() -> None:
     pair = [shapely.box(30, 30, 40, 45), shapely.box(40, 30, 52, 45)]
     bounds = (0.0, 0.0, 80.0, 80.0)
     city = city_of(pair, [10.0, 10.0])
-    mesh, _ = mesh_of(city, tilted_dtm(bounds), bounds, group=np.zeros(2, np.int32))
+    mesh, _ = mesh_of(city, tilted_dtm(bounds), bounds)
     boundary = extract_boundary(mesh, city.numbers)
     wall = mesh.plane.xy[np.repeat(np.arange(len(mesh.plane.xy)), np.diff(mesh.z_start))][boundary.facets]
     inner = (wall[..., 0] == 40).all(axis=1) & (wall[..., 1] > 30).any(axis=1) & (wall[..., 1] < 45).any(axis=1)
@@ -114,8 +113,7 @@ def test_a_wall_between_equal_roofs_does_not_exist() -> None:
 def test_one_triangle_is_filled_by_hand() -> None:
     dtm = tilted_dtm((-40.0, -40.0, 50.0, 50.0), height=2.0)
     options = dataclasses.replace(OPTIONS, domain_height=16.0, stagger=0.0, passes=0)
-    none = np.empty(0)
-    mesh, _ = mesh_adaptive(TRIANGLE, dtm, none, np.empty(0, np.int32), np.empty(0, np.str_), options)
+    mesh, _ = mesh_adaptive(TRIANGLE, dtm, flat_roofs(np.empty(0)), np.empty(0, np.str_), options)
     # Mean edges are 8.03, 8.03 and 8.06 m, the limit 8 m: levels at 2, 10 and 18 m in each column.
     assert mesh.z.tolist() == [2.0, 10.0, 18.0] * 3
     # All middles are equal, so the highest vertex rises first, as in the paper's order.
@@ -178,7 +176,7 @@ def test_quality_is_as_stated(seed: int) -> None:
 def test_same_input_same_bytes() -> None:
     town = terrace_town()
     dtm = hilly_dtm(town.bounds, relief=2.0)
-    one, two = (mesh_of(town.model, dtm, town.bounds, group=town.group)[0] for _ in range(2))
+    one, two = (mesh_of(town.model, dtm, town.bounds)[0] for _ in range(2))
     assert one.z.tobytes() == two.z.tobytes()
     assert one.plane.xy.tobytes() == two.plane.xy.tobytes()
     assert one.bottom.tobytes() == two.bottom.tobytes()
@@ -200,7 +198,7 @@ def test_two_halves_with_a_given_seam_are_one_mesh() -> None:
     dtm = hilly_dtm(town.bounds, relief=4.0)
     city = town.model
     plane, _ = mesh_plane(town.bounds, city.polygons, mesh_size=10.0, min_angle=28, passes=4)
-    whole = fill_columns(plane, dtm, city.roof, city.ids, OPTIONS)
+    whole, _ = fill_columns(plane, dtm, city.roofs, city.ids, OPTIONS)
     parts = halves(plane, 50.0)  # cuts houses and party walls
     common = np.intersect1d(parts[0][1], parts[1][1]).astype(np.int32)
     given = take_columns(whole, common)
@@ -208,7 +206,7 @@ def test_two_halves_with_a_given_seam_are_one_mesh() -> None:
     cells: list[NDArray[np.int32]] = []
     for part, used in parts:
         seam = SeamColumns(np.searchsorted(used, common).astype(np.int32), given)
-        mesh, _ = mesh_adaptive(part, dtm, city.roof, town.group, city.ids, OPTIONS, seam=seam)
+        mesh, _ = mesh_adaptive(part, dtm, city.roofs, city.ids, OPTIONS, seam=seam)
         for k, vertex in enumerate(seam.vertex):
             column = mesh.z[mesh.z_start[vertex] : mesh.z_start[vertex + 1]]
             assert column.tobytes() == given.z[given.start[k] : given.start[k + 1]].tobytes()
@@ -241,15 +239,17 @@ def test_a_column_depends_on_its_neighbourhood_alone() -> None:
     city = city_on(dtm, bounds, 12, seed=4)
     options = dataclasses.replace(OPTIONS, stagger=0.0, domain_height=80.0)
     plane, _ = mesh_plane(bounds, city.polygons, mesh_size=10.0)
-    whole = fill_columns(plane, dtm, city.roof, city.ids, options)
+    whole, _ = fill_columns(plane, dtm, city.roofs, city.ids, options)
     part, used = halves(plane, 100.0)[0]
     reach = int(top_reach(80.0))
     cropped = Dtm(dtm.z[:, : 110 + reach + 2].copy(), dtm.i0, dtm.j0, dtm.spacing)
-    alone = fill_columns(part, cropped, city.roof, city.ids, options)
+    alone, _ = fill_columns(part, cropped, city.roofs, city.ids, options)
     inner = np.flatnonzero(part.xy[:, 0] < 80).astype(np.int32)
     one, two = take_columns(whole, used[inner].astype(np.int32)), take_columns(alone, inner)
     assert one.z.tobytes() == two.z.tobytes()
-    assert one.surface.tobytes() == two.surface.tobytes()
+    assert one.kind.tobytes() == two.kind.tobytes()
+    assert one.surfaces.building.tobytes() == two.surfaces.building.tobytes()
+    assert one.surfaces.level.tobytes() == two.surfaces.level.tobytes()
 
 
 def two_roofs(heights: list[float]) -> PlaneMesh:
@@ -276,10 +276,10 @@ def two_roofs(heights: list[float]) -> PlaneMesh:
 def test_nodes_that_come_too_close_are_parted_upwards(roofs: list[float], placed: list[float]) -> None:
     plane = two_roofs(roofs)
     ground, gap = np.ones(len(plane.xy)), np.ones(len(plane.xy))
-    surface = triangle_surfaces(plane, np.array(roofs))
-    nodes, moves = place_nodes(plane, surface, ground, no_seam(), least_gap=gap)
+    nodes, moves = place_nodes(plane, flat_roofs(np.array(roofs)), ground, no_seam(), spacing=gap, least_gap=gap)
     assert nodes.z[: nodes.start[1]].tolist() == placed
-    assert moves[: nodes.start[1]].max() == pytest.approx(max(np.array(placed[1:]) - sorted(set(roofs))))
+    of_first = moves.distance[: len(roofs) + 1]
+    assert of_first.max() == pytest.approx(max(np.array(placed[1:]) - sorted(set(roofs))))
     wanted = [1.0, *roofs]
     order = np.searchsorted(sorted(set(roofs)), roofs)
     assert nodes.of_corner[:, 0].tolist() == [0, *(1 + order)]
@@ -290,24 +290,26 @@ def test_nodes_that_come_too_close_are_parted_upwards(roofs: list[float], placed
 def test_levels_are_even_between_nodes_and_shifted_by_parts_of_a_step() -> None:
     plane = two_roofs([7.0])
     n = len(plane.xy)
-    surface = triangle_surfaces(plane, np.array([7.0]))
-    nodes, _ = place_nodes(plane, surface, np.ones(n), no_seam(), least_gap=np.ones(n))
+    one, roofs = np.ones(n), flat_roofs(np.array([7.0]))
+    nodes, _ = place_nodes(plane, roofs, one, no_seam(), spacing=one, least_gap=one)
     levels, bottom = fill_levels(nodes, np.full(n, 13.0), np.full(n, 3.5), np.full(n, 0.25), no_seam())
     first = take_columns(levels, np.array([0], np.int32))
     assert first.z.tolist() == [1.0, 4.75, 7.0, 10.75, 13.0]
-    np.testing.assert_array_equal(first.surface, [GROUND_SURFACE, np.nan, 7.0, np.nan, TOP_SURFACE])
+    assert first.kind.tolist() == [GROUND_LEVEL, FREE, ROOF_LEVEL, FREE, TOP_LEVEL]
     assert bottom[:, 0].tolist() == [0, 2]
 
 
 def test_a_seams_nodes_are_taken_over_where_they_stand() -> None:
     plane = two_roofs([7.0])
     n = len(plane.xy)
-    surface, gap = triangle_surfaces(plane, np.array([7.0])), np.ones(n)
-    column = Levels(np.array([0, 4]), np.array([1.0, 7.5, 9.0, 12.0]), np.array([-np.inf, 7.0, 8.0, np.inf]))
+    one, roofs = np.ones(n), flat_roofs(np.array([7.0, 8.0]))
+    z, kind = np.array([1.0, 7.5, 9.0, 12.0]), np.array([GROUND_LEVEL, ROOF_LEVEL, ROOF_LEVEL, TOP_LEVEL], np.int8)
+    surfaces = Surfaces(np.array([0, 3]), np.array([ON_GROUND, 0, 1]), np.array([0, 1, 2], np.int32))
+    column = Levels(np.array([0, 4]), z, kind, z, surfaces)
     seam = SeamColumns(np.array([0], np.int32), column)
-    nodes, moves = place_nodes(plane, surface, np.ones(n), seam, least_gap=gap)
-    assert nodes.z[:3].tolist() == [1.0, 7.5, 9.0]
-    assert moves[:3].tolist() == [0.0, 0.5, 1.0]
+    nodes, moves = place_nodes(plane, roofs, one, seam, spacing=one, least_gap=one)
+    assert nodes.z[:2].tolist() == [1.0, 7.5]  # the roof beyond the seam is none of this tile's
+    assert moves.distance[:2].tolist() == [0.0, 0.5]
     assert nodes.of_corner[:, 0].tolist() == [0, 1]
     levels, bottom = fill_levels(nodes, np.full(n, 12.0), np.full(n, 2.0), np.zeros(n), seam)
     assert take_columns(levels, seam.vertex).z.tolist() == column.z.tolist()
@@ -317,19 +319,15 @@ def test_a_seams_nodes_are_taken_over_where_they_stand() -> None:
 def test_a_seam_without_the_roof_that_a_tile_has_there_is_refused() -> None:
     plane = two_roofs([7.0])
     n = len(plane.xy)
-    ground, gap = np.ones(n), np.ones(n)
-    open_nodes, _ = place_nodes(plane, np.full(2, GROUND_SURFACE), ground, no_seam(), least_gap=gap)
-    levels, _ = fill_levels(open_nodes, np.full(n, 9.0), np.full(n, 2.0), np.zeros(n), no_seam())
+    one, roofs = np.ones(n), flat_roofs(np.array([7.0]))
+    bare = dataclasses.replace(plane, building=np.full(2, ON_GROUND, np.int32))
+    open_nodes, _ = place_nodes(bare, roofs, one, no_seam(), spacing=one, least_gap=one)
+    levels, bottom = fill_levels(open_nodes, np.full(n, 9.0), np.full(n, 2.0), np.zeros(n), no_seam())
     vertex = np.array([0], np.int32)
+    levels = dataclasses.replace(levels, surfaces=collect_surfaces(bare, bottom))
     seam = SeamColumns(vertex, take_columns(levels, vertex))
     with pytest.raises(ValueError, match="surface that the seam's columns lack"):
-        place_nodes(plane, triangle_surfaces(plane, np.array([7.0])), ground, seam, least_gap=gap)
-
-
-def test_groups_of_two_heights_are_refused() -> None:
-    town = terrace_town()
-    with pytest.raises(ValueError, match="group 0 has roofs at"):
-        mesh_of(town.model, tilted_dtm(town.bounds), town.bounds, group=np.zeros(len(town.model), np.int32))
+        place_nodes(plane, roofs, one, seam, spacing=one, least_gap=one)
 
 
 def test_a_tower_above_the_domain_is_refused() -> None:

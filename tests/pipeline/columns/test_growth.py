@@ -15,11 +15,12 @@ from pipeline.columns.columns import lowest_gap
 from pipeline.columns.growth import Growth, count_steps, full_height, height_of_steps, layer_levels, movable_height
 from pipeline.columns.layered import count_layers, mesh_layers
 from pipeline.columns.levels import fill_levels
-from pipeline.columns.nodes import no_seam, place_nodes, take_columns, triangle_surfaces
+from pipeline.columns.nodes import no_seam, place_nodes, take_columns
 from pipeline.columns.spacing import mean_edges, vertical_spacing
 from pipeline.columns.trim_layers import count_removed_layers
 from pipeline.data.citymodel import CityModel
 from pipeline.data.mesh import ColumnMesh, PlaneMesh
+from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 from stitch.tiling.grid import make_grid, tile_keys
@@ -77,12 +78,12 @@ def test_levels_by_hand() -> None:
     angle = 2 * np.pi * np.arange(2) / 2
     xy = np.concatenate(([[-9.0, 0.0]], np.column_stack((np.cos(angle), np.sin(angle) + angle))))
     plane = PlaneMesh(xy, np.array([[0, 1, 2], [0, 1, 2]], np.int32), np.array([-1, 0], np.int32))
-    surface = triangle_surfaces(plane, np.array([8.0]))
-    ground = np.ones(3)
-    nodes, _ = place_nodes(plane, surface, ground, no_seam(), least_gap=np.full(3, 0.5))
+    ground, spacing = np.ones(3), np.full(3, 4.0)
+    roofs = flat_roofs(np.array([8.0]))
+    nodes, _ = place_nodes(plane, roofs, ground, no_seam(), spacing=spacing, least_gap=np.full(3, 0.5))
     shift = np.array([0.25, 0.0, 0.0])
     levels, _ = fill_levels(
-        nodes, np.full(3, 16.0), np.full(3, 4.0), shift, no_seam(), ground=ground, growth=Growth(1.0, 2.0)
+        nodes, np.full(3, 16.0), spacing, shift, no_seam(), ground=ground, growth=Growth(1.0, 2.0)
     )
     shifted, plain = (take_columns(levels, np.array([k], np.int32)).z for k in (0, 1))
     assert plain.tolist() == [1.0, 2.0, 4.0, 8.0, 12.0, 16.0]
@@ -95,7 +96,7 @@ def town_on(dtm: Dtm, *, seed: int = 3) -> CityModel:
     city = city_of(crowded_blocks(BOUNDS, 16, seed=seed), [0.0] * 16)
     wall_ground = highest_wall_ground(city.polygons, dtm)
     roof = wall_ground + np.random.default_rng(seed).uniform(4, 30, 16)
-    return dataclasses.replace(city, roof=raise_low_roofs(roof, wall_ground, clearance=2.0)[0])
+    return dataclasses.replace(city, roofs=flat_roofs(raise_low_roofs(roof, wall_ground, clearance=2.0)[0]))
 
 
 def first_layers(mesh: ColumnMesh, city: CityModel, *, beyond: float) -> NDArray[np.float64]:
@@ -109,10 +110,10 @@ def first_layers(mesh: ColumnMesh, city: CityModel, *, beyond: float) -> NDArray
 @pytest.mark.parametrize("growth", [GROWTH, Growth(1.0, 1.3), Growth(2.0, 1.0)])
 def test_adaptive_columns_begin_with_the_first_layer_and_grow(growth: Growth) -> None:
     dtm = hilly_dtm(BOUNDS, relief=25.0, noise=0.3)
-    city, group = town_on(dtm), np.arange(16, dtype=np.int32)
+    city = town_on(dtm)
     plane, _ = mesh_plane(BOUNDS, city.polygons, mesh_size=10.0, min_angle=28, refinements=1, passes=4)
     options = dataclasses.replace(OPTIONS, growth=growth, passes=3)
-    mesh, report = mesh_adaptive(plane, dtm, city.roof, group, city.ids, options)
+    mesh, report = mesh_adaptive(plane, dtm, city.roofs, city.ids, options)
     prove_conforming(mesh, city.numbers)
     first = first_layers(mesh, city, beyond=1e-6)
     assert np.abs(first / growth.first - 1).max() < 0.1
@@ -124,7 +125,7 @@ def test_adaptive_columns_begin_with_the_first_layer_and_grow(growth: Growth) ->
         wanted = np.minimum(spacing[i], growth.first + (growth.ratio - 1) * z[:-1])
         most = max(most, float((np.diff(z) / wanted).max()))
     assert 1 < most < 2  # steps between two nodes are a whole number, shifts are less than a third
-    still, _ = mesh_adaptive(plane, dtm, city.roof, group, city.ids, dataclasses.replace(options, passes=0))
+    still, _ = mesh_adaptive(plane, dtm, city.roofs, city.ids, dataclasses.replace(options, passes=0))
     height = mesh.z - np.repeat(ground, np.diff(mesh.z_start))
     low = height < np.repeat(movable_height(spacing, growth), np.diff(mesh.z_start))
     assert mesh.z[low].tobytes() == still.z[low].tobytes()
@@ -155,11 +156,11 @@ def test_layers_begin_with_the_first_one_and_grow(top: float | None) -> None:
 
 def test_flat_tops_are_bit_for_bit_flat_and_columns_reach_them() -> None:
     dtm = hilly_dtm(BOUNDS, relief=25.0)
-    city, group = town_on(dtm), np.arange(16, dtype=np.int32)
+    city = town_on(dtm)
     plane, _ = mesh_plane(BOUNDS, city.polygons, mesh_size=10.0, min_angle=28, refinements=1, passes=4)
     top = float(dtm.z.max()) + 60.0
     adaptive, _ = mesh_adaptive(
-        plane, dtm, city.roof, group, city.ids, dataclasses.replace(OPTIONS, top=top, domain_height=60.0)
+        plane, dtm, city.roofs, city.ids, dataclasses.replace(OPTIONS, top=top, domain_height=60.0)
     )
     wall_ground = highest_wall_ground(city.polygons, dtm)
     layered, _ = mesh_layers(plane, dtm, city, wall_ground, BOUNDS, dataclasses.replace(LAYERED, top=top))

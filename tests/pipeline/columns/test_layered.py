@@ -15,6 +15,7 @@ from pipeline.columns.trim_layers import count_removed_layers, first_kept, first
 from pipeline.data.citymodel import CityModel
 from pipeline.data.errors import GeometryError, SolverError
 from pipeline.data.mesh import ColumnMesh, Marker, PlaneMesh, TetMesh
+from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.edges import plane_edges
 from pipeline.plane_mesh.plane import mesh_plane, signed_areas
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
@@ -127,7 +128,7 @@ def test_steep_terrain_is_repaired_not_inverted(relief: float) -> None:
     city = city_of(blocks, [0.0] * 30)
     wall_ground = highest_wall_ground(city.polygons, dtm)
     roof, _ = raise_low_roofs(city.roof, wall_ground, clearance=2.0)
-    city = dataclasses.replace(city, roof=roof)
+    city = dataclasses.replace(city, roofs=flat_roofs(roof))
     plane, _ = mesh_plane(bounds, city.polygons, mesh_size=10.0)
     options = dataclasses.replace(OPTIONS, domain_height=300.0)
     mesh, report = mesh_layers(plane, dtm, city, wall_ground, bounds, options)

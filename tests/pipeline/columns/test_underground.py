@@ -10,10 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.columns.cell_blocks import UsedPoints, number_used
-from pipeline.columns.nodes import GROUND_SURFACE, TOP_SURFACE, Levels, SeamColumns, no_seam
+from pipeline.columns.nodes import (
+    FREE,
+    GROUND_LEVEL,
+    ROOF_LEVEL,
+    TOP_LEVEL,
+    Levels,
+    SeamColumns,
+    bare_levels,
+    no_seam,
+)
 from pipeline.columns.spacing import SpacingLimits
 from pipeline.columns.underground import (
     SoilMesh,
@@ -90,6 +99,11 @@ def test_soil_ends_at_the_ground_or_at_the_terrain_below_the_roof() -> None:
     assert lowered.tolist() == [False, False, True]
 
 
+def levels_of(start: NDArray[np.int64], z: NDArray[np.float64], kind: ArrayLike) -> Levels:
+    """Levels that are something, without their surfaces."""
+    return replace(bare_levels(start, z), kind=np.array(kind, np.int8))
+
+
 def test_levels_of_soil_are_even_down_to_the_depth() -> None:
     plane = two_triangles(-1, -1)
     # Edges of 10 and 10 m at vertex 1, and of 14.1 m besides at vertex 0: 11.4 m in the mean.
@@ -98,7 +112,7 @@ def test_levels_of_soil_are_even_down_to_the_depth() -> None:
     assert levels.start.tolist() == [0, 9, 17]
     np.testing.assert_allclose(levels.z[:9], np.linspace(-81, 3, 9))
     np.testing.assert_allclose(levels.z[9:], np.linspace(-77, 7, 8))
-    assert np.isnan(levels.surface).all()
+    assert (levels.kind == FREE).all()
     # At most 8 m apart where cells are 10 m large, and one step at least.
     assert np.diff(fill_soil(plane, np.array([1], np.int32), np.zeros(1), OPTIONS).start).tolist() == [4]
     shallow = fill_soil(plane, np.array([0], np.int32), np.array([3.0]), replace(options, depth=0.5))
@@ -116,15 +130,15 @@ def test_levels_of_soil_ascend(stagger: float) -> None:
 
 
 def test_air_stands_on_soil_by_its_ground() -> None:
-    air = Levels(
-        np.array([0, 2, 4]), np.array([1.0, 9.0, 6.0, 9.0]), np.array([GROUND_SURFACE, TOP_SURFACE, 6.0, 9.0])
+    air = levels_of(
+        np.array([0, 2, 4]), np.array([1.0, 9.0, 6.0, 9.0]), [GROUND_LEVEL, TOP_LEVEL, ROOF_LEVEL, TOP_LEVEL]
     )
-    soil = Levels(np.array([0, 2, 5]), np.array([-4.0, 1.0, -4.0, 0.0, 1.0]), np.full(5, np.nan))
+    soil = bare_levels(np.array([0, 2, 5]), np.array([-4.0, 1.0, -4.0, 0.0, 1.0]))
     assert is_grounded(air).tolist() == [True, False]
     whole = join_soil(soil, air, is_grounded(air))
     assert whole.start.tolist() == [0, 3, 8]
     assert whole.z.tolist() == [-4.0, 1.0, 9.0, -4.0, 0.0, 1.0, 6.0, 9.0]
-    assert whole.surface[1] == GROUND_SURFACE
+    assert whole.kind[1] == GROUND_LEVEL
     wrong = replace(soil, z=soil.z + 0.5)
     with pytest.raises(ValueError, match="does not end at the ground"):
         join_soil(wrong, air, is_grounded(air))
@@ -167,7 +181,7 @@ def test_soil_ends_at_the_ground_that_a_neighbour_has_at_a_seam() -> None:
     plane = two_triangles(0, 0)
     air = air_over(plane, [0.0, 0.0, 2.0, 2.0], [[1, 0, 0], [1, 1, 0]])
     start, vertex = np.array([0, 3, 6]), np.array([0, 1], np.int32)
-    levels = Levels(start, air.z[:6], np.array([GROUND_SURFACE, 2.0, TOP_SURFACE] * 2))
+    levels = levels_of(start, air.z[:6], [GROUND_LEVEL, ROOF_LEVEL, TOP_LEVEL] * 2)
     given = fill_soil(plane, vertex, np.zeros(2), OPTIONS)
     terrain = np.full(4, 0.7)  # other than the ground of the seam, to tell which is taken
     mesh, raised, _ = add_soil(air, terrain, SeamColumns(vertex, levels), SeamColumns(vertex, given), OPTIONS)
@@ -267,7 +281,7 @@ def test_four_tiles_with_houses_on_seams_are_proved(four: tuple[dict[str, Any], 
     assert report.ok, "\n".join(report.lines())
     store = Store(out / "store.zarr")
     seams = [store.read("seams", name)[0] for name in store.names("seams")]
-    air = [Levels(s["level_start"], s["level_z"], s["level_surface"]) for s in seams if "level_z" in s]
+    air = [levels_of(s["level_start"], s["level_z"], s["level_kind"]) for s in seams if "level_z" in s]
     # Under some vertices of seams there are houses all around.
     assert sum(int((~is_grounded(levels)).sum()) for levels in air) > 0
 

@@ -16,6 +16,7 @@ from pipeline.columns.columns import lowest_gap
 from pipeline.columns.layered import LayeredOptions, mesh_layers
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
+from pipeline.data.roofs import flat_roofs
 from pipeline.geometry.clearance import is_sound
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.simplification.merge import MergedFootprints, merge_footprints
@@ -122,7 +123,7 @@ def test_a_group_is_meshed(number: int, nasty: tuple[NDArray[np.object_], NDArra
     city = city_of(list(merged.polygons), [12.0 + 3 * k for k in range(len(merged.polygons))])
     dtm = hilly_dtm(tuple(np.floor(bounds)), relief=6.0)
     wall_ground = highest_wall_ground(city.polygons, dtm)
-    roofed = dataclasses.replace(city, roof=np.maximum(city.roof, wall_ground + 2.0))
+    roofed = dataclasses.replace(city, roofs=flat_roofs(np.maximum(city.roof, wall_ground + 2.0)))
     options = LayeredOptions(10.0, 10.0, 100.0 + float(roofed.roof.max(initial=0)), "columns", 0.003, 1e-8)
     columns, _ = mesh_layers(plane, dtm, roofed, wall_ground, bounds, options)
     assert lowest_gap(columns)[1] == 0

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.errors import InputError
+from pipeline.data.roofs import flat_roofs
 from tiler.check.check import _in_order
 from tiler.citymodels import building_index
 from tiler.citymodels.building_index import index_buildings
@@ -93,7 +94,7 @@ def octagons(n: int) -> Iterator[tuple[CityModel, dict[str, Any]]]:
         )
         ids = np.array([f"b{j:06d}" for j in k])
         height = (3.0 + k % 7).astype(np.float64)
-        yield CityModel(polygons, ids, number_ids(ids), height / 8, height, ((),) * len(k), ids), {}
+        yield CityModel(polygons, ids, number_ids(ids), height / 8, flat_roofs(height), ((),) * len(k), ids), {}
 
 
 def write(path: Path, n: int) -> Path:

@@ -13,8 +13,10 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.data.citymodel import take_model
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Boundary, Marker, TetMesh
+from pipeline.data.roofs import flat_roofs
 from stitch.pieces.conformity import pair_cell_faces
 from stitch.pieces.frontier import Settled
 from tests.helpers.meshes import (
@@ -209,20 +211,19 @@ def fill_house(city: TinyCity) -> TinyCity:
 
 def leave_house_out_of_model(city: TinyCity) -> TinyCity:
     model, keep = city.model, np.arange(len(city.model)) != 1
-    rows = {name: getattr(model, name)[keep] for name in ("polygons", "ids", "numbers", "ground", "roof", "house")}
-    return replace(city, model=replace(model, **rows, members=model.members[:1] + model.members[2:]))
+    return replace(city, model=take_model(model, keep))
 
 
 def raise_roof_in_model(city: TinyCity) -> TinyCity:
     roof = city.model.roof.copy()
     roof[0] += 2e-6
-    return replace(city, model=replace(city.model, roof=roof))
+    return replace(city, model=replace(city.model, roofs=flat_roofs(roof)))
 
 
 def lower_roof_in_model(city: TinyCity) -> TinyCity:
     roof = city.model.roof.copy()
     roof[0] -= 2e-6
-    return replace(city, model=replace(city.model, roof=roof))
+    return replace(city, model=replace(city.model, roofs=flat_roofs(roof)))
 
 
 def move_footprint_in_model(city: TinyCity) -> TinyCity:

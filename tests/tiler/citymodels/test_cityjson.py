@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from shapely.affinity import rotate, translate
 
 from pipeline.city_model.solids import build_solids
-from pipeline.data.citymodel import CityModel, number_ids
+from pipeline.data.citymodel import CityModel, number_ids, take_model
 from pipeline.data.errors import ConfigError, InputError, OutputError
 from pipeline.data.notes import Note
+from pipeline.data.roofs import flat_roofs
 from tests.helpers.cityjson_rules import area_vector, broken, file_faults, solid_faults, volume
 from tiler.citymodels import cityjson
 from tiler.citymodels.cityjson import read_city_model, write_city_blocks, write_city_model
@@ -46,7 +47,7 @@ def make_model(*polygons: Any, ground: Any = 0.7, roof: Any = 12.3456789, ids: A
         ids=names,
         numbers=np.arange(n) if len(set(names)) < n else number_ids(names),
         ground=np.broadcast_to(np.float64(ground), n).copy(),
-        roof=np.broadcast_to(np.float64(roof), n).copy(),
+        roofs=flat_roofs(np.broadcast_to(np.float64(roof), n).copy()),
         members=tuple((str(name), f"{name}-annex") for name in names),
         house=names,
     )
@@ -201,12 +202,8 @@ def test_equal_input_gives_equal_bytes_and_is_left_alone(target: Path) -> None:
 
 def cut_blocks(model: CityModel, ends: list[int]) -> list[tuple[CityModel, dict[str, list[int]]]]:
     """Cut a model with one attribute column into blocks."""
-    names = ("polygons", "ids", "numbers", "ground", "roof", "members", "house")
     parts = [slice(a, b) for a, b in pairwise([0, *ends, len(model)])]
-    return [
-        (CityModel(*(getattr(model, name)[rows] for name in names)), {"row": list(range(len(model)))[rows]})
-        for rows in parts
-    ]
+    return [(take_model(model, rows), {"row": list(range(len(model)))[rows]}) for rows in parts]
 
 
 def test_blocks_of_any_size_give_the_same_bytes(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:

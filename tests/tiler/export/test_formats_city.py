@@ -13,6 +13,7 @@ import shapely
 
 from pipeline.data.citymodel import CityModel
 from pipeline.data.errors import CityError, InputError, OutputError
+from pipeline.data.roofs import flat_roofs
 from tests.helpers.cityjson_rules import file_faults, solid_faults
 from tiler.citymodels.cityjson import read_city_model, write_city_model
 from tiler.cli.main import main
@@ -44,7 +45,7 @@ def write_parts(path: Path) -> CityModel:
         np.array(["a-1", "a-2", "b", "c"]),
         np.array([5, 6, 2**53 - 1, 8]),
         np.array([0.0, 0.0, 1.5, 2.0]),
-        np.array([10.0, 14.0, 9.0, 7.25]),
+        flat_roofs(np.array([10.0, 14.0, 9.0, 7.25])),
         (("a",), ("a",), ("b", "x"), ()),
         np.array(["a", "a", "b", "c"]),
     )
@@ -145,7 +146,13 @@ def test_missing_values_lists_and_batches(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_city_without_buildings(tmp_path: Path) -> None:
     none = np.empty(0)
     model = CityModel(
-        np.empty(0, object), np.empty(0, "U1"), np.empty(0, np.int64), none, none, (), np.empty(0, "U1")
+        np.empty(0, object),
+        np.empty(0, "U1"),
+        np.empty(0, np.int64),
+        none,
+        flat_roofs(none),
+        (),
+        np.empty(0, "U1"),
     )
     write_city_model(tmp_path / "model.json", model, crs="EPSG:28992", bounds=(0, 0, 0, 1, 1, 1))
     write_cityjsonseq(tmp_path / "x.jsonl", tmp_path / "model.json")

@@ -12,6 +12,7 @@ import shapely
 
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.errors import InputError
+from pipeline.data.roofs import flat_roofs
 from pipeline.quality.point_fidelity import HouseFidelity
 from tests.helpers.cityjson_rules import file_faults, solid_faults
 from tiler.citymodels import cityjson
@@ -43,7 +44,9 @@ def make_town(n: int, *, seed: int = 4) -> Buildings:
     ids, polygons = np.array(names), np.array(boxes, object)
     ground = rng.uniform(-2, 3, len(ids))
     house = np.array(houses)
-    model = CityModel(polygons, ids, number_ids(ids), ground, ground + 9, tuple((name,) for name in houses), house)
+    model = CityModel(
+        polygons, ids, number_ids(ids), ground, flat_roofs(ground + 9), tuple((name,) for name in houses), house
+    )
     values = rng.uniform(0, 1, (3, len(ids)))
     fit = HouseFidelity(np.arange(len(ids)), *values)
     zeros = np.zeros(len(ids), np.int8)
