@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.city import CityOptions
+from pipeline.city_model.city_steps import build_city
 from pipeline.city_model.groups import adjacent_houses
 from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
 from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
@@ -18,7 +19,6 @@ from pipeline.columns.columns import expand_cells
 from pipeline.columns.layered import LayeredOptions, choose_layers, mesh_layers, terrain_reach
 from pipeline.columns.nodes import Levels
 from pipeline.columns.spacing import SpacingLimits, domain_top, top_reach
-from pipeline.columns.tile import build_city
 from pipeline.data.citymodel import CityModel, take_model
 from pipeline.data.mesh import ColumnMesh, TetMesh
 from pipeline.data.pointcloud import PointCloud

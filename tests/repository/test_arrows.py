@@ -15,7 +15,7 @@ ALLOWED = {
     "tiler": {"tiler", "stitch", "pipeline"},
 }
 # The steps of the pipeline that stitch may not see: it takes data rooms and steps, never the composition.
-COMPOSING = {"pipeline.columns.tile", "pipeline.simplification.simplify"}
+COMPOSING = {"pipeline.city_model.city_steps", "pipeline.simplification.simplify"}
 # Libraries with a clock, a disk or a process, and the only places that may import them.
 HOMES = {
     "dask": ("tiler/",),

@@ -7,12 +7,17 @@ from pipeline.columns.adaptive import AdaptiveOptions
 from pipeline.columns.growth import Growth, count_steps
 from pipeline.columns.layered import LayeredOptions
 from pipeline.columns.spacing import SpacingLimits
-from pipeline.columns.tile import ADAPTIVE_ANGLE, ADAPTIVE_PASSES, ADAPTIVE_REFINEMENTS, PAPER_ANGLE
 from pipeline.columns.underground import SoilOptions
 from pipeline.plane_mesh.sizes import SizeRule
 from tiler.config.config import Config
 from tiler.config.declared import Declared
 from tiler.config.domain_height import Domain
+
+# Plane meshes: the paper's, and ours, which Triangle refines again and vertices are moved in.
+PAPER_ANGLE = 25.0  # degrees
+ADAPTIVE_ANGLE = 28.0  # degrees
+ADAPTIVE_REFINEMENTS = 1
+ADAPTIVE_PASSES = 4
 
 # Parameters of the city model; two are raised by what the mesh needs, see `derived_parameters`.
 CITY_PARAMETERS = (

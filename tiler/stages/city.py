@@ -8,12 +8,12 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import reach_of_points
+from pipeline.city_model.city_steps import measure_city, prepare_footprints
 from pipeline.city_model.groups import adjacent_houses
 from pipeline.city_model.houses import Houses, divide_houses, join_houses, take_houses
 from pipeline.city_model.unmarked_roofs import MAY_BE_ROOF
 from pipeline.columns.adaptive import AdaptiveOptions
 from pipeline.columns.layered import LayeredOptions, choose_layers, terrain_reach
-from pipeline.columns.tile import measure_city, prepare_footprints
 from pipeline.data.citymodel import Footprints
 from pipeline.data.classes import BUILDING, GROUND, WATER
 from pipeline.data.notes import Note

@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import reach_of_points
 from pipeline.city_model.city import City, CityOptions, measure_heights
+from pipeline.city_model.city_steps import measure_city
 from pipeline.city_model.footprints import clean_footprints
 from pipeline.city_model.houses import divide_houses
-from pipeline.columns.tile import measure_city
 from pipeline.data.citymodel import Footprints
 from pipeline.data.classes import BUILDING, GROUND, WATER
 from pipeline.data.pointcloud import PointCloud

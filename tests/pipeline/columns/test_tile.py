@@ -8,14 +8,15 @@ import pytest
 import shapely
 
 from pipeline.city_model.city import City, CityOptions
+from pipeline.city_model.city_steps import build_city
 from pipeline.columns.columns import expand_cells, lowest_gap
 from pipeline.columns.layered import LayeredOptions
-from pipeline.columns.tile import build_city, mesh_city
 from pipeline.data.citymodel import Footprints, make_ids, number_ids
 from pipeline.data.errors import InputError
 from pipeline.data.notes import count_notes
 from pipeline.simplification.simplify import simplify_city
 from tests.helpers.cities import Bounds, cloud_over, tilted_dtm
+from tests.helpers.whole_city import mesh_city
 
 BOUNDS: Bounds = (1000.0, 2000.0, 1100.0, 2100.0)
 OPTIONS = CityOptions(

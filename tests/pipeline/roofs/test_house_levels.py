@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.city_model.building_points import extract_building_points
+from pipeline.city_model.city_steps import build_city
 from pipeline.city_model.houses import divide_houses
-from pipeline.columns.tile import build_city
 from pipeline.data.citymodel import Footprints
 from pipeline.data.classes import BUILDING, GROUND
 from pipeline.data.pointcloud import PointCloud

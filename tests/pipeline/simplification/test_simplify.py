@@ -8,12 +8,12 @@ import shapely
 
 from pipeline.city_model.building_points import BuildingPoints, take_building_points
 from pipeline.city_model.city import City
+from pipeline.city_model.city_steps import build_city
 from pipeline.city_model.heights import Heights
 from pipeline.columns.adaptive import AdaptiveOptions
 from pipeline.columns.columns import expand_cells, extract_boundary
 from pipeline.columns.layered import LayeredOptions
 from pipeline.columns.spacing import SpacingLimits
-from pipeline.columns.tile import build_city, mesh_city
 from pipeline.data.citymodel import Footprints
 from pipeline.data.mesh import Marker
 from pipeline.data.notes import count_notes
@@ -22,6 +22,7 @@ from pipeline.quality.building_facts import describe_buildings, measure_model
 from pipeline.simplification.house_clusters import Shapes
 from pipeline.simplification.simplify import _settle_clusters, settle_roofs, simplify_city
 from tests.helpers.cities import cloud_over, tilted_dtm
+from tests.helpers.whole_city import mesh_city
 from tests.pipeline.columns.test_tile import BOUNDS, LAYERS, OPTIONS, footprints_of
 
 PLANAR = dataclasses.replace(OPTIONS, simplify="clearance", roof_percentile=50.0, min_courtyard_area=5.0)

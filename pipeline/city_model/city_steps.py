@@ -1,6 +1,6 @@
-"""The steps composed: from points and footprints to the city model, and to the columns of one tile."""
+"""Steps 1.4 to 1.6 composed: from points and footprints to the city model with its heights."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import shapely
 
@@ -18,30 +18,11 @@ from pipeline.city_model.city import (
 )
 from pipeline.city_model.footprints import clean_footprints
 from pipeline.city_model.heights import highest_wall_ground
-from pipeline.columns.adaptive import AdaptiveOptions, AdaptiveReport, mesh_adaptive
-from pipeline.columns.layered import LayeredOptions, LayeredReport, mesh_layers
 from pipeline.data.citymodel import Footprints
-from pipeline.data.mesh import ColumnMesh
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
-from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.points_terrain.terrain import Dtm
 from pipeline.roofs.roof_points import RoofPoints
-
-# Plane meshes: the paper's, and ours, which Triangle refines again and vertices are moved in.
-PAPER_ANGLE = 25.0  # degrees
-ADAPTIVE_ANGLE = 28.0  # degrees
-ADAPTIVE_REFINEMENTS = 1
-ADAPTIVE_PASSES = 4
-
-
-@dataclass(frozen=True, eq=False)
-class TileMesh:
-    """The columns of a tile and how they were made."""
-
-    columns: ColumnMesh
-    report: LayeredReport | AdaptiveReport
-    notes: tuple[Note, ...]
 
 
 def build_city(
@@ -147,55 +128,6 @@ def measure_city(
         wall_ground = highest_wall_ground(footprints.polygons, dtm)
         city = assemble_city(footprints, points, heights, members, wall_ground)
     return replace(city, notes=tuple(note_heights("footprint", footprints, heights)))
-
-
-def mesh_city(
-    city: City,
-    dtm: Dtm,
-    bounds: Bounds,
-    options: LayeredOptions | AdaptiveOptions,
-    *,
-    min_angle: float = 0.0,
-    trace: Trace = no_trace,
-) -> TileMesh:
-    """Mesh the air over the terrain and between the buildings (paper, steps 3.1 to 3.5, or our columns).
-
-    Parameters
-    ----------
-    city : City
-        Result of `simplify_city`.
-    dtm : Dtm
-        Terrain.
-    bounds : (xmin, ymin, xmax, ymax)
-        The region (m).
-    options : LayeredOptions or AdaptiveOptions
-        Parameters of the mesher, which choose it.
-    min_angle : float
-        Bound on the angles of the plane mesh (degrees); 0 takes the mesher's own.
-    trace : callable, optional
-        Context manager around each step.
-    """
-    adaptive = isinstance(options, AdaptiveOptions)
-    with trace("3.1 plane mesh"):
-        plane, complete = mesh_plane(
-            bounds,
-            city.model.polygons,
-            mesh_size=options.mesh_size,
-            min_angle=min_angle or (ADAPTIVE_ANGLE if adaptive else PAPER_ANGLE),
-            refinements=ADAPTIVE_REFINEMENTS if adaptive else 0,
-            passes=ADAPTIVE_PASSES if adaptive else 0,
-        )
-    columns: ColumnMesh
-    report: LayeredReport | AdaptiveReport
-    with trace("3.2-3.5 columns"):
-        if isinstance(options, AdaptiveOptions):
-            columns, report = mesh_adaptive(plane, dtm, city.model.roofs, city.model.ids, options)
-        else:
-            columns, report = mesh_layers(
-                plane, dtm, city.model, city.wall_ground, bounds, options, group=city.group
-            )
-    notes = [] if complete else [Note("plane-refinement-stopped", detail="limit on added vertices reached")]
-    return TileMesh(columns, report, tuple(notes))
 
 
 def _apply_border_rule(
