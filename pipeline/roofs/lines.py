@@ -73,7 +73,7 @@ def _rank_lines(a: Array, b: Array, xyz: Array, clearance: float, min_points: in
         z[k] -= mean
     if not total > 0:
         return np.empty((0, 3))
-    directions = _directions(a, b)
+    directions = wall_directions(a, b)
     n_found = 2 * len(directions)
     found, loss = np.empty((n_found, 3)), np.empty(n_found)
     across, vertex = np.empty(n), np.empty(len(a))
@@ -97,7 +97,7 @@ def _rank_lines(a: Array, b: Array, xyz: Array, clearance: float, min_points: in
 
 
 @kernel
-def _directions(a: Array, b: Array) -> Array:
+def wall_directions(a: Array, b: Array) -> Array:
     """Unit vectors of the directions with most wall, each that of its longest wall."""
     n = len(a)
     along, length = np.empty((n, 2)), np.empty(n)

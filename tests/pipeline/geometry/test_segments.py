@@ -41,7 +41,7 @@ def in_kernel(kernel: Any) -> Callable[..., Any]:
 
 are_clear, find_nodes = in_kernel(segments.are_clear), in_kernel(segments.find_nodes)
 heights_beside = in_kernel(segments.heights_beside)
-best_lines, directions = in_kernel(lines._best_lines), in_kernel(lines._directions)
+best_lines, directions = in_kernel(lines._best_lines), in_kernel(lines.wall_directions)
 
 
 def segments_away(xy: Array, a: Array, b: Array) -> Array:
