@@ -42,6 +42,7 @@ class CityOptions:
     clearance: float
     clearance_floor: float
     min_courtyard_area: float
+    roofs: Literal["planes", "flat"]
     split_levels: bool
     roof_group: float
     manifold: bool
@@ -67,6 +68,8 @@ class City:
         Roof heights (m) before roofs were grouped and raised.
     group : int32, (n,)
         Buildings of one group have one roof: the same height, and no wall between them.
+    row : int64, (n,)
+        Row of the footprint, or of the simplified building, that each was made of: those without a roof are gone.
     notes : tuple of Note
         What was dropped, repaired or defaulted on the way.
     counts : dict
@@ -83,6 +86,7 @@ class City:
     wall_ground: NDArray[np.float64]
     measured_roof: NDArray[np.float64]
     group: NDArray[np.int32]
+    row: NDArray[np.int64]
     notes: tuple[Note, ...]
     counts: dict[str, int]
     outline: dict[str, float]
@@ -141,6 +145,7 @@ def assemble_city(
         wall_ground[kept],
         heights.roof[kept],
         np.arange(len(kept), dtype=np.int32) if group is None else group[kept],
+        kept,
         (),
         {},
         {},

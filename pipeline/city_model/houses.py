@@ -15,8 +15,10 @@ from pipeline.city_model.building_points import (
 )
 from pipeline.city_model.city import City, CityOptions
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roofs import Roofs, flat_roofs, join_roofs, take_roofs
 from pipeline.geometry.inside import find_inside
 from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
+from pipeline.roofs.house_roofs import FLAT, RoofOptions, fit_roofs
 from pipeline.roofs.roof_points import (
     RoofPoints,
     add_roof_points,
@@ -40,6 +42,10 @@ class Houses:
         Height above ground (m) from an attribute, NaN where none.
     parts : HouseParts
         Parts of all houses; a house that is not divided is its only part.
+    roofs : Roofs
+        Roof of each part, as its points tell; NaN where it has none, or one height is looked for.
+    method : int8, (h,)
+        Where the roof of each house comes from: index into `ROOF_METHODS`.
     points : BuildingPoints
         Roof and ground points of each part.
     """
@@ -48,6 +54,8 @@ class Houses:
     polygons: NDArray[np.object_]
     given_height: NDArray[np.float64]
     parts: HouseParts
+    roofs: Roofs
+    method: NDArray[np.int8]
     points: BuildingPoints
 
     def __len__(self) -> int:
@@ -63,7 +71,9 @@ def divide_houses(
     roofs: RoofPoints | None = None,
     unmarked: NDArray[np.bool_] | None = None,
 ) -> Houses:
-    """Divide houses where their roofs step (step 2.0, ours); with other options, take each as one part.
+    """Divide houses by the planes of their roofs, or where these step (step 2.0, ours).
+
+    With other options, each house is one part.
 
     Parameters
     ----------
@@ -83,10 +93,16 @@ def divide_houses(
     model = city.model
     marks = has_building_class(cloud) if building_class is None else building_class
     parts, points = HouseParts(model.polygons, np.arange(len(model))), city.points
-    if options.split_levels and options.simplify == "clearance" and len(model):
+    sloped = options.roofs == "planes"
+    part_roofs, method = None, np.full(len(model), FLAT, np.int8)
+    if (options.split_levels or sloped) and options.simplify == "clearance" and len(model):
         if roofs is None:
             roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
-        parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
+        if sloped:
+            fitted = fit_roofs(model.polygons, roofs, RoofOptions(clearance=options.clearance))
+            parts, part_roofs, method = fitted.parts, fitted.roofs, fitted.method
+        else:
+            parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
         divided = np.flatnonzero(np.bincount(parts.house)[parts.house] > 1)
         roof = None
         if unmarked is not None and unmarked.any():
@@ -99,7 +115,9 @@ def divide_houses(
         rows = parts.house.copy()  # a house that is not divided keeps its points
         rows[divided] = len(model) + np.arange(len(divided))
         points = take_building_points(join_building_points([points, found]), rows)
-    return Houses(model.ids, model.polygons, city.given_height, parts, points)
+    if part_roofs is None:
+        part_roofs = flat_roofs(np.full(len(parts.polygons), np.nan))
+    return Houses(model.ids, model.polygons, city.given_height, parts, part_roofs, method, points)
 
 
 def _deal_out_roofs(
@@ -129,6 +147,8 @@ def take_houses(houses: Houses, rows: NDArray[np.int64]) -> Houses:
         houses.polygons[rows],
         houses.given_height[rows],
         HouseParts(parts.polygons[mine], number[parts.house[mine]]),
+        take_roofs(houses.roofs, mine),
+        houses.method[rows],
         take_building_points(houses.points, mine),
     )
 
@@ -146,5 +166,7 @@ def join_houses(several: Sequence[Houses]) -> Houses:
             np.concatenate([nothing.astype(object), *(houses.parts.polygons for houses in several)]),
             np.concatenate([nothing.astype(np.int64), *shift]),
         ),
+        join_roofs([houses.roofs for houses in several]),
+        np.concatenate([np.empty(0, np.int8), *(houses.method for houses in several)]),
         join_building_points([houses.points for houses in several]),
     )

@@ -98,6 +98,15 @@ def is_flat(roofs: Roofs) -> NDArray[np.bool_]:
     return level
 
 
+def choose_roofs(first: NDArray[np.bool_], one: Roofs, other: Roofs) -> Roofs:
+    """Roofs of `one` where `first`, bool (n,), and of `other` elsewhere."""
+    return Roofs(
+        np.where(first[:, None], one.plane, other.plane),
+        np.where(first[:, None], one.origin, other.origin),
+        np.where(first[:, None], one.limits, other.limits),
+    )
+
+
 def take_roofs(roofs: Roofs, rows: NDArray[np.int64]) -> Roofs:
     """Take some roofs in the order of `rows`, int64 (k,)."""
     return Roofs(roofs.plane[rows], roofs.origin[rows], roofs.limits[rows])

@@ -35,7 +35,7 @@ def describe_buildings(cloud: PointCloud, city: City) -> dict[str, Sequence[obje
     """
     model = city.model
     points = locate_roof_points(cloud, model.polygons, building_class=has_building_class(cloud))
-    fidelity = measure_houses(points, model.polygons, model.roof)
+    fidelity = measure_houses(points, model.polygons, model.roofs)
     return report_buildings(model, city.roof_source, city.measured_roof, fidelity)
 
 
@@ -112,7 +112,7 @@ def measure_model(
             cloud,
             dtm,
             city.model.polygons,
-            city.model.roof,
+            city.model.roofs,
             footprints=footprints,
             building_class=has_building_class(cloud),
         )

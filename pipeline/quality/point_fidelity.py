@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from pipeline.data.classes import GROUND, WATER
 from pipeline.data.kernel import kernel
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roofs import Roofs, roof_heights, take_roofs
+from pipeline.geometry.group_order import sort_values
 from pipeline.geometry.inside import (
     EVERYWHERE,
     INSIDE,
@@ -113,7 +115,7 @@ def measure_fidelity(
     cloud: PointCloud,
     dtm: Dtm,
     polygons: NDArray[np.object_],
-    roof: NDArray[np.float64],
+    roofs: Roofs,
     *,
     footprints: NDArray[np.object_],
     building_class: bool,
@@ -128,8 +130,8 @@ def measure_fidelity(
         Terrain of the model, without empty nodes.
     polygons : object, (b,)
         Buildings of the model.
-    roof : float64, (b,)
-        Their absolute roof heights (m); a building with NaN counts as none of the model.
+    roofs : Roofs
+        Their roofs, absolute heights (m); a building with NaN counts as none of the model.
     footprints : object, (f,)
         Clean footprints before simplification, which say what a building is.
     building_class : bool
@@ -145,7 +147,7 @@ def measure_fidelity(
     -----
     All points count, outliers too. The result does not depend on the order of the points.
     """
-    model = index_model(polygons, roof, footprints=footprints)
+    model = index_model(polygons, roofs, footprints=footprints)
     found = _find_residuals(cloud, dtm, model, building_class, np.ones(len(cloud.xyz), np.bool_))
     return PointFidelity(**{kind: summarise(residual) for kind, residual in found.items()})
 
@@ -158,20 +160,20 @@ class IndexedModel:
     ----------
     polygons : object, (n,)
         Buildings that have a roof, then footprints.
-    roof : float64, (b,)
-        Absolute roof heights (m) of the first ``b``, the buildings.
+    roofs : Roofs
+        Roofs of the first ``b``, the buildings.
     index : PolygonIndex
         All of them in cells.
     """
 
     polygons: NDArray[np.object_]
-    roof: NDArray[np.float64]
+    roofs: Roofs
     index: PolygonIndex
 
 
 def index_model(
     polygons: NDArray[np.object_],
-    roof: NDArray[np.float64],
+    roofs: Roofs,
     *,
     footprints: NDArray[np.object_],
     box: Box = EVERYWHERE,
@@ -180,14 +182,14 @@ def index_model(
 
     Parameters
     ----------
-    polygons, roof, footprints
+    polygons, roofs, footprints
         As in `measure_fidelity`: all that touch the box, also those that the tiles around it own.
     box : (xmin, ymin, xmax, ymax)
         Box of all points (m), its borders included.
     """
-    built = np.isfinite(roof)
+    built = np.flatnonzero(np.isfinite(roofs.plane[:, 2]))
     both = np.concatenate((polygons[built], footprints))
-    return IndexedModel(both, roof[built], index_polygons(both, box))
+    return IndexedModel(both, take_roofs(roofs, built), index_polygons(both, box))
 
 
 def sum_fidelity(
@@ -222,7 +224,7 @@ def conclude_fidelity(sums: FidelitySums) -> PointFidelity:
     return PointFidelity(**{kind: conclude(getattr(sums, kind)) for kind in KINDS})
 
 
-def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roof: NDArray[np.float64]) -> HouseFidelity:
+def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roofs: Roofs) -> HouseFidelity:
     """Measure each house against its own roof points, outliers included.
 
     Parameters
@@ -231,14 +233,16 @@ def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roof: NDAr
         Points of the houses, as from `locate_roof_points`.
     polygons : object, (n,)
         Houses.
-    roof : float64, (n,)
-        Absolute roof heights (m).
+    roofs : Roofs
+        Their roofs, absolute heights (m).
     """
     n_points = np.diff(points.start)
+    house = np.repeat(np.arange(len(n_points)), n_points)
+    residual = -sort_values(points.start, points.xyz[:, 2] - roof_heights(roofs, house, points.xyz[:, :2]))
     edges = list_edges(polygons)
     low, size = _cells_under(shapely.bounds(polygons).reshape(-1, 4))
     total, squares, filled, cells, unsure = _measure_each(
-        points.start, points.xyz, points.z, roof, low, size, edges.start, edges.a, edges.b
+        points.start, points.xyz, residual, low, size, edges.start, edges.a, edges.b
     )
     house = unsure[:, 0].astype(np.int64)
     cells += np.bincount(house[shapely.contains_xy(polygons[house], *unsure[:, 1:].T)], minlength=len(cells))
@@ -250,14 +254,14 @@ def _find_residuals(
     cloud: PointCloud, dtm: Dtm, model: IndexedModel, building_class: bool, among: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.float64]]:
     """Find the residuals (m) of the points of each kind among some."""
-    xyz, roof = cloud.xyz, model.roof
+    xyz, roofs = cloud.xyz, model.roofs
     is_roof = among & select_roof(cloud, building_class=building_class)
     is_ground = among & ((cloud.classification == GROUND) | (cloud.classification == WATER))
     polygon, point = find_inside(xyz, model.polygons, among=is_roof | is_ground, index=model.index)
-    n = int(np.searchsorted(polygon, len(roof)))
+    n = int(np.searchsorted(polygon, len(roofs)))
     building, point, original = polygon[:n], point[:n], _mark(len(xyz), point[n:])
     outside = ~_mark(len(xyz), point)
-    residual = roof[building] - xyz[point, 2]
+    residual = roof_heights(roofs, building, xyz[point, :2]) - xyz[point, 2]
     return {
         "roof": residual[is_roof[point]],
         "missed": measure_over(dtm, xyz, is_roof & original & outside),
@@ -276,28 +280,26 @@ def _mark(n: int, index: NDArray[np.int64]) -> NDArray[np.bool_]:
 def _measure_each(
     start: NDArray[np.int64],
     xyz: NDArray[np.float64],
-    z: NDArray[np.float64],
-    roof: NDArray[np.float64],
+    residual: NDArray[np.float64],
     low: NDArray[np.int64],
     size: NDArray[np.int64],
     edge_start: NDArray[np.int64],
     a: NDArray[np.float64],
     b: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Sum up the residuals of each house and their squares, by height; count its cells.
+    """Sum up the residuals of each house and their squares, in their order; count its cells.
 
     Gives the sums, the number of cells that have a point, and of those that belong to the house; and house and
     centre of cells without a point of which crossings do not tell.
     """
-    n, n_unsure = len(roof), 0
+    n, n_unsure = len(start) - 1, 0
     total, squares = np.zeros(n), np.zeros(n)
     n_filled, n_cells = np.zeros(n, np.int64), np.zeros(n, np.int64)
     unsure = np.empty(((size[:, 0] * size[:, 1]).sum(), 3))
     for h in range(n):
         for k in range(start[h], start[h + 1]):
-            residual = roof[h] - z[k]
-            total[h] += residual
-            squares[h] += residual * residual
+            total[h] += residual[k]
+            squares[h] += residual[k] * residual[k]
         filled = np.zeros((size[h, 1], size[h, 0]), np.bool_)
         for k in range(start[h], start[h + 1]):
             i, j = int(np.floor(xyz[k, 0] / COVERAGE_CELL)), int(np.floor(xyz[k, 1] / COVERAGE_CELL))

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.building_points import merge_building_points, take_building_points
+from pipeline.city_model.building_points import has_building_class, merge_building_points, take_building_points
 from pipeline.city_model.city import (
     City,
     CityOptions,
@@ -24,10 +24,13 @@ from pipeline.city_model.houses import Houses, divide_houses
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
-from pipeline.data.roofs import flat_roofs
+from pipeline.data.roofs import choose_roofs, flat_roofs, highest_roofs, is_flat, take_roofs
 from pipeline.points_terrain.terrain import Dtm
+from pipeline.roofs.house_roofs import refit_roofs
+from pipeline.roofs.roof_points import RoofPoints, locate_roof_points
 from pipeline.simplification.fidelity import Fidelity, measure_simplification
 from pipeline.simplification.house_clusters import Shapes, simplify_houses
+from pipeline.simplification.roof_crossings import add_crossings
 
 COVERED = 0.5  # a house without a face is not lost if others cover this part of it
 CHANGED = 0.3  # of a house's area: an outline that gained and lost more is told
@@ -58,7 +61,9 @@ def simplify_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions,
         houses = divide_houses(city, cloud, options)
     with trace("2.1 simplify"):
         shapes = simplify_houses(houses.parts, houses.polygons, options)
-    simple = raise_buildings(houses, shapes, dtm, options, reserved=set(city.model.ids.tolist()), trace=trace)
+    located = locate_roof_points(cloud, shapes.polygons, building_class=has_building_class(cloud))
+    reserved = set(city.model.ids.tolist())
+    simple = raise_buildings(houses, shapes, dtm, options, reserved=reserved, roof_points=located, trace=trace)
     return replace(simple, notes=(*city.notes, *simple.notes), counts={**city.counts, **simple.counts})
 
 
@@ -69,6 +74,7 @@ def raise_buildings(
     options: CityOptions,
     *,
     reserved: Set[str],
+    roof_points: RoofPoints | None = None,
     trace: Trace = no_trace,
 ) -> City:
     """Give the buildings of whole clusters their ids and heights (step 2.3).
@@ -85,6 +91,8 @@ def raise_buildings(
         Parameters.
     reserved : set of str
         Ids that no part of a house may get: at least those of all houses that look like one of a part.
+    roof_points : RoofPoints, optional
+        Roof points of the simplified buildings, to which sloped roofs are fitted once more.
     trace : callable, optional
         Context manager around each step.
 
@@ -95,6 +103,8 @@ def raise_buildings(
     with trace("2.3 building heights"):
         if options.simplify == "paper":
             return _raise_merged(houses, shapes, dtm, options)
+        if options.roofs == "planes":
+            return _raise_sloped(houses, shapes, dtm, options, reserved, roof_points)
         return _raise_planar(houses, shapes, dtm, options, reserved)
 
 
@@ -178,6 +188,51 @@ def _raise_planar(houses: Houses, shapes: Shapes, dtm: Dtm, options: CityOptions
         *_note_closed(houses, houses.parts.house[shapes.closed[:, 0]]),
     )
     counts = {**shapes.counts, **_count(houses, city)}
+    return replace(city, notes=notes, counts=counts, outline=_describe_outline(outline, houses))
+
+
+def _raise_sloped(
+    houses: Houses,
+    shapes: Shapes,
+    dtm: Dtm,
+    options: CityOptions,
+    reserved: Set[str],
+    roof_points: RoofPoints | None,
+) -> City:
+    """Every part of a house keeps its plane, fitted to the points of its face; where it has none, one height."""
+    row = houses.parts.house[shapes.member]
+    ids = _name_parts(houses.ids, row, reserved)
+    points = take_building_points(houses.points, shapes.member)
+    heights = measure_heights(points, shapes.polygons, dtm, houses.given_height[row], options)
+    roofs = take_roofs(houses.roofs, shapes.member)
+    if roof_points is not None:
+        roofs = refit_roofs(roofs, shapes.polygons, roof_points)
+    bare = np.isnan(roofs.plane[:, 2])
+    roofs = choose_roofs(bare, flat_roofs(heights.roof), roofs)
+    wall_ground = highest_wall_ground(shapes.polygons, dtm)
+    measured = highest_roofs(roofs, shapes.polygons)
+    least = wall_ground + options.roof_clearance
+    low = is_flat(roofs) & (roofs.plane[:, 2] < least)
+    roofs = choose_roofs(low, flat_roofs(least), roofs)
+    polygons, n_nodes, n_short = add_crossings(shapes.polygons, roofs, clearance=options.clearance)
+    footprints = Footprints(polygons, ids, houses.given_height[row])
+    members = tuple((str(houses.ids[k]),) for k in row)
+    heights = replace(heights, roof=np.where(np.isnan(heights.roof), np.nan, measured))
+    city = assemble_city(footprints, points, heights, members, wall_ground, roofs=roofs, house=houses.ids[row])
+    outline = measure_simplification(houses.polygons, shapes.polygons, row)
+    notes = (
+        *note_heights("building", footprints, heights),
+        *_note_raised(footprints, heights, least, low),
+        *_note_outlines(houses, shapes.polygons, row, outline.house_error),
+        *_note_closed(houses, houses.parts.house[shapes.closed[:, 0]]),
+    )
+    counts = {
+        **shapes.counts,
+        "houses split": int((np.bincount(houses.parts.house, minlength=1) > 1).sum()),
+        "sloped parts": int((~is_flat(roofs)).sum()),
+        "nodes where roofs cross": n_nodes,
+        "walls without room for one": n_short,
+    }
     return replace(city, notes=notes, counts=counts, outline=_describe_outline(outline, houses))
 
 

@@ -118,6 +118,8 @@ def pack_houses(houses: Houses) -> Arrays:
         "given_height": houses.given_height,
         **pack_polygons(houses.parts.polygons, "part"),
         "part_house": houses.parts.house,
+        **{f"part_{name}": values for name, values in pack_roofs(houses.roofs).items()},
+        "method": houses.method,
         "roof_start": houses.points.roof_start,
         "roof_z": houses.points.roof_z,
         "ground_start": houses.points.ground_start,
@@ -126,7 +128,7 @@ def pack_houses(houses: Houses) -> Arrays:
 
 
 POINTS = ("roof", "ground")
-HOUSE_ROWS = ("ids", "given_height", "part_house")
+HOUSE_ROWS = ("ids", "given_height", "part_house", "method", *(f"part_{name}" for name in ROOF_ARRAYS))
 # What simplifying houses takes, and giving them heights after that.
 ARRAYS_TO_SHAPE = (*HOUSE_ROWS, "part", "part_start")
 ARRAYS_TO_RAISE = (*HOUSE_ROWS, "outline", "outline_start", "roof_start", "roof_z", "ground_start", "ground_z")
@@ -144,6 +146,8 @@ def unpack_houses(arrays: Arrays) -> Houses:
         HouseParts(
             unpack_polygons(arrays, "part") if "part" in arrays else np.full(n_parts, None), arrays["part_house"]
         ),
+        Roofs(*(arrays[f"part_{name}"] for name in ROOF_ARRAYS)),
+        arrays["method"],
         BuildingPoints(*roof, *ground),
     )
 

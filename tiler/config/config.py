@@ -153,11 +153,15 @@ class Config:
         above=0,
     )  # fmt: skip
     min_courtyard_area: float = _parameter(5.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
+    roofs: str = _parameter(
+        "flat", "simplify", "roofs of houses: planes found in their points, or flat; always flat with "
+        "mesher = layered or simplify = paper", choices=("planes", "flat"),
+    )  # fmt: skip
     split_levels: bool = _parameter(
-        True, "simplify", "divide houses where their roof points show a step, with simplify = clearance"
+        True, "simplify", "divide houses where their roof points show a step, with roofs = flat"
     )
     roof_group: float = _parameter(
-        2.5, "simplify", "adjacent houses closer in height than this get one roof, with simplify = clearance",
+        2.5, "simplify", "adjacent houses closer in height than this get one roof, with roofs = flat",
         unit="m", least=0,
     )  # fmt: skip
     manifold: bool = _parameter(

@@ -8,6 +8,7 @@ from pipeline.columns.growth import Growth, count_steps
 from pipeline.columns.layered import LayeredOptions
 from pipeline.columns.spacing import SpacingLimits
 from pipeline.columns.underground import SoilOptions
+from pipeline.columns.weld import Weld
 from pipeline.plane_mesh.sizes import SizeRule
 from tiler.config.config import Config
 from tiler.config.declared import Declared
@@ -23,7 +24,14 @@ ADAPTIVE_PASSES = 4
 CITY_PARAMETERS = (
     *("min_building_area", "vertex_tolerance", "ground_margin", "ground_percentile", "roof_height"),
     *("roof_percentile", "default_height", "roof_clearance_or_spacing", "border", "simplify", "clearance"),
-    *("clearance_floor", "min_courtyard_area", "split_levels", "roof_group_or_spacing", "manifold"),
+    *(
+        "clearance_floor",
+        "min_courtyard_area",
+        "roofs_or_flat",
+        "split_levels",
+        "roof_group_or_spacing",
+        "manifold",
+    ),
 )
 # Parameters of seams and plane meshes.
 PLANE_PARAMETERS = ("mesh_size", "min_angle", "mesher")
@@ -40,16 +48,19 @@ LAYER_PARAMETERS = (
 SOIL_PARAMETERS = ("underground", "mesh_size", "least_spacing", "most_spacing", "stagger")
 
 
-def derived_parameters(config: Config) -> dict[str, float]:
+def derived_parameters(config: Config) -> dict[str, float | str]:
     """Parameters that follow from others, by name: a stage that declares one does not depend on the others.
 
     ``graded_size`` is the largest target edge length of region and pad, ``tile_size_or_default`` the side of a
     tile (m).
     ``roof_clearance_or_spacing`` and ``roof_group_or_spacing`` (m) are at least the least vertical spacing of the
-    adaptive mesher: heights closer than that cannot both be exact in a column.
+    adaptive mesher: heights closer than that cannot both be exact in a column. ``roofs_or_flat`` is "flat" where
+    the mesher or the way to simplify knows no sloped roofs.
     """
     spacing = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
+    sloping = config.mesher == "adaptive" and config.simplify == "clearance"
     return {
+        "roofs_or_flat": config.roofs if sloping else "flat",
         "layer_height_or_default": config.layer_height_or_default,
         "graded_size": config.graded_size,
         "tile_size_or_default": config.tile_size_or_default,
@@ -66,7 +77,9 @@ def needs_region(config: Config) -> bool:
 def layer_parameters(config: Config) -> tuple[str, ...]:
     """Parameters of the columns: those of features only where these are used, so that keys stay without them."""
     growth = ("first_layer", "layer_growth") if config.first_layer else ()
-    return (*LAYER_PARAMETERS, *growth, *(("top_elevation",) if config.top == "flat" else ()))
+    sloped = derived_parameters(config)["roofs_or_flat"] == "planes"
+    roofs = ("roofs_or_flat", "roof_clearance_or_spacing") if sloped else ()
+    return (*LAYER_PARAMETERS, *growth, *roofs, *(("top_elevation",) if config.top == "flat" else ()))
 
 
 def expected_levels(config: Config, spacing: float) -> float:
@@ -91,6 +104,7 @@ def city_options(given: Any) -> CityOptions:
         clearance=given.clearance,
         clearance_floor=given.clearance_floor,
         min_courtyard_area=given.min_courtyard_area,
+        roofs="planes" if given.roofs_or_flat == "planes" else "flat",
         split_levels=given.split_levels,
         roof_group=given.roof_group_or_spacing,
         manifold=given.manifold,
@@ -104,6 +118,7 @@ def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | A
     first = _optional(given, "first_layer", 0.0)
     growth = Growth(first, given.layer_growth) if first else None
     if given.mesher == "adaptive":
+        sloped = _optional(given, "roofs_or_flat", "flat") == "planes"
         return AdaptiveOptions(
             mesh_size=given.mesh_size,
             domain_height=domain.height,
@@ -112,6 +127,7 @@ def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | A
             passes=given.improve_passes,
             growth=growth,
             top=domain.top,
+            weld=Weld(clearance=given.roof_clearance_or_spacing) if sloped else None,
         )
     return LayeredOptions(
         mesh_size=given.mesh_size,

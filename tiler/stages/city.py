@@ -170,7 +170,7 @@ def make_houses(task: Task) -> Facts:
         houses = divide_houses(city, cloud, options, building_class=True, roofs=roofs, unmarked=others)
     del cloud  # large, and no longer needed
     with task.step("1.7 fit of roofs"):
-        fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
+        fidelity = measure_houses(roofs, city.model.polygons, city.model.roofs)
         full = make_buildings(city, fidelity, np.zeros(len(city.model), np.int32))
     task.put(**pack_houses(houses), **pack_buildings(full, "full_"), unmarked=others)
     counts = {"buildings before merging": len(houses), **_count_parts(houses)}
@@ -293,7 +293,16 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
     dtm = _terrain_around(task, extent, reach + 2 * given.dtm_spacing)
     reserved = {name for result in task.read("reserved", ()) for name in result.facts["names"]}
     terrain = cut_terrain(dtm, window_of(dtm))
-    city = raise_buildings(gathered.houses, shapes, terrain, options, reserved=reserved, trace=task.step)
+    cloud = points_near(task, extent, options.ground_margin, shapes.polygons, (BUILDING,))
+    with task.step("2.3 roof points"):
+        roofs = locate_roof_points(cloud, shapes.polygons, building_class=True)
+        del cloud
+        rows = _find_unmarked(shapes, gathered)
+        others = find_surfaces(task, shapes.polygons[rows], terrain, MAY_BE_ROOF)
+        roofs = add_roof_points(roofs, rows, others.points)
+    city = raise_buildings(
+        gathered.houses, shapes, terrain, options, reserved=reserved, roof_points=roofs, trace=task.step
+    )
     task.notes(city.notes)
     model = city.model
     layers, parted = np.zeros(len(model), np.int32), 0
@@ -303,14 +312,10 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
             layers, parted = choose_layers(
                 model.polygons, model.roof, city.wall_ground, city.group, pairs, dtm, bounds, mesh
             )
-    cloud = points_near(task, extent, options.ground_margin, shapes.polygons, (BUILDING,))
     with task.step("2.4 fit of roofs"):
-        roofs = locate_roof_points(cloud, city.model.polygons, building_class=True)
-        del cloud
-        rows = _find_unmarked(city.model.members, gathered)
-        others = find_surfaces(task, city.model.polygons[rows], terrain, MAY_BE_ROOF)
-        roofs = add_roof_points(roofs, rows, others.points)
-        fidelity = measure_houses(roofs, city.model.polygons, city.model.roof)
+        kept = np.zeros(len(shapes), np.bool_)
+        kept[city.row] = True
+        fidelity = measure_houses(keep_roof_points(roofs, kept), model.polygons, model.roofs)
     task.put(**pack_model(make_buildings(city, fidelity, layers)))
     counts = {"buildings": len(np.unique(model.house)), PARTS: len(model)}
     counts |= {name: n for name, n in city.counts.items() if name not in shapes.counts}
@@ -341,10 +346,11 @@ def _owned(task: Task, footprints: Footprints) -> Footprints:
     return Footprints(footprints.polygons[mine], footprints.ids[mine], footprints.given_height[mine])
 
 
-def _find_unmarked(members: Sequence[tuple[str, ...]], gathered: "_Gathered") -> NDArray[np.int64]:
+def _find_unmarked(shapes: Shapes, gathered: "_Gathered") -> NDArray[np.int64]:
     """Rows of the buildings whose houses are all unmarked."""
-    unmarked = set(gathered.houses.ids[gathered.unmarked].tolist())
-    return np.array([k for k, names in enumerate(members) if unmarked.issuperset(names)], np.int64)
+    unmarked = gathered.unmarked[gathered.houses.parts.house[shapes.member]]
+    building = np.repeat(np.arange(len(shapes)), np.diff(shapes.member_start))
+    return np.flatnonzero(np.bincount(building[~unmarked], minlength=len(shapes)) == 0)
 
 
 def _terrain_around(task: Task, extent: Box | None, reach: float) -> Dtm:

@@ -206,7 +206,7 @@ def measure_fit(task: Task) -> Facts:
     (found,) = task.read("outlines", ("outline", "outline_start"))
     outlines = unpack_polygons(found.arrays, "outline")
     footprints, _ = read_polygons(outlines, np.arange(len(outlines)))
-    model = index_model(buildings.model.polygons, buildings.model.roof, footprints=footprints, box=task.box)
+    model = index_model(buildings.model.polygons, buildings.model.roofs, footprints=footprints, box=task.box)
     parts, n_building = [], 0
     for cloud in read_bands(task, task.box, classes=FIT_CLASSES, ground_filter=given.ground_filter):
         mine = find_owned(task.box, bounds, cloud.xyz[:, :2])

@@ -32,6 +32,7 @@ OPTIONS = CityOptions(
     clearance=1.0,
     clearance_floor=0.1,
     min_courtyard_area=10.0,
+    roofs="flat",
     split_levels=False,
     roof_group=2.0,
     manifold=False,

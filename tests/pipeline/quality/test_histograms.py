@@ -170,14 +170,14 @@ def test_fidelity_of_tiles_is_that_of_the_region() -> None:
     cloud = PointCloud(xyz, rng.choice([BUILDING, GROUND, WATER], 20_000).astype(np.uint8))
     dtm = tilted_dtm(bounds, slope_x=0.01)
 
-    model = index_model(city.polygons, city.roof, footprints=footprints, box=bounds)
+    model = index_model(city.polygons, city.roofs, footprints=footprints, box=bounds)
 
     def sums_of(own: NDArray[np.bool_]) -> FidelitySums:
         return sum_fidelity(cloud, dtm, model, building_class=True, among=own)
 
     tile = (xyz[:, 0] // 50 * 3 + xyz[:, 1] // 50).astype(int)
     merged = merge_fidelity([sums_of(tile == k) for k in rng.permutation(9)])
-    exact = measure_fidelity(cloud, dtm, city.polygons, city.roof, footprints=footprints, building_class=True)
+    exact = measure_fidelity(cloud, dtm, city.polygons, city.roofs, footprints=footprints, building_class=True)
     found = conclude_fidelity(merged)
     for kind in KINDS:
         assert getattr(exact, kind).n > 50

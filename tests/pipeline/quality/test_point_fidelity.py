@@ -15,6 +15,7 @@ from pipeline.city_model.heights import percentile_by_group
 from pipeline.data.citymodel import Footprints
 from pipeline.data.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roofs import flat_roofs
 from pipeline.geometry.inside import find_inside
 from pipeline.quality.point_fidelity import Residuals, measure_fidelity, measure_houses, summarise
 from pipeline.roofs.house_levels import LevelOptions, split_levels
@@ -57,7 +58,7 @@ CLOUD = cloud_of(
 
 def test_residuals_by_hand() -> None:
     found = measure_fidelity(
-        CLOUD, DTM, polygons(MODEL), np.array([10.0]), footprints=polygons(HOUSE), building_class=True
+        CLOUD, DTM, polygons(MODEL), flat_roofs(np.array([10.0])), footprints=polygons(HOUSE), building_class=True
     )
     assert found.roof == summarise(np.array([1.0, -3.0, 1.0]))
     assert found.roof.rmse == pytest.approx(np.sqrt(11 / 3))
@@ -69,7 +70,12 @@ def test_residuals_by_hand() -> None:
 
 def test_a_building_without_roof_is_none_of_the_model() -> None:
     found = measure_fidelity(
-        CLOUD, DTM, polygons(MODEL), np.array([np.nan]), footprints=polygons(HOUSE), building_class=True
+        CLOUD,
+        DTM,
+        polygons(MODEL),
+        flat_roofs(np.array([np.nan])),
+        footprints=polygons(HOUSE),
+        building_class=True,
     )
     assert (found.roof.n, found.missed.n, found.ground.n, found.swallowed.n) == (0, 3, 5, 0)
     assert np.isnan(found.roof.rmse)
@@ -78,7 +84,7 @@ def test_a_building_without_roof_is_none_of_the_model() -> None:
 def test_without_building_class_unclassified_points_are_roofs() -> None:
     cloud = cloud_of((11, 15, 9.0, UNCLASSIFIED), (11, 16, 9.0, GROUND))
     found = measure_fidelity(
-        cloud, DTM, polygons(HOUSE), np.array([10.0]), footprints=polygons(HOUSE), building_class=False
+        cloud, DTM, polygons(HOUSE), flat_roofs(np.array([10.0])), footprints=polygons(HOUSE), building_class=False
     )
     assert found.roof == Residuals(1, 1.0, 1.0, 1.0, 1.0)
 
@@ -92,7 +98,7 @@ def test_the_order_of_the_points_does_not_matter() -> None:
         measure_fidelity,
         dtm=tilted_dtm((0.0, 0.0, 40.0, 40.0), slope_x=0.1),
         polygons=polygons(MODEL),
-        roof=np.array([10.0]),
+        roofs=flat_roofs(np.array([10.0])),
         footprints=polygons(HOUSE),
         building_class=True,
     )
@@ -101,7 +107,9 @@ def test_the_order_of_the_points_does_not_matter() -> None:
 
 def test_nothing_to_measure_is_nan() -> None:
     empty = PointCloud(np.empty((0, 3)), np.empty(0, np.uint8))
-    found = measure_fidelity(empty, DTM, polygons(), np.empty(0), footprints=polygons(), building_class=True)
+    found = measure_fidelity(
+        empty, DTM, polygons(), flat_roofs(np.empty(0)), footprints=polygons(), building_class=True
+    )
     assert found.ground.n == 0
     assert np.isnan(found.ground.p95)
 
@@ -114,7 +122,9 @@ def test_points_in_two_polygons_are_located_in_each() -> None:
 
 def measure_one(house: shapely.Polygon, *points: tuple[float, float, float]) -> tuple[int, float, float, float]:
     xyz = np.array(points).reshape(-1, 3)
-    found = measure_houses(make_roof_points(np.array([0, len(xyz)]), xyz), polygons(house), np.array([10.0]))
+    found = measure_houses(
+        make_roof_points(np.array([0, len(xyz)]), xyz), polygons(house), flat_roofs(np.array([10.0]))
+    )
     return int(found.n_points[0]), float(found.rmse[0]), float(found.bias[0]), float(found.coverage[0])
 
 
@@ -155,7 +165,7 @@ def test_a_house_without_points_is_told() -> None:
     n, rmse, bias, coverage = measure_one(HOUSE)
     assert (n, coverage) == (0, 0.0)
     assert np.isnan([rmse, bias]).all()
-    found = measure_houses(make_roof_points(np.array([0]), np.empty((0, 3))), polygons(), np.empty(0))
+    found = measure_houses(make_roof_points(np.array([0]), np.empty((0, 3))), polygons(), flat_roofs(np.empty(0)))
     assert len(found.rmse) == len(found.coverage) == 0
 
 
@@ -164,7 +174,7 @@ def test_houses_do_not_mix() -> None:
     houses = polygons(HOUSE, shapely.box(20, 10, 30, 20), shapely.box(50, 50, 60, 60))
     xyz = rng.uniform(5, 35, (3000, 3))
     points = locate_roof_points(PointCloud(xyz, np.full(3000, BUILDING, np.uint8)), houses, building_class=True)
-    all_at_once = measure_houses(points, houses, np.array([10.0, 20.0, 30.0]))
+    all_at_once = measure_houses(points, houses, flat_roofs(np.array([10.0, 20.0, 30.0])))
     for k, (house, roof) in enumerate(zip(houses, (10.0, 20.0, 30.0), strict=True)):
         inside = xyz[shapely.contains_xy(house, xyz[:, 0], xyz[:, 1])]
         assert all_at_once.n_points[k] == len(inside)
@@ -195,7 +205,9 @@ def roof_error(
     points = extract_building_points(cloud, houses, margin=1.0, building_class=building_class)
     roof = percentile_by_group(points.roof_start, points.roof_z, percentile)
     dtm = tilted_dtm((120000.0, 485900.0, 120001.0, 485901.0))
-    found = measure_fidelity(cloud, dtm, houses, roof, footprints=houses, building_class=building_class)
+    found = measure_fidelity(
+        cloud, dtm, houses, flat_roofs(roof), footprints=houses, building_class=building_class
+    )
     return found.roof
 
 

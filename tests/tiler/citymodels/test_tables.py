@@ -6,6 +6,7 @@ import shapely
 
 from pipeline.city_model.building_points import BuildingPoints
 from pipeline.city_model.houses import Houses, join_houses, take_houses
+from pipeline.data.roofs import flat_roofs
 from pipeline.quality.point_fidelity import HouseFidelity
 from pipeline.roofs.house_levels import HouseParts
 from tests.helpers.cities import city_of, crowded_blocks
@@ -34,6 +35,8 @@ def make_houses() -> Houses:
         outlines,
         np.array([np.nan, 7.0]),
         HouseParts(parts, np.array([0, 1, 1])),
+        flat_roofs(np.array([np.nan, 4.0, 6.0])),
+        np.array([3, 0], np.int8),
         BuildingPoints(*roof, *ground),
     )
 
@@ -46,6 +49,8 @@ def test_houses_come_back_whole() -> None:
     assert (found.parts.polygons == houses.parts.polygons).all()
     assert found.points.roof_z.tolist() == houses.points.roof_z.tolist()
     assert found.points.ground_start.tolist() == houses.points.ground_start.tolist()
+    assert found.roofs.plane[1:].tolist() == [[0.0, 0.0, 4.0], [0.0, 0.0, 6.0]]
+    assert found.method.tolist() == [3, 0]
 
 
 @pytest.mark.parametrize("names", [ARRAYS_TO_SHAPE, ARRAYS_TO_RAISE])
@@ -55,6 +60,8 @@ def test_houses_are_taken_and_joined_without_what_was_not_read(names: tuple[str,
     found = take_houses(join_houses([unpack_houses(packed)] * 2), np.array([3, 0]))
     assert found.ids.tolist() == ["b", "a"]
     assert found.parts.house.tolist() == [0, 0, 1]
+    assert found.roofs.plane[:2, 2].tolist() == [4.0, 6.0]
+    assert found.method.tolist() == [0, 3]
     if names == ARRAYS_TO_SHAPE:
         assert (found.parts.polygons == houses.parts.polygons[[1, 2, 0]]).all()
         assert unpack_houses(packed).points.roof_start.tolist() == [0, 0, 0, 0]
