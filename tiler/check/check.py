@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker
 from stitch.pieces.frontier import Settled, add_rim, close_frontier, start_frontier
-from tiler.check import city_proofs, pad_proofs, proofs, soil_proofs
+from tiler.check import city_proofs, pad_proofs, proofs, soil_proofs, wall_proofs
 from tiler.check.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
 from tiler.check.proofs import Dtm, Fault, Finding, Proof, Vertices
 from tiler.check.solid_proofs import SolidProofs
@@ -112,6 +112,7 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
             sums.add_piece(piece, fresh, record, index, dtm)
             sums.add_settled(settled)
         sums.add_settled(close_frontier(frontier))
+        sums.add_rim_walls()
         claims, facts = _conclude(sums, len(files), record, index)
         claims += (solids.prove(),)
         parts = sums.count_parts()
@@ -133,19 +134,23 @@ class _Sums:
     part_cells: NDArray[np.int64]  # (p,): cells of each part of a piece
     part_soil: NDArray[np.bool_]  # (p,): whether it is soil
     joined: NDArray[np.int64]  # (j, 2): pairs of parts that share faces
+    rim_walls: wall_proofs.Walls  # over the rims of pieces
 
     @classmethod
     def start(cls, n_buildings: int) -> "_Sums":
         built = city_proofs.start_built(n_buildings)
         counts = {"cells": 0, "points": 0, "facets": 0, PARTS: n_buildings}
         pairs, part = np.empty((0, 2), np.int64), (np.empty(0, np.int64), np.empty(0, np.bool_))
-        return cls({}, built, counts, np.inf, (), np.empty((0, 2)), pairs, *part, pairs)
+        walls = wall_proofs.no_walls()
+        return cls({}, built, counts, np.inf, (), np.empty((0, 2)), pairs, *part, pairs, walls)
 
     def add_piece(
         self, piece: Piece, fresh: NDArray[np.bool_], record: RunRecord, index: BuildingIndex, dtm: Dtm
     ) -> None:
         """Add what a piece says; `fresh` are the points of its rim that no earlier piece had."""
         surface = piece.surface
+        within, over_rim = wall_proofs.split_walls(surface, piece.on_rim)
+        self.rim_walls = wall_proofs.join_walls(self.rim_walls, over_rim)
         rows = _find_buildings(index, piece)
         buildings = index.take(rows)
         ground = take_vertices(piece, Marker.GROUND, GROUND, fresh)
@@ -156,8 +161,9 @@ class _Sums:
             "box": proofs.check_box(surface, record.bounds, piece.rim.edges),
             "top": proofs.check_top(take_vertices(piece, Marker.TOP, TOP, fresh), record.top),
             "ground": proofs.check_ground(ground, dtm),
-            "roofs": city_proofs.check_roofs(surface, buildings),
-            "walls": city_proofs.check_walls(surface, buildings),
+            "roofs": city_proofs.check_roofs(surface, buildings, dtm, record.roofs),
+            "walls": city_proofs.check_walls(surface, buildings, dtm, record.roofs),
+            "overlap": wall_proofs.check_overlap(within),
             "sizes": proofs.check_sizes(surface, piece.outline, piece.air),
         }
         if record.core is not None:
@@ -189,6 +195,10 @@ class _Sums:
         if len(settled.seams):
             self.seams = np.unique(np.concatenate((self.seams, settled.seams)), axis=0)
             self.joined = np.unique(np.concatenate((self.joined, settled.joined)), axis=0)
+
+    def add_rim_walls(self) -> None:
+        """Add the walls over the rims of pieces, of which no more will come."""
+        self._join("overlap", wall_proofs.check_overlap(self.rim_walls))
 
     def count_parts(self) -> list[int]:
         """Cells of the parts of the air that share no face, the largest first."""
@@ -230,7 +240,8 @@ def _conclude(
         proofs.prove_ground(found["ground"]),
         city_proofs.prove_roofs(found["roofs"]),
         city_proofs.prove_walls(found["walls"]),
-        city_proofs.prove_buildings(sums.built, index, bounds, partial=partial),
+        wall_proofs.prove_overlap(found["overlap"]),
+        city_proofs.prove_buildings(sums.built, index, bounds, rules=record.roofs, partial=partial),
         proofs.prove_plan(found["sizes"], bounds, partial=partial),
         proofs.prove_volume(found["sizes"]),
         proofs.prove_record(record, sums.counts, partial=partial),

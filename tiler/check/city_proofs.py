@@ -8,11 +8,13 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.mesh import Marker
+from pipeline.data.roofs import roof_heights
 from tiler.check.proofs import (
     HEIGHT_TOLERANCE,
     N_PLACES,
     SIDE_TOLERANCE,
     Bounds,
+    Dtm,
     Fault,
     Finding,
     Mask,
@@ -23,12 +25,12 @@ from tiler.check.proofs import (
     find_faults,
     measure_plan_widths,
 )
+from tiler.check.roof_proofs import OUTLINE_TOLERANCE, are_above_roofs, check_roof_heights
 from tiler.citymodels.building_index import BuildingIndex
-from tiler.store.run_folder import Buildings
+from tiler.store.run_folder import FLAT_ROOFS, Buildings, RoofRules
 
 LOADED = 4096  # footprints that are measured at once
 BELOW = (Marker.BOTTOM, Marker.FOUNDATION)  # markers that only a run with soil has
-OUTLINE_TOLERANCE = 2e-3  # m, in the plane: CityJSON rounds coordinates to 1 mm
 
 
 def check_marks(surface: Surface, buildings: Buildings, *, soil: bool = False) -> Finding:
@@ -66,35 +68,38 @@ def prove_marks(found: Finding) -> Proof:
     return Proof(f"every facet has one marker: {counts}", found.faults)
 
 
-def check_roofs(surface: Surface, buildings: Buildings) -> Finding:
-    """Roofs lie at the height of their building and inside its footprint."""
-    chosen, row, corners = _facets_of(surface, buildings, Marker.ROOF)
-    error = np.abs(corners[:, :, 2] - buildings.roof[row][:, None]).max(axis=1)
-    off = ~(error <= HEIGHT_TOLERANCE)
+def check_roofs(surface: Surface, buildings: Buildings, dtm: Dtm, rules: RoofRules) -> Finding:
+    """Roofs lie on the plane of their building, at outlines near it, and inside its footprint."""
+    _, row, corners = _facets_of(surface, buildings, Marker.ROOF)
+    found = check_roof_heights(corners, row, buildings, dtm, rules)
     outside = ~_all_near(buildings.footprints, row, corners)
-    centres, worst = corners.mean(axis=1), error.max(initial=0)
-    faults = [
-        *find_faults("roof-height", centres[off], f"{worst:.3g} m off; {at_most(HEIGHT_TOLERANCE)}"),
-        *find_faults("roof-off-footprint", centres[outside], f"not inside; {at_most(OUTLINE_TOLERANCE)}"),
-    ]
-    return Finding(tuple(faults), {"facets": len(chosen)}, {"worst": float(worst)})
+    centres = corners.mean(axis=1)
+    faults = find_faults("roof-off-footprint", centres[outside], f"not inside; {at_most(OUTLINE_TOLERANCE)}")
+    return replace(found, faults=(*found.faults, *faults))
 
 
 def prove_roofs(found: Finding) -> Proof:
     """Tell how far roofs are off at most."""
     count, worst = found.sums["facets"], found.largest["worst"]
     claim = f"{count} roof facets lie at their building's height and in its footprint, worst {worst:.2g} m"
-    return Proof(f"{claim}; {at_most(HEIGHT_TOLERANCE)} up, {OUTLINE_TOLERANCE:g} m across", found.faults)
+    bounds = f"{at_most(HEIGHT_TOLERANCE)} up, {OUTLINE_TOLERANCE:g} m across"
+    if found.sums["moved"]:
+        share = 100 * found.sums["moved"] / found.sums["corners"]
+        bounds += (
+            f"; {share:.1f} % of their corners, at outlines, are joined with other roofs, parted from them or"
+            f" raised over terrain, by {found.largest['largest move']:.2f} m at most"
+        )
+    return Proof(f"{claim}; {bounds}", found.faults)
 
 
-def check_walls(surface: Surface, buildings: Buildings) -> Finding:
+def check_walls(surface: Surface, buildings: Buildings, dtm: Dtm, rules: RoofRules) -> Finding:
     """Walls are vertical, on the outline of their building and not above its roof."""
     chosen, row, corners = _facets_of(surface, buildings, Marker.WALL)
     width = measure_plan_widths(corners, surface.area[chosen])
     leaning = ~(width <= SIDE_TOLERANCE)
     used, index = np.unique(row, return_inverse=True)
     astray = ~_all_near(shapely.boundary(buildings.footprints[used]), index, corners)
-    above = ~(corners[:, :, 2].max(axis=1) <= buildings.roof[row] + HEIGHT_TOLERANCE)
+    above = are_above_roofs(corners, row, buildings, dtm, rules)
     centres = corners.mean(axis=1)
     lean = f"{width.max(initial=0):.3g} m wide in plan; {at_most(SIDE_TOLERANCE)}"
     faults = [
@@ -163,13 +168,16 @@ def add_built(total: Built, rows: NDArray[np.int64], part: Built) -> None:
         getattr(total, name)[rows] += getattr(part, name)
 
 
-def prove_buildings(built: Built, index: BuildingIndex, bounds: Bounds, *, partial: bool) -> Proof:
+def prove_buildings(
+    built: Built, index: BuildingIndex, bounds: Bounds, *, rules: RoofRules = FLAT_ROOFS, partial: bool
+) -> Proof:
     """Every building of the city model has its walls, and a roof as large as its footprint.
 
     Notes
     -----
     A roof may differ from the footprint by `OUTLINE_TOLERANCE` along its whole outline. A building
-    needs no wall of its own where its outline runs along the region's border or a house that is as high.
+    needs no wall of its own where its outline runs along the region's border or a house that is as high, or, if
+    roofs are sloped, lower by no more than the step by which roofs are parted.
     If pieces are missing (`partial`), what counts of a footprint is what lies in the others' plan.
     """
     n = len(index)
@@ -180,7 +188,7 @@ def prove_buildings(built: Built, index: BuildingIndex, bounds: Bounds, *, parti
     error = np.abs(built.roof_area - wanted)
     uneven = has_roof & ~(error <= slack)
     bare = ~has_wall & has_roof & whole
-    bare[bare] = [_needs_wall(row, index, bounds) for row in np.flatnonzero(bare).tolist()]
+    bare[bare] = [_needs_wall(row, index, bounds, rules) for row in np.flatnonzero(bare).tolist()]
     expected = wanted > (slack if partial else -1)
     faults = [
         *_find_faults(
@@ -252,14 +260,29 @@ def _all_near(shapes: NDArray[np.object_], row: NDArray[np.int64], corners: Vert
     return near
 
 
-def _needs_wall(row: int, index: BuildingIndex, bounds: Bounds) -> bool:
+def _needs_wall(row: int, index: BuildingIndex, bounds: Bounds, rules: RoofRules) -> bool:
     """Tell whether air must touch the outline of a building below its roof."""
     own = index.take(np.array([row]))
-    roof, outline = own.roof[0], shapely.boundary(own.footprints[0])
+    outline = shapely.boundary(own.footprints[0])
     west, south, east, north = shapely.buffer(outline, OUTLINE_TOLERANCE).bounds
     others = index.find_near((west, south, east, north))
     near = index.take(others[others != row])
-    hides = shapely.dwithin(near.footprints, outline, OUTLINE_TOLERANCE) & (near.roof >= roof - HEIGHT_TOLERANCE)
+    lower = np.array([_rises_above(own, near, k, rules) for k in range(len(near))], np.bool_)
+    hides = shapely.dwithin(near.footprints, outline, OUTLINE_TOLERANCE) & ~lower
     hidden = [*near.footprints[hides], shapely.boundary(shapely.box(*bounds))]
     cover = shapely.union_all(shapely.buffer(hidden, OUTLINE_TOLERANCE))
     return bool(shapely.length(shapely.difference(outline, cover)) > OUTLINE_TOLERANCE)
+
+
+def _rises_above(own: Buildings, near: Buildings, k: int, rules: RoofRules) -> bool:
+    """Tell whether a roof is the higher one where it meets another, so that there must be a wall."""
+    common = shapely.intersection(
+        shapely.boundary(own.footprints[0]), shapely.buffer(near.footprints[k], OUTLINE_TOLERANCE)
+    )
+    xy = shapely.get_coordinates(common)
+    if not len(xy):
+        return True
+    zeros = np.zeros(len(xy), np.int64)
+    rise = roof_heights(own.roofs, zeros, xy) - roof_heights(near.roofs, zeros + k, xy)
+    least = rules.step if rules.sloped else HEIGHT_TOLERANCE
+    return bool((rise > least).any())

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.columns.weld import Weld
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Region, TetMesh
 from tiler.store.json_stream import iterate_members, read_members
@@ -19,6 +20,7 @@ SCHEMA = 1  # of run.json
 RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")
 TILES = "tiles"
 PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
+LARGEST_STEP = Weld.most  # m
 REGION = "region"  # cell array of a piece with soil
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
@@ -31,6 +33,28 @@ class MeshPart:
     cells: int
     tiles: tuple[str, ...] = ()
     divided: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class RoofRules:
+    """How far the mesher may move roofs at their outlines.
+
+    Attributes
+    ----------
+    sloped : bool
+        Whether roofs are planes; flat ones are exact.
+    step : float
+        Largest step by which it parts two roofs that meet (m).
+    clearance : float
+        Height above the terrain at its walls up to which it raises a roof (m).
+    """
+
+    sloped: bool = False
+    step: float = 0.0
+    clearance: float = 0.0
+
+
+FLAT_ROOFS = RoofRules()
 
 
 @dataclass(frozen=True)
@@ -58,6 +82,8 @@ class RunRecord:
     parts : tuple of MeshPart
         Parts of the mesh, that of the most cells first; of many those beyond the first are empty. None at all
         where the record does not tell.
+    roofs : RoofRules
+        How far the mesher may move roofs.
     """
 
     status: str
@@ -69,6 +95,7 @@ class RunRecord:
     core: tuple[float, float, float, float] | None = None
     rim: float = math.nan
     parts: tuple[MeshPart, ...] = ()
+    roofs: RoofRules = FLAT_ROOFS
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +151,27 @@ def read_run_record(path: Path) -> RunRecord:
         depth = float(record.get("parameters", {}).get("underground", 0.0))
         core, rim = _read_pad(record["region"])
         parts = _read_parts(record.get("parts") or {}, counts["cells"])
+        roofs = _read_roof_rules(record.get("parameters", {}))
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
     if not (west < east and south < north and math.isfinite(west + south + east + north)):
         raise InputError(f"{path}: region bounds {west, south, east, north} are no box; run again")
     if not 0 <= depth < math.inf:
         raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
-    return RunRecord(status, (west, south, east, north), top, counts, record[TILES], depth, core, rim, parts)
+    return RunRecord(
+        status, (west, south, east, north), top, counts, record[TILES], depth, core, rim, parts, roofs
+    )
+
+
+def _read_roof_rules(parameters: Mapping[str, Any]) -> RoofRules:
+    if (parameters.get("roofs"), parameters.get("mesher"), parameters.get("simplify")) != (
+        "planes",
+        "adaptive",
+        "clearance",
+    ):
+        return FLAT_ROOFS
+    least = float(parameters["least_spacing"]) * float(parameters["mesh_size"])
+    return RoofRules(True, max(LARGEST_STEP, least), max(float(parameters["roof_clearance"]), least))
 
 
 def _read_parts(found: Mapping[str, Any], n_cells: int) -> tuple[MeshPart, ...]:

@@ -1,0 +1,120 @@
+"""How high roofs and walls may stand, for `citystitch check`: on the planes of the city model, or near them.
+
+Inside its outline a roof lies on its plane, to the bit. At the outline the mesher moves it where it must: roofs
+that meet there are joined or parted by a step at most, and a roof stands some way above the terrain at its walls.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.data.roofs import roof_heights
+from tiler.check.proofs import HEIGHT_TOLERANCE, Dtm, Finding, Mask, Vertices, at_most, find_faults
+from tiler.store.run_folder import Buildings, RoofRules
+
+OUTLINE_TOLERANCE = 2e-3  # m, in the plane: CityJSON rounds coordinates to 1 mm
+
+
+@dataclass(frozen=True, eq=False)
+class RoofRange:
+    """Between which heights roofs may stand at ``k`` places.
+
+    Attributes
+    ----------
+    low, high : float64, (k,)
+        Heights (m); equal where a roof must lie on its plane. NaN where no building is.
+    """
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+
+def find_roof_range(xy: NDArray[np.float64], buildings: Buildings, dtm: Dtm, rules: RoofRules) -> RoofRange:
+    """Find between which heights roofs may stand at places (k, 2).
+
+    Parameters
+    ----------
+    xy : float64, (k, 2)
+        Places (m).
+    buildings : Buildings
+        All buildings that touch one of them.
+    dtm : Dtm
+        Terrain.
+    rules : RoofRules
+        How far roofs may be moved at outlines.
+    """
+    low, high = np.full(len(xy), np.nan), np.full(len(xy), np.nan)
+    points = shapely.points(xy)
+    place, row = buildings.tree.query(points, predicate="dwithin", distance=OUTLINE_TOLERANCE)
+    if not len(place):
+        return RoofRange(low, high)
+    z = roof_heights(buildings.roofs, row.astype(np.int64), xy[place])
+    np.fmin.at(low, place, z)
+    np.fmax.at(high, place, z)
+    if not rules.sloped:
+        return RoofRange(low, high)
+    others = np.bincount(place, minlength=len(xy)) - 1.0
+    outline = shapely.boundary(buildings.footprints)
+    shapely.prepare(outline)
+    edge = np.zeros(len(xy), np.bool_)
+    edge[place[shapely.dwithin(outline[row], points[place], OUTLINE_TOLERANCE)]] = True
+    at = np.flatnonzero(edge)
+    least = dtm.sample(xy[at]) + rules.clearance + others[at] * rules.step
+    low[at] -= others[at] * rules.step / 2
+    high[at] = np.fmax(high[at] + others[at] * rules.step / 2, least)
+    return RoofRange(low, high)
+
+
+def check_roof_heights(
+    corners: Vertices, row: NDArray[np.int64], buildings: Buildings, dtm: Dtm, rules: RoofRules
+) -> Finding:
+    """Roof facets lie on the planes of their buildings, or at outlines in the range that is left to the mesher.
+
+    Parameters
+    ----------
+    corners : float64, (k, 3, 3)
+        Roof facets (m).
+    row : int64, (k,)
+        Row of the building of each.
+    buildings, dtm, rules
+        As in `find_roof_range`.
+    """
+    places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    allowed = find_roof_range(places, buildings, dtm, rules)
+    z, plane = corners[:, :, 2].ravel(), roof_heights(buildings.roofs, np.repeat(row, 3), places[index])
+    error = np.abs(z - plane)
+    fixed = allowed.low[index] == allowed.high[index]
+    wrong = np.where(fixed | (not rules.sloped), ~(error <= HEIGHT_TOLERANCE), _is_beyond(z, allowed, index))
+    off = wrong.reshape(-1, 3).any(axis=1)
+    centres = corners.mean(axis=1)
+    worst = float(error[wrong].max(initial=0))
+    faults = find_faults("roof-height", centres[off], f"{worst:.3g} m off; {at_most(HEIGHT_TOLERANCE)}")
+    moved = error > HEIGHT_TOLERANCE
+    return Finding(
+        tuple(faults),
+        {"facets": len(corners), "corners": len(z), "moved": int(moved.sum())},
+        {"worst": worst, "largest move": float(error[~wrong].max(initial=0))},
+    )
+
+
+def are_above_roofs(
+    corners: Vertices, row: NDArray[np.int64], buildings: Buildings, dtm: Dtm, rules: RoofRules
+) -> Mask:
+    """Tell which wall facets (k, 3, 3) rise above the roof of their building, bool (k,)."""
+    if not rules.sloped:
+        below: Mask = corners[:, :, 2].max(axis=1) <= buildings.roof[row] + HEIGHT_TOLERANCE
+        return ~below
+    places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
+    allowed = find_roof_range(places, buildings, dtm, rules)
+    highest = allowed.high[index.reshape(-1)].reshape(-1, 3)
+    low: Mask = (corners[:, :, 2] <= highest + HEIGHT_TOLERANCE).all(axis=1)
+    return ~low
+
+
+def _is_beyond(z: NDArray[np.float64], allowed: RoofRange, index: NDArray[np.int64]) -> Mask:
+    low, high = allowed.low[index], allowed.high[index]
+    within: Mask = (z >= low - HEIGHT_TOLERANCE) & (z <= high + HEIGHT_TOLERANCE)
+    return ~within
