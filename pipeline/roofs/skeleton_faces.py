@@ -1,0 +1,142 @@
+"""Faces of a straight skeleton: one polygon for each edge of the outline, and the checks that they pass."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+from pipeline.data.errors import GeometryError
+from pipeline.roofs.wavefront import CONTACT, Point, Wavefront
+
+AREA_TOLERANCE = 1e-9  # of the area of the polygon, by which the sum of the faces may differ from it
+PLACE_TOLERANCE = 1e-5  # m, by which nodes may be off the planes of their edges where none were joined
+
+
+def follow_faces(front: Wavefront) -> list[list[int]]:
+    """Collect the nodes of each face, counter-clockwise, the two ends of its edge first.
+
+    A wavefront that has come to its end has noted what follows on what around each face.
+
+    Raises
+    ------
+    GeometryError
+        If a face does not close.
+    """
+    faces = []
+    n_lines = 2 * len(front.birth)
+    for e, start in enumerate(front.first):
+        end = front.end[e]
+        nodes = [front.birth[start], front.birth[end]]
+        line, left = 2 * end, n_lines
+        while line >= 0 and left:
+            v, down = divmod(line, 2)
+            nodes += (front.death[v], front.birth[v]) if down else (front.birth[v], front.death[v])
+            line = (front.after_down if down else front.after_up)[v]
+            left -= 1
+        if line >= 0 or nodes[-1] != nodes[0]:
+            raise GeometryError(f"the face of the edge{describe_edge(front, e)} does not close")
+        faces.append(drop_repeated(nodes))
+    return faces
+
+
+def drop_repeated(nodes: Sequence[int]) -> list[int]:
+    """Drop nodes that follow on themselves, and the last one if it is the first."""
+    kept = [node for k, node in enumerate(nodes) if k == 0 or node != nodes[k - 1]]
+    while len(kept) > 1 and kept[-1] == kept[0]:
+        kept.pop()
+    return kept
+
+
+def describe_edge(front: Wavefront, e: int) -> str:
+    """Name an edge by its ends."""
+    (x, y), (to_x, to_y) = (front.node_xy[front.birth[v]] for v in (front.first[e], front.end[e]))
+    return f" from ({x:.3f}, {y:.3f}) to ({to_x:.3f}, {to_y:.3f})"
+
+
+def join_close_nodes(front: Wavefront, faces: list[list[int]], tolerance: float) -> list[int]:
+    """Find the nodes that are one within a tolerance: ends of ridges, hips and valleys that are shorter.
+
+    Parameters
+    ----------
+    front : Wavefront
+        Nodes.
+    faces : list of list of int
+        Nodes of each face.
+    tolerance : float
+        Length below which a line between two nodes is none (m).
+
+    Returns
+    -------
+    list of int
+        The node that each node becomes: the first of those that are one, so that the ends of edges stay.
+    """
+    same = list(range(len(front.node_xy)))
+
+    def find(node: int) -> int:
+        while same[node] != node:
+            node = same[node]
+        return node
+
+    for face in faces:
+        for a, b in pairwise([*face[1:], face[0]]):
+            if math.dist(front.node_xy[a], front.node_xy[b]) < tolerance:
+                low, high = sorted((find(a), find(b)))
+                if low != high and high >= len(front.first):
+                    same[high] = low
+    return [find(node) for node in range(len(same))]
+
+
+def face_area(xy: Sequence[Point]) -> float:
+    """Area of a polygon, positive if it is counter-clockwise."""
+    x0, y0 = xy[0]
+    return 0.5 * sum(
+        (ax - x0) * (by - y0) - (ay - y0) * (bx - x0) for (ax, ay), (bx, by) in zip(xy, [*xy[1:], xy[0]], strict=True)
+    )
+
+
+def is_monotone(xy: Sequence[Point], tolerance: float) -> bool:
+    """Tell whether a face is monotone to its edge, which goes from its first node to its second.
+
+    Seen along the edge, the nodes after it go forward (around its end), then back, then forward (around its
+    start). A step of up to `tolerance` in the other direction counts as none.
+    """
+    (x0, y0), (x1, y1) = xy[0], xy[1]
+    length = math.hypot(x1 - x0, y1 - y0)
+    ux, uy = (x1 - x0) / length, (y1 - y0) / length
+    places = [ux * (x - x0) + uy * (y - y0) for x, y in [*xy[1:], xy[0]]]
+    turns = 0
+    extreme = places[0]
+    for s in places:
+        sign = -1 if turns == 1 else 1
+        if (s - extreme) * sign >= 0:
+            extreme = s
+        elif abs(s - extreme) > tolerance:
+            turns += 1
+            extreme = s
+    return turns <= 2
+
+
+def check_faces(front: Wavefront, faces: list[list[int]], area: float, tolerance: float) -> None:
+    """Prove that faces divide the polygon.
+
+    Raises
+    ------
+    GeometryError
+        If an edge has no face, a face is not simple, not monotone to its edge (where all edges have one speed)
+        or not in the plane of its edge, or the areas do not sum to that of the polygon.
+    """
+    if len(faces) != len(front.offset):
+        raise GeometryError(f"{len(faces)} faces for {len(front.offset)} edges")
+    total, even = 0.0, len(set(front.speed)) == 1
+    for e, face in enumerate(faces):
+        xy = [front.node_xy[node] for node in face]
+        size = face_area(xy) if len(face) > 2 else 0.0
+        total += size
+        if front.speed[e] > 0 and not size > 0:
+            raise GeometryError(f"the face of the edge{describe_edge(front, e)} has the area {size:.3g} m²")
+        off = max(abs(front.ahead(e, xy, front.node_time[node])) for xy, node in zip(xy, face, strict=True))
+        if off > tolerance + PLACE_TOLERANCE:
+            raise GeometryError(f"a node is {off:.3g} m off the plane of the edge{describe_edge(front, e)}")
+        if even and not is_monotone(xy, tolerance + CONTACT):
+            raise GeometryError(f"the face of the edge{describe_edge(front, e)} is not monotone")
+    if abs(total - area) > AREA_TOLERANCE * area:
+        raise GeometryError(f"faces have {total:.9g} m² of {area:.9g} m²")
