@@ -4,6 +4,9 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
+import numpy as np
+import shapely
+
 from pipeline.data.errors import GeometryError
 from pipeline.roofs.wavefront import CONTACT, Point, Wavefront
 
@@ -52,8 +55,8 @@ def describe_edge(front: Wavefront, e: int) -> str:
     return f" from ({x:.3f}, {y:.3f}) to ({to_x:.3f}, {to_y:.3f})"
 
 
-def join_close_nodes(front: Wavefront, faces: list[list[int]], tolerance: float) -> list[int]:
-    """Find the nodes that are one within a tolerance: ends of ridges, hips and valleys that are shorter.
+def join_close_nodes(front: Wavefront, faces: list[list[int]], tolerance: float) -> list[list[int]]:
+    """Make one node of those at both ends of a ridge, hip or valley that is shorter than a tolerance.
 
     Parameters
     ----------
@@ -66,23 +69,38 @@ def join_close_nodes(front: Wavefront, faces: list[list[int]], tolerance: float)
 
     Returns
     -------
-    list of int
-        The node that each node becomes: the first of those that are one, so that the ends of edges stay.
+    list of list of int
+        Nodes of each face, no node farther than the tolerance from the one that it became. Nodes whose joining
+        would break a face stay as they were: faces narrower than the tolerance are as true as wide ones.
     """
-    same = list(range(len(front.node_xy)))
+    same = _find_joined(front, faces, tolerance)
+    while True:
+        joined = [drop_repeated([same[node] for node in face]) for face in faces]
+        faults = find_faults(front, joined, tolerance)
+        broken = {same[node] for e in faults for node in faces[e]}
+        apart = [node for node, to in enumerate(same) if to in broken and to != node]
+        if not apart:
+            return joined
+        for node in apart:
+            same[node] = node
 
-    def find(node: int) -> int:
-        while same[node] != node:
-            node = same[node]
-        return node
 
-    for face in faces:
-        for a, b in pairwise([*face[1:], face[0]]):
-            if math.dist(front.node_xy[a], front.node_xy[b]) < tolerance:
-                low, high = sorted((find(a), find(b)))
-                if low != high and high >= len(front.first):
-                    same[high] = low
-    return [find(node) for node in range(len(same))]
+def _find_joined(front: Wavefront, faces: list[list[int]], tolerance: float) -> list[int]:
+    """Give the node that each node becomes, the first of those that are one, shortest lines first."""
+    xy, n_edges = front.node_xy, len(faces)
+    lines = {tuple(sorted(pair)) for face in faces for pair in pairwise([*face[1:], face[0]])}
+    short = sorted((math.dist(xy[a], xy[b]), a, b) for a, b in lines)
+    same = list(range(len(xy)))
+    members = {node: [node] for node in same}
+    for length, a, b in short:
+        low, high = sorted((same[a], same[b]))
+        if length >= tolerance:
+            break
+        if low != high and high >= n_edges and all(math.dist(xy[low], xy[k]) < tolerance for k in members[high]):
+            for node in members[high]:
+                same[node] = low
+            members[low] += members.pop(high)
+    return same
 
 
 def face_area(xy: Sequence[Point]) -> float:
@@ -115,28 +133,46 @@ def is_monotone(xy: Sequence[Point], tolerance: float) -> bool:
     return turns <= 2
 
 
+def find_faults(front: Wavefront, faces: list[list[int]], tolerance: float) -> dict[int, str]:
+    """Find the faces that are no faces of a skeleton, and say why.
+
+    A face has an area (where its edge has a speed) and no side that crosses another one. It is monotone to its
+    edge (where all edges have one speed). Its nodes are as far from its edge as their time says.
+    """
+    faults: dict[int, str] = {}
+    even = len(set(front.speed)) == 1
+    for e, face in enumerate(faces):
+        xy = [front.node_xy[node] for node in face]
+        off = max(abs(front.ahead(e, xy, front.node_time[node])) for xy, node in zip(xy, face, strict=True))
+        if off > tolerance + PLACE_TOLERANCE:
+            faults[e] = f"has a node {off:.3g} m off its plane"
+        elif front.speed[e] > 0 and not (len(face) > 2 and face_area(xy) > 0):
+            faults[e] = "has no area"
+        elif even and not is_monotone(xy, tolerance + CONTACT):
+            faults[e] = "is not monotone"
+    whole = [e for e, face in enumerate(faces) if len(face) > 3 and front.speed[e] > 0 and e not in faults]
+    if whole:
+        rings = shapely.linearrings(
+            [front.node_xy[node] for e in whole for node in faces[e]],
+            indices=np.repeat(np.arange(len(whole)), [len(faces[e]) for e in whole]),
+        )
+        crossed = ~shapely.is_simple(rings)
+        faults.update((whole[k], "crosses itself") for k in np.flatnonzero(crossed).tolist())
+    return faults
+
+
 def check_faces(front: Wavefront, faces: list[list[int]], area: float, tolerance: float) -> None:
-    """Prove that faces divide the polygon.
+    """Prove that faces divide the polygon, one for each edge.
 
     Raises
     ------
     GeometryError
-        If an edge has no face, a face is not simple, not monotone to its edge (where all edges have one speed)
-        or not in the plane of its edge, or the areas do not sum to that of the polygon.
+        If an edge has no face, a face has a fault (`find_faults`), or the areas do not sum to that of the polygon.
     """
     if len(faces) != len(front.offset):
         raise GeometryError(f"{len(faces)} faces for {len(front.offset)} edges")
-    total, even = 0.0, len(set(front.speed)) == 1
-    for e, face in enumerate(faces):
-        xy = [front.node_xy[node] for node in face]
-        size = face_area(xy) if len(face) > 2 else 0.0
-        total += size
-        if front.speed[e] > 0 and not size > 0:
-            raise GeometryError(f"the face of the edge{describe_edge(front, e)} has the area {size:.3g} m²")
-        off = max(abs(front.ahead(e, xy, front.node_time[node])) for xy, node in zip(xy, face, strict=True))
-        if off > tolerance + PLACE_TOLERANCE:
-            raise GeometryError(f"a node is {off:.3g} m off the plane of the edge{describe_edge(front, e)}")
-        if even and not is_monotone(xy, tolerance + CONTACT):
-            raise GeometryError(f"the face of the edge{describe_edge(front, e)} is not monotone")
+    for e, fault in find_faults(front, faces, tolerance).items():
+        raise GeometryError(f"the face of the edge{describe_edge(front, e)} {fault}")
+    total = sum(face_area([front.node_xy[node] for node in face]) for face in faces)
     if abs(total - area) > AREA_TOLERANCE * area:
         raise GeometryError(f"faces have {total:.9g} m² of {area:.9g} m²")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import GeometryError
 from pipeline.geometry.rings import make_canonical
-from pipeline.roofs.skeleton_faces import check_faces, drop_repeated, follow_faces, join_close_nodes
+from pipeline.roofs.skeleton_faces import check_faces, follow_faces, join_close_nodes
 from pipeline.roofs.wavefront import CONTACT, Point, Wavefront
 
 MIN_EDGE = 1e-3  # m, a polygon with a shorter edge is refused
@@ -144,9 +144,7 @@ def straight_skeleton(
         front.run()
         faces = follow_faces(front)
         check_faces(front, faces, polygon.area, 0.0)
-        same = join_close_nodes(front, faces, tolerance)
-        joined = [drop_repeated([same[node] for node in face]) for face in faces]
-        check_faces(front, joined, polygon.area, 2 * tolerance)
+        joined = join_close_nodes(front, faces, tolerance)
     except GeometryError as error:
         x, y = origin.tolist()
         raise GeometryError(
