@@ -13,7 +13,7 @@ from pipeline.geometry.rings import make_canonical
 from pipeline.roofs.skeleton_faces import check_faces, follow_faces, join_close_nodes
 from pipeline.roofs.wavefront import CONTACT, Point, Wavefront
 
-MIN_EDGE = 1e-3  # m, a polygon with a shorter edge is refused
+MIN_EDGE = 1e-4  # m, a polygon with a shorter edge is refused
 MAX_EXTENT = 1e5  # m
 TOLERANCE = 0.005  # m, lines of the skeleton that are shorter are one node
 

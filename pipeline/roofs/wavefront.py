@@ -381,11 +381,9 @@ class Wavefront:
         other = self._after[v]
         if self._after[other] != v:
             return
-        self._end([v], self.birth[v])
+        self._end([v] if other == v else [v, other], self.birth[v])  # the line of the other one is the ridge
         self.after_up[v] = 2 * other + 1
-        if other != v:
-            self._end([other], self._node_at(self._at(other, self._now)))
-            self.after_up[other] = 2 * v + 1
+        self.after_up[other] = 2 * v + 1
 
     def _find_at_once(self, v: int) -> None:
         """Note what a new vertex between parallel edges leads to at the same time.
