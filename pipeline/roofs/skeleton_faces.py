@@ -106,9 +106,8 @@ def _find_joined(front: Wavefront, faces: list[list[int]], tolerance: float) -> 
 def face_area(xy: Sequence[Point]) -> float:
     """Area of a polygon, positive if it is counter-clockwise."""
     x0, y0 = xy[0]
-    return 0.5 * sum(
-        (ax - x0) * (by - y0) - (ay - y0) * (bx - x0) for (ax, ay), (bx, by) in zip(xy, [*xy[1:], xy[0]], strict=True)
-    )
+    from_first = [(x - x0, y - y0) for x, y in xy]
+    return 0.5 * sum(ax * by - ay * bx for (ax, ay), (bx, by) in pairwise(from_first))
 
 
 def is_monotone(xy: Sequence[Point], tolerance: float) -> bool:

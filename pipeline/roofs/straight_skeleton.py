@@ -148,8 +148,8 @@ def straight_skeleton(
     except GeometryError as error:
         x, y = origin.tolist()
         raise GeometryError(
-            f"straight skeleton of the polygon of {n_edges} edges at ({x:.0f}, {y:.0f}): {error} (places relative to "
-            "that); simplify the polygon there, or give it a flat roof"
+            f"straight skeleton of the polygon of {n_edges} edges at ({x:.0f}, {y:.0f}): {error} (places "
+            "relative to that); simplify the polygon there, or give it a flat roof"
         ) from None
     return _make_skeleton(front, joined, origin)
 
@@ -186,9 +186,8 @@ def _check_edges(rings: list[list[Point]], speeds: list[float]) -> None:
             (ax, ay), (bx, by), (cx, cy) = ring[k], ring[(k + 1) % n], ring[(k + 2) % n]
             length, following = math.hypot(bx - ax, by - ay), math.hypot(cx - bx, cy - by)
             if not MIN_EDGE <= length <= MAX_EXTENT:
-                raise GeometryError(
-                    f"the edge at ({ax:.3f}, {ay:.3f}) is {length:.2g} m long, not {MIN_EDGE} to {MAX_EXTENT:.0f} m"
-                )
+                bounds = f"{MIN_EDGE} to {MAX_EXTENT:.0f} m"
+                raise GeometryError(f"the edge at ({ax:.3f}, {ay:.3f}) is {length:.2g} m long, not {bounds}")
             one, other = speeds[start + k], speeds[start + (k + 1) % n]
             turn = (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
             ahead = (bx - ax) * (cx - bx) + (by - ay) * (cy - by)

@@ -56,10 +56,10 @@ class Wavefront:
     """A moving outline: vertices in rings, each between two edges of the polygon, and the nodes where they end.
 
     Edge ``e`` lies at time ``t`` on the line of the places ``x`` with ``normal[e] · x = offset[e] + speed[e] t``.
-    Each vertex moves along a straight line from its birth node to its death node; the faces of the two edges beside
-    it lie on either side of that line. Going around the face of an edge, counter-clockwise, the lines of the end
-    vertices of the edge are passed upwards and those of its start vertices downwards. What follows is noted at
-    each event, so that faces need no search.
+    Each vertex moves along a straight line from its birth node to its death node; the faces of the two edges
+    beside it lie on either side of that line. Going around the face of an edge, counter-clockwise, the lines of
+    the end vertices of the edge are passed upwards and those of its start vertices downwards. What follows is
+    noted at each event, so that faces need no search.
 
     Attributes
     ----------
@@ -270,7 +270,9 @@ class Wavefront:
         for loop in loops:
             self._end(loop, node)
             self._link_inside([*loop, loop[0]])
-        self._start([self._join(chains[k], chains[(k + 1) % len(chains)], node) for k in range(len(chains))], chains)
+        self._start(
+            [self._join(chains[k], chains[(k + 1) % len(chains)], node) for k in range(len(chains))], chains
+        )
 
     def _gather(self, xy: Point, ending: tuple[int, ...]) -> tuple[set[int], list[int]]:
         """Find the vertices at a place, and the start vertices of edges that have it between their ends."""
