@@ -143,7 +143,7 @@ def find_faults(front: Wavefront, faces: list[list[int]], tolerance: float) -> d
     for e, face in enumerate(faces):
         xy = [front.node_xy[node] for node in face]
         off = max(abs(front.ahead(e, xy, front.node_time[node])) for xy, node in zip(xy, face, strict=True))
-        if off > tolerance + PLACE_TOLERANCE:
+        if off > PLACE_TOLERANCE + (tolerance if front.speed[e] > 0 else 0.0):  # a gable is upright
             faults[e] = f"has a node {off:.3g} m off its plane"
         elif front.speed[e] > 0 and not (len(face) > 2 and face_area(xy) > 0):
             faults[e] = "has no area"

@@ -22,6 +22,10 @@ BREAK_HEIGHT = 0.6  # share of its height that it has there
 MIN_DISTANCE = 0.01  # m, distance from each edge of the apex of a pyramidal roof
 GABLE_BETWEEN = -0.7  # cosine of the angle between the two edges beside a gable, above which there is none
 
+STRAIGHT = 0.17  # sine of the angle between edges of one side, about 10 degrees
+LEAST_CORNER = 0.5  # sine of the turn at both ends of a gable: from 30 to 150 degrees
+TRIANGLE_OFF = 0.05  # share of its area by which the hip over a gable may differ from a triangle
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -176,30 +180,62 @@ def find_gables(skeleton: Skeleton) -> list[int]:
     Returns
     -------
     list of int
-        Edges whose face is a triangle between two convex corners, and whose neighbours run in about opposite
-        directions: the ends of the wings of a house. Shorter edges come first; none is beside another one.
+        The edges of sides whose hip is a triangle between two convex corners, and whose neighbours run in about
+        opposite directions: the ends of the wings of a house. Shorter sides come first; none is beside another
+        one.
+
+    Notes
+    -----
+    A side is a run of edges that turn by less than 10 degrees from one to the next: outlines have vertices within
+    their walls, where they touch others.
     """
     xy, edges = (skeleton.nodes - skeleton.origin).tolist(), skeleton.edges.tolist()
     before = {stop: e for e, (_, stop) in enumerate(edges)}
     after = {start: e for e, (start, _) in enumerate(edges)}
+    along = [_direction(xy, edge) for edge in edges]
     found = []
-    for e, (start, stop) in enumerate(edges):
-        face = skeleton.face(e).tolist()
-        if len(face) != 3:
-            continue
+    for side in _straight_sides(edges, along, after):
+        start, stop = edges[side[0]][0], edges[side[-1]][1]
         one, other = before[start], after[stop]
-        back, here, ahead = (_direction(xy, edges[k]) for k in (one, e, other))
-        convex = min(_cross(back, here), _cross(here, ahead)) > 0
-        (x, y), (tip_x, tip_y) = xy[start], xy[face[2]]
-        length = math.dist(xy[start], xy[stop])
-        place = (here[0] * (tip_x - x) + here[1] * (tip_y - y)) / length
-        if convex and 0 < place < 1 and back[0] * ahead[0] + back[1] * ahead[1] < GABLE_BETWEEN:
-            found.append((round(length, 3), e, one, other))
+        corners = min(_cross(along[one], along[side[0]]), _cross(along[side[-1]], along[other]))
+        opposite = along[one][0] * along[other][0] + along[one][1] * along[other][1] < GABLE_BETWEEN
+        if corners > LEAST_CORNER and opposite and _is_triangle(skeleton, side, (start, stop)):
+            found.append((round(math.dist(xy[start], xy[stop]), 3), side, one, other))
     gables: list[int] = []
-    for _, e, one, other in sorted(found):
+    for _, side, one, other in sorted(found):
         if one not in gables and other not in gables:
-            gables.append(e)
+            gables += side
     return gables
+
+
+def _straight_sides(
+    edges: list[list[int]], along: list[tuple[float, float]], after: dict[int, int]
+) -> list[list[int]]:
+    """Put edges together that turn little from one to the next; a ring without a corner has no sides."""
+    following = [after[stop] for _, stop in edges]
+    bends = [abs(_cross(along[e], along[k])) > STRAIGHT for e, k in enumerate(following)]
+    sides = []
+    for e, bend in enumerate(bends):
+        if bend:
+            side = [following[e]]
+            while not bends[side[-1]]:
+                side.append(following[side[-1]])
+            sides.append(side)
+    return sides
+
+
+def _is_triangle(skeleton: Skeleton, side: list[int], ends: tuple[int, int]) -> bool:
+    """Tell whether the faces of a side make about a triangle whose tip lies between its ends."""
+    xy = skeleton.nodes - skeleton.origin
+    faces = [skeleton.face(e) for e in side]
+    nodes = np.concatenate(faces)
+    tip = nodes[np.argmax(skeleton.time[nodes])]
+    (x, y), (to_x, to_y), (tip_x, tip_y) = ((float(p[0]), float(p[1])) for p in xy[[*ends, tip]])
+    square = (to_x - x) ** 2 + (to_y - y) ** 2
+    place = ((to_x - x) * (tip_x - x) + (to_y - y) * (tip_y - y)) / square
+    triangle = face_area([(x, y), (to_x, to_y), (tip_x, tip_y)])
+    area = sum(face_area([(float(p[0]), float(p[1])) for p in xy[face]]) for face in faces)
+    return 0 < place < 1 and abs(area - triangle) <= TRIANGLE_OFF * triangle
 
 
 def roof_solid(roof: ShapedRoof, floor: float) -> tuple[Array, list[list[int]]]:
