@@ -388,10 +388,10 @@ def _plane(plan: _Plan, skeleton: Skeleton, k: int) -> tuple[float, float, float
 def _make_roof(shape: str, plan: _Plan, skeleton: Skeleton, polygon: shapely.Polygon) -> ShapedRoof:
     limits = [[f([plan.height[node] for node in cycle]) for f in (min, max)] for cycle in plan.cycles]
     n = len(plan.cycles)
-    # The sum gives the vertices of the polygon to the bit: they were whole metres less without rounding.
+    added = np.array(plan.xy[len(skeleton.nodes) :]).reshape(-1, 2) + skeleton.origin
     return ShapedRoof(
         shape=shape,
-        nodes=np.array(plan.xy) + skeleton.origin,
+        nodes=np.concatenate((skeleton.nodes, added)),
         height=np.array(plan.height),
         part_start=np.cumsum([0, *map(len, plan.cycles)]),
         part_node=np.array([node for cycle in plan.cycles for node in cycle], np.int64),

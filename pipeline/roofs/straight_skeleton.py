@@ -26,7 +26,8 @@ class Skeleton:
     """Straight skeleton of a polygon of ``m`` edges.
 
     Edges are numbered along the rings of the polygon in canonical form (`make_canonical`): the outline
-    counter-clockwise, then courtyards clockwise, so that the polygon is on their left.
+    counter-clockwise, then courtyards clockwise, so that the polygon is on their left. Where the vertex of a
+    courtyard lies on an edge of another ring, it divides that edge in two.
 
     Attributes
     ----------
@@ -151,7 +152,7 @@ def straight_skeleton(
             f"straight skeleton of the polygon of {n_edges} edges at ({x:.0f}, {y:.0f}): {error} (places "
             "relative to that); simplify the polygon there, or give it a flat roof"
         ) from None
-    return _make_skeleton(front, joined, origin)
+    return _make_skeleton(front, joined, np.concatenate(rings), origin)
 
 
 def _read_rings(polygon: shapely.Polygon) -> tuple[list[Array], Array]:
@@ -167,7 +168,26 @@ def _read_rings(polygon: shapely.Polygon) -> tuple[list[Array], Array]:
     stays[1:] = (ring[1:] != ring[:-1]) | (xy[1:] != xy[:-1]).any(axis=1)
     xy, ring = xy[stays], ring[stays]
     rings = [part[:-1] for part in np.split(xy, np.flatnonzero(np.diff(ring)) + 1)]
+    if len(rings) > 1:
+        rings = [_divide(ring, np.concatenate(rings[:k] + rings[k + 1 :])) for k, ring in enumerate(rings)]
     return rings, np.floor(rings[0].min(axis=0))
+
+
+def _divide(ring: Array, vertices: Array) -> Array:
+    """Put the vertices of other rings that lie on edges of a ring between the ends of these."""
+    along = np.roll(ring, -1, axis=0) - ring
+    square = (along**2).sum(axis=1)
+    to = vertices[:, np.newaxis] - ring
+    place = (to * along).sum(axis=2) / square
+    across = np.abs(along[:, 0] * to[..., 1] - along[:, 1] * to[..., 0]) / np.sqrt(square)
+    apart = CONTACT / np.sqrt(square)
+    vertex, edge = np.nonzero((across <= CONTACT) & (place > apart) & (place < 1 - apart))
+    if not len(edge):
+        return ring
+    order = np.lexsort((place[vertex, edge], edge))
+    divided: Array = np.insert(ring, edge[order] + 1, vertices[vertex[order]], axis=0)
+    distinct: Array = divided[(divided != np.roll(divided, 1, axis=0)).any(axis=1)]
+    return distinct
 
 
 def _check_speed(speed: Sequence[float] | Array | None, n_edges: int) -> list[float]:
@@ -196,7 +216,7 @@ def _check_edges(rings: list[list[Point]], speeds: list[float]) -> None:
         start += n
 
 
-def _make_skeleton(front: Wavefront, faces: list[list[int]], origin: Array) -> Skeleton:
+def _make_skeleton(front: Wavefront, faces: list[list[int]], outline: Array, origin: Array) -> Skeleton:
     """Put the nodes that are left in the order of their place, after those of the outline."""
     n_edges = len(faces)
     inside = sorted(
@@ -206,8 +226,14 @@ def _make_skeleton(front: Wavefront, faces: list[list[int]], origin: Array) -> S
     kept = [*range(n_edges), *inside]
     place = {node: k for k, node in enumerate(kept)}
     count = np.array([0, *map(len, faces)], np.int64)
+    nodes = np.array([front.node_xy[node] for node in kept]) + origin
+    # To the bit: also those inside that lie over a vertex, as at the top of a wall between two gables.
+    vertex = {front.node_xy[node]: node for node in range(n_edges)}
+    for k, node in enumerate(kept):
+        if front.node_xy[node] in vertex:
+            nodes[k] = outline[vertex[front.node_xy[node]]]
     return Skeleton(
-        nodes=np.array([front.node_xy[node] for node in kept]) + origin,
+        nodes=nodes,
         time=np.array([front.node_time[node] for node in kept]),
         edges=np.array([face[:2] for face in faces], np.int64),
         speed=np.array(front.speed),
