@@ -42,7 +42,7 @@ class CityOptions:
     clearance: float
     clearance_floor: float
     min_courtyard_area: float
-    roofs: Literal["planes", "flat"]
+    roofs: Literal["planes", "skeleton", "flat"]
     split_levels: bool
     roof_group: float
     manifold: bool

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import (
@@ -14,6 +15,8 @@ from pipeline.city_model.building_points import (
     take_building_points,
 )
 from pipeline.city_model.city import City, CityOptions
+from pipeline.city_model.heights import ROOF_SOURCES
+from pipeline.city_model.shaped_roofs import have_few_points, shape_roofs
 from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roofs import Roofs, flat_roofs, join_roofs, take_roofs
 from pipeline.geometry.inside import find_inside
@@ -93,13 +96,18 @@ def divide_houses(
     model = city.model
     marks = has_building_class(cloud) if building_class is None else building_class
     parts, points = HouseParts(model.polygons, np.arange(len(model))), city.points
-    sloped = options.roofs == "planes"
+    sloped = options.roofs != "flat"
     part_roofs, method = None, np.full(len(model), FLAT, np.int8)
     if (options.split_levels or sloped) and options.simplify == "clearance" and len(model):
         if roofs is None:
             roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
         if sloped:
-            fitted = fit_roofs(model.polygons, roofs, RoofOptions(clearance=options.clearance))
+            fit = RoofOptions(clearance=options.clearance)
+            fitted = fit_roofs(model.polygons, roofs, fit)
+            few = have_few_points(np.diff(roofs.start), shapely.area(model.polygons), fit)
+            told = city.roof_source != ROOF_SOURCES.index("default")
+            chosen = few & told if options.roofs == "planes" else np.ones(len(model), np.bool_)
+            fitted = shape_roofs(fitted, model.polygons, chosen, model.ground, model.roof)
             parts, part_roofs, method = fitted.parts, fitted.roofs, fitted.method
         else:
             parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))

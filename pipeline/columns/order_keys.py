@@ -99,28 +99,32 @@ def _push_apart(
     least: float,
 ) -> int:
     """Move keys until the merge passes through both ends of every gate; how many conditions are left."""
-    left = 0
     for _ in range(sweeps):
-        left = 0
+        moved = False
         for g in range(len(gates)):
             for k in range(2):
                 a, b = gates[g, k, 1], gates[g, 1 - k, 1]
                 if b == gates[g, 1 - k, 0]:
                     continue  # no wall at that end: nothing lies below its top
                 missing = key[b - 1] + key[b] + least - key[a] - key[a + 1]
-                if missing <= 0:
+                if missing <= 0.5 * least:
                     continue
-                left += 1
                 free_a, free_b = not given[column[a]], not given[column[b]]
                 if not (free_a or free_b):
                     continue
-                part = missing / (4.0 if free_a and free_b else 2.0) * 1.001
+                moved = True
+                part = missing / (4.0 if free_a and free_b else 2.0)
                 if free_a:
                     _raise_keys(key, a, start[column[a]], start[column[a] + 1] - 1, part, least)
                 if free_b:
                     _lower_keys(key, b, start[column[b]], start[column[b] + 1] - 1, part, least)
-        if left == 0:
+        if not moved:
             break
+    left = 0
+    for g in range(len(gates)):
+        for k in range(2):
+            a, b = gates[g, k, 1], gates[g, 1 - k, 1]
+            left += b != gates[g, 1 - k, 0] and key[b - 1] + key[b] >= key[a] + key[a + 1]
     return left
 
 

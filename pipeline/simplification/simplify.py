@@ -103,7 +103,7 @@ def raise_buildings(
     with trace("2.3 building heights"):
         if options.simplify == "paper":
             return _raise_merged(houses, shapes, dtm, options)
-        if options.roofs == "planes":
+        if options.roofs != "flat":
             return _raise_sloped(houses, shapes, dtm, options, reserved, roof_points)
         return _raise_planar(houses, shapes, dtm, options, reserved)
 

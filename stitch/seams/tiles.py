@@ -34,6 +34,7 @@ def mesh_tile(
     refinements: int,
     passes: int,
     sizes: SizeField | None = None,
+    divide_chords: bool = False,
 ) -> tuple[PlaneMesh, bool]:
     """Mesh a tile between its four seams.
 
@@ -47,6 +48,9 @@ def mesh_tile(
         Their walls in pieces (`cut_walls`).
     mesh_size, min_angle, refinements, passes, sizes
         As in `mesh_plane`.
+    divide_chords : bool
+        Set a vertex in the middle of each piece of a wall that crosses the tile from seam to seam: with sloped
+        roofs the tile must be free to move a column of every wall.
 
     Returns
     -------
@@ -71,6 +75,8 @@ def mesh_tile(
     pieces = split_walls(walls_within(walls, shapely.box(*tile.bounds)), nodes, reach=ON_WALL)
     middle = pieces.mean(axis=1)
     inner = pieces[shapely.contains_xy(tile, middle[:, 0], middle[:, 1])]
+    if divide_chords:
+        inner = _divide_chords(inner, ring)
     border = np.stack((ring, np.roll(ring, -1, axis=0)), axis=1)
     graph = collect_graph(np.concatenate((border, inner)), np.empty((0, 2)))
     loose = _strip_vertices(sides, tile, inner, mesh_size, sizes)
@@ -127,6 +133,15 @@ def tile_ring(sides: Sides) -> NDArray[np.float64]:
     """Give the vertices of a tile's border counter-clockwise, float64 (k, 2) (m), each once."""
     south, east, north, west = (side.xy for side in sides)
     return np.concatenate((south[:-1], east[:-1], north[:0:-1], west[:0:-1]))
+
+
+def _divide_chords(pieces: NDArray[np.float64], ring: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Halve the pieces (p, 2, 2) that have both ends among the vertices of the ring."""
+    places = np.ascontiguousarray(pieces.reshape(-1, 2)).view(np.complex128).reshape(-1, 2)
+    chord = np.isin(places, np.ascontiguousarray(ring).view(np.complex128)).all(axis=1)
+    middle = pieces[chord].mean(axis=1)
+    halves = [np.stack((pieces[chord][:, k], middle), axis=1) for k in (0, 1)]
+    return np.concatenate((pieces[~chord], *halves))
 
 
 def _strip_vertices(

@@ -105,16 +105,14 @@ def are_above_roofs(
 ) -> Mask:
     """Tell which wall facets (k, 3, 3) rise above the roof of their building, bool (k,)."""
     if not rules.sloped:
-        below: Mask = corners[:, :, 2].max(axis=1) <= buildings.roof[row] + HEIGHT_TOLERANCE
-        return ~below
-    places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
-    allowed = find_roof_range(places, buildings, dtm, rules)
-    highest = allowed.high[index.reshape(-1)].reshape(-1, 3)
+        highest = buildings.roof[row][:, None]
+    else:
+        places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
+        highest = find_roof_range(places, buildings, dtm, rules).high[index.reshape(-1)].reshape(-1, 3)
     low: Mask = (corners[:, :, 2] <= highest + HEIGHT_TOLERANCE).all(axis=1)
     return ~low
 
 
 def _is_beyond(z: NDArray[np.float64], allowed: RoofRange, index: NDArray[np.int64]) -> Mask:
-    low, high = allowed.low[index], allowed.high[index]
-    within: Mask = (z >= low - HEIGHT_TOLERANCE) & (z <= high + HEIGHT_TOLERANCE)
+    within: Mask = (z >= allowed.low[index] - HEIGHT_TOLERANCE) & (z <= allowed.high[index] + HEIGHT_TOLERANCE)
     return ~within

@@ -154,8 +154,9 @@ class Config:
     )  # fmt: skip
     min_courtyard_area: float = _parameter(5.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
     roofs: str = _parameter(
-        "flat", "simplify", "roofs of houses: planes found in their points, or flat; always flat with "
-        "mesher = layered or simplify = paper", choices=("planes", "flat"),
+        "flat", "simplify", "roofs of houses: planes found in their points, hipped ones by the skeleton of the "
+        "outline, or flat; always flat with mesher = layered or simplify = paper",
+        choices=("planes", "skeleton", "flat"),
     )  # fmt: skip
     split_levels: bool = _parameter(
         True, "simplify", "divide houses where their roof points show a step, with roofs = flat"

@@ -1,6 +1,6 @@
 """From the parameters of a run to the options of the steps, and which parameters each of these needs."""
 
-from typing import Any
+from typing import Any, Literal
 
 from pipeline.city_model.city import CityOptions
 from pipeline.columns.adaptive import AdaptiveOptions
@@ -77,7 +77,7 @@ def needs_region(config: Config) -> bool:
 def layer_parameters(config: Config) -> tuple[str, ...]:
     """Parameters of the columns: those of features only where these are used, so that keys stay without them."""
     growth = ("first_layer", "layer_growth") if config.first_layer else ()
-    sloped = derived_parameters(config)["roofs_or_flat"] == "planes"
+    sloped = derived_parameters(config)["roofs_or_flat"] != "flat"
     roofs = ("roofs_or_flat", "roof_clearance_or_spacing") if sloped else ()
     return (*LAYER_PARAMETERS, *growth, *roofs, *(("top_elevation",) if config.top == "flat" else ()))
 
@@ -104,11 +104,15 @@ def city_options(given: Any) -> CityOptions:
         clearance=given.clearance,
         clearance_floor=given.clearance_floor,
         min_courtyard_area=given.min_courtyard_area,
-        roofs="planes" if given.roofs_or_flat == "planes" else "flat",
+        roofs=_roofs(given.roofs_or_flat),
         split_levels=given.split_levels,
         roof_group=given.roof_group_or_spacing,
         manifold=given.manifold,
     )
+
+
+def _roofs(name: str) -> Literal["planes", "skeleton", "flat"]:
+    return "planes" if name == "planes" else "skeleton" if name == "skeleton" else "flat"
 
 
 def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | AdaptiveOptions:
@@ -118,7 +122,7 @@ def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | A
     first = _optional(given, "first_layer", 0.0)
     growth = Growth(first, given.layer_growth) if first else None
     if given.mesher == "adaptive":
-        sloped = _optional(given, "roofs_or_flat", "flat") == "planes"
+        sloped = _optional(given, "roofs_or_flat", "flat") != "flat"
         return AdaptiveOptions(
             mesh_size=given.mesh_size,
             domain_height=domain.height,

@@ -15,6 +15,7 @@ from pipeline.columns.underground import SoilOptions
 from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.data.notes import Note
+from pipeline.data.roofs import is_flat
 from pipeline.plane_mesh.sizes import SizeField
 from pipeline.points_terrain.raster import Dtm, sample_dtm, window_of
 from pipeline.points_terrain.terrain import cut_terrain
@@ -163,7 +164,13 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
     sides = tuple(unpack_seam(found[name].arrays, model.numbers) for name in names)
     with task.step("3.1 plane mesh"):
         plane, complete = mesh_tile(
-            _four(sides), model.polygons, walls, mesh_size=given.mesh_size, sizes=sizes, **plane_options(given)
+            _four(sides),
+            model.polygons,
+            walls,
+            mesh_size=given.mesh_size,
+            sizes=sizes,
+            divide_chords=not is_flat(model.roofs).all(),
+            **plane_options(given),
         )
     inner = [k for k, seam in enumerate(sides) if not seam.border]
     given_columns = [(sides[k], unpack_levels(found[names[k]].arrays, model.numbers, "level")) for k in inner]

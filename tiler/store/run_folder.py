@@ -164,11 +164,8 @@ def read_run_record(path: Path) -> RunRecord:
 
 
 def _read_roof_rules(parameters: Mapping[str, Any]) -> RoofRules:
-    if (parameters.get("roofs"), parameters.get("mesher"), parameters.get("simplify")) != (
-        "planes",
-        "adaptive",
-        "clearance",
-    ):
+    sloping = (parameters.get("mesher"), parameters.get("simplify")) == ("adaptive", "clearance")
+    if not sloping or parameters.get("roofs", "flat") == "flat":
         return FLAT_ROOFS
     least = float(parameters["least_spacing"]) * float(parameters["mesh_size"])
     return RoofRules(True, max(LARGEST_STEP, least), max(float(parameters["roof_clearance"]), least))
