@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from tiler.check.proofs import N_PLACES, Fault, Proof, Vertices
+from tiler.citymodels.building_index import BuildingRow, check_indices
 from tiler.citymodels.building_index import Vertices as ModelVertices
-from tiler.citymodels.building_index import check_indices
 
 HEIGHT_STEP = 1e-3  # m: CityJSON rounds coordinates to 1 mm, the heights among the attributes are not rounded
 KINDS = ("GroundSurface", "RoofSurface", "WallSurface")
@@ -45,7 +45,7 @@ class SolidProofs:
         name: str,
         thing: Mapping[str, Any],
         vertices: ModelVertices,
-        building: tuple[float, float, Any] | None,
+        building: BuildingRow | None,
     ) -> None:
         """Look at an object.
 
@@ -57,8 +57,8 @@ class SolidProofs:
             The object.
         vertices : Vertices
             Vertices of the city model.
-        building : (float, float, shapely geometry), optional
-            Heights of ground and roof (m) and footprint; none for a house of parts.
+        building : BuildingRow, optional
+            What was read of it; none for a house of parts.
 
         Raises
         ------
@@ -70,7 +70,7 @@ class SolidProofs:
             self._kin[1] += sum(_hash_pair(house, name) for house in thing.get("parents", ()))
             if building is None:
                 return
-            ground, roof, footprint = building
+            _, ground, roof, _, footprint = building
             for kind in self._find(thing, vertices, ground, roof, footprint):
                 place = footprint.representative_point()
                 self._count[kind] = self._count.get(kind, 0) + 1

@@ -5,15 +5,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
+from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError, OutputError
+from pipeline.data.roofs import Roofs
 from tiler.store.json_stream import iterate_elements, iterate_members, read_members
 from tiler.store.run_folder import WRONG_FIELD, Buildings, broken_field
 
@@ -21,9 +23,28 @@ CITYJSON = "2.0"
 MAX_NUMBER = 2**53  # of a building
 BLOCK = 1 << 14  # vertices that are read at once
 KEPT_BLOCKS = 32
-HEAD = np.dtype([("ground", "<f8"), ("roof", "<f8")])
+PLANE = "roof_plane"  # attribute of a sloped roof: a, b, c, x0, y0, lowest and highest height
+PLANE_VALUES = 7
+HEAD = np.dtype([("ground", "<f8"), ("roof", "<f8"), ("plane", "<f8", PLANE_VALUES)])
 Box = tuple[float, float, float, float]
-See = Callable[[str, Any, "Vertices", tuple[float, float, Any] | None], None]
+
+
+class BuildingRow(NamedTuple):
+    """What is read of a building or part.
+
+    ``number``; heights ``ground`` and ``roof``, the highest place (m); ``plane``: a, b, c, x0, y0, lowest and
+    highest height as `Roofs` has them, those of a flat roof at `roof` where the file states none; ``footprint``,
+    a Polygon or MultiPolygon.
+    """
+
+    number: int
+    ground: float
+    roof: float
+    plane: tuple[float, ...]
+    footprint: Any
+
+
+See = Callable[[str, Any, "Vertices", BuildingRow | None], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +60,7 @@ class BuildingIndex:
     start, size : int64 and int32, (n,)
         Where the building lies in the file, and how long it is (bytes).
     file : binary file
-        Heights and footprints.
+        Heights, roofs and footprints.
     """
 
     numbers: NDArray[np.int64]
@@ -77,7 +98,9 @@ class BuildingIndex:
             shapes.append((k, data[HEAD.itemsize :]))
         footprints = np.empty(len(rows), np.object_)
         footprints[[k for k, _ in shapes]] = shapely.from_wkb([data for _, data in shapes])
-        return Buildings(self.numbers[rows], footprints, head["ground"].copy(), head["roof"].copy())
+        a, b, c, x0, y0, low, high = head["plane"].T
+        roofs = Roofs(np.column_stack((a, b, c)), np.column_stack((x0, y0)), np.column_stack((low, high)))
+        return Buildings(self.numbers[rows], footprints, head["ground"].copy(), head["roof"].copy(), roofs)
 
 
 @contextmanager
@@ -89,8 +112,8 @@ def index_buildings(path: Path, see: See | None = None) -> Iterator[BuildingInde
     path : Path
         The file, in any layout.
     see : callable, optional
-        Is called with each object as it is read: its id, itself, the vertices, and the heights of ground and roof
-        (m) and footprint that were read of it, or None for a house of parts.
+        Is called with each object as it is read: its id, itself, the vertices, and what was read of it, or None
+        for a house of parts.
 
     Raises
     ------
@@ -221,13 +244,13 @@ def _read_objects(path: Path, vertices: Vertices, file: IO[bytes], see: See | No
             if see is not None:
                 see(name, thing, vertices, None)
             continue
-        number, ground, roof, footprint = read_building(path, name, thing, vertices)
+        row = read_building(path, name, thing, vertices)
         if see is not None:
-            see(name, thing, vertices, (ground, roof, footprint))
-        data = np.array([(ground, roof)], HEAD).tobytes() + shapely.to_wkb(footprint)
+            see(name, thing, vertices, row)
+        data = np.array([(row.ground, row.roof, row.plane)], HEAD).tobytes() + shapely.to_wkb(row.footprint)
         _write(file, data)
-        numbers.append(number)
-        boxes.extend(shapely.bounds(footprint).tolist())
+        numbers.append(row.number)
+        boxes.extend(shapely.bounds(row.footprint).tolist())
         starts.append(start)
         sizes.append(len(data))
         start += len(data)
@@ -254,10 +277,8 @@ def has_parts(path: Path, thing: Any) -> bool:
         raise broken_field(path, error) from None
 
 
-def read_building(
-    path: Path, name: str, thing: Mapping[str, Any], vertices: Vertices
-) -> tuple[int, float, float, Any]:
-    """Take number, ground and roof height (m) and footprint of a building of a city model.
+def read_building(path: Path, name: str, thing: Mapping[str, Any], vertices: Vertices) -> BuildingRow:
+    """Take number, ground and roof height (m), roof and footprint of a building of a city model.
 
     Raises
     ------
@@ -273,13 +294,27 @@ def read_building(
             float(values["ground_height"]),
             float(values["roof_height"]),
         )
+        plane = _read_plane(values.get(PLANE), roof)
         (geometry,) = (part for part in thing["geometry"] if str(part["lod"]) == "0")
         surfaces = [_read_polygon(rings, vertices) for rings in geometry["boundaries"]]
     except (*WRONG_FIELD, shapely.GEOSException) as error:
         raise InputError(
             f"{path}: building {name!r}: a field is missing or wrong ({error!r}); run again"
         ) from None
-    return number, ground, roof, surfaces[0] if len(surfaces) == 1 else shapely.multipolygons(surfaces)
+    footprint = surfaces[0] if len(surfaces) == 1 else shapely.multipolygons(surfaces)
+    return BuildingRow(number, ground, roof, plane, footprint)
+
+
+def _read_plane(stated: Any, roof: float) -> tuple[float, ...]:
+    """Make numbers of the attribute of a sloped roof; of one height where a building has none."""
+    if stated is None:
+        return 0.0, 0.0, roof, 0.0, 0.0, roof, roof
+    plane = tuple(map(float, stated))
+    if len(plane) != PLANE_VALUES or not all(map(isfinite, plane)) or not plane[5] <= roof <= plane[6]:
+        raise ValueError(
+            f"{PLANE} {stated} with roof_height {roof}; expected {PLANE_VALUES} numbers, the last two around it"
+        )
+    return plane
 
 
 def _read_polygon(rings: list[list[int]], vertices: Vertices) -> Any:

@@ -20,7 +20,8 @@ from pipeline.city_model.solids import Solids, build_solids
 from pipeline.data.citymodel import CityModel, join_models, take_model
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
-from pipeline.data.roofs import flat_roofs
+from pipeline.data.roofs import Roofs, choose_roofs, flat_roofs, is_flat
+from tiler.citymodels.building_index import PLANE, PLANE_VALUES
 from tiler.store.atomic import replacing
 
 # Coordinates are whole multiples of this length (m).
@@ -174,7 +175,7 @@ class _Writer:
         self._check_ids(model.ids)
         solids, notes = build_solids(model, self.origin, grid=GRID)
         self.notes += notes
-        attributes, geometry = _attribute_texts(columns, len(model)), _geometry_texts(solids, self.n_vertices)
+        attributes, geometry = _attribute_texts(columns, model.roofs), _geometry_texts(solids, self.n_vertices)
         objects = []
         for name, house, *told in zip(model.ids.tolist(), model.house.tolist(), attributes, geometry, strict=True):
             objects.append(_object_text(name, house, *told))
@@ -302,7 +303,7 @@ def _object_text(name: str, house: str, attributes: str, geometry: str) -> str:
 def _columns(model: CityModel, extra: Attributes) -> dict[str, Sequence[object]]:
     """Gather the attributes by name."""
     for name in extra:
-        if name in ATTRIBUTES:
+        if name in (*ATTRIBUTES, PLANE):
             raise ValueError(f"attribute {name!r} is one of ours; rename the column")
     own: tuple[Sequence[object], ...] = (
         model.numbers.tolist(),
@@ -314,11 +315,19 @@ def _columns(model: CityModel, extra: Attributes) -> dict[str, Sequence[object]]
     return {**dict(zip(ATTRIBUTES, own, strict=True)), **extra}
 
 
-def _attribute_texts(columns: Attributes, n: int) -> list[str]:
-    """Write the attributes of each of n buildings."""
+def _attribute_texts(columns: Attributes, roofs: Roofs) -> list[str]:
+    """Write the attributes of each building; those with a sloped roof have its plane besides."""
+    if not len(roofs):
+        return []
     form = ",".join(f"{_text(name).replace('%', '%%')}:%s" for name in columns)
     texts = [_value_texts(column) for column in columns.values()]
-    return [f"{{{form}}}" % row for row in zip(*texts, strict=True)] if n else []
+    planes = np.column_stack((roofs.plane, roofs.origin, roofs.limits)).tolist()
+    last = [
+        "" if flat else f",{_text(PLANE)}:{_text(plane)}"
+        for flat, plane in zip(is_flat(roofs).tolist(), planes, strict=True)
+    ]
+    rows = zip(*texts, strict=True)
+    return [f"{{{form % row}{plane}}}" for row, plane in zip(rows, last, strict=True)]
 
 
 def _value_texts(column: Sequence[object]) -> list[str]:
@@ -393,12 +402,17 @@ def _parse(document: dict[str, Any]) -> CityModel:
     rows = [item["attributes"] for item in objects.values()]
     polygons = np.empty(len(objects), dtype=np.object_)
     polygons[:] = [_footprint(item["geometry"], vertices) for item in objects.values()]
+    stated = [row.get(PLANE) for row in rows]
+    plane = np.array([[np.nan] * PLANE_VALUES if one is None else one for one in stated], np.float64)
+    plane = plane.reshape(-1, PLANE_VALUES)
+    flat = flat_roofs(np.array([row["roof_height"] for row in rows], dtype=np.float64))
+    sloped = Roofs(plane[:, :3], plane[:, 3:5], plane[:, 5:])
     return CityModel(
         polygons=polygons,
         ids=np.array(list(objects), dtype=np.str_),
         numbers=np.array([row["number"] for row in rows], dtype=np.int64),
         ground=np.array([row["ground_height"] for row in rows], dtype=np.float64),
-        roofs=flat_roofs(np.array([row["roof_height"] for row in rows], dtype=np.float64)),
+        roofs=choose_roofs(np.array([one is None for one in stated], np.bool_), flat, sloped),
         members=tuple(tuple(row["members"]) for row in rows),
         house=np.array([item.get("parents", [name])[0] for name, item in objects.items()], dtype=np.str_),
     )

@@ -78,7 +78,9 @@ def write_gpkg(path: Path, model: Path, *, crs: str) -> None:
     kinds = _survey(model)
     with TemporaryFile() as spool, _fixed_time():
         vertices = spool_vertices(model, spool)
-        rows = ((name, thing, read_building(model, name, thing, vertices)[3]) for name, thing in _objects(model))
+        rows = (
+            (name, thing, read_building(model, name, thing, vertices).footprint) for name, thing in _objects(model)
+        )
         batch = list(islice(rows, BATCH))
         _append(path, batch, kinds, crs)
         while batch := list(islice(rows, BATCH)):

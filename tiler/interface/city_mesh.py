@@ -351,9 +351,9 @@ class CityMesh:
             for name, thing in read_objects(model):
                 if has_parts(model, thing):
                     continue
-                number, ground, roof, footprint = read_building(model, name, thing, vertices)
+                row = read_building(model, name, thing, vertices)
                 house = thing["parents"][0] if thing.get("parents") else name
-                yield Building(name, house, number, ground, roof, footprint, thing["attributes"])
+                yield Building(name, house, row.number, row.ground, row.roof, row.footprint, thing["attributes"])
 
     def __repr__(self) -> str:
         facts = [f"{number} {name}" for name, number in self._facts()]

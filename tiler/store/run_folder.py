@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipeline.columns.weld import Weld
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Region, TetMesh
+from pipeline.data.roofs import Roofs
 from tiler.store.json_stream import iterate_members, read_members
 
 SCHEMA = 1  # of run.json
@@ -109,13 +110,16 @@ class Buildings:
     footprints : object, (n,)
         shapely Polygons, or MultiPolygons where the file has several surfaces (m).
     ground, roof : float64, (n,)
-        Attributes ``ground_height`` and ``roof_height``, absolute (m).
+        Attributes ``ground_height`` and ``roof_height``, absolute (m): of a sloped roof the highest place.
+    roofs : Roofs
+        Roofs, by attribute ``roof_plane``; flat at `roof` where a building has none.
     """
 
     numbers: NDArray[np.int64]
     footprints: NDArray[np.object_]
     ground: NDArray[np.float64]
     roof: NDArray[np.float64]
+    roofs: Roofs
 
     def __len__(self) -> int:
         return len(self.numbers)

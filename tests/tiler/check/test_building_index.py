@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.errors import InputError
-from pipeline.data.roofs import flat_roofs
+from pipeline.data.roofs import Roofs, flat_roofs, roof_heights
 from tiler.check.check import _in_order
 from tiler.citymodels import building_index
 from tiler.citymodels.building_index import index_buildings
@@ -160,6 +160,30 @@ def test_a_city_model_without_buildings(tmp_path: Path) -> None:
         assert len(index.take(np.empty(0, np.int64))) == 0
 
 
+def test_sloped_roofs_are_read_as_they_were_given(tmp_path: Path) -> None:
+    ids = np.array(["flat", "shed", "gutter"])
+    roofs = Roofs(
+        np.array([[0, 0, 9.0], [0.5, -0.1 / 3, 8.123456789], [0.3, 0, 12.0]]),
+        np.array([[0, 0], [150_012.0, 460_003.0], [150_031.0, 460_004.0]]),
+        np.array([[9.0, 9.0], [6.5, 11.25], [11.8, 30.0]]),
+    )
+    boxes = shapely.box(150_000 + 20 * np.arange(3), [460_000] * 3, 150_010 + 20 * np.arange(3), [460_008] * 3)
+    model = CityModel(boxes, ids, np.array([3, 1, 2]), np.zeros(3), roofs, ((),) * 3, ids)
+    file = tmp_path / "a.json"
+    write_city_blocks(file, [(model, {})], crs="EPSG:28992", bounds=(150_000, 460_000, 0, 160_000, 470_000, 100))
+    with index_buildings(file) as index:
+        found = index.take(np.arange(3))
+    order = [1, 2, 0]
+    assert found.numbers.tolist() == [1, 2, 3]
+    np.testing.assert_array_equal(found.roof, model.roof[order])
+    for name in ("plane", "origin", "limits"):
+        np.testing.assert_array_equal(getattr(found.roofs, name), getattr(roofs, name)[order])
+    height = roof_heights(
+        found.roofs, np.array([0, 2]), np.array([[150_014.0, 460_003.0], [150_001.0, 460_001.0]])
+    )
+    assert height.tolist() == [9.123456789, 9.0]
+
+
 def test_memory_is_a_hundred_bytes_a_building(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(building_index, "BLOCK", 256)
     monkeypatch.setitem(json_stream.OPTIONS, "buf_size", 10_000)
@@ -181,6 +205,14 @@ CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "a word": (lambda model: model["vertices"][3].__setitem__(0, "x"), "a field is missing or wrong"),
     "scale": (lambda model: model["transform"].update(scale=[1, 2]), "a field is missing or wrong"),
     "object": (lambda model: model["CityObjects"].update(b=3), "a field is missing or wrong"),
+    "a plane of six": (
+        lambda model: model["CityObjects"]["b000004"]["attributes"].update(roof_plane=[0, 0, 7, 0, 0, 7]),
+        "building 'b000004': a field is missing or wrong",
+    ),
+    "a roof above its plane": (
+        lambda model: model["CityObjects"]["b000004"]["attributes"].update(roof_plane=[0, 0, 7, 0, 0, 6, 6.9]),
+        "building 'b000004': a field is missing or wrong",
+    ),
     "two of one number": (
         lambda model: model["CityObjects"].update(other=model["CityObjects"]["b000004"]),
         "two buildings have one number",
