@@ -136,9 +136,14 @@ def tile_ring(sides: Sides) -> NDArray[np.float64]:
 
 
 def _divide_chords(pieces: NDArray[np.float64], ring: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Halve the pieces (p, 2, 2) that have both ends among the vertices of the ring."""
+    """Halve the pieces (p, 2, 2) that have both ends among the vertices of the ring, and are no edge of it."""
     places = np.ascontiguousarray(pieces.reshape(-1, 2)).view(np.complex128).reshape(-1, 2)
-    chord = np.isin(places, np.ascontiguousarray(ring).view(np.complex128)).all(axis=1)
+    vertices = np.ascontiguousarray(ring).view(np.complex128).ravel()
+    order = np.argsort(vertices)
+    row = order[np.searchsorted(vertices, places, sorter=order).clip(max=len(order) - 1)]
+    on_ring = (vertices[row] == places).all(axis=1)
+    apart = np.abs(row[:, 0] - row[:, 1])
+    chord = on_ring & (apart > 1) & (apart < len(ring) - 1)
     middle = pieces[chord].mean(axis=1)
     halves = [np.stack((pieces[chord][:, k], middle), axis=1) for k in (0, 1)]
     return np.concatenate((pieces[~chord], *halves))
