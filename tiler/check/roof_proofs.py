@@ -104,13 +104,13 @@ def are_above_roofs(
     corners: Vertices, row: NDArray[np.int64], buildings: Buildings, dtm: Dtm, rules: RoofRules
 ) -> Mask:
     """Tell which wall facets (k, 3, 3) rise above the roof of their building, bool (k,)."""
-    if not rules.sloped:
-        highest = buildings.roof[row][:, None]
-    else:
+    highest = buildings.roof[row][:, None]
+    if rules.sloped:
         places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
         highest = find_roof_range(places, buildings, dtm, rules).high[index.reshape(-1)].reshape(-1, 3)
-    low: Mask = (corners[:, :, 2] <= highest + HEIGHT_TOLERANCE).all(axis=1)
-    return ~low
+    low = corners[:, :, 2] <= highest + HEIGHT_TOLERANCE
+    above: Mask = ~np.all(low, axis=1)
+    return above
 
 
 def _is_beyond(z: NDArray[np.float64], allowed: RoofRange, index: NDArray[np.int64]) -> Mask:
