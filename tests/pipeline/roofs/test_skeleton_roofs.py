@@ -94,6 +94,8 @@ def test_roofs_over_random_outlines_are_closed(kind: str, shape: str) -> None:
         ("gabled", 6 * 6.0),
         ("hipped", 2 * 6.0 + 4 * 4 * 3 / 3),
         ("pyramidal", 6 * 4 * 3 / 3),
+        # Each half hip takes a third of its gable above 1.5 m, 2 m wide there, times the 1 m that it is deep.
+        ("half-hipped", 6 * 6.0 - 2 * 0.5),
         # Up to 0.3 of 2 m the height is 0.6 of 3 m: (0.6 x 1.8 + 1.4 x (1.8 + 3)) across.
         ("gambrel", 6 * (0.6 * 1.8 + 1.4 * 4.8)),
     ],

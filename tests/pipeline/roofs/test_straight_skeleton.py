@@ -43,7 +43,7 @@ def meeting(skeleton: Skeleton, node: int) -> set[int]:
 def same(one: Skeleton, other: Skeleton) -> bool:
     return all(
         np.array_equal(getattr(one, name), getattr(other, name))
-        for name in ("nodes", "time", "edges", "speed", "face_start", "face_node", "origin")
+        for name in ("nodes", "time", "edges", "speed", "start", "face_start", "face_node", "origin")
     )
 
 
@@ -140,6 +140,20 @@ def test_one_moving_edge_is_a_shed() -> None:
     np.testing.assert_array_equal(skeleton.nodes[4:], [(0, 4), (6, 4)])
 
 
+def test_an_edge_that_sets_off_later_is_a_gable_below_a_hip() -> None:
+    """The ends of a rectangle set off when both walls have come 1 m closer."""
+    skeleton = straight_skeleton(HAND["rectangle"], start=[0, 1, 0, 1])
+    assert inside(skeleton) == [(0, 1, 1), (0, 3, 1), (6, 1, 1), (6, 3, 1), (1, 2, 2), (5, 2, 2)]
+    assert {len(skeleton.face(e)) for e in (1, 3)} == {5}
+
+
+def test_an_edge_that_sets_off_too_late_is_a_gable() -> None:
+    late = straight_skeleton(HAND["rectangle"], start=[0, 2.5, 0, 2.5])
+    gabled = straight_skeleton(HAND["rectangle"], [1, 0, 1, 0])
+    assert inside(late) == inside(gabled)
+    assert late.speed.tolist() == [1, 0, 1, 0]
+
+
 def test_a_faster_edge_goes_further() -> None:
     """Walls at 1 and 3 across 4 m meet after 1, at 1 m and 3 m from them."""
     skeleton = straight_skeleton(HAND["rectangle"], [1, 1, 3, 1])
@@ -204,8 +218,10 @@ def test_what_has_no_skeleton_is_one_clear_error(polygon: shapely.Polygon, reaso
 def test_speeds_that_never_close_the_roof_are_an_error() -> None:
     with pytest.raises(GeometryError, match="meet no other edge"):
         straight_skeleton(HAND["plus"], [1.0] + [0.0] * 11)
+    with pytest.raises(ValueError, match="starts"):
+        straight_skeleton(HAND["square"], start=[0, 0, 0, -1])
     walls = HAND["vertices in walls"]
-    with pytest.raises(GeometryError, match="on one line have the speeds"):
+    with pytest.raises(GeometryError, match="on one line have speeds"):
         straight_skeleton(walls, [1, 2, 1, 1, 1, 1])
 
 
