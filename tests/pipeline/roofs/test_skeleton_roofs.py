@@ -165,6 +165,20 @@ def test_a_gable_may_have_vertices_within() -> None:
     check_roof(house, roof)
 
 
+def test_an_edge_that_ends_before_its_half_hip_is_a_gable() -> None:
+    """The lower 60 cm of the end are gone when the hip begins, at 1 of 2 m."""
+    house = shapely.Polygon([(0, 0), (10, 0), (10.01, 0.6), (10, 4), (0, 4)])
+    roof = skeleton_roofs(house, 0.0, RoofForm("half-hipped"))
+    check_roof(house, roof)
+    assert len(roof) == 4  # two sides, two half hips
+
+
+def test_shorter_sides_are_gables() -> None:
+    for axis, nearly_square in enumerate((shapely.box(0, 0, 4.003, 4), shapely.box(0, 0, 4, 4.003))):
+        gables = find_gables(straight_skeleton(nearly_square))
+        assert np.ptp(outline_edges(nearly_square)[gables], axis=1)[:, axis].tolist() == [0, 0]
+
+
 def test_gables_may_be_given() -> None:
     """With its long sides as gables the ridge of a rectangle runs across."""
     roof = skeleton_roofs(HAND["rectangle"], 0.0, RoofForm("gabled", height=3.0, gables=(0, 2)))

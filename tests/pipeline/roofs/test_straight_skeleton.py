@@ -13,6 +13,7 @@ from shapely import affinity
 
 from pipeline.data.errors import GeometryError
 from pipeline.roofs.straight_skeleton import Skeleton, outline_edges, straight_skeleton
+from pipeline.roofs.wavefront import Chain
 from tests.helpers.house_outlines import HAND, KINDS, random_outlines, symmetric_star
 
 # Place and time of the nodes inside, by hand.
@@ -161,15 +162,40 @@ def test_a_faster_edge_goes_further() -> None:
 
 
 def test_a_faster_edge_takes_the_place_of_a_slower_one_on_its_line() -> None:
-    """A U whose court is closed at the time 1: the ends of its wings are on one line then, one of them a gable."""
-    u = shapely.Polygon([(0, 0), (10, 0), (10, 6), (6, 6), (6, 4), (4, 4), (4, 6), (0, 6)])
-    edges = outline_edges(u)
-    right_end = next(e for e, (a, b) in enumerate(edges) if a[1] == b[1] == 6 and a[0] == 10)
+    """A T whose shoulders are on one line, y = 2, when its stem ends: the left one, half as fast, is gone then."""
+    t = shapely.Polygon([(0, -8), (12, -8), (12, 4), (8, 4), (8, 12), (4, 12), (4, 3), (0, 3)])
+    edges = outline_edges(t)
+    right, left = (next(e for e, (a, b) in enumerate(edges) if a[1] == b[1] == y) for y in (4, 3))
     speed = np.ones(8)
-    speed[right_end] = 0.0
-    skeleton = straight_skeleton(u, speed)
-    faces = [shapely.Polygon(skeleton.nodes[skeleton.face(e)]) for e in range(8) if e != right_end]
-    assert sum(face.area for face in faces) == pytest.approx(u.area)
+    speed[left] = 0.5
+    skeleton = straight_skeleton(t, speed)
+    assert (6, 2, 2) in inside(skeleton)
+    assert (2, 2, 2) in inside(skeleton)
+    areas = [shapely.Polygon(skeleton.nodes[skeleton.face(e)]).area for e in range(8)]
+    assert areas[left] == pytest.approx(0.5 * (4 + 4))  # (0, 3), (2, 2), (6, 2), (4, 3)
+    # From there on the right one has all of the line.
+    assert skeleton.nodes[skeleton.face(right), 0].min() == pytest.approx(2)
+
+
+def test_no_two_nodes_are_one() -> None:
+    for name, polygon in HAND.items():
+        skeleton = straight_skeleton(polygon, tolerance=0.0)
+        nodes = {(round(x, 6), round(y, 6), round(t, 6)) for x, y, t in inside(skeleton)}
+        assert len(nodes) == len(skeleton.nodes) - len(skeleton), name
+        assert skeleton.time[len(skeleton) :].min() > 0, name
+
+
+def test_nodes_are_joined_no_farther_than_the_tolerance() -> None:
+    """Nodes around the middle of an almost round house, 7 mm apart in all, are not all one."""
+    rng = np.random.default_rng(4)
+    angle = np.arange(24) * math.pi / 12
+    radius = 5 + rng.uniform(-0.01, 0.01, 24)
+    house = shapely.Polygon(np.column_stack((radius * np.cos(angle), radius * np.sin(angle))))
+    exact, joined = straight_skeleton(house, tolerance=0.0), straight_skeleton(house)
+    assert len(joined.nodes) < len(exact.nodes)
+    distance = np.hypot(*(exact.nodes[24:, np.newaxis] - joined.nodes[24:]).transpose(2, 0, 1))
+    assert distance.min(axis=1).max() < 0.005
+    assert np.ptp(exact.nodes[24:], axis=0).max() > 0.01
 
 
 def test_close_nodes_are_one() -> None:
@@ -251,3 +277,25 @@ def test_a_small_house_takes_some_milliseconds() -> None:
     for _ in range(20):
         straight_skeleton(polygon)
     assert (time.process_time() - start) / 20 < 0.02
+
+
+ALONG = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]  # edges to the right, up, to the left, down
+
+
+def test_an_edge_has_its_outer_side_to_its_right() -> None:
+    wall = Chain([], (0, 1), (0, 0), ALONG)
+    assert (wall.middle, wall.half) == pytest.approx((1.5 * math.pi, 0.5 * math.pi))
+
+
+def test_what_touches_from_outside_is_apart_and_what_moved_on_is_not() -> None:
+    wall = Chain([], (0, 1), (0, 0), ALONG)
+    tip = Chain([5], (2, 3), (3, 1), ALONG)  # down and up again: a notch from above without width
+    corner = Chain([6], (2, 3), (1, 2), ALONG)  # a corner of a house, its outer side three quarters
+    assert tip.half == pytest.approx(0.0)
+    assert tip.is_apart(wall)
+    assert not corner.is_apart(wall)
+    assert not corner.is_apart(corner)
+
+
+def test_edges_that_came_to_lie_on_each_other_have_no_inner_side() -> None:
+    assert Chain([5, 6], (2, 3), (2, 0), ALONG).half == pytest.approx(math.pi)
