@@ -11,6 +11,8 @@ from pipeline.data.errors import GeometryError
 from pipeline.roofs.wavefront import CONTACT, Point, Wavefront
 
 AREA_TOLERANCE = 1e-9  # of the area of the polygon, by which the sum of the faces may differ from it
+UPRIGHT = 1e-4  # m², area that the upright part of a face may have by rounding
+SAME_TIME = 4 * CONTACT
 PLACE_TOLERANCE = 1e-5  # m, by which nodes may be off the planes of their edges where none were joined
 
 
@@ -136,28 +138,51 @@ def find_faults(front: Wavefront, faces: list[list[int]], tolerance: float) -> d
     """Find the faces that are no faces of a skeleton, and say why.
 
     A face has an area (where its edge has a speed) and no side that crosses another one. It is monotone to its
-    edge (where all edges have one speed). Its nodes are as far from its edge as their time says.
+    edge (where all edges have one speed from the start). Its nodes are as far from its edge as their time says.
     """
     faults: dict[int, str] = {}
-    even = len(set(front.speed)) == 1
+    even = len(set(front.speed)) == 1 and not any(front.start)
+    sloped = [sloped_part(face, front.node_time, front.start[e]) for e, face in enumerate(faces)]
     for e, face in enumerate(faces):
-        xy = [front.node_xy[node] for node in face]
-        off = max(abs(front.ahead(e, xy, front.node_time[node])) for xy, node in zip(xy, face, strict=True))
-        if off > PLACE_TOLERANCE + (tolerance if front.speed[e] > 0 else 0.0):  # a gable is upright
+        xy = [front.node_xy[node] for node in sloped[e]]
+        off = max(_off_plane(front, e, node, tolerance) for node in face)
+        if off > PLACE_TOLERANCE:
             faults[e] = f"has a node {off:.3g} m off its plane"
-        elif front.speed[e] > 0 and not (len(face) > 2 and face_area(xy) > 0):
+        elif front.speed[e] > 0 and not (len(xy) > 2 and face_area(xy) > 0):
             faults[e] = "has no area"
         elif even and not is_monotone(xy, tolerance + CONTACT):
             faults[e] = "is not monotone"
-    whole = [e for e, face in enumerate(faces) if len(face) > 3 and front.speed[e] > 0 and e not in faults]
+        elif _upright_area(front, e, face, xy) > UPRIGHT:
+            faults[e] = "is not upright below"
+    whole = [e for e, face in enumerate(sloped) if len(face) > 3 and front.speed[e] > 0 and e not in faults]
     if whole:
         rings = shapely.linearrings(
-            [front.node_xy[node] for e in whole for node in faces[e]],
-            indices=np.repeat(np.arange(len(whole)), [len(faces[e]) for e in whole]),
+            [front.node_xy[node] for e in whole for node in sloped[e]],
+            indices=np.repeat(np.arange(len(whole)), [len(sloped[e]) for e in whole]),
         )
         crossed = ~shapely.is_simple(rings)
         faults.update((whole[k], "crosses itself") for k in np.flatnonzero(crossed).tolist())
     return faults
+
+
+def sloped_part(face: Sequence[int], time: Sequence[float], start: float) -> list[int]:
+    """Nodes of a face but for the upright part of an edge that sets off later."""
+    return [node for node in face if time[node] > start - SAME_TIME] if start > 0 else list(face)
+
+
+def _off_plane(front: Wavefront, e: int, node: int, tolerance: float) -> float:
+    """How much farther than the tolerance a node is from the plane of an edge; upright parts have no tolerance."""
+    start, time = front.start[e], front.node_time[node]
+    off = abs(front.ahead(e, front.node_xy[node], max(time, start)))
+    return off - tolerance if front.speed[e] > 0 and time > start else off
+
+
+def _upright_area(front: Wavefront, e: int, face: list[int], sloped: list[Point]) -> float:
+    """Area in plan (m²) of the part of a face that should be upright, and have none."""
+    if front.speed[e] > 0 and not front.start[e] > 0:
+        return 0.0
+    rest = face_area(sloped) if front.speed[e] > 0 else 0.0
+    return abs(face_area([front.node_xy[node] for node in face]) - rest)
 
 
 def check_faces(front: Wavefront, faces: list[list[int]], area: float, tolerance: float) -> None:

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from pipeline.data.roofs import Roofs
 from pipeline.geometry.rings import make_canonical
 from pipeline.roofs.part_cycles import LevelCuts, join_cycles
-from pipeline.roofs.skeleton_faces import face_area
+from pipeline.roofs.skeleton_faces import face_area, sloped_part
 from pipeline.roofs.straight_skeleton import TOLERANCE, Skeleton, outline_edges, straight_skeleton
 
-ROOF_SHAPES = ("flat", "skillion", "hipped", "pyramidal", "gabled", "mansard", "gambrel")
+ROOF_SHAPES = ("flat", "skillion", "hipped", "pyramidal", "gabled", "half-hipped", "mansard", "gambrel")
 DEFAULT_SLOPE = 0.7  # m per m, about 35 degrees
 BREAK_TIME = 0.3  # share of the way from the eaves to the highest ridge where a mansard roof becomes less steep
 BREAK_HEIGHT = 0.6  # share of its height that it has there
+HALF_HIP = 0.5  # share of its height that the gable of a half-hipped roof has below its hip
 MIN_DISTANCE = 0.01  # m, distance from each edge of the apex of a pyramidal roof
 GABLE_BETWEEN = -0.7  # cosine of the angle between the two edges beside a gable, above which there is none
 
@@ -46,8 +47,8 @@ class RoofForm:
         Where a skillion roof looks, downhill: degrees clockwise from north. If none is given, towards the longest
         edge.
     gables : sequence of int, optional
-        Edges, numbered as by `outline_edges`, that are gables of a gabled or gambrel roof. If none are given,
-        those that `find_gables` finds.
+        Edges, numbered as by `outline_edges`, that are gables of a gabled, half-hipped or gambrel roof. If
+        none are given, those that `find_gables` finds.
     """
 
     shape: str = "hipped"
@@ -144,9 +145,10 @@ def skeleton_roofs(
 
     Notes
     -----
-    A gable is an edge of speed 0. The roof of a mansard is the hipped one, that of a gambrel the gabled one, with
-    a steep lower part: as all edges that move have one speed, both have one plan. The edges of a pyramidal roof
-    meet in one place, the centroid; where an edge does not face it the roof is hipped.
+    A gable is an edge of speed 0, a half hip one that sets off when it is half as high as a gable. The roof of a
+    mansard is the hipped one, that of a gambrel the gabled one, with a steep lower part: as all edges that move
+    have one speed, both have one plan. The edges of a pyramidal roof meet in one place, the centroid; where an
+    edge does not face it the roof is hipped.
 
     Examples
     --------
@@ -283,8 +285,9 @@ class _Plan:
         moving = np.flatnonzero(skeleton.speed > 0).tolist()
         xy = [(x, y) for x, y in (skeleton.nodes - skeleton.origin).tolist()]
         height = (eaves + rise * skeleton.time).tolist()
-        n = len(moving)
-        return cls(xy, height, [skeleton.face(e).tolist() for e in moving], moving, [eaves] * n, [rise] * n)
+        starts, time = skeleton.start[moving].tolist(), skeleton.time.tolist()
+        cycles = [sloped_part(skeleton.face(e).tolist(), time, t) for e, t in zip(moving, starts, strict=True)]
+        return cls(xy, height, cycles, moving, [eaves + rise * t for t in starts], [rise] * len(moving))
 
 
 def _shaped_skeleton(polygon: shapely.Polygon, form: RoofForm, tolerance: float) -> tuple[str, Skeleton]:
@@ -296,13 +299,28 @@ def _shaped_skeleton(polygon: shapely.Polygon, form: RoofForm, tolerance: float)
             return shape, pyramid
         shape = "hipped"
     skeleton = straight_skeleton(polygon, tolerance=tolerance)
-    if shape in ("gabled", "gambrel"):
+    gables = []
+    if shape in ("gabled", "gambrel", "half-hipped"):
         gables = list(find_gables(skeleton) if form.gables is None else form.gables)
-        if gables:
-            speed = np.ones(len(skeleton))
-            speed[gables] = 0.0
-            skeleton = straight_skeleton(polygon, speed, tolerance=tolerance)
+    if gables:
+        speed = np.ones(len(skeleton))
+        speed[gables] = 0.0
+        skeleton = straight_skeleton(polygon, speed, tolerance=tolerance)
+    if gables and shape == "half-hipped":
+        skeleton = straight_skeleton(polygon, start=HALF_HIP * _gable_tips(skeleton), tolerance=tolerance)
     return shape, skeleton
+
+
+def _gable_tips(skeleton: Skeleton) -> Array:
+    """Time of the highest node of each gable, the same for all edges of one side; 0 for edges that move."""
+    gables = np.flatnonzero(skeleton.speed == 0).tolist()
+    tips = np.zeros(len(skeleton))
+    for e in gables:
+        tips[e] = skeleton.time[skeleton.face(e)].max()
+    beside = [(e, k) for e in gables for k in gables if skeleton.edges[e, 1] == skeleton.edges[k, 0]]
+    for e, k in [*beside, *beside[::-1]]:
+        tips[[e, k]] = tips[[e, k]].max()
+    return tips
 
 
 def _pyramid(polygon: shapely.Polygon) -> Skeleton | None:
@@ -321,6 +339,7 @@ def _pyramid(polygon: shapely.Polygon) -> Skeleton | None:
         time=np.append(np.zeros(n), 1.0),
         edges=edges,
         speed=distance,
+        start=np.zeros(n),
         face_start=np.arange(n + 1) * 3,
         face_node=np.column_stack((edges, np.full(n, n))).ravel(),
         origin=np.floor(a.min(axis=0)),

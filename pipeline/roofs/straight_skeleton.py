@@ -39,11 +39,13 @@ class Skeleton:
         Nodes where each edge starts and ends.
     speed : float64, (m,)
         Distance that each edge moves in a unit of time.
+    start : float64, (m,)
+        Time when each edge sets off.
     face_start : int64, (m + 1,)
         The face of edge ``e`` has the nodes ``face_node[face_start[e]:face_start[e + 1]]``.
     face_node : int64, (k,)
         Nodes of each face, counter-clockwise, the two ends of its edge first. An edge of speed 0 has a face
-        without area.
+        without area, one that sets off later a part without area below its other nodes.
     origin : float64, (2,)
         Whole metres near the polygon; the work is done in coordinates relative to it.
     """
@@ -52,6 +54,7 @@ class Skeleton:
     time: Array
     edges: Index
     speed: Array
+    start: Array
     face_start: Index
     face_node: Index
     origin: Array
@@ -82,7 +85,11 @@ def outline_edges(polygon: shapely.Polygon) -> Array:
 
 
 def straight_skeleton(
-    polygon: shapely.Polygon, speed: Sequence[float] | Array | None = None, *, tolerance: float = TOLERANCE
+    polygon: shapely.Polygon,
+    speed: Sequence[float] | Array | None = None,
+    *,
+    start: Sequence[float] | Array | None = None,
+    tolerance: float = TOLERANCE,
 ) -> Skeleton:
     """Compute the straight skeleton of a polygon.
 
@@ -93,6 +100,8 @@ def straight_skeleton(
     speed : float64, (m,), optional
         Speed of each edge in the order of `outline_edges`, not negative: 1 if none are given. The roof of an
         edge of speed 2 is half as steep, an edge of speed 0 stays where it is: a gable.
+    start : float64, (m,), optional
+        Time when each edge sets off, not negative: 0 if none are given. Until then it stays, a gable under a hip.
     tolerance : float
         Lines of the skeleton that are shorter are one node (m).
 
@@ -107,7 +116,7 @@ def straight_skeleton(
         If the polygon is not valid, has an edge shorter than `MIN_EDGE` or no skeleton with these speeds, or
         the result fails a check (`check_faces`). It names the place.
     ValueError
-        If there is not one finite speed ≥ 0 for each edge, or all are 0.
+        If there is not one finite speed ≥ 0 for each edge, or all are 0; likewise for starts.
 
     Notes
     -----
@@ -137,11 +146,14 @@ def straight_skeleton(
     """
     rings, origin = _read_rings(polygon)
     n_edges = sum(map(len, rings))
-    speeds = _check_speed(speed, n_edges)
+    speeds = _check_values("speeds", [1.0] * n_edges if speed is None else speed, n_edges)
+    starts = _check_values("starts", [0.0] * n_edges if start is None else start, n_edges)
+    if not any(speeds):
+        raise ValueError("not all speeds may be 0")
     local = [[(float(x), float(y)) for x, y in (ring - origin).tolist()] for ring in rings]
     try:
-        _check_edges(local, speeds)
-        front = Wavefront(local, speeds)
+        _check_edges(local, list(zip(speeds, starts, strict=True)))
+        front = Wavefront(local, speeds, starts)
         front.run()
         faces = follow_faces(front)
         check_faces(front, faces, polygon.area, 0.0)
@@ -190,15 +202,15 @@ def _divide(ring: Array, vertices: Array) -> Array:
     return distinct
 
 
-def _check_speed(speed: Sequence[float] | Array | None, n_edges: int) -> list[float]:
-    speeds = [1.0] * n_edges if speed is None else np.asarray(speed, np.float64).tolist()
-    if len(speeds) != n_edges or not all(0 <= s < math.inf for s in speeds) or not any(speeds):
-        raise ValueError(f"{n_edges} edges need as many finite speeds ≥ 0, not all 0: {speeds}")
-    return speeds
+def _check_values(name: str, given: Sequence[float] | Array, n_edges: int) -> list[float]:
+    values: list[float] = np.asarray(given, np.float64).tolist()
+    if len(values) != n_edges or not all(0 <= value < math.inf for value in values):
+        raise ValueError(f"{n_edges} edges need as many finite {name} ≥ 0: {values}")
+    return values
 
 
-def _check_edges(rings: list[list[Point]], speeds: list[float]) -> None:
-    """Refuse edges that are too short, and those on one line with different speeds."""
+def _check_edges(rings: list[list[Point]], motion: list[tuple[float, float]]) -> None:
+    """Refuse edges that are too short, and those on one line with different speeds or starts."""
     start = 0
     for ring in rings:
         n = len(ring)
@@ -208,11 +220,13 @@ def _check_edges(rings: list[list[Point]], speeds: list[float]) -> None:
             if not MIN_EDGE <= length <= MAX_EXTENT:
                 bounds = f"{MIN_EDGE} to {MAX_EXTENT:.0f} m"
                 raise GeometryError(f"the edge at ({ax:.3f}, {ay:.3f}) is {length:.2g} m long, not {bounds}")
-            one, other = speeds[start + k], speeds[start + (k + 1) % n]
+            one, other = motion[start + k], motion[start + (k + 1) % n]
             turn = (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
             ahead = (bx - ax) * (cx - bx) + (by - ay) * (cy - by)
             if one != other and ahead > 0 and abs(turn) <= CONTACT * length * following:
-                raise GeometryError(f"edges on one line have the speeds {one} and {other} at ({bx:.3f}, {by:.3f})")
+                raise GeometryError(
+                    f"edges on one line have speeds and starts {one} and {other} at ({bx:.3f}, {by:.3f})"
+                )
         start += n
 
 
@@ -237,6 +251,7 @@ def _make_skeleton(front: Wavefront, faces: list[list[int]], outline: Array, ori
         time=np.array([front.node_time[node] for node in kept]),
         edges=np.array([face[:2] for face in faces], np.int64),
         speed=np.array(front.speed),
+        start=np.array(front.start),
         face_start=np.cumsum(count),
         face_node=np.array([place[node] for face in faces for node in face], np.int64),
         origin=origin,

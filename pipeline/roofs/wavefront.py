@@ -11,6 +11,7 @@ CONTACT = 1e-6  # m, what comes this close at one time meets there
 PARALLEL = 1e-9  # sine of the angle below which edges of different speed count as parallel
 REFLEX = 1e-9  # sine of the turn to the left below which a vertex is tested against edges that it may run into
 TOUCHING = 1e-4  # radians by which the outer sides of two parts of the outline may overlap where they touch
+SHRUNK, SPLIT, SET_OFF = range(3)  # kinds of events: an edge without length, a vertex on an edge, edges set off
 EVENTS_PER_EDGE = 30  # far above what any polygon needs: a polygon of n edges has fewer than 2 n nodes
 
 Point = tuple[float, float]
@@ -63,6 +64,10 @@ class Wavefront:
 
     Attributes
     ----------
+    start : list of float
+        Time when each edge sets off; it stays where it is before.
+    speed : list of float
+        Speed of each edge now.
     birth, death : list of int
         Nodes where each vertex begins and ends; -1 while it moves.
     after_up, after_down : list of int
@@ -74,8 +79,12 @@ class Wavefront:
         Place (m) and time of each node.
     """
 
-    def __init__(self, rings: Sequence[Sequence[Point]], speed: Sequence[float]) -> None:
-        self.speed = list(speed)
+    def __init__(
+        self, rings: Sequence[Sequence[Point]], speed: Sequence[float], start: Sequence[float] | None = None
+    ) -> None:
+        self.start = [0.0] * len(speed) if start is None else list(start)
+        self.speed = [s if t == 0 else 0.0 for s, t in zip(speed, self.start, strict=True)]
+        self._waiting = {e: s for e, (s, t) in enumerate(zip(speed, self.start, strict=True)) if t > 0}
         self.along: list[Point] = []
         self.normal: list[Point] = []
         self.offset: list[float] = []
@@ -116,12 +125,14 @@ class Wavefront:
         for v in vertices:
             self._add_shrinking(v)
             self._add_splits(v)
+        for t in sorted({self.start[e] for e in self._waiting}):
+            heapq.heappush(self._queue, (t, SET_OFF, -1, -1))
         left = EVENTS_PER_EDGE * len(self.offset) + 100
         while self._queue and self._moving:
-            time, split, v, other = heapq.heappop(self._queue)
-            if self._happens(time, split, v, other):
+            time, kind, v, other = heapq.heappop(self._queue)
+            if self._happens(time, kind, v, other):
                 self._now = max(self._now, time)
-                self._take_event(split, v, other)
+                self._take_event(kind, v, other)
                 left -= 1
             if left < 0:
                 raise GeometryError(f"more than {EVENTS_PER_EDGE} events an edge{self._place()}")
@@ -207,7 +218,7 @@ class Wavefront:
         rate = ux * (to_vx - vx) + uy * (to_vy - vy)
         if rate < 0:
             length = ux * (to_x - x) + uy * (to_y - y)
-            heapq.heappush(self._queue, (now + max(length, 0.0) / -rate, 0, v, other))
+            heapq.heappush(self._queue, (now + max(length, 0.0) / -rate, SHRUNK, v, other))
 
     def _add_splits(self, v: int) -> None:
         """Note when a vertex that may run into edges meets the line of each of them."""
@@ -226,13 +237,15 @@ class Wavefront:
                 if ahead > -CONTACT:
                     lasts = ahead / -rate if ahead > 0 else 0.0
                     if low_x <= x + vx * lasts <= high_x and low_y <= y + vy * lasts <= high_y:
-                        heapq.heappush(queue, (now + lasts, 1, v, e))
+                        heapq.heappush(queue, (now + lasts, SPLIT, v, e))
 
-    def _happens(self, time: float, split: int, v: int, other: int) -> bool:
+    def _happens(self, time: float, kind: int, v: int, other: int) -> bool:
         """Tell whether an event that was noted is still to come."""
+        if kind == SET_OFF:
+            return True
         if v not in self._moving:
             return False
-        if not split:
+        if kind == SHRUNK:
             return other in self._moving and self._after[v] == other
         xy = self._at(v, time)
         return any(self._holds(s, xy, time) for s in self._starts[other] if s in self._moving)
@@ -247,11 +260,13 @@ class Wavefront:
 
     # Events
 
-    def _take_event(self, split: int, v: int, other: int) -> None:
-        xy = self._at(v, self._now)
-        if split:
-            self._meet(xy, (v,))
+    def _take_event(self, kind: int, v: int, other: int) -> None:
+        if kind == SET_OFF:
+            self._set_off()
+        elif kind == SPLIT:
+            self._meet(self._at(v, self._now), (v,))
         else:
+            xy = self._at(v, self._now)
             to = self._at(other, self._now)
             self._meet((0.5 * (xy[0] + to[0]), 0.5 * (xy[1] + to[1])), (v, other))
         while self._at_once:
@@ -368,7 +383,10 @@ class Wavefront:
         for v in born:
             if v in self._moving:
                 self._close_flat(v)
-        born = [v for v in born if v in self._moving]
+        self._begin([v for v in born if v in self._moving])
+
+    def _begin(self, born: list[int]) -> None:
+        """Let new vertices move, and note what follows from it."""
         for v in born:
             self._set_motion(v)
         for v in born:
@@ -376,6 +394,31 @@ class Wavefront:
             self._add_shrinking(v)
             if self._before[v] not in born:
                 self._add_shrinking(self._before[v])
+            self._add_splits(v)
+
+    def _set_off(self) -> None:
+        """Let the edges move whose time it is: their vertices end, and others begin there."""
+        ready = {e for e in self._waiting if self.start[e] <= self._now}
+        there = {self._right[v] for v in self._moving}
+        for e in ready:
+            speed = self._waiting.pop(e)
+            if e in there:  # else others met above it: it is a gable
+                self.speed[e] = speed
+                self.offset[e] -= speed * self._now
+        born = []
+        for old in list(self._moving):
+            edges = self._left[old], self._right[old]
+            if ready.intersection(edges):
+                node = self._node_at(self._at(old, self._now))
+                v = self._add_vertex(edges, node)
+                self._starts[edges[1]].append(v)
+                self._end([old], node)
+                self.after_up[old], self.after_down[v] = 2 * v, 2 * old + 1
+                self._before[v], self._after[v] = self._before[old], self._after[old]
+                self._after[self._before[v]] = self._before[self._after[v]] = v
+                born.append(v)
+        self._begin(born)
+        for v in self._moving:
             self._add_splits(v)
 
     def _close_flat(self, v: int) -> None:

@@ -94,6 +94,8 @@ def test_roofs_over_random_outlines_are_closed(kind: str, shape: str) -> None:
         ("gabled", 6 * 6.0),
         ("hipped", 2 * 6.0 + 4 * 4 * 3 / 3),
         ("pyramidal", 6 * 4 * 3 / 3),
+        # Each half hip takes a third of its gable above 1.5 m, 2 m wide there, times the 1 m that it is deep.
+        ("half-hipped", 6 * 6.0 - 2 * 0.5),
         # Up to 0.3 of 2 m the height is 0.6 of 3 m: (0.6 x 1.8 + 1.4 x (1.8 + 3)) across.
         ("gambrel", 6 * (0.6 * 1.8 + 1.4 * 4.8)),
     ],
@@ -161,6 +163,20 @@ def test_a_gable_may_have_vertices_within() -> None:
     roof = skeleton_roofs(house, 0.0, RoofForm("gabled"))
     assert len(roof) == 2
     check_roof(house, roof)
+
+
+def test_an_edge_that_ends_before_its_half_hip_is_a_gable() -> None:
+    """The lower 60 cm of the end are gone when the hip begins, at 1 of 2 m."""
+    house = shapely.Polygon([(0, 0), (10, 0), (10.01, 0.6), (10, 4), (0, 4)])
+    roof = skeleton_roofs(house, 0.0, RoofForm("half-hipped"))
+    check_roof(house, roof)
+    assert len(roof) == 4  # two sides, two half hips
+
+
+def test_shorter_sides_are_gables() -> None:
+    for axis, nearly_square in enumerate((shapely.box(0, 0, 4.003, 4), shapely.box(0, 0, 4, 4.003))):
+        gables = find_gables(straight_skeleton(nearly_square))
+        assert np.ptp(outline_edges(nearly_square)[gables], axis=1)[:, axis].tolist() == [0, 0]
 
 
 def test_gables_may_be_given() -> None:

@@ -13,6 +13,7 @@ from shapely import affinity
 
 from pipeline.data.errors import GeometryError
 from pipeline.roofs.straight_skeleton import Skeleton, outline_edges, straight_skeleton
+from pipeline.roofs.wavefront import Chain
 from tests.helpers.house_outlines import HAND, KINDS, random_outlines, symmetric_star
 
 # Place and time of the nodes inside, by hand.
@@ -43,7 +44,7 @@ def meeting(skeleton: Skeleton, node: int) -> set[int]:
 def same(one: Skeleton, other: Skeleton) -> bool:
     return all(
         np.array_equal(getattr(one, name), getattr(other, name))
-        for name in ("nodes", "time", "edges", "speed", "face_start", "face_node", "origin")
+        for name in ("nodes", "time", "edges", "speed", "start", "face_start", "face_node", "origin")
     )
 
 
@@ -140,6 +141,20 @@ def test_one_moving_edge_is_a_shed() -> None:
     np.testing.assert_array_equal(skeleton.nodes[4:], [(0, 4), (6, 4)])
 
 
+def test_an_edge_that_sets_off_later_is_a_gable_below_a_hip() -> None:
+    """The ends of a rectangle set off when both walls have come 1 m closer."""
+    skeleton = straight_skeleton(HAND["rectangle"], start=[0, 1, 0, 1])
+    assert inside(skeleton) == [(0, 1, 1), (0, 3, 1), (6, 1, 1), (6, 3, 1), (1, 2, 2), (5, 2, 2)]
+    assert {len(skeleton.face(e)) for e in (1, 3)} == {5}
+
+
+def test_an_edge_that_sets_off_too_late_is_a_gable() -> None:
+    late = straight_skeleton(HAND["rectangle"], start=[0, 2.5, 0, 2.5])
+    gabled = straight_skeleton(HAND["rectangle"], [1, 0, 1, 0])
+    assert inside(late) == inside(gabled)
+    assert late.speed.tolist() == [1, 0, 1, 0]
+
+
 def test_a_faster_edge_goes_further() -> None:
     """Walls at 1 and 3 across 4 m meet after 1, at 1 m and 3 m from them."""
     skeleton = straight_skeleton(HAND["rectangle"], [1, 1, 3, 1])
@@ -147,15 +162,40 @@ def test_a_faster_edge_goes_further() -> None:
 
 
 def test_a_faster_edge_takes_the_place_of_a_slower_one_on_its_line() -> None:
-    """A U whose court is closed at the time 1: the ends of its wings are on one line then, one of them a gable."""
-    u = shapely.Polygon([(0, 0), (10, 0), (10, 6), (6, 6), (6, 4), (4, 4), (4, 6), (0, 6)])
-    edges = outline_edges(u)
-    right_end = next(e for e, (a, b) in enumerate(edges) if a[1] == b[1] == 6 and a[0] == 10)
+    """A T whose shoulders are on one line, y = 2, when its stem ends: the left one, half as fast, is gone then."""
+    t = shapely.Polygon([(0, -8), (12, -8), (12, 4), (8, 4), (8, 12), (4, 12), (4, 3), (0, 3)])
+    edges = outline_edges(t)
+    right, left = (next(e for e, (a, b) in enumerate(edges) if a[1] == b[1] == y) for y in (4, 3))
     speed = np.ones(8)
-    speed[right_end] = 0.0
-    skeleton = straight_skeleton(u, speed)
-    faces = [shapely.Polygon(skeleton.nodes[skeleton.face(e)]) for e in range(8) if e != right_end]
-    assert sum(face.area for face in faces) == pytest.approx(u.area)
+    speed[left] = 0.5
+    skeleton = straight_skeleton(t, speed)
+    assert (6, 2, 2) in inside(skeleton)
+    assert (2, 2, 2) in inside(skeleton)
+    areas = [shapely.Polygon(skeleton.nodes[skeleton.face(e)]).area for e in range(8)]
+    assert areas[left] == pytest.approx(0.5 * (4 + 4))  # (0, 3), (2, 2), (6, 2), (4, 3)
+    # From there on the right one has all of the line.
+    assert skeleton.nodes[skeleton.face(right), 0].min() == pytest.approx(2)
+
+
+def test_no_two_nodes_are_one() -> None:
+    for name, polygon in HAND.items():
+        skeleton = straight_skeleton(polygon, tolerance=0.0)
+        nodes = {(round(x, 6), round(y, 6), round(t, 6)) for x, y, t in inside(skeleton)}
+        assert len(nodes) == len(skeleton.nodes) - len(skeleton), name
+        assert skeleton.time[len(skeleton) :].min() > 0, name
+
+
+def test_nodes_are_joined_no_farther_than_the_tolerance() -> None:
+    """Nodes around the middle of an almost round house, 7 mm apart in all, are not all one."""
+    rng = np.random.default_rng(4)
+    angle = np.arange(24) * math.pi / 12
+    radius = 5 + rng.uniform(-0.01, 0.01, 24)
+    house = shapely.Polygon(np.column_stack((radius * np.cos(angle), radius * np.sin(angle))))
+    exact, joined = straight_skeleton(house, tolerance=0.0), straight_skeleton(house)
+    assert len(joined.nodes) < len(exact.nodes)
+    distance = np.hypot(*(exact.nodes[24:, np.newaxis] - joined.nodes[24:]).transpose(2, 0, 1))
+    assert distance.min(axis=1).max() < 0.005
+    assert np.ptp(exact.nodes[24:], axis=0).max() > 0.01
 
 
 def test_close_nodes_are_one() -> None:
@@ -204,8 +244,10 @@ def test_what_has_no_skeleton_is_one_clear_error(polygon: shapely.Polygon, reaso
 def test_speeds_that_never_close_the_roof_are_an_error() -> None:
     with pytest.raises(GeometryError, match="meet no other edge"):
         straight_skeleton(HAND["plus"], [1.0] + [0.0] * 11)
+    with pytest.raises(ValueError, match="starts"):
+        straight_skeleton(HAND["square"], start=[0, 0, 0, -1])
     walls = HAND["vertices in walls"]
-    with pytest.raises(GeometryError, match="on one line have the speeds"):
+    with pytest.raises(GeometryError, match="on one line have speeds"):
         straight_skeleton(walls, [1, 2, 1, 1, 1, 1])
 
 
@@ -235,3 +277,25 @@ def test_a_small_house_takes_some_milliseconds() -> None:
     for _ in range(20):
         straight_skeleton(polygon)
     assert (time.process_time() - start) / 20 < 0.02
+
+
+ALONG = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]  # edges to the right, up, to the left, down
+
+
+def test_an_edge_has_its_outer_side_to_its_right() -> None:
+    wall = Chain([], (0, 1), (0, 0), ALONG)
+    assert (wall.middle, wall.half) == pytest.approx((1.5 * math.pi, 0.5 * math.pi))
+
+
+def test_what_touches_from_outside_is_apart_and_what_moved_on_is_not() -> None:
+    wall = Chain([], (0, 1), (0, 0), ALONG)
+    tip = Chain([5], (2, 3), (3, 1), ALONG)  # down and up again: a notch from above without width
+    corner = Chain([6], (2, 3), (1, 2), ALONG)  # a corner of a house, its outer side three quarters
+    assert tip.half == pytest.approx(0.0)
+    assert tip.is_apart(wall)
+    assert not corner.is_apart(wall)
+    assert not corner.is_apart(corner)
+
+
+def test_edges_that_came_to_lie_on_each_other_have_no_inner_side() -> None:
+    assert Chain([5, 6], (2, 3), (2, 0), ALONG).half == pytest.approx(math.pi)
