@@ -41,7 +41,7 @@ from tiler.mesh_files.vtk_files import write_vtp, write_vtu
 from tiler.mesh_files.vtk_xml import make_stream, write_data_file
 
 Tamper = Callable[[TinyCity], TinyCity]
-N_PROOFS = 15
+N_PROOFS = 16
 
 
 @pytest.fixture(scope="module")

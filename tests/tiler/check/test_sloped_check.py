@@ -1,0 +1,152 @@
+"""Tests of `citystitch check` on sloped roofs: what it finds where they or their walls are wrong."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.columns.adaptive import mesh_adaptive
+from pipeline.columns.columns import expand_cells, extract_boundary
+from pipeline.data.mesh import ColumnMesh, Marker
+from pipeline.points_terrain.terrain import Dtm, sample_dtm
+from tests.helpers.meshes import PlaneDtm, TinyCity, edit_json, write_run
+from tests.helpers.sloped_towns import BOUNDS, OPTIONS, SlopedTown, sloped_town
+from tiler.check.check import CheckReport, check_run
+
+
+class Terrain:
+    """A raster that can be sampled."""
+
+    def __init__(self, dtm: Dtm) -> None:
+        self._dtm = dtm
+
+    def sample(self, xy: NDArray[np.float64], /) -> NDArray[np.float64]:
+        return sample_dtm(self._dtm, xy)
+
+
+@pytest.fixture(scope="module")
+def town() -> SlopedTown:
+    return sloped_town(0, 16)
+
+
+@pytest.fixture(scope="module")
+def mesh(town: SlopedTown) -> ColumnMesh:
+    return mesh_adaptive(town.plane, town.dtm, town.model.roofs, town.model.ids, OPTIONS)[0]
+
+
+def write(folder: Path, town: SlopedTown, mesh: ColumnMesh, *, roofs: str = "planes") -> None:
+    """Write the run folder of a mesh of the town."""
+    boundary = extract_boundary(mesh, town.model.numbers)
+    used = expand_cells(mesh)
+    write_run(folder, TinyCity(used, boundary, np.empty(0, np.int64), town.model, PlaneDtm(), BOUNDS))
+    parameters: dict[str, object] = {"roofs": roofs, "mesher": "adaptive", "simplify": "clearance"}
+    parameters |= {"least_spacing": 0.1, "mesh_size": 10.0, "roof_clearance": 2.0}
+    edit_json(folder / "run.json", lambda record: record.update(parameters=parameters))
+
+
+def check(folder: Path, town: SlopedTown) -> CheckReport:
+    return check_run(folder, lambda _: Terrain(town.dtm))
+
+
+def kinds(report: CheckReport) -> set[str]:
+    return {fault.kind for fault in report.faults}
+
+
+def test_a_town_with_sloped_roofs_is_proved(tmp_path: Path, town: SlopedTown, mesh: ColumnMesh) -> None:
+    write(tmp_path, town, mesh)
+    report = check(tmp_path, town)
+    assert report.ok, report.lines()
+    assert any("are joined with other roofs, parted from them or" in line for line in report.lines())
+    assert any("none twice" in line for line in report.lines())
+
+
+def test_a_mesh_without_order_keys_has_walls_twice(tmp_path: Path, town: SlopedTown, mesh: ColumnMesh) -> None:
+    assert mesh.key is not None
+    write(tmp_path, town, dataclasses.replace(mesh, key=None))
+    report = check(tmp_path, town)
+    assert kinds(report) >= {"wall-twice"}
+    # Nothing else about the cells tells of it: they are closed, and their volumes add up.
+    assert kinds(report) <= {"wall-twice", "wall-above-roof"}
+
+
+def test_roofs_that_should_be_flat_are_not(tmp_path: Path, town: SlopedTown, mesh: ColumnMesh) -> None:
+    write(tmp_path, town, mesh, roofs="flat")
+    assert "roof-height" in kinds(check(tmp_path, town))
+
+
+def inner_roof_level(town: SlopedTown, mesh: ColumnMesh) -> int:
+    """A level of a sloped roof at a vertex that touches nothing but this roof."""
+    plane = town.plane
+    building = np.full(len(plane.xy), -2)
+    for row, triangle in zip(plane.building.tolist(), plane.triangles.tolist(), strict=True):
+        for vertex in triangle:
+            building[vertex] = row if building[vertex] in (-2, row) else -3
+    steep = np.abs(town.model.roofs.plane[:, :2]).max(axis=1) > 0.1
+    vertex = next(k for k, row in enumerate(building.tolist()) if row >= 0 and steep[row])
+    return int(mesh.z_start[vertex])
+
+
+def raise_inner_corner(town: SlopedTown, mesh: ColumnMesh) -> ColumnMesh:
+    z = mesh.z.copy()
+    z[inner_roof_level(town, mesh)] += 1e-5
+    return dataclasses.replace(mesh, z=z)
+
+
+def lift_eaves(town: SlopedTown, mesh: ColumnMesh) -> ColumnMesh:
+    """Raise a roof at the outline of its house by more than roofs may be moved."""
+    gates = [
+        (int(mesh.z_start[v] + level), t)
+        for t in np.flatnonzero(town.plane.building >= 0).tolist()
+        for v, level in zip(town.plane.triangles[t].tolist(), mesh.bottom[t].tolist(), strict=True)
+        if level > 0
+    ]
+    level, _ = gates[0]
+    z = mesh.z.copy()
+    z[level : level + 3] += 4.0 + np.arange(3) * 0.1
+    end = int(np.searchsorted(mesh.z_start, level, side="right"))
+    top = mesh.z_start[end] - 1
+    z[level : top + 1] = np.sort(np.maximum(z[level : top + 1], z[level] + 0.1 * np.arange(top + 1 - level)))
+    z[top] = max(mesh.z[top], z[top])
+    return dataclasses.replace(mesh, z=z, key=None)
+
+
+@pytest.mark.parametrize(("change", "fault"), [(raise_inner_corner, "roof-height"), (lift_eaves, "roof-height")])
+def test_a_roof_that_is_off_its_plane(
+    tmp_path: Path,
+    town: SlopedTown,
+    mesh: ColumnMesh,
+    change: Callable[[SlopedTown, ColumnMesh], ColumnMesh],
+    fault: str,
+) -> None:
+    write(tmp_path, town, change(town, mesh))
+    assert fault in kinds(check(tmp_path, town))
+
+
+def test_another_plane_in_the_city_model(tmp_path: Path, town: SlopedTown, mesh: ColumnMesh) -> None:
+    write(tmp_path, town, mesh)
+
+    def tilt(model: dict[str, Any]) -> None:
+        sloped = [thing for thing in model["CityObjects"].values() if thing["attributes"].get("roof_plane")]
+        plane = sloped[0]["attributes"]["roof_plane"]
+        plane[2] += 0.01
+
+    edit_json(tmp_path / "citymodel.city.json", tilt)
+    assert "roof-height" in kinds(check(tmp_path, town))
+
+
+def test_a_house_that_lost_its_walls(tmp_path: Path, town: SlopedTown, mesh: ColumnMesh) -> None:
+    boundary = extract_boundary(mesh, town.model.numbers)
+    number = boundary.building[boundary.marker == Marker.WALL][0]
+    kept = ~((boundary.marker == Marker.WALL) & (boundary.building == number))
+    write(tmp_path, town, mesh)
+    less = dataclasses.replace(
+        boundary, facets=boundary.facets[kept], marker=boundary.marker[kept], building=boundary.building[kept]
+    )
+    city = TinyCity(expand_cells(mesh), less, np.empty(0, np.int64), town.model, PlaneDtm(), BOUNDS)
+    write_run(tmp_path / "less", city)
+    (tmp_path / "less" / "run.json").write_text((tmp_path / "run.json").read_text())
+    assert {"building-without-wall", "facet-missing"} <= kinds(check(tmp_path / "less", town))
