@@ -3,13 +3,15 @@
 import time
 import uuid
 from collections import Counter, deque
+from collections.abc import Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
 from pipeline.data.errors import CityError
-from tiler.engine.executor import LEAST_TASKS, TASKS_PER_WORKER, Function, Outcome
+from tiler.engine.executor import LEAST, PER_WORKER
+from tiler.engine.submission import Outcome, Part, run_parts
 from tiler.engine.task import Failure, Task
 from tiler.engine.task_limits import Limits, WorkerError, describe_death, describe_memory, run_guarded
 from tiler.executors.worker_requirements import (
@@ -21,7 +23,7 @@ from tiler.executors.worker_requirements import (
     find_mismatch,
 )
 
-BYSTANDER = 20  # how often a task may be lost with a worker that died before it began, before it is an error
+BYSTANDER = 20  # how often tasks may be lost with a worker that died before they began, before it is an error
 LOOK = 5.0  # s without a result, after which the scheduler is asked whether it has workers
 NO_WORKERS = 300.0  # s without any worker, after which a run ends; a busy machine starts them slowly
 
@@ -31,11 +33,10 @@ class ClusterError(CityError):
 
 
 class _Given(NamedTuple):
-    """A task as the engine submitted it."""
+    """Tasks as the engine submitted them."""
 
     ticket: int
-    function: Function
-    task: Task
+    parts: Sequence[Part]
     rank: int
 
 
@@ -58,8 +59,9 @@ class DaskExecutor:
 
     Notes
     -----
-    Where a worker dies, Dask blames all tasks that it had. Here a task is blamed if it had begun, which its trace
-    file tells (`tiler.engine.task_limits`); the others are sent again.
+    Where a worker dies, Dask blames all that it had. Here a task is blamed if it had begun, which its trace
+    file tells (`tiler.engine.task_limits`); the others are sent again, those before it in its submission too, whose
+    results are found in the store.
     """
 
     def __init__(
@@ -77,22 +79,22 @@ class DaskExecutor:
         self._waiting: list[_Given] = []
         self._sent: dict[str, tuple[Any, _Given]] = {}  # future and task by key
         self._ready: SimpleQueue[tuple[str, Any]] = SimpleQueue()  # key, and the result or the error
-        self._done: deque[tuple[int, Outcome]] = deque()
+        self._done: deque[tuple[int, list[Outcome | None]]] = deque()
         self._losses: Counter[int] = Counter()  # by ticket
         self._lost = False
 
     @property
     def window(self) -> int:
         """Some for each worker."""
-        return max(TASKS_PER_WORKER * self.workers, LEAST_TASKS)
+        return max(PER_WORKER * self.workers, LEAST)
 
-    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
-        """Take a task, the lower its rank the sooner it begins; ClusterError if the scheduler is lost."""
+    def submit(self, ticket: int, parts: Sequence[Part], rank: int = 0) -> None:
+        """Take tasks, the lower their rank the sooner they begin; ClusterError if the scheduler is lost."""
         self._check_scheduler()
-        self._waiting.append(_Given(ticket, function, task, rank))
+        self._waiting.append(_Given(ticket, parts, rank))
 
-    def wait(self) -> tuple[int, Outcome]:
-        """Wait until any task is done.
+    def wait(self) -> tuple[int, list[Outcome | None]]:
+        """Wait until any submission is done.
 
         Raises
         ------
@@ -118,7 +120,7 @@ class DaskExecutor:
                 key, found = self._next()
                 future, given = self._sent.pop(key)
                 dropped.add(given.ticket)
-                self._outcome(found, given)
+                self._outcomes(found, given)
                 future.release()
         except (OSError, RuntimeError, CancelledError, ClusterError):
             if not self._is_lost():
@@ -136,10 +138,11 @@ class DaskExecutor:
         if not self._waiting:
             return
         batch, self._waiting = self._waiting, []
-        keys = [f"{given.task.stage}-{uuid.uuid4().hex}" for given in batch]  # a second try has another one
+        # Dask shows the stages; a second try has another key.
+        keys = [f"{'+'.join(part.task.stage for part in given.parts)}-{uuid.uuid4().hex}" for given in batch]
         priority = {key: -given.rank for key, given in zip(keys, batch, strict=True)}
         try:
-            packed = [dumps((given.function, given.task)) for given in batch]
+            packed = [dumps(given.parts) for given in batch]
         except Exception:  # a function that cannot be sent
             self._waiting = batch
             raise
@@ -159,7 +162,7 @@ class DaskExecutor:
             self._client.loop.add_callback(self._follow, future)
 
     async def _follow(self, future: Any) -> None:
-        """Put the result of a task, or its error, into the queue when it is there."""
+        """Put the result of a submission, or its error, into the queue when it is there."""
         try:
             found = await future
         except Exception as error:
@@ -186,42 +189,52 @@ class DaskExecutor:
                 )
 
     def _take(self, key: str, found: Any) -> None:
-        """Take the result of a task; what had not begun when its worker died is sent again."""
+        """Take what came of a submission; one that had not begun when its worker died is sent again."""
         future, given = self._sent[key]
-        outcome = self._outcome(found, given)
+        outcomes = self._outcomes(found, given)
         del self._sent[key]
         future.release()
-        if outcome is None:
+        if outcomes is None:
             self._losses[given.ticket] += 1
             self._waiting.append(given)
         else:
             self._losses.pop(given.ticket, None)
-            self._done.append((given.ticket, outcome))
+            self._done.append((given.ticket, outcomes))
 
-    def _outcome(self, found: Any, given: _Given) -> Outcome | None:
-        """Record or failure of a task; None if it must be sent again."""
+    def _outcomes(self, found: Any, given: _Given) -> list[Outcome | None] | None:
+        """Records and failures of a submission; None if it must be sent again."""
         from distributed import KilledWorker
 
         match found:
-            case Failure(kind="memory"):
-                return describe_memory(found, self._limits)
+            case list():
+                return [
+                    describe_memory(one, self._limits) if isinstance(one, Failure) and one.kind == "memory" else one
+                    for one in found
+                ]
+            case Failure():
+                return _of_one(found, given)
             case Mismatch():
-                return Failure(found.as_error(self._address))
+                return _of_one(Failure(found.as_error(self._address)), given)
             case KilledWorker():
-                death = describe_death(given.task, self._limits)
-                if death is not None and self._forgives(given.task, death):
-                    return None
-                return death or self._bystander(given.ticket)
+                return self._find_dead(given)
             case CancelledError():  # of a lost scheduler alone
                 self._lost = True
                 self._check_scheduler()
             case Exception():  # of Dask itself: a module that a worker lacks
-                return Failure(self._find_mismatch() or found)
-        outcome: Outcome | None = found
-        return outcome
+                return _of_one(Failure(self._find_mismatch() or found), given)
+        return None  # dropped
+
+    def _find_dead(self, given: _Given) -> list[Outcome | None] | None:
+        """Find by their files what a submission had come to when its worker died; None if it must be sent again."""
+        for k, part in enumerate(given.parts):
+            death = describe_death(part.task, self._limits)
+            if death is not None:
+                return None if self._forgives(part.task, death) else _of_one(death, given, k)
+        failure = self._bystander(given.ticket)
+        return None if failure is None else _of_one(failure, given)
 
     def _bystander(self, ticket: int) -> Failure | None:
-        """Failure of a task that had not begun in a worker that died; None if it must be sent again."""
+        """Failure of what had not begun in a worker that died; None if it must be sent again."""
         if mismatch := self._find_mismatch():
             return Failure(mismatch)
         if self._losses[ticket] < BYSTANDER:
@@ -269,6 +282,11 @@ class DaskExecutor:
         return str(self._client.scheduler.address)
 
 
+def _of_one(failure: Failure, given: _Given, k: int = 0) -> list[Outcome | None]:
+    """The outcomes of a submission of which one task failed, and nothing is known of the others."""
+    return [failure if k == number else None for number in range(len(given.parts))]
+
+
 _REFUSED = set[str]()  # rounds, in a worker
 
 
@@ -279,8 +297,8 @@ def refuse_round(dropped: str) -> None:
 
 def run_packed(
     packed: bytes, *, seconds: float, in_round: str, requirements: Requirements | None
-) -> Outcome | Mismatch | None:
-    """In a worker: run a task as it was sent; an error of reading it is its failure, None if it was dropped."""
+) -> list[Outcome | None] | Failure | Mismatch | None:
+    """In a worker: run tasks as they were sent; an error of reading them is a failure, None if they were dropped."""
     from distributed.protocol.pickle import loads
 
     if in_round in _REFUSED:
@@ -288,7 +306,9 @@ def run_packed(
     if requirements is not None and (mismatch := find_mismatch(requirements)):
         return mismatch
     try:
-        function, task = loads(packed)
+        parts = loads(packed)
     except Exception as error:
         return Failure(RuntimeError(f"cannot be read by a worker: {type(error).__name__}: {error}"))
-    return run_guarded(function, task, seconds)
+    return run_parts(
+        parts, lambda function, task: run_guarded(function, task, seconds), lambda: in_round not in _REFUSED
+    )
