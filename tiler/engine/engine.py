@@ -548,9 +548,7 @@ class _Run:
         )
         return Part(planned.stage.function, task, made if key is None else None)
 
-    def _find_reads(
-        self, ticket: int, before: Collection[Item]
-    ) -> tuple[dict[str, tuple[str, ...]], list[Item]]:
+    def _find_reads(self, ticket: int, before: Collection[Item]) -> tuple[dict[str, tuple[str, ...]], list[Item]]:
         """Find what a task reads and is there, by stage, and what it cannot do without and is not there.
 
         What comes before it in its submission is taken to be there.

@@ -1,11 +1,13 @@
 """Tasks on the workers of a Dask scheduler, on this machine or anywhere."""
 
+import asyncio
 import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from itertools import count
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
@@ -62,6 +64,9 @@ class DaskExecutor:
     Where a worker dies, Dask blames all that it had. Here a task is blamed if it had begun, which its trace
     file tells (`tiler.engine.task_limits`); the others are sent again, those before it in its submission too, whose
     results are found in the store.
+
+    What a submission comes to is told by an event of Dask, in the stream of messages that says that it is done: to
+    fetch the result of a future takes a connection and four messages each.
     """
 
     def __init__(
@@ -75,13 +80,18 @@ class DaskExecutor:
     ) -> None:
         self.workers, self.scheduler = workers, scheduler
         self._client, self._limits, self._requirements = client, limits or Limits(), requirements
-        self._round = uuid.uuid4().hex  # of tasks that are dropped together
+        self._round = uuid.uuid4().hex  # of submissions that are dropped together
+        self._number = count()
         self._waiting: list[_Given] = []
         self._sent: dict[str, tuple[Any, _Given]] = {}  # future and task by key
-        self._ready: SimpleQueue[tuple[str, Any]] = SimpleQueue()  # key, and the result or the error
+        self._over: list[Any] = []  # futures of what is done
+        self._told: dict[str, bytes] = {}  # what workers say that submissions came to, by key
+        self._ready: SimpleQueue[tuple[str, BaseException | None]] = SimpleQueue()  # key, and the error
         self._done: deque[tuple[int, list[Outcome | None]]] = deque()
         self._losses: Counter[int] = Counter()  # by ticket
         self._lost = False
+        self._topic = f"citystitch-{self._round}"
+        client.subscribe_topic(self._topic, self._hear)
 
     @property
     def window(self) -> int:
@@ -104,6 +114,9 @@ class DaskExecutor:
         while not self._done:
             self._send()
             self._take(*self._next())
+            # What else is there comes too, so that what follows from it is sent in one call.
+            while not self._ready.empty():
+                self._take(*self._next())
         return self._done.popleft()
 
     def drop_waiting(self) -> set[int]:
@@ -117,16 +130,16 @@ class DaskExecutor:
             self._check_scheduler()
             self._client.run(refuse_round, self._round, on_error="ignore")
             while self._sent:
-                key, found = self._next()
-                future, given = self._sent.pop(key)
+                key, error = self._next()
+                _, given = self._sent.pop(key)
                 dropped.add(given.ticket)
-                self._outcomes(found, given)
-                future.release()
+                self._outcomes(key, error, given)
         except (OSError, RuntimeError, CancelledError, ClusterError):
             if not self._is_lost():
                 raise
             dropped |= {given.ticket for _, given in self._sent.values()}
             self._sent.clear()
+        self._told.clear()
         self._round = uuid.uuid4().hex
         return dropped
 
@@ -135,11 +148,15 @@ class DaskExecutor:
         from dask import annotate
         from distributed.protocol.pickle import dumps
 
+        self._over.clear()  # all at once: Dask would send a message for each
         if not self._waiting:
             return
         batch, self._waiting = self._waiting, []
         # Dask shows the stages; a second try has another key.
-        keys = [f"{'+'.join(part.task.stage for part in given.parts)}-{uuid.uuid4().hex}" for given in batch]
+        keys = [
+            f"{'+'.join(part.task.stage for part in given.parts)}-{self._round}{next(self._number)}"
+            for given in batch
+        ]
         priority = {key: -given.rank for key, given in zip(keys, batch, strict=True)}
         try:
             packed = [dumps(given.parts) for given in batch]
@@ -148,35 +165,41 @@ class DaskExecutor:
             raise
         with annotate(priority=priority.get):
             futures = self._client.map(
-                run_packed,
+                run_and_tell,
                 packed,
+                keys,
                 key=keys,
                 pure=False,
                 retries=0,
+                topic=self._topic,
                 seconds=self._limits.seconds,
                 in_round=self._round,
                 requirements=self._requirements,
             )
-        for future, given in zip(futures, batch, strict=True):
-            self._sent[future.key] = future, given
-            self._client.loop.add_callback(self._follow, future)
+        self._sent.update((key, (future, given)) for key, future, given in zip(keys, futures, batch, strict=True))
+        self._client.loop.add_callback(self._follow, futures)
 
-    async def _follow(self, future: Any) -> None:
-        """Put the result of a submission, or its error, into the queue when it is there."""
-        try:
-            found = await future
-        except Exception as error:
-            found = error
-        self._ready.put((future.key, found))
+    def _hear(self, event: tuple[float, tuple[str, bytes]]) -> None:
+        """Take what a worker says that a submission came to."""
+        key, packed = event[1]
+        self._told[key] = packed
 
-    def _next(self) -> tuple[str, Any]:
-        """Wait for the next result; Dask itself would wait for ever where there are no workers."""
+    async def _follow(self, futures: Sequence[Any]) -> None:
+        """Put what submissions came to, or the error of one, into the queue when they are done."""
+        await asyncio.gather(*map(self._follow_one, futures))
+
+    async def _follow_one(self, future: Any) -> None:
+        error = await future.exception()
+        self._ready.put((future.key, CancelledError() if future.cancelled() else error))
+
+    def _next(self) -> tuple[str, BaseException | None]:
+        """Wait for the next submission that is done, and its error; Dask itself would wait for ever where there are no workers."""
         began = time.monotonic()
         while True:
             with suppress(Empty):
-                key, found = self._ready.get(timeout=LOOK)
+                key, error = self._ready.get(timeout=LOOK)
                 if key in self._sent:
-                    return key, found
+                    return key, error
                 continue
             self._check_scheduler()
             now = time.monotonic()
@@ -188,12 +211,11 @@ class DaskExecutor:
                     "start some, the same command goes on where it ended"
                 )
 
-    def _take(self, key: str, found: Any) -> None:
+    def _take(self, key: str, error: BaseException | None) -> None:
         """Take what came of a submission; one that had not begun when its worker died is sent again."""
-        future, given = self._sent[key]
-        outcomes = self._outcomes(found, given)
-        del self._sent[key]
-        future.release()
+        future, given = self._sent.pop(key)
+        outcomes = self._outcomes(key, error, given)
+        self._over.append(future)
         if outcomes is None:
             self._losses[given.ticket] += 1
             self._waiting.append(given)
@@ -201,26 +223,32 @@ class DaskExecutor:
             self._losses.pop(given.ticket, None)
             self._done.append((given.ticket, outcomes))
 
-    def _outcomes(self, found: Any, given: _Given) -> list[Outcome | None] | None:
+    def _outcomes(self, key: str, error: BaseException | None, given: _Given) -> list[Outcome | None] | None:
         """Records and failures of a submission; None if it must be sent again."""
         from distributed import KilledWorker
+        from distributed.protocol.pickle import loads
 
-        match found:
-            case list():
+        packed = self._told.pop(key, None)
+        if packed is None and error is None:
+            raise ClusterError(f"a worker of the Dask cluster has not told what became of {key}; run again")
+        match error if packed is None else loads(packed):
+            case list() as found:
                 return [
-                    describe_memory(one, self._limits) if isinstance(one, Failure) and one.kind == "memory" else one
+                    describe_memory(one, self._limits)
+                    if isinstance(one, Failure) and one.kind == "memory"
+                    else one
                     for one in found
                 ]
-            case Failure():
+            case Failure() as found:
                 return _of_one(found, given)
-            case Mismatch():
+            case Mismatch() as found:
                 return _of_one(Failure(found.as_error(self._address)), given)
             case KilledWorker():
                 return self._find_dead(given)
             case CancelledError():  # of a lost scheduler alone
                 self._lost = True
                 self._check_scheduler()
-            case Exception():  # of Dask itself: a module that a worker lacks
+            case Exception() as found:  # of Dask itself: a module that a worker lacks
                 return _of_one(Failure(self._find_mismatch() or found), given)
         return None  # dropped
 
@@ -293,6 +321,14 @@ _REFUSED = set[str]()  # rounds, in a worker
 def refuse_round(dropped: str) -> None:
     """In a worker: begin no task of a round any more."""
     _REFUSED.add(dropped)
+
+
+def run_and_tell(packed: bytes, key: str, *, topic: str, **given: Any) -> None:
+    """In a worker: run tasks by `run_packed`, and tell what they come to."""
+    from distributed import get_worker
+    from distributed.protocol.pickle import dumps
+
+    get_worker().log_event(topic, (key, dumps(run_packed(packed, **given))))
 
 
 def run_packed(
