@@ -498,8 +498,9 @@ class _Run:
         engine._executor.submit(tickets[0], list(parts.values()), int(self.order[tickets[0]]))
         self.in_flight[tickets[0]] = tickets
         self.begun[tickets] = True
-        for item in parts if engine._watch is not None else ():
-            engine._watch.submitted(*item)
+        if engine._watch is not None:
+            for item in parts:
+                engine._watch.submitted(*item)
 
     def _item(self, ticket: int) -> Item:
         planned = self.plan[self.rank[ticket]]
@@ -560,7 +561,7 @@ class _Run:
         refs = {}
         for r in planned.refs:
             if r.stage in planned.named_by:
-                names = tuple(engine._listed(planned.named_by[r.stage], name))
+                names = tuple(sorted(set(engine._listed(planned.named_by[r.stage], name))))
             else:
                 names = self._names(r, ticket - planned.first)
             ahead = {n for n in names if r.stage in planned.by_name and not engine._settled((r.stage, n))}

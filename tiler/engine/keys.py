@@ -110,8 +110,8 @@ class OpenKey:
         For each stage that is read, in a fixed order, the digest of each result by name; None where the same
         submission makes it.
     named_by : dict of str to str
-        Of stages that are read, the stage whose result for the same item, of the same submission, names the results
-        that are read.
+        Of stages that are read, the stage whose result for the same item names what is read, where the same
+        submission makes that.
     """
 
     shared: bytes
@@ -143,7 +143,7 @@ class OpenKey:
         for stage, items in self.refs.items():
             refs[stage] = [(n, done[stage, n].digest if digest is None else digest) for n, digest in items.items()]
             if stage in self.named_by:
-                names = sorted(done[self.named_by[stage], self.name].facts["names"])
+                names = sorted(set(done[self.named_by[stage], self.name].facts["names"]))
                 refs[stage] = [(name, store.describe(stage, name)[1]) for name in names]
         key = item_key(self.shared, self.name, self.box, self.identity, refs.items(), self.gaps)
         return key, {stage: tuple(name for name, _ in items) for stage, items in refs.items()}

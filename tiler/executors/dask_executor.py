@@ -62,8 +62,8 @@ class DaskExecutor:
     Notes
     -----
     Where a worker dies, Dask blames all that it had. Here a task is blamed if it had begun, which its trace
-    file tells (`tiler.engine.task_limits`); the others are sent again, those before it in its submission too, whose
-    results are found in the store.
+    file tells (`tiler.engine.task_limits`); the others are sent again, and so are those before it in its
+    submission, whose results are found in the store.
 
     What a submission comes to is told by an event of Dask, in the stream of messages that says that it is done: to
     fetch the result of a future takes a connection and four messages each.
@@ -193,7 +193,7 @@ class DaskExecutor:
         self._ready.put((future.key, CancelledError() if future.cancelled() else error))
 
     def _next(self) -> tuple[str, BaseException | None]:
-        """Wait for the next submission that is done, and its error; Dask itself would wait for ever where there are no workers."""
+        """Wait for the next that is done, and its error; Dask would wait for ever where there are no workers."""
         began = time.monotonic()
         while True:
             with suppress(Empty):
@@ -253,7 +253,7 @@ class DaskExecutor:
         return None  # dropped
 
     def _find_dead(self, given: _Given) -> list[Outcome | None] | None:
-        """Find by their files what a submission had come to when its worker died; None if it must be sent again."""
+        """Find by its files which task a worker died of; None if the submission must be sent again."""
         for k, part in enumerate(given.parts):
             death = describe_death(part.task, self._limits)
             if death is not None:
@@ -334,7 +334,7 @@ def run_and_tell(packed: bytes, key: str, *, topic: str, **given: Any) -> None:
 def run_packed(
     packed: bytes, *, seconds: float, in_round: str, requirements: Requirements | None
 ) -> list[Outcome | None] | Failure | Mismatch | None:
-    """In a worker: run tasks as they were sent; an error of reading them is a failure, None if they were dropped."""
+    """In a worker: run tasks as they were sent; what cannot be read is a failure, None if they were dropped."""
     from distributed.protocol.pickle import loads
 
     if in_round in _REFUSED:
