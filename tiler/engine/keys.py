@@ -5,7 +5,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from enum import Enum
-from functools import cache
+from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import PurePath
 from typing import Any
@@ -183,8 +183,9 @@ def version_of(name: str) -> str:
         return "unknown"
 
 
-def _hex(box: Box) -> list[str]:
-    return [float(v).hex() for v in box]
+@lru_cache(maxsize=2**16)  # those of absent tiles come again and again
+def _hex(box: Box) -> tuple[str, ...]:
+    return tuple(float(v).hex() for v in box)
 
 
 def _hash(data: bytes) -> bytes:

@@ -1,5 +1,6 @@
 """Tasks of one item that are submitted together: each has its own result, key, record and failure."""
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -46,6 +47,11 @@ def reaches_far(task: Task) -> Facts:
 
 def not_yet(task: Task) -> Facts | None:
     return seen(task) if task.name != "1.1" or task.refs["more"] else None
+
+
+def takes_time(task: Task) -> Facts:
+    time.sleep(0.05)
+    return puts(task)
 
 
 def is_interrupted(_: Task) -> None:
@@ -274,14 +280,15 @@ def test_events_and_times_are_told_by_stage(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     log = EventLog(path, begin_file(path), every=0.0)
     engine = make(tmp_path, progress=log)
-    engine.run(FIRST, SECOND)
+    engine.run(FIRST, replace(SECOND, function=takes_time))
     log.end("done")
     events = [event for event in read_events(path) if event.get("name") == "1.1"]
     assert [(event["event"], event["stage"]) for event in events] == [
         *(("submitted", "first"), ("submitted", "second"), ("done", "first"), ("done", "second"))
     ]
     first, second = events[2:]
-    assert first["ago"] >= second["seconds"] > 0
+    assert second["seconds"] >= 0.05
+    assert first["ago"] == pytest.approx(second["seconds"], abs=0.02)
     assert "ago" not in second
     assert {"first", "second"} <= set(engine.records.seconds)
     timeline = read_timeline(path, frozenset(engine.layout.tiles))
