@@ -5,6 +5,7 @@ import heapq
 import tempfile
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ import numpy as np
 
 from pipeline.data.errors import CityError
 from tests.benchmarks.recorded import choose, draw, make_facts
-from tiler.engine.executor import LEAST_TASKS, TASKS_PER_WORKER, Function
+from tiler.engine.executor import LEAST, PER_WORKER
 from tiler.engine.stage import Box, Facts, Layout, Scope
+from tiler.engine.submission import Function, Outcome, Part, run_parts
 from tiler.engine.task import Failure, Record, Task, run_task
 from tiler.store.store import Store
 
@@ -28,7 +30,20 @@ def simulate(task: Task) -> Facts:
     return make_facts(choose(task.context.tile_size, task.stage, task.name), task.scope, task.name, task.box)
 
 
-class StandInStore(Store):
+def digest_of(stage: str, name: str) -> str:
+    """Digest of a result that is not there: always the same one."""
+    return hashlib.blake2b(f"{stage} {name}".encode(), digest_size=16).hexdigest()
+
+
+class NoStore(Store):
+    """A store that holds nothing, for workers whose tasks are done at once: it knows the digests alone."""
+
+    def describe(self, stage: str, name: str) -> tuple[dict[str, Any], str]:
+        """Digest of a result, without attributes."""
+        return {}, digest_of(stage, name)
+
+
+class StandInStore(NoStore):
     """What would be in a store, made anew when asked for; of commits it keeps a hash of the key each, in a file.
 
     Parameters
@@ -49,8 +64,8 @@ class StandInStore(Store):
             self._keys = np.memmap(file, np.uint64, shape=(slots,))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Go to a worker as a plain store, which nobody there looks into."""
-        return Store, (self.path,)
+        """Go to a worker as a store that holds nothing."""
+        return NoStore, (self.path,)
 
     def commit(self, task: Task) -> tuple[str, bool]:
         """Take a result; gives its digest, and whether it was there before."""
@@ -59,8 +74,7 @@ class StandInStore(Store):
         while (found := int(self._keys[place])) not in (0, number):
             place = (place + 1) & self._mask
         self._keys[place] = number
-        digest = hashlib.blake2b(f"{task.stage} {task.name}".encode(), digest_size=16).hexdigest()
-        return digest, found == number
+        return digest_of(task.stage, task.name), found == number
 
     def facts(self, stage: str, name: str) -> Facts:
         """Facts of a result."""
@@ -110,37 +124,38 @@ class VirtualWorkers:
         Seconds of all workers in which they had a task.
     own : float
         Wall time that this process spent in here (s), which is not the driver's.
-    done, reused : int
-        Number of tasks, and of those whose result was there.
+    submitted, done, reused : int
+        Number of submissions, of those that are done, and of tasks whose result was there.
     flying : float
-        Tasks in flight, integrated over the virtual time (s).
+        Submissions in flight, integrated over the virtual time (s).
     stored, written, files : int
         Bytes in the store and beside it, and number of all these files, as recorded.
     """
 
     def __init__(self, workers: int, store: StandInStore | None = None, fail: float = 0.0) -> None:
-        self.workers, self.window = workers, max(TASKS_PER_WORKER * workers, LEAST_TASKS)
+        self.workers, self.window = workers, max(PER_WORKER * workers, LEAST)
         self.clock = self.busy = self.own = 0.0
-        self.done = self.reused = self.in_flight = 0
-        self.flying = 0.0  # integral of the number of tasks in flight over virtual time
+        self.submitted = self.done = self.reused = self.in_flight = 0
+        self.flying = 0.0  # integral of the number in flight over virtual time
         self.stored = self.written = self.files = 0
         self._store, self._fail = store, fail
-        self._queue: deque[tuple[int, Task]] = deque()
-        self._running: list[tuple[float, int, int, Record | Failure]] = []
+        self._queue: deque[tuple[int, Sequence[Part]]] = deque()
+        self._running: list[tuple[float, int, int, list[Outcome | None]]] = []
         self._serial = 0
 
-    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
-        """Take a task; they begin as they come."""
+    def submit(self, ticket: int, parts: Sequence[Part], rank: int = 0) -> None:
+        """Take tasks; they begin as they come."""
         begin = time.perf_counter()
+        self.submitted += 1
         self.in_flight += 1
-        self._queue.append((ticket, task))
+        self._queue.append((ticket, parts))
         self._fill()
         self.own += time.perf_counter() - begin
 
-    def wait(self) -> tuple[int, Record | Failure]:
-        """Go on to the time at which the next task is done."""
+    def wait(self) -> tuple[int, list[Outcome | None]]:
+        """Go on to the time at which the next submission is done."""
         begin = time.perf_counter()
-        end, _, ticket, outcome = heapq.heappop(self._running)
+        end, _, ticket, outcomes = heapq.heappop(self._running)
         self.busy += (len(self._running) + 1) * (end - self.clock)
         self.flying += self.in_flight * (end - self.clock)
         self.clock = end
@@ -148,7 +163,7 @@ class VirtualWorkers:
         self.done += 1
         self._fill()
         self.own += time.perf_counter() - begin
-        return ticket, outcome
+        return ticket, outcomes
 
     def drop_waiting(self) -> set[int]:
         """Forget what has not begun."""
@@ -159,18 +174,25 @@ class VirtualWorkers:
 
     def _fill(self) -> None:
         while self._queue and len(self._running) < self.workers:
-            ticket, task = self._queue.popleft()
-            seconds, outcome = self._run(task)
-            self._serial += 1
-            heapq.heappush(self._running, (self.clock + seconds, self._serial, ticket, outcome))
+            ticket, parts = self._queue.popleft()
+            taken: list[float] = []
 
-    def _run(self, task: Task) -> tuple[float, Record | Failure]:
+            def run(_: Function, task: Task, taken: list[float] = taken) -> Outcome:
+                seconds, outcome = self._run(task)
+                taken.append(seconds)
+                return outcome
+
+            outcomes = run_parts(parts, run)
+            self._serial += 1
+            heapq.heappush(self._running, (self.clock + sum(taken), self._serial, ticket, outcomes))
+
+    def _run(self, task: Task) -> tuple[float, Outcome]:
         chosen = choose(task.context.tile_size, task.stage, task.name)
         if task.scope is not Scope.REGION and draw("fails", task.stage, task.name) < self._fail * 2**32:
             return chosen.seconds, Failure(CityError("simulated failure"), "Traceback: simulated\n" * 10)
         if self._store is None:
             outcome = run_task(simulate, task)
-            if isinstance(outcome, Failure):
+            if not isinstance(outcome, Record):
                 return chosen.seconds, outcome
         else:
             digest, there = self._store.commit(task)
@@ -192,5 +214,5 @@ def instant(function: Function, task: Task, seconds: float) -> Record:
     chosen = choose(task.context.tile_size, task.stage, task.name)
     facts = make_facts(chosen, task.scope, task.name, task.box)
     notes = {"simulated": chosen.notes} if chosen.notes else {}
-    digest = hashlib.blake2b(f"{task.stage} {task.name}".encode(), digest_size=16).hexdigest()
+    digest = digest_of(task.stage, task.name)
     return Record(task.stage, task.name, task.key, digest, facts, notes, {"all": chosen.seconds}, 2**20)

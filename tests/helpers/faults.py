@@ -47,10 +47,10 @@ def is_killed(_: Task) -> None:
 class Faulty:
     """The function of a stage, but for some of its items."""
 
-    function: Callable[[Task], Facts]
+    function: Callable[[Task], Facts | None]
     faults: Mapping[str, Callable[[Task], None]]
 
-    def __call__(self, task: Task) -> Facts:
+    def __call__(self, task: Task) -> Facts | None:
         if task.name in self.faults:
             self.faults[task.name](task)
         return self.function(task)

@@ -1,5 +1,8 @@
 """The engine: runs stages over the items of a layout, each result once, and skips what is there already.
 
+A task is submitted together with those of its item that wait for nothing else, so that one worker runs them one
+after the other; each has its own result, key and record.
+
 The driver decides what may run and keeps small records; functions, arrays and files are the workers'. Nothing here
 knows Dask: see `tiler.engine.executor`.
 """
@@ -21,13 +24,15 @@ from tiler.config.declared import Declared
 from tiler.engine.absent_tiles import Gaps
 from tiler.engine.executor import Executor
 from tiler.engine.failures import Policy, SetAside, describe_reason, ends_the_run, tries
-from tiler.engine.keys import declared_values, file_identity, item_key, stage_digest
+from tiler.engine.keys import OpenKey, declared_values, file_identity, stage_digest
 from tiler.engine.records import Records
 from tiler.engine.stage import Box, Layout, Scope, Stage
-from tiler.engine.task import Failure, Record, Task
+from tiler.engine.submission import Item, Outcome, Part
+from tiler.engine.task import Failure, Later, Record, Task
 from tiler.engine.task_graph import (
     Items,
     Refs,
+    chain_seams,
     extents,
     find_refs,
     invert,
@@ -36,14 +41,15 @@ from tiler.engine.task_graph import (
     list_items,
     list_refs,
     order_stages,
+    own_refs,
     readers,
     reads_everything,
 )
 from tiler.store.store import Store
 from tiler.words.stage_groups import place_of_item
 
+SMALL_ONES = 8  # small tasks of a stage that are submitted together, at most
 Progress = Callable[[str, int, int, Record], None]
-Item = tuple[str, str]  # stage and name
 
 
 @runtime_checkable
@@ -65,7 +71,10 @@ class Watch(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Planned:
-    """A stage of this call: its items are the tasks ``first`` to ``first + len(items.names)``."""
+    """A stage of this call: its items are the tasks ``first`` to ``first + len(items.names)``.
+
+    ``named_by`` has the stages that it reads and the stage of this call that names what of them.
+    """
 
     stage: Stage
     items: Items
@@ -73,6 +82,7 @@ class _Planned:
     first: int
     digest: bytes
     parameters: Declared
+    named_by: dict[str, str]
 
     @cached_property
     def by_name(self) -> set[str]:
@@ -102,7 +112,7 @@ class Engine:
     executor : Executor
         Where tasks run, see `tiler.engine.executor`.
     window : int, optional
-        Largest number of tasks in flight; what the executor wants by default.
+        Largest number of submissions in flight; what the executor wants by default.
     folder : Path, optional
         Where the files are that results state as the fact ``"files"``; beside the store by default.
     progress : callable, optional
@@ -158,14 +168,15 @@ class Engine:
 
     @property
     def _window(self) -> int:
-        """Tasks in flight: more when workers come."""
+        """Submissions in flight: more when workers come."""
         return self._executor.window if self._given_window is None else self._given_window
 
     def run(self, *stages: Stage, items: Mapping[str, Collection[str]] | None = None) -> None:
         """Run stages whose reads are among them or were run before.
 
         A task is submitted when all that it reads is done; of those that may run, those of later stages go first,
-        then those of larger tiles and what these read, then in the order of names. Of what counts by its name
+        then those of larger tiles and what these read, then in the order of names. With it go those of its item
+        that wait for nothing but it and each other; of seams those of the same owner. Of what counts by its name
         alone it is taken for granted that it will be there; what was misled by that is run again in the end.
 
         Parameters
@@ -291,10 +302,17 @@ class Engine:
             here = (
                 self._all(self.layout, stage.scope) if wanted is None else list_items(stage, self.layout, wanted)
             )
-            refs = tuple(self._refs(stage, here, source, known) for source, _ in joined_reads(stage))
+            here_too = {other.name for other in order}
+            named_by = {read.stage: read.named_by for read in stage.reads if read.named_by in here_too}
+            refs = tuple(
+                list_refs(here, source, here, dict.fromkeys(here.names, ()))
+                if source in named_by
+                else self._refs(stage, here, source, known)
+                for source, _ in joined_reads(stage)
+            )
             values = declared_values(stage, self._parameters)
             digest = stage_digest(stage, values, self.layout)
-            plan.append(_Planned(stage, here, refs, first, digest, Declared(stage.name, values)))
+            plan.append(_Planned(stage, here, refs, first, digest, Declared(stage.name, values), named_by))
             known[stage.name] = (stage.scope, here)
             first += len(here.names)
         return plan
@@ -344,8 +362,9 @@ class Engine:
         everything = reads_everything(stage.scope, scope)
         (first, *_) = (read for read in stage.reads if read.stage == source)
         if first.own:
-            there = set(run.names if first.optional else here.names)
-            return list_refs(here, source, run, {name: (name,) if name in there else () for name in here.names})
+            if first.optional:
+                return own_refs(here, source, run)
+            return list_refs(here, source, run, {name: (name,) for name in here.names})
         if first.named_by:
             listed = {name: tuple(self._listed(first.named_by, name)) for name in here.names}
             return list_refs(here, source, run, listed)
@@ -360,7 +379,10 @@ class Engine:
 
 
 class _Run:
-    """One call of `Engine.run`: the heap of ready tasks, and what is in flight."""
+    """One call of `Engine.run`: the heap of ready tasks, and what is in flight.
+
+    A task is begun from its submission to its end; one that was not run, or failed and is tried again, is not.
+    """
 
     def __init__(self, engine: Engine, plan: list[_Planned]) -> None:
         self.engine, self.plan = engine, plan
@@ -372,6 +394,13 @@ class _Run:
             for refs in p.refs
             if refs.stage in place
         ]
+        for p in plan:
+            if p.stage.after in place:
+                other = place[p.stage.after]
+                links.append((p.first, own_refs(p.items, other.stage.name, other.items), other.first))
+            if p.stage.scope is Scope.SEAM:
+                chain = chain_seams(p.items, p.stage.name, engine.layout.owners)
+                links.append((p.first, chain, p.first))
         self.start, self.waiting = invert(links, n_tasks)
         self.rank = np.repeat(np.arange(len(plan)), [len(planned.items.names) for planned in plan])
         earlier = [engine._settled((p.stage.name, name)) for p in plan for name in p.items.names]
@@ -383,9 +412,10 @@ class _Run:
         self.order = self._order()
         self.ready = [(int(self.order[task]), task) for task in ready.tolist()]
         heapq.heapify(self.ready)
-        self.in_flight: set[int] = set()
+        self.in_flight: dict[int, list[int]] = {}  # tasks of a submission, by its first
+        self.begun = done
+        self.open: set[int] = set()  # of these, whose key a worker finds
         self.tried: Counter[int] = Counter()
-        self.tasks: dict[int, Task] = {}
         self.lost: defaultdict[str, set[str]] = defaultdict(set)  # names of what failed or was not run, by stage
         if engine._watch is not None:
             for planned in plan:
@@ -418,61 +448,131 @@ class _Run:
                 if self.engine._stop:
                     raise StoppedError("stopped as asked, all that was done is kept; the same command goes on")
                 while self.ready and len(self.in_flight) < self.engine._window:
-                    self._begin(heapq.heappop(self.ready)[1])
+                    self._begin(self._next())
                 if self.in_flight:
-                    ticket, outcome = executor.wait()
-                    self.in_flight.remove(ticket)
-                    self._end(ticket, outcome)
+                    ticket, outcomes = executor.wait()
+                    self._end(self.in_flight.pop(ticket), outcomes)
         except Exception:
             self._settle()
             raise
 
-    def _begin(self, ticket: int) -> None:
-        """Submit a task; what it reads counts by its content. The worker looks for an earlier result."""
-        engine, planned = self.engine, self.plan[self.rank[ticket]]
-        stage, item = planned.stage, ticket - planned.first
-        name = planned.items.names[item]
-        refs, lacking = self._find_reads(planned, item)
-        if lacking:
-            engine.blocked[stage.name, name] = lacking[0]
-            self._lose(ticket, name, f"not run: {' '.join(lacking[0])} is not there", lacking[0])
-            return
-        path, identity, frame = file_identity(engine.layout, stage.scope, name)
-        xmin, ymin, xmax, ymax = planned.items.boxes[item].tolist()
-        box = (xmin, ymin, xmax, ymax)
-        digest = engine.records.digest
-        found = (
-            (source, [(n, "" if source in planned.by_name and n != name else digest(source, n)) for n in names])
-            for source, names in refs.items()
-        )
-        held = {
-            source: [n for n in names if n == name or source not in planned.by_name]
-            for source, names in refs.items()
-        }
-        key = item_key(planned.digest, name, box, identity, found, engine._find_gaps(stage.scope, box, held))
-        parameters, context, store = planned.parameters, engine.context, engine.store
-        self.tasks[ticket] = Task(
-            stage.name, name, stage.scope, box, parameters, context, path, store, refs, key, engine._folder, frame
-        )
-        self._submit(ticket)
-        if engine._watch is not None:
-            engine._watch.submitted(stage.name, name)
+    def _next(self) -> list[int]:
+        """Take the next task that may run, and of small ones several, while enough are left for all workers."""
+        rank, ready = self.rank, self.ready
+        tickets = [heapq.heappop(ready)[1]]
+        if self.plan[rank[tickets[0]]].stage.small:
+            n = min(SMALL_ONES, len(ready) // (2 * self.engine._executor.workers))
+            while ready and len(tickets) < n and rank[ready[0][1]] == rank[tickets[0]]:
+                tickets.append(heapq.heappop(ready)[1])
+        return tickets
 
-    def _find_reads(self, planned: _Planned, item: int) -> tuple[dict[str, tuple[str, ...]], list[Item]]:
-        """Find what an item reads and is there, by stage, and what it cannot do without and is not there."""
-        engine, stage, name = self.engine, planned.stage, planned.items.names[item]
+    def _begin(self, ready: list[int]) -> None:
+        """Submit tasks and those that go with them, unless they lack something that they read."""
+        engine = self.engine
+        parts: dict[Item, Part] = {}
+        tickets: list[int] = []
+        left: dict[int, int] = {}  # how many others each task waits for
+        for ticket in ready:
+            refs, lacking = self._find_reads(ticket, {})
+            if lacking:
+                self.begun[ticket] = True
+                engine.blocked[self._item(ticket)] = lacking[0]
+                self._lose(ticket, f"not run: {' '.join(lacking[0])} is not there", lacking[0])
+            else:
+                parts[self._item(ticket)] = self._make_part(ticket, refs, {})
+                tickets.append(ticket)
+        for one in tickets:  # which grows
+            for other in self.waiting[self.start[one] : self.start[one + 1]].tolist():
+                if self.begun[other] or not self._are_together(one, other):
+                    continue
+                left[other] = left.get(other, int(self.n_missing[other])) - 1
+                if left[other] == 0:
+                    refs, lacking = self._find_reads(other, parts)
+                    if not lacking:
+                        part = parts[self._item(other)] = self._make_part(other, refs, parts)
+                        tickets.append(other)
+                        if part.key is not None:
+                            self.open.add(other)
+        if not tickets:
+            return
+        engine._executor.submit(tickets[0], list(parts.values()), int(self.order[tickets[0]]))
+        self.in_flight[tickets[0]] = tickets
+        self.begun[tickets] = True
+        if engine._watch is not None:
+            for item in parts:
+                engine._watch.submitted(*item)
+
+    def _item(self, ticket: int) -> Item:
+        planned = self.plan[self.rank[ticket]]
+        return planned.stage.name, planned.items.names[ticket - planned.first]
+
+    def _are_together(self, one: int, other: int) -> bool:
+        """Tell whether two tasks are of the same item, or of seams of the same owner."""
+        scope, owners = self.plan[self.rank[one]].stage.scope, self.engine.layout.owners
+        if self.plan[self.rank[other]].stage.scope is not scope:
+            return False
+        (_, a), (_, b) = self._item(one), self._item(other)
+        return a == b or (scope is Scope.SEAM and owners.get(a, a) == owners.get(b, b))
+
+    def _make_part(self, ticket: int, refs: dict[str, tuple[str, ...]], before: Collection[Item]) -> Part:
+        """Make a task; what it reads counts by its content. The worker looks for an earlier result.
+
+        Parameters
+        ----------
+        ticket : int
+            Number of the task.
+        refs : dict of str to tuple of str
+            What it reads, from `_find_reads`.
+        before : collection of (str, str)
+            Items before it in its submission, whose content is not known yet.
+        """
+        engine, planned = self.engine, self.plan[self.rank[ticket]]
+        scope, (stage, name) = planned.stage.scope, self._item(ticket)
+        path, identity, frame = file_identity(engine.layout, scope, name)
+        xmin, ymin, xmax, ymax = planned.items.boxes[ticket - planned.first].tolist()
+        box = (xmin, ymin, xmax, ymax)
+
+        def digest(source: str, n: str) -> str | None:
+            if source in planned.by_name and n != name:
+                return ""
+            return None if (source, n) in before else engine.records.digest(source, n)
+
+        digests = {source: {n: digest(source, n) for n in names} for source, names in refs.items()}
+        held = {source: [n for n, found in names.items() if found] for source, names in digests.items()}
+        gaps = engine._find_gaps(scope, box, held)
+        named_by = {source: by for source, by in planned.named_by.items() if (by, name) in before}
+        made = OpenKey(planned.digest, name, box, identity, digests, gaps, named_by)
+        key = None if made.awaited() else made.close({}, engine.store)[0]
+        task = Task(
+            *(stage, name, scope, box, planned.parameters, engine.context, path, engine.store, refs, key or ""),
+            *(engine._folder, frame),
+        )
+        return Part(planned.stage.function, task, made if key is None else None)
+
+    def _find_reads(self, ticket: int, before: Collection[Item]) -> tuple[dict[str, tuple[str, ...]], list[Item]]:
+        """Find what a task reads and is there, by stage, and what it cannot do without and is not there.
+
+        What comes before it in its submission is taken to be there.
+        """
+        engine, planned = self.engine, self.plan[self.rank[ticket]]
+        stage, (_, name) = planned.stage, self._item(ticket)
         needed = {read.stage for read in stage.reads if not read.optional}
         wanted = [(by, name) for read in stage.reads for by in (read.around, read.named_by) if by]
         refs = {}
         for r in planned.refs:
-            names = self._names(r, item)
+            if r.stage in planned.named_by:
+                names = tuple(sorted(set(engine._listed(planned.named_by[r.stage], name))))
+            else:
+                names = self._names(r, ticket - planned.first)
             ahead = {n for n in names if r.stage in planned.by_name and not engine._settled((r.stage, n))}
-            refs[r.stage] = tuple(n for n in names if n in ahead or (r.stage, n) in engine.records)
+            refs[r.stage] = tuple(
+                n for n in names if n in ahead or (r.stage, n) in engine.records or (r.stage, n) in before
+            )
             same = engine._items[r.stage][0] is stage.scope
             wanted += [
                 (r.stage, n) for n in names if n not in ahead and (r.stage in needed or (same and n == name))
             ]
-        return refs, [one for one in wanted if one not in engine.records]
+        return refs, [one for one in wanted if one not in engine.records and one not in before]
 
     def find_misled(self) -> dict[str, set[str]]:
         """Find the items that were run as if something were there that failed later, by stage.
@@ -494,55 +594,80 @@ class _Run:
                 misled[planned.stage.name] = {planned.items.names[k] for k in np.flatnonzero(hit).tolist()}
         return misled
 
-    def _submit(self, ticket: int) -> None:
-        function = self.plan[self.rank[ticket]].stage.function
-        self.engine._executor.submit(ticket, function, self.tasks[ticket], int(self.order[ticket]))
-        self.in_flight.add(ticket)
-
     def _names(self, refs: Refs, item: int) -> tuple[str, ...]:
         names = self.engine._items[refs.stage][1].names
         return tuple(names[k] for k in refs.of(item).tolist())
 
-    def _end(self, ticket: int, outcome: Record | Failure) -> None:
-        """Keep what came of a task."""
+    def _end(self, tickets: list[int], outcomes: list[Outcome | None]) -> None:
+        """Keep what came of a submission; what of it was not run is submitted again when it may run."""
+        for ticket, outcome in zip(tickets, outcomes, strict=True):
+            open_key = ticket in self.open
+            self.open.discard(ticket)
+            match outcome:
+                case Record():
+                    if open_key and not self._is_key(ticket, outcome):
+                        self._put_back(ticket)
+                    else:
+                        self._keep(ticket, outcome)
+                case Failure():
+                    self._fail(ticket, outcome)
+                case Later():
+                    self._leave(ticket)
+                case None:
+                    self._put_back(ticket)
+
+    def _is_key(self, ticket: int, record: Record) -> bool:
+        """Whether a record has the key that follows now that all before it in its submission is known.
+
+        It has not where that reaches farther than its item, and an absent tile is near there.
+        """
+        refs, lacking = self._find_reads(ticket, {})
+        return not lacking and self._make_part(ticket, refs, {}).task.key == record.key
+
+    def _keep(self, ticket: int, record: Record) -> None:
+        """Keep the record of a task."""
         rank = int(self.rank[ticket])
         planned = self.plan[rank]
-        if isinstance(outcome, Failure):
-            self._fail(ticket, outcome)
-            return
-        self.engine.records.add(outcome)
+        self.engine.records.add(record)
         self.n_done[rank] += 1
         if self.engine._progress is not None:
-            self.engine._progress(planned.stage.name, self.n_done[rank], len(planned.items.names), outcome)
+            self.engine._progress(planned.stage.name, self.n_done[rank], len(planned.items.names), record)
         self._settle_one(ticket)
+
+    def _put_back(self, ticket: int) -> None:
+        """Let a task begin once more."""
+        self.begun[ticket] = False
+        if self.n_missing[ticket] == 0:
+            heapq.heappush(self.ready, (int(self.order[ticket]), ticket))
+
+    def _leave(self, ticket: int) -> None:
+        """Leave an item to a later call; ValueError if something waits for it."""
+        stage, name = self._item(ticket)
+        if self.start[ticket] < self.start[ticket + 1]:
+            raise ValueError(f"stage {stage}, {name}: is left to a later call, and a stage of this one reads it")
 
     def _fail(self, ticket: int, failure: Failure) -> None:
         """Try again, set aside, or end the run."""
-        engine, stage, task = self.engine, self.plan[self.rank[ticket]].stage, self.tasks[ticket]
+        engine, stage, (_, name) = self.engine, self.plan[self.rank[ticket]].stage, self._item(ticket)
         self.tried[ticket] += 1
         if self.tried[ticket] < tries(failure, engine._policy):
-            self._submit(ticket)
+            self._put_back(ticket)
             return
+        reason = describe_reason(failure.error)
         if ends_the_run(failure, stage.scope, engine._policy):
             if engine._watch is not None:
-                engine._watch.failed(stage.name, task.name, describe_reason(failure.error))
-            raise _named(failure.error, stage, task.name)
-        engine.set_aside[stage.name, task.name] = SetAside(
-            stage.name,
-            task.name,
-            stage.scope,
-            failure.kind,
-            describe_reason(failure.error),
-            failure.trace,
-            self.tried[ticket],
-            task.refs,
-            task.file,
+                engine._watch.failed(stage.name, name, reason)
+            raise _named(failure.error, stage, name)
+        refs, _ = self._find_reads(ticket, {})
+        path, _, _ = file_identity(engine.layout, stage.scope, name)
+        engine.set_aside[stage.name, name] = SetAside(
+            stage.name, name, stage.scope, failure.kind, reason, failure.trace, self.tried[ticket], refs, path
         )
-        self._lose(ticket, task.name, describe_reason(failure.error))
+        self._lose(ticket, reason)
 
-    def _lose(self, ticket: int, name: str, reason: str, needs: Item | None = None) -> None:
+    def _lose(self, ticket: int, reason: str, needs: Item | None = None) -> None:
         """Go on without an item."""
-        stage = self.plan[self.rank[ticket]].stage.name
+        stage, name = self._item(ticket)
         self.lost[stage].add(name)
         if self.engine._watch is not None:
             self.engine._watch.failed(stage, name, reason, needs)
@@ -550,18 +675,18 @@ class _Run:
 
     def _settle_one(self, ticket: int) -> None:
         """Make ready what waited for this item and for nothing else."""
-        self.tasks.pop(ticket, None)
         for task in self.waiting[self.start[ticket] : self.start[ticket + 1]].tolist():
             self.n_missing[task] -= 1
-            if self.n_missing[task] == 0:
+            if self.n_missing[task] == 0 and not self.begun[task]:
                 heapq.heappush(self.ready, (int(self.order[task]), task))
 
     def _settle(self) -> None:
         """After an error: give up what has not begun, wait for the rest, and keep no record of either."""
-        self.in_flight -= self.engine._executor.drop_waiting()
+        for ticket in self.engine._executor.drop_waiting():
+            self.in_flight.pop(ticket, None)
         while self.in_flight:
             ticket, _ = self.engine._executor.wait()
-            self.in_flight.discard(ticket)
+            self.in_flight.pop(ticket, None)
 
 
 def _contents(planned: _Planned, refs: Refs, source: Items) -> Refs:

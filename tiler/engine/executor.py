@@ -1,17 +1,15 @@
 """The interface of executors, and the one that runs tasks in this process; see `tiler.executors.dask_executor`."""
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
-from tiler.engine.stage import Facts
-from tiler.engine.task import Failure, Record, Task, run_task
+from tiler.engine.submission import Function, Outcome, Part, run_parts
+from tiler.engine.task import Failure, Task, run_task
 from tiler.engine.task_limits import Limits, describe_memory
 
-Function = Callable[[Task], Facts]
-Outcome = Record | Failure
-TASKS_PER_WORKER, LEAST_TASKS = 8, 8  # submitted and not done
+PER_WORKER, LEAST = 8, 8  # submissions that are not done
 
 
 class Executor(Protocol):
@@ -21,13 +19,19 @@ class Executor(Protocol):
 
     @property
     def window(self) -> int:
-        """Number of tasks that should be submitted and not done; more when workers come."""
+        """Number of submissions that should be made and not done; more when workers come."""
 
-    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
-        """Take a task; of those that wait, an executor may let the one of the lowest rank begin first."""
+    def submit(self, ticket: int, parts: Sequence[Part], rank: int = 0) -> None:
+        """Take tasks that one worker runs one after the other.
 
-    def wait(self) -> tuple[int, Outcome]:
-        """Wait until any task is done; returns its ticket and its record or failure."""
+        Of the submissions that wait, an executor may let the one of the lowest rank begin first.
+        """
+
+    def wait(self) -> tuple[int, list[Outcome | None]]:
+        """Wait until any submission is done.
+
+        Returns its ticket, and for each of its tasks the record, the failure, or None if it was not begun.
+        """
 
     def drop_waiting(self) -> set[int]:
         """Give up what is not done, and wait for what runs; returns the tickets of all that was given up."""
@@ -37,28 +41,32 @@ class Serial:
     """One task after the other in this process; no limits, and a crash ends all."""
 
     workers = 1
-    window = LEAST_TASKS
+    window = LEAST
 
     def __init__(self) -> None:
-        self._queue: deque[tuple[int, Function, Task]] = deque()
+        self._queue: deque[tuple[int, Sequence[Part]]] = deque()
 
-    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
-        """Take a task; they run in the order of submission."""
-        self._queue.append((ticket, function, task))
+    def submit(self, ticket: int, parts: Sequence[Part], rank: int = 0) -> None:
+        """Take tasks; they run in the order of submission."""
+        self._queue.append((ticket, parts))
 
-    def wait(self) -> tuple[int, Outcome]:
-        """Run the oldest task."""
-        ticket, function, task = self._queue.popleft()
-        outcome = run_task(function, task)
-        if isinstance(outcome, Failure) and outcome.kind == "memory":
-            outcome = describe_memory(outcome, Limits())
-        return ticket, outcome
+    def wait(self) -> tuple[int, list[Outcome | None]]:
+        """Run the oldest submission."""
+        ticket, parts = self._queue.popleft()
+        return ticket, run_parts(parts, _run)
 
     def drop_waiting(self) -> set[int]:
         """Forget all."""
-        dropped = {ticket for ticket, _, _ in self._queue}
+        dropped = {ticket for ticket, _ in self._queue}
         self._queue.clear()
         return dropped
+
+
+def _run(function: Function, task: Task) -> Outcome:
+    outcome = run_task(function, task)
+    if isinstance(outcome, Failure) and outcome.kind == "memory":
+        return describe_memory(outcome, Limits())
+    return outcome
 
 
 @contextmanager

@@ -5,7 +5,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from enum import Enum
-from functools import cache
+from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import PurePath
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 
 from tiler.engine.stage import Box, Layout, Scope, Stage
 from tiler.georeference.frame import AS_IT_IS, Frame
+from tiler.store.store import Store
 
 # What computes results: a change of one of their versions redoes everything.
 CODE = (
@@ -97,6 +98,57 @@ def item_key(
     return _hash(shared + json.dumps(parts).encode()).hex()
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class OpenKey:
+    """What the key of a result is made of; what a submission makes before it is left open.
+
+    Attributes
+    ----------
+    shared, name, box, identity, gaps
+        As for `item_key`.
+    refs : dict of str to dict of str to str or None
+        For each stage that is read, in a fixed order, the digest of each result by name; None where the same
+        submission makes it.
+    named_by : dict of str to str
+        Of stages that are read, the stage whose result for the same item names what is read, where the same
+        submission makes that.
+    """
+
+    shared: bytes
+    name: str
+    box: Box
+    identity: str
+    refs: dict[str, dict[str, str | None]]
+    gaps: list[Box]
+    named_by: dict[str, str]
+
+    def awaited(self) -> list[tuple[str, str]]:
+        """List the results that are left open, by stage and name."""
+        open_refs = [
+            (stage, name) for stage, items in self.refs.items() for name, digest in items.items() if digest is None
+        ]
+        return open_refs + [(stage, self.name) for stage in self.named_by.values()]
+
+    def close(self, done: Mapping[tuple[str, str], Any], store: Store) -> tuple[str, dict[str, tuple[str, ...]]]:
+        """Give the key, and the names of what is read by stage.
+
+        Parameters
+        ----------
+        done : mapping of (str, str) to Record
+            Records of all that is awaited.
+        store : Store
+            Has the results that one of these names.
+        """
+        refs: dict[str, list[tuple[str, str]]] = {}
+        for stage, items in self.refs.items():
+            refs[stage] = [(n, done[stage, n].digest if digest is None else digest) for n, digest in items.items()]
+            if stage in self.named_by:
+                names = sorted(set(done[self.named_by[stage], self.name].facts["names"]))
+                refs[stage] = [(name, store.describe(stage, name)[1]) for name in names]
+        key = item_key(self.shared, self.name, self.box, self.identity, refs.items(), self.gaps)
+        return key, {stage: tuple(name for name, _ in items) for stage, items in refs.items()}
+
+
 def declared_values(stage: Stage, parameters: Any) -> dict[str, Any]:
     """Take the declared parameters of a stage; ValueError if one is not there."""
     missing = [name for name in stage.parameters if not hasattr(parameters, name)]
@@ -131,8 +183,9 @@ def version_of(name: str) -> str:
         return "unknown"
 
 
-def _hex(box: Box) -> list[str]:
-    return [float(v).hex() for v in box]
+@lru_cache(maxsize=2**16)  # those of absent tiles come again and again
+def _hex(box: Box) -> tuple[str, ...]:
+    return tuple(float(v).hex() for v in box)
 
 
 def _hash(data: bytes) -> bytes:

@@ -93,14 +93,24 @@ def pack_tiles(grid: TileGrid) -> bytes:
 def make_layout(grid: TileGrid, files: dict[str, FileItem], *, identity: str) -> Layout:
     """List the items of a run: files, tiles, and seams with the box of their nominal line."""
     tiles = np.argwhere(tiles_present(grid))
+    own = _named_boxes(grid, "", tiles, tiles + 1)
+    names = {name: name for name in own}
     seams: dict[str, Box] = {}
+    owners: dict[str, str] = {}
     for axis, there in enumerate(seams_present(grid)):
         at = np.argwhere(there)
-        seams |= _named_boxes(grid, AXES[axis], at, at + np.eye(2, dtype=np.int64)[axis])
+        along = np.eye(2, dtype=np.int64)[axis]
+        here = _named_boxes(grid, AXES[axis], at, at + along)
+        # A tile owns its southern and its western seam, and one towards no tile.
+        before = (at - along[::-1] + grid.first).tolist()
+        for name, (i, j) in zip(here, before, strict=True):
+            owners[name] = names.get(name[1:]) or names[f"{i}_{j}"]
+        seams |= here
     return Layout(
         files=files,
-        tiles=_named_boxes(grid, "", tiles, tiles + 1),
+        tiles=own,
         seams=seams,
+        owners=owners,
         bounds=grid.bounds,
         identity=identity,
         absent=tuple(tile_box(grid, key) for key in absent_tiles(grid)),

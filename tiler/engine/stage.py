@@ -88,21 +88,29 @@ class Stage:
     scope : Scope
         What it is computed for.
     function : callable
-        Top-level function of a `Task`; it gives back facts: a small dict of plain JSON values.
+        Top-level function of a `Task`; it gives back facts: a small dict of plain JSON values. Where it gives back
+        None, nothing of the item is kept, and a later call must run it.
     reads : tuple of Read
         The stages whose results it may read.
     parameters : tuple of str
         The attributes of the run's parameters that it may use; a change of another one does not touch its results.
     version : int
         Raise it when the function computes something else.
+    after : str
+        A stage of the same scope: where it is run in the same call, an item is not begun before that stage's item
+        of its name, and then in one submission with it. It reads nothing of it by that.
+    small : bool
+        An item takes some milliseconds: where many may run, several are submitted together.
     """
 
     name: str
     scope: Scope
-    function: "Callable[[Task], Facts]"
+    function: "Callable[[Task], Facts | None]"
     reads: tuple[Read, ...] = ()
     parameters: tuple[str, ...] = ()
     version: int = 1
+    after: str = ""
+    small: bool = False
 
 
 @dataclass(frozen=True)
@@ -145,6 +153,8 @@ class Layout:
         Boxes within the region that no tile covers (m); part of the keys of tiles and seams near them.
     near : float
         How far from its extent a tile or seam may look whether there is a tile (m).
+    owners : mapping of str to str
+        The tile that owns each seam: the seams of one are submitted together. One without an owner goes alone.
 
     Raises
     ------
@@ -159,6 +169,7 @@ class Layout:
     identity: str = ""
     absent: tuple[Box, ...] = ()
     near: float = 0.0
+    owners: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for scope in Scope:

@@ -71,6 +71,8 @@ class Record:
         True if an earlier result with the same key was taken.
     damage : str
         What was wrong with an earlier result that was there and computed again for that; else empty.
+    ago : float
+        How long the submission went on with its other tasks (s), before this record was given back.
     """
 
     stage: str
@@ -83,6 +85,7 @@ class Record:
     peak_memory: int = 0
     reused: bool = False
     damage: str = ""
+    ago: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +105,11 @@ class Failure:
     error: Exception
     trace: str = ""
     kind: str = "error"
+
+
+@dataclass(frozen=True)
+class Later:
+    """A function gave nothing back: its item is left to a later call of the engine."""
 
 
 @dataclass(eq=False)
@@ -246,7 +254,7 @@ class Task:
         return self._writer
 
 
-def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
+def run_task(function: Callable[[Task], Facts | None], task: Task) -> Record | Failure | Later:
     """Take an earlier result of a task, or run its stage's function and commit what comes of it.
 
     An earlier result is taken if it has the task's key, and every byte of it and of the files that it states is as
@@ -261,14 +269,17 @@ def run_task(function: Callable[[Task], Facts], task: Task) -> Record | Failure:
             return earlier
         _drop_stale(task)
         with task.store.writer(task.stage, task.name) as task._writer:
-            facts = _plain_facts(task, function(task))
+            found = function(task)
+            if found is None:
+                return Later()
+            facts = _plain_facts(task, found)
             notes = [_note_to_json(note) for note in task._notes]
             digest = task._writer.commit({"key": task.key, "facts": facts, "notes": notes}, apart=APART)
     except CityError as error:
-        return Failure(error, _trace(error))
+        return Failure(error, describe_trace(error))
     except Exception as error:
         kind = "memory" if isinstance(error, MemoryError) else "error"
-        return Failure(_portable(error), _trace(error), kind)
+        return Failure(_portable(error), describe_trace(error), kind)
     finally:
         task._writer = None
     seconds = {step: round(value, 4) for step, value in task._seconds.items()}
@@ -361,13 +372,14 @@ def _note_from_json(values: list[Any]) -> Note:
     return Note(kind, subject, nan if x is None else x, nan if y is None else y, detail)
 
 
-def _trace(error: Exception) -> str:
+def describe_trace(error: Exception) -> str:
+    """Say where in the code an error arose."""
     return "".join(traceback.format_exception(error))
 
 
 def _portable(error: Exception) -> Exception:
     """Make an error survive the way back, with the traceback as a note."""
-    text = _trace(error)
+    text = describe_trace(error)
     try:
         error.add_note(f"where it arose:\n{text}")
         pickle.loads(pickle.dumps(error))

@@ -56,8 +56,8 @@ def order_stages(stages: Sequence[Stage], earlier: Collection[str]) -> list[Stag
     Raises
     ------
     ValueError
-        If a name comes twice, a stage is unknown, the reads form a cycle, or an extent is read of a stage of the
-        same call.
+        If a name comes twice, a stage is unknown, the reads form a cycle, an extent is read of a stage of the
+        same call, or the stage that one goes after has another scope.
     """
     names = [stage.name for stage in stages]
     if len(set(names)) < len(names):
@@ -68,22 +68,33 @@ def order_stages(stages: Sequence[Stage], earlier: Collection[str]) -> list[Stag
                 raise ValueError(
                     f"stage {stage.name} reads stage {read.stage}, which was not run and is not given"
                 )
-            early = [read.stage] * read.by_extent + [name for name in (read.around, read.named_by) if name]
-            for name in early:
+            for name in _known_before(stage, read, names):
                 if name in names or name not in earlier:
                     raise ValueError(
-                        f"stage {stage.name} reads {read.stage} by facts of {name}: run {name} in an earlier call"
+                        f"stage {stage.name} reads {read.stage} by facts of others: run {name} in an earlier call"
                     )
+    scope = {stage.name: stage.scope for stage in stages}
+    for stage in stages:
+        if scope.get(stage.after, stage.scope) is not stage.scope:
+            raise ValueError(f"stage {stage.name} goes after {stage.after}, which has another scope")
     done: list[Stage] = []
     left = list(stages)
     while left:
         waiting = {stage.name for stage in left}
-        ready = [s for s in left if not any(read.stage in waiting for read in s.reads)]
+        ready = [s for s in left if waiting.isdisjoint([s.after, *(read.stage for read in s.reads)])]
         if not ready:
             raise ValueError(f"stages read each other in a cycle: {', '.join(sorted(waiting))}")
         done.append(ready[0])
         left.remove(ready[0])
     return done
+
+
+def _known_before(stage: Stage, read: Read, names: Collection[str]) -> list[str]:
+    """List the stages that must have run in an earlier call, as their facts decide what is read."""
+    found = [read.stage] * read.by_extent + [read.around] * bool(read.around)
+    if read.named_by in names and any(r.stage == read.named_by and r.own and not r.optional for r in stage.reads):
+        return [*found, read.stage]  # named when the reader begins
+    return found + [read.named_by] * bool(read.named_by)
 
 
 def list_items(stage: Stage, layout: Layout, only: Collection[str] | None) -> Items:
@@ -143,6 +154,23 @@ def list_refs(items: Items, source: str, reach: Items, listed: Mapping[str, Sequ
         raise ValueError(f"stage {source} has no item {', '.join(unknown)}")
     pairs = [(row, place[name]) for row, item in enumerate(items.names) for name in listed[item]]
     return _make_refs(source, np.array(pairs, np.int64).reshape(-1, 2).T, len(items.names), len(reach.names))
+
+
+def own_refs(items: Items, source: str, reach: Items) -> Refs:
+    """Make the refs of items that read, or go after, what has their own name among `reach`."""
+    there = set(reach.names)
+    return list_refs(items, source, reach, {name: (name,) if name in there else () for name in items.names})
+
+
+def chain_seams(items: Items, source: str, owners: Mapping[str, str]) -> Refs:
+    """Make the refs of seams that go after the one before of the same owner."""
+    last: dict[str, str] = {}
+    listed: dict[str, Sequence[str]] = {}
+    for name in items.names:
+        owner = owners.get(name, name)
+        listed[name] = (last[owner],) if owner in last else ()
+        last[owner] = name
+    return list_refs(items, source, items, listed)
 
 
 def _make_refs(source: str, pairs: NDArray[np.int64], n_items: int, n_source: int) -> Refs:

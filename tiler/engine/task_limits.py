@@ -8,7 +8,7 @@ limit; the file goes when the task ends. What is found in it afterwards says whi
 import faulthandler
 import os
 import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +16,8 @@ from typing import TextIO
 
 from pipeline.data.errors import CityError, OutputError
 from tiler.config.config import Config
-from tiler.engine.stage import Facts
-from tiler.engine.task import Failure, Record, Task, run_task
+from tiler.engine.submission import Function, Outcome
+from tiler.engine.task import Failure, Task, run_task
 from tiler.objects.places import local_folder
 from tiler.store.out_folder import TASKS
 
@@ -61,7 +61,7 @@ def trace_file(task: Task) -> Path:
     return local_folder(task.store.path.parent) / TASKS / f"{task.stage}.{task.name}.txt"
 
 
-def run_guarded(function: Callable[[Task], Facts], task: Task, seconds: float) -> Record | Failure:
+def run_guarded(function: Function, task: Task, seconds: float) -> Outcome:
     """Run a task so that a crash leaves a traceback, and end the process at the time limit.
 
     Notes

@@ -1,15 +1,19 @@
 """Tasks on the workers of a Dask scheduler, on this machine or anywhere."""
 
+import asyncio
 import time
 import uuid
 from collections import Counter, deque
+from collections.abc import Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from itertools import count
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
 from pipeline.data.errors import CityError
-from tiler.engine.executor import LEAST_TASKS, TASKS_PER_WORKER, Function, Outcome
+from tiler.engine.executor import LEAST, PER_WORKER
+from tiler.engine.submission import Outcome, Part, run_parts
 from tiler.engine.task import Failure, Task
 from tiler.engine.task_limits import Limits, WorkerError, describe_death, describe_memory, run_guarded
 from tiler.executors.worker_requirements import (
@@ -21,7 +25,7 @@ from tiler.executors.worker_requirements import (
     find_mismatch,
 )
 
-BYSTANDER = 20  # how often a task may be lost with a worker that died before it began, before it is an error
+BYSTANDER = 20  # how often tasks may be lost with a worker that died before they began, before it is an error
 LOOK = 5.0  # s without a result, after which the scheduler is asked whether it has workers
 NO_WORKERS = 300.0  # s without any worker, after which a run ends; a busy machine starts them slowly
 
@@ -31,11 +35,10 @@ class ClusterError(CityError):
 
 
 class _Given(NamedTuple):
-    """A task as the engine submitted it."""
+    """Tasks as the engine submitted them."""
 
     ticket: int
-    function: Function
-    task: Task
+    parts: Sequence[Part]
     rank: int
 
 
@@ -58,8 +61,12 @@ class DaskExecutor:
 
     Notes
     -----
-    Where a worker dies, Dask blames all tasks that it had. Here a task is blamed if it had begun, which its trace
-    file tells (`tiler.engine.task_limits`); the others are sent again.
+    Where a worker dies, Dask blames all that it had. Here a task is blamed if it had begun, which its trace
+    file tells (`tiler.engine.task_limits`); the others are sent again, and so are those before it in its
+    submission, whose results are found in the store.
+
+    What a submission comes to is told by an event of Dask, in the stream of messages that says that it is done: to
+    fetch the result of a future takes a connection and four messages each.
     """
 
     def __init__(
@@ -73,26 +80,31 @@ class DaskExecutor:
     ) -> None:
         self.workers, self.scheduler = workers, scheduler
         self._client, self._limits, self._requirements = client, limits or Limits(), requirements
-        self._round = uuid.uuid4().hex  # of tasks that are dropped together
+        self._round = uuid.uuid4().hex  # of submissions that are dropped together
+        self._number = count()
         self._waiting: list[_Given] = []
         self._sent: dict[str, tuple[Any, _Given]] = {}  # future and task by key
-        self._ready: SimpleQueue[tuple[str, Any]] = SimpleQueue()  # key, and the result or the error
-        self._done: deque[tuple[int, Outcome]] = deque()
+        self._over: list[Any] = []  # futures of what is done
+        self._told: dict[str, bytes] = {}  # what workers say that submissions came to, by key
+        self._ready: SimpleQueue[tuple[str, BaseException | None]] = SimpleQueue()  # key, and the error
+        self._done: deque[tuple[int, list[Outcome | None]]] = deque()
         self._losses: Counter[int] = Counter()  # by ticket
         self._lost = False
+        self._topic = f"citystitch-{self._round}"
+        client.subscribe_topic(self._topic, self._hear)
 
     @property
     def window(self) -> int:
         """Some for each worker."""
-        return max(TASKS_PER_WORKER * self.workers, LEAST_TASKS)
+        return max(PER_WORKER * self.workers, LEAST)
 
-    def submit(self, ticket: int, function: Function, task: Task, rank: int = 0) -> None:
-        """Take a task, the lower its rank the sooner it begins; ClusterError if the scheduler is lost."""
+    def submit(self, ticket: int, parts: Sequence[Part], rank: int = 0) -> None:
+        """Take tasks, the lower their rank the sooner they begin; ClusterError if the scheduler is lost."""
         self._check_scheduler()
-        self._waiting.append(_Given(ticket, function, task, rank))
+        self._waiting.append(_Given(ticket, parts, rank))
 
-    def wait(self) -> tuple[int, Outcome]:
-        """Wait until any task is done.
+    def wait(self) -> tuple[int, list[Outcome | None]]:
+        """Wait until any submission is done.
 
         Raises
         ------
@@ -102,6 +114,9 @@ class DaskExecutor:
         while not self._done:
             self._send()
             self._take(*self._next())
+            # What else is there comes too, so that what follows from it is sent in one call.
+            while not self._ready.empty():
+                self._take(*self._next())
         return self._done.popleft()
 
     def drop_waiting(self) -> set[int]:
@@ -115,16 +130,16 @@ class DaskExecutor:
             self._check_scheduler()
             self._client.run(refuse_round, self._round, on_error="ignore")
             while self._sent:
-                key, found = self._next()
-                future, given = self._sent.pop(key)
+                key, error = self._next()
+                _, given = self._sent.pop(key)
                 dropped.add(given.ticket)
-                self._outcome(found, given)
-                future.release()
+                self._outcomes(key, error, given)
         except (OSError, RuntimeError, CancelledError, ClusterError):
             if not self._is_lost():
                 raise
             dropped |= {given.ticket for _, given in self._sent.values()}
             self._sent.clear()
+        self._told.clear()
         self._round = uuid.uuid4().hex
         return dropped
 
@@ -133,47 +148,58 @@ class DaskExecutor:
         from dask import annotate
         from distributed.protocol.pickle import dumps
 
+        self._over.clear()  # all at once: Dask would send a message for each
         if not self._waiting:
             return
         batch, self._waiting = self._waiting, []
-        keys = [f"{given.task.stage}-{uuid.uuid4().hex}" for given in batch]  # a second try has another one
+        # Dask shows the stages; a second try has another key.
+        keys = [
+            f"{'+'.join(part.task.stage for part in given.parts)}-{self._round}{next(self._number)}"
+            for given in batch
+        ]
         priority = {key: -given.rank for key, given in zip(keys, batch, strict=True)}
         try:
-            packed = [dumps((given.function, given.task)) for given in batch]
+            packed = [dumps(given.parts) for given in batch]
         except Exception:  # a function that cannot be sent
             self._waiting = batch
             raise
         with annotate(priority=priority.get):
             futures = self._client.map(
-                run_packed,
+                run_and_tell,
                 packed,
+                keys,
                 key=keys,
                 pure=False,
                 retries=0,
+                topic=self._topic,
                 seconds=self._limits.seconds,
                 in_round=self._round,
                 requirements=self._requirements,
             )
-        for future, given in zip(futures, batch, strict=True):
-            self._sent[future.key] = future, given
-            self._client.loop.add_callback(self._follow, future)
+        self._sent.update((key, (future, given)) for key, future, given in zip(keys, futures, batch, strict=True))
+        self._client.loop.add_callback(self._follow, futures)
 
-    async def _follow(self, future: Any) -> None:
-        """Put the result of a task, or its error, into the queue when it is there."""
-        try:
-            found = await future
-        except Exception as error:
-            found = error
-        self._ready.put((future.key, found))
+    def _hear(self, event: tuple[float, tuple[str, bytes]]) -> None:
+        """Take what a worker says that a submission came to."""
+        key, packed = event[1]
+        self._told[key] = packed
 
-    def _next(self) -> tuple[str, Any]:
-        """Wait for the next result; Dask itself would wait for ever where there are no workers."""
+    async def _follow(self, futures: Sequence[Any]) -> None:
+        """Put what submissions came to, or the error of one, into the queue when they are done."""
+        await asyncio.gather(*map(self._follow_one, futures))
+
+    async def _follow_one(self, future: Any) -> None:
+        error = await future.exception()
+        self._ready.put((future.key, CancelledError() if future.cancelled() else error))
+
+    def _next(self) -> tuple[str, BaseException | None]:
+        """Wait for the next that is done, and its error; Dask would wait for ever where there are no workers."""
         began = time.monotonic()
         while True:
             with suppress(Empty):
-                key, found = self._ready.get(timeout=LOOK)
+                key, error = self._ready.get(timeout=LOOK)
                 if key in self._sent:
-                    return key, found
+                    return key, error
                 continue
             self._check_scheduler()
             now = time.monotonic()
@@ -185,43 +211,58 @@ class DaskExecutor:
                     "start some, the same command goes on where it ended"
                 )
 
-    def _take(self, key: str, found: Any) -> None:
-        """Take the result of a task; what had not begun when its worker died is sent again."""
-        future, given = self._sent[key]
-        outcome = self._outcome(found, given)
-        del self._sent[key]
-        future.release()
-        if outcome is None:
+    def _take(self, key: str, error: BaseException | None) -> None:
+        """Take what came of a submission; one that had not begun when its worker died is sent again."""
+        future, given = self._sent.pop(key)
+        outcomes = self._outcomes(key, error, given)
+        self._over.append(future)
+        if outcomes is None:
             self._losses[given.ticket] += 1
             self._waiting.append(given)
         else:
             self._losses.pop(given.ticket, None)
-            self._done.append((given.ticket, outcome))
+            self._done.append((given.ticket, outcomes))
 
-    def _outcome(self, found: Any, given: _Given) -> Outcome | None:
-        """Record or failure of a task; None if it must be sent again."""
+    def _outcomes(self, key: str, error: BaseException | None, given: _Given) -> list[Outcome | None] | None:
+        """Records and failures of a submission; None if it must be sent again."""
         from distributed import KilledWorker
+        from distributed.protocol.pickle import loads
 
-        match found:
-            case Failure(kind="memory"):
-                return describe_memory(found, self._limits)
-            case Mismatch():
-                return Failure(found.as_error(self._address))
+        packed = self._told.pop(key, None)
+        if packed is None and error is None:
+            raise ClusterError(f"a worker of the Dask cluster has not told what became of {key}; run again")
+        match error if packed is None else loads(packed):
+            case list() as found:
+                return [
+                    describe_memory(one, self._limits)
+                    if isinstance(one, Failure) and one.kind == "memory"
+                    else one
+                    for one in found
+                ]
+            case Failure() as found:
+                return _of_one(found, given)
+            case Mismatch() as found:
+                return _of_one(Failure(found.as_error(self._address)), given)
             case KilledWorker():
-                death = describe_death(given.task, self._limits)
-                if death is not None and self._forgives(given.task, death):
-                    return None
-                return death or self._bystander(given.ticket)
+                return self._find_dead(given)
             case CancelledError():  # of a lost scheduler alone
                 self._lost = True
                 self._check_scheduler()
-            case Exception():  # of Dask itself: a module that a worker lacks
-                return Failure(self._find_mismatch() or found)
-        outcome: Outcome | None = found
-        return outcome
+            case Exception() as found:  # of Dask itself: a module that a worker lacks
+                return _of_one(Failure(self._find_mismatch() or found), given)
+        return None  # dropped
+
+    def _find_dead(self, given: _Given) -> list[Outcome | None] | None:
+        """Find by its files which task a worker died of; None if the submission must be sent again."""
+        for k, part in enumerate(given.parts):
+            death = describe_death(part.task, self._limits)
+            if death is not None:
+                return None if self._forgives(part.task, death) else _of_one(death, given, k)
+        failure = self._bystander(given.ticket)
+        return None if failure is None else _of_one(failure, given)
 
     def _bystander(self, ticket: int) -> Failure | None:
-        """Failure of a task that had not begun in a worker that died; None if it must be sent again."""
+        """Failure of what had not begun in a worker that died; None if it must be sent again."""
         if mismatch := self._find_mismatch():
             return Failure(mismatch)
         if self._losses[ticket] < BYSTANDER:
@@ -269,6 +310,11 @@ class DaskExecutor:
         return str(self._client.scheduler.address)
 
 
+def _of_one(failure: Failure, given: _Given, k: int = 0) -> list[Outcome | None]:
+    """The outcomes of a submission of which one task failed, and nothing is known of the others."""
+    return [failure if k == number else None for number in range(len(given.parts))]
+
+
 _REFUSED = set[str]()  # rounds, in a worker
 
 
@@ -277,10 +323,18 @@ def refuse_round(dropped: str) -> None:
     _REFUSED.add(dropped)
 
 
+def run_and_tell(packed: bytes, key: str, *, topic: str, **given: Any) -> None:
+    """In a worker: run tasks by `run_packed`, and tell what they come to."""
+    from distributed import get_worker
+    from distributed.protocol.pickle import dumps
+
+    get_worker().log_event(topic, (key, dumps(run_packed(packed, **given))))
+
+
 def run_packed(
     packed: bytes, *, seconds: float, in_round: str, requirements: Requirements | None
-) -> Outcome | Mismatch | None:
-    """In a worker: run a task as it was sent; an error of reading it is its failure, None if it was dropped."""
+) -> list[Outcome | None] | Failure | Mismatch | None:
+    """In a worker: run tasks as they were sent; what cannot be read is a failure, None if they were dropped."""
     from distributed.protocol.pickle import loads
 
     if in_round in _REFUSED:
@@ -288,7 +342,9 @@ def run_packed(
     if requirements is not None and (mismatch := find_mismatch(requirements)):
         return mismatch
     try:
-        function, task = loads(packed)
+        parts = loads(packed)
     except Exception as error:
         return Failure(RuntimeError(f"cannot be read by a worker: {type(error).__name__}: {error}"))
-    return run_guarded(function, task, seconds)
+    return run_parts(
+        parts, lambda function, task: run_guarded(function, task, seconds), lambda: in_round not in _REFUSED
+    )

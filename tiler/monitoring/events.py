@@ -54,7 +54,8 @@ class EventLog(Watcher):
     - ``planned``: ``stage``, ``scope``, ``total``; again where it changes.
     - ``submitted``: ``stage``, ``name``.
     - ``done``: ``stage``, ``name``, ``done``, ``total``, ``seconds``, ``memory`` (bytes), ``reused``, ``notes`` by
-      kind, and ``facts``: numbers that are not 0.
+      kind, and ``facts``: numbers that are not 0; ``ago`` (s), where it ended so long before ``t``, as its worker
+      went on with what was submitted with it.
     - ``failed``: ``stage``, ``name``, ``reason``, and the ``command`` that shows it alone; none for an item that
       is not run because another one failed.
     - ``message``: ``text``.
@@ -110,6 +111,7 @@ class EventLog(Watcher):
             reused=record.reused,
             notes=record.notes,
             facts=numbers(record.facts),
+            **({"ago": record.ago} if record.ago else {}),
         )
 
     def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:

@@ -112,7 +112,8 @@ def _tasks(path: Path) -> Iterator[tuple[dict[str, Any], str, float, float]]:
         if event.get("event") not in ("done", "failed"):
             continue
         try:
-            end, seconds = float(event["t"]), float(event.get("seconds") or 0.0)
+            end = float(event["t"]) - float(event.get("ago") or 0.0)
+            seconds = float(event.get("seconds") or 0.0)
         except (KeyError, TypeError, ValueError):
             continue
         if math.isfinite(end) and 0 <= seconds < math.inf:

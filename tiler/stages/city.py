@@ -76,6 +76,7 @@ def first_round(config: Config) -> list[Stage]:
             find_near_houses,
             (Read("houses", config.clearance, by_extent=True),),
             ("clearance",),
+            small=True,
         ),
         Stage("join-0", Scope.REGION, join_houses_in_clusters, (Read("houses"), Read("near-0")), version=2),
         member_stage(0),
@@ -104,6 +105,7 @@ def later_round(config: Config, number: int) -> list[Stage]:
             find_near_shapes,
             (Read(f"shapes-{before}", config.clearance, by_extent=True),),
             ("clearance",),
+            small=True,
         ),
         Stage(
             f"join-{after}",

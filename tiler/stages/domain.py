@@ -27,7 +27,7 @@ def domain_stages(config: Config) -> list[Stage]:
     reads = [Read("model"), Read(LEFT_OUT)]
     stages = [left_out_stage(config)]
     if config.top == "flat":
-        stages += [Stage("summits", Scope.TILE, find_summit, (Read("terrain", own=True),))]
+        stages += [Stage("summits", Scope.TILE, find_summit, (Read("terrain", own=True),), after=LEFT_OUT)]
         reads += [Read("summits")]
     parameters = ("domain_height", "top")
     return [*stages, Stage("domain", Scope.REGION, measure_domain, tuple(reads), parameters, version=2)]

@@ -64,7 +64,11 @@ def input_stages(config: Config) -> list[Stage]:
             version=3,
         ),
         # What a tile needs of the footprints: it does not run again when others change.
-        Stage("outlines", Scope.TILE, take_outlines, (Read("footprints"),), ("footprints_shift",), version=3),
+        Stage(
+            *("outlines", Scope.TILE, take_outlines, (Read("footprints"),), ("footprints_shift",)),
+            version=3,
+            after="ground",
+        ),
         Stage("reserved", Scope.REGION, list_reserved, (Read("footprints"),)),
         Stage(
             "ground", Scope.TILE, bin_tile, (Read("points", halo_of_points(config, spacing)),), ground, version=2
@@ -296,11 +300,13 @@ def take_coarse(task: Task) -> Facts:
     return _raster_facts(around)
 
 
-def fill_tile(task: Task) -> Facts:
-    """Fill the large empty areas of a tile's terrain (step 1.3)."""
+def fill_tile(task: Task) -> Facts | None:
+    """Fill the large empty areas of a tile's terrain (step 1.3); nothing yet where that takes the coarse level."""
     (own,) = task.read("flooded")
     terrain, n_deep = _raster(own.arrays["z"], own.facts), own.facts["deep"]
     if n_deep:
+        if not task.refs["lakes"]:
+            return None
         (lakes,) = task.read("lakes")
         flooded = FloodedDtm(terrain, own.arrays["ring"])
         terrain, _ = fill_terrain(flooded, _raster(lakes.arrays["z"], lakes.facts))

@@ -38,7 +38,7 @@ def left_out_stage(config: Config) -> Stage:
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
     parameters = (*CITY_PARAMETERS, "dtm_spacing", "ground_filter")
-    return Stage(LEFT_OUT, Scope.TILE, find_left_out, reads, parameters)
+    return Stage(LEFT_OUT, Scope.TILE, find_left_out, reads, parameters, small=True)
 
 
 def find_left_out(task: Task) -> Facts:

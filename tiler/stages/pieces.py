@@ -67,7 +67,8 @@ def fit_stage(config: Config) -> Stage:
         Read("model", by_extent=True),
         Read("outlines", own=True),
     )
-    return Stage("fit", Scope.TILE, measure_fit, reads, ("dtm_spacing", "ground_filter"), version=2)
+    parameters = ("dtm_spacing", "ground_filter")
+    return Stage("fit", Scope.TILE, measure_fit, reads, parameters, version=2, after="alignment")
 
 
 def piece_stages() -> list[Stage]:

@@ -77,16 +77,15 @@ def run_city_stages(engine: Engine, config: Config, *, shift: tuple[float, float
         engine.add_parameters(footprints_shift=shift)
     elif config.align and config.footprints:
         _align(engine, config)
-    engine.run(*input_stages(config))
+    # The terrain of tiles with deep lakes waits for the coarse level, that of all others does not.
+    engine.run(*input_stages(config), lake_stage(), fill_stage(), items={"lakes": ()})
     stop_at_holes(engine)
-    deep = engine.records["coarse", REGION_ITEM].facts["deep"]
-    engine.run(lake_stage(), fill_stage(), items={"lakes": deep})
-    stop_at_holes(engine)
+    if deep := engine.records["coarse", REGION_ITEM].facts["deep"]:
+        engine.run(lake_stage(), fill_stage(), items={"lakes": deep, "terrain": deep})
+        stop_at_holes(engine)
     engine.run(house_stage(config))
     stop_at_holes(engine)
-    engine.run(*first_round(config))
-    stop_at_holes(engine)
-    engine.run(shape_stage(0))
+    engine.run(*first_round(config), shape_stage(0))
     stop_at_holes(engine)
     last = 0
     while True:
@@ -95,9 +94,7 @@ def run_city_stages(engine: Engine, config: Config, *, shift: tuple[float, float
         if not engine.records[f"join-{last + 1}", REGION_ITEM].facts["joined"]:
             break
         last += 1
-        engine.run(member_stage(last))
-        stop_at_holes(engine)
-        engine.run(shape_stage(last))
+        engine.run(member_stage(last), shape_stage(last))
         stop_at_holes(engine)
     engine.run(model_stage(config, last))
     stop_at_holes(engine)

@@ -22,7 +22,8 @@ from tiler.engine.engine import Engine
 from tiler.engine.executor import Executor, Serial
 from tiler.engine.keys import item_key, stage_digest
 from tiler.engine.stage import Box, Facts, FileItem, Layout, Read, Scope, Stage
-from tiler.engine.task import Failure, Record, Task
+from tiler.engine.submission import Outcome
+from tiler.engine.task import Record, Task
 from tiler.executors.local_cluster import local
 from tiler.executors.remote_cluster import connect
 from tiler.store.checksums import state_files
@@ -129,7 +130,7 @@ class Shuffled(Serial):
         self.random = random.Random(seed)
         self.most = 0
 
-    def wait(self) -> tuple[int, Record | Failure]:
+    def wait(self) -> tuple[int, list[Outcome | None]]:
         self.most = max(self.most, len(self._queue))
         self.random.shuffle(self._queue)
         return super().wait()
