@@ -193,6 +193,14 @@ def place_walls(
     -----
     The middle of a wall that `are_clear` lets pass is away from all edges: no rounding decides where it is.
     """
+    return walls_along(a, b, along, offset, clearance)
+
+
+@kernel
+def walls_along(
+    a: Array, b: Array, along: Array, offset: float, clearance: float
+) -> tuple[Array, NDArray[np.int64]]:
+    """Place walls along a line as `place_walls` does, for kernels."""
     side_a, side_b = np.empty(len(a)), np.empty(len(a))
     for e in range(len(a)):
         side_a[e] = a[e, 1] * along[0] - a[e, 0] * along[1] - offset

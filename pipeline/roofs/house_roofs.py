@@ -10,18 +10,25 @@ from numpy.typing import NDArray
 from pipeline.data.kernel import kernel
 from pipeline.data.roofs import ROOF_METHODS, Roofs
 from pipeline.geometry.group_order import sort_points, sort_values
-from pipeline.geometry.outlines import open_outline
+from pipeline.geometry.inside import read_rings
 from pipeline.geometry.rings import make_canonical
 from pipeline.roofs.families import fit_family
 from pipeline.roofs.house_levels import HouseParts
 from pipeline.roofs.lines import wall_directions
 from pipeline.roofs.local_planes import fit_locally
-from pipeline.roofs.partition import Fit, cut_to_cells, join_parts
+from pipeline.roofs.partition import PartRules, cut_house, join_faces, limit_parts
 from pipeline.roofs.plane_search import BAND, MAX_PLANES, misfit, refit_plane, regularise, search_planes
 from pipeline.roofs.roof_points import RoofPoints
+from pipeline.roofs.subdivision import (
+    HALVES,
+    NODES,
+    area_of_edges,
+    edges_of_face,
+    open_subdivision,
+    outline_regions,
+)
 
 PLANES, FAMILY, _, FLAT = range(len(ROOF_METHODS))
-STRAIGHT = 1e-3  # m, square root of the area of the triangle at a vertex that is dropped as straight
 LIMIT_SHARE = 0.02  # of a part's points may lie beyond its limits, on either side
 LIMIT_ROOM = 0.5  # m, between these points and the limits
 MIN_REFIT = 6  # points that move a face
@@ -59,7 +66,7 @@ class RoofOptions:
     min_density: float = 0.5
     max_slope: float = 1.7
     cut_price: float = 4.0
-    min_step: float = 1.0
+    min_step: float = 0.3
     min_kink: float = 0.18
     max_depth: int = 9
 
@@ -97,29 +104,90 @@ def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOp
     xyz[:, :2] -= np.repeat(origin, count, axis=0)
     local = fit_locally(points.start, xyz, area)
     enough = (count >= 2 * options.min_points) & (count >= options.min_density * area)
-    parts: list[shapely.Polygon] = []
-    planes, limits, house = [], [], []
-    method, n_planes = np.full(len(polygons), FLAT, np.int8), np.ones(len(polygons), np.int32)
-    for i, (first, last) in enumerate(pairwise(points.start.tolist())):
-        if enough[i]:
-            mine, plane, limit, method[i] = _fit_house(
-                polygons[i], origin[i], xyz[first:last], local[first:last], options
-            )
-        else:
-            mine, plane = [polygons[i]], np.array([[0.0, 0.0, _median(xyz[first:last, 2])]])
-            limit = plane[:, [2, 2]]
-        parts += mine
-        planes.append(plane)
-        limits.append(limit)
-        house += [i] * len(mine)
-        n_planes[i] = len(np.unique(plane, axis=0))
-    result = np.empty(len(parts), dtype=object)
-    result[:] = parts
-    of_part = np.array(house, np.int64)
-    roofs = Roofs(
-        np.concatenate([np.empty((0, 3)), *planes]), origin[of_part], np.concatenate([np.empty((0, 2)), *limits])
+    heights = [_median(xyz[first:last, 2]) for first, last in pairwise(points.start.tolist())]
+    fitted = _fit_houses(polygons, origin, points.start, (xyz, local), np.flatnonzero(enough), options)
+    return _assemble(polygons, origin, np.array(heights), fitted)
+
+
+@dataclass(frozen=True, eq=False)
+class _FittedHouse:
+    """Parts of a house, as from `_fit_house`."""
+
+    house: int
+    plane: Array
+    limits: Array
+    xy: Array
+    ring: NDArray[np.int64]
+    part: NDArray[np.int64]
+    shell: NDArray[np.bool_]
+    of_family: bool
+
+
+def _fit_houses(
+    polygons: NDArray[np.object_],
+    origin: Array,
+    start: NDArray[np.int64],
+    points: tuple[Array, Array],
+    rows: NDArray[np.int64],
+    options: RoofOptions,
+) -> list[_FittedHouse]:
+    rings = read_rings(polygons[rows])
+    rules = PartRules(
+        float(options.clearance),
+        float(options.min_area),
+        float(options.min_points),
+        float(options.cut_price),
+        float(options.min_step),
+        float(options.min_kink),
+        float(options.max_depth),
     )
-    return HouseRoofs(HouseParts(result, of_part), roofs, method, n_planes)
+    found = []
+    for k, i in enumerate(rows.tolist()):
+        begin, end = rings.start[k], rings.start[k + 1]
+        first, last = start[i], start[i + 1]
+        fitted = _fit_house(
+            points[0][first:last],
+            points[1][first:last],
+            rings.xy[begin:end] - origin[i],
+            rings.ring[begin:end],
+            rules,
+            float(options.max_slope),
+        )
+        found.append(_FittedHouse(i, *fitted))
+    return found
+
+
+def _assemble(
+    polygons: NDArray[np.object_], origin: Array, height: Array, fitted: list[_FittedHouse]
+) -> HouseRoofs:
+    """Put the parts of all houses together: those fitted, and one flat part of each other house."""
+    n = len(polygons)
+    n_parts, n_planes, method = np.ones(n, np.int64), np.ones(n, np.int32), np.full(n, FLAT, np.int8)
+    for one in fitted:
+        flat = bool((one.plane[:, :2] == 0).all())
+        method[one.house] = FLAT if flat else FAMILY if one.of_family else PLANES
+        n_parts[one.house], n_planes[one.house] = len(one.plane), len(np.unique(one.plane, axis=0))
+    first = np.cumsum(n_parts) - n_parts
+    house = np.repeat(np.arange(n), n_parts)
+    parts, plane, limits = polygons[house], np.zeros((len(house), 3)), np.empty((len(house), 2))
+    plane[first, 2] = height
+    for one in fitted:
+        plane[first[one.house] : first[one.house] + len(one.plane)] = one.plane
+        limits[first[one.house] : first[one.house] + len(one.plane)] = one.limits
+    flat = (plane[:, :2] == 0).all(axis=1)
+    limits[flat] = plane[flat][:, [2, 2]]
+    divided = [one for one in fitted if len(one.plane) > 1]
+    if divided:
+        n_rings = np.cumsum([0, *(len(one.part) for one in divided)])
+        owner = np.concatenate([first[one.house] + one.part for one in divided])
+        xy = np.concatenate([one.xy + origin[one.house] for one in divided])
+        ring = np.concatenate([one.ring + begin for one, begin in zip(divided, n_rings, strict=False)])
+        shell = np.concatenate([one.shell for one in divided])
+        order = np.lexsort((~shell, owner))
+        rings = shapely.linearrings(xy, indices=ring)[order]
+        rows, index = np.unique(owner[order], return_inverse=True)
+        parts[rows] = make_canonical(shapely.polygons(rings, indices=index))
+    return HouseRoofs(HouseParts(parts, house), Roofs(plane, origin[house], limits), method, n_planes)
 
 
 def _median(z: Array) -> float:
@@ -128,59 +196,50 @@ def _median(z: Array) -> float:
     return float((z[(n - 1) // 2] + z[n // 2]) / 2) if n else np.nan
 
 
+@kernel
 def _fit_house(
-    polygon: shapely.Polygon, origin: Array, xyz: Array, local: Array, options: RoofOptions
-) -> tuple[list[shapely.Polygon], Array, Array, int]:
-    outline = open_outline(shapely.transform(polygon, lambda xy: xy - origin))
-    density = len(xyz) / outline.area
-    least = max(options.min_points, density * options.min_area)
-    planes, cost, along, n_family = _find_candidates(
-        xyz, local, *outline.ends, density, float(least), options.max_slope
-    )
-    fit = Fit(xyz, planes, cost, along, options.cut_price * density)
-    cells, rows = cut_to_cells(
-        outline,
-        fit,
-        clearance=options.clearance,
-        min_area=options.min_area,
-        min_points=options.min_points,
-        max_depth=options.max_depth,
-    )
-    region, best = join_parts(
-        cells,
-        rows,
-        fit,
-        min_area=options.min_area,
-        min_points=options.min_points,
-        min_step=options.min_step,
-        min_kink=options.min_kink,
-    )
-    names = np.unique(region)
-    used = best[names]
-    plane = planes[used]
-    limit = np.empty((len(names), 2))
-    for k, name in enumerate(names):
-        mine = np.sort(np.concatenate([rows[c] for c in np.flatnonzero(region == name)]))
-        z = xyz[mine, 2] if len(mine) >= MIN_REFIT else xyz[:, 2]
-        limit[k] = _limits(z)
-    flat = (plane[:, :2] == 0).all(axis=1)
-    limit[flat] = plane[flat][:, [2, 2]]
-    method = FLAT if flat.all() else FAMILY if (used < n_family).all() else PLANES
-    if len(names) == 1:
-        return [polygon], plane, limit, method
-    pieces = np.array([cell.polygon for cell in cells], dtype=object)
-    dissolved = np.array([shapely.coverage_union_all(pieces[region == k]) for k in names], dtype=object)
-    simple = shapely.coverage_simplify(dissolved, STRAIGHT)
-    back = shapely.transform(simple, lambda xy: xy + origin)
-    if not (shapely.is_valid(back).all() and (shapely.get_type_id(back) == 3).all()):
-        z = _median(xyz[:, 2])
-        return [polygon], np.array([[0.0, 0.0, z]]), np.array([[z, z]]), FLAT
-    return list(make_canonical(back)), plane, limit, method
+    xyz: Array, local: Array, vertices: Array, ring: NDArray[np.int64], rules: PartRules, max_slope: float
+) -> tuple[Array, Array, Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], bool]:
+    """Fit planes to a house.
 
-
-def _limits(z: Array) -> Array:
-    low, high = np.percentile(z, (100 * LIMIT_SHARE, 100 - 100 * LIMIT_SHARE))
-    return np.array([low - LIMIT_ROOM, high + LIMIT_ROOM])
+    Gives slopes and heights, and limits of its parts; vertices of closed rings, their rings, the part of each
+    ring and whether it is a shell; and whether all planes are of a family.
+    """
+    net = open_subdivision(vertices, ring)
+    n_given = net[2][NODES]
+    _, a, b = edges_of_face(net[0], net[1], net[2][HALVES], 0)
+    density = len(xyz) / area_of_edges(a, b)
+    least = max(rules.min_points, density * rules.min_area)
+    planes, cost, along, n_family = _find_candidates(xyz, local, a, b, density, least, max_slope)
+    rules = PartRules(
+        rules.clearance,
+        rules.min_area,
+        rules.min_points,
+        rules.price * density,
+        rules.min_step,
+        rules.min_kink,
+        rules.max_depth,
+    )
+    face, area = cut_house(xyz, planes, cost, along, net, rules)
+    region, best = join_faces(planes, cost, face, area, net, rules)
+    part = np.empty(len(region), np.int64)
+    n_parts = 0
+    for f in range(len(region)):
+        if region[f] == f:
+            part[f] = n_parts
+            n_parts += 1
+    used, of_family = np.empty((n_parts, 3)), True
+    for f in range(len(region)):
+        part[f] = part[region[f]]
+        if region[f] == f:
+            of_family &= best[f] < n_family
+            for q in range(3):
+                used[part[f], q] = planes[best[f], q]
+    for p in range(len(face)):
+        face[p] = part[face[p]]
+    limits = limit_parts(xyz, face, n_parts, LIMIT_SHARE, LIMIT_ROOM)
+    xy, of_ring, owner, shell = outline_regions(net[0], net[1], net[2], part, n_given)
+    return used, limits, xy, of_ring, owner, shell, of_family
 
 
 @kernel

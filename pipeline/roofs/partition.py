@@ -1,328 +1,301 @@
-"""A house cut into cells, each under one of its planes, and cells joined to parts (for `house_roofs`)."""
+"""A house divided into parts, each under one of its planes, by cuts that pay (for `house_roofs`)."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
-from pipeline.geometry.group_order import order_values
-from pipeline.geometry.outlines import Outline, deal_out
-from pipeline.geometry.segments import add_places
-from pipeline.roofs.cuts import cut_along
-from pipeline.roofs.lines import Line
+from pipeline.geometry.inside import INSIDE, side_of
+from pipeline.roofs.cut_search import OPEN, find_rectangle, find_ridges, rank_cuts
+from pipeline.roofs.subdivision import (
+    FACE,
+    FACES,
+    HALVES,
+    NEXT,
+    NODE,
+    ROOM,
+    TWIN,
+    area_of_edges,
+    cut_face,
+    edges_of_face,
+)
 
-MAX_TRIES = 5  # lines that are tried for a cut, the best first
-RIDGE_BONUS = 0.25  # share of the price of a cut by which intersections of planes go before other lines
-SAME_PLANE = 0.15  # difference of slopes below which planes have no ridge
+RECTANGLE_BONUS = 0.25  # share of the price of a cut by which the best line goes before a rectangle
+SAME, SMALL, CHEAP, LEVEL, APART = range(5)  # why two regions are joined, the first reason first; or not
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """Points of a house and the planes that its parts may have.
+class PartRules(NamedTuple):
+    """When a piece is cut, and when parts are joined.
 
     Attributes
     ----------
-    xyz : float64, (n, 3)
-        Points (m) about an origin near the house, in an order of their own.
-    planes : float64, (k, 3)
-        Slopes and height at that origin.
-    cost : float64, (n, k)
-        Misfit of each point under each plane.
-    along : float64, (d, 2)
-        Directions of walls, unit vectors.
+    clearance : float
+        Distance of new walls from others (m).
+    min_area, min_points : float
+        What a part has at least (m², points).
     price : float
-        What a cut must save.
+        Misfit that a wall must save.
+    min_step, min_kink : float
+        A wall stays where the roof steps by this (m), or its slopes differ by so much.
+    max_depth : float
+        How often a piece is cut.
     """
 
-    xyz: Array
-    planes: Array
-    cost: Array
-    along: Array
+    clearance: float
+    min_area: float
+    min_points: float
     price: float
-
-
-def cut_to_cells(
-    outline: Outline, fit: Fit, *, clearance: float, min_area: float, min_points: int, max_depth: int
-) -> tuple[list[Outline], list[Index]]:
-    """Cut a house into cells that share all vertices.
-
-    Returns
-    -------
-    cells : list of Outline
-    points : list of int64 arrays
-        Rows of the points in each.
-    """
-    everything = np.arange(len(fit.xyz))
-    todo = [(outline, everything, max_depth)]
-    cells: list[Outline] = []
-    points: list[Index] = []
-    corners = np.empty((0, 2))
-    lines = find_ridges(fit.planes)
-    while todo:
-        piece, rows, depth = todo.pop()
-        cut = None
-        if depth > 0 and len(rows) >= 2 * min_points and piece.area >= 2 * min_area:
-            least = max(min_points // 2, int(0.5 * len(rows) * min_area / piece.area))
-            ranked = rank_cuts(fit.xyz, fit.cost, rows, fit.along, lines, least, fit.price)
-            for x, y, offset in ranked.tolist():
-                pieces, ends = cut_along(
-                    piece.with_corners(corners), Line(np.array([x, y]), offset), clearance=clearance
-                )
-                if len(pieces):
-                    cut = pieces, ends
-                    break
-        if cut is None:
-            cells.append(piece)
-            points.append(rows)
-            continue
-        corners = add_places(corners, cut[1])
-        tagged = np.column_stack((fit.xyz[rows, :2], rows.astype(np.float64)))
-        for part, inside in deal_out(cut[0], tagged):
-            todo.append((part, inside[:, 2].astype(np.int64), depth - 1))
-    return [cell.with_corners(corners) for cell in cells], points
+    min_step: float
+    min_kink: float
+    max_depth: float
 
 
 @kernel
-def find_ridges(planes: Array) -> Array:
-    """Lines in which planes meet: direction and offset of each, float64 (m, 3)."""
-    lines = np.empty((len(planes) * (len(planes) - 1) // 2, 3))
-    n = 0
-    for i in range(len(planes)):
-        for j in range(i):
-            a, b, c = planes[i, 0] - planes[j, 0], planes[i, 1] - planes[j, 1], planes[i, 2] - planes[j, 2]
-            slope = math.hypot(a, b)
-            if slope >= SAME_PLANE:
-                lines[n, 0], lines[n, 1], lines[n, 2] = -b / slope, a / slope, c / slope
-                n += 1
-    return lines[:n].copy()
-
-
-@kernel
-def rank_cuts(  # noqa: PLR0912
-    xyz: Array, cost: Array, rows: Index, along: Array, lines: Array, min_points: int, price: float
-) -> Array:
-    """Rank the lines by the misfit that they save when each side takes its own best plane.
+def cut_house(
+    xyz: Array, planes: Array, cost: Array, along: Array, net: tuple[Index, Array, Index], rules: PartRules
+) -> tuple[Index, Array]:
+    """Cut the only face of a subdivision until no cut pays.
 
     Parameters
     ----------
-    xyz, cost
-        As in `Fit`.
-    rows : int64, (m,)
-        Points of the piece that is to be cut.
+    xyz : float64, (n, 3)
+        Points of the house (m).
+    planes : float64, (k, 3)
+        Planes that parts may have.
+    cost : float64, (n, k)
+        Misfit of each point under each.
     along : float64, (d, 2)
-        Directions, along each of which the best line is looked for.
-    lines : float64, (l, 3)
-        Direction and offset of further lines.
-    min_points : int
-        Least number of points on either side.
-    price : float
-        What a line must save.
+        Directions of walls.
+    net
+        As from `open_subdivision`.
+    rules : PartRules
+        Thresholds.
 
     Returns
     -------
-    float64, (k, 3)
-        Direction and offset of the lines that save as much, the best first, at most `MAX_TRIES`.
+    face : int64, (n,)
+        Face of each point.
+    area : float64, (faces,)
+        Areas (m²).
     """
-    n, n_planes = len(rows), cost.shape[1]
-    total, left = np.zeros(n_planes), np.empty(n_planes)
-    for p in rows:
-        for k in range(n_planes):
-            total[k] += cost[p, k]
-    whole = total.min()
-    n_lines = len(along) + len(lines)
-    found, loss, saved = np.empty((n_lines, 3)), np.zeros(n_lines), np.zeros(n_lines)
-    across = np.empty(n)
-    for d in range(n_lines if whole > price else 0):
-        free = d < len(along)
-        x, y = (along[d, 0], along[d, 1]) if free else (lines[d - len(along), 0], lines[d - len(along), 1])
-        for m in range(n):
-            across[m] = xyz[rows[m], 1] * x - xyz[rows[m], 0] * y
-        left[:] = 0
-        best, offset = 0.0, 0.0
-        if free:
-            order = order_values(across)
-            for m in range(n - 1):
-                low = high = math.inf
-                p = rows[order[m]]
-                for k in range(n_planes):
-                    left[k] += cost[p, k]
-                    low, high = min(low, left[k]), min(high, total[k] - left[k])
-                if min_points <= m + 1 <= n - min_points and whole - low - high > best:
-                    best = whole - low - high
-                    offset = (across[order[m]] + across[order[m + 1]]) / 2
-        else:
-            offset = lines[d - len(along), 2]
-            count = 0
-            for m in range(n):
-                if across[m] < offset:
-                    count += 1
-                    for k in range(n_planes):
-                        left[k] += cost[rows[m], k]
-            if min_points <= count <= n - min_points:
-                low = high = math.inf
-                for k in range(n_planes):
-                    low, high = min(low, left[k]), min(high, total[k] - left[k])
-                best = whole - low - high
-        found[d, 0], found[d, 1], found[d, 2], saved[d] = x, y, offset, best
-        loss[d] = -best if free or best <= 0 else -best - RIDGE_BONUS * price
-    ranked, n_ranked = np.empty((MAX_TRIES, 3)), 0
-    for d in order_values(loss):
-        if saved[d] < price or n_ranked == MAX_TRIES or saved[d] <= 0:
+    half, place, count = net
+    face, area = np.zeros(len(xyz), np.int64), np.zeros(len(place) + ROOM)
+    depth, todo = np.zeros(len(area), np.int64), np.empty(len(area), np.int64)
+    lines = find_ridges(planes)
+    _, a, b = edges_of_face(half, place, count[HALVES], 0)
+    area[0] = area_of_edges(a, b)
+    todo[0], n_todo = 0, 1
+    while n_todo:
+        n_todo -= 1
+        piece = todo[n_todo]
+        rows = _points_of(face, piece)
+        if depth[piece] >= rules.max_depth or len(rows) < 2 * rules.min_points or area[piece] < 2 * rules.min_area:
+            continue
+        least = max(int(rules.min_points) // 2, int(0.5 * len(rows) * rules.min_area / area[piece]))
+        n_before = count[FACES]
+        if not _cut_piece(piece, rows, least, xyz, cost, (along, lines), net, rules):
+            continue
+        for f in range(n_before, count[FACES]):
+            _, a, b = edges_of_face(half, place, count[HALVES], f)
+            area[f] = area_of_edges(a, b)
+            area[piece] -= area[f]
+            for p in rows:
+                if side_of(xyz[p, 0], xyz[p, 1], 0, len(a), a, b) == INSIDE:
+                    face[p] = f
+        depth[piece] += 1
+        todo[n_todo] = piece
+        n_todo += 1
+        for f in range(n_before, count[FACES]):
+            depth[f] = depth[piece]
+            todo[n_todo] = f
+            n_todo += 1
+    return face, area[: count[FACES]].copy()
+
+
+@kernel
+def _points_of(face: Index, wanted: int) -> Index:
+    rows = np.empty(len(face), np.int64)
+    n = 0
+    for p in range(len(face)):
+        if face[p] == wanted:
+            rows[n] = p
+            n += 1
+    return rows[:n].copy()
+
+
+@kernel
+def _cut_piece(
+    piece: int,
+    rows: Index,
+    least: int,
+    xyz: Array,
+    cost: Array,
+    lines: tuple[Array, Array],
+    net: tuple[Index, Array, Index],
+    rules: PartRules,
+) -> bool:
+    """Cut a face along the best line, or along the best rectangle if that saves more; tell whether it is cut."""
+    half, place, count = net
+    ranked = rank_cuts(xyz, cost, rows, lines[0], lines[1], least, rules.price)
+    saved = ranked[0, 3] + RECTANGLE_BONUS * rules.price if len(ranked) else 0.0
+    sides = find_rectangle(xyz, cost, rows, lines[0], least, max(saved, rules.price), rules.clearance)
+    cut = False
+    if sides[0] > 0:
+        x, y, current = sides[1], sides[2], piece
+        for side in range(4):
+            if abs(sides[3 + side]) >= OPEN:
+                continue
+            line = (x, y, sides[3 + side]) if side < 2 else (-y, x, sides[3 + side])
+            n_before = count[FACES]
+            if cut_face(half, place, count, current, line, rules.clearance):
+                cut = True
+                for f in range(n_before, count[FACES]):
+                    _, a, b = edges_of_face(half, place, count[HALVES], f)
+                    if side_of(sides[7], sides[8], 0, len(a), a, b) == INSIDE:
+                        current = f
+    for k in range(len(ranked)):
+        if cut:
             break
-        ranked[n_ranked, 0], ranked[n_ranked, 1], ranked[n_ranked, 2] = found[d, 0], found[d, 1], found[d, 2]
-        n_ranked += 1
-    return ranked[:n_ranked].copy()
+        cut = cut_face(half, place, count, piece, (ranked[k, 0], ranked[k, 1], ranked[k, 2]), rules.clearance)
+    return cut
 
 
-def join_parts(
-    cells: list[Outline],
-    points: list[Index],
-    fit: Fit,
-    *,
-    min_area: float,
-    min_points: int,
-    min_step: float,
-    min_kink: float,
+@kernel
+def join_faces(  # noqa: PLR0912, PLR0915
+    planes: Array, cost: Array, face: Index, area: Array, net: tuple[Index, Array, Index], rules: PartRules
 ) -> tuple[Index, Index]:
-    """Join cells under the same plane, too small ones, and those that a wall does not pay for.
+    """Join faces under the same plane, too small ones, and those whose wall does not pay.
+
+    Parameters
+    ----------
+    planes, cost, net, rules
+        As for `cut_house`.
+    face, area
+        As from there.
 
     Returns
     -------
-    region : int64, (c,)
-        Region of each cell, named by its first cell.
-    plane : int64, (c,)
+    region : int64, (faces,)
+        Region of each face, named by its first face.
+    plane : int64, (faces,)
         Row of the plane of each region, by its name.
     """
-    n = len(cells)
-    energy = np.array([fit.cost[rows].sum(axis=0) for rows in points]).reshape(n, -1)
-    area = np.array([cell.area for cell in cells])
-    count = np.array([len(rows) for rows in points])
-    borders = find_borders(
-        np.cumsum([0, *(len(cell.xy) for cell in cells)]),
-        np.concatenate([cell.xy for cell in cells]),
-        np.concatenate([cell.ring for cell in cells]),
-    )
-    region = join_regions(
-        borders, energy, area, count, fit.planes, (min_area, float(min_points), fit.price, min_step, min_kink)
-    )
-    return region, energy.argmin(axis=1)
-
-
-@kernel
-def find_borders(start: Index, xy: Array, ring: Index) -> Array:
-    """Edges that two cells share: both cells and both ends, float64 (b, 6)."""
-    n = len(xy)
-    m = 0
-    owner = np.empty(n, np.int64)
-    for c in range(len(start) - 1):
-        for v in range(start[c], start[c + 1]):
-            owner[v] = c
-    for v in range(1, n):
-        if ring[v] == ring[v - 1] and owner[v] == owner[v - 1]:
-            m += 1
-    key = np.empty(m)
-    row = np.empty(m, np.int64)
-    m = 0
-    for v in range(1, n):
-        if ring[v] == ring[v - 1] and owner[v] == owner[v - 1]:
-            key[m] = xy[v, 0] + xy[v - 1, 0] + math.pi * (xy[v, 1] + xy[v - 1, 1])
-            row[m] = v
-            m += 1
-    order = order_values(key)
-    borders = np.empty((m, 6))
-    b = 0
-    for i in range(m):
-        v = row[order[i]]
-        for j in range(i + 1, m):
-            if key[order[j]] > key[order[i]] + 1e-6:
-                break
-            w = row[order[j]]
-            if (
-                owner[v] != owner[w]
-                and xy[v, 0] == xy[w - 1, 0]
-                and xy[v, 1] == xy[w - 1, 1]
-                and xy[w, 0] == xy[v - 1, 0]
-                and xy[w, 1] == xy[v - 1, 1]
-            ):
-                borders[b, 0], borders[b, 1] = min(owner[v], owner[w]), max(owner[v], owner[w])
-                borders[b, 2], borders[b, 3] = xy[v, 0], xy[v, 1]
-                borders[b, 4], borders[b, 5] = xy[v - 1, 0], xy[v - 1, 1]
-                b += 1
-    return borders[:b].copy()
-
-
-@kernel
-def join_regions(  # noqa: PLR0912
-    borders: Array,
-    energy: Array,
-    area: Array,
-    count: Index,
-    planes: Array,
-    rules: tuple[float, float, float, float, float],
-) -> Index:
-    """Join cells as `join_parts` does; energy, area and count of cells become those of regions."""
-    min_area, min_points, price, min_step, min_kink = rules
-    region = np.arange(len(area))
-    best_plane = np.empty(len(area), np.int64)
-    for c in range(len(area)):
-        best_plane[c] = energy[c].argmin()
+    half, place, count = net
+    n = len(area)
+    energy, number, area = np.zeros((n, len(planes))), np.zeros(n, np.int64), area.copy()
+    for p in range(len(face)):
+        number[face[p]] += 1
+        for k in range(len(planes)):
+            energy[face[p], k] += cost[p, k]
+    region, plane = np.arange(n), np.empty(n, np.int64)
+    for f in range(n):
+        plane[f] = energy[f].argmin()
+    walls = np.empty((count[HALVES], 2), np.int64)
+    n_walls = 0
+    for h in range(count[HALVES]):
+        t = half[h, TWIN]
+        if t > h and half[h, FACE] != half[t, FACE]:
+            walls[n_walls, 0], walls[n_walls, 1] = h, t
+            n_walls += 1
+    gap, loss = np.empty((n, n)), np.empty((n, n))
+    why = np.empty((n, n), np.int64)
+    changed = -1  # region whose walls are looked at anew; at first, all are
     while True:
-        best_why, best_cost, best_one, best_two = 9, math.inf, -1, -1
-        for k in range(len(borders)):
-            r, s = region[int(borders[k, 0])], region[int(borders[k, 1])]
-            one, two = min(r, s), max(r, s)
-            if one == two:
+        for step in range(2):
+            for w in range(n_walls):
+                h = walls[w, 0]
+                one, two = region[half[h, FACE]], region[half[walls[w, 1], FACE]]
+                one, two = min(one, two), max(one, two)
+                if one == two or (changed >= 0 and changed not in (one, two)):
+                    continue
+                if step == 0:
+                    gap[one, two], why[one, two] = 0.0, -1
+                    continue
+                i, j = plane[one], plane[two]
+                a, b, c = planes[i, 0] - planes[j, 0], planes[i, 1] - planes[j, 1], planes[i, 2] - planes[j, 2]
+                for node in (half[h, NODE], half[half[h, NEXT], NODE]):
+                    gap[one, two] = max(gap[one, two], abs(a * place[node, 0] + b * place[node, 1] + c))
+                if why[one, two] < 0:
+                    low = math.inf
+                    for k in range(len(planes)):
+                        low = min(low, energy[one, k] + energy[two, k])
+                    loss[one, two] = low - energy[one, i] - energy[two, j]
+                    why[one, two] = APART
+                    if i == j:
+                        why[one, two] = SAME
+                    elif (
+                        min(area[one], area[two]) < rules.min_area
+                        or min(number[one], number[two]) < rules.min_points
+                    ):
+                        why[one, two] = SMALL
+                    elif loss[one, two] < rules.price:
+                        why[one, two] = CHEAP
+                    elif math.hypot(a, b) < rules.min_kink:
+                        why[one, two] = LEVEL
+        best, best_one, best_two = APART, -1, -1
+        for w in range(n_walls):
+            one, two = region[half[walls[w, 0], FACE]], region[half[walls[w, 1], FACE]]
+            one, two = min(one, two), max(one, two)
+            if one == two or why[one, two] == APART:
                 continue
-            low = math.inf
-            for p in range(len(planes)):
-                low = min(low, energy[one, p] + energy[two, p])
-            i, j = best_plane[one], best_plane[two]
-            cost = low - energy[one, i] - energy[two, j]
-            why = 9
-            if i == j:
-                why = 0
-            elif min(area[one], area[two]) < min_area or min(count[one], count[two]) < min_points:
-                why = 1
-            elif cost < price:
-                why = 2
-            elif math.hypot(planes[i, 0] - planes[j, 0], planes[i, 1] - planes[j, 1]) < min_kink:
-                gap = 0.0
-                for m in range(len(borders)):
-                    q, t = region[int(borders[m, 0])], region[int(borders[m, 1])]
-                    if min(q, t) == one and max(q, t) == two:
-                        for at in (2, 4):
-                            gap = max(
-                                gap,
-                                abs(
-                                    (planes[i, 0] - planes[j, 0]) * borders[m, at]
-                                    + (planes[i, 1] - planes[j, 1]) * borders[m, at + 1]
-                                    + planes[i, 2]
-                                    - planes[j, 2]
-                                ),
-                            )
-                if gap < min_step:
-                    why = 3
-            better = why < best_why or (
-                why == best_why
+            if why[one, two] == LEVEL and gap[one, two] >= rules.min_step:
+                continue
+            if why[one, two] < best or (
+                why[one, two] == best
                 and (
-                    cost < best_cost
-                    or (cost == best_cost and (one < best_one or (one == best_one and two < best_two)))
+                    loss[one, two] < loss[best_one, best_two]
+                    or (loss[one, two] == loss[best_one, best_two] and (one, two) < (best_one, best_two))
                 )
-            )
-            if why < 9 and better:
-                best_why, best_cost, best_one, best_two = why, cost, one, two
+            ):
+                best, best_one, best_two = why[one, two], one, two
         if best_one < 0:
-            return region
-        for c in range(len(region)):
-            if region[c] == best_two:
-                region[c] = best_one
-        for p in range(len(planes)):
-            energy[best_one, p] += energy[best_two, p]
+            return region, plane
+        for f in range(n):
+            if region[f] == best_two:
+                region[f] = best_one
+        for k in range(len(planes)):
+            energy[best_one, k] += energy[best_two, k]
         area[best_one] += area[best_two]
-        count[best_one] += count[best_two]
-        best_plane[best_one] = energy[best_one].argmin()
+        number[best_one] += number[best_two]
+        plane[best_one] = energy[best_one].argmin()
+        changed = best_one
+
+
+@kernel
+def limit_parts(xyz: Array, part: Index, n_parts: int, share: float, room: float) -> Array:
+    """Heights between which the roof of each part is kept, float64 (n_parts, 2).
+
+    Parameters
+    ----------
+    xyz : float64, (n, 3)
+        Points, ascending by height (m).
+    part : int64, (n,)
+        Part of each.
+    n_parts : int
+        Number of parts.
+    share : float
+        Share of a part's points below the lower limit less the room, and above the upper one.
+    room : float
+        Distance of the limits from these points (m).
+
+    Returns
+    -------
+    float64, (n_parts, 2)
+        Of all points for a part without any.
+    """
+    limits = np.empty((n_parts, 2))
+    for k in range(n_parts):
+        rows = _points_of(part, k)
+        if len(rows) == 0:
+            rows = np.arange(len(xyz))
+        for side in range(2):
+            at = (share if side == 0 else 1 - share) * (len(rows) - 1)
+            below = int(at)
+            low, high = xyz[rows[below], 2], xyz[rows[min(below + 1, len(rows) - 1)], 2]
+            limits[k, side] = low + (at - below) * (high - low) + (-room if side == 0 else room)
+    return limits

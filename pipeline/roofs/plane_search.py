@@ -16,9 +16,9 @@ ROUGH = 0.3  # weight of a point without a local plane of its own
 FLAT = 0.09  # slope below which a plane is flat
 SNAP = 0.978  # cosine of 12 degrees: a plane this close to uphill across a wall is turned there
 REFITS = 4
-TOLERANCE = 1.0  # m, misfit is the square of the distance over this
+TOLERANCE = 0.5  # m, misfit is the square of the distance over this
 FAR = 0.5  # misfit a metre of what is beyond
-FARTHEST = 10.0  # m, beyond which misfit grows no more
+FARTHEST = 20.0  # m, beyond which misfit grows no more
 
 Array = NDArray[np.float64]
 
