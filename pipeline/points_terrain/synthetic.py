@@ -1,6 +1,7 @@
 """A synthetic city as arrays: hills, a pond, buildings, and the points that a flight would give."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -10,7 +11,15 @@ from scipy.spatial import cKDTree
 from pipeline.data.classes import BUILDING, GROUND, HIGH_NOISE, HIGH_VEGETATION, LOW_NOISE, UNCLASSIFIED, WATER
 from pipeline.data.errors import GeometryError
 from pipeline.data.pointcloud import PointCloud
+from pipeline.points_terrain.synthetic_roofs import (
+    RoofShapes,
+    draw_roofs,
+    flat_shapes,
+    highest_places,
+    shape_heights,
+)
 
+ROOFS = ("flat", "mixed")
 ORIGIN = (318_000.0, 6_399_000.0)  # lower left corner in EPSG:3006 (m): western Sweden, as in the paper
 
 _BASE = 10.0  # m, lowest ground
@@ -20,6 +29,7 @@ _LARGEST_RADIUS = 18.0  # m, circle around a building or a pair
 _LEAST_RADIUS = 2.5  # m, of the largest circle
 _FILLING = 0.36  # largest radius per mean spacing; from about 0.45 circles placed at random find no room
 _TOUCHING, _OVERLAPPING = 0.08, 0.02  # pairs per building
+_ROWS, _IN_ROW = 0.04, 4  # rows of terraced houses per building, with mixed roofs; houses in one
 _L_SHAPED = 0.4  # share of the single buildings
 _MAX_ROUNDS = 500
 # Shares of the points in open space, and of all points for noise.
@@ -30,7 +40,7 @@ _GROUND_SIGMA, _ROOF_SIGMA = 0.03, 0.05  # m
 
 @dataclass(frozen=True, eq=False)
 class SyntheticCity:
-    """Hills, a pond and flat-roofed buildings on a square.
+    """Hills, a pond and buildings on a square.
 
     Attributes
     ----------
@@ -51,7 +61,11 @@ class SyntheticCity:
     ids : str, (n,)
         Their ids.
     ground, roof : float64, (n,)
-        Terrain at the centroid, and the flat roof above it (m, absolute).
+        Terrain at the centroid, and the flat roof above it, or the highest place of another roof (m, absolute).
+    roofs : str
+        One of `ROOFS`.
+    shapes : RoofShapes
+        The roofs.
     """
 
     size: float
@@ -64,9 +78,22 @@ class SyntheticCity:
     ids: NDArray[np.str_]
     ground: NDArray[np.float64]
     roof: NDArray[np.float64]
+    roofs: str
+    shapes: RoofShapes
 
 
-def make_city(*, size: float, buildings: int, density: float, relief: float, seed: int) -> SyntheticCity:
+class _Counts(NamedTuple):
+    """How many circles hold a building, a pair that touches, a pair that overlaps, and a row."""
+
+    single: int
+    touching: int
+    overlapping: int
+    rows: int
+
+
+def make_city(
+    *, size: float, buildings: int, density: float, relief: float, seed: int, roofs: str = "flat"
+) -> SyntheticCity:
     """Make a city of randomly placed and rotated buildings (paper, section 2.2, benchmark b).
 
     Parameters
@@ -82,6 +109,9 @@ def make_city(*, size: float, buildings: int, density: float, relief: float, see
         Highest minus lowest ground (m).
     seed : int
         Not negative; the same seed gives the same city.
+    roofs : str
+        "flat", or "mixed": flat, shed, gable, hip, pyramid and mansard roofs, and 16 buildings in a hundred in
+        rows of four that share walls.
 
     Returns
     -------
@@ -107,6 +137,8 @@ def make_city(*, size: float, buildings: int, density: float, relief: float, see
     """
     spacing = size / max(buildings, 1) ** 0.5
     radius = min(_FILLING * spacing, size / 6, _LARGEST_RADIUS)
+    if roofs not in ROOFS:
+        raise ValueError(f"roofs {roofs!r}; one of {', '.join(ROOFS)}")
     if not (0 < size < 1e6 and buildings >= 0 and density >= 0 and relief >= 0 and seed >= 0):
         raise ValueError(f"size {size}, buildings {buildings}, density {density}, relief {relief}, seed {seed}")
     if radius < _LEAST_RADIUS:
@@ -116,19 +148,26 @@ def make_city(*, size: float, buildings: int, density: float, relief: float, see
     waves, base = _hills(rng, size, relief)
     n_touching = max(int(_TOUCHING * buildings), int(buildings >= 4))
     n_overlapping = max(int(_OVERLAPPING * buildings), int(buildings >= 6))
-    n_single = buildings - 2 * (n_touching + n_overlapping)
-    radii = radius * rng.uniform(0.7, 1.0, n_single + n_touching + n_overlapping)
+    n_rows = max(int(_ROWS * buildings), int(buildings >= 12)) if roofs == "mixed" else 0
+    n_single = buildings - 2 * (n_touching + n_overlapping) - _IN_ROW * n_rows
+    counts = _Counts(n_single, n_touching, n_overlapping, n_rows)
+    radii = radius * rng.uniform(0.7, 1.0, sum(counts))
     shore = size * np.array([*np.abs(rng.integers(0, 2, 2) - rng.uniform(0.08, 0.15, 2)), 0.05])
     centres = _place(rng, radii, size, shore)
-    rings = _draw(rng, radii, n_single, n_touching)
-    polygons = _turn(rng, rings, centres, n_single, n_touching)
+    rings = _draw(rng, radii, counts)
+    polygons = _turn(rng, rings, centres, counts)
     pond = np.array([shore[0] + ORIGIN[0], shore[1] + ORIGIN[1], shore[2] / 2, 0.0])
     pond[3] = _wave_height(waves, base, pond[:1], pond[1:2])[0]
     x, y = shapely.get_coordinates(shapely.centroid(polygons)).T
     ground = _terrain(waves, base, pond, x, y)
     roof = ground + rng.uniform(*_HEIGHTS, buildings)
     ids = np.array([f"B{number:06d}" for number in range(1, buildings + 1)], dtype=np.str_)
-    return SyntheticCity(size, density, seed, waves, base, pond, polygons, ids, ground, roof)
+    if roofs == "mixed":
+        shapes = draw_roofs(polygons, ground, roof, seed=seed)
+        roof = highest_places(shapes)
+    else:
+        shapes = flat_shapes(polygons, roof)
+    return SyntheticCity(size, density, seed, waves, base, pond, polygons, ids, ground, roof, roofs, shapes)
 
 
 def terrain_height(city: SyntheticCity, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -261,19 +300,20 @@ def _place(
 
 
 def _draw(
-    rng: np.random.Generator, radii: NDArray[np.float64], n_single: int, n_touching: int
+    rng: np.random.Generator, radii: NDArray[np.float64], counts: _Counts
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Draw shapes around the origin: four-cornered rings (a, 4, 2) and six-cornered rings (b, 6, 2).
 
-    Rows follow the circles: singles (L-shapes last), then first and second of each pair.
+    Rows follow the circles: singles (L-shapes last), then both of each pair, then the houses of each row.
     """
     aspect = rng.uniform(1.0, 2.0, len(radii))
     half = np.column_stack((aspect, np.ones(len(radii)))) * (radii / np.hypot(aspect, 1))[:, None]
     w, d = half.T
     u, v = rng.uniform(-0.2, 0.3, (2, len(radii)))
-    n_l = int(_L_SHAPED * n_single)
-    single, bent = slice(0, n_single - n_l), slice(n_single - n_l, n_single)
-    touching, overlapping = slice(n_single, n_single + n_touching), slice(n_single + n_touching, None)
+    n_l = int(_L_SHAPED * counts.single)
+    single, bent = slice(0, counts.single - n_l), slice(counts.single - n_l, counts.single)
+    last = np.cumsum(counts)
+    touching, overlapping = slice(last[0], last[1]), slice(last[1], last[2])
     wt, dt, ct = w[touching], d[touching], (u * w)[touching]
     wo, do, co = w[overlapping], d[overlapping], (u * w)[overlapping]
     squares = [
@@ -283,6 +323,11 @@ def _draw(
         _rectangle(-wo, -do, co + 0.15 * wo, 0.7 * do),
         _rectangle(co - 0.15 * wo, -0.6 * do, wo, do),
     ]
+    wr, dr = w[last[2] :], d[last[2] :]
+    between = np.linspace(-1.0, 1.0, _IN_ROW + 1) + np.zeros((counts.rows, 1))
+    if counts.rows:
+        between[:, 1:-1] += rng.uniform(-0.12, 0.12, (counts.rows, _IN_ROW - 1))
+    squares += [_rectangle(between[:, k] * wr, -dr, between[:, k + 1] * wr, dr) for k in range(_IN_ROW)]
     wl, dl, x, y = w[bent], d[bent], (u * w)[bent], (v * d)[bent]
     corners = [(-wl, -dl), (wl, -dl), (wl, y), (x, y), (x, dl), (-wl, dl)]
     bends = np.stack([np.column_stack(corner) for corner in corners], axis=1)
@@ -300,16 +345,16 @@ def _turn(
     rng: np.random.Generator,
     rings: tuple[NDArray[np.float64], NDArray[np.float64]],
     centres: NDArray[np.float64],
-    n_single: int,
-    n_touching: int,
+    counts: _Counts,
 ) -> NDArray[np.object_]:
     """Turn the rings by their circle's angle, move them there, and order them by circle."""
     squares, bends = rings
-    n_straight = n_single - len(bends)
+    n_straight = counts.single - len(bends)
     circles = np.arange(len(centres))
-    touching, overlapping = np.split(circles[n_single:], [n_touching])
-    of_square = np.concatenate((circles[:n_straight], touching, touching, overlapping, overlapping))
-    of_bend = circles[n_straight:n_single]
+    _, touching, overlapping, rows = np.split(circles, np.cumsum(counts)[:-1])
+    pairs = (touching, touching, overlapping, overlapping)
+    of_square = np.concatenate((circles[:n_straight], *pairs, *([rows] * _IN_ROW)))
+    of_bend = circles[n_straight : counts.single]
     angle = rng.uniform(0, 2 * np.pi, len(centres))
     polygons = [
         shapely.polygons(_moved(ring, angle[circle], centres[circle]))
@@ -339,6 +384,6 @@ def _roof_at(
     near = shapely.STRtree(city.polygons).query(shapely.box(*bounds))
     roof = np.full(len(x), -np.inf)
     hits, which = shapely.STRtree(city.polygons[near]).query(shapely.points(x, y), predicate="intersects")
-    np.maximum.at(roof, hits, city.roof[near][which])
+    np.maximum.at(roof, hits, shape_heights(city.shapes, near[which], np.column_stack((x, y))[hits]))
     roof[np.isneginf(roof)] = np.nan
     return roof

@@ -254,6 +254,7 @@ def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":
         density=options.density,
         relief=options.relief,
         seed=options.seed,
+        roofs=options.roofs,
     )
     clouds, shapefile = files.clouds[0].parent, files.shapefile
     say(f"{len(files.clouds)} LAZ files in {clouds}, footprints in {shapefile} and {files.footprints.name}")

@@ -238,6 +238,12 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int) -
     parser.add_argument("--density", type=float, default=1.5, help="points per m2 (default: 1.5)")
     parser.add_argument("--relief", type=float, default=20.0, help="height of the hills in m (default: 20)")
     parser.add_argument("--seed", type=int, default=1, help="same seed, same bytes (default: 1)")
+    parser.add_argument(
+        "--roofs",
+        choices=("flat", "mixed"),
+        default="flat",
+        help="roofs of the city; mixed: flat, shed, gable, hip, pyramid and mansard ones (default: flat)",
+    )
 
 
 def _add_fetch(fetch: argparse.ArgumentParser) -> None:

@@ -143,8 +143,8 @@ def write_city(folder: Source, *, size: float = 1000.0, buildings: int = 500, **
     buildings : int
         Their number.
     **options
-        ``density`` (points/m²), ``relief`` (height of the hills, m), ``seed``: see
-        `tiler.interface.synth.write_city`.
+        ``density`` (points/m²), ``relief`` (height of the hills, m), ``seed``, ``roofs`` ("flat", or "mixed" for
+        sloped ones too): see `tiler.interface.synth.write_city`.
 
     Returns
     -------

@@ -16,6 +16,7 @@ import shapely
 from pipeline.data.errors import ConfigError
 from pipeline.data.pointcloud import PointCloud
 from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, make_city
+from pipeline.points_terrain.synthetic_roofs import ROOF_TYPES, wing_rings
 
 CRS = "EPSG:3006"
 DENSITY = 1.5  # points/m2
@@ -39,7 +40,10 @@ class SynthFiles:
     footprints, shapefile : Path
         The same footprints as GPKG and SHP, with the attribute ``id``.
     truth : Path
-        JSON with the parameters, and ground and roof height of each building (m).
+        JSON with the parameters, and the ground and the highest place of the roof of each building (m); with mixed
+        roofs also its type, its eaves, and its planes: over each of the ``wings``, whose corners are ``ring``, the
+        roof is the lowest of ``a (x - x0) + b (y - y0) + c``, where ``origin`` is ``x0, y0`` and each of
+        ``planes`` is ``a, b, c``; where two wings overlap, the higher of both.
     """
 
     clouds: list[Path]
@@ -56,6 +60,7 @@ def write_city(
     density: float = DENSITY,
     relief: float = RELIEF,
     seed: int = SEED,
+    roofs: str = "flat",
 ) -> SynthFiles:
     """Make a synthetic city and write it: the same parameters give the same bytes.
 
@@ -63,7 +68,7 @@ def write_city(
     ----------
     directory : Path
         Folder to write to; made if it is missing.
-    size, buildings, density, relief, seed
+    size, buildings, density, relief, seed, roofs
         See `pipeline.points_terrain.synthetic.make_city`.
 
     Returns
@@ -81,7 +86,7 @@ def write_city(
     One LAZ file at a time is in memory.
     """
     try:
-        city = make_city(size=size, buildings=buildings, density=density, relief=relief, seed=seed)
+        city = make_city(size=size, buildings=buildings, density=density, relief=relief, seed=seed, roofs=roofs)
     except ValueError as error:
         raise ConfigError(f"synth: {error}") from error
     tiles = _tiles(city, directory / "tiles")
@@ -149,6 +154,7 @@ def _write_footprints(city: SyntheticCity, files: SynthFiles) -> None:
 
 def _truth(city: SyntheticCity, buildings: int, relief: float) -> dict[str, object]:
     pond = dict(zip(("x", "y", "radius", "level"), city.pond.tolist(), strict=True))
+    roofs: dict[str, object] = {} if city.roofs == "flat" else {"roofs": city.roofs}
     return {
         "crs": CRS,
         "bounds": [*ORIGIN, ORIGIN[0] + city.size, ORIGIN[1] + city.size],
@@ -157,12 +163,37 @@ def _truth(city: SyntheticCity, buildings: int, relief: float) -> dict[str, obje
         "density": city.density,
         "relief": relief,
         "seed": city.seed,
+        **roofs,
         "pond": pond,
         "buildings": [
-            {"id": str(name), "ground": round(ground, 3), "roof": round(roof, 3)}
-            for name, ground, roof in zip(city.ids, city.ground.tolist(), city.roof.tolist(), strict=True)
+            {"id": str(name), "ground": round(ground, 3), "roof": round(roof, 3), **shape}
+            for name, ground, roof, shape in zip(
+                city.ids, city.ground.tolist(), city.roof.tolist(), _shapes(city), strict=True
+            )
         ],
     }
+
+
+def _shapes(city: SyntheticCity) -> list[dict[str, object]]:
+    """Tell type, eaves and planes of each roof, but for a city of flat ones."""
+    shapes = city.shapes
+    if city.roofs == "flat":
+        return [{}] * len(shapes)
+    rings = np.round(wing_rings(shapes), 3).tolist()
+    wings = [
+        {
+            "ring": ring,
+            "origin": [round(place, 3) for place in centre],
+            "planes": [[round(part, 9) for part in plane] for plane in planes if plane[2] != np.inf],
+        }
+        for ring, centre, planes in zip(rings, shapes.centre.tolist(), shapes.plane.tolist(), strict=True)
+    ]
+    return [
+        {"type": ROOF_TYPES[kind], "eaves": round(eaves, 3), "wings": wings[first:last]}
+        for kind, eaves, first, last in zip(
+            shapes.kind.tolist(), shapes.eaves.tolist(), shapes.start[:-1], shapes.start[1:], strict=True
+        )
+    ]
 
 
 @contextmanager
