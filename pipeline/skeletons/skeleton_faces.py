@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 
 from pipeline.data.errors import GeometryError
-from pipeline.roofs.wavefront import CONTACT, Point, Wavefront
+from pipeline.skeletons.wavefront import CONTACT, Point, Wavefront
 
 AREA_TOLERANCE = 1e-9  # of the area of the polygon, by which the sum of the faces may differ from it
 UPRIGHT = 1e-4  # m², area that the upright part of a face may have by rounding

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from shapely import affinity
 
 from pipeline.data.errors import GeometryError
-from pipeline.roofs.straight_skeleton import Skeleton, outline_edges, straight_skeleton
-from pipeline.roofs.wavefront import Chain
+from pipeline.skeletons.straight_skeleton import Skeleton, outline_edges, straight_skeleton
+from pipeline.skeletons.wavefront import Chain
 from tests.helpers.house_outlines import HAND, KINDS, random_outlines, symmetric_star
 
 # Place and time of the nodes inside, by hand.
