@@ -76,6 +76,8 @@ def join_close_nodes(front: Wavefront, faces: list[list[int]], tolerance: float)
         would break a face stay as they were: faces narrower than the tolerance are as true as wide ones.
     """
     same = _find_joined(front, faces, tolerance)
+    if all(node == to for node, to in enumerate(same)):
+        return faces
     while True:
         joined = [drop_repeated([same[node] for node in face]) for face in faces]
         faults = find_faults(front, joined, tolerance)

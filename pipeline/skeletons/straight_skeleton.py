@@ -127,7 +127,7 @@ def straight_skeleton(
     Where two edges come to lie on each other (line-segment event) the part that they share ends at once as a
     ridge. At last nodes are joined whose line is shorter than `tolerance`.
 
-    O(n²) for n edges; about 1 ms for 10 edges.
+    O(n²) for n edges; about 1.5 ms for 8 edges.
 
     References
     ----------
