@@ -56,8 +56,9 @@ def first_of(kind: int, polygon: shapely.Polygon, *, across: bool = False) -> Ro
 
 
 def height(shapes: RoofShapes, *places: tuple[float, float]) -> NDArray[np.float64]:
-    above: NDArray[np.float64] = shape_heights(shapes, np.zeros(len(places), np.int64), np.array(places))
-    return above - shapes.eaves[0]
+    z = shape_heights(shapes, np.zeros(len(places), np.int64), np.array(places))
+    above: NDArray[np.float64] = z - shapes.eaves[0]
+    return above
 
 
 def test_roofs_over_a_rectangle() -> None:
