@@ -11,7 +11,7 @@ from pipeline.roofs.plane_search import fit_weighted, misfit
 
 # What a family must save against a flat roof: area (m²) whose points are off by `misfit` of 1.
 SHED, GABLE, VALLEY, HIP, MANSARD = 1.5, 4.0, 6.0, 3.0, 8.0
-SAMPLES = 200  # points that are looked at, at most
+SAMPLES = 100  # points that are looked at, at most
 RIDGES = 14  # places of a ridge that are tried across a house, less one
 BREAKS = 4  # widths of the upper part of a mansard roof that are tried, less one
 ROUNDS = 4  # of robust fits

@@ -31,6 +31,8 @@ from pipeline.roofs.subdivision import (
 PLANES, FAMILY, _, FLAT = range(len(ROOF_METHODS))
 LIMIT_SHARE = 0.02  # of a part's points may lie beyond its limits, on either side
 LIMIT_ROOM = 0.5  # m, between these points and the limits
+MIN_NEAREST = 4  # points of a house to which a plane is the nearest
+DENSITY = 6.0  # points a m², of which denser ones are thinned to up to twice as many
 MIN_REFIT = 6  # points that move a face
 
 Array = NDArray[np.float64]
@@ -85,28 +87,80 @@ class HouseRoofs:
         Where the roof of each house comes from: index into `ROOF_METHODS`.
     n_planes : int32, (h,)
         Number of different planes of each house.
+    too_few : bool, (h,)
+        Houses with too few points for planes: one flat part.
     """
 
     parts: HouseParts
     roofs: Roofs
     method: NDArray[np.int8]
     n_planes: NDArray[np.int32]
+    too_few: NDArray[np.bool_]
 
 
 def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOptions) -> HouseRoofs:
-    """Divide houses into parts with a plane each."""
+    """Divide houses into parts, each under a plane, by their points and outlines alone.
+
+    Parameters
+    ----------
+    polygons : object, (h,)
+        Valid shapely Polygons (m), courtyards as holes.
+    points : RoofPoints
+        Their roof points, as from `locate_roof_points`.
+    options : RoofOptions
+        Thresholds.
+
+    Returns
+    -------
+    HouseRoofs
+        Parts in canonical form that cover each house without overlap and share their vertices to the bit; a
+        house that is not divided keeps its polygon, to the bit.
+
+    Raises
+    ------
+    ValueError
+        If the options are out of range, or polygons and points do not match.
+
+    Notes
+    -----
+    1. A plane is fitted to the neighbours of each point (`fit_locally`), and of these the planes that most points
+       support are taken one after the other (`search_planes`); flat, or uphill across a wall, where they nearly
+       are. The planes of the best family of roofs (`fit_family`) and a flat one at the median are added.
+    2. Each point has a misfit under each plane: the square of its distance over half a metre, linear beyond.
+       The outline is cut in two where both sides fall best under a plane each (`cut_house`), along walls or
+       where planes meet, or along a rectangle under another plane, as long as a cut saves `cut_price`.
+    3. Neighbouring faces are joined (`join_faces`): under the same plane, too small, or not worth their wall.
+
+    Points are put in an order of their own first, so theirs does not matter. Of dense points every second, third
+    (...) is looked at. A house with fewer than `min_points` or `min_density` has one height, and so has one
+    whose best roof is flat: `too_few` tells them apart. O(n k) for n points and k planes of a house, a cut.
+    """
     _check(polygons, points, options)
     area = shapely.area(polygons)
     bounds = shapely.bounds(polygons).reshape(-1, 4)
     origin = np.floor((bounds[:, :2] + bounds[:, 2:]) / 2)
     count = np.diff(points.start)
+    too_few = (count < options.min_points) | (count < options.min_density * area)
     xyz = sort_points(points.start, points.xyz)
-    xyz[:, :2] -= np.repeat(origin, count, axis=0)
-    local = fit_locally(points.start, xyz, area)
-    enough = (count >= 2 * options.min_points) & (count >= options.min_density * area)
-    heights = [_median(xyz[first:last, 2]) for first, last in pairwise(points.start.tolist())]
-    fitted = _fit_houses(polygons, origin, points.start, (xyz, local), np.flatnonzero(enough), options)
-    return _assemble(polygons, origin, np.array(heights), fitted)
+    heights = np.array([_median(xyz[first:last, 2]) for first, last in pairwise(points.start.tolist())])
+    start, kept = _thin_out(points.start, np.where(too_few, np.inf, count / (area * DENSITY)))
+    xyz = xyz[kept]
+    xyz[:, :2] -= np.repeat(origin, np.diff(start), axis=0)
+    local = fit_locally(start, xyz, area)
+    fitted = _fit_houses(polygons, origin, start, (xyz, local), np.flatnonzero(~too_few), options)
+    return _assemble(polygons, origin, heights, too_few, fitted)
+
+
+def _thin_out(start: NDArray[np.int64], share: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Keep one in so many points of each house: `share` rounded down, 1 at least; none where it is infinite.
+
+    Gives where those of each house start, and bool (n,) which they are.
+    """
+    count = np.diff(start)
+    every = np.repeat(np.maximum(np.floor(share), 1), count)
+    kept: NDArray[np.bool_] = (np.arange(start[-1]) - np.repeat(start[:-1], count)) % every == 0
+    kept &= np.isfinite(every)
+    return np.concatenate(([0], np.cumsum(kept)))[start], kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +212,11 @@ def _fit_houses(
 
 
 def _assemble(
-    polygons: NDArray[np.object_], origin: Array, height: Array, fitted: list[_FittedHouse]
+    polygons: NDArray[np.object_],
+    origin: Array,
+    height: Array,
+    too_few: NDArray[np.bool_],
+    fitted: list[_FittedHouse],
 ) -> HouseRoofs:
     """Put the parts of all houses together: those fitted, and one flat part of each other house."""
     n = len(polygons)
@@ -187,7 +245,7 @@ def _assemble(
         rings = shapely.linearrings(xy, indices=ring)[order]
         rows, index = np.unique(owner[order], return_inverse=True)
         parts[rows] = make_canonical(shapely.polygons(rings, indices=index))
-    return HouseRoofs(HouseParts(parts, house), Roofs(plane, origin[house], limits), method, n_planes)
+    return HouseRoofs(HouseParts(parts, house), Roofs(plane, origin[house], limits), method, n_planes, too_few)
 
 
 def _median(z: Array) -> float:
@@ -205,7 +263,7 @@ def _fit_house(
     Gives slopes and heights, and limits of its parts; vertices of closed rings, their rings, the part of each
     ring and whether it is a shell; and whether all planes are of a family.
     """
-    net = open_subdivision(vertices, ring)
+    net = open_subdivision(vertices, ring, len(xyz))
     n_given = net[2][NODES]
     _, a, b = edges_of_face(net[0], net[1], net[2][HALVES], 0)
     density = len(xyz) / area_of_edges(a, b)
@@ -243,6 +301,22 @@ def _fit_house(
 
 
 @kernel
+def _is_known(xyz: Array, plane: Array, others: Array) -> bool:
+    """Whether a plane is, over the points near it, close to another one."""
+    n, far = 0, np.zeros(len(others))
+    for p in range(len(xyz)):
+        z = plane[0] * xyz[p, 0] + plane[1] * xyz[p, 1] + plane[2]
+        if abs(xyz[p, 2] - z) < 2 * BAND:
+            n += 1
+            for k in range(len(others)):
+                far[k] += abs(others[k, 0] * xyz[p, 0] + others[k, 1] * xyz[p, 1] + others[k, 2] - z)
+    known = False
+    for k in range(len(others)):
+        known |= far[k] < BAND * n
+    return known
+
+
+@kernel
 def _find_candidates(  # noqa: PLR0912
     xyz: Array, local: Array, a: Array, b: Array, density: float, least: float, max_slope: float
 ) -> tuple[Array, Array, Array, int]:
@@ -255,7 +329,12 @@ def _find_candidates(  # noqa: PLR0912
     found = np.empty((MAX_PLANES, 3))
     n_found = search_planes(xyz, local, least, max_slope, found)
     n = len(xyz)
-    k_family = len(family)
+    k_family = 0
+    for k in range(len(family)):
+        if not _is_known(xyz, family[k], found[:n_found]):
+            for q in range(3):
+                family[k_family, q] = family[k, q]
+            k_family += 1
     planes = np.empty((k_family + n_found + 1, 3))
     for k in range(k_family):
         planes[k, 0], planes[k, 1], planes[k, 2] = family[k, 0], family[k, 1], family[k, 2]
@@ -266,13 +345,14 @@ def _find_candidates(  # noqa: PLR0912
         planes[k_family + k, 0], planes[k_family + k, 1], planes[k_family + k, 2] = p, q, c
     last = k_family + n_found
     planes[last, 0], planes[last, 1], planes[last, 2] = 0.0, 0.0, (xyz[(n - 1) // 2, 2] + xyz[n // 2, 2]) / 2
-    nearest = np.empty(n, np.int64)
+    nearest, n_nearest = np.empty(n, np.int64), np.zeros(last + 1, np.int64)
     for p in range(n):
         low = np.inf
         for k in range(last + 1):
             r = abs(xyz[p, 2] - planes[k, 0] * xyz[p, 0] - planes[k, 1] * xyz[p, 1] - planes[k, 2])
             if r < low:
                 low, nearest[p] = r, k
+        n_nearest[nearest[p]] += 1
     mine = np.empty((n, 3))
     for k in range(last):
         m = 0
@@ -286,6 +366,15 @@ def _find_candidates(  # noqa: PLR0912
             s, t, c = regularise(some, start, along)
             if s * s + t * t <= max_slope * max_slope:
                 planes[k, 0], planes[k, 1], planes[k, 2] = s, t, c
+    # Planes that hardly any point is near go, but for the flat one.
+    kept, kept_family = 0, 0
+    for k in range(last + 1):
+        if k == last or n_nearest[k] >= MIN_NEAREST:
+            for q in range(3):
+                planes[kept, q] = planes[k, q]
+            kept += 1
+            kept_family += k < k_family
+    planes, k_family, last = planes[:kept].copy(), kept_family, kept - 1
     cost = np.empty((n, last + 1))
     for p in range(n):
         for k in range(last + 1):
@@ -344,3 +433,7 @@ def _quantile(start: NDArray[np.int64], ascending: Array, share: float, wanted: 
 def _check(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOptions) -> None:
     if len(points.start) != len(polygons) + 1:
         raise ValueError(f"{len(polygons)} polygons do not match the points of {len(points.start) - 1}")
+    positive = (options.clearance, options.min_area, options.min_points, options.max_slope, options.cut_price)
+    others = (options.min_density, options.min_step, options.min_kink, options.max_depth)
+    if not (all(value > 0 for value in positive) and all(value >= 0 for value in others)):
+        raise ValueError(f"options of roofs must be positive, min_density to max_depth not negative: {options}")

@@ -42,7 +42,7 @@ def fit_locally(start: Index, xyz: Array, area: Array) -> Array:
     from it. O(n k).
     """
     planes = np.empty((len(xyz), 4))
-    near = np.empty((len(xyz), MANY), np.int64)
+    near, sums, far = np.empty((len(xyz), MANY), np.int64), np.empty(9), np.empty(MANY)
     for i in range(len(start) - 1):
         first, last = start[i], start[i + 1]
         n = last - first
@@ -51,7 +51,7 @@ def fit_locally(start: Index, xyz: Array, area: Array) -> Array:
             _find_nearest(xyz, first, last, k, near)
         for p in range(first, last):
             if k >= 3:
-                _fit_one(xyz, p, near, k, planes)
+                _fit_one(xyz, p, near, k, planes, sums, far)
             else:
                 planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3] = 0.0, 0.0, xyz[p, 2], math.inf
     return planes
@@ -120,15 +120,14 @@ def _find_nearest(  # noqa: PLR0912
 
 
 @kernel
-def _fit_one(xyz: Array, p: int, near: Index, k: int, planes: Array) -> None:
+def _fit_one(xyz: Array, p: int, near: Index, k: int, planes: Array, sums: Array, far: Array) -> None:
     """Write the plane through the neighbours of a point."""
     x0, y0, z0 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
-    sums = np.zeros(9)
+    sums[:] = 0
     for m in range(k):
         q = near[p, m]
         add_point(sums, 1.0, xyz[q, 0] - x0, xyz[q, 1] - y0, xyz[q, 2] - z0)
     a, b, c = solve_plane(sums)
-    far = np.empty(k)
     for m in range(k):
         q = near[p, m]
         far[m] = abs(xyz[q, 2] - z0 - a * (xyz[q, 0] - x0) - b * (xyz[q, 1] - y0) - c)

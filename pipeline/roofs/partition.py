@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
 from pipeline.geometry.inside import INSIDE, side_of
-from pipeline.roofs.cut_search import OPEN, find_rectangle, find_ridges, rank_cuts
+from pipeline.roofs.cut_search import OPEN, find_rectangle, find_ridges, order_across, rank_cuts
 from pipeline.roofs.subdivision import (
     FACE,
     FACES,
     HALVES,
     NEXT,
     NODE,
-    ROOM,
     TWIN,
     area_of_edges,
     cut_face,
@@ -84,9 +83,9 @@ def cut_house(
         Areas (m²).
     """
     half, place, count = net
-    face, area = np.zeros(len(xyz), np.int64), np.zeros(len(place) + ROOM)
+    face, area = np.zeros(len(xyz), np.int64), np.zeros(len(place))
     depth, todo = np.zeros(len(area), np.int64), np.empty(len(area), np.int64)
-    lines = find_ridges(planes)
+    lines = (along, find_ridges(planes), *order_across(xyz, along))
     _, a, b = edges_of_face(half, place, count[HALVES], 0)
     area[0] = area_of_edges(a, b)
     todo[0], n_todo = 0, 1
@@ -98,7 +97,7 @@ def cut_house(
             continue
         least = max(int(rules.min_points) // 2, int(0.5 * len(rows) * rules.min_area / area[piece]))
         n_before = count[FACES]
-        if not _cut_piece(piece, rows, least, xyz, cost, (along, lines), net, rules):
+        if not _cut_piece(piece, rows, least, (xyz, cost, face), lines, net, rules):
             continue
         for f in range(n_before, count[FACES]):
             _, a, b = edges_of_face(half, place, count[HALVES], f)
@@ -133,15 +132,15 @@ def _cut_piece(
     piece: int,
     rows: Index,
     least: int,
-    xyz: Array,
-    cost: Array,
-    lines: tuple[Array, Array],
+    points: tuple[Array, Array, Index],
+    lines: tuple[Array, Array, Array, Index],
     net: tuple[Index, Array, Index],
     rules: PartRules,
 ) -> bool:
     """Cut a face along the best line, or along the best rectangle if that saves more; tell whether it is cut."""
     half, place, count = net
-    ranked = rank_cuts(xyz, cost, rows, lines[0], lines[1], least, rules.price)
+    xyz, cost, face = points
+    ranked = rank_cuts(xyz, cost, face, piece, lines, least, rules.price)
     saved = ranked[0, 3] + RECTANGLE_BONUS * rules.price if len(ranked) else 0.0
     sides = find_rectangle(xyz, cost, rows, lines[0], least, max(saved, rules.price), rules.clearance)
     cut = False
