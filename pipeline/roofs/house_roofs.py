@@ -1,5 +1,6 @@
 """Roofs of houses as planes from their points: houses divided into parts with a plane each (step 2.0)."""
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -31,6 +32,7 @@ from pipeline.roofs.subdivision import (
 PLANES, FAMILY, _, FLAT = range(len(ROOF_METHODS))
 LIMIT_SHARE = 0.02  # of a part's points may lie beyond its limits, on either side
 LIMIT_ROOM = 0.5  # m, between these points and the limits
+MIN_FITTED = 8  # points to which a plane is fitted again
 MIN_NEAREST = 4  # points of a house to which a plane is the nearest
 DENSITY = 6.0  # points a m², of which denser ones are thinned to up to twice as many
 MIN_REFIT = 6  # points that move a face
@@ -317,7 +319,7 @@ def _is_known(xyz: Array, plane: Array, others: Array) -> bool:
 
 
 @kernel
-def _find_candidates(  # noqa: PLR0912
+def _find_candidates(
     xyz: Array, local: Array, a: Array, b: Array, density: float, least: float, max_slope: float
 ) -> tuple[Array, Array, Array, int]:
     """Find the planes that parts may have.
@@ -328,58 +330,73 @@ def _find_candidates(  # noqa: PLR0912
     family = fit_family(xyz, a, b, along, density, max_slope)
     found = np.empty((MAX_PLANES, 3))
     n_found = search_planes(xyz, local, least, max_slope, found)
-    n = len(xyz)
-    k_family = 0
+    planes = np.empty((len(family) + n_found + 1, 3))
+    n_family = n = 0
     for k in range(len(family)):
         if not _is_known(xyz, family[k], found[:n_found]):
-            for q in range(3):
-                family[k_family, q] = family[k, q]
-            k_family += 1
-    planes = np.empty((k_family + n_found + 1, 3))
-    for k in range(k_family):
-        planes[k, 0], planes[k, 1], planes[k, 2] = family[k, 0], family[k, 1], family[k, 2]
+            planes[n, 0], planes[n, 1], planes[n, 2] = family[k, 0], family[k, 1], family[k, 2]
+            n += 1
+    n_family = n
     for k in range(n_found):
-        p, q, c = regularise(xyz, (found[k, 0], found[k, 1], found[k, 2]), along)
-        if p * p + q * q > max_slope * max_slope:
-            p, q, c = found[k, 0], found[k, 1], found[k, 2]
-        planes[k_family + k, 0], planes[k_family + k, 1], planes[k_family + k, 2] = p, q, c
-    last = k_family + n_found
-    planes[last, 0], planes[last, 1], planes[last, 2] = 0.0, 0.0, (xyz[(n - 1) // 2, 2] + xyz[n // 2, 2]) / 2
-    nearest, n_nearest = np.empty(n, np.int64), np.zeros(last + 1, np.int64)
-    for p in range(n):
-        low = np.inf
-        for k in range(last + 1):
-            r = abs(xyz[p, 2] - planes[k, 0] * xyz[p, 0] - planes[k, 1] * xyz[p, 1] - planes[k, 2])
-            if r < low:
-                low, nearest[p] = r, k
-        n_nearest[nearest[p]] += 1
-    mine = np.empty((n, 3))
-    for k in range(last):
-        m = 0
-        for p in range(n):
-            if nearest[p] == k:
-                mine[m, 0], mine[m, 1], mine[m, 2] = xyz[p, 0], xyz[p, 1], xyz[p, 2]
-                m += 1
-        if m >= 8:
-            some = mine[:m]
-            start = refit_plane(some, (planes[k, 0], planes[k, 1], planes[k, 2]), 2 * BAND)
-            s, t, c = regularise(some, start, along)
-            if s * s + t * t <= max_slope * max_slope:
-                planes[k, 0], planes[k, 1], planes[k, 2] = s, t, c
-    # Planes that hardly any point is near go, but for the flat one.
-    kept, kept_family = 0, 0
-    for k in range(last + 1):
-        if k == last or n_nearest[k] >= MIN_NEAREST:
-            for q in range(3):
-                planes[kept, q] = planes[k, q]
-            kept += 1
-            kept_family += k < k_family
-    planes, k_family, last = planes[:kept].copy(), kept_family, kept - 1
-    cost = np.empty((n, last + 1))
-    for p in range(n):
-        for k in range(last + 1):
+        s, t, c = _regularise_gently(xyz, (found[k, 0], found[k, 1], found[k, 2]), along, max_slope)
+        planes[n, 0], planes[n, 1], planes[n, 2] = s, t, c
+        n += 1
+    planes[n, 0], planes[n, 1] = 0.0, 0.0
+    planes[n, 2] = (xyz[(len(xyz) - 1) // 2, 2] + xyz[len(xyz) // 2, 2]) / 2
+    planes, n_family = _refit_nearest(xyz, planes[: n + 1], along, max_slope, n_family)
+    cost = np.empty((len(xyz), len(planes)))
+    for p in range(len(xyz)):
+        for k in range(len(planes)):
             cost[p, k] = misfit(xyz[p, 2] - planes[k, 0] * xyz[p, 0] - planes[k, 1] * xyz[p, 1] - planes[k, 2])
-    return planes, cost, along, k_family
+    return planes, cost, along, n_family
+
+
+@kernel
+def _regularise_gently(
+    xyz: Array, plane: tuple[float, float, float], along: Array, max_slope: float
+) -> tuple[float, float, float]:
+    """Give a plane as `regularise` does, or as it was where that is too steep."""
+    a, b, c = regularise(xyz, plane, along)
+    if a * a + b * b > max_slope * max_slope:
+        return plane
+    return a, b, c
+
+
+@kernel
+def _refit_nearest(xyz: Array, planes: Array, along: Array, max_slope: float, n_family: int) -> tuple[Array, int]:
+    """Fit each plane but the last, flat one to the points nearest to it; those with hardly any point go.
+
+    Gives the planes that are left, and how many of them are of a family.
+    """
+    nearest, count = np.empty(len(xyz), np.int64), np.zeros(len(planes), np.int64)
+    for p in range(len(xyz)):
+        low = math.inf
+        for k in range(len(planes)):
+            far = abs(xyz[p, 2] - planes[k, 0] * xyz[p, 0] - planes[k, 1] * xyz[p, 1] - planes[k, 2])
+            if far < low:
+                low, nearest[p] = far, k
+        count[nearest[p]] += 1
+    kept = np.empty((len(planes), 3))
+    n = left_family = 0
+    mine = np.empty((len(xyz), 3))
+    for k in range(len(planes)):
+        last = k == len(planes) - 1
+        if count[k] < MIN_NEAREST and not last:
+            continue
+        a, b, c = planes[k, 0], planes[k, 1], planes[k, 2]
+        if count[k] >= MIN_FITTED and not last:
+            m = 0
+            for p in range(len(xyz)):
+                if nearest[p] == k:
+                    mine[m, 0], mine[m, 1], mine[m, 2] = xyz[p, 0], xyz[p, 1], xyz[p, 2]
+                    m += 1
+            s, t, height = regularise(mine[:m], refit_plane(mine[:m], (a, b, c), 2 * BAND), along)
+            if s * s + t * t <= max_slope * max_slope:
+                a, b, c = s, t, height
+        kept[n, 0], kept[n, 1], kept[n, 2] = a, b, c
+        n += 1
+        left_family += k < n_family
+    return kept[:n].copy(), left_family
 
 
 def refit_roofs(roofs: Roofs, polygons: NDArray[np.object_], points: RoofPoints) -> Roofs:

@@ -225,9 +225,11 @@ def test_roofs_of_faces_move_to_their_points() -> None:
     few = np.column_stack((x[:5] + 20, np.full(5, 55.0), np.full(5, 99.0)))
     points = make_roof_points(np.array([0, 101, 202, 207]), np.concatenate((slope, level, few)))
     found = refit_roofs(roofs, faces, points)
-    np.testing.assert_allclose(found.plane, [[0.5, 0, 10.4], [0, 0, 8], [0.5, 0, 10]], atol=1e-12)
+    plane = np.array([[0.5, 0, 10.4], [0, 0, 8], [0.5, 0, 10]])
+    np.testing.assert_allclose(found.plane, plane, atol=1e-12)
     z = np.sort(slope[:, 2])
-    np.testing.assert_allclose(found.limits, [[z[2] - 0.5, z[98] + 0.5], [8, 8], [9, 13]], atol=1e-12)
+    limits = np.array([[z[2] - 0.5, z[98] + 0.5], [8, 8], [9, 13]])
+    np.testing.assert_allclose(found.limits, limits, atol=1e-12)
 
 
 @pytest.mark.parametrize(
