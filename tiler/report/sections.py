@@ -256,13 +256,23 @@ def _describe_roof_fit(found: dict[str, Any]) -> Iterator[str]:
     if found.get("worst_roofs"):
         rows = [
             [
-                one["id"], METHODS[one["method"]], f"{one['x']:.1f}, {one['y']:.1f}", number(one["points"]),
-                *(number(one[name]) for name in ("rmse", "median", "within")), one["why"],
+                one["id"],
+                METHODS[one["method"]],
+                *(number(one[name]) for name in ("parts", "points", "rmse", "within")),
+                f"{one['worst_part']} at {one['x']:.1f}, {one['y']:.1f}: {one['why']}",
             ]
             for one in found["worst_roofs"]
-        ]  # fmt: skip
-        head = ["part", "roof", "place", "points", "RMSE (m)", "median (m)", "within 0.25 m", "what is known"]
-        yield folded("The building parts whose roofs fit worst", table("Roofs of largest RMSE", head, rows))
+        ]
+        head = [
+            "house",
+            "roof",
+            "parts",
+            "points",
+            "RMSE (m)",
+            "within 0.25 m",
+            "worst part, and what is known of it",
+        ]
+        yield folded("The houses whose roofs fit worst", table("Roofs of largest RMSE", head, rows))
 
 
 def format_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:
