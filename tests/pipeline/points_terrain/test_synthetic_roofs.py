@@ -30,7 +30,14 @@ ELL = [(0, 0), (20, 0), (20, 8), (6, 8), (6, 15), (0, 15)]
 
 
 def city(**changes: Any) -> SyntheticCity:
-    given = {"size": 400.0, "buildings": 200, "density": 1.5, "relief": 20.0, "seed": 1, "roofs": "mixed"}
+    given: dict[str, Any] = {
+        "size": 400.0,
+        "buildings": 200,
+        "density": 1.5,
+        "relief": 20.0,
+        "seed": 1,
+        "roofs": "mixed",
+    }
     return make_city(**given | changes)
 
 
@@ -49,7 +56,9 @@ def first_of(kind: int, polygon: shapely.Polygon, *, across: bool = False) -> Ro
 
 
 def height(shapes: RoofShapes, *places: tuple[float, float]) -> NDArray[np.float64]:
-    return shape_heights(shapes, np.zeros(len(places), np.int64), np.array(places)) - shapes.eaves[0]
+    found: NDArray[np.float64] = shape_heights(shapes, np.zeros(len(places), np.int64), np.array(places))
+    found -= shapes.eaves[0]
+    return found
 
 
 def test_roofs_over_a_rectangle() -> None:
@@ -207,7 +216,8 @@ def test_truth_has_types_and_planes(tmp_path: Path) -> None:
 
 
 def _centroid(made: SyntheticCity, k: int) -> NDArray[np.float64]:
-    return shapely.get_coordinates(shapely.centroid(made.polygons[k])).reshape(-1, 1, 2).T[:, 0]
+    place: NDArray[np.float64] = shapely.get_coordinates(shapely.centroid(made.polygons[k])).T
+    return place
 
 
 def test_no_and_few_houses() -> None:
