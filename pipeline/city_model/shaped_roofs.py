@@ -8,7 +8,7 @@ from pipeline.data.errors import GeometryError
 from pipeline.data.roofs import ROOF_METHODS, Roofs, join_roofs, take_roofs
 from pipeline.roofs.house_levels import HouseParts
 from pipeline.roofs.house_roofs import HouseRoofs, RoofOptions
-from pipeline.roofs.skeleton_roofs import RoofForm, skeleton_roofs
+from pipeline.skeletons.skeleton_roofs import RoofForm, skeleton_roofs
 
 SKELETON = ROOF_METHODS.index("skeleton")
 SLOPE = 0.7  # m per m, about 35 degrees

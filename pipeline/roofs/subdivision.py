@@ -317,7 +317,7 @@ def outline_regions(
 
 @kernel
 def _put_ring(place: Array, nodes: Index, kept: tuple[Index, int], xy: Array, m: int) -> int:
-    """Write the vertices of a closed ring after m others, but for new ones on straight walls; give their number."""
+    """Write a closed ring after m vertices, but for new ones on straight walls; give the number of all."""
     degree, n_given = kept
     begin, length = m, len(nodes)
     for k in range(length):

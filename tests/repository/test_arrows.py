@@ -95,6 +95,7 @@ ORDER = {
         "data",
         "geometry",
         "points_terrain",
+        "skeletons",
         "roofs",
         "city_model",
         "simplification",

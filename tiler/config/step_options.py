@@ -58,15 +58,19 @@ def derived_parameters(config: Config) -> dict[str, float | str]:
     the mesher or the way to simplify knows no sloped roofs.
     """
     spacing = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
-    sloping = config.mesher == "adaptive" and config.simplify == "clearance"
     return {
-        "roofs_or_flat": config.roofs if sloping else "flat",
+        "roofs_or_flat": "flat" if roofs_stay_flat(config) else config.roofs,
         "layer_height_or_default": config.layer_height_or_default,
         "graded_size": config.graded_size,
         "tile_size_or_default": config.tile_size_or_default,
         "roof_clearance_or_spacing": max(config.roof_clearance, spacing),
         "roof_group_or_spacing": max(config.roof_group, spacing),
     }
+
+
+def roofs_stay_flat(config: Config) -> bool:
+    """Whether roofs are flat whatever is asked: mesher = layered and simplify = paper know no others."""
+    return config.mesher != "adaptive" or config.simplify != "clearance"
 
 
 def needs_region(config: Config) -> bool:

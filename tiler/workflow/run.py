@@ -14,6 +14,7 @@ from typing import Any
 
 from pipeline.data.errors import CityError, OutputError
 from tiler.config.config import ANYWHERE, Config
+from tiler.config.step_options import roofs_stay_flat
 from tiler.dashboard.server import read_address, watched
 from tiler.engine.engine import StoppedError
 from tiler.engine.executor import Executor, serial
@@ -377,8 +378,15 @@ def _find_damage(out: Path) -> dict[str, str]:
 
 
 def _foresee(plan: Plan, config: Config) -> list[str]:
-    """Say which tiles may not fit into the memory of this machine."""
-    return [] if config.on_cluster else warn_of_memory(plan.survey, config, memory=machine_memory())
+    """Say which roofs stay flat against what was asked, and which tiles may not fit into this machine's memory."""
+    flat = [warn_of_flat_roofs(config)] if config.roofs != "flat" and roofs_stay_flat(config) else []
+    return flat + ([] if config.on_cluster else warn_of_memory(plan.survey, config, memory=machine_memory()))
+
+
+def warn_of_flat_roofs(config: Config) -> str:
+    """Say why roofs are flat although sloped ones were asked for."""
+    why = f"mesher = {config.mesher}" if config.mesher != "adaptive" else f"simplify = {config.simplify}"
+    return f"roofs are flat, not {config.roofs}: {why} has no sloped ones"
 
 
 def describe_error(error: BaseException) -> str:

@@ -56,9 +56,9 @@ def first_of(kind: int, polygon: shapely.Polygon, *, across: bool = False) -> Ro
 
 
 def height(shapes: RoofShapes, *places: tuple[float, float]) -> NDArray[np.float64]:
-    found: NDArray[np.float64] = shape_heights(shapes, np.zeros(len(places), np.int64), np.array(places))
-    found -= shapes.eaves[0]
-    return found
+    z = shape_heights(shapes, np.zeros(len(places), np.int64), np.array(places))
+    above: NDArray[np.float64] = z - shapes.eaves[0]
+    return above
 
 
 def test_roofs_over_a_rectangle() -> None:
@@ -216,8 +216,8 @@ def test_truth_has_types_and_planes(tmp_path: Path) -> None:
 
 
 def _centroid(made: SyntheticCity, k: int) -> NDArray[np.float64]:
-    place: NDArray[np.float64] = shapely.get_coordinates(shapely.centroid(made.polygons[k])).T
-    return place
+    xy: NDArray[np.float64] = shapely.get_coordinates(shapely.centroid(made.polygons[k])).reshape(-1, 1, 2).T[:, 0]
+    return xy
 
 
 def test_no_and_few_houses() -> None:

@@ -12,8 +12,10 @@ from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.cli.main import make_parser
 from tiler.config.config import Config, annotated_defaults, load_config, make_config
 from tiler.config.config_file import with_file
+from tiler.config.step_options import derived_parameters
 from tiler.interface.synth import write_city
 from tiler.planning.plan import survey_inputs
+from tiler.workflow.run import warn_of_flat_roofs
 
 
 def test_the_annotated_defaults_are_the_defaults() -> None:
@@ -124,3 +126,12 @@ def test_tiles_follow_the_mesh_size_alone_where_no_side_is_given(tmp_path: Path)
     said: list[str] = []
     assert survey_inputs(make_config(given), said.append).region.tile_size == 350.0
     assert survey_inputs(make_config(given | {"tile_size": 90.0}), said.append).region.tile_size == 90.0
+
+
+def test_roofs_stay_flat_where_the_mesher_or_the_simplification_knows_no_others() -> None:
+    sloped = Config(roofs="planes")
+    assert derived_parameters(sloped)["roofs_or_flat"] == "planes"
+    layered, paper = Config(roofs="planes", mesher="layered"), Config(roofs="planes", simplify="paper")
+    for config, why in ((layered, "mesher = layered"), (paper, "simplify = paper")):
+        assert derived_parameters(config)["roofs_or_flat"] == "flat"
+        assert warn_of_flat_roofs(config) == f"roofs are flat, not planes: {why} has no sloped ones"

@@ -9,8 +9,8 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.roofs import is_flat, roof_heights
-from pipeline.roofs.part_cycles import LevelCuts, join_cycles
-from pipeline.roofs.skeleton_roofs import (
+from pipeline.skeletons.part_cycles import LevelCuts, join_cycles
+from pipeline.skeletons.skeleton_roofs import (
     ROOF_SHAPES,
     RoofForm,
     ShapedRoof,
@@ -18,9 +18,9 @@ from pipeline.roofs.skeleton_roofs import (
     roof_solid,
     skeleton_roofs,
 )
-from pipeline.roofs.straight_skeleton import outline_edges, straight_skeleton
+from pipeline.skeletons.straight_skeleton import outline_edges, straight_skeleton
 from tests.helpers.house_outlines import HAND, KINDS, random_outlines
-from tests.pipeline.roofs.test_skeleton_peer import read_footprints
+from tests.pipeline.skeletons.test_skeleton_peer import read_footprints
 
 Array = NDArray[np.float64]
 

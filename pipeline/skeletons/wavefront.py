@@ -108,6 +108,7 @@ class Wavefront:
         self._now = 0.0
         for ring in rings:
             self._add_ring(ring)
+        self._events_left = EVENTS_PER_EDGE * len(self.offset) + 100
         xs, ys = zip(*(xy for ring in rings for xy in ring), strict=True)
         self._bounds = min(xs) - CONTACT, min(ys) - CONTACT, max(xs) + CONTACT, max(ys) + CONTACT
 
@@ -127,15 +128,11 @@ class Wavefront:
             self._add_splits(v)
         for t in sorted({self.start[e] for e in self._waiting}):
             heapq.heappush(self._queue, (t, SET_OFF, -1, -1))
-        left = EVENTS_PER_EDGE * len(self.offset) + 100
         while self._queue and self._moving:
             time, kind, v, other = heapq.heappop(self._queue)
             if self._happens(time, kind, v, other):
                 self._now = max(self._now, time)
                 self._take_event(kind, v, other)
-                left -= 1
-            if left < 0:
-                raise GeometryError(f"more than {EVENTS_PER_EDGE} events an edge{self._place()}")
         if self._moving:
             raise GeometryError(f"{len(self._moving)} edges meet no other edge{self._place()}")
 
@@ -276,6 +273,9 @@ class Wavefront:
 
     def _meet(self, xy: Point, ending: tuple[int, ...]) -> None:
         """End what meets at a place, the vertices ``ending`` in any case, and join the edges around it anew."""
+        self._events_left -= 1
+        if self._events_left < 0:
+            raise GeometryError(f"more than {EVENTS_PER_EDGE} events an edge{self._place()}")
         gathered, divided = self._gather(xy, ending)
         loops, chains = self._chain(gathered, divided)
         chains = self._choose(chains, ending)

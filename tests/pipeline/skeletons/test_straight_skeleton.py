@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from shapely import affinity
 
 from pipeline.data.errors import GeometryError
-from pipeline.roofs.straight_skeleton import Skeleton, outline_edges, straight_skeleton
-from pipeline.roofs.wavefront import Chain
+from pipeline.skeletons.straight_skeleton import Skeleton, outline_edges, straight_skeleton
+from pipeline.skeletons.wavefront import Chain
 from tests.helpers.house_outlines import HAND, KINDS, random_outlines, symmetric_star
 
 # Place and time of the nodes inside, by hand.
@@ -299,3 +299,9 @@ def test_what_touches_from_outside_is_apart_and_what_moved_on_is_not() -> None:
 
 def test_edges_that_came_to_lie_on_each_other_have_no_inner_side() -> None:
     assert Chain([5, 6], (2, 3), (2, 0), ALONG).half == pytest.approx(math.pi)
+
+
+def test_events_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.roofs.wavefront.EVENTS_PER_EDGE", -25)
+    with pytest.raises(GeometryError, match="more than -25 events an edge near"):
+        straight_skeleton(HAND["square"])

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.data.roofs import Roofs
 from pipeline.geometry.rings import make_canonical
-from pipeline.roofs.part_cycles import LevelCuts, join_cycles
-from pipeline.roofs.skeleton_faces import face_area, sloped_part
-from pipeline.roofs.straight_skeleton import TOLERANCE, Skeleton, outline_edges, straight_skeleton
+from pipeline.skeletons.part_cycles import LevelCuts, join_cycles
+from pipeline.skeletons.skeleton_faces import face_area, sloped_part
+from pipeline.skeletons.straight_skeleton import TOLERANCE, Skeleton, outline_edges, straight_skeleton
 
 ROOF_SHAPES = ("flat", "skillion", "hipped", "pyramidal", "gabled", "half-hipped", "mansard", "gambrel")
 DEFAULT_SLOPE = 0.7  # m per m, about 35 degrees

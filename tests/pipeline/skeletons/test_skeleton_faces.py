@@ -3,8 +3,8 @@
 import pytest
 
 from pipeline.data.errors import GeometryError
-from pipeline.roofs.skeleton_faces import check_faces, drop_repeated, face_area, follow_faces, is_monotone
-from pipeline.roofs.wavefront import Point, Wavefront
+from pipeline.skeletons.skeleton_faces import check_faces, drop_repeated, face_area, follow_faces, is_monotone
+from pipeline.skeletons.wavefront import Point, Wavefront
 
 RECTANGLE = [(0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (0.0, 4.0)]
 

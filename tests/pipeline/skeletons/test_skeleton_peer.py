@@ -11,7 +11,7 @@ from compas_cgal.straight_skeleton_2 import interior_straight_skeleton, interior
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pipeline.roofs.straight_skeleton import Skeleton, outline_edges, straight_skeleton
+from pipeline.skeletons.straight_skeleton import Skeleton, outline_edges, straight_skeleton
 from tests.helpers.house_outlines import HAND, KINDS, random_outlines
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import GeometryError
 from pipeline.geometry.rings import make_canonical
-from pipeline.roofs.skeleton_faces import check_faces, follow_faces, join_close_nodes
-from pipeline.roofs.wavefront import CONTACT, Point, Wavefront
+from pipeline.skeletons.skeleton_faces import check_faces, follow_faces, join_close_nodes
+from pipeline.skeletons.wavefront import CONTACT, Point, Wavefront
 
 MIN_EDGE = 1e-4  # m, a polygon with a shorter edge is refused
 MAX_EXTENT = 1e5  # m
@@ -127,7 +127,7 @@ def straight_skeleton(
     Where two edges come to lie on each other (line-segment event) the part that they share ends at once as a
     ridge. At last nodes are joined whose line is shorter than `tolerance`.
 
-    O(n²) for n edges; about 1 ms for 10 edges.
+    O(n²) for n edges; about 1.5 ms for 8 edges.
 
     References
     ----------

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 
 from pipeline.data.errors import GeometryError
-from pipeline.roofs.wavefront import CONTACT, Point, Wavefront
+from pipeline.skeletons.wavefront import CONTACT, Point, Wavefront
 
 AREA_TOLERANCE = 1e-9  # of the area of the polygon, by which the sum of the faces may differ from it
 UPRIGHT = 1e-4  # m², area that the upright part of a face may have by rounding
@@ -76,6 +76,8 @@ def join_close_nodes(front: Wavefront, faces: list[list[int]], tolerance: float)
         would break a face stay as they were: faces narrower than the tolerance are as true as wide ones.
     """
     same = _find_joined(front, faces, tolerance)
+    if all(node == to for node, to in enumerate(same)):
+        return faces
     while True:
         joined = [drop_repeated([same[node] for node in face]) for face in faces]
         faults = find_faults(front, joined, tolerance)
