@@ -77,12 +77,16 @@ def set_order_keys(
 
     Notes
     -----
-    Keys are pushed apart in sweeps over the edges, both ends alike where both are free. The lowest and the
-    highest key of a column stay. A sweep costs O(edges).
+    Keys are pushed apart in sweeps over the edges, both ends alike where both are free. The highest key of a
+    column stays, and so does the lowest one where it is the ground, which soil has too. Between two roofs the
+    lowest one may sink: a wall that begins there may taper to nothing at a given column that stands lower.
+    A sweep costs O(edges).
     """
     key = key.copy()
     column = np.repeat(np.arange(len(mesh.plane.xy)), np.diff(mesh.z_start))
-    unmet = _push_apart(gates, mesh.z_start, column, given, key, SWEEPS, LEAST_STEP) if len(gates) else 0
+    outdoors = np.zeros(len(given), np.bool_)
+    outdoors[mesh.plane.triangles[mesh.plane.building < 0]] = True
+    unmet = _push_apart(gates, mesh.z_start, column, given, outdoors, key, SWEEPS, LEAST_STEP) if len(gates) else 0
     if np.array_equal(key, mesh.z):
         return mesh, unmet
     return replace(mesh, key=key), unmet
@@ -94,6 +98,7 @@ def _push_apart(
     start: NDArray[np.int64],
     column: NDArray[np.int64],
     given: NDArray[np.bool_],
+    outdoors: NDArray[np.bool_],
     key: NDArray[np.float64],
     sweeps: int,
     least: float,
@@ -117,7 +122,8 @@ def _push_apart(
                 if free_a:
                     _raise_keys(key, a, start[column[a]], start[column[a] + 1] - 1, part, least)
                 if free_b:
-                    _lower_keys(key, b, start[column[b]], start[column[b] + 1] - 1, part, least)
+                    low, high = start[column[b]], start[column[b] + 1] - 1
+                    _lower_keys(key, b, low, high, not outdoors[column[b]], part, least)
         if not moved:
             break
     left = 0
@@ -146,13 +152,15 @@ def _raise_keys(key: NDArray[np.float64], a: int, low: int, high: int, part: flo
 
 
 @kernel(inline="always")
-def _lower_keys(key: NDArray[np.float64], b: int, low: int, high: int, part: float, least: float) -> None:
-    """Lower the keys of level `b` and the one below it, and what is in their way; the ends of the column stay."""
+def _lower_keys(
+    key: NDArray[np.float64], b: int, low: int, high: int, sinks: bool, part: float, least: float
+) -> None:
+    """Lower the keys of level `b` and the one below it, and what is in their way; the lowest if it may sink."""
     if b < high:
         key[b] -= part
-    if b - 1 > low:
+    if b - 1 > low or sinks:
         key[b - 1] -= part
-    for i in range(b - 2, low, -1):
+    for i in range(b - 2, low - sinks, -1):
         if key[i] <= key[i + 1] - least:
             break
         key[i] = key[i + 1] - least

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.data.classes import BUILDING, GROUND
+from pipeline.points_terrain.synthetic_roofs import RoofShapes, draw_roofs, shape_heights
 from stitch.tiling.grid import Bounds
 from tiler.config.config import Config, make_config
 from tiler.config.step_options import derived_parameters
@@ -34,17 +35,22 @@ from tiler.workflow.settled_domain import settle_domain
 from tiler.workflow.stage_sequence import run_city_stages
 
 CRS = "EPSG:3006"
+ROOF_SIGMA = 0.05  # m, of the points on sloped roofs
 ROAD = 14.0  # m between two terraces, back to back ones are closer
 
 
 @dataclass(frozen=True, eq=False)
 class Town:
-    """Footprints, heights of their roofs above the ground at their centroid (m), and hills of some height (m)."""
+    """Footprints, heights of their roofs above the ground at their centroid (m), hills of some height (m).
+
+    Roofs are flat but for those that have `shapes`.
+    """
 
     bounds: Bounds
     polygons: NDArray[np.object_]
     heights: NDArray[np.float64]
     relief: float = 0.0
+    shapes: RoofShapes | None = None
 
     def ground(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Height of the ground (m), a function of the place alone."""
@@ -54,9 +60,16 @@ class Town:
 
 def make_town(bounds: Bounds, polygons: Sequence[shapely.Polygon], *, relief: float = 0.0, seed: int = 0) -> Town:
     """Town of some footprints with heights of 4 to 25 m."""
-    shapes = np.empty(len(polygons), object)
-    shapes[:] = list(polygons)
-    return Town(bounds, shapes, np.random.default_rng([seed, 1]).uniform(4, 25, len(shapes)), relief)
+    outlines = np.empty(len(polygons), object)
+    outlines[:] = list(polygons)
+    return Town(bounds, outlines, np.random.default_rng([seed, 1]).uniform(4, 25, len(outlines)), relief)
+
+
+def put_roofs(town: Town, *, seed: int) -> Town:
+    """Give the houses of a town roofs of all types; those that are flat have their heights."""
+    ground = town.ground(*shapely.get_coordinates(shapely.centroid(town.polygons)).reshape(-1, 2).T)
+    shapes = draw_roofs(town.polygons, ground, ground + town.heights, seed=seed)
+    return dataclasses.replace(town, shapes=shapes)
 
 
 def terraces(bounds: Bounds, *, seed: int, angle: float = 17.0) -> list[shapely.Polygon]:
@@ -126,7 +139,11 @@ def write_town(
     z, classes = town.ground(x, y), np.full(len(x), GROUND, np.uint8)
     where, house = shapely.STRtree(shapely.points(x, y)).query(town.polygons, predicate="intersects")[::-1]
     centre = shapely.get_coordinates(shapely.centroid(town.polygons)).reshape(-1, 2)
-    z[where] = (town.ground(*centre.T) + town.heights)[house]
+    if town.shapes is None:
+        z[where] = (town.ground(*centre.T) + town.heights)[house]
+    else:
+        z[where] = shape_heights(town.shapes, house, np.column_stack((x, y))[where])
+        z[where] += np.random.default_rng(1).normal(0, ROOF_SIGMA, len(where))
     classes[where] = BUILDING
     dry = np.ones(len(x), np.bool_) if lake is None else ~shapely.contains_xy(lake, x, y)
     (folder / "tiles").mkdir(parents=True)

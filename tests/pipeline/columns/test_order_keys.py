@@ -114,6 +114,29 @@ def test_keys_let_the_merge_pass_through_both_ends_of_a_gate() -> None:
     assert (still.key, unmet) == (None, 1)
 
 
+def test_between_roofs_the_lowest_key_sinks() -> None:
+    """A wall between two roofs tapers to nothing at a given vertex that stands lower than its other end."""
+    columns = [[16.0, 18.0, 24.0], [12.0, 24.0], [20.0, 24.0], [17.5, 18.7, 24.0]]
+    start = np.concatenate(([0], np.cumsum([len(column) for column in columns])))
+    plane = dataclasses.replace(SQUARE, building=np.array([0, 1], np.int32))
+    bottom = np.array([[0, 0, 0], [0, 0, 1]], np.int32)
+    mesh = ColumnMesh(plane, start, np.concatenate(columns), bottom, "heights")
+    given, gates = np.array([True, False, False, False]), wall_gates(mesh)
+    assert gates.tolist() == [[[0, 0], [7, 8]]]
+    # Above 16 m the segment at vertex 0 has its middle at 17 m: that of the wall at vertex 3 must be lower.
+    keyed, unmet = set_order_keys(mesh, mesh.z, given, gates)
+    assert unmet == 0
+    assert keyed.key is not None
+    assert keyed.key[:3].tolist() == [16.0, 18.0, 24.0]
+    assert (np.diff(keyed.key[7:]) > 0).all()
+    assert keyed.key[7] + keyed.key[8] < 34.0
+    # The ground stays, and with it what is in the way.
+    ground = dataclasses.replace(mesh, plane=dataclasses.replace(SQUARE, building=np.array([-1, 1], np.int32)))
+    still, unmet = set_order_keys(ground, ground.z, given, gates)
+    assert unmet == 1
+    assert still.key is None or still.key[7] == 17.5
+
+
 def test_level_walls_need_no_keys() -> None:
     mesh = steep_wall()
     level = dataclasses.replace(mesh, z=np.where(mesh.z == 13.0, 4.5, np.where(mesh.z == 9.0, 4.2, mesh.z)))
