@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import (
@@ -16,7 +15,7 @@ from pipeline.city_model.building_points import (
 )
 from pipeline.city_model.city import City, CityOptions
 from pipeline.city_model.heights import ROOF_SOURCES
-from pipeline.city_model.shaped_roofs import have_few_points, shape_roofs
+from pipeline.city_model.shaped_roofs import shape_roofs
 from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roofs import Roofs, flat_roofs, join_roofs, take_roofs
 from pipeline.geometry.inside import find_inside
@@ -104,9 +103,8 @@ def divide_houses(
         if sloped:
             fit = RoofOptions(clearance=options.clearance)
             fitted = fit_roofs(model.polygons, roofs, fit)
-            few = have_few_points(np.diff(roofs.start), shapely.area(model.polygons), fit)
             told = city.roof_source != ROOF_SOURCES.index("default")
-            chosen = few & told if options.roofs == "planes" else np.ones(len(model), np.bool_)
+            chosen = fitted.too_few & told if options.roofs == "planes" else np.ones(len(model), np.bool_)
             fitted = shape_roofs(fitted, model.polygons, chosen, model.ground, model.roof)
             parts, part_roofs, method = fitted.parts, fitted.roofs, fitted.method
         else:

@@ -16,24 +16,6 @@ WIDEST_RISE = 4.0  # m; over outlines whose hipped roof would be higher, roofs a
 LEAST_EAVES = 2.0  # m above the ground
 
 
-def have_few_points(
-    count: NDArray[np.int64], area: NDArray[np.float64], options: RoofOptions
-) -> NDArray[np.bool_]:
-    """Tell which houses have too few roof points for planes.
-
-    Parameters
-    ----------
-    count : int64, (h,)
-        Number of roof points of each.
-    area : float64, (h,)
-        Area of each (m²).
-    options : RoofOptions
-        How roofs are fitted to points.
-    """
-    few: NDArray[np.bool_] = (count < 2 * options.min_points) | (count < options.min_density * area)
-    return few
-
-
 def shape_roofs(
     fitted: HouseRoofs,
     polygons: NDArray[np.object_],
@@ -78,7 +60,8 @@ def shape_roofs(
     method, n_planes = fitted.method.copy(), fitted.n_planes.copy()
     method[new] = SKELETON
     n_planes[new] = [len(np.unique(each.plane, axis=0)) for _, each in shaped.values()]
-    return HouseRoofs(HouseParts(pieces[order], house[order]), take_roofs(roofs, order), method, n_planes)
+    parts = HouseParts(pieces[order], house[order])
+    return HouseRoofs(parts, take_roofs(roofs, order), method, n_planes, fitted.too_few)
 
 
 def _hip(polygon: shapely.Polygon, ground: float, roof: float) -> tuple[NDArray[np.object_], Roofs] | None:

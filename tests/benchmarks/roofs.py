@@ -16,10 +16,10 @@ import numpy as np
 import pyogrio
 import shapely
 from numpy.typing import NDArray
-from pipeline.columns.tile import prepare_footprints
 
 from pipeline.city_model.building_points import has_building_class
 from pipeline.city_model.city import CityOptions
+from pipeline.city_model.city_steps import prepare_footprints
 from pipeline.data.citymodel import Footprints
 from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roofs import Roofs, flat_roofs, roof_heights, take_roofs
@@ -171,6 +171,7 @@ def main() -> None:
         clearance=given.clearance,
         clearance_floor=0.1,
         min_courtyard_area=5.0,
+        roofs="flat",
         split_levels=True,
         roof_group=2.5,
         manifold=False,

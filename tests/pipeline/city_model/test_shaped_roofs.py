@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.city_model.shaped_roofs import LEAST_EAVES, SKELETON, SLOPE, have_few_points, shape_roofs
+from pipeline.city_model.shaped_roofs import LEAST_EAVES, SKELETON, SLOPE, shape_roofs
 from pipeline.data.roofs import flat_roofs, is_flat, roof_heights
 from pipeline.roofs.house_levels import HouseParts
-from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions
+from pipeline.roofs.house_roofs import FLAT, HouseRoofs
 
 HOUSES = np.array([shapely.box(100, 0, 112, 8), shapely.box(120, 0, 130, 8), shapely.box(0, 40, 60, 80)])
 
@@ -15,7 +15,9 @@ HOUSES = np.array([shapely.box(100, 0, 112, 8), shapely.box(120, 0, 130, 8), sha
 def flat_houses(heights: list[float]) -> HouseRoofs:
     n = len(heights)
     parts = HouseParts(HOUSES[:n], np.arange(n))
-    return HouseRoofs(parts, flat_roofs(np.array(heights)), np.full(n, FLAT, np.int8), np.ones(n, np.int32))
+    return HouseRoofs(
+        parts, flat_roofs(np.array(heights)), np.full(n, FLAT, np.int8), np.ones(n, np.int32), np.ones(n, np.bool_)
+    )
 
 
 def shape(heights: list[float], chosen: list[bool], ground: float = 0.0) -> HouseRoofs:
@@ -50,10 +52,3 @@ def test_houses_stay_flat_where_a_hipped_roof_is_no_roof_of_theirs() -> None:
     for found in (wide, low, unknown):
         assert (found.method == FLAT).all()
         assert (found.parts.polygons == HOUSES[: len(found.method)]).all()
-
-
-def test_few_points_are_less_than_two_parts_need_or_one_on_two_square_metres() -> None:
-    few = have_few_points(
-        np.array([15, 16, 40, 60]), np.array([10.0, 10.0, 100.0, 100.0]), RoofOptions(clearance=1)
-    )
-    assert few.tolist() == [True, False, True, False]
