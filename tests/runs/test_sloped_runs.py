@@ -140,4 +140,11 @@ def test_random_sloped_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -
         run_of(values, tmp_path / "two", workers=2)
         assert mesh_bytes(tmp_path / "two") == mesh_bytes(tmp_path / "out")
     prove(tmp_path / "out")
-    keep_outcome("sloped", seed=seed, **{what: counts[what] for what in ("tiles", "buildings", "cells")})
+    quality = record["quality"]
+    keep_outcome(
+        "sloped",
+        seed=seed,
+        **{what: counts[what] for what in ("tiles", "buildings", "cells")},
+        radius_ratio={share: quality["radius_ratio"][share] for share in ("0", "0.1", "1", "50")},
+        least_dihedral=quality["min_dihedral"]["0"],
+    )
