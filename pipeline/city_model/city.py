@@ -13,7 +13,7 @@ from pipeline.city_model.building_points import BuildingPoints, take_building_po
 from pipeline.city_model.heights import ROOF_SOURCES, Heights, compute_building_heights
 from pipeline.data.citymodel import CityModel, Footprints, number_ids
 from pipeline.data.notes import Note
-from pipeline.data.roofs import Roofs, flat_roofs, take_roofs
+from pipeline.data.roofs import NOT_FITTED, Roofs, flat_roofs, take_roofs
 from pipeline.points_terrain.terrain import Dtm
 
 Bounds = tuple[float, float, float, float]
@@ -74,6 +74,10 @@ class City:
         What was dropped, repaired or defaulted on the way.
     counts : dict
         Numbers by name, for the report.
+    roof_method : int8, (n,)
+        Where the roof of the house of each comes from: index into `ROOF_METHODS`; `NOT_FITTED` with flat roofs.
+    roof_fallback : int8, (n,)
+        Why the roof of that house has one height: index into `ROOF_FALLBACKS`.
     outline : dict
         How the simplified outlines compare with the footprints: ``area_error`` (share of all area that houses
         lost or gained), ``min_clearance`` (m), ``sharpest`` (degrees); empty before simplification.
@@ -87,6 +91,8 @@ class City:
     measured_roof: NDArray[np.float64]
     group: NDArray[np.int32]
     row: NDArray[np.int64]
+    roof_method: NDArray[np.int8]
+    roof_fallback: NDArray[np.int8]
     notes: tuple[Note, ...]
     counts: dict[str, int]
     outline: dict[str, float]
@@ -146,6 +152,8 @@ def assemble_city(
         heights.roof[kept],
         np.arange(len(kept), dtype=np.int32) if group is None else group[kept],
         kept,
+        np.full(len(kept), NOT_FITTED, np.int8),
+        np.zeros(len(kept), np.int8),
         (),
         {},
         {},

@@ -1,19 +1,22 @@
 """Buildings as solids: oriented faces over one table of vertices, for the export (steps 1.7 and 2.4)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.city_model.sloped_solids import ROOM, Face, build_cut_solids, put_on_grid, straighten
 from pipeline.data.citymodel import CityModel
 from pipeline.data.notes import Note
+from pipeline.data.roofs import is_flat, roof_heights
 from pipeline.geometry.rounding import round_corners
 
 
 @dataclass(frozen=True, eq=False)
 class Solids:
-    """Prisms over footprints, on an integer grid.
+    """Solids of buildings at one level of detail: prisms with a roof over each, and others.
 
     Building ``i`` has the rings ``building_start[i]:building_start[i + 1]``: its shell, counter-clockwise
     seen from above, then its courtyards, clockwise. Ring ``r`` has the corners
@@ -21,8 +24,6 @@ class Solids:
 
     Attributes
     ----------
-    vertices : int64, (v, 3)
-        Grid coordinates, each vertex once, ascending by x, y, z.
     building_start : int64, (n + 1,)
         First ring of each building.
     ring_start : int64, (r + 1,)
@@ -33,18 +34,42 @@ class Solids:
         Vertices of the wall from each corner to the next of its ring, counter-clockwise seen from outside.
     has_solid : bool, (n,)
         True where the roof is above the ground on the grid.
+    others : dict of int to list of Face
+        Faces of the buildings whose roof is several faces, by row: these hold instead of the prism.
     """
 
-    vertices: NDArray[np.int64]
     building_start: NDArray[np.int64]
     ring_start: NDArray[np.int64]
     low: NDArray[np.int64]
     high: NDArray[np.int64]
     walls: NDArray[np.int64]
     has_solid: NDArray[np.bool_]
+    others: dict[int, list[Face]]
 
 
-def build_solids(model: CityModel, origin: NDArray[np.float64], *, grid: float) -> tuple[Solids, tuple[Note, ...]]:
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Solids of buildings at several levels of detail, on an integer grid.
+
+    Attributes
+    ----------
+    vertices : int64, (v, 3)
+        Grid coordinates, each vertex once, ascending by x, y, z.
+    solids : tuple of Solids
+        A level each.
+    """
+
+    vertices: NDArray[np.int64]
+    solids: tuple[Solids, ...]
+
+
+def build_solids(
+    model: CityModel,
+    origin: NDArray[np.float64],
+    *,
+    grid: float,
+    blocks: NDArray[np.float64] | None = None,
+) -> tuple[Levels, tuple[Note, ...]]:
     """Build the solids of a city model, rounded to a grid.
 
     Parameters
@@ -55,16 +80,20 @@ def build_solids(model: CityModel, origin: NDArray[np.float64], *, grid: float) 
         Point with the grid coordinates (0, 0, 0) (m), itself a multiple of `grid`.
     grid : float
         Spacing of the grid (m).
+    blocks : float64, (n, m), optional
+        Heights of flat roofs (m) of `m` levels, after which comes one with the model's own roofs. By default
+        there is one level, with the highest place of each roof.
 
     Returns
     -------
-    Solids
+    Levels
         The solids, buildings in the model's order. A footprint that vanishes has no ring.
     tuple of Note
         ``footprint-lost``: a footprint vanishes on the grid. ``footprint-split``: the grid cuts it at a
-        neck, the largest part is taken. ``solid-flat``: the roof is not above the ground on the grid,
-        there is no solid. ``solid-touching``: a ring meets itself or another one in a point, so four
-        walls share a vertical edge.
+        neck, the largest part is taken. ``solid-flat``: the highest place of the roof is not above the ground on
+        the grid, there is no solid at some level. ``solid-touching``: a ring meets itself or another one in a
+        point, so four walls share a vertical edge. ``solid-into-ground``: a sloped roof meets the ground, it is
+        raised over that.
 
     Raises
     ------
@@ -74,7 +103,8 @@ def build_solids(model: CityModel, origin: NDArray[np.float64], *, grid: float) 
     Notes
     -----
     Cost is O(k log k) in the corners. Rounding goes through a noded overlay, so no ring becomes
-    invalid and no corner is repeated.
+    invalid and no corner is repeated. Faces of sloped roofs are planar but for rounding and the tolerances of
+    `sloped_solids`: 7 mm at a grid of 1 mm.
 
     Examples
     --------
@@ -83,45 +113,108 @@ def build_solids(model: CityModel, origin: NDArray[np.float64], *, grid: float) 
     >>> model = CityModel(
     ...     square, np.array(["a"]), np.array([1]), 0 * one, flat_roofs(3 * one), (("a",),), np.array(["a"])
     ... )
-    >>> solids, _ = build_solids(model, np.zeros(3), grid=1.0)
-    >>> len(solids.vertices), len(solids.walls)
+    >>> levels, _ = build_solids(model, np.zeros(3), grid=1.0)
+    >>> len(levels.vertices), len(levels.solids[0].walls)
     (8, 4)
     """
     _check(model)
     polygons, notes = _round(model, grid)
+    rings = _list_rings(polygons, origin, grid)
+    ground = _to_grid(model.ground, origin[2], grid)
+    tops = model.roof[:, None] if blocks is None else blocks
+    raised = [_raise(rings, ground, top, top[rings.owner]) for top in _to_grid(tops, origin[2], grid).T]
+    if blocks is not None:
+        on_grid = put_on_grid(model.roofs, model.ground, origin, grid=grid)
+        straight = straighten(polygons, model.roofs)
+        outline = _list_rings(straight, origin, grid)
+        top = on_grid.heights(outline.owner, outline.xy)
+        others = build_cut_solids(straight, ground, on_grid)
+        raised.append(_raise(outline, ground, _to_grid(model.roof, origin[2], grid), top, others))
+        notes += _sunk(model, polygons)
+    has_solid = np.all([level.has_solid for level in raised], axis=0)
+    vertices, solids = _number_levels(raised)
+    notes += [*_flat(model, has_solid), *_touching(model, rings.owner, solids[0].low)]
+    return Levels(vertices, solids), tuple(notes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rings:
+    """Rings of outlines as of `Solids`: corners on the grid (k, 2), buildings of these, the corner after each."""
+
+    building_start: NDArray[np.int64]
+    ring_start: NDArray[np.int64]
+    xy: NDArray[np.int64]
+    owner: NDArray[np.int64]
+    onward: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Raised:
+    """Rings with their ground and roof at a level: vertices of corners (k, 3), and of other solids."""
+
+    rings: _Rings
+    has_solid: NDArray[np.bool_]
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    others: dict[int, tuple[list[Face], NDArray[np.int64]]]
+
+
+def _list_rings(polygons: NDArray[np.object_], origin: NDArray[np.float64], grid: float) -> _Rings:
     rings, ring_owner = shapely.get_rings(polygons, return_index=True)
     closed, closed_ring = shapely.get_coordinates(rings, return_index=True)
     first = np.diff(closed_ring, prepend=-1) > 0
     xy, corner_ring = closed[~first], closed_ring[~first]
-    owner = ring_owner[corner_ring]
     ring_start = np.searchsorted(corner_ring, np.arange(len(rings) + 1))
-
-    heights = _to_grid(np.column_stack([model.ground, model.roof]), origin[2], grid)
-    has_solid = heights[:, 1] > heights[:, 0]
-    plane = _to_grid(xy, origin[:2], grid)
-    raised = has_solid[owner]
-    vertices, index = _number_rows(
-        np.concatenate(
-            [
-                np.column_stack([plane, heights[owner, 0]]),
-                np.column_stack([plane, heights[owner, 1]])[raised],
-            ]
-        )
-    )
-    low, high = index[: len(plane)], np.full(len(plane), -1, dtype=np.int64)
-    high[raised] = index[len(plane) :]
-    onward = np.arange(1, len(plane) + 1)
+    onward = np.arange(1, len(xy) + 1)
     onward[ring_start[1:] - 1] = ring_start[:-1]
-    solids = Solids(
-        vertices=vertices,
-        building_start=np.searchsorted(ring_owner, np.arange(len(model) + 1)),
-        ring_start=ring_start,
-        low=low,
-        high=high,
-        walls=np.column_stack([low, low[onward], high[onward], high]),
-        has_solid=has_solid,
+    return _Rings(
+        np.searchsorted(ring_owner, np.arange(len(polygons) + 1)),
+        ring_start,
+        _to_grid(xy, origin[:2], grid),
+        ring_owner[corner_ring],
+        onward,
     )
-    return solids, (*notes, *_flat(model, has_solid), *_touching(model, owner, low))
+
+
+def _raise(
+    rings: _Rings,
+    ground: NDArray[np.int64],
+    roof: NDArray[np.int64],
+    top: NDArray[np.int64],
+    others: dict[int, tuple[list[Face], NDArray[np.int64]]] | None = None,
+) -> _Raised:
+    """Raise rings from the ground to a roof; `top` (k,) is its height at each corner, `roof` (n,) the highest."""
+    low = np.column_stack([rings.xy, ground[rings.owner]])
+    has_solid = roof > ground
+    kept = {row: solid for row, solid in (others or {}).items() if has_solid[row]}
+    return _Raised(rings, has_solid, low, np.column_stack([rings.xy, top]), kept)
+
+
+def _number_levels(levels: Sequence[_Raised]) -> tuple[NDArray[np.int64], tuple[Solids, ...]]:
+    """Number the vertices of all levels, each once."""
+    used = []
+    for level in levels:
+        raised = level.has_solid[level.rings.owner]
+        raised[np.isin(level.rings.owner, list(level.others))] = False
+        used.append(raised)
+    tables = [np.empty((0, 3), np.int64)]
+    for level, raised in zip(levels, used, strict=True):
+        floors = level.low if level is levels[0] else level.low[raised]
+        tables += [floors, level.high[raised], *(vertices for _, vertices in level.others.values())]
+    vertices, index = _number_rows(np.concatenate(tables))
+    numbers = iter(np.split(index, np.cumsum([len(table) for table in tables[1:]])[:-1]))
+    solids = []
+    for level, raised in zip(levels, used, strict=True):
+        low, high = np.full((2, len(raised)), -1)
+        low[slice(None) if level is levels[0] else raised] = next(numbers)
+        high[raised] = next(numbers)
+        rings, others = level.rings, {}
+        for row, (faces, _) in level.others.items():
+            number = next(numbers)
+            others[row] = [(kind, tuple(number[ring] for ring in face)) for kind, face in faces]
+        walls = np.column_stack([low, low[rings.onward], high[rings.onward], high])
+        solids.append(Solids(rings.building_start, rings.ring_start, low, high, walls, level.has_solid, others))
+    return vertices, tuple(solids)
 
 
 def _check(model: CityModel) -> None:
@@ -185,6 +278,18 @@ def _flat(model: CityModel, has_solid: NDArray[np.bool_]) -> list[Note]:
     return [
         _note("solid-flat", model, i, f"roof {model.roof[i]:.3f} m, ground {model.ground[i]:.3f} m")
         for i in np.flatnonzero(~has_solid)
+    ]
+
+
+def _sunk(model: CityModel, polygons: NDArray[np.object_]) -> list[Note]:
+    """Tell of the sloped roofs that meet the ground."""
+    xy, owner = shapely.get_coordinates(polygons, return_index=True)
+    over = roof_heights(model.roofs, owner, xy) - model.ground[owner]
+    lowest = np.full(len(model), np.inf)
+    np.minimum.at(lowest, owner, over)
+    return [
+        _note("solid-into-ground", model, i, f"roof {lowest[i]:.2f} m above ground; least: {ROOM:g} m")
+        for i in np.flatnonzero(~is_flat(model.roofs) & (lowest < ROOM))
     ]
 
 

@@ -167,10 +167,12 @@ def mesh_adaptive(
         lowest = sample_dtm(dtm, plane.xy) + movable_height(spacing, options.growth)
         free &= levels.z > np.repeat(lowest, count)
     del levels  # its kinds are of no use any more
+    gates = wall_gates(mesh)
+    mesh, _ = _key_columns(mesh, seam, given, gates)
     mesh, worst, improved = improve_columns(
         mesh, free, spacing, passes=options.passes, flat_cells=options.growth is not None
     )
-    mesh, passed = _key_columns(mesh, seam, given)
+    mesh, passed = _key_columns(mesh, seam, given, gates)  # levels beside walls moved
     report = AdaptiveReport(
         n_columns=len(plane.xy),
         n_levels=len(mesh.z),
@@ -258,13 +260,15 @@ def highest_roofs(plane: PlaneMesh, roofs: Roofs) -> NDArray[np.float64]:
     return highest
 
 
-def _key_columns(mesh: ColumnMesh, seam: SeamColumns, given: NDArray[np.bool_]) -> tuple[ColumnMesh, int]:
+def _key_columns(
+    mesh: ColumnMesh, seam: SeamColumns, given: NDArray[np.bool_], gates: NDArray[np.int64]
+) -> tuple[ColumnMesh, int]:
     """Give the columns order keys, but for those of seams, which have theirs; edges between these were seen to."""
-    key = mesh.z.copy()
+    key = mesh.merge_keys.copy()
     place = np.repeat(mesh.z_start[seam.vertex], np.diff(seam.levels.start))
     within = np.arange(len(seam.levels.z)) - np.repeat(seam.levels.start[:-1], np.diff(seam.levels.start))
     key[place + within] = seam.levels.key
-    return set_order_keys(mesh, key, given, wall_gates(mesh))
+    return set_order_keys(mesh, key, given, gates)
 
 
 def _check_top(

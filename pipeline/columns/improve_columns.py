@@ -58,9 +58,10 @@ def improve_columns(
 
     Notes
     -----
-    Merging anew changes cells beside those that were looked at; of all rounds, the mesh with the least sum over
-    all its cells is kept. Memory is that of the levels, and of the cells around those that may move, an area after
-    the other where they are many: all others are made and measured a triangle at a time.
+    Keys move with their levels. Merging anew changes cells beside those that were looked at; of all rounds, the
+    mesh with the least sum over all its cells is kept. Memory is that of the levels, and of the cells around those
+    that may move, an area after the other where they are many: all others are made and measured a triangle at a
+    time.
     """
     survey = ColumnSurvey(mesh, free, flat_cells)
     best, least_cost = mesh, survey.cost
@@ -71,7 +72,7 @@ def improve_columns(
         n_moved += moved
         survey.move(z, last=k == passes - 1)
         if survey.cost < least_cost:
-            best, least_cost, after = replace(mesh, z=z), survey.cost, survey.worst
+            best, least_cost, after = replace(mesh, z=z, key=survey.key), survey.cost, survey.worst
     return best, (before, after), n_moved
 
 
@@ -137,8 +138,14 @@ class ColumnSurvey:
         self._n_cells = count_by_triangle(mesh)
         self._most = int(self._n_cells.max(initial=0))
         self._z = mesh.z
+        self._lift = None if mesh.key is None else mesh.key - mesh.z
         self.of_cells, self.least = np.empty(m), np.empty(m)
         self._measure(np.ones(m, np.bool_))
+
+    @property
+    def key(self) -> NDArray[np.float64] | None:
+        """Keys of the mesh at its heights, None where these are its keys."""
+        return None if self._lift is None else self._z + self._lift
 
     @property
     def cost(self) -> float:
@@ -192,8 +199,9 @@ class ColumnSurvey:
         return found
 
     def _merged(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64], NDArray[np.float64], bool]:
-        mesh = self._mesh
-        return mesh.plane.triangles, mesh.bottom, mesh.z_start, self._z, mesh.order == "heights"
+        mesh, key = self._mesh, self.key
+        key = self._z if key is None else key
+        return mesh.plane.triangles, mesh.bottom, mesh.z_start, key, mesh.order == "heights"
 
     def _measure(self, wanted: NDArray[np.bool_]) -> None:
         self.bad = np.zeros(len(self._z), np.bool_)
@@ -203,6 +211,7 @@ class ColumnSurvey:
             self._most,
             self._clockwise,
             self._mesh.plane.xy,
+            self._z,
             self._free,
             self._flat_cells,
             self.of_cells,
@@ -287,12 +296,13 @@ def _survey(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
     z_start: NDArray[np.int64],
-    z: NDArray[np.float64],
+    key: NDArray[np.float64],
     by_height: bool,
     wanted: NDArray[np.bool_],
     most: int,
     clockwise: NDArray[np.bool_],
     xy: NDArray[np.float64],
+    z: NDArray[np.float64],
     free: NDArray[np.bool_],
     flat_cells: bool,
     of_cells: NDArray[np.float64],
@@ -305,7 +315,7 @@ def _survey(
     for t in range(len(triangles)):
         if not wanted[t]:
             continue
-        n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, first)
+        n = merge_triangle(triangles[t], bottom[t], z_start, key, by_height, clockwise[t], cells, first)
         for i in range(n):
             _lay_out(xy, triangles[t], clockwise[t], z, cells[i], at, i)
         _measure_block(at, n, ratio)
@@ -324,7 +334,7 @@ def _gather(
     triangles: NDArray[np.int32],
     bottom: NDArray[np.int32],
     z_start: NDArray[np.int64],
-    z: NDArray[np.float64],
+    key: NDArray[np.float64],
     by_height: bool,
     wanted: NDArray[np.bool_],
     most: int,
@@ -342,7 +352,7 @@ def _gather(
     for t in range(len(triangles)):
         if not wanted[t]:
             continue
-        n = merge_triangle(triangles[t], bottom[t], z_start, z, by_height, clockwise[t], cells, 0)
+        n = merge_triangle(triangles[t], bottom[t], z_start, key, by_height, clockwise[t], cells, 0)
         for i in range(n):
             a, b, c, d = cells[i]
             if place[a] >= 0 or place[b] >= 0 or place[c] >= 0 or place[d] >= 0:

@@ -62,7 +62,7 @@ def set_order_keys(
     mesh : ColumnMesh
         Columns that are merged by heights.
     key : float64, (z_start[-1],)
-        Keys to begin with, ascending in every column: heights, and those of columns that are given.
+        Keys to begin with: heights, those of columns that are given, or those that were set before levels moved.
     given : bool, (n,)
         Columns whose keys stay.
     gates : int64, (g, 2, 2)
@@ -86,10 +86,24 @@ def set_order_keys(
     column = np.repeat(np.arange(len(mesh.plane.xy)), np.diff(mesh.z_start))
     outdoors = np.zeros(len(given), np.bool_)
     outdoors[mesh.plane.triangles[mesh.plane.building < 0]] = True
+    _sort_keys(key, mesh.z_start, given, LEAST_STEP)
     unmet = _push_apart(gates, mesh.z_start, column, given, outdoors, key, SWEEPS, LEAST_STEP) if len(gates) else 0
-    if np.array_equal(key, mesh.z):
-        return mesh, unmet
-    return replace(mesh, key=key), unmet
+    return replace(mesh, key=None if np.array_equal(key, mesh.z) else key), unmet
+
+
+@kernel
+def _sort_keys(key: NDArray[np.float64], start: NDArray[np.int64], given: NDArray[np.bool_], least: float) -> None:
+    """Make keys ascend where they do not, in columns that are not given; the ends of a column stay."""
+    for i in range(len(start) - 1):
+        if given[i]:
+            continue
+        low, high = start[i], start[i + 1] - 1
+        for k in range(low + 1, high):
+            if key[k] <= key[k - 1]:
+                key[k] = key[k - 1] + least
+        for k in range(high - 1, low, -1):
+            if key[k] >= key[k + 1]:
+                key[k] = key[k + 1] - least
 
 
 @kernel

@@ -3,13 +3,16 @@
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import has_building_class
 from pipeline.city_model.city import City
 from pipeline.city_model.heights import ROOF_SOURCES
+from pipeline.city_model.roof_areas import block_heights, measure_roof_areas
 from pipeline.data.citymodel import CityModel
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roofs import ROOF_FALLBACKS, ROOF_METHODS, is_flat
 from pipeline.points_terrain.terrain import Dtm
 from pipeline.quality.point_fidelity import KINDS, HouseFidelity, PointFidelity, measure_fidelity, measure_houses
 from pipeline.roofs.roof_points import locate_roof_points
@@ -82,6 +85,60 @@ def report_buildings(
         "roof_coverage": _rounded(fidelity.coverage),
         "roof_moved": _rounded(moved),
         "changes": changes,
+    }
+
+
+def describe_roofs(
+    model: CityModel, roof_method: NDArray[np.int8], roof_fallback: NDArray[np.int8], fidelity: HouseFidelity
+) -> dict[str, Sequence[object]]:
+    """Attributes of each building's roof, where roofs of planes were looked for.
+
+    Parameters
+    ----------
+    model : CityModel
+        Buildings, all parts of each house among them.
+    roof_method, roof_fallback : int8, (n,)
+        As of `City`.
+    fidelity : HouseFidelity
+        How the roofs fit their points.
+
+    Returns
+    -------
+    dict of str to a sequence of n values
+        Of the house: ``roof_method``; ``roof_fallback``, why it has one height, empty where its points tell so;
+        ``roof_parts`` and ``roof_planes``, the numbers of parts and of different planes. Of the row:
+        ``roof_median`` (m), ``roof_within`` (share of its points within 0.25 m), ``roof_density`` (points a m²),
+        ``roof_clipped`` (share of the area where its plane is cut by its limits), ``roof_slope`` (degrees) and
+        ``roof_azimuth`` (degrees from north, clockwise, downwards; None where flat), and ``lod12_height`` and
+        ``lod13_height``, the heights (m) of its block models.
+    """
+    area = shapely.area(model.polygons)
+    areas = measure_roof_areas(model.polygons, model.roofs)
+    _, house = np.unique(model.house, return_inverse=True)
+    house = house.reshape(-1)
+    n_houses = int(house.max(initial=-1)) + 1
+    planes = np.column_stack((house, model.roofs.plane, model.roofs.origin))
+    different = np.unique(planes, axis=0)[:, 0].astype(np.int64)
+    flat = is_flat(model.roofs)
+    east, north = np.where(flat[:, None], 0.0, model.roofs.plane[:, :2]).T
+    azimuth = np.degrees(np.arctan2(-east, -north)) % 360
+    blocks = block_heights(model)
+    return {
+        "roof_method": [ROOF_METHODS[method] for method in roof_method.tolist()],
+        "roof_fallback": [ROOF_FALLBACKS[why] for why in roof_fallback.tolist()],
+        "roof_parts": np.bincount(house, minlength=n_houses)[house].tolist(),
+        "roof_planes": np.bincount(different, minlength=n_houses)[house].tolist(),
+        "roof_median": _rounded(fidelity.median),
+        "roof_within": _rounded(fidelity.within),
+        "roof_density": _rounded(fidelity.n_points / area),
+        "roof_clipped": _rounded((areas.at_low + areas.at_high) / area),
+        "roof_slope": [round(value, 1) for value in np.degrees(np.arctan(np.hypot(east, north))).tolist()],
+        "roof_azimuth": [
+            None if level else round(value, 1) % 360
+            for level, value in zip(flat.tolist(), azimuth.tolist(), strict=True)
+        ],
+        "lod12_height": blocks[:, 0].tolist(),
+        "lod13_height": blocks[:, 1].tolist(),
     }
 
 

@@ -44,6 +44,7 @@ __all__ = [
 ]
 
 KINDS = ("roof", "missed", "ground", "swallowed")  # of points
+NEAR = 0.25  # m; a point this close to a roof is on it
 COVERAGE_CELL = 1.0  # m, side of the cells in which points are looked for
 
 
@@ -103,12 +104,18 @@ class HouseFidelity:
     coverage : float64, (n,)
         Share of the 1 m cells of the footprint that have a roof point, 0 to 1. A cell belongs to it if its
         centre is inside or a roof point of the house lies in it. 0 without points.
+    median : float64, (n,)
+        Median distance of the points from the roof, up or down (m); NaN without points or roof.
+    within : float64, (n,)
+        Share of the points within `NEAR` of the roof, 0 to 1; NaN likewise.
     """
 
     n_points: NDArray[np.int64]
     rmse: NDArray[np.float64]
     bias: NDArray[np.float64]
     coverage: NDArray[np.float64]
+    median: NDArray[np.float64]
+    within: NDArray[np.float64]
 
 
 def measure_fidelity(
@@ -237,8 +244,9 @@ def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roofs: Roo
         Their roofs, absolute heights (m).
     """
     n_points = np.diff(points.start)
-    house = np.repeat(np.arange(len(n_points)), n_points)
-    residual = -sort_values(points.start, points.xyz[:, 2] - roof_heights(roofs, house, points.xyz[:, :2]))
+    house_of_point = np.repeat(np.arange(len(n_points)), n_points)
+    height = roof_heights(roofs, house_of_point, points.xyz[:, :2])
+    residual = -sort_values(points.start, points.xyz[:, 2] - height)
     edges = list_edges(polygons)
     low, size = _cells_under(shapely.bounds(polygons).reshape(-1, 4))
     total, squares, filled, cells, unsure = _measure_each(
@@ -247,7 +255,16 @@ def measure_houses(points: RoofPoints, polygons: NDArray[np.object_], roofs: Roo
     house = unsure[:, 0].astype(np.int64)
     cells += np.bincount(house[shapely.contains_xy(polygons[house], *unsure[:, 1:].T)], minlength=len(cells))
     some = np.where(n_points > 0, n_points, np.nan)
-    return HouseFidelity(n_points, np.sqrt(squares / some), total / some, filled / np.maximum(cells, 1))
+    distance = sort_values(points.start, np.abs(residual))
+    first, several = points.start[:-1], n_points > 0
+    median = np.full(len(n_points), np.nan)
+    middle = (first + (n_points - 1) // 2)[several], (first + n_points // 2)[several]
+    median[several] = (distance[middle[0]] + distance[middle[1]]) / 2
+    within = np.bincount(house_of_point[distance <= NEAR], minlength=len(n_points)) / some
+    within[np.isnan(median)] = np.nan
+    return HouseFidelity(
+        n_points, np.sqrt(squares / some), total / some, filled / np.maximum(cells, 1), median, within
+    )
 
 
 def _find_residuals(

@@ -11,7 +11,7 @@ from pipeline.geometry.group_order import order_values
 MAX_TRIES = 5  # lines that are tried for a cut, the best first
 RIDGE_BONUS = 0.25  # share of the price of a cut by which intersections of planes go before other lines
 SAME_PLANE = 0.15  # difference of slopes below which planes have no ridge
-MAX_BINS = 24  # across a piece, along each side of a rectangle
+MAX_BINS = 20  # across a piece, along each side of a rectangle
 LEAST_BIN = 0.5  # m
 RIGHT = 0.09  # cosine of 85 degrees: directions this close to a right angle have the same rectangles
 OPEN = 1e9  # offset of a side of a rectangle that lies on the piece's own walls
@@ -36,8 +36,27 @@ def find_ridges(planes: Array) -> Array:
 
 
 @kernel
-def rank_cuts(  # noqa: PLR0912
-    xyz: Array, cost: Array, rows: Index, along: Array, lines: Array, min_points: int, price: float
+def order_across(xyz: Array, along: Array) -> tuple[Array, Index]:
+    """Place of each point across each direction (m), (d, n), and the rows of points in that order, (d, n)."""
+    across, order = np.empty((len(along), len(xyz))), np.empty((len(along), len(xyz)), np.int64)
+    for d in range(len(along)):
+        for p in range(len(xyz)):
+            across[d, p] = xyz[p, 1] * along[d, 0] - xyz[p, 0] * along[d, 1]
+        rows = order_values(across[d])
+        for m in range(len(xyz)):
+            order[d, m] = rows[m]
+    return across, order
+
+
+@kernel
+def rank_cuts(
+    xyz: Array,
+    cost: Array,
+    face: Index,
+    piece: int,
+    lines: tuple[Array, Array, Array, Index],
+    min_points: int,
+    price: float,
 ) -> Array:
     """Rank the lines by the misfit that they save when each side takes its own best plane.
 
@@ -47,12 +66,13 @@ def rank_cuts(  # noqa: PLR0912
         Points of the house (m).
     cost : float64, (n, k)
         Misfit of each under each plane.
-    rows : int64, (m,)
-        Points of the piece that is to be cut.
-    along : float64, (d, 2)
-        Directions, along each of which the best line is looked for.
-    lines : float64, (l, 3)
-        Direction and offset of further lines.
+    face : int64, (n,)
+        Face of each.
+    piece : int
+        The face that is to be cut.
+    lines : tuple
+        Directions, (d, 2), along each of which the best line is looked for; direction and offset of further
+        lines, (l, 3); and what `order_across` gives for the directions.
     min_points : int
         Least number of points on either side.
     price : float
@@ -64,45 +84,25 @@ def rank_cuts(  # noqa: PLR0912
         Direction and offset of the lines that save as much, and what they save, the best first, at most
         `MAX_TRIES`.
     """
-    n, n_planes = len(rows), cost.shape[1]
-    total, left = sum_costs(cost, rows), np.empty(n_planes)
-    whole = total.min()
-    n_lines = len(along) + len(lines)
+    along, fixed, across, order = lines
+    n, total = 0, np.zeros(cost.shape[1])
+    for p in range(len(face)):
+        if face[p] == piece:
+            n += 1
+            for k in range(len(total)):
+                total[k] += cost[p, k]
+    n_lines = len(along) + len(fixed) if total.min() >= price else 0
     found, loss = np.empty((n_lines, 4)), np.zeros(n_lines)
-    across = np.empty(n)
     for d in range(n_lines):
-        free = d < len(along)
-        x, y = (along[d, 0], along[d, 1]) if free else (lines[d - len(along), 0], lines[d - len(along), 1])
-        for m in range(n):
-            across[m] = xyz[rows[m], 1] * x - xyz[rows[m], 0] * y
-        left[:] = 0
-        best, offset = 0.0, 0.0
-        if free:
-            order = order_values(across)
-            for m in range(n - 1):
-                low = high = math.inf
-                p = rows[order[m]]
-                for k in range(n_planes):
-                    left[k] += cost[p, k]
-                    low, high = min(low, left[k]), min(high, total[k] - left[k])
-                if min_points <= m + 1 <= n - min_points and whole - low - high > best:
-                    best = whole - low - high
-                    offset = (across[order[m]] + across[order[m + 1]]) / 2
+        if d < len(along):
+            found[d, 0], found[d, 1] = along[d, 0], along[d, 1]
+            saved, found[d, 2] = _best_offset(cost, face, piece, order[d], across[d], (total, n, min_points))
+            loss[d] = -saved
         else:
-            offset = lines[d - len(along), 2]
-            count = 0
-            for m in range(n):
-                if across[m] < offset:
-                    count += 1
-                    for k in range(n_planes):
-                        left[k] += cost[rows[m], k]
-            if min_points <= count <= n - min_points:
-                low = high = math.inf
-                for k in range(n_planes):
-                    low, high = min(low, left[k]), min(high, total[k] - left[k])
-                best = whole - low - high
-        found[d, 0], found[d, 1], found[d, 2], found[d, 3] = x, y, offset, best
-        loss[d] = -best if free or best <= 0 else -best - RIDGE_BONUS * price
+            found[d, 0], found[d, 1], found[d, 2] = fixed[d - len(along)]
+            saved = _saved_by(xyz, cost, face, piece, fixed[d - len(along)], (total, n, min_points))
+            loss[d] = -saved - RIDGE_BONUS * price
+        found[d, 3] = saved
     ranked, n_ranked = np.empty((MAX_TRIES, 4)), 0
     for d in order_values(loss):
         if n_ranked < MAX_TRIES and found[d, 3] >= price:
@@ -110,6 +110,51 @@ def rank_cuts(  # noqa: PLR0912
                 ranked[n_ranked, q] = found[d, q]
             n_ranked += 1
     return ranked[:n_ranked].copy()
+
+
+@kernel
+def _best_offset(
+    cost: Array, face: Index, piece: int, order: Index, across: Array, sums: tuple[Array, int, int]
+) -> tuple[float, float]:
+    """What the best line across a direction saves, 0 if none does, and its offset (m)."""
+    total, n, min_points = sums
+    left, whole = np.zeros(len(total)), total.min()
+    best, offset, before, last = 0.0, 0.0, 0, 0.0
+    saved = 0.0
+    for p in order:
+        if face[p] != piece:
+            continue
+        if saved > best:
+            best, offset = saved, (last + across[p]) / 2
+        saved, low, high = 0.0, math.inf, math.inf
+        for k in range(len(total)):
+            left[k] += cost[p, k]
+            low, high = min(low, left[k]), min(high, total[k] - left[k])
+        before, last = before + 1, across[p]
+        if min_points <= before <= n - min_points:
+            saved = whole - low - high
+    return best, offset
+
+
+@kernel
+def _saved_by(
+    xyz: Array, cost: Array, face: Index, piece: int, line: Array, sums: tuple[Array, int, int]
+) -> float:
+    """What a line saves; 0 with too few points on a side."""
+    total, n, min_points = sums
+    left, before = np.zeros(len(total)), 0
+    for p in range(len(face)):
+        if face[p] == piece and xyz[p, 1] * line[0] - xyz[p, 0] * line[1] < line[2]:
+            before += 1
+            for k in range(len(total)):
+                left[k] += cost[p, k]
+    if not min_points <= before <= n - min_points:
+        return 0.0
+    low = high = math.inf
+    for k in range(len(total)):
+        low, high = min(low, left[k]), min(high, total[k] - left[k])
+    saved: float = total.min() - low - high
+    return saved
 
 
 @kernel
@@ -202,8 +247,14 @@ def _best_bins(grid: Array, best: float, least: tuple[int, int, int]) -> tuple[f
     n_rows, n_columns = grid.shape[1], grid.shape[2]
     n_points = grid[1].sum()
     found = (0.0, 0, 0, 0, 0)
-    column = np.empty((2, n_columns))
+    column, hope = np.empty((2, n_columns)), np.zeros(n_rows + 1)
+    for i in range(n_rows - 1, -1, -1):  # what rectangles that begin in this row or later can save
+        hope[i] = hope[i + 1]
+        for j in range(n_columns):
+            hope[i] += max(grid[0, i, j], 0.0)
     for i in range(n_rows):
+        if hope[i] <= best:
+            break
         column[:] = 0
         for k in range(i, n_rows):
             run, count, first = 0.0, 0.0, 0

@@ -11,7 +11,7 @@ from pipeline.roofs.plane_search import fit_weighted, misfit
 
 # What a family must save against a flat roof: area (m²) whose points are off by `misfit` of 1.
 SHED, GABLE, VALLEY, HIP, MANSARD = 1.5, 4.0, 6.0, 3.0, 8.0
-SAMPLES = 200  # points that are looked at, at most
+SAMPLES = 100  # points that are looked at, at most
 RIDGES = 14  # places of a ridge that are tried across a house, less one
 BREAKS = 4  # widths of the upper part of a mansard roof that are tried, less one
 ROUNDS = 4  # of robust fits
@@ -25,9 +25,7 @@ Array = NDArray[np.float64]
 
 
 @kernel
-def fit_family(  # noqa: PLR0912
-    xyz: Array, a: Array, b: Array, along: Array, density: float, max_slope: float
-) -> Array:
+def fit_family(xyz: Array, a: Array, b: Array, along: Array, density: float, max_slope: float) -> Array:
     """Fit each family to the points of a house; give the planes of the one that fits best.
 
     Parameters
@@ -49,67 +47,116 @@ def fit_family(  # noqa: PLR0912
         Slopes and height at the origin; none where a flat roof is best.
     """
     step = max(1, len(xyz) // SAMPLES)
-    n = (len(xyz) + step - 1) // step
-    some = np.empty((n, 3))
-    for k in range(n):
+    some = np.empty(((len(xyz) + step - 1) // step, 3))
+    for k in range(len(some)):
         some[k, 0], some[k, 1], some[k, 2] = xyz[k * step, 0], xyz[k * step, 1], xyz[k * step, 2]
-    unit = density / step
-    best, planes, n_planes = 0.0, np.empty((MAX_FACES, 3)), 0
-    for k in range(n):
-        best += misfit(some[k, 2] - some[n // 2, 2])
-    rows, weight = np.empty((n, 3)), np.empty(n)
+    best, unit = 0.0, density / step
+    for k in range(len(some)):
+        best += misfit(some[k, 2] - some[len(some) // 2, 2])
+    planes, n_planes = np.empty((MAX_FACES, 3)), 0
     for way in range(2 * min(len(along), 2)):
-        up_x, up_y = along[way // 2, 0], along[way // 2, 1]
-        if way % 2 == 0:
-            up_x, up_y = -up_y, up_x
-        low = high = a[0, 0] * up_x + a[0, 1] * up_y
-        for e in range(len(a)):
-            t = a[e, 0] * up_x + a[e, 1] * up_y
-            low, high = min(low, t), max(high, t)
-        # One slope: the break lies at the lower end.
-        for ridge in range(RIDGES):
-            t0 = low + (high - low) * ridge / RIDGES
-            left, right, top = _fit_broken(some, (up_x, up_y), t0, math.inf, rows, weight)
-            if max(abs(left), abs(right)) > max_slope:
-                continue
-            cost = _sum_misfit(rows, (left, right, top)) + unit * (
-                SHED if ridge == 0 else GABLE if left > right else VALLEY
-            )
-            if cost < best:
-                best, n_planes = cost, 1 if ridge == 0 else 2
-                planes[0, 0], planes[0, 1], planes[0, 2] = right * up_x, right * up_y, top - right * t0
-                planes[1, 0], planes[1, 1], planes[1, 2] = left * up_x, left * up_y, top - left * t0
-        for width in range(1, BREAKS):
-            t0, half = (low + high) / 2, (high - low) / 2 * width / BREAKS
-            upper, lower, top = _fit_broken(some, (up_x, up_y), t0, half, rows, weight)
-            if not 0 <= upper < lower <= max_slope:
-                continue
-            cost = _sum_misfit(rows, (upper, lower, top)) + unit * MANSARD
-            if cost < best:
-                best, n_planes = cost, 4
-                for side in range(2):
-                    sign = 1 if side == 0 else -1
-                    u, v = -sign * upper, -sign * lower
-                    row = 2 * side
-                    planes[row, 0], planes[row, 1], planes[row, 2] = u * up_x, u * up_y, top - u * t0
-                    corner = top - upper * half
-                    planes[row + 1, 0], planes[row + 1, 1] = v * up_x, v * up_y
-                    planes[row + 1, 2] = corner - v * (t0 + sign * half)
-    normal, n_faces = np.empty((MAX_FACES, 3)), 0
+        x, y = along[way // 2, 0], along[way // 2, 1]
+        up = (-y, x) if way % 2 == 0 else (x, y)
+        cost, n = _try_gables(some, _extent(a, up), up, (best, unit, max_slope), planes)
+        best, n_planes = (cost, n) if n else (best, n_planes)
+        cost, n = _try_mansards(some, _extent(a, up), up, (best, unit, max_slope), planes)
+        best, n_planes = (cost, n) if n else (best, n_planes)
+    n = _try_hip(some, a, b, (best, unit, max_slope), planes)
+    return planes[: n if n else n_planes].copy()
+
+
+@kernel
+def _extent(xy: Array, up: tuple[float, float]) -> tuple[float, float]:
+    """Least and greatest place of an outline along a direction (m)."""
+    low, high = math.inf, -math.inf
+    for e in range(len(xy)):
+        t = xy[e, 0] * up[0] + xy[e, 1] * up[1]
+        low, high = min(low, t), max(high, t)
+    return low, high
+
+
+@kernel
+def _try_gables(
+    xyz: Array,
+    extent: tuple[float, float],
+    up: tuple[float, float],
+    bounds: tuple[float, float, float],
+    planes: Array,
+) -> tuple[float, int]:
+    """Try shed, gable and valley roofs across a house; write the best one's planes, give cost and number.
+
+    0 planes where none is better than the first of the bounds; the others are the price of an area, and a slope.
+    """
+    best, unit, max_slope = bounds
+    rows, weight = np.empty((len(xyz), 3)), np.empty(len(xyz))
+    n_planes = 0
+    for ridge in range(RIDGES):  # a shed has its bend at the lower end
+        t0 = extent[0] + (extent[1] - extent[0]) * ridge / RIDGES
+        left, right, top = _fit_broken(xyz, up, t0, math.inf, rows, weight)
+        if max(abs(left), abs(right)) > max_slope:
+            continue
+        area = SHED if ridge == 0 else GABLE if left > right else VALLEY
+        cost = _sum_misfit(rows, (left, right, top)) + unit * area
+        if cost < best:
+            best, n_planes = cost, 1 if ridge == 0 else 2
+            _put_slope(planes, 0, right, up, (t0, top))
+            _put_slope(planes, 1, left, up, (t0, top))
+    return best, n_planes
+
+
+@kernel
+def _try_mansards(
+    xyz: Array,
+    extent: tuple[float, float],
+    up: tuple[float, float],
+    bounds: tuple[float, float, float],
+    planes: Array,
+) -> tuple[float, int]:
+    """Try symmetrical roofs with two slopes on each side, as `_try_gables` does."""
+    best, unit, max_slope = bounds
+    rows, weight = np.empty((len(xyz), 3)), np.empty(len(xyz))
+    t0, n_planes = (extent[0] + extent[1]) / 2, 0
+    for width in range(1, BREAKS):
+        half = (extent[1] - extent[0]) / 2 * width / BREAKS
+        upper, lower, top = _fit_broken(xyz, up, t0, half, rows, weight)
+        if not 0 <= upper < lower <= max_slope:
+            continue
+        cost = _sum_misfit(rows, (upper, lower, top)) + unit * MANSARD
+        if cost < best:
+            best, n_planes = cost, 4
+            for side in range(2):
+                sign = 1 if side == 0 else -1
+                _put_slope(planes, 2 * side, -sign * upper, up, (t0, top))
+                _put_slope(planes, 2 * side + 1, -sign * lower, up, (t0 + sign * half, top - upper * half))
+    return best, n_planes
+
+
+@kernel
+def _put_slope(planes: Array, row: int, slope: float, up: tuple[float, float], at: tuple[float, float]) -> None:
+    """Write the plane with a slope along a direction, and a height at a place along it."""
+    planes[row, 0], planes[row, 1], planes[row, 2] = slope * up[0], slope * up[1], at[1] - slope * at[0]
+
+
+@kernel
+def _try_hip(xyz: Array, a: Array, b: Array, bounds: tuple[float, float, float], planes: Array) -> int:
+    """Try a roof of one slope from all edges of a convex outline; write its planes and give their number, or 0."""
+    best, unit, max_slope = bounds
+    normal = np.empty((MAX_FACES, 3))
     n_faces = _find_eaves(a, b, normal)
-    if n_faces >= 3:
-        for k in range(n):
-            inside = math.inf
-            for f in range(n_faces):
-                inside = min(inside, normal[f, 0] * some[k, 0] + normal[f, 1] * some[k, 1] - normal[f, 2])
-            rows[k, 0], rows[k, 1], rows[k, 2] = inside, 0.0, some[k, 2]
-        slope, _, eave = _fit_robustly(rows, weight)
-        if 0 < slope <= max_slope and _sum_misfit(rows, (slope, 0.0, eave)) + unit * HIP < best:
-            n_planes = n_faces
-            for f in range(n_faces):
-                planes[f, 0], planes[f, 1] = slope * normal[f, 0], slope * normal[f, 1]
-                planes[f, 2] = eave - slope * normal[f, 2]
-    return planes[:n_planes].copy()
+    if n_faces < 3:
+        return 0
+    rows, weight = np.empty((len(xyz), 3)), np.empty(len(xyz))
+    for k in range(len(xyz)):
+        inside = math.inf
+        for f in range(n_faces):
+            inside = min(inside, normal[f, 0] * xyz[k, 0] + normal[f, 1] * xyz[k, 1] - normal[f, 2])
+        rows[k, 0], rows[k, 1], rows[k, 2] = inside, 0.0, xyz[k, 2]
+    slope, _, eave = _fit_robustly(rows, weight)
+    if not 0 < slope <= max_slope or _sum_misfit(rows, (slope, 0.0, eave)) + unit * HIP >= best:
+        return 0
+    for f in range(n_faces):
+        _put_slope(planes, f, slope, (normal[f, 0], normal[f, 1]), (normal[f, 2], eave))
+    return n_faces
 
 
 @kernel

@@ -1,5 +1,6 @@
 """Roofs of houses as planes from their points: houses divided into parts with a plane each (step 2.0)."""
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -31,6 +32,9 @@ from pipeline.roofs.subdivision import (
 PLANES, FAMILY, _, FLAT = range(len(ROOF_METHODS))
 LIMIT_SHARE = 0.02  # of a part's points may lie beyond its limits, on either side
 LIMIT_ROOM = 0.5  # m, between these points and the limits
+MIN_FITTED = 8  # points to which a plane is fitted again
+MIN_NEAREST = 4  # points of a house to which a plane is the nearest
+DENSITY = 6.0  # points a m², of which denser ones are thinned to up to twice as many
 MIN_REFIT = 6  # points that move a face
 
 Array = NDArray[np.float64]
@@ -85,28 +89,80 @@ class HouseRoofs:
         Where the roof of each house comes from: index into `ROOF_METHODS`.
     n_planes : int32, (h,)
         Number of different planes of each house.
+    too_few : bool, (h,)
+        Houses with too few points for planes: one flat part.
     """
 
     parts: HouseParts
     roofs: Roofs
     method: NDArray[np.int8]
     n_planes: NDArray[np.int32]
+    too_few: NDArray[np.bool_]
 
 
 def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOptions) -> HouseRoofs:
-    """Divide houses into parts with a plane each."""
+    """Divide houses into parts, each under a plane, by their points and outlines alone.
+
+    Parameters
+    ----------
+    polygons : object, (h,)
+        Valid shapely Polygons (m), courtyards as holes.
+    points : RoofPoints
+        Their roof points, as from `locate_roof_points`.
+    options : RoofOptions
+        Thresholds.
+
+    Returns
+    -------
+    HouseRoofs
+        Parts in canonical form that cover each house without overlap and share their vertices to the bit; a
+        house that is not divided keeps its polygon, to the bit.
+
+    Raises
+    ------
+    ValueError
+        If the options are out of range, or polygons and points do not match.
+
+    Notes
+    -----
+    1. A plane is fitted to the neighbours of each point (`fit_locally`), and of these the planes that most points
+       support are taken one after the other (`search_planes`); flat, or uphill across a wall, where they nearly
+       are. The planes of the best family of roofs (`fit_family`) and a flat one at the median are added.
+    2. Each point has a misfit under each plane: the square of its distance over half a metre, linear beyond.
+       The outline is cut in two where both sides fall best under a plane each (`cut_house`), along walls or
+       where planes meet, or along a rectangle under another plane, as long as a cut saves `cut_price`.
+    3. Neighbouring faces are joined (`join_faces`): under the same plane, too small, or not worth their wall.
+
+    Points are put in an order of their own first, so theirs does not matter. Of dense points every second, third
+    (...) is looked at. A house with fewer than `min_points` or `min_density` has one height, and so has one
+    whose best roof is flat: `too_few` tells them apart. O(n k) for n points and k planes of a house, a cut.
+    """
     _check(polygons, points, options)
     area = shapely.area(polygons)
     bounds = shapely.bounds(polygons).reshape(-1, 4)
     origin = np.floor((bounds[:, :2] + bounds[:, 2:]) / 2)
     count = np.diff(points.start)
+    too_few = (count < options.min_points) | (count < options.min_density * area)
     xyz = sort_points(points.start, points.xyz)
-    xyz[:, :2] -= np.repeat(origin, count, axis=0)
-    local = fit_locally(points.start, xyz, area)
-    enough = (count >= 2 * options.min_points) & (count >= options.min_density * area)
-    heights = [_median(xyz[first:last, 2]) for first, last in pairwise(points.start.tolist())]
-    fitted = _fit_houses(polygons, origin, points.start, (xyz, local), np.flatnonzero(enough), options)
-    return _assemble(polygons, origin, np.array(heights), fitted)
+    heights = np.array([_median(xyz[first:last, 2]) for first, last in pairwise(points.start.tolist())])
+    start, kept = _thin_out(points.start, np.where(too_few, np.inf, count / (area * DENSITY)))
+    xyz = xyz[kept]
+    xyz[:, :2] -= np.repeat(origin, np.diff(start), axis=0)
+    local = fit_locally(start, xyz, area)
+    fitted = _fit_houses(polygons, origin, start, (xyz, local), np.flatnonzero(~too_few), options)
+    return _assemble(polygons, origin, heights, too_few, fitted)
+
+
+def _thin_out(start: NDArray[np.int64], share: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Keep one in so many points of each house: `share` rounded down, 1 at least; none where it is infinite.
+
+    Gives where those of each house start, and bool (n,) which they are.
+    """
+    count = np.diff(start)
+    every = np.repeat(np.maximum(np.floor(share), 1), count)
+    kept: NDArray[np.bool_] = (np.arange(start[-1]) - np.repeat(start[:-1], count)) % every == 0
+    kept &= np.isfinite(every)
+    return np.concatenate(([0], np.cumsum(kept)))[start], kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +214,11 @@ def _fit_houses(
 
 
 def _assemble(
-    polygons: NDArray[np.object_], origin: Array, height: Array, fitted: list[_FittedHouse]
+    polygons: NDArray[np.object_],
+    origin: Array,
+    height: Array,
+    too_few: NDArray[np.bool_],
+    fitted: list[_FittedHouse],
 ) -> HouseRoofs:
     """Put the parts of all houses together: those fitted, and one flat part of each other house."""
     n = len(polygons)
@@ -187,7 +247,7 @@ def _assemble(
         rings = shapely.linearrings(xy, indices=ring)[order]
         rows, index = np.unique(owner[order], return_inverse=True)
         parts[rows] = make_canonical(shapely.polygons(rings, indices=index))
-    return HouseRoofs(HouseParts(parts, house), Roofs(plane, origin[house], limits), method, n_planes)
+    return HouseRoofs(HouseParts(parts, house), Roofs(plane, origin[house], limits), method, n_planes, too_few)
 
 
 def _median(z: Array) -> float:
@@ -205,7 +265,7 @@ def _fit_house(
     Gives slopes and heights, and limits of its parts; vertices of closed rings, their rings, the part of each
     ring and whether it is a shell; and whether all planes are of a family.
     """
-    net = open_subdivision(vertices, ring)
+    net = open_subdivision(vertices, ring, len(xyz))
     n_given = net[2][NODES]
     _, a, b = edges_of_face(net[0], net[1], net[2][HALVES], 0)
     density = len(xyz) / area_of_edges(a, b)
@@ -243,7 +303,23 @@ def _fit_house(
 
 
 @kernel
-def _find_candidates(  # noqa: PLR0912
+def _is_known(xyz: Array, plane: Array, others: Array) -> bool:
+    """Whether a plane is, over the points near it, close to another one."""
+    n, far = 0, np.zeros(len(others))
+    for p in range(len(xyz)):
+        z = plane[0] * xyz[p, 0] + plane[1] * xyz[p, 1] + plane[2]
+        if abs(xyz[p, 2] - z) < 2 * BAND:
+            n += 1
+            for k in range(len(others)):
+                far[k] += abs(others[k, 0] * xyz[p, 0] + others[k, 1] * xyz[p, 1] + others[k, 2] - z)
+    known = False
+    for k in range(len(others)):
+        known |= far[k] < BAND * n
+    return known
+
+
+@kernel
+def _find_candidates(
     xyz: Array, local: Array, a: Array, b: Array, density: float, least: float, max_slope: float
 ) -> tuple[Array, Array, Array, int]:
     """Find the planes that parts may have.
@@ -254,43 +330,73 @@ def _find_candidates(  # noqa: PLR0912
     family = fit_family(xyz, a, b, along, density, max_slope)
     found = np.empty((MAX_PLANES, 3))
     n_found = search_planes(xyz, local, least, max_slope, found)
-    n = len(xyz)
-    k_family = len(family)
-    planes = np.empty((k_family + n_found + 1, 3))
-    for k in range(k_family):
-        planes[k, 0], planes[k, 1], planes[k, 2] = family[k, 0], family[k, 1], family[k, 2]
+    planes = np.empty((len(family) + n_found + 1, 3))
+    n_family = n = 0
+    for k in range(len(family)):
+        if not _is_known(xyz, family[k], found[:n_found]):
+            planes[n, 0], planes[n, 1], planes[n, 2] = family[k, 0], family[k, 1], family[k, 2]
+            n += 1
+    n_family = n
     for k in range(n_found):
-        p, q, c = regularise(xyz, (found[k, 0], found[k, 1], found[k, 2]), along)
-        if p * p + q * q > max_slope * max_slope:
-            p, q, c = found[k, 0], found[k, 1], found[k, 2]
-        planes[k_family + k, 0], planes[k_family + k, 1], planes[k_family + k, 2] = p, q, c
-    last = k_family + n_found
-    planes[last, 0], planes[last, 1], planes[last, 2] = 0.0, 0.0, (xyz[(n - 1) // 2, 2] + xyz[n // 2, 2]) / 2
-    nearest = np.empty(n, np.int64)
-    for p in range(n):
-        low = np.inf
-        for k in range(last + 1):
-            r = abs(xyz[p, 2] - planes[k, 0] * xyz[p, 0] - planes[k, 1] * xyz[p, 1] - planes[k, 2])
-            if r < low:
-                low, nearest[p] = r, k
-    mine = np.empty((n, 3))
-    for k in range(last):
-        m = 0
-        for p in range(n):
-            if nearest[p] == k:
-                mine[m, 0], mine[m, 1], mine[m, 2] = xyz[p, 0], xyz[p, 1], xyz[p, 2]
-                m += 1
-        if m >= 8:
-            some = mine[:m]
-            start = refit_plane(some, (planes[k, 0], planes[k, 1], planes[k, 2]), 2 * BAND)
-            s, t, c = regularise(some, start, along)
-            if s * s + t * t <= max_slope * max_slope:
-                planes[k, 0], planes[k, 1], planes[k, 2] = s, t, c
-    cost = np.empty((n, last + 1))
-    for p in range(n):
-        for k in range(last + 1):
+        s, t, c = _regularise_gently(xyz, (found[k, 0], found[k, 1], found[k, 2]), along, max_slope)
+        planes[n, 0], planes[n, 1], planes[n, 2] = s, t, c
+        n += 1
+    planes[n, 0], planes[n, 1] = 0.0, 0.0
+    planes[n, 2] = (xyz[(len(xyz) - 1) // 2, 2] + xyz[len(xyz) // 2, 2]) / 2
+    planes, n_family = _refit_nearest(xyz, planes[: n + 1], along, max_slope, n_family)
+    cost = np.empty((len(xyz), len(planes)))
+    for p in range(len(xyz)):
+        for k in range(len(planes)):
             cost[p, k] = misfit(xyz[p, 2] - planes[k, 0] * xyz[p, 0] - planes[k, 1] * xyz[p, 1] - planes[k, 2])
-    return planes, cost, along, k_family
+    return planes, cost, along, n_family
+
+
+@kernel
+def _regularise_gently(
+    xyz: Array, plane: tuple[float, float, float], along: Array, max_slope: float
+) -> tuple[float, float, float]:
+    """Give a plane as `regularise` does, or as it was where that is too steep."""
+    a, b, c = regularise(xyz, plane, along)
+    if a * a + b * b > max_slope * max_slope:
+        return plane
+    return a, b, c
+
+
+@kernel
+def _refit_nearest(xyz: Array, planes: Array, along: Array, max_slope: float, n_family: int) -> tuple[Array, int]:
+    """Fit each plane but the last, flat one to the points nearest to it; those with hardly any point go.
+
+    Gives the planes that are left, and how many of them are of a family.
+    """
+    nearest, count = np.empty(len(xyz), np.int64), np.zeros(len(planes), np.int64)
+    for p in range(len(xyz)):
+        low = math.inf
+        for k in range(len(planes)):
+            far = abs(xyz[p, 2] - planes[k, 0] * xyz[p, 0] - planes[k, 1] * xyz[p, 1] - planes[k, 2])
+            if far < low:
+                low, nearest[p] = far, k
+        count[nearest[p]] += 1
+    kept = np.empty((len(planes), 3))
+    n = left_family = 0
+    mine = np.empty((len(xyz), 3))
+    for k in range(len(planes)):
+        last = k == len(planes) - 1
+        if count[k] < MIN_NEAREST and not last:
+            continue
+        a, b, c = planes[k, 0], planes[k, 1], planes[k, 2]
+        if count[k] >= MIN_FITTED and not last:
+            m = 0
+            for p in range(len(xyz)):
+                if nearest[p] == k:
+                    mine[m, 0], mine[m, 1], mine[m, 2] = xyz[p, 0], xyz[p, 1], xyz[p, 2]
+                    m += 1
+            s, t, height = regularise(mine[:m], refit_plane(mine[:m], (a, b, c), 2 * BAND), along)
+            if s * s + t * t <= max_slope * max_slope:
+                a, b, c = s, t, height
+        kept[n, 0], kept[n, 1], kept[n, 2] = a, b, c
+        n += 1
+        left_family += k < n_family
+    return kept[:n].copy(), left_family
 
 
 def refit_roofs(roofs: Roofs, polygons: NDArray[np.object_], points: RoofPoints) -> Roofs:
@@ -344,3 +450,7 @@ def _quantile(start: NDArray[np.int64], ascending: Array, share: float, wanted: 
 def _check(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOptions) -> None:
     if len(points.start) != len(polygons) + 1:
         raise ValueError(f"{len(polygons)} polygons do not match the points of {len(points.start) - 1}")
+    positive = (options.clearance, options.min_area, options.min_points, options.max_slope, options.cut_price)
+    others = (options.min_density, options.min_step, options.min_kink, options.max_depth)
+    if not (all(value > 0 for value in positive) and all(value >= 0 for value in others)):
+        raise ValueError(f"options of roofs must be positive, min_density to max_depth not negative: {options}")

@@ -10,6 +10,7 @@ from pipeline.data.kernel import kernel
 FEW, MANY = 9, 14  # neighbours of a point, itself among them, below and above `DENSE`
 DENSE = 7.0  # points a m²
 LEFT_OUT = 5  # one in so many neighbours, the farthest from a first plane, is left out of the second
+LEAST_CELL, MOST_CELLS = 0.1, 1000  # m; and cells along a house
 CELL_POINTS = 3.0  # mean number of points of a cell in which neighbours are looked for
 THIN = 1e-6  # points whose spread across is less than this share of that along have no slope
 
@@ -42,7 +43,7 @@ def fit_locally(start: Index, xyz: Array, area: Array) -> Array:
     from it. O(n k).
     """
     planes = np.empty((len(xyz), 4))
-    near = np.empty((len(xyz), MANY), np.int64)
+    near, sums, far = np.empty((len(xyz), MANY), np.int64), np.empty(9), np.empty(MANY)
     for i in range(len(start) - 1):
         first, last = start[i], start[i + 1]
         n = last - first
@@ -51,68 +52,39 @@ def fit_locally(start: Index, xyz: Array, area: Array) -> Array:
             _find_nearest(xyz, first, last, k, near)
         for p in range(first, last):
             if k >= 3:
-                _fit_one(xyz, p, near, k, planes)
+                _fit_one(xyz, p, near, k, planes, sums, far)
             else:
                 planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3] = 0.0, 0.0, xyz[p, 2], math.inf
     return planes
 
 
 @kernel
-def _find_nearest(  # noqa: PLR0912
-    xyz: Array, first: int, last: int, k: int, near: Index
-) -> None:
+def _find_nearest(xyz: Array, first: int, last: int, k: int, near: Index) -> None:
     """Write the rows of the k nearest points, in the plan, of each of some points."""
-    left, right, under, over = xyz[first, 0], xyz[first, 0], xyz[first, 1], xyz[first, 1]
+    left, right, under, over = math.inf, -math.inf, math.inf, -math.inf
     for p in range(first, last):
         left, right = min(left, xyz[p, 0]), max(right, xyz[p, 0])
         under, over = min(under, xyz[p, 1]), max(over, xyz[p, 1])
-    n = last - first
-    size = max(math.sqrt(max((right - left) * (over - under), 1e-6) * CELL_POINTS / n), 0.1)
-    size = max(size, max(right - left, over - under) / 1000)
+    mean = math.sqrt((right - left) * (over - under) * CELL_POINTS / (last - first))
+    size = max(mean, LEAST_CELL, max(right - left, over - under) / MOST_CELLS)
     columns, rows = int((right - left) / size) + 1, int((over - under) / size) + 1
-    start = np.zeros(columns * rows + 1, np.int64)
-    cell = np.empty(n, np.int64)
-    for p in range(first, last):
-        c = int((xyz[p, 1] - under) / size) * columns + int((xyz[p, 0] - left) / size)
-        cell[p - first] = c
-        start[c + 1] += 1
-    for c in range(columns * rows):
-        start[c + 1] += start[c]
-    order, free = np.empty(n, np.int64), start.copy()
-    for p in range(first, last):
-        c = cell[p - first]
-        order[free[c]] = p
-        free[c] += 1
+    start, order = _put_in_cells(xyz, first, last, (left, under, size), (columns, rows))
     away = np.empty(k)
     for p in range(first, last):
         x, y = xyz[p, 0], xyz[p, 1]
-        i, j = cell[p - first] % columns, cell[p - first] // columns
+        i, j = int((x - left) / size), int((y - under) / size)
         # What is within this distance of the point, and `size` more with each ring, lies in the cells looked at.
-        margin = min(
-            x - left - i * size,
-            left + (i + 1) * size - x,
-            y - under - j * size,
-            under + (j + 1) * size - y,
-        )
-        found, ring = 0, 0
+        beside = min(x - left - i * size, left + (i + 1) * size - x)
+        margin = min(beside, y - under - j * size, under + (j + 1) * size - y)
+        found = ring = 0
         while ring <= max(columns, rows):
             for row in range(max(j - ring, 0), min(j + ring, rows - 1) + 1):
                 step = 1 if row in (j - ring, j + ring) else max(2 * ring, 1)
                 for column in range(i - ring, i + ring + 1, step):
-                    if column < 0 or column >= columns:
-                        continue
-                    c = row * columns + column
-                    for m in range(start[c], start[c + 1]):
-                        q = order[m]
-                        d = (xyz[q, 0] - x) ** 2 + (xyz[q, 1] - y) ** 2
-                        if found == k and (d > away[k - 1] or (d == away[k - 1] and q > near[p, k - 1])):
-                            continue
-                        at = found if found < k else k - 1
-                        while at > 0 and (d < away[at - 1] or (d == away[at - 1] and q < near[p, at - 1])):
-                            away[at], near[p, at] = away[at - 1], near[p, at - 1]
-                            at -= 1
-                        away[at], near[p, at] = d, q
-                        found = min(found + 1, k)
+                    if 0 <= column < columns:
+                        cell = row * columns + column
+                        for m in range(start[cell], start[cell + 1]):
+                            found = _put_near(xyz, p, order[m], away, near, found)
             reach = margin + ring * size
             if found == k and reach > 0 and away[k - 1] < reach * reach:
                 break
@@ -120,15 +92,49 @@ def _find_nearest(  # noqa: PLR0912
 
 
 @kernel
-def _fit_one(xyz: Array, p: int, near: Index, k: int, planes: Array) -> None:
+def _put_in_cells(
+    xyz: Array, first: int, last: int, grid: tuple[float, float, float], shape: tuple[int, int]
+) -> tuple[Index, Index]:
+    """Put points into square cells: where those of each cell start, row by row, and rows of points."""
+    left, under, size = grid
+    cell, start = np.empty(last - first, np.int64), np.zeros(shape[0] * shape[1] + 1, np.int64)
+    for p in range(first, last):
+        cell[p - first] = int((xyz[p, 1] - under) / size) * shape[0] + int((xyz[p, 0] - left) / size)
+        start[cell[p - first] + 1] += 1
+    for c in range(len(start) - 1):
+        start[c + 1] += start[c]
+    order, free = np.empty(last - first, np.int64), start.copy()
+    for p in range(first, last):
+        c = cell[p - first]
+        order[free[c]] = p
+        free[c] += 1
+    return start, order
+
+
+@kernel(inline="always")
+def _put_near(xyz: Array, p: int, q: int, away: Array, near: Index, found: int) -> int:
+    """Take point q among the nearest of point p, by distance, then by row; give how many there are."""
+    k = len(away)
+    d = (xyz[q, 0] - xyz[p, 0]) ** 2 + (xyz[q, 1] - xyz[p, 1]) ** 2
+    if found == k and (d > away[k - 1] or (d == away[k - 1] and q > near[p, k - 1])):
+        return found
+    at = found if found < k else k - 1
+    while at > 0 and (d < away[at - 1] or (d == away[at - 1] and q < near[p, at - 1])):
+        away[at], near[p, at] = away[at - 1], near[p, at - 1]
+        at -= 1
+    away[at], near[p, at] = d, q
+    return min(found + 1, k)
+
+
+@kernel
+def _fit_one(xyz: Array, p: int, near: Index, k: int, planes: Array, sums: Array, far: Array) -> None:
     """Write the plane through the neighbours of a point."""
     x0, y0, z0 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
-    sums = np.zeros(9)
+    sums[:] = 0
     for m in range(k):
         q = near[p, m]
         add_point(sums, 1.0, xyz[q, 0] - x0, xyz[q, 1] - y0, xyz[q, 2] - z0)
     a, b, c = solve_plane(sums)
-    far = np.empty(k)
     for m in range(k):
         q = near[p, m]
         far[m] = abs(xyz[q, 2] - z0 - a * (xyz[q, 0] - x0) - b * (xyz[q, 1] - y0) - c)

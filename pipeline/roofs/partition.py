@@ -8,14 +8,12 @@ from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
 from pipeline.geometry.inside import INSIDE, side_of
-from pipeline.roofs.cut_search import OPEN, find_rectangle, find_ridges, rank_cuts
+from pipeline.roofs.cut_search import OPEN, find_rectangle, find_ridges, order_across, rank_cuts
 from pipeline.roofs.subdivision import (
     FACE,
     FACES,
     HALVES,
-    NEXT,
     NODE,
-    ROOM,
     TWIN,
     area_of_edges,
     cut_face,
@@ -84,9 +82,9 @@ def cut_house(
         Areas (m²).
     """
     half, place, count = net
-    face, area = np.zeros(len(xyz), np.int64), np.zeros(len(place) + ROOM)
+    face, area = np.zeros(len(xyz), np.int64), np.zeros(len(place))
     depth, todo = np.zeros(len(area), np.int64), np.empty(len(area), np.int64)
-    lines = find_ridges(planes)
+    lines = (along, find_ridges(planes), *order_across(xyz, along))
     _, a, b = edges_of_face(half, place, count[HALVES], 0)
     area[0] = area_of_edges(a, b)
     todo[0], n_todo = 0, 1
@@ -98,7 +96,7 @@ def cut_house(
             continue
         least = max(int(rules.min_points) // 2, int(0.5 * len(rows) * rules.min_area / area[piece]))
         n_before = count[FACES]
-        if not _cut_piece(piece, rows, least, xyz, cost, (along, lines), net, rules):
+        if not _cut_piece(piece, rows, least, (xyz, cost, face), lines, net, rules):
             continue
         for f in range(n_before, count[FACES]):
             _, a, b = edges_of_face(half, place, count[HALVES], f)
@@ -133,15 +131,15 @@ def _cut_piece(
     piece: int,
     rows: Index,
     least: int,
-    xyz: Array,
-    cost: Array,
-    lines: tuple[Array, Array],
+    points: tuple[Array, Array, Index],
+    lines: tuple[Array, Array, Array, Index],
     net: tuple[Index, Array, Index],
     rules: PartRules,
 ) -> bool:
     """Cut a face along the best line, or along the best rectangle if that saves more; tell whether it is cut."""
     half, place, count = net
-    ranked = rank_cuts(xyz, cost, rows, lines[0], lines[1], least, rules.price)
+    xyz, cost, face = points
+    ranked = rank_cuts(xyz, cost, face, piece, lines, least, rules.price)
     saved = ranked[0, 3] + RECTANGLE_BONUS * rules.price if len(ranked) else 0.0
     sides = find_rectangle(xyz, cost, rows, lines[0], least, max(saved, rules.price), rules.clearance)
     cut = False
@@ -166,7 +164,7 @@ def _cut_piece(
 
 
 @kernel
-def join_faces(  # noqa: PLR0912, PLR0915
+def join_faces(
     planes: Array, cost: Array, face: Index, area: Array, net: tuple[Index, Array, Index], rules: PartRules
 ) -> tuple[Index, Index]:
     """Join faces under the same plane, too small ones, and those whose wall does not pay.
@@ -185,8 +183,7 @@ def join_faces(  # noqa: PLR0912, PLR0915
     plane : int64, (faces,)
         Row of the plane of each region, by its name.
     """
-    half, place, count = net
-    n = len(area)
+    half, n = net[0], len(area)
     energy, number, area = np.zeros((n, len(planes))), np.zeros(n, np.int64), area.copy()
     for p in range(len(face)):
         number[face[p]] += 1
@@ -195,75 +192,104 @@ def join_faces(  # noqa: PLR0912, PLR0915
     region, plane = np.arange(n), np.empty(n, np.int64)
     for f in range(n):
         plane[f] = energy[f].argmin()
-    walls = np.empty((count[HALVES], 2), np.int64)
-    n_walls = 0
-    for h in range(count[HALVES]):
-        t = half[h, TWIN]
-        if t > h and half[h, FACE] != half[t, FACE]:
-            walls[n_walls, 0], walls[n_walls, 1] = h, t
-            n_walls += 1
-    gap, loss = np.empty((n, n)), np.empty((n, n))
-    why = np.empty((n, n), np.int64)
+    walls, sums = _find_walls(half, net[2][HALVES]), (energy, area, number, plane)
+    why, loss = np.empty(len(walls), np.int64), np.empty(len(walls))
     changed = -1  # region whose walls are looked at anew; at first, all are
     while True:
-        for step in range(2):
-            for w in range(n_walls):
-                h = walls[w, 0]
-                one, two = region[half[h, FACE]], region[half[walls[w, 1], FACE]]
-                one, two = min(one, two), max(one, two)
-                if one == two or (changed >= 0 and changed not in (one, two)):
-                    continue
-                if step == 0:
-                    gap[one, two], why[one, two] = 0.0, -1
-                    continue
-                i, j = plane[one], plane[two]
-                a, b, c = planes[i, 0] - planes[j, 0], planes[i, 1] - planes[j, 1], planes[i, 2] - planes[j, 2]
-                for node in (half[h, NODE], half[half[h, NEXT], NODE]):
-                    gap[one, two] = max(gap[one, two], abs(a * place[node, 0] + b * place[node, 1] + c))
-                if why[one, two] < 0:
-                    low = math.inf
-                    for k in range(len(planes)):
-                        low = min(low, energy[one, k] + energy[two, k])
-                    loss[one, two] = low - energy[one, i] - energy[two, j]
-                    why[one, two] = APART
-                    if i == j:
-                        why[one, two] = SAME
-                    elif (
-                        min(area[one], area[two]) < rules.min_area
-                        or min(number[one], number[two]) < rules.min_points
-                    ):
-                        why[one, two] = SMALL
-                    elif loss[one, two] < rules.price:
-                        why[one, two] = CHEAP
-                    elif math.hypot(a, b) < rules.min_kink:
-                        why[one, two] = LEVEL
-        best, best_one, best_two = APART, -1, -1
-        for w in range(n_walls):
-            one, two = region[half[walls[w, 0], FACE]], region[half[walls[w, 1], FACE]]
-            one, two = min(one, two), max(one, two)
-            if one == two or why[one, two] == APART:
+        best = -1
+        for w in range(len(walls)):
+            one, two = _beside(walls, w, region, half)
+            if one == two:
                 continue
-            if why[one, two] == LEVEL and gap[one, two] >= rules.min_step:
-                continue
-            if why[one, two] < best or (
-                why[one, two] == best
-                and (
-                    loss[one, two] < loss[best_one, best_two]
-                    or (loss[one, two] == loss[best_one, best_two] and (one, two) < (best_one, best_two))
-                )
-            ):
-                best, best_one, best_two = why[one, two], one, two
-        if best_one < 0:
+            if changed < 0 or changed in (one, two):
+                why[w], loss[w] = _judge_wall(one, two, planes, sums, rules)
+                if why[w] == LEVEL and _step_at(one, two, walls, region, planes, plane, net) >= rules.min_step:
+                    why[w] = APART
+            if why[w] != APART and (best < 0 or _goes_before(w, best, why, loss, walls, region, half)):
+                best = w
+        if best < 0:
             return region, plane
-        for f in range(n):
-            if region[f] == best_two:
-                region[f] = best_one
+        changed, gone = _beside(walls, best, region, half)
+        region[region == gone] = changed
         for k in range(len(planes)):
-            energy[best_one, k] += energy[best_two, k]
-        area[best_one] += area[best_two]
-        number[best_one] += number[best_two]
-        plane[best_one] = energy[best_one].argmin()
-        changed = best_one
+            energy[changed, k] += energy[gone, k]
+        area[changed] += area[gone]
+        number[changed] += number[gone]
+        plane[changed] = energy[changed].argmin()
+
+
+@kernel
+def _find_walls(half: Index, n: int) -> Index:
+    """Half-edges on both sides of each wall between two faces, int64 (w, 2)."""
+    walls, m = np.empty((n, 2), np.int64), 0
+    for h in range(n):
+        twin = half[h, TWIN]
+        if twin > h and half[h, FACE] != half[twin, FACE]:
+            walls[m, 0], walls[m, 1] = h, twin
+            m += 1
+    return walls[:m].copy()
+
+
+@kernel
+def _beside(walls: Index, w: int, region: Index, half: Index) -> tuple[int, int]:
+    """Regions on both sides of a wall, the lesser first."""
+    one, two = region[half[walls[w, 0], FACE]], region[half[walls[w, 1], FACE]]
+    return min(one, two), max(one, two)
+
+
+@kernel
+def _judge_wall(
+    one: int, two: int, planes: Array, sums: tuple[Array, Array, Index, Index], rules: PartRules
+) -> tuple[int, float]:
+    """Why two regions are joined, whatever the roof's step between them, and the misfit that it costs."""
+    energy, area, number, plane = sums
+    i, j = plane[one], plane[two]
+    low = math.inf
+    for k in range(len(planes)):
+        low = min(low, energy[one, k] + energy[two, k])
+    loss = low - energy[one, i] - energy[two, j]
+    why = APART
+    if i == j:
+        why = SAME
+    elif min(area[one], area[two]) < rules.min_area or min(number[one], number[two]) < rules.min_points:
+        why = SMALL
+    elif loss < rules.price:
+        why = CHEAP
+    elif math.hypot(planes[i, 0] - planes[j, 0], planes[i, 1] - planes[j, 1]) < rules.min_kink:
+        why = LEVEL
+    return why, loss
+
+
+@kernel
+def _step_at(
+    one: int,
+    two: int,
+    walls: Index,
+    region: Index,
+    planes: Array,
+    plane: Index,
+    net: tuple[Index, Array, Index],
+) -> float:
+    """Greatest step of the roof at the vertices of the walls between two regions (m)."""
+    half, place, _ = net
+    i, j = plane[one], plane[two]
+    a, b, c = planes[i, 0] - planes[j, 0], planes[i, 1] - planes[j, 1], planes[i, 2] - planes[j, 2]
+    step = 0.0
+    for w in range(len(walls)):
+        if _beside(walls, w, region, half) == (one, two):
+            for node in (half[walls[w, 0], NODE], half[walls[w, 1], NODE]):
+                step = max(step, abs(a * place[node, 0] + b * place[node, 1] + c))
+    return step
+
+
+@kernel
+def _goes_before(w: int, other: int, why: Index, loss: Array, walls: Index, region: Index, half: Index) -> bool:
+    """Whether the regions at a wall are joined before those at another one: by reason, cost, then their names."""
+    if why[w] != why[other]:
+        return bool(why[w] < why[other])
+    if loss[w] != loss[other]:
+        return bool(loss[w] < loss[other])
+    return bool(_beside(walls, w, region, half) < _beside(walls, other, region, half))
 
 
 @kernel

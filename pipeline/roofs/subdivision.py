@@ -17,7 +17,10 @@ from pipeline.geometry.segments import ON_EDGE, walls_along
 NEXT, BEFORE, TWIN, FACE, NODE = range(5)
 HALVES, NODES, FACES = range(3)  # numbers that are kept in `count`
 WALL_ROWS = 6  # half-edges that a wall adds at most: two of its own, and two at each end
-ROOM = 400  # walls that a house may get
+ROOM, POINTS_OF_WALL = (
+    100,
+    4,
+)  # walls that a house may get, and one more for so many points: no house needs as many
 STRAIGHT = 1e-3  # m, square root of the area of the triangle at a vertex that is dropped as straight
 
 Array = NDArray[np.float64]
@@ -25,7 +28,7 @@ Index = NDArray[np.int64]
 
 
 @kernel
-def open_subdivision(xy: Array, ring: Index) -> tuple[Index, Array, Index]:
+def open_subdivision(xy: Array, ring: Index, n_points: int) -> tuple[Index, Array, Index]:
     """Make one face of a house.
 
     Parameters
@@ -34,6 +37,8 @@ def open_subdivision(xy: Array, ring: Index) -> tuple[Index, Array, Index]:
         Vertices of closed rings (m), the shell first.
     ring : int64, (n,)
         Ring of each vertex, ascending.
+    n_points : int
+        Points of the house: with more there is room for more walls.
 
     Returns
     -------
@@ -45,7 +50,8 @@ def open_subdivision(xy: Array, ring: Index) -> tuple[Index, Array, Index]:
         Half-edges, vertices and faces that there are.
     """
     n = len(xy)
-    half, place = np.empty((n + WALL_ROWS * ROOM, 5), np.int64), np.empty((n + 2 * ROOM, 2))
+    room = ROOM + n_points // POINTS_OF_WALL
+    half, place = np.empty((n + WALL_ROWS * room, 5), np.int64), np.empty((n + 2 * room, 2))
     count = np.zeros(3, np.int64)
     first = 0
     while first < n:
@@ -317,7 +323,7 @@ def outline_regions(
 
 @kernel
 def _put_ring(place: Array, nodes: Index, kept: tuple[Index, int], xy: Array, m: int) -> int:
-    """Write a closed ring after m vertices, but for new ones on straight walls; give the number of all."""
+    """Write the vertices of a closed ring after m others, without new ones on straight walls; give the number."""
     degree, n_given = kept
     begin, length = m, len(nodes)
     for k in range(length):

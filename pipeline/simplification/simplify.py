@@ -24,9 +24,9 @@ from pipeline.city_model.houses import Houses, divide_houses
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
-from pipeline.data.roofs import choose_roofs, flat_roofs, highest_roofs, is_flat, take_roofs
+from pipeline.data.roofs import ROOF_FALLBACKS, choose_roofs, flat_roofs, highest_roofs, is_flat, take_roofs
 from pipeline.points_terrain.terrain import Dtm
-from pipeline.roofs.house_roofs import refit_roofs
+from pipeline.roofs.house_roofs import FLAT, RoofOptions, refit_roofs
 from pipeline.roofs.roof_points import RoofPoints, locate_roof_points
 from pipeline.simplification.fidelity import Fidelity, measure_simplification
 from pipeline.simplification.house_clusters import Shapes, simplify_houses
@@ -34,6 +34,7 @@ from pipeline.simplification.roof_crossings import add_crossings
 
 COVERED = 0.5  # a house without a face is not lost if others cover this part of it
 CHANGED = 0.3  # of a house's area: an outline that gained and lost more is told
+NO_POINTS, FEW_POINTS = (ROOF_FALLBACKS.index(why) for why in ("no roof points", "few roof points"))
 SETTLE_ROUNDS = 20  # of grouping roofs and raising them over terrain, in turn
 
 
@@ -233,7 +234,23 @@ def _raise_sloped(
         "nodes where roofs cross": n_nodes,
         "walls without room for one": n_short,
     }
-    return replace(city, notes=notes, counts=counts, outline=_describe_outline(outline, houses))
+    return replace(
+        city,
+        roof_method=houses.method[row][city.row],
+        roof_fallback=_find_fallbacks(houses)[row][city.row],
+        notes=notes,
+        counts=counts,
+        outline=_describe_outline(outline, houses),
+    )
+
+
+def _find_fallbacks(houses: Houses) -> NDArray[np.int8]:
+    """Index into `ROOF_FALLBACKS` of each house."""
+    count = np.bincount(houses.parts.house, np.diff(houses.points.roof_start), len(houses))
+    rule = RoofOptions
+    few = (count < 2 * rule.min_points) | (count < rule.min_density * shapely.area(houses.polygons))
+    reason = np.where(few, np.where(count > 0, FEW_POINTS, NO_POINTS), 0)
+    return np.where(houses.method == FLAT, reason, 0).astype(np.int8)
 
 
 def _settle_clusters(

@@ -49,7 +49,7 @@ GEOMETRY = array(
     {
         "oneOf": [
             geometry("MultiSurface", "0", array(FACE, 1)),
-            geometry("Solid", "1.2", array(array(FACE, 5), 1, 1)),
+            *(geometry("Solid", lod, array(array(FACE, 5), 1, 1)) for lod in ("1.2", "1.3", "2.2")),
         ]
     }
 )
@@ -122,11 +122,11 @@ def file_faults(document: Json) -> set[str]:
 def solid_faults(document: Json) -> dict[str, set[str]]:
     """Name what breaks ISO 19107, or disagrees with the attributes, in the solids of each building."""
     points = np.array(document["vertices"]) * document["transform"]["scale"] + document["transform"]["translate"]
-    found = {}
+    found: dict[str, set[str]] = {}
     for name, item in document["CityObjects"].items():
         for solid in item.get("geometry", []):
             if solid["type"] == "Solid":
-                found[name] = set(_solid_faults(solid, points, item["attributes"]))
+                found.setdefault(name, set()).update(_solid_faults(solid, points, item["attributes"]))
     return found
 
 
@@ -167,6 +167,10 @@ def broken(document: Json, path: list[Any], value: Any) -> Json:
 
 def _solid_faults(solid: Json, points: NDArray[np.float64], attributes: Json) -> Iterator[str]:
     faces = faces_of(solid)
+    sloped = solid["lod"] == "2.2" and "roof_plane" in attributes
+    names = {"1.2": "lod12_height", "1.3": "lod13_height", "2.2": "roof_height"}
+    top = attributes.get(names[solid["lod"]], attributes["roof_height"])
+    height = attributes["height"] if top == attributes["roof_height"] else top - attributes["ground_height"]
     edges = Counter(edge for face in faces for ring in face for edge in pairwise([*ring, ring[0]]))
     if any(a == b for a, b in edges):
         yield "corner repeated"
@@ -180,13 +184,25 @@ def _solid_faults(solid: Json, points: NDArray[np.float64], attributes: Json) ->
         corners = points[[corner for ring in face for corner in ring]]
         if size < 1e-9:
             yield "face without area"
-        elif np.abs((corners - corners[0]) @ vector / size).max() > 1e-3:
+        elif np.ptp((corners - corners[0]) @ vector / size) > (0.01 if sloped else 1e-3):
             yield "face not planar"
-        if kind != {-1: "GroundSurface", 0: "WallSurface", 1: "RoofSurface"}[round(vector[2] / max(size, 1e-9))]:
+        rise = float(vector[2] / max(size, 1e-9))
+        if kind != {-1: "GroundSurface", 0: "WallSurface", 1: "RoofSurface"}[(rise > 1e-6) - (rise < -1e-6)]:
             yield "semantics do not fit the normal"
         ground_area -= vector[2] if kind == "GroundSurface" else 0.0
-        level = {"GroundSurface": "ground_height", "RoofSurface": "roof_height"}.get(kind)
-        if level and np.abs(corners[:, 2] - attributes[level]).max() > 0.0005 + 1e-6:
+        level = {"GroundSurface": attributes["ground_height"], "RoofSurface": top}.get(kind)
+        if level is None:
+            continue
+        levels = _plane_heights(attributes, corners) if sloped and kind == "RoofSurface" else level
+        if np.abs(corners[:, 2] - levels).max() > (0.0055 if sloped else 0.0005) + 1e-6:
             yield "face not at its height"
-    if abs(volume(solid, points) - ground_area * attributes["height"]) > 0.001 * ground_area + 1e-6:
+    if sloped:  # it has the volume of the solid of LoD1.3
+        height = attributes["lod13_height"] - attributes["ground_height"]
+    if abs(volume(solid, points) - ground_area * height) > (0.007 if sloped else 0.001) * ground_area + 1e-6:
         yield "volume is not area times height"
+
+
+def _plane_heights(attributes: Json, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    a, b, c, x0, y0, low, high = attributes["roof_plane"]
+    heights: NDArray[np.float64] = np.clip(a * (corners[:, 0] - x0) + b * (corners[:, 1] - y0) + c, low, high)
+    return heights

@@ -2,25 +2,38 @@
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.city_model.roof_areas import measure_roof_areas
+from pipeline.city_model.sloped_solids import LEVEL_TOLERANCE, ROOM, STRAIGHT
 from pipeline.data.errors import InputError
+from pipeline.data.roofs import Roofs, roof_heights
 from tiler.check.proofs import N_PLACES, Fault, Proof, Vertices
 from tiler.citymodels.building_index import BuildingRow, check_indices
 from tiler.citymodels.building_index import Vertices as ModelVertices
+from tiler.citymodels.cityjson import BLOCK_HEIGHTS
 
 HEIGHT_STEP = 1e-3  # m: CityJSON rounds coordinates to 1 mm, the heights among the attributes are not rounded
-KINDS = ("GroundSurface", "RoofSurface", "WallSurface")
+ROOF_TOLERANCE = LEVEL_TOLERANCE + HEIGHT_STEP  # m, up or down, of a corner of a sloped roof
+PLAN_TOLERANCE = STRAIGHT + HEIGHT_STEP  # m, in the plane, of a corner under a sloped roof
+PLANARITY = 0.01  # m, of the corners of a face along its normal: what val3dity takes by default
+FLOOR, ROOF, SIDE = KINDS = ("GroundSurface", "RoofSurface", "WallSurface")
+LOD12, LOD13 = BLOCK_HEIGHTS["1.2"], BLOCK_HEIGHTS["1.3"]
 DETAILS = {
     "solid-missing": "a building with a height has no solid",
     "solid-open": "an edge of the solid is not used once in each direction",
     "solid-height": f"a vertex of the solid is not at its building's ground or roof; bound: {HEIGHT_STEP:g} m",
     "solid-plan": "floor or roof of the solid is not the footprint",
     "solid-volume": "the solid's volume is not that of its footprint times its height",
+    "solid-roof": f"a corner of a roof is not on the plane of its building; bound: {ROOF_TOLERANCE:g} m",
+    "solid-bent": f"a face of the solid is not plane; bound: {PLANARITY:g} m",
+    "solid-semantics": "a face does not look down, up or aside as its semantic surface says",
+    "block-height": f"lod13_height is not the mean height of the roof; bound: {ROOF_TOLERANCE:g} m",
     "height-attribute": f"height is not roof_height less ground_height; bound: {HEIGHT_STEP:g} m",
 }
 
@@ -35,7 +48,7 @@ class SolidProofs:
     """
 
     def __init__(self) -> None:
-        self.n_solids = self.n_flat = 0
+        self.n_solids = self.n_sloped = self.n_flat = 0
         self._places: dict[str, list[tuple[float, float, float]]] = {}
         self._count: dict[str, int] = {}
         self._kin = [0, 0]  # sums of hashes of (house, part), as houses and as parts have them
@@ -70,13 +83,12 @@ class SolidProofs:
             self._kin[1] += sum(_hash_pair(house, name) for house in thing.get("parents", ()))
             if building is None:
                 return
-            _, ground, roof, _, footprint = building
-            for kind in self._find(thing, vertices, ground, roof, footprint):
-                place = footprint.representative_point()
+            for kind in self._find(thing, vertices, building):
+                place = building.footprint.representative_point()
                 self._count[kind] = self._count.get(kind, 0) + 1
                 places = self._places.setdefault(kind, [])
                 if len(places) < N_PLACES:
-                    places.append((place.x, place.y, roof))
+                    places.append((place.x, place.y, building.roof))
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise InputError(
                 f"city model: building {name!r}: its solid is damaged ({error!r}); run again"
@@ -91,53 +103,138 @@ class SolidProofs:
             faults.append(Fault("parts", 1, (), "children of houses and parents of parts differ"))
         flat = f", {self.n_flat} flat buildings have none" if self.n_flat else ""
         claim = f"{self.n_solids} solids of the city model are closed and stand from ground to roof{flat}"
-        return Proof(f"{claim}; bound: {HEIGHT_STEP:g} m", tuple(faults))
+        bound = f"bound: {HEIGHT_STEP:g} m"
+        if self.n_sloped:
+            bound += f", {ROOF_TOLERANCE:g} m of the {self.n_sloped} with sloped roofs"
+        return Proof(f"{claim}; {bound}", tuple(faults))
 
-    def _find(
-        self, thing: Mapping[str, Any], vertices: ModelVertices, ground: float, roof: float, footprint: Any
-    ) -> list[str]:
-        height = thing["attributes"].get("height", roof - ground)
+    def _find(self, thing: Mapping[str, Any], vertices: ModelVertices, building: BuildingRow) -> list[str]:
+        ground, roof, footprint = building.ground, building.roof, building.footprint
+        attributes = thing["attributes"]
+        height = attributes.get("height", roof - ground)
         found = [] if abs(height - (roof - ground)) <= HEIGHT_STEP else ["height-attribute"]
-        solids = [geometry for geometry in thing["geometry"] if geometry["type"] == "Solid"]
-        if not solids:
-            self.n_flat += 1
-            return found + (["solid-missing"] if roof - ground > 2 * HEIGHT_STEP else [])
-        for solid in solids:
-            self.n_solids += 1
-            found += _find_faults(solid, vertices, ground, roof, footprint)
-        return found
+        tops, mean = {"1.2": roof}, roof
+        roofs, flat = _roof_over_ground(building), building.plane[5] == building.plane[6]
+        if LOD12 in attributes:
+            tops = {"1.2": float(attributes[LOD12]), "1.3": float(attributes[LOD13]), "2.2": roof}
+            if not flat and footprint.area:
+                mean = float(measure_roof_areas(np.array([footprint]), roofs).mean[0])
+            found += [] if abs(tops["1.3"] - mean) <= ROOF_TOLERANCE else ["block-height"]
+        solids = {str(solid["lod"]): solid for solid in thing["geometry"] if solid["type"] == "Solid"}
+        self.n_flat += not solids
+        self.n_solids += len(solids)
+        for lod, top in tops.items():
+            if lod not in solids:
+                found += ["solid-missing"] if top - ground > 2 * HEIGHT_STEP else []
+            elif lod == "2.2" and not flat:
+                self.n_sloped += 1
+                found += _find_sloped_faults(_read_solid(solids[lod], vertices), building, roofs, mean)
+            else:
+                found += _find_faults(_read_solid(solids[lod], vertices), ground, top, footprint)
+        return list(dict.fromkeys(found))
 
 
-def _find_faults(
-    solid: Mapping[str, Any], vertices: ModelVertices, ground: float, roof: float, footprint: Any
-) -> list[str]:
+@dataclass(frozen=True, eq=False)
+class _Solid:
+    """Corners of the faces of a solid, ring after ring: vertex, place (m) and those of the next, face, kind."""
+
+    corner: NDArray[np.int64]
+    after: NDArray[np.int64]
+    place: Vertices
+    onward: Vertices
+    face: NDArray[np.int64]
+    kinds: NDArray[np.int64]
+
+    def measure_volume(self) -> float:
+        """Volume (m³), by the edges of rings and the first corner of each face."""
+        first = self.place[np.searchsorted(self.face, self.face)]
+        at = self.place[0]
+        return _volume(first - at, self.place - at, self.onward - at)
+
+    def measure_areas(self) -> Vertices:
+        """Area times normal of each face, outwards (m²): half the sum of the cross products of its edges."""
+        first = self.place[np.searchsorted(self.face, self.face)]
+        twice = np.cross(self.place - first, self.onward - first)
+        return np.column_stack([np.bincount(self.face, axis) for axis in twice.T]) / 2
+
+
+def _read_solid(solid: Mapping[str, Any], vertices: ModelVertices) -> _Solid:
     (faces,) = solid["boundaries"]
     (values,) = solid["semantics"]["values"]
     names = [surface["type"] for surface in solid["semantics"]["surfaces"]]
     if len(values) != len(faces):
         raise ValueError(f"{len(values)} values for {len(faces)} faces")
     rings = [ring for face in faces for ring in face]
-    kind = np.repeat([KINDS.index(names[value]) for value in values], [len(face) for face in faces])
     size = np.array([len(ring) for ring in rings])
     corner = check_indices([vertex for ring in rings for vertex in ring], len(vertices))
     place = vertices.take(corner)
     after = np.arange(1, len(corner) + 1)
     after[np.cumsum(size) - 1] -= size
-    kinds = np.repeat(kind, size)
-    levels = np.array([[ground, ground], [roof, roof], [ground, roof]])[kinds]
-    off = np.abs(place[:, 2:] - levels).min(axis=1) > HEIGHT_STEP
+    face = np.repeat(np.repeat(np.arange(len(faces)), [len(face) for face in faces]), size)
+    kinds = np.array([KINDS.index(names[value]) for value in values])[face]
+    return _Solid(corner, corner[after], place, place[after], face, kinds)
+
+
+def _find_faults(solid: _Solid, ground: float, roof: float, footprint: Any) -> list[str]:
+    """Name what is wrong with a prism."""
+    levels = np.array([[ground, ground], [roof, roof], [ground, roof]])[solid.kinds]
+    off = np.abs(solid.place[:, 2:] - levels).min(axis=1) > HEIGHT_STEP
     found = ["solid-height"] if off.any() else []
-    if not _is_closed(corner, corner[after]):
+    if not _is_closed(solid.corner, solid.after):
         found.append("solid-open")
     floor = shapely.get_coordinates(footprint)
-    if any(not _same_places(place[kinds == k, :2], floor) for k in (0, 1)):
+    if any(not _same_places(solid.place[solid.kinds == k, :2], floor) for k in (0, 1)):
         found.append("solid-plan")
     wanted = footprint.area * (roof - ground)
     slack = 2 * HEIGHT_STEP * footprint.area + 1e-6 * abs(wanted)
-    first = np.repeat(place[np.cumsum(size) - size], size, axis=0)
-    if abs(_volume(first - place[0], place - place[0], place[after] - place[0]) - wanted) > slack:
+    if abs(solid.measure_volume() - wanted) > slack:
         found.append("solid-volume")
     return found
+
+
+def _find_sloped_faults(solid: _Solid, building: BuildingRow, roofs: Roofs, mean: float) -> list[str]:
+    """Name what is wrong with a solid under a sloped roof, of this mean height."""
+    ground, footprint = building.ground, building.footprint
+    floor, roof = solid.kinds == KINDS.index(FLOOR), solid.kinds == KINDS.index(ROOF)
+    z = solid.place[:, 2]
+    expected = roof_heights(roofs, np.zeros(len(z), np.int64), solid.place[:, :2])
+    off_ground = np.abs(z - ground) > HEIGHT_STEP
+    off_roof = np.abs(z - expected) > ROOF_TOLERANCE
+    found = ["solid-height"] if (off_ground & ~roof & (floor | off_roof)).any() else []
+    found += ["solid-roof"] if (off_roof & roof).any() else []
+    found += [] if _is_closed(solid.corner, solid.after) else ["solid-open"]
+    areas = solid.measure_areas()
+    size = np.linalg.norm(areas, axis=1)
+    normal = areas / np.maximum(size, 1e-12)[:, None]
+    first = np.searchsorted(solid.face, solid.face)
+    apart = np.einsum("ij,ij->i", solid.place - solid.place[first], normal[solid.face])
+    found += ["solid-bent"] if np.ptp(apart) > PLANARITY and _is_bent(apart, solid.face) else []
+    kinds = solid.kinds[np.searchsorted(solid.face, np.arange(len(areas)))]
+    length = np.bincount(solid.face, np.linalg.norm(solid.onward - solid.place, axis=1))
+    turned = np.where(np.abs(areas[:, 2]) <= HEIGHT_STEP * HEIGHT_STEP * length, 2, (areas[:, 2] > 0).astype(int))
+    found += ["solid-semantics"] if (turned != kinds).any() else []
+    outline, slack = shapely.boundary(footprint), PLAN_TOLERANCE * footprint.length
+    plan = np.array([-areas[kinds == 0, 2].sum(), areas[kinds == 1, 2].sum()])
+    astray = shapely.distance(outline, shapely.points(solid.place[floor, :2])) > PLAN_TOLERANCE
+    found += ["solid-plan"] if astray.any() or (np.abs(plan - footprint.area) > slack).any() else []
+    slack = (ROOF_TOLERANCE + HEIGHT_STEP) * footprint.area + slack * (roofs.limits[0, 1] - ground)
+    found += ["solid-volume"] if abs(solid.measure_volume() - footprint.area * (mean - ground)) > slack else []
+    return found
+
+
+def _is_bent(apart: NDArray[np.float64], face: NDArray[np.int64]) -> bool:
+    """Tell whether corners of a face are farther from each other along its normal than `PLANARITY`."""
+    start = np.flatnonzero(np.diff(face, prepend=-1))
+    spread = np.maximum.reduceat(apart, start) - np.minimum.reduceat(apart, start)
+    return bool((spread > PLANARITY).any())
+
+
+def _roof_over_ground(building: BuildingRow) -> Roofs:
+    """Give the roof of a building as its solid has it: nowhere in the ground."""
+    a, b, c, x0, y0, low, high = building.plane
+    least = building.ground + ROOM if low < high else low
+    limits = np.array([[max(low, least), max(high, least)]])
+    return Roofs(np.array([[a, b, c]]), np.array([[x0, y0]]), limits)
 
 
 def _is_closed(start: NDArray[np.int64], end: NDArray[np.int64]) -> bool:

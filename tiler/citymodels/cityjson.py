@@ -16,7 +16,8 @@ import shapely
 from numpy.typing import NDArray
 from pyproj.exceptions import CRSError
 
-from pipeline.city_model.solids import Solids, build_solids
+from pipeline.city_model.sloped_solids import GROUND, ROOF, WALL
+from pipeline.city_model.solids import Levels, Solids, build_solids
 from pipeline.data.citymodel import CityModel, join_models, take_model
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
@@ -28,11 +29,13 @@ from tiler.store.atomic import replacing
 GRID = 0.001
 # Attributes of every building; further columns may not take their names.
 ATTRIBUTES = ("number", "ground_height", "roof_height", "height", "members")
+# Columns with the heights of flat roofs of LoD1.2 and LoD1.3; with them, the solids of these and of LoD2.2 are
+# written, else one of LoD1.2 up to the highest place of the roof.
+BLOCK_HEIGHTS = {"1.2": "lod12_height", "1.3": "lod13_height"}
 RUN = 512  # buildings that are written at once, and share their vertices
 COPY_BYTES = 1 << 20
 ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
-GROUND, ROOF, WALL = range(3)
-# Semantic surfaces of every solid, by the numbers above.
+# Semantic surfaces of every solid, by the numbers GROUND, ROOF and WALL.
 SURFACES = '[{"type":"GroundSurface"},{"type":"RoofSurface"},{"type":"WallSurface"}]'
 WITHOUT_COMMA = {bool, int, float, type(None)}  # types of values whose text has no comma
 Attributes = Mapping[str, Sequence[object]]
@@ -47,7 +50,7 @@ def write_city_model(
     title: str = "",
     attributes: Attributes | None = None,
 ) -> tuple[Note, ...]:
-    """Write the buildings as CityJSON 2.0: LoD0 footprints and LoD1.2 solids.
+    """Write the buildings as CityJSON 2.0: LoD0 footprints and solids.
 
     Parameters
     ----------
@@ -63,7 +66,8 @@ def write_city_model(
     title : str
         Title of the dataset; the file has none if empty.
     attributes : mapping of str to a sequence of n values
-        Further attributes, one column each. NaN is written as null.
+        Further attributes, one column each. NaN is written as null. With `BLOCK_HEIGHTS` among them there are
+        solids of LoD1.2, LoD1.3 and LoD2.2, else of LoD1.2 alone, up to the highest place of the roof.
 
     Returns
     -------
@@ -173,23 +177,23 @@ class _Writer:
         """Write the objects of a run."""
         columns = _columns(model, extra)
         self._check_ids(model.ids)
-        solids, notes = build_solids(model, self.origin, grid=GRID)
+        levels, notes = build_solids(model, self.origin, grid=GRID, blocks=_block_heights(columns))
         self.notes += notes
-        attributes, geometry = _attribute_texts(columns, model.roofs), _geometry_texts(solids, self.n_vertices)
+        attributes, geometry = _attribute_texts(columns, model.roofs), _geometry_texts(levels, self.n_vertices)
         objects = []
         for name, house, *told in zip(model.ids.tolist(), model.house.tolist(), attributes, geometry, strict=True):
             objects.append(_object_text(name, house, *told))
             if house != name:
                 self.children.setdefault(house, []).append(name)
         self._objects(objects)
-        if len(solids.vertices):
-            places = solids.vertices * GRID + self.origin
+        if len(levels.vertices):
+            places = levels.vertices * GRID + self.origin
             self.box = np.vstack((self.box, places.min(axis=0), places.max(axis=0)))
             self.box = np.stack((self.box.min(axis=0), self.box.max(axis=0)))
             # All at once: a call for each takes twelve times as long, the encoder of lists three times.
-            text = ",\n".join(["[%d,%d,%d]"] * len(solids.vertices)) % tuple(solids.vertices.reshape(-1).tolist())
+            text = ",\n".join(["[%d,%d,%d]"] * len(levels.vertices)) % tuple(levels.vertices.reshape(-1).tolist())
             self.spool.write(f"{',' if self.n_vertices else ''}\n{text}".encode("ascii"))
-            self.n_vertices += len(solids.vertices)
+            self.n_vertices += len(levels.vertices)
 
     def finish(self) -> None:
         """Write the houses that have parts, and the vertices."""
@@ -355,22 +359,64 @@ def _extent(bounds: Sequence[float], points: NDArray[np.floating]) -> list[float
     return [round(float(value), 3) for value in (*low, *high)]
 
 
-def _geometry_texts(solids: Solids, first: int) -> list[str]:
-    """Write the geometry of each building, LoD0 and LoD1.2 if it has a solid, on vertices from `first` on.
+def _block_heights(columns: Attributes) -> NDArray[np.float64] | None:
+    """Heights of the block models among the columns; None where there are none."""
+    names = [name for name in BLOCK_HEIGHTS.values() if name in columns]
+    if not names:
+        return None
+    if len(names) < len(BLOCK_HEIGHTS):
+        raise ValueError(
+            f"attribute {names[0]!r} without the other of {', '.join(BLOCK_HEIGHTS.values())}; give both"
+        )
+    return np.column_stack([np.array(columns[name], np.float64) for name in names])
+
+
+def _geometry_texts(levels: Levels, first: int) -> list[str]:
+    """Write the geometry of each building, LoD0 and those of its solids, on vertices from `first` on.
 
     Text is put together here: of a million lists, Python's encoder would take twice as long as all else.
     """
-    low, high = ([str(vertex) for vertex in (corners + first).tolist()] for corners in (solids.low, solids.high))
-    walls = [f"[[{a},{b},{c},{d}]]" for a, b, c, d in (solids.walls + first).tolist()]
-    start, building = solids.ring_start.tolist(), solids.building_start.tolist()
+    lods = (*BLOCK_HEIGHTS, "2.2")[: len(levels.solids)]
+    texts = [_floor_texts(levels.solids[0], first)]
+    texts += [_solid_texts(solids, lod, first) for solids, lod in zip(levels.solids, lods, strict=True)]
+    return [f"[{','.join(filter(None, row))}]" for row in zip(*texts, strict=True)]
+
+
+def _floor_texts(solids: Solids, first: int) -> list[str]:
+    low, start = _as_texts(solids.low + first), solids.ring_start.tolist()
     texts = []
-    for has_solid, (ring, end) in zip(solids.has_solid.tolist(), pairwise(building), strict=True):
+    for ring, end in pairwise(solids.building_start.tolist()):
         rings = list(pairwise(start[ring : end + 1]))
-        objects = [_floor_text(low, rings)] if rings else []
-        if rings and has_solid:
-            objects.append(_solid_text(low, high, walls[start[ring] : start[end]], rings))
-        texts.append(f"[{','.join(objects)}]")
+        texts.append(_floor_text(low, rings) if rings else "")
     return texts
+
+
+def _solid_texts(solids: Solids, lod: str, first: int) -> list[str]:
+    """Write the solid of each building that has one."""
+    low, high = _as_texts(solids.low + first), _as_texts(solids.high + first)
+    walls = [f"[[{a},{b},{c},{d}]]" for a, b, c, d in (solids.walls + first).tolist()]
+    start, texts = solids.ring_start.tolist(), []
+    rows = zip(solids.has_solid.tolist(), pairwise(solids.building_start.tolist()), strict=True)
+    for row, (has_solid, (ring, end)) in enumerate(rows):
+        rings = list(pairwise(start[ring : end + 1]))
+        if not (rings and has_solid):
+            texts.append("")
+        elif row in solids.others:
+            faces = solids.others[row]
+            shell = ",".join(_face_text([ring + first for ring in face]) for _, face in faces)
+            texts.append(_shell_text(lod, shell, ",".join(str(kind) for kind, _ in faces)))
+        else:
+            texts.append(_prism_text(lod, low, high, walls[start[ring] : start[end]], rings))
+    return texts
+
+
+def _as_texts(numbers: NDArray[np.int64]) -> list[str]:
+    return [str(number) for number in numbers.tolist()]
+
+
+def _face_text(rings: Sequence[NDArray[np.int64]]) -> str:
+    texts = [",".join(_as_texts(ring)) for ring in rings]
+    return f"[{','.join(f'[{text}]' for text in texts)}]"
 
 
 def _floor_text(low: list[str], rings: list[tuple[int, int]]) -> str:
@@ -378,14 +424,17 @@ def _floor_text(low: list[str], rings: list[tuple[int, int]]) -> str:
     return f'{{"type":"MultiSurface","lod":"0","boundaries":[[{floor}]]}}'
 
 
-def _solid_text(low: list[str], high: list[str], walls: list[str], rings: list[tuple[int, int]]) -> str:
+def _prism_text(lod: str, low: list[str], high: list[str], walls: list[str], rings: list[tuple[int, int]]) -> str:
     """Put one closed shell together; the floor is turned over to look down."""
     floor = ",".join(f"[{','.join(reversed(low[a:b]))}]" for a, b in rings)
     roof = ",".join(f"[{','.join(high[a:b])}]" for a, b in rings)
     kinds = f"{GROUND},{ROOF}" + f",{WALL}" * len(walls)
-    shell = ",".join((f"[{floor}]", f"[{roof}]", *walls))
+    return _shell_text(lod, ",".join((f"[{floor}]", f"[{roof}]", *walls)), kinds)
+
+
+def _shell_text(lod: str, shell: str, kinds: str) -> str:
     return (
-        f'{{"type":"Solid","lod":"1.2","boundaries":[[{shell}]],'
+        f'{{"type":"Solid","lod":"{lod}","boundaries":[[{shell}]],'
         f'"semantics":{{"surfaces":{SURFACES},"values":[[{kinds}]]}}}}'
     )
 

@@ -40,6 +40,8 @@ class Buildings:
         Layers that the layered mesher removes; 0 with the other one.
     fidelity : HouseFidelity
         How the roof fits its points.
+    roof_method, roof_fallback : int8, (n,)
+        As of `City`.
     """
 
     model: CityModel
@@ -49,6 +51,8 @@ class Buildings:
     group: NDArray[np.int64]
     layers: NDArray[np.int32]
     fidelity: HouseFidelity
+    roof_method: NDArray[np.int8]
+    roof_fallback: NDArray[np.int8]
 
     def __len__(self) -> int:
         return len(self.model)
@@ -162,6 +166,8 @@ def make_buildings(city: City, fidelity: HouseFidelity, layers: NDArray[np.int32
         city.group.astype(np.int64),
         layers,
         fidelity,
+        city.roof_method,
+        city.roof_fallback,
     )
 
 
@@ -184,19 +190,23 @@ def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
         "wall_ground": buildings.wall_ground,
         "group": buildings.group,
         "layers": buildings.layers,
-        "fidelity_points": fidelity.n_points,
-        "fidelity_rmse": fidelity.rmse,
-        "fidelity_bias": fidelity.bias,
-        "fidelity_coverage": fidelity.coverage,
+        "roof_method": buildings.roof_method,
+        "roof_fallback": buildings.roof_fallback,
+        **{name: getattr(fidelity, field) for field, name in FIDELITY_ARRAYS.items()},
     }
     return {prefix + name: values for name, values in arrays.items()}
 
 
+FIDELITY_ARRAYS = {
+    "n_points": "fidelity_points",
+    **{name: f"fidelity_{name}" for name in ("rmse", "bias", "coverage", "median", "within")},
+}
 BUILDING_ARRAYS = (
     *("polygon", "polygon_start", "id", "number", "house", "ground", "member", "member_start"),
     *ROOF_ARRAYS,
     *("roof_source", "measured_roof", "wall_ground", "group", "layers"),
-    *("fidelity_points", "fidelity_rmse", "fidelity_bias", "fidelity_coverage"),
+    *("roof_method", "roof_fallback"),
+    *FIDELITY_ARRAYS.values(),
 )
 
 
@@ -213,7 +223,7 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
         tuple(tuple(names[a:b]) for a, b in pairwise(start)),
         arrays["house"],
     )
-    fidelity = HouseFidelity(*(arrays[f"fidelity_{name}"] for name in ("points", "rmse", "bias", "coverage")))
+    fidelity = HouseFidelity(**{field: arrays[name] for field, name in FIDELITY_ARRAYS.items()})
     return Buildings(
         model,
         arrays["roof_source"],
@@ -222,6 +232,8 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
         arrays["group"],
         arrays["layers"],
         fidelity,
+        arrays["roof_method"],
+        arrays["roof_fallback"],
     )
 
 
@@ -284,8 +296,9 @@ def no_buildings() -> Buildings:
     text, number, rows = np.empty(0, np.str_), np.empty(0), np.empty(0, np.int64)
     model = CityModel(np.empty(0, object), text, rows, number, join_roofs([]), (), text)
     layers = np.empty(0, np.int32)
-    fidelity = HouseFidelity(rows, number, number, number)
-    return Buildings(model, np.empty(0, np.int8), number, number, rows, layers, fidelity)
+    fidelity = HouseFidelity(rows, *(number,) * 5)
+    code = np.empty(0, np.int8)
+    return Buildings(model, code, number, number, rows, layers, fidelity, code, code)
 
 
 def join_buildings(several: Sequence[Buildings]) -> Buildings:

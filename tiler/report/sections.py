@@ -56,6 +56,12 @@ POINT_KINDS = {
 }
 
 
+METHODS = {
+    "planes": "planes of points",
+    "family": "gable, hip or the like",
+    "skeleton": "hipped, by its outline",
+    "flat": "one height",
+}
 POINT_COLUMNS = ("rmse", "p50", "p95", "bias")
 SURFACES = {
     "roof on roof": "roof points over roofs",
@@ -226,6 +232,7 @@ def describe_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
     head = ["points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "bias (m)"]
     yield heading("The city model and its terrain")
     yield table("Heights of the city model over LiDAR points, all points, outliers too", head, rows)
+    yield from _describe_roof_fit(found)
     if outline := found.get("outline"):
         names = (
             ("area that outlines gained or lost", f"{100 * outline['area_error']:.2f} %"),
@@ -233,6 +240,39 @@ def describe_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
             ("sharpest corner", f"{outline['sharpest']:.1f}°"),
         )
         yield figures(names)
+
+
+def _describe_roof_fit(found: dict[str, Any]) -> Iterator[str]:
+    """Show how roofs of planes fit their points, by method, and the worst of them."""
+    if "roof_fit" in found:
+        names = ("buildings", "points", "rmse", "median", "within")
+        rows = [
+            [METHODS[method], *(number(fit.get(name)) for name in names)]
+            for method, fit in found["roof_fit"].items()
+        ]
+        head = ["roof", "building parts", "points", "RMSE (m)", "median of medians (m)", "within 0.25 m"]
+        yield heading("Roofs by method")
+        yield table("Roofs over their points, façade points and what stands on roofs too", head, rows)
+    if found.get("worst_roofs"):
+        rows = [
+            [
+                one["id"],
+                METHODS[one["method"]],
+                *(number(one[name]) for name in ("parts", "points", "rmse", "within")),
+                f"{one['worst_part']} at {one['x']:.1f}, {one['y']:.1f}: {one['why']}",
+            ]
+            for one in found["worst_roofs"]
+        ]
+        head = [
+            "house",
+            "roof",
+            "parts",
+            "points",
+            "RMSE (m)",
+            "within 0.25 m",
+            "worst part, and what is known of it",
+        ]
+        yield folded("The houses whose roofs fit worst", table("Roofs of largest RMSE", head, rows))
 
 
 def format_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.errors import InputError
-from pipeline.quality.building_facts import report_buildings
+from pipeline.data.roofs import NOT_FITTED
+from pipeline.quality.building_facts import describe_roofs, report_buildings
+from pipeline.quality.roof_fits import RoofFits
 from tiler.citymodels.cityjson import Attributes, write_city_blocks
 from tiler.citymodels.tables import (
     BUILDING_ARRAYS,
@@ -45,7 +47,10 @@ def write_full_model(task: Task) -> Facts:
 
 def write_simple_model(task: Task) -> Facts:
     """Write the simplified city model (step 2.4)."""
-    return _write(task, "model", "", CITY_MODEL)
+    fits = RoofFits()
+    facts = _write(task, "model", "", CITY_MODEL, fits)
+    table = fits.by_method()
+    return facts | ({"roof_fit": table, "worst_roofs": fits.worst} if table else {})
 
 
 def house_cells(model: CityModel) -> NDArray[np.int64]:
@@ -98,12 +103,12 @@ class _Survey:
     high: float
 
 
-def _write(task: Task, stage: str, prefix: str, file: str) -> Facts:
+def _write(task: Task, stage: str, prefix: str, file: str, fits: RoofFits | None = None) -> Facts:
     with task.step("survey"):
         survey = _survey(task, stage, prefix)
         _check_numbers(task, stage, prefix, survey)
     xmin, ymin, xmax, ymax = task.context.bounds
-    blocks = ((part.model, _tell(part)) for part in _by_cell(task, stage, prefix, survey))
+    blocks = ((part.model, _tell(part, fits)) for part in _by_cell(task, stage, prefix, survey))
     bounds = (xmin, ymin, survey.low, xmax, ymax, survey.high)
     with task.step("write"), task.output() as out:
         task.notes(write_city_blocks(out / file, blocks, crs=task.context.crs, bounds=bounds))
@@ -191,8 +196,13 @@ def _by_cell(task: Task, stage: str, prefix: str, survey: _Survey) -> Iterator[B
         )
 
 
-def _tell(buildings: Buildings) -> Attributes:
+def _tell(buildings: Buildings, fits: RoofFits | None) -> Attributes:
     told: dict[str, Sequence[object]] = report_buildings(
         buildings.model, buildings.roof_source, buildings.measured_roof, buildings.fidelity
     )
+    method, fallback = buildings.roof_method, buildings.roof_fallback
+    if fits is not None and (method != NOT_FITTED).any():
+        roofs = describe_roofs(buildings.model, method, fallback, buildings.fidelity)
+        fits.add(buildings.model, method, buildings.fidelity, roofs)
+        told |= roofs
     return told

@@ -114,6 +114,9 @@ WORDS: dict[str, Words] = {
     "solid-flat": Words(
         REPAIRED, "{n} building[s] [has|have] no solid in the CityJSON: the roof is not above the ground"
     ),
+    "solid-into-ground": Words(
+        REPAIRED, "{n} sloped roof[s] [meets|meet] the ground; [its solid is|their solids are] cut off there"
+    ),
     "solid-touching": Words(REPAIRED, "{n} solid[s] of the CityJSON [touches itself|touch themselves]"),
     "building-ground-from-dtm": Words(
         DEFAULTED, "{n} building part[s] without ground points took the ground height of the terrain"

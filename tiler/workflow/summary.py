@@ -11,6 +11,7 @@ from pipeline.simplification.house_clusters import add_counts
 from tiler.config.config import Config
 from tiler.config.domain_height import settle
 from tiler.engine.engine import Engine
+from tiler.engine.records import Records
 from tiler.engine.run_context import absent_tiles, tile_name
 from tiler.engine.stage import REGION_ITEM, Facts
 from tiler.engine.task import read_notes
@@ -115,7 +116,7 @@ def summarise_run(
         **empty,
         "parts": describe_parts(report["parts"]),
         "quality": report["quality"],
-        "fidelity": report["fidelity"] | ({"outline": outline} if outline else {}),
+        "fidelity": report["fidelity"] | ({"outline": outline} if outline else {}) | _roof_fit(records),
         "left_out": left_out,
         "tasks": {"all": len(records), "ran": len(records) - sum(records.count_reused().values())},
         "reused": records.count_reused(),
@@ -132,6 +133,12 @@ def summarise_run(
         "unreadable": unreadable,
         "notes": group_notes(notes),
     }
+
+
+def _roof_fit(records: Records) -> dict[str, Any]:
+    """Tell how roofs of planes fit their points."""
+    facts = records["citymodel", REGION_ITEM].facts
+    return {name: facts[name] for name in ("roof_fit", "worst_roofs") if name in facts}
 
 
 def _describe_pad(engine: Engine) -> dict[str, Any]:

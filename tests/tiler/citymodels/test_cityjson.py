@@ -451,12 +451,13 @@ def test_corners_are_where_the_noded_overlay_rounds_them_to(seed: int, grid: flo
             polygon = polygon.difference(hole)
         polygons.append(polygon if isinstance(polygon, shapely.Polygon) and polygon.is_valid else hole)
     model, origin = make_model(*polygons, *shapely.reverse(polygons)), np.array([121000.0, 121000.0, 0.0])
-    solids, _ = build_solids(model, origin, grid=grid)
+    levels, _ = build_solids(model, origin, grid=grid)
+    found = levels.vertices[levels.solids[0].low, :2]
     expected = shapely.set_precision(model.polygons, grid)
     parts = [max(shapely.get_parts(polygon), key=shapely.area, default=polygon) for polygon in expected]
     rings = shapely.get_rings(shapely.orient_polygons(np.array(parts)))
     xy = np.concatenate([shapely.get_coordinates(ring)[1:] for ring in rings])
-    assert solids.vertices[solids.low, :2].tolist() == np.rint((xy - origin[:2]) / grid).astype(int).tolist()
+    assert found.tolist() == np.rint((xy - origin[:2]) / grid).astype(int).tolist()
 
 
 def test_real_footprints_make_valid_solids(shared_data: Path, target: Path) -> None:

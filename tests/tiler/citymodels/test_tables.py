@@ -85,7 +85,9 @@ def make_town() -> Buildings:
         0.25 * heights,
         rows // 2,
         rows.astype(np.int32),
-        HouseFidelity(rows, *np.zeros((3, len(rows)))),
+        HouseFidelity(rows, *np.zeros((5, len(rows)))),
+        (rows % 4).astype(np.int8),
+        (rows % 3).astype(np.int8),
     )
 
 

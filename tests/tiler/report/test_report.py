@@ -330,3 +330,21 @@ def test_run_facts_hold_little_of_long_lists(copy: Path) -> None:
     change_record(copy, notes={"a": {"count": 2_000, "items": items}})
     (notes,) = read_run_facts(copy).notes
     assert (len(notes.items), len(notes.places), notes.count) == (SHOWN, 300, 2_000)
+
+
+def test_roofs_of_planes_are_told_by_method_and_the_worst_are_listed(copy: Path) -> None:
+    record = json.loads((copy / "run.json").read_text())
+    assert "roof_fit" not in record["fidelity"]
+    fit = {
+        "planes": {"buildings": 1234, "points": 56789, "rmse": 1.25, "median": 0.125, "within": 0.75},
+        "flat": {"buildings": 4321, "points": 0},
+    }
+    worst = {
+        **{"id": "<h1>", "method": "planes", "parts": 3, "points": 77, "rmse": 9.875, "within": 0.25},
+        **{"worst_part": "h1-part2", "x": 12.5, "y": 7.0, "why": "few & far"},
+    }
+    change_record(copy, fidelity=record["fidelity"] | {"roof_fit": fit, "worst_roofs": [worst]})
+    words = read(write_report(copy)).words
+    for told in ("1,234", "56,789", "1.250", "0.125", "0.750", "4,321", "<h1>", "9.875"):
+        assert told in words
+    assert "h1-part2 at 12.5, 7.0: few & far" in words

@@ -12,7 +12,7 @@ import shapely
 
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.errors import InputError
-from pipeline.data.roofs import flat_roofs
+from pipeline.data.roofs import NOT_FITTED, flat_roofs
 from pipeline.quality.point_fidelity import HouseFidelity
 from tests.helpers.cityjson_rules import file_faults, solid_faults
 from tiler.citymodels import cityjson
@@ -47,10 +47,13 @@ def make_town(n: int, *, seed: int = 4) -> Buildings:
     model = CityModel(
         polygons, ids, number_ids(ids), ground, flat_roofs(ground + 9), tuple((name,) for name in houses), house
     )
-    values = rng.uniform(0, 1, (3, len(ids)))
+    values = rng.uniform(0, 1, (5, len(ids)))
     fit = HouseFidelity(np.arange(len(ids)), *values)
     zeros = np.zeros(len(ids), np.int8)
-    return Buildings(model, zeros, ground + 8.5, ground, np.arange(len(ids)), zeros.astype(np.int32), fit)
+    methods = np.full(len(ids), NOT_FITTED, np.int8)
+    return Buildings(
+        model, zeros, ground + 8.5, ground, np.arange(len(ids)), zeros.astype(np.int32), fit, methods, zeros
+    )
 
 
 def put_town(task: Task) -> Facts:
