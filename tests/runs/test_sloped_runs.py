@@ -112,6 +112,7 @@ def test_random_sloped_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -
     """Rows and blocks of any density and relief in 9 to 25 tiles, from files to files."""
     rng = np.random.default_rng([seed, 3])
     tile_size = float(rng.integers(60, 121))
+    mesh_size = tile_size / float(rng.uniform(14, 15))
     across = rng.uniform(2.95, 3.95, 2) * tile_size
     west, south = X + float(rng.integers(500)), Y + float(rng.integers(500))
     region = box(*np.rint(across).tolist(), west=west, south=south)
@@ -127,7 +128,7 @@ def test_random_sloped_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -
     values = write_town(tmp_path / "city", town, files=files, spacing=float(rng.uniform(0.45, 1.0))) | {
         "roofs": "planes",
         "tile_size": tile_size,
-        "mesh_size": tile_size / float(rng.uniform(14, 15)),
+        "mesh_size": mesh_size,
         "domain_height": 40.0,
         "border": str(rng.choice(["drop", "clip"])),
         "manifold": bool(rng.random() < 0.2),
