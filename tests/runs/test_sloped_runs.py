@@ -112,6 +112,7 @@ def test_random_sloped_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -
     """Rows and blocks of any density and relief in 9 to 25 tiles, from files to files."""
     rng = np.random.default_rng([seed, 3])
     tile_size = float(rng.integers(60, 121))
+    mesh_size = tile_size / float(rng.uniform(14, 15))
     across = rng.uniform(2.95, 3.95, 2) * tile_size
     west, south = X + float(rng.integers(500)), Y + float(rng.integers(500))
     region = box(*np.rint(across).tolist(), west=west, south=south)
@@ -127,7 +128,7 @@ def test_random_sloped_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -
     values = write_town(tmp_path / "city", town, files=files, spacing=float(rng.uniform(0.45, 1.0))) | {
         "roofs": "planes",
         "tile_size": tile_size,
-        "mesh_size": tile_size / float(rng.uniform(14, 15)),
+        "mesh_size": mesh_size,
         "domain_height": 40.0,
         "border": str(rng.choice(["drop", "clip"])),
         "manifold": bool(rng.random() < 0.2),
@@ -140,4 +141,11 @@ def test_random_sloped_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -
         run_of(values, tmp_path / "two", workers=2)
         assert mesh_bytes(tmp_path / "two") == mesh_bytes(tmp_path / "out")
     prove(tmp_path / "out")
-    keep_outcome("sloped", seed=seed, **{what: counts[what] for what in ("tiles", "buildings", "cells")})
+    quality = record["quality"]
+    keep_outcome(
+        "sloped",
+        seed=seed,
+        **{what: counts[what] for what in ("tiles", "buildings", "cells")},
+        radius_ratio={share: quality["radius_ratio"][share] for share in ("0", "0.1", "1", "50")},
+        least_dihedral=quality["min_dihedral"]["0"],
+    )
