@@ -8,9 +8,11 @@ from typing import Any
 
 import jsonschema
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 Json = dict[str, Any]
+MOST_TURN = 20.0  # degrees; val3dity's planarity_n_tol
 
 
 def record(properties: Json, *optional: str) -> Json:
@@ -186,6 +188,8 @@ def _solid_faults(solid: Json, points: NDArray[np.float64], attributes: Json) ->
             yield "face without area"
         elif np.ptp((corners - corners[0]) @ vector / size) > (0.01 if sloped else 1e-3):
             yield "face not planar"
+        elif kind == "RoofSurface" and _largest_turn(face, points, vector) > MOST_TURN:
+            yield "face bent in a corner"
         rise = float(vector[2] / max(size, 1e-9))
         if kind != {-1: "GroundSurface", 0: "WallSurface", 1: "RoofSurface"}[(rise > 1e-6) - (rise < -1e-6)]:
             yield "semantics do not fit the normal"
@@ -200,6 +204,19 @@ def _solid_faults(solid: Json, points: NDArray[np.float64], attributes: Json) ->
         height = attributes["lod13_height"] - attributes["ground_height"]
     if abs(volume(solid, points) - ground_area * height) > (0.007 if sloped else 0.001) * ground_area + 1e-6:
         yield "volume is not area times height"
+
+
+def _largest_turn(face: list[list[int]], points: NDArray[np.float64], normal: NDArray[np.float64]) -> float:
+    """Largest angle of a triangle of a roof's face with its plane (degrees)."""
+    shell, *holes = (points[ring, :2] for ring in face)
+    rows = {(x, y): points[row] for ring in face for row in ring for x, y in [points[row, :2].tolist()]}
+    triangles = shapely.orient_polygons(
+        shapely.get_parts(shapely.constrained_delaunay_triangles(shapely.Polygon(shell, holes)))
+    )
+    corners = np.array([[rows[x, y] for x, y in one.exterior.coords[:3]] for one in triangles])
+    turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = np.linalg.norm(np.cross(turned, normal), axis=1)
+    return float(np.degrees(np.arctan2(across, turned @ normal)).max())
 
 
 def _plane_heights(attributes: Json, corners: NDArray[np.float64]) -> NDArray[np.float64]:
