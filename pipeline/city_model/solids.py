@@ -108,6 +108,7 @@ def build_solids(
 
     Examples
     --------
+    >>> from pipeline.data.roofs import flat_roofs
     >>> one = np.ones(1)
     >>> square = np.array([shapely.box(0, 0, 2, 2)])
     >>> model = CityModel(

@@ -70,6 +70,7 @@ def house_cells(model: CityModel) -> NDArray[np.int64]:
     Examples
     --------
     >>> from pipeline.data.citymodel import CityModel
+    >>> from pipeline.data.roofs import flat_roofs
     >>> ids, one = np.array(["a-2", "a-1", "b"]), np.ones(3)
     >>> boxes = shapely.box([9, 1020, 3000], [0, 0, 5], [10, 1030, 3010], [5, 5, 9])
     >>> roofs = flat_roofs(one)

@@ -302,6 +302,6 @@ def test_edges_that_came_to_lie_on_each_other_have_no_inner_side() -> None:
 
 
 def test_events_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.roofs.wavefront.EVENTS_PER_EDGE", -25)
+    monkeypatch.setattr("pipeline.skeletons.wavefront.EVENTS_PER_EDGE", -25)
     with pytest.raises(GeometryError, match="more than -25 events an edge near"):
         straight_skeleton(HAND["square"])

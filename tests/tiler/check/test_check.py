@@ -438,7 +438,7 @@ OPEN = {"facet-missing", "boundary-open", "counts"}
 FACETS: dict[str, tuple[Tamper, set[str]]] = {
     "facet removed": (remove_facet, OPEN),
     "facet twice": (repeat_facet, {"facet-duplicate", "boundary-open", "counts"}),
-    "facet flipped": (flip_facet, {"facet-flipped", "boundary-open"}),
+    "facet flipped": (flip_facet, {"facet-flipped", "boundary-open", "wall-twice"}),
     "facet inside": (add_inner_facet, {"boundary-open", "counts", "facet-extra", "plan-area", "volume"}),
     "ground as wall": (
         partial(mark, marker=Marker.GROUND, to=2, building=0),

@@ -97,13 +97,13 @@ def test_a_run_at_work(
     assert (status["state"], status["held"], status["pid"]) == ("running", True, os.getpid())
     stages = status["stages"]
     assert "finished" in stages["model"]
-    # Of the largest tile, whose seams went first, columns and piece are there.
-    assert (stages["columns"]["total"], stages["columns"]["done"]) == (4, 1)
+    assert (stages["columns"]["total"], stages["columns"]["done"]) == (4, 0)
     assert (stages["seams"]["done"], stages["seams"]["finished"] > 0) == (12, True)
     running = Counter(item["stage"] for item in status["running"])
     assert running == {name: stage["running"] for name, stage in stages.items() if stage["running"]}
     assert status["n_running"] == running.total() > 0
-    assert (stages["pieces"]["left"], stages["report"]["left"]) == (3, 1)
+    # Pieces are given out with the columns that they are made of: those of three tiles.
+    assert (stages["pieces"]["left"], stages["report"]["left"]) == (1, 1)
     assert next(iter(stages)) == "points"
     assert f"running, process {os.getpid()} on {socket.gethostname()}, since " in seen["text"]
     assert f"next: wait, and ask again: citystitch status {out}" in seen["text"].replace("\n", " ")
@@ -122,11 +122,11 @@ def test_a_killed_run_is_told_to_be_dead_and_gone_on_with(
     assert process.returncode == -signal.SIGKILL
     status = read_status(out)
     assert (status["state"], status["held"]) == ("stopped", False)
-    # The piece of the largest tile, whose seams went first, is there; the last tile's was not given out yet.
+    # A tile's piece is made after its columns in one submission: the last tile's was at work.
     assert {count: status["stages"]["pieces"][count] for count in ("done", "running", "left")} == {
-        "done": 1,
-        "running": 2,
-        "left": 1,
+        "done": 3,
+        "running": 1,
+        "left": 0,
     }
     text = show(out, capsys)
     assert "stopped without a word after " in text
