@@ -28,10 +28,9 @@ from pipeline.columns.nodes import (
 from pipeline.columns.order_keys import set_order_keys, wall_gates
 from pipeline.columns.spacing import SpacingLimits, domain_top, mean_edges, vertical_spacing
 from pipeline.columns.trim_layers import check_headroom
-from pipeline.columns.weld import Weld
 from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import ColumnMesh, PlaneMesh
-from pipeline.data.roofs import Roofs, roof_heights
+from pipeline.data.roofs import Roofs, Weld, roof_heights
 from pipeline.plane_mesh.edges import plane_edges
 from pipeline.plane_mesh.sizes import SizeField, local_sizes
 from pipeline.points_terrain.terrain import Dtm, sample_dtm

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns.weld import Weld, least_steps, weld_heights
+from pipeline.columns.weld import least_steps, weld_heights
 from pipeline.data.mesh import PlaneMesh
-from pipeline.data.roofs import Roofs, roof_heights
+from pipeline.data.roofs import Roofs, Weld, roof_heights
 from pipeline.plane_mesh.edges import plane_edges
 
 # What a level is.

@@ -5,34 +5,13 @@ that meet are compared with a least step: those closer than half of it become on
 the step are moved apart, both by the same way. Walls then taper to nothing at a vertex, and no lower gap is left.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
+from pipeline.data.roofs import Weld
 
 PART_SWEEPS = 6  # of moving heights apart from below to above
-
-
-@dataclass(frozen=True)
-class Weld:
-    """When heights of roofs at a vertex are joined or parted.
-
-    Attributes
-    ----------
-    factor : float
-        Least step of two roofs at a vertex, in vertical spacings of its column.
-    least, most : float
-        Limits of that step (m).
-    clearance : float
-        Least height of a roof above the terrain at a wall (m).
-    """
-
-    factor: float = 0.7
-    least: float = 1.0
-    most: float = 2.5
-    clearance: float = 2.0
 
 
 def least_steps(weld: Weld | None, spacing: NDArray[np.float64]) -> NDArray[np.float64]:

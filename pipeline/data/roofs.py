@@ -37,6 +37,26 @@ class Roofs:
         return len(self.plane)
 
 
+@dataclass(frozen=True)
+class Weld:
+    """When heights of roofs at a vertex are joined or parted.
+
+    Attributes
+    ----------
+    factor : float
+        Least step of two roofs at a vertex, in vertical spacings of its column.
+    least, most : float
+        Limits of that step (m).
+    clearance : float
+        Least height of a roof above the terrain at a wall (m).
+    """
+
+    factor: float = 0.7
+    least: float = 1.0
+    most: float = 2.5
+    clearance: float = 2.0
+
+
 def flat_roofs(height: NDArray[np.float64]) -> Roofs:
     """Flat roofs of given heights (m), float64 (n,); NaN stays NaN.
 

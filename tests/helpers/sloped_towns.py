@@ -7,10 +7,9 @@ import shapely
 
 from pipeline.columns.adaptive import AdaptiveOptions
 from pipeline.columns.spacing import SpacingLimits
-from pipeline.columns.weld import Weld
 from pipeline.data.citymodel import CityModel
 from pipeline.data.mesh import PlaneMesh
-from pipeline.data.roofs import Roofs
+from pipeline.data.roofs import Roofs, Weld
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.points_terrain.terrain import Dtm
 from tests.helpers.cities import city_of, crowded_blocks, hilly_dtm

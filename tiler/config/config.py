@@ -338,6 +338,11 @@ class Config:
         return height_in_metres(self.domain_height, EXPECTED_TALLEST)
 
 
+def roofs_stay_flat(mesher: str, simplify: str) -> bool:
+    """Whether roofs are flat whatever is asked: mesher = layered and simplify = paper know no others."""
+    return mesher != "adaptive" or simplify != "clearance"
+
+
 # Parameters that count only where another one has a certain value.
 CONDITIONS = {
     "roof_percentile": ("roof_height", "percentile"),

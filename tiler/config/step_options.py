@@ -8,9 +8,9 @@ from pipeline.columns.growth import Growth, count_steps
 from pipeline.columns.layered import LayeredOptions
 from pipeline.columns.spacing import SpacingLimits
 from pipeline.columns.underground import SoilOptions
-from pipeline.columns.weld import Weld
+from pipeline.data.roofs import Weld
 from pipeline.plane_mesh.sizes import SizeRule
-from tiler.config.config import Config
+from tiler.config.config import Config, roofs_stay_flat
 from tiler.config.declared import Declared
 from tiler.config.domain_height import Domain
 
@@ -59,18 +59,13 @@ def derived_parameters(config: Config) -> dict[str, float | str]:
     """
     spacing = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
     return {
-        "roofs_or_flat": "flat" if roofs_stay_flat(config) else config.roofs,
+        "roofs_or_flat": "flat" if roofs_stay_flat(config.mesher, config.simplify) else config.roofs,
         "layer_height_or_default": config.layer_height_or_default,
         "graded_size": config.graded_size,
         "tile_size_or_default": config.tile_size_or_default,
         "roof_clearance_or_spacing": max(config.roof_clearance, spacing),
         "roof_group_or_spacing": max(config.roof_group, spacing),
     }
-
-
-def roofs_stay_flat(config: Config) -> bool:
-    """Whether roofs are flat whatever is asked: mesher = layered and simplify = paper know no others."""
-    return config.mesher != "adaptive" or config.simplify != "clearance"
 
 
 def needs_region(config: Config) -> bool:

@@ -11,10 +11,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.columns.weld import Weld
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Region, TetMesh
-from pipeline.data.roofs import Roofs
+from pipeline.data.roofs import Roofs, Weld
+from tiler.config.config import roofs_stay_flat
 from tiler.store.json_stream import iterate_members, read_members
 
 SCHEMA = 1  # of run.json
@@ -168,8 +168,7 @@ def read_run_record(path: Path) -> RunRecord:
 
 
 def _read_roof_rules(parameters: Mapping[str, Any]) -> RoofRules:
-    sloping = (parameters.get("mesher"), parameters.get("simplify")) == ("adaptive", "clearance")
-    if not sloping or parameters.get("roofs", "flat") == "flat":
+    if parameters.get("roofs", "flat") == "flat" or roofs_stay_flat(parameters["mesher"], parameters["simplify"]):
         return FLAT_ROOFS
     least = float(parameters["least_spacing"]) * float(parameters["mesh_size"])
     return RoofRules(True, max(LARGEST_STEP, least), max(float(parameters["roof_clearance"]), least))

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import CityError, OutputError
-from tiler.config.config import ANYWHERE, Config
-from tiler.config.step_options import roofs_stay_flat
+from tiler.config.config import ANYWHERE, Config, roofs_stay_flat
 from tiler.dashboard.server import read_address, watched
 from tiler.engine.engine import StoppedError
 from tiler.engine.executor import Executor, serial
@@ -379,7 +378,8 @@ def _find_damage(out: Path) -> dict[str, str]:
 
 def _foresee(plan: Plan, config: Config) -> list[str]:
     """Say which roofs stay flat against what was asked, and which tiles may not fit into this machine's memory."""
-    flat = [warn_of_flat_roofs(config)] if config.roofs != "flat" and roofs_stay_flat(config) else []
+    stay_flat = config.roofs != "flat" and roofs_stay_flat(config.mesher, config.simplify)
+    flat = [warn_of_flat_roofs(config)] if stay_flat else []
     return flat + ([] if config.on_cluster else warn_of_memory(plan.survey, config, memory=machine_memory()))
 
 

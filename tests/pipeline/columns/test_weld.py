@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.columns.weld import Weld, least_steps, weld_heights
+from pipeline.columns.weld import least_steps, weld_heights
+from pipeline.data.roofs import Weld
 
 NONE = -np.inf
 

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from distributed.system import memory_limit
 
 from tiler.engine.task_limits import machine_memory
@@ -15,7 +16,6 @@ SCIPY = tuple(f"scipy.{part}" for part in ("fft", "io", "linalg", "ndimage", "sp
 UNNEEDED = ("meshio", "numpy.testing", "pyamg", "zarr", *SCIPY)
 BY_NUMBA = {"numpy.testing", "scipy.linalg"}  # imported at the first kernel, as numba asks scipy for BLAS
 RUN = ("tiler.workflow.run", "tiler.monitoring.terminal", "tiler.stages.own_stages")
-BY_NUMBA = {"numpy.testing", "scipy.linalg"}  # imported where the first kernel is called
 
 
 def find_imported(names: tuple[str, ...], modules: tuple[str, ...]) -> list[str]:
@@ -40,8 +40,9 @@ def test_the_tasks_of_a_run_import_nothing_more(tmp_path: Path) -> None:
     }
 
 
-def test_help_imports_no_numba() -> None:
-    assert find_imported(("numba",), ("tiler.cli.main",)) == []
+@pytest.mark.parametrize("module", ["tiler.cli.main", "tiler.monitoring.status", "tiler.store.run_folder"])
+def test_help_and_status_import_no_numba(module: str) -> None:
+    assert find_imported(("numba",), (module,)) == []
 
 
 def find_imported_by_a_run(tmp_path: Path, names: tuple[str, ...], workers: int) -> list[str]:
