@@ -7,6 +7,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import BuildingPoints
+from pipeline.geometry.group_order import percentile_by_group
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 
 ROOF_SOURCES = ("points", "attribute", "default", "none")
@@ -74,28 +75,6 @@ def compute_building_heights(
         roof[use_default] = ground[use_default] + default_height
         source[use_default] = 2
     return Heights(ground, roof, source, from_dtm)
-
-
-def percentile_by_group(
-    start: NDArray[np.int64], z: NDArray[np.float64], percentile: float
-) -> NDArray[np.float64]:
-    """Percentile of each group of ascending values, linear between order statistics; NaN if empty.
-
-    Examples
-    --------
-    >>> percentile_by_group(np.array([0, 3, 3]), np.array([1.0, 2.0, 4.0]), 75)
-    array([ 3., nan])
-    """
-    count = np.diff(start)
-    filled = count > 0
-    position = (count[filled] - 1) * (percentile / 100)
-    low = np.floor(position).astype(np.int64)
-    high = np.minimum(low + 1, count[filled] - 1)
-    begin = start[:-1][filled]
-    below, above = z[begin + low], z[begin + high]
-    result = np.full(len(count), np.nan)
-    result[filled] = below + (above - below) * (position - low)
-    return result
 
 
 def highest_wall_ground(polygons: NDArray[np.object_], dtm: Dtm) -> NDArray[np.float64]:

@@ -48,6 +48,8 @@ class Houses:
         Roof of each part, as its points tell; NaN where it has none, or one height is looked for.
     method : int8, (h,)
         Where the roof of each house comes from: index into `ROOF_METHODS`.
+    too_few : bool, (h,)
+        Houses with too few points for planes; none where one height is looked for.
     points : BuildingPoints
         Roof and ground points of each part.
     """
@@ -58,6 +60,7 @@ class Houses:
     parts: HouseParts
     roofs: Roofs
     method: NDArray[np.int8]
+    too_few: NDArray[np.bool_]
     points: BuildingPoints
 
     def __len__(self) -> int:
@@ -96,17 +99,16 @@ def divide_houses(
     marks = has_building_class(cloud) if building_class is None else building_class
     parts, points = HouseParts(model.polygons, np.arange(len(model))), city.points
     sloped = options.roofs != "flat"
-    part_roofs, method = None, np.full(len(model), FLAT, np.int8)
+    part_roofs, method, too_few = None, np.full(len(model), FLAT, np.int8), np.zeros(len(model), np.bool_)
     if (options.split_levels or sloped) and options.simplify == "clearance" and len(model):
         if roofs is None:
             roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
         if sloped:
-            fit = RoofOptions(clearance=options.clearance)
-            fitted = fit_roofs(model.polygons, roofs, fit)
+            fitted = fit_roofs(model.polygons, roofs, RoofOptions(clearance=options.clearance))
             told = city.roof_source != ROOF_SOURCES.index("default")
             chosen = fitted.too_few & told if options.roofs == "planes" else np.ones(len(model), np.bool_)
             fitted = shape_roofs(fitted, model.polygons, chosen, model.ground, model.roof)
-            parts, part_roofs, method = fitted.parts, fitted.roofs, fitted.method
+            parts, part_roofs, method, too_few = fitted.parts, fitted.roofs, fitted.method, fitted.too_few
         else:
             parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
         divided = np.flatnonzero(np.bincount(parts.house)[parts.house] > 1)
@@ -123,7 +125,7 @@ def divide_houses(
         points = take_building_points(join_building_points([points, found]), rows)
     if part_roofs is None:
         part_roofs = flat_roofs(np.full(len(parts.polygons), np.nan))
-    return Houses(model.ids, model.polygons, city.given_height, parts, part_roofs, method, points)
+    return Houses(model.ids, model.polygons, city.given_height, parts, part_roofs, method, too_few, points)
 
 
 def _deal_out_roofs(
@@ -155,6 +157,7 @@ def take_houses(houses: Houses, rows: NDArray[np.int64]) -> Houses:
         HouseParts(parts.polygons[mine], number[parts.house[mine]]),
         take_roofs(houses.roofs, mine),
         houses.method[rows],
+        houses.too_few[rows],
         take_building_points(houses.points, mine),
     )
 
@@ -174,5 +177,6 @@ def join_houses(several: Sequence[Houses]) -> Houses:
         ),
         join_roofs([houses.roofs for houses in several]),
         np.concatenate([np.empty(0, np.int8), *(houses.method for houses in several)]),
+        np.concatenate([np.empty(0, np.bool_), *(houses.too_few for houses in several)]),
         join_building_points([houses.points for houses in several]),
     )

@@ -7,7 +7,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.citymodel import CityModel
-from pipeline.data.roofs import Roofs, is_flat, roof_heights
+from pipeline.data.roofs import Roofs, is_flat, plane_heights, roof_heights
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def _measure_above(
     along = slope / steepness[:, None]
     bounds = shapely.bounds(polygons).reshape(-1, 4)
     centre, size = (bounds[:, :2] + bounds[:, 2:]) / 2, np.hypot(*(bounds[:, 2:] - bounds[:, :2]).T)
-    distance = (level - _plane_heights(roofs, rows, centre)) / steepness  # from the centre up to the level
+    distance = (level - plane_heights(roofs, rows, centre)) / steepness  # from the centre up to the level
     parts = polygons.copy()
     parts[distance >= size] = shapely.Polygon()
     cut = np.abs(distance) < size
@@ -106,12 +106,5 @@ def _measure_above(
     middle = shapely.get_coordinates(shapely.centroid(parts[area > 0]))
     volume = np.zeros(len(rows))
     some = np.flatnonzero(area > 0)
-    volume[some] = area[some] * (_plane_heights(roofs, rows[some], middle) - level[some])
+    volume[some] = area[some] * (plane_heights(roofs, rows[some], middle) - level[some])
     return area, volume
-
-
-def _plane_heights(roofs: Roofs, rows: NDArray[np.int64], xy: Array) -> Array:
-    a, b, c = roofs.plane[rows].T
-    x, y = (xy - roofs.origin[rows]).T
-    height: Array = a * x + b * y + c
-    return height

@@ -5,7 +5,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import GeometryError
-from pipeline.data.roofs import ROOF_METHODS, Roofs, join_roofs, take_roofs
+from pipeline.data.roofs import ROOF_METHODS, Roofs, join_roofs, plane_heights, take_roofs
 from pipeline.roofs.house_levels import HouseParts
 from pipeline.roofs.house_roofs import HouseRoofs, RoofOptions
 from pipeline.skeletons.skeleton_roofs import RoofForm, skeleton_roofs
@@ -72,10 +72,8 @@ def _hip(polygon: shapely.Polygon, ground: float, roof: float) -> tuple[NDArray[
         return None
     parts, over = found.parts, found.roofs
     centre = shapely.get_coordinates(shapely.centroid(parts))
-    a, b, c = over.plane.T
-    x, y = (centre - over.origin).T
     area = shapely.area(parts)
-    eaves = roof - float((area * (a * x + b * y + c)).sum() / area.sum())
+    eaves = roof - float((area * plane_heights(over, np.arange(len(over)), centre)).sum() / area.sum())
     if found.height.max() > WIDEST_RISE or eaves < ground + LEAST_EAVES:
         return None
     return parts, Roofs(over.plane + np.array([0.0, 0.0, eaves]), over.origin, over.limits + eaves)

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.roofs import Roofs, is_flat
+from pipeline.data.roofs import Roofs, is_flat, plane_heights
 
 GROUND, ROOF, WALL = range(3)
 Face = tuple[int, tuple[NDArray[np.int64], ...]]  # a kind, and rings
@@ -54,10 +54,7 @@ class GridRoofs:
 
     def planes(self, row: NDArray[np.int64], xy: NDArray[np.int64]) -> NDArray[np.float64]:
         """Heights of the planes (m) without their limits."""
-        a, b, c = self.roofs.plane[row].T
-        x, y = (xy * self.grid + self.origin[:2] - self.roofs.origin[row]).T
-        height: NDArray[np.float64] = a * x + b * y + c
-        return height
+        return plane_heights(self.roofs, row, xy * self.grid + self.origin[:2])
 
 
 def put_on_grid(

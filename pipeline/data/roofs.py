@@ -96,10 +96,16 @@ def roof_heights(roofs: Roofs, row: NDArray[np.int64], xy: NDArray[np.float64]) 
     >>> roof_heights(shed, np.array([0, 0, 0]), np.array([[100.0, 7.0], [102.0, 0.0], [110.0, 0.0]])).tolist()
     [10.0, 11.0, 12.0]
     """
+    low, high = roofs.limits[row].T
+    height: NDArray[np.float64] = np.minimum(np.maximum(plane_heights(roofs, row, xy), low), high)
+    return height
+
+
+def plane_heights(roofs: Roofs, row: NDArray[np.int64], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heights of the planes of roofs at places (m), as `roof_heights` without the limits."""
     a, b, c = roofs.plane[row].T
     x, y = (xy - roofs.origin[row]).T
-    low, high = roofs.limits[row].T
-    height: NDArray[np.float64] = np.minimum(np.maximum(a * x + b * y + c, low), high)
+    height: NDArray[np.float64] = a * x + b * y + c
     return height
 
 

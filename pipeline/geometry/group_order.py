@@ -25,6 +25,28 @@ def sort_values(start: NDArray[np.int64], values: NDArray[np.float64]) -> NDArra
     return ordered
 
 
+def percentile_by_group(
+    start: NDArray[np.int64], z: NDArray[np.float64], percentile: float
+) -> NDArray[np.float64]:
+    """Percentile of each group of ascending values, linear between order statistics; NaN if empty.
+
+    Examples
+    --------
+    >>> percentile_by_group(np.array([0, 3, 3]), np.array([1.0, 2.0, 4.0]), 75)
+    array([ 3., nan])
+    """
+    count = np.diff(start)
+    filled = count > 0
+    position = (count[filled] - 1) * (percentile / 100)
+    low = np.floor(position).astype(np.int64)
+    high = np.minimum(low + 1, count[filled] - 1)
+    begin = start[:-1][filled]
+    below, above = z[begin + low], z[begin + high]
+    result = np.full(len(count), np.nan)
+    result[filled] = below + (above - below) * (position - low)
+    return result
+
+
 @kernel
 def sort_points(start: NDArray[np.int64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sort the points of each group by height, then y, then x.

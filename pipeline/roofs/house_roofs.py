@@ -2,15 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
-from pipeline.data.roofs import ROOF_METHODS, Roofs
-from pipeline.geometry.group_order import sort_points, sort_values
+from pipeline.data.roofs import ROOF_METHODS, Roofs, plane_heights
+from pipeline.geometry.group_order import percentile_by_group, sort_points, sort_values
 from pipeline.geometry.inside import read_rings
 from pipeline.geometry.rings import make_canonical
 from pipeline.roofs.families import fit_family
@@ -144,7 +143,7 @@ def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOp
     count = np.diff(points.start)
     too_few = (count < options.min_points) | (count < options.min_density * area)
     xyz = sort_points(points.start, points.xyz)
-    heights = np.array([_median(xyz[first:last, 2]) for first, last in pairwise(points.start.tolist())])
+    heights = percentile_by_group(points.start, points.z, 50)
     start, kept = _thin_out(points.start, np.where(too_few, np.inf, count / (area * DENSITY)))
     xyz = xyz[kept]
     xyz[:, :2] -= np.repeat(origin, np.diff(start), axis=0)
@@ -248,12 +247,6 @@ def _assemble(
         rows, index = np.unique(owner[order], return_inverse=True)
         parts[rows] = make_canonical(shapely.polygons(rings, indices=index))
     return HouseRoofs(HouseParts(parts, house), Roofs(plane, origin[house], limits), method, n_planes, too_few)
-
-
-def _median(z: Array) -> float:
-    """Median of ascending heights; NaN without any."""
-    n = len(z)
-    return float((z[(n - 1) // 2] + z[n // 2]) / 2) if n else np.nan
 
 
 @kernel
@@ -423,28 +416,15 @@ def refit_roofs(roofs: Roofs, polygons: NDArray[np.object_], points: RoofPoints)
         )
     start, count = points.start, np.diff(points.start)
     row = np.repeat(np.arange(len(polygons)), count)
-    x, y = (points.xyz[:, :2] - roofs.origin[row]).T
-    a, b, c = roofs.plane[row].T
+    above = sort_values(start, points.xyz[:, 2] - plane_heights(roofs, row, points.xyz[:, :2]))
     moved = count >= MIN_REFIT
-    shift = _quantile(start, sort_values(start, points.xyz[:, 2] - a * x - b * y - c), 0.5, moved)
     plane, limits = roofs.plane.copy(), roofs.limits.copy()
-    plane[moved, 2] += shift
-    limits[moved, 0] = _quantile(start, points.z, LIMIT_SHARE, moved) - LIMIT_ROOM
-    limits[moved, 1] = _quantile(start, points.z, 1 - LIMIT_SHARE, moved) + LIMIT_ROOM
+    plane[moved, 2] += percentile_by_group(start, above, 50)[moved]
+    low, high = (percentile_by_group(start, points.z, q) for q in (100 * LIMIT_SHARE, 100 - 100 * LIMIT_SHARE))
+    limits[moved] = np.column_stack((low - LIMIT_ROOM, high + LIMIT_ROOM))[moved]
     flat = (plane[:, :2] == 0).all(axis=1) & moved
     limits[flat] = plane[flat][:, [2, 2]]
     return Roofs(plane, roofs.origin, limits)
-
-
-def _quantile(start: NDArray[np.int64], ascending: Array, share: float, wanted: NDArray[np.bool_]) -> Array:
-    """Quantiles of the ascending values of the wanted groups, none of them empty; linear between values."""
-    first, count = start[:-1][wanted], np.diff(start)[wanted]
-    at = share * (count - 1)
-    below = np.floor(at).astype(np.int64)
-    low = ascending[first + below]
-    high = ascending[first + np.minimum(below + 1, count - 1)]
-    result: Array = low + (at - below) * (high - low)
-    return result
 
 
 def _check(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOptions) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.roofs import Roofs, is_flat, roof_heights
+from pipeline.data.roofs import Roofs, is_flat, plane_heights, roof_heights
+from pipeline.geometry.inside import list_edges
 
 GRID = 1e-3  # m; nodes lie on it, as all vertices of a planar city model
 LEAST_STEP = 0.5  # m; roofs closer than that at an end of a wall are joined there by the mesher, and need no node
@@ -60,10 +61,8 @@ def add_crossings(
 
 def _party_walls(polygons: NDArray[np.object_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Walls between two polygons: ends (w, 2, 2), the smaller first, and both polygons (w, 2)."""
-    rings, owner = shapely.get_rings(polygons, return_index=True)
-    xy, ring = shapely.get_coordinates(rings, return_index=True)
-    inner = ring[1:] == ring[:-1]
-    a, b, of = xy[:-1][inner], xy[1:][inner], owner[ring[:-1][inner]]
+    edges = list_edges(polygons)
+    a, b, of = edges.a, edges.b, np.repeat(np.arange(len(polygons)), np.diff(edges.start))
     swap = (b[:, 0] < a[:, 0]) | ((b[:, 0] == a[:, 0]) & (b[:, 1] < a[:, 1]))
     a[swap], b[swap] = b[swap], a[swap]
     order = np.lexsort((of, b[:, 1], b[:, 0], a[:, 1], a[:, 0]))
@@ -80,9 +79,7 @@ def _find_crossings(
     """Places (0 to 1) along walls where their roofs change order, wall by wall, ascending."""
     along = [np.zeros(len(ends)), np.ones(len(ends))]
     for k in (0, 1):  # where a roof reaches one of its limits its line bends
-        a, b, c = roofs.plane[sides[:, k]].T
-        x, y = np.moveaxis(ends - roofs.origin[sides[:, k]][:, None], 2, 0)
-        height = a[:, None] * x + b[:, None] * y + c[:, None]
+        height = plane_heights(roofs, np.repeat(sides[:, k], 2), ends.reshape(-1, 2)).reshape(-1, 2)
         rise = height[:, 1] - height[:, 0]
         for limit in roofs.limits[sides[:, k]].T:
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -106,10 +103,8 @@ def _is_near_others(
     polygons: NDArray[np.object_], xy: NDArray[np.float64], ends: NDArray[np.float64], distance: float
 ) -> NDArray[np.bool_]:
     """Whether places are close to a wall other than their own."""
-    rings = shapely.get_rings(polygons)
-    line, ring = shapely.get_coordinates(rings, return_index=True)
-    inner = ring[1:] == ring[:-1]
-    segments = np.stack((line[:-1][inner], line[1:][inner]), axis=1)
+    edges = list_edges(polygons)
+    segments = np.stack((edges.a, edges.b), axis=1)
     tree = shapely.STRtree(shapely.linestrings(segments))
     at, near = tree.query(shapely.points(xy), predicate="dwithin", distance=distance)
     one, other = segments[near], ends[at]

@@ -1,7 +1,7 @@
 """Step 2 composed: the city model simplified, the paper's way or as a planar city model."""
 
 from collections.abc import Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -24,9 +24,9 @@ from pipeline.city_model.houses import Houses, divide_houses
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
-from pipeline.data.roofs import ROOF_FALLBACKS, choose_roofs, flat_roofs, highest_roofs, is_flat, take_roofs
+from pipeline.data.roofs import ROOF_FALLBACKS, Roofs, choose_roofs, flat_roofs, highest_roofs, is_flat, take_roofs
 from pipeline.points_terrain.terrain import Dtm
-from pipeline.roofs.house_roofs import FLAT, RoofOptions, refit_roofs
+from pipeline.roofs.house_roofs import FLAT, refit_roofs
 from pipeline.roofs.roof_points import RoofPoints, locate_roof_points
 from pipeline.simplification.fidelity import Fidelity, measure_simplification
 from pipeline.simplification.house_clusters import Shapes, simplify_houses
@@ -104,9 +104,7 @@ def raise_buildings(
     with trace("2.3 building heights"):
         if options.simplify == "paper":
             return _raise_merged(houses, shapes, dtm, options)
-        if options.roofs != "flat":
-            return _raise_sloped(houses, shapes, dtm, options, reserved, roof_points)
-        return _raise_planar(houses, shapes, dtm, options, reserved)
+        return _raise_planar(houses, shapes, dtm, options, reserved, roof_points)
 
 
 def settle_roofs(
@@ -160,39 +158,23 @@ def settle_roofs(
     return roof, group
 
 
-def _raise_planar(houses: Houses, shapes: Shapes, dtm: Dtm, options: CityOptions, reserved: Set[str]) -> City:
-    """Every house keeps its own faces, points and height; neighbours of nearly equal height get one roof."""
-    row = houses.parts.house[shapes.member]
-    ids = _name_parts(houses.ids, row, reserved)
-    footprints = Footprints(shapes.polygons, ids, houses.given_height[row])
-    points = take_building_points(houses.points, shapes.member)
-    heights = measure_heights(points, shapes.polygons, dtm, footprints.given_height, options)
-    wall_ground = highest_wall_ground(shapes.polygons, dtm)
-    roof, group = _settle_clusters(shapes, heights, wall_ground, ids, options)
-    members = tuple((str(houses.ids[k]),) for k in row)
-    city = assemble_city(
-        footprints,
-        points,
-        heights,
-        members,
-        wall_ground,
-        roofs=flat_roofs(roof),
-        house=houses.ids[row],
-        group=group,
-    )
-    outline = measure_simplification(houses.polygons, shapes.polygons, row)
-    raised = wall_ground + options.roof_clearance > heights.roof
-    notes = (
-        *note_heights("building", footprints, heights),
-        *_note_raised(footprints, heights, roof, raised),
-        *_note_outlines(houses, shapes.polygons, row, outline.house_error),
-        *_note_closed(houses, houses.parts.house[shapes.closed[:, 0]]),
-    )
-    counts = {**shapes.counts, **_count(houses, city)}
-    return replace(city, notes=notes, counts=counts, outline=_describe_outline(outline, houses))
+@dataclass(frozen=True, eq=False)
+class _Raised:
+    """Roofs of buildings, clear of the terrain.
+
+    ``measured`` is the highest place of each (m) before it was moved, `least` that which `raised` ones got.
+    """
+
+    polygons: NDArray[np.object_]
+    roofs: Roofs
+    group: NDArray[np.int32] | None
+    measured: NDArray[np.float64]
+    least: NDArray[np.float64]
+    raised: NDArray[np.bool_]
+    counts: dict[str, int]
 
 
-def _raise_sloped(
+def _raise_planar(
     houses: Houses,
     shapes: Shapes,
     dtm: Dtm,
@@ -200,56 +182,92 @@ def _raise_sloped(
     reserved: Set[str],
     roof_points: RoofPoints | None,
 ) -> City:
-    """Every part of a house keeps its plane, fitted to the points of its face; where it has none, one height."""
+    """Every house keeps its own faces and points, and its roofs: planes, or one height for each part."""
     row = houses.parts.house[shapes.member]
     ids = _name_parts(houses.ids, row, reserved)
     points = take_building_points(houses.points, shapes.member)
     heights = measure_heights(points, shapes.polygons, dtm, houses.given_height[row], options)
-    roofs = take_roofs(houses.roofs, shapes.member)
+    wall_ground = highest_wall_ground(shapes.polygons, dtm)
+    if options.roofs == "flat":
+        made = _settle_flat(shapes, heights, wall_ground, ids, options)
+    else:
+        made = _fit_sloped(
+            take_roofs(houses.roofs, shapes.member), shapes, heights, wall_ground, roof_points, options
+        )
+    footprints = Footprints(made.polygons, ids, houses.given_height[row])
+    members = tuple((str(houses.ids[k]),) for k in row)
+    heights = replace(heights, roof=np.where(np.isnan(heights.roof), np.nan, made.measured))
+    city = assemble_city(
+        footprints,
+        points,
+        heights,
+        members,
+        wall_ground,
+        roofs=made.roofs,
+        house=houses.ids[row],
+        group=made.group,
+    )
+    outline = measure_simplification(houses.polygons, shapes.polygons, row)
+    notes = (
+        *note_heights("building", footprints, heights),
+        *_note_raised(footprints, heights, made.least, made.raised),
+        *_note_outlines(houses, shapes.polygons, row, outline.house_error),
+        *_note_closed(houses, houses.parts.house[shapes.closed[:, 0]]),
+    )
+    divided = int((np.bincount(houses.parts.house, minlength=1) > 1).sum())
+    counts = {**shapes.counts, "houses split": divided, **made.counts}
+    city = replace(city, notes=notes, counts=counts, outline=_describe_outline(outline, houses))
+    if options.roofs == "flat":
+        return city
+    return replace(
+        city,
+        roof_method=houses.method[row][city.row],
+        roof_fallback=_find_fallbacks(houses)[row][city.row],
+    )
+
+
+def _settle_flat(
+    shapes: Shapes, heights: Heights, wall_ground: NDArray[np.float64], ids: NDArray[np.str_], options: CityOptions
+) -> _Raised:
+    """Neighbours of nearly equal height get one roof."""
+    roof, group = _settle_clusters(shapes, heights, wall_ground, ids, options)
+    raised = wall_ground + options.roof_clearance > heights.roof
+    counts = {
+        "roof groups": len(np.unique(group[~np.isnan(heights.roof)])),
+        "roofs moved by more than 1 m": int((np.abs(roof - heights.roof) > 1).sum()),
+    }
+    return _Raised(shapes.polygons, flat_roofs(roof), group, heights.roof, roof, raised, counts)
+
+
+def _fit_sloped(
+    roofs: Roofs,
+    shapes: Shapes,
+    heights: Heights,
+    wall_ground: NDArray[np.float64],
+    roof_points: RoofPoints | None,
+    options: CityOptions,
+) -> _Raised:
+    """Every part keeps its plane, fitted to the points of its face; where it has none, one height."""
     if roof_points is not None:
         roofs = refit_roofs(roofs, shapes.polygons, roof_points)
-    bare = np.isnan(roofs.plane[:, 2])
-    roofs = choose_roofs(bare, flat_roofs(heights.roof), roofs)
-    wall_ground = highest_wall_ground(shapes.polygons, dtm)
+    roofs = choose_roofs(np.isnan(roofs.plane[:, 2]), flat_roofs(heights.roof), roofs)
     measured = highest_roofs(roofs, shapes.polygons)
     least = wall_ground + options.roof_clearance
     low = is_flat(roofs) & (roofs.plane[:, 2] < least)
     roofs = choose_roofs(low, flat_roofs(least), roofs)
     polygons, n_nodes, n_short = add_crossings(shapes.polygons, roofs, clearance=options.clearance)
-    footprints = Footprints(polygons, ids, houses.given_height[row])
-    members = tuple((str(houses.ids[k]),) for k in row)
-    heights = replace(heights, roof=np.where(np.isnan(heights.roof), np.nan, measured))
-    city = assemble_city(footprints, points, heights, members, wall_ground, roofs=roofs, house=houses.ids[row])
-    outline = measure_simplification(houses.polygons, shapes.polygons, row)
-    notes = (
-        *note_heights("building", footprints, heights),
-        *_note_raised(footprints, heights, least, low),
-        *_note_outlines(houses, shapes.polygons, row, outline.house_error),
-        *_note_closed(houses, houses.parts.house[shapes.closed[:, 0]]),
-    )
     counts = {
-        **shapes.counts,
-        "houses split": int((np.bincount(houses.parts.house, minlength=1) > 1).sum()),
         "sloped parts": int((~is_flat(roofs)).sum()),
         "nodes where roofs cross": n_nodes,
         "walls without room for one": n_short,
     }
-    return replace(
-        city,
-        roof_method=houses.method[row][city.row],
-        roof_fallback=_find_fallbacks(houses)[row][city.row],
-        notes=notes,
-        counts=counts,
-        outline=_describe_outline(outline, houses),
-    )
+    return _Raised(polygons, roofs, None, measured, least, low, counts)
 
 
 def _find_fallbacks(houses: Houses) -> NDArray[np.int8]:
     """Index into `ROOF_FALLBACKS` of each house."""
     count = np.bincount(houses.parts.house, np.diff(houses.points.roof_start), len(houses))
-    rule = RoofOptions
-    few = (count < 2 * rule.min_points) | (count < rule.min_density * shapely.area(houses.polygons))
-    reason = np.where(few, np.where(count > 0, FEW_POINTS, NO_POINTS), 0)
+    reason = np.where(houses.too_few, np.where(count > 0, FEW_POINTS, NO_POINTS), 0)
     return np.where(houses.method == FLAT, reason, 0).astype(np.int8)
 
 
@@ -340,15 +358,6 @@ def _note_raised(
         Note("building-roof-raised", *place, f"{heights.roof[row]:.2f} m raised to {roof[row]:.2f} m over terrain")
         for row, place in find_places(footprints, raised)
     ]
-
-
-def _count(houses: Houses, city: City) -> dict[str, int]:
-    moved = np.abs(city.model.roof - city.measured_roof)
-    return {
-        "houses split": int((np.bincount(houses.parts.house, minlength=1) > 1).sum()),
-        "roof groups": len(np.unique(city.group)),
-        "roofs moved by more than 1 m": int((moved > 1).sum()),
-    }
 
 
 def _describe_outline(found: Fidelity, houses: Houses) -> dict[str, float]:

@@ -9,7 +9,7 @@ them; then the median over houses of RMSE and share within 0.2 m.
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
 from pipeline.roofs.house_roofs import RoofOptions, fit_roofs, refit_roofs
 from pipeline.roofs.roof_points import RoofPoints, locate_roof_points, make_roof_points
 from pipeline.simplification.house_clusters import simplify_houses
+from tests.helpers.cities import CITY_OPTIONS
 from tests.helpers.sloped_roofs import town_of_slopes
 from tests.helpers.whole_clouds import read_points
 from tiler.pointclouds.clouds import find_clouds
@@ -158,23 +159,14 @@ def main() -> None:
     parser.add_argument("--cut-price", type=float, default=RoofOptions(clearance=1.0).cut_price)
     parser.add_argument("--thin", type=float, help="points a m² that are kept")
     given = parser.parse_args()
-    options = CityOptions(
-        min_building_area=5.0,
-        vertex_tolerance=0.01,
-        ground_margin=1.0,
-        ground_percentile=10.0,
+    options = replace(
+        CITY_OPTIONS,
         roof_percentile=50.0,
-        default_height=6.0,
-        roof_clearance=2.0,
-        border="drop",
         simplify="clearance",
         clearance=given.clearance,
-        clearance_floor=0.1,
         min_courtyard_area=5.0,
-        roofs="flat",
         split_levels=True,
         roof_group=2.5,
-        manifold=False,
     )
     towns = {str(folder): read_town(folder, options) for folder in given.data}
     for name, town in {"sloped roofs": make_town(*town_of_slopes(160)), **towns}.items():

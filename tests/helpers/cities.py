@@ -5,6 +5,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
+from pipeline.city_model.city import CityOptions
 from pipeline.city_model.heights import highest_wall_ground
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.classes import BUILDING, GROUND
@@ -13,6 +14,27 @@ from pipeline.data.roofs import flat_roofs
 from pipeline.points_terrain.terrain import Dtm
 
 Bounds = tuple[float, float, float, float]
+
+
+# The parameters of a city model as the paper has it; `dataclasses.replace` gives others.
+CITY_OPTIONS = CityOptions(
+    min_building_area=5.0,
+    vertex_tolerance=0.01,
+    ground_margin=1.0,
+    ground_percentile=10.0,
+    roof_percentile=90.0,
+    default_height=6.0,
+    roof_clearance=2.0,
+    border="drop",
+    simplify="paper",
+    clearance=1.0,
+    clearance_floor=0.1,
+    min_courtyard_area=10.0,
+    roofs="flat",
+    split_levels=False,
+    roof_group=2.0,
+    manifold=False,
+)
 
 
 def tilted_dtm(bounds: Bounds, *, slope_x: float = 0.0, slope_y: float = 0.0, height: float = 0.0) -> Dtm:

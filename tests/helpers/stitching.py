@@ -10,7 +10,6 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.city_model.city import CityOptions
 from pipeline.city_model.city_steps import build_city
 from pipeline.city_model.groups import adjacent_houses
 from pipeline.city_model.heights import highest_wall_ground, raise_low_roofs
@@ -36,7 +35,7 @@ from stitch.tiling.corners import Corner, place_corner
 from stitch.tiling.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile, tile_keys
 from stitch.tiling.patches import mesh_patch
 from stitch.tiling.walls import cut_walls
-from tests.helpers.cities import Bounds, city_of, crowded_blocks, hilly_dtm
+from tests.helpers.cities import CITY_OPTIONS, Bounds, city_of, crowded_blocks, hilly_dtm
 from tests.helpers.footprint_reading import read_footprints
 from tests.helpers.whole_clouds import read_points
 from tiler.pointclouds.clouds import find_clouds
@@ -93,24 +92,7 @@ def amsterdam_scene(folder: Path, bounds: Bounds, simplify: Literal["clearance",
     )
     footprints, _ = read_footprints(folder / "footprints.shp", crs=pyproj.CRS("EPSG:28992"), bounds=bounds)
     dtm = compute_dtm(cloud, bounds)
-    options = CityOptions(
-        min_building_area=5.0,
-        vertex_tolerance=0.01,
-        ground_margin=1.0,
-        ground_percentile=10.0,
-        roof_percentile=50.0,
-        default_height=6.0,
-        roof_clearance=2.0,
-        border="drop",
-        simplify=simplify,
-        clearance=1.0,
-        clearance_floor=0.1,
-        min_courtyard_area=10.0,
-        roofs="flat",
-        split_levels=True,
-        roof_group=2.5,
-        manifold=False,
-    )
+    options = replace(CITY_OPTIONS, roof_percentile=50.0, simplify=simplify, split_levels=True, roof_group=2.5)
     city = simplify_city(build_city(cloud, footprints, dtm, bounds, options), cloud, dtm, options)
     return Scene(city.model, city.group, dtm)
 

@@ -124,6 +124,7 @@ def pack_houses(houses: Houses) -> Arrays:
         "part_house": houses.parts.house,
         **{f"part_{name}": values for name, values in pack_roofs(houses.roofs).items()},
         "method": houses.method,
+        "too_few": houses.too_few,
         "roof_start": houses.points.roof_start,
         "roof_z": houses.points.roof_z,
         "ground_start": houses.points.ground_start,
@@ -132,7 +133,7 @@ def pack_houses(houses: Houses) -> Arrays:
 
 
 POINTS = ("roof", "ground")
-HOUSE_ROWS = ("ids", "given_height", "part_house", "method", *(f"part_{name}" for name in ROOF_ARRAYS))
+HOUSE_ROWS = ("ids", "given_height", "part_house", "method", "too_few", *(f"part_{name}" for name in ROOF_ARRAYS))
 # What simplifying houses takes, and giving them heights after that.
 ARRAYS_TO_SHAPE = (*HOUSE_ROWS, "part", "part_start")
 ARRAYS_TO_RAISE = (*HOUSE_ROWS, "outline", "outline_start", "roof_start", "roof_z", "ground_start", "ground_z")
@@ -152,6 +153,7 @@ def unpack_houses(arrays: Arrays) -> Houses:
         ),
         Roofs(*(arrays[f"part_{name}"] for name in ROOF_ARRAYS)),
         arrays["method"],
+        arrays["too_few"],
         BuildingPoints(*roof, *ground),
     )
 

@@ -17,11 +17,11 @@ from pipeline.city_model.heights import (
     Heights,
     compute_building_heights,
     highest_wall_ground,
-    percentile_by_group,
     raise_low_roofs,
 )
 from pipeline.data.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from pipeline.data.pointcloud import PointCloud
+from pipeline.geometry.group_order import percentile_by_group
 from tests.helpers.cities import cloud_over, tilted_dtm
 
 HOUSE = shapely.box(10, 10, 20, 20)

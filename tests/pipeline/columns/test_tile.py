@@ -15,28 +15,11 @@ from pipeline.data.citymodel import Footprints, make_ids, number_ids
 from pipeline.data.errors import InputError
 from pipeline.data.notes import count_notes
 from pipeline.simplification.simplify import simplify_city
+from tests.helpers.cities import CITY_OPTIONS as OPTIONS
 from tests.helpers.cities import Bounds, cloud_over, tilted_dtm
 from tests.helpers.whole_city import mesh_city
 
 BOUNDS: Bounds = (1000.0, 2000.0, 1100.0, 2100.0)
-OPTIONS = CityOptions(
-    min_building_area=5.0,
-    vertex_tolerance=0.01,
-    ground_margin=1.0,
-    ground_percentile=10.0,
-    roof_percentile=90.0,
-    default_height=6.0,
-    roof_clearance=2.0,
-    border="drop",
-    simplify="paper",
-    clearance=1.0,
-    clearance_floor=0.1,
-    min_courtyard_area=10.0,
-    roofs="flat",
-    split_levels=False,
-    roof_group=2.0,
-    manifold=False,
-)
 LAYERS = LayeredOptions(
     mesh_size=10.0, layer_height=10.0, domain_height=100.0, smoother="columns", tolerance=0.003, fem_tolerance=1e-8
 )

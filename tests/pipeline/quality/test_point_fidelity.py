@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import extract_building_points
 from pipeline.city_model.footprints import clean_footprints
-from pipeline.city_model.heights import percentile_by_group
 from pipeline.data.citymodel import Footprints
 from pipeline.data.classes import BUILDING, GROUND, HIGH_VEGETATION, UNCLASSIFIED, WATER
 from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roofs import flat_roofs
+from pipeline.geometry.group_order import percentile_by_group
 from pipeline.geometry.inside import find_inside
 from pipeline.quality.point_fidelity import Residuals, measure_fidelity, measure_houses, summarise
 from pipeline.roofs.house_levels import LevelOptions, split_levels

@@ -21,7 +21,7 @@ from pipeline.geometry.rings import make_canonical
 from pipeline.points_terrain.raster import Dtm
 from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
 from pipeline.roofs.roof_points import locate_roof_points, make_roof_points
-from tests.pipeline.columns import test_tile
+from tests.helpers.cities import CITY_OPTIONS
 
 Array = NDArray[np.float64]
 Roof = Callable[[Array, Array], Array]
@@ -83,7 +83,7 @@ def test_parts_have_the_points_that_are_found_in_and_around_each() -> None:
     count = len(xyz) - len(soil.xyz), len(soil.xyz)
     cloud = PointCloud(xyz, np.repeat(np.array([BUILDING, GROUND], np.uint8), count))
     footprints = Footprints(houses, np.array(["a", "b", "c"]), np.full(3, np.nan))
-    options = replace(test_tile.OPTIONS, simplify="clearance", clearance=0.5, split_levels=True)
+    options = replace(CITY_OPTIONS, simplify="clearance", clearance=0.5, split_levels=True)
     dtm = Dtm(np.zeros((80, 80)), -10, -10, 1.0)
     city = build_city(cloud, footprints, dtm, (-20.0, -20.0, 60.0, 60.0), options)
     divided = divide_houses(city, cloud, options)

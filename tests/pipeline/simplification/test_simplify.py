@@ -15,15 +15,18 @@ from pipeline.columns.columns import expand_cells, extract_boundary
 from pipeline.columns.layered import LayeredOptions
 from pipeline.columns.spacing import SpacingLimits
 from pipeline.data.citymodel import Footprints
+from pipeline.data.classes import BUILDING
 from pipeline.data.mesh import Marker
 from pipeline.data.notes import count_notes
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roofs import ROOF_FALLBACKS, ROOF_METHODS
 from pipeline.quality.building_facts import describe_buildings, measure_model
 from pipeline.simplification.house_clusters import Shapes
 from pipeline.simplification.simplify import _settle_clusters, settle_roofs, simplify_city
+from tests.helpers.cities import CITY_OPTIONS as OPTIONS
 from tests.helpers.cities import cloud_over, tilted_dtm
 from tests.helpers.whole_city import mesh_city
-from tests.pipeline.columns.test_tile import BOUNDS, LAYERS, OPTIONS, footprints_of
+from tests.pipeline.columns.test_tile import BOUNDS, LAYERS, footprints_of
 
 PLANAR = dataclasses.replace(OPTIONS, simplify="clearance", roof_percentile=50.0, min_courtyard_area=5.0)
 SPLIT = dataclasses.replace(PLANAR, split_levels=True)
@@ -84,6 +87,22 @@ def test_a_house_of_two_levels_becomes_two_parts() -> None:
     assert found["roof"]["rmse"] < 2.0
     assert flat["roof"]["rmse"] > 5.0
     assert all("split" in words for words in describe_buildings(cloud, city)["changes"])  # type: ignore[operator]
+
+
+def test_a_house_of_one_height_tells_why() -> None:
+    """Houses of 16 m²: 12 points are enough to find it flat, 5 are too few, and a hipped roof has no room."""
+    houses = [shapely.box(x, 2020, x + 4, 2024) for x in (1020, 1040, 1060)]
+    cloud = cloud_over(BOUNDS, [(house, 2.2) for house in houses], spacing=1.0)
+    on_roof = np.flatnonzero(cloud.classification == BUILDING)
+    first = cloud.xyz[on_roof, 0] < 1030
+    second = (cloud.xyz[on_roof, 0] > 1030) & (cloud.xyz[on_roof, 0] < 1050)
+    dropped = [*on_roof[first][12:], *on_roof[second][5:], *on_roof[~first & ~second]]
+    kept = np.delete(np.arange(len(cloud.xyz)), dropped)
+    cloud = PointCloud(cloud.xyz[kept], cloud.classification[kept])
+    city = planar_city(footprints_of(*houses), cloud, options=dataclasses.replace(PLANAR, roofs="planes"))
+    told = dict(zip(city.model.ids.tolist(), (ROOF_FALLBACKS[k] for k in city.roof_fallback), strict=True))
+    assert told == {"house-0": "", "house-1": "few roof points", "house-2": "no roof points"}
+    assert {ROOF_METHODS[k] for k in city.roof_method.tolist()} == {"flat"}
 
 
 def test_a_house_without_room_is_lost_and_told() -> None:

@@ -37,6 +37,7 @@ def make_houses() -> Houses:
         HouseParts(parts, np.array([0, 1, 1])),
         flat_roofs(np.array([np.nan, 4.0, 6.0])),
         np.array([3, 0], np.int8),
+        np.array([True, False]),
         BuildingPoints(*roof, *ground),
     )
 
@@ -51,6 +52,7 @@ def test_houses_come_back_whole() -> None:
     assert found.points.ground_start.tolist() == houses.points.ground_start.tolist()
     assert found.roofs.plane[1:].tolist() == [[0.0, 0.0, 4.0], [0.0, 0.0, 6.0]]
     assert found.method.tolist() == [3, 0]
+    assert found.too_few.tolist() == [True, False]
 
 
 @pytest.mark.parametrize("names", [ARRAYS_TO_SHAPE, ARRAYS_TO_RAISE])
