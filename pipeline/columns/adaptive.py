@@ -166,7 +166,8 @@ def mesh_adaptive(
         lowest = sample_dtm(dtm, plane.xy) + movable_height(spacing, options.growth)
         free &= levels.z > np.repeat(lowest, count)
     del levels  # its kinds are of no use any more
-    gates = wall_gates(mesh)
+    # Level tops of walls are never passed by: without sloped roofs there is nothing to see to.
+    gates = np.empty((0, 2, 2), np.int64) if options.weld is None else wall_gates(mesh)
     mesh, _ = _key_columns(mesh, seam, given, gates)
     mesh, worst, improved = improve_columns(
         mesh, free, spacing, passes=options.passes, flat_cells=options.growth is not None

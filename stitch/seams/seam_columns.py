@@ -82,6 +82,13 @@ def fill_seam(
     which move their own columns alone.
     """
     levels, bottom = fill_columns(seam.ring, dtm, roofs, ids, options, sizes=sizes)
+    if options.weld is not None:
+        levels = _key_along(seam, levels, bottom)
+    return join_levels([ends[0], take_columns(levels, seam.vertex[1:-1]), ends[1]])
+
+
+def _key_along(seam: Seam, levels: Levels, bottom: NDArray[np.int32]) -> Levels:
+    """Set the order keys of a seam's columns, but for those of its corners, for the edges along it."""
     mesh = ColumnMesh(seam.ring, levels.start, levels.z, bottom, "heights")
     given = np.ones(len(seam.ring.xy), np.bool_)
     given[seam.vertex[1:-1]] = False
@@ -92,8 +99,7 @@ def fill_seam(
     at = along[column]
     mine = gates[(at >= 0).all(axis=1) & (np.abs(at[:, 0] - at[:, 1]) == 1)]
     mesh, _ = set_order_keys(mesh, levels.z, given, mine)
-    keyed = replace(levels, key=mesh.merge_keys)
-    return join_levels([ends[0], take_columns(keyed, seam.vertex[1:-1]), ends[1]])
+    return replace(levels, key=mesh.merge_keys)
 
 
 def tile_columns(plane: PlaneMesh, seams: Sequence[tuple[Seam, Levels]]) -> SeamColumns:

@@ -55,16 +55,30 @@ def find_roof_range(xy: NDArray[np.float64], buildings: Buildings, dtm: Dtm, rul
     np.fmax.at(high, place, z)
     if not rules.sloped:
         return RoofRange(low, high)
-    others = np.bincount(place, minlength=len(xy)) - 1.0
+    others = (np.bincount(place, minlength=len(xy)) - 1).astype(np.float64)
     outline = shapely.boundary(buildings.footprints)
     shapely.prepare(outline)
     edge = np.zeros(len(xy), np.bool_)
     edge[place[shapely.dwithin(outline[row], points[place], OUTLINE_TOLERANCE)]] = True
     at = np.flatnonzero(edge)
     least = dtm.sample(xy[at]) + rules.clearance + others[at] * rules.step
-    low[at] -= others[at] * rules.step / 2
-    high[at] = np.fmax(high[at] + others[at] * rules.step / 2, least)
+    down, up = _find_moves(others[at], high[at] - low[at], rules)
+    low[at] -= down
+    high[at] = np.fmax(high[at] + up, least)
     return RoofRange(low, high)
+
+
+def _find_moves(
+    others: NDArray[np.float64], spread: NDArray[np.float64], rules: RoofRules
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How far the lowest roof may be moved down, and the highest one up (m), where so many others meet one.
+
+    Roofs within half of the least step become one. Two roofs less than a step apart are parted to it, both by the
+    same way; where the least distance of nodes is more than a step may be, the upper one has to give all of it.
+    """
+    apart = np.where(others == 1, np.maximum(rules.step - spread, 0), others * rules.step)
+    apart = np.where((others == 0) | (spread < rules.joined), 0.0, apart)
+    return apart / 2, apart if rules.lifts else apart / 2
 
 
 def check_roof_heights(

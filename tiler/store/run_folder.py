@@ -21,7 +21,6 @@ SCHEMA = 1  # of run.json
 RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")
 TILES = "tiles"
 PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
-LARGEST_STEP = Weld.most  # m
 REGION = "region"  # cell array of a piece with soil
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
@@ -48,11 +47,17 @@ class RoofRules:
         Largest step by which it parts two roofs that meet (m).
     clearance : float
         Height above the terrain at its walls up to which it raises a roof (m).
+    joined : float
+        Roofs closer than this are always joined (m).
+    lifts : bool
+        Whether the least distance of two nodes may be more than the step, so that the upper one is raised.
     """
 
     sloped: bool = False
     step: float = 0.0
     clearance: float = 0.0
+    joined: float = 0.0
+    lifts: bool = False
 
 
 FLAT_ROOFS = RoofRules()
@@ -171,7 +176,13 @@ def _read_roof_rules(parameters: Mapping[str, Any]) -> RoofRules:
     if parameters.get("roofs", "flat") == "flat" or roofs_stay_flat(parameters["mesher"], parameters["simplify"]):
         return FLAT_ROOFS
     least = float(parameters["least_spacing"]) * float(parameters["mesh_size"])
-    return RoofRules(True, max(LARGEST_STEP, least), max(float(parameters["roof_clearance"]), least))
+    return RoofRules(
+        sloped=True,
+        step=max(Weld.most, least),
+        clearance=max(float(parameters["roof_clearance"]), least),
+        joined=Weld.least / 2,
+        lifts=least > Weld.least,
+    )
 
 
 def _read_parts(found: Mapping[str, Any], n_cells: int) -> tuple[MeshPart, ...]:

@@ -114,7 +114,30 @@ def lift_eaves(town: SlopedTown, mesh: ColumnMesh) -> ColumnMesh:
     return dataclasses.replace(mesh, z=z, key=None)
 
 
-@pytest.mark.parametrize(("change", "fault"), [(raise_inner_corner, "roof-height"), (lift_eaves, "roof-height")])
+def move_ridge(town: SlopedTown, mesh: ColumnMesh) -> ColumnMesh:
+    """Raise by 0.3 m a level where two sloped roofs of one height meet, and nothing else does."""
+    plane = town.plane
+    at: dict[int, set[tuple[int, int]]] = {}
+    for row, triangle, bottom in zip(plane.building, plane.triangles, mesh.bottom, strict=True):
+        for vertex, level in zip(triangle.tolist(), bottom.tolist(), strict=True):
+            at.setdefault(vertex, set()).add((int(row), level))
+    rows = {vertex: {row for row, _ in found} for vertex, found in at.items()}
+    ridges = [
+        vertex
+        for vertex, found in at.items()
+        if len(found) == 2 and min(rows[vertex]) >= 0 and len({level for _, level in found}) == 1
+    ]
+    z = mesh.z.copy()
+    level = int(mesh.z_start[ridges[0]])
+    z[level] += 0.3
+    assert z[level] < z[level + 1]
+    return dataclasses.replace(mesh, z=z)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [(raise_inner_corner, "roof-height"), (lift_eaves, "roof-height"), (move_ridge, "roof-height")],
+)
 def test_a_roof_that_is_off_its_plane(
     tmp_path: Path,
     town: SlopedTown,
