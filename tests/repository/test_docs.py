@@ -140,7 +140,7 @@ def open_pages(paths: list[Path], width: int, folder: Path) -> list[dict[str, An
     asked = folder / "asked.json"
     asked.write_text(json.dumps({"width": width, "urls": [path.as_uri() for path in paths]}))
     modules = subprocess.run(["npm", "root", "-g"], capture_output=True, text=True, check=True).stdout.strip()
-    command = ["node", str(ROOT / "tests" / "open_pages.mjs"), str(asked)]
+    command = ["node", str(ROOT / "tests" / "helpers" / "open_pages.mjs"), str(asked)]
     done = subprocess.run(
         command, capture_output=True, text=True, env={**os.environ, "NODE_PATH": modules}, check=False, timeout=600
     )
