@@ -8,8 +8,8 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
-from pipeline.data.roofs import ROOF_METHODS, Roofs, plane_heights
-from pipeline.geometry.group_order import percentile_by_group, sort_points, sort_values
+from pipeline.data.roofs import ROOF_METHODS, Roofs
+from pipeline.geometry.group_order import percentile_by_group, sort_points
 from pipeline.geometry.inside import read_rings
 from pipeline.geometry.rings import make_canonical
 from pipeline.roofs.families import fit_family
@@ -18,6 +18,7 @@ from pipeline.roofs.lines import wall_directions
 from pipeline.roofs.local_planes import fit_locally
 from pipeline.roofs.partition import PartRules, cut_house, join_faces, limit_parts
 from pipeline.roofs.plane_search import BAND, MAX_PLANES, misfit, refit_plane, regularise, search_planes
+from pipeline.roofs.refit import LIMIT_ROOM, LIMIT_SHARE
 from pipeline.roofs.roof_points import RoofPoints
 from pipeline.roofs.subdivision import (
     HALVES,
@@ -28,13 +29,11 @@ from pipeline.roofs.subdivision import (
     outline_regions,
 )
 
+WALL_ROOM = 1.5  # clearances: walls within a house that are closer to others cost more cells than points they win
 PLANES, FAMILY, _, FLAT = range(len(ROOF_METHODS))
-LIMIT_SHARE = 0.02  # of a part's points may lie beyond its limits, on either side
-LIMIT_ROOM = 0.5  # m, between these points and the limits
 MIN_FITTED = 8  # points to which a plane is fitted again
 MIN_NEAREST = 4  # points of a house to which a plane is the nearest
 DENSITY = 6.0  # points a m², of which denser ones are thinned to up to twice as many
-MIN_REFIT = 6  # points that move a face
 
 Array = NDArray[np.float64]
 
@@ -46,7 +45,7 @@ class RoofOptions:
     Attributes
     ----------
     clearance : float
-        A new wall passes through a vertex or keeps this distance from it (m).
+        A new wall passes through a vertex or keeps 1.5 times this distance from it (m).
     min_area : float
         Least area of a part (m²).
     min_points : int
@@ -188,7 +187,7 @@ def _fit_houses(
 ) -> list[_FittedHouse]:
     rings = read_rings(polygons[rows])
     rules = PartRules(
-        float(options.clearance),
+        WALL_ROOM * options.clearance,
         float(options.min_area),
         float(options.min_points),
         float(options.cut_price),
@@ -390,41 +389,6 @@ def _refit_nearest(xyz: Array, planes: Array, along: Array, max_slope: float, n_
         n += 1
         left_family += k < n_family
     return kept[:n].copy(), left_family
-
-
-def refit_roofs(roofs: Roofs, polygons: NDArray[np.object_], points: RoofPoints) -> Roofs:
-    """Move the roof of each face to its points, and set its limits by them (step 2.3).
-
-    Parameters
-    ----------
-    roofs : Roofs
-        Roofs of the faces, from the parts that they were made of.
-    polygons : object, (n,)
-        The faces.
-    points : RoofPoints
-        Their roof points.
-
-    Returns
-    -------
-    Roofs
-        With the height moved by the median of the points over the plane, and limits of half a metre beyond the
-        2nd and the 98th percentile of the points; unchanged with fewer than `MIN_REFIT` points.
-    """
-    if len(roofs) != len(polygons) or len(points.start) != len(polygons) + 1:
-        raise ValueError(
-            f"{len(roofs)} roofs, {len(polygons)} polygons and {len(points.start) - 1} sets of points"
-        )
-    start, count = points.start, np.diff(points.start)
-    row = np.repeat(np.arange(len(polygons)), count)
-    above = sort_values(start, points.xyz[:, 2] - plane_heights(roofs, row, points.xyz[:, :2]))
-    moved = count >= MIN_REFIT
-    plane, limits = roofs.plane.copy(), roofs.limits.copy()
-    plane[moved, 2] += percentile_by_group(start, above, 50)[moved]
-    low, high = (percentile_by_group(start, points.z, q) for q in (100 * LIMIT_SHARE, 100 - 100 * LIMIT_SHARE))
-    limits[moved] = np.column_stack((low - LIMIT_ROOM, high + LIMIT_ROOM))[moved]
-    flat = (plane[:, :2] == 0).all(axis=1) & moved
-    limits[flat] = plane[flat][:, [2, 2]]
-    return Roofs(plane, roofs.origin, limits)
 
 
 def _check(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOptions) -> None:

@@ -26,7 +26,8 @@ from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roofs import ROOF_FALLBACKS, Roofs, choose_roofs, flat_roofs, highest_roofs, is_flat, take_roofs
 from pipeline.points_terrain.terrain import Dtm
-from pipeline.roofs.house_roofs import FLAT, refit_roofs
+from pipeline.roofs.house_roofs import FLAT, RoofOptions
+from pipeline.roofs.refit import refit_roofs
 from pipeline.roofs.roof_points import RoofPoints, locate_roof_points
 from pipeline.simplification.fidelity import Fidelity, measure_simplification
 from pipeline.simplification.house_clusters import Shapes, simplify_houses
@@ -249,7 +250,7 @@ def _fit_sloped(
 ) -> _Raised:
     """Every part keeps its plane, fitted to the points of its face; where it has none, one height."""
     if roof_points is not None:
-        roofs = refit_roofs(roofs, shapes.polygons, roof_points)
+        roofs = refit_roofs(roofs, shapes.polygons, roof_points, max_slope=RoofOptions.max_slope)
     roofs = choose_roofs(np.isnan(roofs.plane[:, 2]), flat_roofs(heights.roof), roofs)
     measured = highest_roofs(roofs, shapes.polygons)
     least = wall_ground + options.roof_clearance

@@ -25,7 +25,8 @@ from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roofs import Roofs, flat_roofs, roof_heights, take_roofs
 from pipeline.geometry.inside import find_inside
 from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
-from pipeline.roofs.house_roofs import RoofOptions, fit_roofs, refit_roofs
+from pipeline.roofs.house_roofs import RoofOptions, fit_roofs
+from pipeline.roofs.refit import refit_roofs
 from pipeline.roofs.roof_points import RoofPoints, locate_roof_points, make_roof_points
 from pipeline.simplification.house_clusters import simplify_houses
 from tests.helpers.cities import CITY_OPTIONS
@@ -131,7 +132,9 @@ def measure(town: Town, options: CityOptions, cut_price: float) -> None:
         refitted = None
         if roofs is not None:
             points = points_of(town, shapes.polygons)[2]
-            refitted = refit_roofs(take_roofs(roofs, shapes.member), shapes.polygons, points)
+            refitted = refit_roofs(
+                take_roofs(roofs, shapes.member), shapes.polygons, points, max_slope=fitting.max_slope
+            )
         report(town, f"{name}, simplified", shapes.polygons, refitted)
 
 

@@ -7,10 +7,10 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.roofs import ROOF_METHODS, Roofs, roof_heights
+from pipeline.data.roofs import ROOF_METHODS, roof_heights
 from pipeline.geometry.inside import find_inside
 from pipeline.geometry.rings import make_canonical
-from pipeline.roofs.house_roofs import HouseRoofs, RoofOptions, fit_roofs, refit_roofs
+from pipeline.roofs.house_roofs import HouseRoofs, RoofOptions, fit_roofs
 from pipeline.roofs.roof_points import make_roof_points, no_roof_points
 from tests.helpers.sloped_roofs import SHAPES, SlopedHouse, scan_roof, town_of_slopes
 
@@ -212,26 +212,6 @@ def test_random_points_leave_parts_that_cover_the_house() -> None:
         check_cover(fit(star, xyz, replace(OPTIONS, cut_price=0.3)), one(star))
 
 
-def test_roofs_of_faces_move_to_their_points() -> None:
-    roofs = Roofs(
-        np.array([[0.5, 0.0, 10.0], [0.0, 0.0, 7.0], [0.5, 0.0, 10.0]]),
-        np.array([[100.0, 50.0]] * 3),
-        np.array([[9.0, 13.0], [7.0, 7.0], [9.0, 13.0]]),
-    )
-    faces = np.array([shapely.box(100 + 10 * k, 50, 110 + 10 * k, 60) for k in range(3)], object)
-    x = np.linspace(100.5, 109.5, 101)
-    slope = np.column_stack((x, np.full(101, 55.0), 10.4 + 0.5 * (x - 100)))
-    level = np.column_stack((x + 10, np.full(101, 55.0), np.where(np.arange(101) < 60, 8.0, 3.0)))
-    few = np.column_stack((x[:5] + 20, np.full(5, 55.0), np.full(5, 99.0)))
-    points = make_roof_points(np.array([0, 101, 202, 207]), np.concatenate((slope, level, few)))
-    found = refit_roofs(roofs, faces, points)
-    plane = np.array([[0.5, 0, 10.4], [0, 0, 8], [0.5, 0, 10]])
-    np.testing.assert_allclose(found.plane, plane, atol=1e-12)
-    z = np.sort(slope[:, 2])
-    limits = np.array([[z[2] - 0.5, z[98] + 0.5], [8, 8], [9, 13]])
-    np.testing.assert_allclose(found.limits, limits, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     "change", [{"clearance": 0.0}, {"min_area": -1.0}, {"min_points": 0}, {"cut_price": 0.0}, {"max_depth": -1}]
 )
@@ -240,9 +220,3 @@ def test_options_out_of_range_and_other_points_are_refused(change: dict[str, flo
         fit_roofs(one(shapely.box(0, 0, 1, 1)), no_roof_points(1), replace(OPTIONS, **change))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="do not match"):
         fit_roofs(one(shapely.box(0, 0, 1, 1)), no_roof_points(2), OPTIONS)
-    with pytest.raises(ValueError, match="3 roofs"):
-        refit_roofs(
-            Roofs(np.zeros((3, 3)), np.zeros((3, 2)), np.zeros((3, 2))),
-            one(shapely.Point(0, 0)),
-            no_roof_points(1),
-        )
