@@ -1,7 +1,7 @@
 """Roofs by the straight skeletons of outlines: the form that attributes give, or a hipped one (step 2.0, ours)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -56,10 +56,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class _Shaped:
-    """Parts of a house with their planes."""
+    """Parts of a house with their planes; ``shape`` is one of `ROOF_SHAPES`."""
 
     parts: NDArray[np.object_]
     roofs: Roofs
+    shape: str
 
     @property
     def rise(self) -> float:
@@ -77,7 +78,7 @@ class _Shaped:
         """Make it higher by a factor, and put its eaves to a height (m); they were at 0."""
         over = self.roofs
         plane = over.plane * factor + np.array([0.0, 0.0, eaves])
-        return _Shaped(self.parts, Roofs(plane, over.origin, over.limits * factor + eaves))
+        return replace(self, roofs=Roofs(plane, over.origin, over.limits * factor + eaves))
 
 
 def shape_roofs(
@@ -136,10 +137,11 @@ def form_roofs(
         The roofs. A house stays as it is where there is no height, no straight skeleton of its outline for that
         shape, or no room for the roof above its least eaves.
     int8, (h,)
-        Index into `ROOF_SHAPES` of the form of each house that has its own now, `NO_FORM` of those not chosen, and
-        else a code of `roof_forms` that tells why not.
+        Index into `ROOF_SHAPES` of the shape of each house that has a form now (hipped instead of a pyramidal one
+        over some outlines), `NO_FORM` of those not chosen, else a code of `roof_forms` that tells why not.
     list of Note
-        ``footprint-roof-form-unused``, ``footprint-roof-form-lowered`` and ``footprint-roof-form-off``.
+        ``footprint-roof-form-unused``, ``footprint-roof-form-replaced``, ``footprint-roof-form-lowered`` and
+        ``footprint-roof-form-off``.
 
     Notes
     -----
@@ -172,7 +174,7 @@ def form_roofs(
         if placed is None:
             code[row] = TOO_LOW
             continue
-        code[row] = int(forms[row, SHAPE])
+        code[row] = ROOF_SHAPES.index(unit.shape)
         shaped[row], lowered[row], off[row] = unit.moved(placed.eaves, placed.factor), placed.lowered, placed.off
     return _replace_roofs(fitted, shaped), code, _note_forms(city, code, lowered, off)
 
@@ -209,7 +211,7 @@ def _unit_roof(polygon: shapely.Polygon, form: Array) -> _Shaped | None:
     """Make the roof of a form with its eaves at 0 and the slope 1; None where the outline has none."""
     shape = ROOF_SHAPES[int(form[SHAPE])]
     if shape == "flat":
-        return _Shaped(np.array([polygon], dtype=object), flat_roofs(np.zeros(1)))
+        return _Shaped(np.array([polygon], dtype=object), flat_roofs(np.zeros(1)), shape)
     direction = None if math.isnan(form[DIRECTION]) else float(form[DIRECTION])
     wanted = RoofForm(shape, 1.0, direction=direction, across=form[ACROSS] == 1)
     least = min(RoofOptions.min_area, LEAST_SHARE * polygon.area)
@@ -217,7 +219,7 @@ def _unit_roof(polygon: shapely.Polygon, form: Array) -> _Shaped | None:
         found = skeleton_roofs(polygon, 0.0, wanted, min_area=least)
     except GeometryError:
         return None
-    return _Shaped(found.parts, found.roofs)
+    return _Shaped(found.parts, found.roofs, found.shape)
 
 
 def _points_over(units: dict[int, _Shaped], points: RoofPoints) -> dict[int, tuple[Array, Array]]:
@@ -292,7 +294,7 @@ def _hip(polygon: shapely.Polygon, ground: float, roof: float) -> _Shaped | None
         found = skeleton_roofs(polygon, 0.0, RoofForm("hipped", DEFAULT_SLOPE), min_area=RoofOptions.min_area)
     except GeometryError:
         return None
-    shaped = _Shaped(found.parts, found.roofs)
+    shaped = _Shaped(found.parts, found.roofs, found.shape)
     eaves = roof - shaped.mean
     if found.height.max() > WIDEST_RISE or eaves < ground + LEAST_EAVES:
         return None
@@ -333,6 +335,10 @@ def _note_forms(city: City, code: NDArray[np.int8], lowered: Array, off: Array) 
     for row, place in find_places(footprints, np.isin(code, list(reasons))):
         shape = ROOF_SHAPES[int(city.forms[row, SHAPE])]
         notes.append(Note("footprint-roof-form-unused", *place, f"{shape}: {reasons[int(code[row])]}"))
+    for row, place in find_places(footprints, (code >= 0) & (code != city.forms[:, SHAPE])):
+        wanted, made = ROOF_SHAPES[int(city.forms[row, SHAPE])], ROOF_SHAPES[code[row]]
+        detail = f"{wanted}: an edge does not face the middle; {made}"
+        notes.append(Note("footprint-roof-form-replaced", *place, detail))
     for row, place in find_places(footprints, np.isfinite(lowered)):
         detail = (
             f"{ROOF_SHAPES[code[row]]}: eaves raised by {lowered[row]:.2f} m to {LEAST_EAVES:g} m above ground"

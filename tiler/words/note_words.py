@@ -139,6 +139,9 @@ WORDS: dict[str, Words] = {
     "footprint-roof-form-unused": Words(
         DEFAULTED, "{n} footprint[s] cannot have the shape of roof that [its attribute|their attributes] name[s|]"
     ),
+    "footprint-roof-form-replaced": Words(
+        DEFAULTED, "{n} footprint[s] got a hipped roof instead of the pyramidal one that [it names|they name]"
+    ),
     "footprint-roof-form-lowered": Words(
         REPAIRED, "{n} roof[s] of a given form [was|were] made lower, for the eaves to be above the ground"
     ),

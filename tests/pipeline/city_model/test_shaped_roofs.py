@@ -200,3 +200,12 @@ def test_parts_of_small_houses_stay_apart() -> None:
     found, _, _ = give_form(form_of("pyramidal", height=2), 20.0, house=tower)
     assert len(found.parts.polygons) == 4
     assert heights_of(found) == pytest.approx((18.0, 20.0))
+
+
+def test_a_pyramid_is_hipped_where_it_cannot_be() -> None:
+    bent = shapely.Polygon([(0, 0), (20, 0), (20, 6), (6, 6), (6, 20), (0, 20)])
+    _, code, notes = give_form(form_of("pyramidal", height=2), 9.0, house=bent)
+    assert code == ROOF_SHAPES.index("hipped")
+    assert [(note.kind, note.detail) for note in notes] == [
+        ("footprint-roof-form-replaced", "pyramidal: an edge does not face the middle; hipped")
+    ]
