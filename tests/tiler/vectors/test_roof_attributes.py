@@ -92,7 +92,7 @@ def test_tags_of_an_extract(tmp_path: Path) -> None:
 def test_codes_of_citygml(tmp_path: Path) -> None:
     """Beside codes, other columns are no tags of OSM: a `roof_height` may be absolute."""
     codes = ["1000", "1030.0", "3200", "1020", None]
-    fields: dict[str, list[Any]] = {"roofType": codes, "roof_height": ["112.5"] * 5}
+    fields: dict[str, list[Any]] = {"roofType": codes, "roof_height": ["12.5"] * 5}
     footprints, notes = read(write_houses(tmp_path / "a.gpkg", fields))
     assert shapes_of(footprints.forms) == ["flat", "gabled", "hipped", "", ""]
     assert np.isnan(footprints.forms[:, HEIGHT]).all()
