@@ -13,6 +13,7 @@ from pipeline.city_model.building_points import BuildingPoints, take_building_po
 from pipeline.city_model.heights import ROOF_SOURCES, Heights, compute_building_heights
 from pipeline.data.citymodel import CityModel, Footprints, number_ids
 from pipeline.data.notes import Note
+from pipeline.data.roof_forms import NO_FORM
 from pipeline.data.roofs import NOT_FITTED, Roofs, flat_roofs, take_roofs
 from pipeline.points_terrain.terrain import Dtm
 
@@ -60,6 +61,8 @@ class City:
         Their roof and ground points.
     given_height : float64, (n,)
         Height above ground (m) from an attribute, NaN where none.
+    forms : float64, (n, 6)
+        What attributes say of their roofs, by the columns of `roof_forms`.
     roof_source : int8, (n,)
         Where the roof's height comes from: index into `heights.ROOF_SOURCES`.
     wall_ground : float64, (n,)
@@ -78,6 +81,8 @@ class City:
         Where the roof of the house of each comes from: index into `ROOF_METHODS`; `NOT_FITTED` with flat roofs.
     roof_fallback : int8, (n,)
         Why the roof of that house has one height: index into `ROOF_FALLBACKS`.
+    roof_form : int8, (n,)
+        The form of that house by an attribute: index into `ROOF_SHAPES`; negative where it has none.
     outline : dict
         How the simplified outlines compare with the footprints: ``area_error`` (share of all area that houses
         lost or gained), ``min_clearance`` (m), ``sharpest`` (degrees); empty before simplification.
@@ -86,6 +91,7 @@ class City:
     model: CityModel
     points: BuildingPoints
     given_height: NDArray[np.float64]
+    forms: NDArray[np.float64]
     roof_source: NDArray[np.int8]
     wall_ground: NDArray[np.float64]
     measured_roof: NDArray[np.float64]
@@ -93,6 +99,7 @@ class City:
     row: NDArray[np.int64]
     roof_method: NDArray[np.int8]
     roof_fallback: NDArray[np.int8]
+    roof_form: NDArray[np.int8]
     notes: tuple[Note, ...]
     counts: dict[str, int]
     outline: dict[str, float]
@@ -147,6 +154,7 @@ def assemble_city(
         model,
         take_building_points(points, kept),
         footprints.given_height[kept],
+        footprints.forms[kept],
         heights.roof_source[kept],
         wall_ground[kept],
         heights.roof[kept],
@@ -154,6 +162,7 @@ def assemble_city(
         kept,
         np.full(len(kept), NOT_FITTED, np.int8),
         np.zeros(len(kept), np.int8),
+        np.full(len(kept), NO_FORM, np.int8),
         (),
         {},
         {},

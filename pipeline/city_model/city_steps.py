@@ -18,7 +18,7 @@ from pipeline.city_model.city import (
 )
 from pipeline.city_model.footprints import clean_footprints
 from pipeline.city_model.heights import highest_wall_ground
-from pipeline.data.citymodel import Footprints
+from pipeline.data.citymodel import Footprints, take_footprints
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
 from pipeline.points_terrain.terrain import Dtm
@@ -136,19 +136,19 @@ def _apply_border_rule(
     """Keep footprints that lie inside by the clearance; drop or clip those on the border."""
     inner = shapely.buffer(region, -options.clearance, join_style="mitre")
     shapely.prepare([inner, region])
-    polygons, ids = footprints.polygons, footprints.ids
+    polygons = footprints.polygons
     inside = shapely.contains_properly(inner, polygons)
     touching = ~inside & shapely.intersects(region, polygons)
     rule = "dropped" if options.border == "drop" else "clipped"
     notes = tuple(Note(f"footprint-on-border-{rule}", *place) for _, place in find_places(footprints, touching))
     if options.border == "drop":
-        return Footprints(polygons[inside], ids[inside], footprints.given_height[inside]), notes
+        return take_footprints(footprints, inside), notes
     kept = inside | touching
     clipped = polygons[kept].copy()
     cut = touching[kept]
     clipped[cut] = shapely.intersection(clipped[cut], inner)
     cleaned, clip_notes = clean_footprints(
-        Footprints(clipped, ids[kept], footprints.given_height[kept]),
+        replace(take_footprints(footprints, kept), polygons=clipped),
         min_area=options.min_building_area,
         tolerance=options.vertex_tolerance,
     )

@@ -1,7 +1,7 @@
 """Clean footprints: valid, oriented, canonical polygons without needless vertices (steps 1.4 and 2.2)."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
+from pipeline.data.roof_forms import form_order
 from pipeline.geometry.holes import fill_holes, list_holes
 from pipeline.geometry.rings import drop_needless_vertices, make_canonical, sort_canonically
 
@@ -52,8 +53,8 @@ def clean_footprints(
     -----
     Does not depend on the order of the input, and a second call changes nothing. A footprint ``A`` of several
     parts becomes ``A-1``, ``A-2``, ... in canonical order of the parts, and so do several footprints of one
-    id; names that are taken are left out. Of equal polygons the one with the smallest id (then height) stays.
-    Empty input gives empty output. O(n log n) in the vertices.
+    id; names that are taken are left out. Of equal polygons the one with the smallest id stays (then height,
+    then form). Empty input gives empty output. O(n log n) in the vertices.
 
     References
     ----------
@@ -69,27 +70,33 @@ def clean_footprints(
     parts = _drop_duplicates(parts, notes)
     parts = _rename(parts, notes)
     parts = parts.take(np.argsort(parts.ids, kind="stable"))
-    clean = Footprints(parts.polygons, parts.ids, parts.given_height)
+    clean = Footprints(parts.polygons, parts.ids, parts.given_height, parts.forms)
     return clean, tuple(sorted(notes, key=lambda note: (note.kind, note.subject, note.detail, str(note))))
 
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """Polygons with their footprint's row, id, height and place: one row a polygon."""
+    """Polygons with their footprint's row, id, height, form of the roof and place: one row a polygon."""
 
     polygons: NDArray[np.object_]
     row: NDArray[np.int64]
     ids: NDArray[np.str_]
     given_height: NDArray[np.float64]
+    forms: NDArray[np.float64]
     place: NDArray[np.float64]
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "_Parts":
         return _Parts(
-            self.polygons[rows], self.row[rows], self.ids[rows], self.given_height[rows], self.place[rows]
+            self.polygons[rows],
+            self.row[rows],
+            self.ids[rows],
+            self.given_height[rows],
+            self.forms[rows],
+            self.place[rows],
         )
 
-    def replace(self, polygons: NDArray[np.object_]) -> "_Parts":
-        return _Parts(polygons, self.row, self.ids, self.given_height, self.place)
+    def with_polygons(self, polygons: NDArray[np.object_]) -> "_Parts":
+        return replace(self, polygons=polygons)
 
     def note(self, kind: str, rows: NDArray[np.int64], details: Iterable[str]) -> Iterable[Note]:
         for i, detail in zip(rows, details, strict=True):
@@ -106,7 +113,7 @@ def _read(footprints: Footprints, notes: list[Note]) -> _Parts:
     bounds = shapely.bounds(geometries[fine]).reshape(-1, 4)
     place[fine] = (bounds[:, :2] + bounds[:, 2:]) / 2
     ids = np.asarray(footprints.ids, dtype=np.str_)
-    rows = _Parts(geometries, np.arange(len(geometries)), ids, footprints.given_height, place)
+    rows = _Parts(geometries, np.arange(len(geometries)), ids, footprints.given_height, footprints.forms, place)
     empty = np.setdiff1d(np.arange(len(geometries)), np.concatenate([fine, bad]))
     notes.extend(rows.note("footprint-empty", empty, ["no geometry"] * len(empty)))
     detail = f"a coordinate is no number below {FARTHEST:g} m"
@@ -125,13 +132,13 @@ def _make_simple(parts: _Parts, tolerance: float, notes: list[Note]) -> _Parts:
         rounds += 1
         left = _split(left)
         if rounds > MAX_ROUNDS:
-            left = left.replace(make_canonical(shapely.convex_hull(left.polygons)))
+            left = left.with_polygons(make_canonical(shapely.convex_hull(left.polygons)))
         polygons, tips = drop_needless_vertices(left.polygons, tolerance)
         spiked = np.union1d(spiked, left.row[tips])
-        left = left.replace(polygons).take(~shapely.is_missing(polygons))
+        left = left.with_polygons(polygons).take(~shapely.is_missing(polygons))
         valid = shapely.is_valid(left.polygons)
         whole = left.take(valid)
-        done.append(whole.replace(make_canonical(whole.polygons)))
+        done.append(whole.with_polygons(make_canonical(whole.polygons)))
         left = left.take(~valid)
     simple = _concatenate(done, parts)
     vanished = np.flatnonzero(~np.isin(parts.row, simple.row))
@@ -155,7 +162,7 @@ def _split(parts: _Parts) -> _Parts:
         geometries, index = shapely.get_parts(geometries, return_index=True)
         rows = rows[index]
     area = (shapely.get_type_id(geometries) == shapely.GeometryType.POLYGON) & ~shapely.is_empty(geometries)
-    return parts.take(rows[area]).replace(make_canonical(geometries[area]))
+    return parts.take(rows[area]).with_polygons(make_canonical(geometries[area]))
 
 
 def _concatenate(pieces: list[_Parts], like: _Parts) -> _Parts:
@@ -166,6 +173,7 @@ def _concatenate(pieces: list[_Parts], like: _Parts) -> _Parts:
         np.concatenate([piece.row for piece in pieces]),
         np.concatenate([piece.ids for piece in pieces]),
         np.concatenate([piece.given_height for piece in pieces]),
+        np.concatenate([piece.forms for piece in pieces]),
         np.concatenate([piece.place for piece in pieces]),
     )
 
@@ -183,7 +191,7 @@ def _fill_courtyards(parts: _Parts, min_area: float, notes: list[Note]) -> _Part
         for area, width in zip(shapely.area(holes[small]), _mean_width(holes[small]), strict=True)
     ]
     notes.extend(parts.note("courtyard-filled", owner[small], details))
-    return parts.replace(fill_holes(parts.polygons, small))
+    return parts.with_polygons(fill_holes(parts.polygons, small))
 
 
 def _drop_small(parts: _Parts, min_area: float, notes: list[Note]) -> _Parts:
@@ -198,8 +206,8 @@ def _drop_small(parts: _Parts, min_area: float, notes: list[Note]) -> _Parts:
 
 
 def _drop_duplicates(parts: _Parts, notes: list[Note]) -> _Parts:
-    """Keep of bitwise equal polygons the one with the smallest id, then the smallest known height."""
-    ordered = parts.take(np.lexsort((parts.given_height, parts.ids)))
+    """Keep of bitwise equal polygons the one with the smallest id, then the smallest known height and form."""
+    ordered = parts.take(np.lexsort((*form_order(parts.forms), parts.given_height, parts.ids)))
     blobs = np.array(shapely.to_wkb(ordered.polygons, byte_order=1), dtype=object)
     _, first, group = (
         np.unique(blobs, return_index=True, return_inverse=True) if len(blobs) else 3 * (np.zeros(0, int),)
@@ -227,7 +235,7 @@ def _rename(parts: _Parts, notes: list[Note]) -> _Parts:
         detail = f"{size} polygons, named {names[first]} to {names[first + size - 1]}"
         notes.extend(ordered.note(kind, group[:1], [detail]))
     renamed = np.array(names, dtype=np.str_)
-    return _Parts(ordered.polygons, ordered.row, renamed, ordered.given_height, ordered.place)
+    return replace(ordered, ids=renamed)
 
 
 def _free_names(base: str, size: int, taken: set[str]) -> list[str]:

@@ -15,12 +15,14 @@ from pipeline.city_model.building_points import (
 )
 from pipeline.city_model.city import City, CityOptions
 from pipeline.city_model.heights import ROOF_SOURCES
-from pipeline.city_model.shaped_roofs import shape_roofs
+from pipeline.city_model.shaped_roofs import form_roofs, shape_roofs
+from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roof_forms import NO_FORM, POINTS_TELL, SHAPE
 from pipeline.data.roofs import Roofs, flat_roofs, join_roofs, take_roofs
 from pipeline.geometry.inside import find_inside
 from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
-from pipeline.roofs.house_roofs import FLAT, RoofOptions, fit_roofs
+from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions, fit_roofs
 from pipeline.roofs.roof_points import (
     RoofPoints,
     add_roof_points,
@@ -50,8 +52,13 @@ class Houses:
         Where the roof of each house comes from: index into `ROOF_METHODS`.
     too_few : bool, (h,)
         Houses with too few points for planes; none where one height is looked for.
+    form : int8, (h,)
+        The form of the roof by an attribute: index into `ROOF_SHAPES`; negative where there is none, or why it is
+        not used, by the codes of `roof_forms`.
     points : BuildingPoints
         Roof and ground points of each part.
+    notes : tuple of Note
+        What became of given forms, where the houses were divided just now.
     """
 
     ids: NDArray[np.str_]
@@ -61,7 +68,9 @@ class Houses:
     roofs: Roofs
     method: NDArray[np.int8]
     too_few: NDArray[np.bool_]
+    form: NDArray[np.int8]
     points: BuildingPoints
+    notes: tuple[Note, ...] = ()
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -100,14 +109,12 @@ def divide_houses(
     parts, points = HouseParts(model.polygons, np.arange(len(model))), city.points
     sloped = options.roofs != "flat"
     part_roofs, method, too_few = None, np.full(len(model), FLAT, np.int8), np.zeros(len(model), np.bool_)
+    form, notes = np.full(len(model), NO_FORM, np.int8), list[Note]()
     if (options.split_levels or sloped) and options.simplify == "clearance" and len(model):
         if roofs is None:
             roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
         if sloped:
-            fitted = fit_roofs(model.polygons, roofs, RoofOptions(clearance=options.clearance))
-            told = city.roof_source != ROOF_SOURCES.index("default")
-            chosen = fitted.too_few & told if options.roofs == "planes" else np.ones(len(model), np.bool_)
-            fitted = shape_roofs(fitted, model.polygons, chosen, model.ground, model.roof)
+            fitted, form, notes = _fit_sloped(city, roofs, options)
             parts, part_roofs, method, too_few = fitted.parts, fitted.roofs, fitted.method, fitted.too_few
         else:
             parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
@@ -125,7 +132,36 @@ def divide_houses(
         points = take_building_points(join_building_points([points, found]), rows)
     if part_roofs is None:
         part_roofs = flat_roofs(np.full(len(parts.polygons), np.nan))
-    return Houses(model.ids, model.polygons, city.given_height, parts, part_roofs, method, too_few, points)
+    return Houses(
+        model.ids,
+        model.polygons,
+        city.given_height,
+        parts,
+        part_roofs,
+        method,
+        too_few,
+        form,
+        points,
+        tuple(notes),
+    )
+
+
+def _fit_sloped(
+    city: City, points: RoofPoints, options: CityOptions
+) -> tuple[HouseRoofs, NDArray[np.int8], list[Note]]:
+    """Roofs of planes, of given forms, and hipped ones, in this order where all are looked for.
+
+    Where planes are, points tell the roof if they are enough; else a given form does, and at last the outline.
+    """
+    model = city.model
+    fitted = fit_roofs(model.polygons, points, RoofOptions(clearance=options.clearance))
+    left = fitted.too_few if options.roofs == "planes" else np.ones(len(model), np.bool_)
+    given = np.isfinite(city.forms[:, SHAPE])
+    fitted, form, notes = form_roofs(fitted, city, points, given & left)
+    form[given & ~left] = POINTS_TELL
+    told = city.roof_source != ROOF_SOURCES.index("default")
+    hipped = left & (form < 0) & (told if options.roofs == "planes" else True)
+    return shape_roofs(fitted, model.polygons, hipped, model.ground, model.roof), form, notes
 
 
 def _deal_out_roofs(
@@ -158,6 +194,7 @@ def take_houses(houses: Houses, rows: NDArray[np.int64]) -> Houses:
         take_roofs(houses.roofs, mine),
         houses.method[rows],
         houses.too_few[rows],
+        houses.form[rows],
         take_building_points(houses.points, mine),
     )
 
@@ -178,5 +215,6 @@ def join_houses(several: Sequence[Houses]) -> Houses:
         join_roofs([houses.roofs for houses in several]),
         np.concatenate([np.empty(0, np.int8), *(houses.method for houses in several)]),
         np.concatenate([np.empty(0, np.bool_), *(houses.too_few for houses in several)]),
+        np.concatenate([np.empty(0, np.int8), *(houses.form for houses in several)]),
         join_building_points([houses.points for houses in several]),
     )

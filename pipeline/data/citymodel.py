@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
+from pipeline.data.roof_forms import N_COLUMNS, no_forms
 from pipeline.data.roofs import Roofs, highest_roofs, join_roofs, take_roofs
 
 
@@ -25,11 +26,26 @@ class Footprints:
         Region-wide building id: the input's own, else made from the geometry.
     given_height : float64, (n,)
         Height above ground (m) from an attribute of the input; NaN where there is none.
+    forms : float64, (n, 6)
+        What attributes say of their roofs, by the columns of `roof_forms`; nothing by default.
     """
 
     polygons: NDArray[np.object_]
     ids: NDArray[np.str_]
     given_height: NDArray[np.float64]
+    forms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, N_COLUMNS)))
+
+    def __post_init__(self) -> None:
+        """Give no form to any footprint where none is stated."""
+        if not len(self.forms):
+            object.__setattr__(self, "forms", no_forms(len(self.polygons)))
+
+
+def take_footprints(footprints: Footprints, rows: NDArray[np.integer[Any]] | NDArray[np.bool_]) -> Footprints:
+    """Take some footprints, in the order of the rows."""
+    return Footprints(
+        footprints.polygons[rows], footprints.ids[rows], footprints.given_height[rows], footprints.forms[rows]
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from pipeline.city_model.heights import ROOF_SOURCES
 from pipeline.city_model.roof_areas import block_heights, measure_roof_areas
 from pipeline.data.citymodel import CityModel
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roof_forms import ROOF_SHAPES
 from pipeline.data.roofs import ROOF_FALLBACKS, ROOF_METHODS, is_flat
 from pipeline.points_terrain.terrain import Dtm
 from pipeline.quality.point_fidelity import KINDS, HouseFidelity, PointFidelity, measure_fidelity, measure_houses
@@ -89,7 +90,11 @@ def report_buildings(
 
 
 def describe_roofs(
-    model: CityModel, roof_method: NDArray[np.int8], roof_fallback: NDArray[np.int8], fidelity: HouseFidelity
+    model: CityModel,
+    roof_method: NDArray[np.int8],
+    roof_fallback: NDArray[np.int8],
+    roof_form: NDArray[np.int8],
+    fidelity: HouseFidelity,
 ) -> dict[str, Sequence[object]]:
     """Attributes of each building's roof, where roofs of planes were looked for.
 
@@ -97,7 +102,7 @@ def describe_roofs(
     ----------
     model : CityModel
         Buildings, all parts of each house among them.
-    roof_method, roof_fallback : int8, (n,)
+    roof_method, roof_fallback, roof_form : int8, (n,)
         As of `City`.
     fidelity : HouseFidelity
         How the roofs fit their points.
@@ -106,6 +111,7 @@ def describe_roofs(
     -------
     dict of str to a sequence of n values
         Of the house: ``roof_method``; ``roof_fallback``, why it has one height, empty where its points tell so;
+        ``roof_form``, the shape that it has by an attribute of its footprint, empty where it has none by that;
         ``roof_parts`` and ``roof_planes``, the numbers of parts and of different planes. Of the row:
         ``roof_median`` (m), ``roof_within`` (share of its points within 0.25 m), ``roof_density`` (points a m²),
         ``roof_clipped`` (share of the area where its plane is cut by its limits), ``roof_slope`` (degrees) and
@@ -126,6 +132,7 @@ def describe_roofs(
     return {
         "roof_method": [ROOF_METHODS[method] for method in roof_method.tolist()],
         "roof_fallback": [ROOF_FALLBACKS[why] for why in roof_fallback.tolist()],
+        "roof_form": [ROOF_SHAPES[form] if form >= 0 else "" for form in roof_form.tolist()],
         "roof_parts": np.bincount(house, minlength=n_houses)[house].tolist(),
         "roof_planes": np.bincount(different, minlength=n_houses)[house].tolist(),
         "roof_median": _rounded(fidelity.median),

@@ -66,7 +66,9 @@ def simplify_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions,
     located = locate_roof_points(cloud, shapes.polygons, building_class=has_building_class(cloud))
     reserved = set(city.model.ids.tolist())
     simple = raise_buildings(houses, shapes, dtm, options, reserved=reserved, roof_points=located, trace=trace)
-    return replace(simple, notes=(*city.notes, *simple.notes), counts={**city.counts, **simple.counts})
+    return replace(
+        simple, notes=(*city.notes, *houses.notes, *simple.notes), counts={**city.counts, **simple.counts}
+    )
 
 
 def raise_buildings(
@@ -193,7 +195,12 @@ def _raise_planar(
         made = _settle_flat(shapes, heights, wall_ground, ids, options)
     else:
         made = _fit_sloped(
-            take_roofs(houses.roofs, shapes.member), shapes, heights, wall_ground, roof_points, options
+            (take_roofs(houses.roofs, shapes.member), houses.form[row] >= 0),
+            shapes,
+            heights,
+            wall_ground,
+            roof_points,
+            options,
         )
     footprints = Footprints(made.polygons, ids, houses.given_height[row])
     members = tuple((str(houses.ids[k]),) for k in row)
@@ -224,6 +231,7 @@ def _raise_planar(
         city,
         roof_method=houses.method[row][city.row],
         roof_fallback=_find_fallbacks(houses)[row][city.row],
+        roof_form=houses.form[row][city.row],
     )
 
 
@@ -241,16 +249,21 @@ def _settle_flat(
 
 
 def _fit_sloped(
-    roofs: Roofs,
+    houses: tuple[Roofs, NDArray[np.bool_]],
     shapes: Shapes,
     heights: Heights,
     wall_ground: NDArray[np.float64],
     roof_points: RoofPoints | None,
     options: CityOptions,
 ) -> _Raised:
-    """Every part keeps its plane, fitted to the points of its face; where it has none, one height."""
+    """Every part keeps its plane, fitted to the points of its face; where it has none, one height.
+
+    Roofs of forms that are given, as the second of `houses` tells, keep theirs as a whole.
+    """
+    roofs, formed = houses
     if roof_points is not None:
-        roofs = refit_roofs(roofs, shapes.polygons, roof_points, max_slope=RoofOptions.max_slope)
+        fitted = refit_roofs(roofs, shapes.polygons, roof_points, max_slope=RoofOptions.max_slope)
+        roofs = choose_roofs(formed, roofs, fitted)
     roofs = choose_roofs(np.isnan(roofs.plane[:, 2]), flat_roofs(heights.roof), roofs)
     measured = highest_roofs(roofs, shapes.polygons)
     least = wall_ground + options.roof_clearance
@@ -269,7 +282,7 @@ def _find_fallbacks(houses: Houses) -> NDArray[np.int8]:
     """Index into `ROOF_FALLBACKS` of each house."""
     count = np.bincount(houses.parts.house, np.diff(houses.points.roof_start), len(houses))
     reason = np.where(houses.too_few, np.where(count > 0, FEW_POINTS, NO_POINTS), 0)
-    return np.where(houses.method == FLAT, reason, 0).astype(np.int8)
+    return np.where((houses.method == FLAT) & (houses.form < 0), reason, 0).astype(np.int8)
 
 
 def _settle_clusters(

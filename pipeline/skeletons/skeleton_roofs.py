@@ -9,13 +9,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.data.roof_forms import ROOF_SHAPES
 from pipeline.data.roofs import Roofs
 from pipeline.geometry.rings import make_canonical
 from pipeline.skeletons.part_cycles import LevelCuts, join_cycles
 from pipeline.skeletons.skeleton_faces import face_area, sloped_part
 from pipeline.skeletons.straight_skeleton import TOLERANCE, Skeleton, outline_edges, straight_skeleton
 
-ROOF_SHAPES = ("flat", "skillion", "hipped", "pyramidal", "gabled", "half-hipped", "mansard", "gambrel")
 DEFAULT_SLOPE = 0.7  # m per m, about 35 degrees
 BREAK_TIME = 0.3  # share of the way from the eaves to the highest ridge where a mansard roof becomes less steep
 BREAK_HEIGHT = 0.6  # share of its height that it has there
@@ -45,7 +45,9 @@ class RoofForm:
         Height of the highest ridge above the eaves (m).
     direction : float, optional
         Where a skillion roof looks, downhill: degrees clockwise from north. If none is given, towards the longest
-        edge.
+        edge. A gabled, half-hipped or gambrel roof over four sides has its gables where it looks least.
+    across : bool
+        Whether the ridge of such a roof over four sides runs along the shorter ones, where no direction is given.
     gables : sequence of int, optional
         Edges, numbered as by `outline_edges`, that are gables of a gabled, half-hipped or gambrel roof. If
         none are given, those that `find_gables` finds.
@@ -55,6 +57,7 @@ class RoofForm:
     slope: float = DEFAULT_SLOPE
     height: float | None = None
     direction: float | None = None
+    across: bool = False
     gables: Sequence[int] | None = None
 
 
@@ -301,7 +304,7 @@ def _shaped_skeleton(polygon: shapely.Polygon, form: RoofForm, tolerance: float)
     skeleton = straight_skeleton(polygon, tolerance=tolerance)
     gables = []
     if shape in ("gabled", "gambrel", "half-hipped"):
-        gables = list(find_gables(skeleton) if form.gables is None else form.gables)
+        gables = list(_choose_gables(skeleton, form) if form.gables is None else form.gables)
     if gables:
         speed = np.ones(len(skeleton))
         speed[gables] = 0.0
@@ -309,6 +312,28 @@ def _shaped_skeleton(polygon: shapely.Polygon, form: RoofForm, tolerance: float)
     if gables and shape == "half-hipped":
         skeleton = straight_skeleton(polygon, start=HALF_HIP * _gable_tips(skeleton), tolerance=tolerance)
     return shape, skeleton
+
+
+def _choose_gables(skeleton: Skeleton, form: RoofForm) -> list[int]:
+    """Find the gables; over four sides those that the form asks for."""
+    if not form.across and form.direction is None:
+        return find_gables(skeleton)
+    xy, edges = (skeleton.nodes - skeleton.origin).tolist(), skeleton.edges.tolist()
+    along = [_direction(xy, edge) for edge in edges]
+    sides = _straight_sides(edges, along, {start: e for e, (start, _) in enumerate(edges)})
+    if len(sides) != 4 or sum(map(len, sides)) != len(edges):
+        return find_gables(skeleton)
+    length, facing = [], []
+    for side in sides:
+        x, y = (xy[edges[side[-1]][1]][k] - xy[edges[side[0]][0]][k] for k in range(2))
+        length.append(math.hypot(x, y))
+        angle = math.radians(form.direction or 0.0)
+        facing.append(abs(y * math.sin(angle) - x * math.cos(angle)) / length[-1])
+    if form.direction is not None:
+        odd = facing[0] + facing[2] > facing[1] + facing[3]  # the even sides look there: the odd ones are gables
+    else:
+        odd = length[0] + length[2] < length[1] + length[3]
+    return sides[1] + sides[3] if odd else sides[0] + sides[2]
 
 
 def _gable_tips(skeleton: Skeleton) -> Array:

@@ -40,7 +40,7 @@ class Buildings:
         Layers that the layered mesher removes; 0 with the other one.
     fidelity : HouseFidelity
         How the roof fits its points.
-    roof_method, roof_fallback : int8, (n,)
+    roof_method, roof_fallback, roof_form : int8, (n,)
         As of `City`.
     """
 
@@ -53,6 +53,7 @@ class Buildings:
     fidelity: HouseFidelity
     roof_method: NDArray[np.int8]
     roof_fallback: NDArray[np.int8]
+    roof_form: NDArray[np.int8]
 
     def __len__(self) -> int:
         return len(self.model)
@@ -125,6 +126,7 @@ def pack_houses(houses: Houses) -> Arrays:
         **{f"part_{name}": values for name, values in pack_roofs(houses.roofs).items()},
         "method": houses.method,
         "too_few": houses.too_few,
+        "form": houses.form,
         "roof_start": houses.points.roof_start,
         "roof_z": houses.points.roof_z,
         "ground_start": houses.points.ground_start,
@@ -133,7 +135,15 @@ def pack_houses(houses: Houses) -> Arrays:
 
 
 POINTS = ("roof", "ground")
-HOUSE_ROWS = ("ids", "given_height", "part_house", "method", "too_few", *(f"part_{name}" for name in ROOF_ARRAYS))
+HOUSE_ROWS = (
+    "ids",
+    "given_height",
+    "part_house",
+    "method",
+    "too_few",
+    "form",
+    *(f"part_{name}" for name in ROOF_ARRAYS),
+)
 # What simplifying houses takes, and giving them heights after that.
 ARRAYS_TO_SHAPE = (*HOUSE_ROWS, "part", "part_start")
 ARRAYS_TO_RAISE = (*HOUSE_ROWS, "outline", "outline_start", "roof_start", "roof_z", "ground_start", "ground_z")
@@ -154,6 +164,7 @@ def unpack_houses(arrays: Arrays) -> Houses:
         Roofs(*(arrays[f"part_{name}"] for name in ROOF_ARRAYS)),
         arrays["method"],
         arrays["too_few"],
+        arrays["form"],
         BuildingPoints(*roof, *ground),
     )
 
@@ -170,6 +181,7 @@ def make_buildings(city: City, fidelity: HouseFidelity, layers: NDArray[np.int32
         fidelity,
         city.roof_method,
         city.roof_fallback,
+        city.roof_form,
     )
 
 
@@ -194,6 +206,7 @@ def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
         "layers": buildings.layers,
         "roof_method": buildings.roof_method,
         "roof_fallback": buildings.roof_fallback,
+        "roof_form": buildings.roof_form,
         **{name: getattr(fidelity, field) for field, name in FIDELITY_ARRAYS.items()},
     }
     return {prefix + name: values for name, values in arrays.items()}
@@ -207,7 +220,7 @@ BUILDING_ARRAYS = (
     *("polygon", "polygon_start", "id", "number", "house", "ground", "member", "member_start"),
     *ROOF_ARRAYS,
     *("roof_source", "measured_roof", "wall_ground", "group", "layers"),
-    *("roof_method", "roof_fallback"),
+    *("roof_method", "roof_fallback", "roof_form"),
     *FIDELITY_ARRAYS.values(),
 )
 
@@ -236,6 +249,7 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
         fidelity,
         arrays["roof_method"],
         arrays["roof_fallback"],
+        arrays["roof_form"],
     )
 
 
@@ -300,7 +314,7 @@ def no_buildings() -> Buildings:
     layers = np.empty(0, np.int32)
     fidelity = HouseFidelity(rows, *(number,) * 5)
     code = np.empty(0, np.int8)
-    return Buildings(model, code, number, number, rows, layers, fidelity, code, code)
+    return Buildings(model, code, number, number, rows, layers, fidelity, code, code, code)
 
 
 def join_buildings(several: Sequence[Buildings]) -> Buildings:

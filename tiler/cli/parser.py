@@ -27,7 +27,7 @@ METAVARS = {str: "NAME", float: "NUMBER", int: "NUMBER"}
 KINDS = {
     **dict.fromkeys(("footprints", "cluster", "tls_ca", "tls_cert", "tls_key"), "FILE"),
     **{"out": "DIR", "crs": "EPSG", "layer": "LAYER", "scheduler": "ADDRESS"},
-    **dict.fromkeys(("id_attribute", "height_attribute"), "ATTRIBUTE"),
+    **dict.fromkeys(("id_attribute", "height_attribute", "roof_attribute"), "ATTRIBUTE"),
 }
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
 # What a first run needs stands first in the help of a run, what is for studies of the method last.

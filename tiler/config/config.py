@@ -76,6 +76,10 @@ class Config:
     height_attribute: str = _parameter(
         UNSET, "input", "attribute with heights above ground, for buildings without roof points", unit="m"
     )
+    roof_attribute: str = _parameter(
+        UNSET, "input", "attribute with the shapes of roofs, as roof:shape of OSM has them or codes of CityGML; "
+        "empty: a well-known name; only for --roofs planes and skeleton",
+    )  # fmt: skip
     crs: str = _parameter(
         UNSET, "input", "CRS of the region, as EPSG:NNNN; empty: that of the data, where it states one"
     )

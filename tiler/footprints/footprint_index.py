@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
+from pipeline.data.roof_forms import no_forms
 from tiler.footprints.footprint_source import FootprintSource, count_notes_of, make_footprints, open_source
 from tiler.footprints.repeated_ids import find_repeated_ids
 from tiler.georeference.frame import Frame
@@ -39,6 +40,8 @@ class FootprintRows:
         Building ids.
     given_height : float64, (n,)
         Height above ground (m), NaN where there is none.
+    forms : float64, (n, 6)
+        What attributes say of their roofs, by the columns of `roof_forms`.
     box : float64, (n, 4)
         xmin, ymin, xmax, ymax of each polygon in the region's CRS (m).
     """
@@ -47,6 +50,7 @@ class FootprintRows:
     wkb_start: NDArray[np.int64]
     ids: NDArray[np.str_]
     given_height: NDArray[np.float64]
+    forms: NDArray[np.float64]
     box: NDArray[np.float64]
 
     def __len__(self) -> int:
@@ -70,8 +74,9 @@ class FootprintBlock:
     notes : tuple of Note
         What was converted, left out, assumed or renamed; they add up over the blocks of a file. One a footprint
         for what `outline_all` tells, ``footprint-not-finite``, ``footprint-id-missing``,
-        ``footprint-id-repeated`` and ``footprint-height-missing``; one a file for ``footprints-without-crs``,
-        ``footprints-reprojected``, ``footprints-outside`` and ``footprints-reader-warning``.
+        ``footprint-id-repeated``, ``footprint-height-missing`` and ``footprint-roof-unread``; one a file for what
+        `count_notes_of` counts, ``footprints-without-crs``, ``footprints-reprojected``, ``footprints-outside`` and
+        ``footprints-reader-warning``.
     """
 
     rows: FootprintRows
@@ -89,6 +94,7 @@ def scan_footprints(
     layer: str = "",
     id_attribute: str = "",
     height_attribute: str = "",
+    roof_attribute: str = "",
     frame: Frame | None = None,
     batch: int = BATCH,
 ) -> Iterator[FootprintBlock]:
@@ -96,7 +102,7 @@ def scan_footprints(
 
     Parameters
     ----------
-    path, crs, bounds, layer, id_attribute, height_attribute, frame
+    path, crs, bounds, layer, id_attribute, height_attribute, roof_attribute, frame
         As `open_source` has them.
     batch : int
         Features in memory at once.
@@ -125,6 +131,7 @@ def scan_footprints(
         layer=layer,
         id_attribute=id_attribute,
         height_attribute=height_attribute,
+        roof_attribute=roof_attribute,
         frame=frame,
     )
     repeated = find_repeated_ids(source.layer, source.id_name, batch=batch)
@@ -183,22 +190,23 @@ def join_footprints(parts: Sequence[FootprintRows], box: Box) -> Footprints:
     Returns
     -------
     Footprints
-        By ascending id, those of one id by their geometry as stored, then by height: the same whatever the
-        order of the parts and of their rows.
+        By ascending id, those of one id by their geometry as stored, then by height and form: the same whatever
+        the order of the parts and of their rows.
     """
-    blobs, ids, heights = [], [np.empty(0, np.str_)], [np.empty(0)]
+    blobs, ids, heights, roofs = [], [np.empty(0, np.str_)], [np.empty(0)], [no_forms(0)]
     for part in parts:
         near = np.flatnonzero(_meets(part.box, box))
         stored, start = part.wkb.tobytes(), part.wkb_start - part.wkb_start[0]
         blobs += [stored[start[row] : start[row + 1]] for row in near]
         ids.append(part.ids[near])
         heights.append(part.given_height[near])
-    names, given = np.concatenate(ids), np.concatenate(heights)
-    keys = list(zip(names.tolist(), blobs, map(str, given.tolist()), strict=True))
+        roofs.append(part.forms[near])
+    names, given, forms = np.concatenate(ids), np.concatenate(heights), np.concatenate(roofs)
+    keys = list(zip(names.tolist(), blobs, map(str, given.tolist()), map(str, forms.tolist()), strict=True))
     order = np.array(sorted(range(len(keys)), key=keys.__getitem__), np.int64)
     geometry = shapely.from_wkb([blobs[row] for row in order], on_invalid="fix").astype(np.object_)
     kept = shapely.intersects(geometry, shapely.box(*box))
-    return Footprints(geometry[kept], names[order[kept]], given[order[kept]])
+    return Footprints(geometry[kept], names[order[kept]], given[order[kept]], forms[order[kept]])
 
 
 def _meets(boxes: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
@@ -219,6 +227,7 @@ def _block(footprints: Footprints, notes: Sequence[Note]) -> FootprintBlock:
         np.concatenate([np.zeros(1, np.int64), np.cumsum(length)]),
         footprints.ids[order],
         footprints.given_height[order],
+        footprints.forms[order],
         box[order],
     )
     first = cells.start[:-1]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipeline.data.citymodel import Footprints, make_ids
 from pipeline.data.errors import InputError
 from pipeline.data.notes import Note
+from pipeline.data.roof_forms import ROOF_SHAPES, SHAPE, TO_EAVES
 from tiler.footprints.footprint_attributes import (
     explain_repeated,
     find_attribute,
@@ -24,6 +25,7 @@ from tiler.footprints.footprint_attributes import (
     read_ids,
 )
 from tiler.footprints.plan_outlines import Finding, outline_all
+from tiler.footprints.roof_attributes import RoofAttributes, find_roof_attributes, read_roofs, roof_columns
 from tiler.georeference.crs import crs_name, horizontal_crs
 from tiler.georeference.footprints import footprint_frame
 from tiler.georeference.frame import Frame, box_to_file, to_region
@@ -32,6 +34,9 @@ from tiler.vectors.features import Box, Features
 from tiler.vectors.layers import Layer, describe_layer
 from tiler.vectors.osm_tags import STOREY, find_osm_tags, is_building
 
+# Kinds of the notes of forms, before the shape: that of each is counted.
+GIVEN_FORMS, UNKNOWN_FORMS = "footprint-roof-forms:", "footprint-roof-forms-unknown:"
+MOST_SHAPES = 12  # that a note lists
 _NOWHERE = (float("nan"),) * 4
 
 
@@ -43,8 +48,9 @@ class FootprintSource:
     ----------
     layer : Layer
         The layer.
-    id_name, height_name : str
-        Attributes with the id and with the height above ground, ``""`` for none.
+    id_name, height_name, roof_name : str
+        Attributes with the id, the height above ground and the shape of the roof, ``""`` for none that is asked
+        for.
     frame : Frame
         How coordinates of the file become those of the region.
     bounds : tuple of 4 floats
@@ -58,6 +64,7 @@ class FootprintSource:
     layer: Layer
     id_name: str
     height_name: str
+    roof_name: str
     frame: Frame
     bounds: Box
     box: Box
@@ -67,7 +74,8 @@ class FootprintSource:
     def columns(self) -> list[str]:
         """Attributes that `make_footprints` needs."""
         ids = id_columns(self.layer, self.id_name)
-        return list(dict.fromkeys([*ids, *height_columns(self.layer, self.height_name)]))
+        heights = height_columns(self.layer, self.height_name)
+        return list(dict.fromkeys([*ids, *heights, *roof_columns(self.layer, self.roof_name)]))
 
 
 def open_source(
@@ -78,6 +86,7 @@ def open_source(
     layer: str,
     id_attribute: str,
     height_attribute: str,
+    roof_attribute: str = "",
     frame: Frame | None = None,
 ) -> FootprintSource:
     """Decide how footprints are read from a file.
@@ -96,6 +105,8 @@ def open_source(
         Attribute with the building's id; ``""`` for the first of `ID_ATTRIBUTES` that the layer has.
     height_attribute : str
         Attribute with the height above ground (m); ``""`` for none.
+    roof_attribute : str
+        Attribute with the shape of the roof; ``""`` for ``roof:shape`` and the like, where there is one.
     frame : Frame, optional
         How coordinates of the file become those of the region; by default as the CRSs have it.
 
@@ -112,13 +123,14 @@ def open_source(
     """
     info = describe_layer(path, layer)
     id_name, height_name = find_id_attribute(info, id_attribute), find_attribute(info, height_attribute)
+    find_roof_attributes(info, roof_attribute)
     own = horizontal_crs(info.crs)
     _check_extent(info, own or crs)
     if frame is None:
         frame = Frame() if own is None else footprint_frame(own, crs, bounds)[0]
     box = box_to_file(frame, bounds) if frame.changes_plan else bounds
     return FootprintSource(
-        info, id_name, height_name, frame, bounds, box, tuple(_crs_notes(info, own, crs, frame))
+        info, id_name, height_name, roof_attribute, frame, bounds, box, tuple(_crs_notes(info, own, crs, frame))
     )
 
 
@@ -169,7 +181,10 @@ def make_footprints(
     counts["footprint-heights-by-levels"] += int(by_levels[rows].sum())
     none = np.array([bool(bad[row]) for row in rows], np.bool_)
     notes += _notes("footprint-height-missing", geometry[none], [bad[row] for row in rows[none]], ids[none])
-    return Footprints(geometry, ids, height[rows]), notes
+    roofs = read_roofs(source.layer, source.roof_name, features)
+    roofs.forms[by_levels & np.isfinite(roofs.forms[:, SHAPE]), TO_EAVES] = 1.0
+    notes += _tell_roofs(roofs, rows, geometry, ids, counts)
+    return Footprints(geometry, ids, height[rows], roofs.forms[rows]), notes
 
 
 def count_notes_of(source: FootprintSource, counts: Counter[str]) -> list[Note]:
@@ -178,13 +193,38 @@ def count_notes_of(source: FootprintSource, counts: Counter[str]) -> list[Note]:
         "footprints-without-geometry": "{} features have no geometry",
         "footprints-not-buildings": "{} polygons without building=* or building:part=* are left out",
         "footprint-heights-by-levels": f"{{}} heights are building:levels x {STOREY:g} m",
+        "footprint-roofs-by-levels": f"{{}} heights of roofs are roof:levels x {STOREY:g} m",
     }
     name = source.layer.path.name
-    return [
+    notes = [
         Note(kind, name, detail=detail.format(counts[kind]))
         for kind, detail in details.items()
         if counts[kind] > 0
     ]
+    for kind in (GIVEN_FORMS, UNKNOWN_FORMS):
+        shapes = {key[len(kind) :]: n for key, n in counts.items() if key.startswith(kind) and n > 0}
+        named = sorted(shapes, key=lambda shape: (-shapes[shape], shape))
+        told = ", ".join(f"{shapes[shape]} {shape}" for shape in named[:MOST_SHAPES])
+        rest = sum(shapes[shape] for shape in named[MOST_SHAPES:])
+        if named:
+            notes.append(Note(kind[:-1], name, detail=told + (f", {rest} others" if rest else "")))
+    return notes
+
+
+def _tell_roofs(
+    roofs: RoofAttributes,
+    rows: NDArray[np.int64],
+    geometry: NDArray[np.object_],
+    ids: NDArray[np.str_],
+    counts: Counter[str],
+) -> list[Note]:
+    """Count the forms of roofs by shape, and tell of each that is said in part only."""
+    counts["footprint-roofs-by-levels"] += int(roofs.by_levels[rows].sum())
+    shape = roofs.forms[rows, SHAPE]
+    counts.update(GIVEN_FORMS + ROOF_SHAPES[int(each)] for each in shape[np.isfinite(shape)].tolist())
+    counts.update(UNKNOWN_FORMS + roofs.unknown[row] for row in rows.tolist() if roofs.unknown[row])
+    bad = np.array([bool(roofs.wrong[row]) for row in rows.tolist()], np.bool_)
+    return _notes("footprint-roof-unread", geometry[bad], [roofs.wrong[row] for row in rows[bad]], ids[bad])
 
 
 def _crs_notes(info: Layer, own: pyproj.CRS | None, crs: pyproj.CRS, frame: Frame) -> list[Note]:

@@ -6,12 +6,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
 import pyogrio
 import pyproj
 import shapely
+from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
 from pipeline.data.pointcloud import PointCloud
@@ -24,6 +26,7 @@ RELIEF = 20.0  # m
 SEED = 1
 
 _TILE_SIZE = 500.0  # m, about: a city is cut into equal squares
+_TAGS = {"shed": "skillion", "gable": "gabled", "hip": "hipped", "pyramid": "pyramidal"}  # of `ROOF_TYPES`
 _SCALE = 0.01  # m
 _DAY = date(2022, 1, 1)  # in all files, so that the same seed gives the same bytes
 _GPKG_TIME = {"OGR_CURRENT_DATE": f"{_DAY.isoformat()}T00:00:00.000Z"}
@@ -38,7 +41,9 @@ class SynthFiles:
     clouds : list of Path
         LAZ files, sorted.
     footprints, shapefile : Path
-        The same footprints as GPKG and SHP, with the attribute ``id``.
+        The same footprints as GPKG and SHP, with the attribute ``id``. With mixed roofs the GPKG has besides, in
+        the words of OpenStreetMap, ``height`` (m, from the ground to the ridge), ``roof:shape``, ``roof:height``,
+        ``roof:direction`` and ``roof:orientation``.
     truth : Path
         JSON with the parameters, and the ground and the highest place of the roof of each building (m); with mixed
         roofs also its type, its eaves, and its planes: over each of the ``wings``, whose corners are ``ring``, the
@@ -137,19 +142,46 @@ def _write_laz(path: Path, cloud: PointCloud, bounds: tuple[float, float, float,
 
 def _write_footprints(city: SyntheticCity, files: SynthFiles) -> None:
     wkb = shapely.to_wkb(city.polygons)
-    ids = city.ids.astype(np.object_)
+    ids = {"id": city.ids.astype(np.object_)}
+    words = {} if city.roofs == "flat" else _roof_tags(city)
     pyogrio.set_gdal_config_options(_GPKG_TIME)
     try:
-        for path, options in (
-            (files.footprints, {}),
-            (files.shapefile, {"DBF_DATE_LAST_UPDATE": _DAY.isoformat()}),
+        for path, fields, options in (
+            (files.footprints, ids | words, {}),
+            (files.shapefile, ids, {"DBF_DATE_LAST_UPDATE": _DAY.isoformat()}),
         ):
             path.unlink(missing_ok=True)
+            values = list(fields.values())
             pyogrio.raw.write(
-                path, wkb, [ids], ["id"], geometry_type="Polygon", crs=CRS, layer="footprints", **options
+                path, wkb, values, list(fields), geometry_type="Polygon", crs=CRS, layer="footprints", **options
             )
     finally:
         pyogrio.set_gdal_config_options(dict.fromkeys(_GPKG_TIME))
+
+
+def _roof_tags(city: SyntheticCity) -> dict[str, NDArray[Any]]:
+    """Attributes of roofs as OpenStreetMap has them; None or NaN where one says nothing."""
+    shapes, first = city.shapes, city.shapes.start[:-1]
+    types = [ROOF_TYPES[kind] for kind in shapes.kind.tolist()]
+    gabled = ~np.isfinite(shapes.plane[first, 0, 2])  # no plane rises from the ends of the ridge
+    shape = [_TAGS.get(name, name) for name in types]
+    shape = ["gambrel" if name == "mansard" and ends else name for name, ends in zip(shape, gabled, strict=True)]
+    shed = np.array([name == "skillion" for name in shape])
+    used = np.isfinite(shapes.plane[first, :, 2]).argmax(axis=1)
+    east, north = shapes.plane[first, used, :2].T
+    direction = np.degrees(np.arctan2(-east, -north)) % 360
+    across = shapes.half[first, 0] < shapes.half[first, 1]
+    ridge = np.array([name in ("gabled", "gambrel") for name in shape])
+    words = ["across" if wide else "along" for wide in across.tolist()]
+    return {
+        "height": np.round(city.roof - city.ground, 3),
+        "roof:shape": np.array(shape, np.object_),
+        "roof:height": np.round(city.roof - shapes.eaves, 3),
+        "roof:direction": np.where(shed, np.round(direction, 1) % 360, np.nan),
+        "roof:orientation": np.array(
+            [word if known else None for word, known in zip(words, ridge.tolist(), strict=True)], np.object_
+        ),
+    }
 
 
 def _truth(city: SyntheticCity, buildings: int, relief: float) -> dict[str, object]:

@@ -96,6 +96,7 @@ def sample_footprints(
         id_attribute=config.id_attribute,
         frame=frame,
         height_attribute=config.height_attribute,
+        roof_attribute=config.roof_attribute,
     )
     parts, n_read, complete = [np.empty(0, np.object_)], 0, True
     for features in scan_layer(source.layer, source.columns, source.box, batch=min(BATCH, limit)):

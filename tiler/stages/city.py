@@ -14,9 +14,10 @@ from pipeline.city_model.houses import Houses, divide_houses, join_houses, take_
 from pipeline.city_model.unmarked_roofs import MAY_BE_ROOF
 from pipeline.columns.adaptive import AdaptiveOptions
 from pipeline.columns.layered import LayeredOptions, choose_layers, terrain_reach
-from pipeline.data.citymodel import Footprints
+from pipeline.data.citymodel import Footprints, take_footprints
 from pipeline.data.classes import BUILDING, GROUND, WATER
 from pipeline.data.notes import Note
+from pipeline.data.roof_forms import POINTS_TELL
 from pipeline.geometry.components import join_pairs
 from pipeline.points_terrain.raster import Dtm, window_of
 from pipeline.points_terrain.terrain import cut_terrain
@@ -64,7 +65,7 @@ def house_stage(config: Config) -> Stage:
         Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
-    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN), version=5)
+    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN), version=6)
 
 
 def first_round(config: Config) -> list[Stage]:
@@ -133,7 +134,7 @@ def model_stage(config: Config, last: int) -> Stage:
     )
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
-    version = 8 if layered else 6
+    version = 9 if layered else 7
     return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=version)
 
 
@@ -174,8 +175,9 @@ def make_houses(task: Task) -> Facts:
     with task.step("1.7 fit of roofs"):
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roofs)
         full = make_buildings(city, fidelity, np.zeros(len(city.model), np.int32))
+    task.notes(houses.notes)
     task.put(**pack_houses(houses), **pack_buildings(full, "full_"), unmarked=others)
-    counts = {"buildings before merging": len(houses), **_count_parts(houses)}
+    counts = {"buildings before merging": len(houses), **_count_parts(houses), **_count_forms(houses)}
     counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
     return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts}
 
@@ -345,7 +347,7 @@ def _owned(task: Task, footprints: Footprints) -> Footprints:
     """Take the footprints whose representative point is the tile's."""
     xy = shapely.get_coordinates(shapely.point_on_surface(footprints.polygons))
     mine = find_owned(task.box, task.context.bounds, xy.reshape(-1, 2))
-    return Footprints(footprints.polygons[mine], footprints.ids[mine], footprints.given_height[mine])
+    return take_footprints(footprints, mine)
 
 
 def _find_unmarked(shapes: Shapes, gathered: "_Gathered") -> NDArray[np.int64]:
@@ -446,6 +448,15 @@ def _find_rows(among: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.
 
 def _hull(one: Box, other: Box) -> Box:
     return min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
+
+
+def _count_forms(houses: Houses) -> dict[str, int]:
+    """Houses with the roof of a given form, and those whose points tell it instead; nothing without any."""
+    counts = {
+        "roofs of a given form": int((houses.form >= 0).sum()),
+        "given forms of roofs with points": int((houses.form == POINTS_TELL).sum()),
+    }
+    return {name: n for name, n in counts.items() if n}
 
 
 def _count_parts(houses: Houses) -> dict[str, int]:

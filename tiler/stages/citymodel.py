@@ -203,7 +203,7 @@ def _tell(buildings: Buildings, fits: RoofFits | None) -> Attributes:
     )
     method, fallback = buildings.roof_method, buildings.roof_fallback
     if fits is not None and (method != NOT_FITTED).any():
-        roofs = describe_roofs(buildings.model, method, fallback, buildings.fidelity)
+        roofs = describe_roofs(buildings.model, method, fallback, buildings.roof_form, buildings.fidelity)
         fits.add(buildings.model, method, buildings.fidelity, roofs)
         told |= roofs
     return told

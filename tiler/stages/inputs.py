@@ -59,14 +59,14 @@ def input_stages(config: Config) -> list[Stage]:
             read_footprint_file,
             parameters=(
                 *("footprints", "footprints_identity", "footprints_frame", "align"),
-                *("layer", "id_attribute", "height_attribute"),
+                *("layer", "id_attribute", "height_attribute", "roof_attribute"),
             ),
-            version=3,
+            version=4,
         ),
         # What a tile needs of the footprints: it does not run again when others change.
         Stage(
             *("outlines", Scope.TILE, take_outlines, (Read("footprints"),), ("footprints_shift",)),
-            version=3,
+            version=4,
             after="ground",
         ),
         Stage("reserved", Scope.REGION, list_reserved, (Read("footprints"),)),
@@ -181,6 +181,7 @@ def read_footprint_file(task: Task) -> Facts:
         layer=given.layer,
         id_attribute=given.id_attribute,
         height_attribute=given.height_attribute,
+        roof_attribute=given.roof_attribute,
     ):
         task.notes(block.notes)
         rows = block.rows
@@ -193,6 +194,7 @@ def read_footprint_file(task: Task) -> Facts:
             id=letters,
             id_end=n_letters + np.cumsum([len(name) for name in names], dtype=np.int64),
             given_height=rows.given_height,
+            forms=rows.forms,
             box=rows.box.reshape(-1, 4),
             cell_box=block.cell_box.reshape(-1, 4),
             cell_start=block.start[:-1] + n,
@@ -214,6 +216,7 @@ def take_outlines(task: Task) -> Facts:
         **pack_polygons(footprints.polygons, "outline"),
         ids=footprints.ids,
         given_height=footprints.given_height,
+        forms=footprints.forms,
     )
     extent: Box | None = None
     if len(footprints.ids):

@@ -212,7 +212,7 @@ def read_outlines(task: Task, *, shift: tuple[float, float] = (0.0, 0.0)) -> Foo
 def read_own_outlines(task: Task) -> Footprints:
     """Take the footprints that meet a tile, from the stage ``outlines`` for the same tile."""
     (found,) = (result.arrays for result in task.read("outlines"))
-    return Footprints(unpack_polygons(found, "outline"), found["ids"], found["given_height"])
+    return Footprints(unpack_polygons(found, "outline"), found["ids"], found["given_height"], found["forms"])
 
 
 def _read_outlines(task: Task, box: Box) -> Footprints:
@@ -231,8 +231,8 @@ def _read_outlines(task: Task, box: Box) -> Footprints:
     id_ranges, letter = _cut_ranges(ends["id_end"], ranges)
     wkb, text = read(wkb_ranges, "wkb")["wkb"], read(id_ranges, "id")["id"].tobytes()
     ids = np.array([text[first:last].decode() for first, last in pairwise(letter.tolist())], np.str_)
-    rest = read(ranges, "given_height", "box")
-    return join_footprints([FootprintRows(wkb, byte, ids, rest["given_height"], rest["box"])], box)
+    rest = read(ranges, "given_height", "forms", "box")
+    return join_footprints([FootprintRows(wkb, byte, ids, rest["given_height"], rest["forms"], rest["box"])], box)
 
 
 def _cut_ranges(ends: NDArray[np.int64], ranges: Ranges) -> tuple[Ranges, NDArray[np.int64]]:

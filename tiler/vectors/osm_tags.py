@@ -140,6 +140,18 @@ def values_of(tags: OsmTags, key: str, columns: Mapping[str, NDArray[Any]]) -> l
     return [value if _text(value) else _parse(text).get(key) for value, text in zip(own, texts, strict=True)]
 
 
+def tags_of(texts: NDArray[Any], keys: Sequence[str]) -> dict[str, list[str | None]]:
+    """Give the values of some tags from texts with all further tags, (n,): each text is parsed once.
+
+    Examples
+    --------
+    >>> tags_of(np.array(['"roof:shape"=>"gabled","roof:height"=>"3"', None], object), ["roof:shape"])
+    {'roof:shape': ['gabled', None]}
+    """
+    parsed = [_parse(text) for text in texts]
+    return {key: [tags.get(key) for tags in parsed] for key in keys}
+
+
 def _parse(text: Any) -> dict[str, str]:
     if not isinstance(text, str):
         return {}

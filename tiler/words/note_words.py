@@ -133,6 +133,26 @@ WORDS: dict[str, Words] = {
     "footprint-height-missing": Words(
         DEFAULTED, "{n} footprint[s] [has|have] a height attribute that is no height"
     ),
+    "footprint-roof-unread": Words(
+        DEFAULTED, "{n} footprint[s] [has|have] attributes of the roof that are out of bounds or cannot be read"
+    ),
+    "footprint-roof-form-unused": Words(
+        DEFAULTED, "{n} footprint[s] cannot have the shape of roof that [its attribute|their attributes] name[s|]"
+    ),
+    "footprint-roof-form-replaced": Words(
+        DEFAULTED, "{n} footprint[s] got a hipped roof instead of the pyramidal one that [it names|they name]"
+    ),
+    "footprint-roof-form-lowered": Words(
+        REPAIRED, "{n} roof[s] of a given form [was|were] made lower, for the eaves to be above the ground"
+    ),
+    "footprint-roof-form-off": Words(
+        OTHER, "{n} roof[s] of a given form [lies|lie] more than 1 m from [its|their] points"
+    ),
+    "footprint-roof-forms": Words(OTHER, "attributes of footprints name shapes of roofs"),
+    "footprint-roof-forms-unknown": Words(
+        DEFAULTED, "attributes of footprints name shapes of roofs that are not made"
+    ),
+    "footprint-roofs-by-levels": Words(DEFAULTED, "heights of roofs were taken from numbers of levels, 3 m each"),
     "footprint-id-missing": Words(DEFAULTED, "{n} footprint[s] without an id [was|were] named by geometry"),
     "footprint-roof-from-attribute": Words(
         DEFAULTED, "{n} footprint[s] without roof points took the height of the attribute"

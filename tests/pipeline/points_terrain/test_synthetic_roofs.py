@@ -1,10 +1,12 @@
 """Roofs of synthetic houses: by hand, by their slopes, and that other houses change nothing."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyogrio
 import pytest
 import shapely
 from numpy.typing import NDArray
@@ -231,3 +233,29 @@ def test_no_and_few_houses() -> None:
 def test_unknown_roofs_are_refused() -> None:
     with pytest.raises(ValueError, match="roofs 'thatched'; one of flat, mixed"):
         city(roofs="thatched")
+
+
+def test_footprints_have_the_tags_of_their_roofs(tmp_path: Path) -> None:
+    files = write_city(tmp_path, size=200, buildings=40, density=0.1, roofs="mixed")
+    meta, _, _, columns = pyogrio.raw.read(files.footprints)
+    tags = dict(zip(meta["fields"].tolist(), columns, strict=True))
+    truth = json.loads(files.truth.read_text())["buildings"]
+    assert len(truth) == len(tags["id"]) == 40
+    seen = set()
+    for k, house in enumerate(truth):
+        shape, planes = tags["roof:shape"][k], np.array(house["wings"][0]["planes"])
+        seen.add(shape)
+        assert tags["height"][k] == pytest.approx(house["roof"] - house["ground"], abs=2e-3)
+        assert tags["roof:height"][k] == pytest.approx(house["roof"] - house["eaves"], abs=2e-3)
+        assert (tags["roof:orientation"][k] in ("along", "across")) == (shape in ("gabled", "gambrel"))
+        assert (shape in ("mansard", "gambrel")) == (house["type"] == "mansard")
+        if shape == "skillion":
+            angle = math.radians(tags["roof:direction"][k])
+            downhill = planes[0, 0] * math.sin(angle) + planes[0, 1] * math.cos(angle)
+            assert downhill == pytest.approx(-math.hypot(*planes[0, :2]), rel=1e-4)
+        else:
+            assert np.isnan(tags["roof:direction"][k])
+    assert {"flat", "skillion", "gabled", "hipped"} <= seen
+    plain = write_city(tmp_path / "flat", size=200, buildings=4, density=0.1)
+    assert pyogrio.read_info(plain.footprints)["fields"].tolist() == ["id"]
+    assert pyogrio.read_info(files.shapefile)["fields"].tolist() == ["id"]

@@ -5,6 +5,7 @@ import pytest
 import shapely
 
 from pipeline.data.citymodel import CityModel
+from pipeline.data.roof_forms import NO_FORM, ROOF_SHAPES
 from pipeline.data.roofs import ROOF_FALLBACKS, ROOF_METHODS, Roofs
 from pipeline.quality.building_facts import describe_roofs
 from pipeline.quality.point_fidelity import HouseFidelity, measure_houses
@@ -12,6 +13,7 @@ from pipeline.quality.roof_fits import WORST, RoofFits
 from pipeline.roofs.roof_points import make_roof_points
 
 PLANES, FAMILY, FLAT = (np.int8(ROOF_METHODS.index(name)) for name in ("planes", "family", "flat"))
+NO_FORMS = np.full(3, NO_FORM)
 FEW = np.int8(ROOF_FALLBACKS.index("few roof points"))
 
 
@@ -34,9 +36,11 @@ def make_fit(n: list[int], rmse: list[float], median: list[float], within: list[
 
 def test_attributes_of_roofs() -> None:
     fit = make_fit([80, 20, 0], [1.0, 3.0, np.nan], [0.1, 0.5, np.nan], [0.75, 0.25, np.nan])
-    told = describe_roofs(make_model(), np.array([PLANES, PLANES, FLAT]), np.array([0, 0, FEW]), fit)
+    forms = np.array([-2, -2, ROOF_SHAPES.index("flat")])
+    told = describe_roofs(make_model(), np.array([PLANES, PLANES, FLAT]), np.array([0, 0, FEW]), forms, fit)
     assert told["roof_method"] == ["planes", "planes", "flat"]
     assert told["roof_fallback"] == ["", "", "few roof points"]
+    assert told["roof_form"] == ["", "", "flat"]
     assert told["roof_parts"] == [2, 2, 1]
     assert told["roof_planes"] == [2, 2, 1]
     assert told["roof_density"] == [2.0, 0.5, 0.0]
@@ -52,7 +56,7 @@ def test_fit_by_method_and_the_worst_houses() -> None:
     fits, model = RoofFits(), make_model()
     fit = make_fit([80, 20, 100], [1.0, 3.0, 2.0], [0.1, 0.5, 0.2], [0.75, 0.25, 0.5])
     method = np.array([PLANES, PLANES, FLAT])
-    fits.add(model, method, fit, describe_roofs(model, method, np.array([0, 0, FEW]), fit))
+    fits.add(model, method, fit, describe_roofs(model, method, np.array([0, 0, FEW]), NO_FORMS, fit))
     assert fits.by_method() == {
         "planes": {"buildings": 2, "points": 100, "rmse": round(2.6**0.5, 4), "median": 0.3, "within": 0.65},
         "flat": {"buildings": 1, "points": 100, "rmse": 2.0, "median": 0.2, "within": 0.5},
@@ -72,7 +76,7 @@ def test_houses_without_points_or_with_few_are_not_listed() -> None:
     fits, model = RoofFits(), make_model()
     fit = make_fit([0, 0, 7], [np.nan, np.nan, 9.0], [np.nan, np.nan, 1.0], [np.nan, np.nan, 0.0])
     method = np.array([FAMILY, FAMILY, FLAT])
-    fits.add(model, method, fit, describe_roofs(model, method, np.array([0, 0, 0]), fit))
+    fits.add(model, method, fit, describe_roofs(model, method, np.array([0, 0, 0]), NO_FORMS, fit))
     assert fits.worst == []
     assert fits.by_method()["family"] == {"buildings": 2, "points": 0}
 
@@ -94,7 +98,12 @@ def test_the_worst_of_many_blocks_do_not_depend_on_their_order() -> None:
         for k in order:
             model, fit = blocks[k]
             method = np.full(len(model), FLAT)
-            fits.add(model, method, fit, describe_roofs(model, method, np.zeros(len(model), np.int8), fit))
+            fits.add(
+                model,
+                method,
+                fit,
+                describe_roofs(model, method, np.zeros(len(model), np.int8), np.full(len(model), NO_FORM), fit),
+            )
         found.append(fits.worst)
     assert found[0] == found[1]
     assert len(found[0]) == WORST

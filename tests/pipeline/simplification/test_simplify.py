@@ -19,6 +19,7 @@ from pipeline.data.classes import BUILDING
 from pipeline.data.mesh import Marker
 from pipeline.data.notes import count_notes
 from pipeline.data.pointcloud import PointCloud
+from pipeline.data.roof_forms import HEIGHT, POINTS_TELL, ROOF_SHAPES, SHAPE, no_forms
 from pipeline.data.roofs import ROOF_FALLBACKS, ROOF_METHODS
 from pipeline.quality.building_facts import describe_buildings, measure_model
 from pipeline.simplification.house_clusters import Shapes
@@ -103,6 +104,37 @@ def test_a_house_of_one_height_tells_why() -> None:
     told = dict(zip(city.model.ids.tolist(), (ROOF_FALLBACKS[k] for k in city.roof_fallback), strict=True))
     assert told == {"house-0": "", "house-1": "few roof points", "house-2": "no roof points"}
     assert {ROOF_METHODS[k] for k in city.roof_method.tolist()} == {"flat"}
+
+
+def formed(shape: str, height: float) -> Footprints:
+    """The front house with the form of a roof by its attributes."""
+    forms = no_forms(1)
+    forms[0, [SHAPE, HEIGHT]] = ROOF_SHAPES.index(shape), height
+    return dataclasses.replace(footprints_of(FRONT), forms=forms)
+
+
+def test_with_skeletons_a_given_form_stays_whole_whatever_points_say() -> None:
+    cloud = cloud_over(BOUNDS, [(FRONT, 12.0)], spacing=1.0)
+    city = planar_city(formed("gabled", 4.0), cloud, options=dataclasses.replace(PLANAR, roofs="skeleton"))
+    assert [ROOF_SHAPES[form] for form in city.roof_form.tolist()] == ["gabled", "gabled"]
+    assert {ROOF_METHODS[k] for k in city.roof_method.tolist()} == {"skeleton"}
+    low, high = city.model.roofs.limits.T
+    assert low.tolist() == pytest.approx([low[0]] * 2)
+    assert (high - low).tolist() == pytest.approx([4.0, 4.0])
+    assert low[0] < 12.0 < high[0]
+    assert {note.kind for note in city.notes} & {"footprint-roof-form-off"} == set()  # 1 m in the median, no more
+
+
+def test_with_planes_points_tell_the_roof_where_they_are_enough() -> None:
+    options = dataclasses.replace(PLANAR, roofs="planes")
+    enough = planar_city(formed("gabled", 4.0), cloud_over(BOUNDS, [(FRONT, 12.0)], spacing=1.0), options=options)
+    assert enough.roof_form.tolist() == [POINTS_TELL]
+    assert enough.model.roof.tolist() == pytest.approx([12.0])
+    few = planar_city(formed("gabled", 4.0), cloud_over(BOUNDS, [(FRONT, 12.0)], spacing=5.0), options=options)
+    assert [ROOF_SHAPES[form] for form in few.roof_form.tolist()] == ["gabled", "gabled"]
+    flat = planar_city(formed("flat", 4.0), cloud_over(BOUNDS, [(FRONT, 12.0)], spacing=5.0), options=options)
+    assert [ROOF_FALLBACKS[k] for k in flat.roof_fallback.tolist()] == [""]
+    assert [ROOF_SHAPES[form] for form in flat.roof_form.tolist()] == ["flat"]
 
 
 def test_a_house_without_room_is_lost_and_told() -> None:

@@ -109,7 +109,7 @@ def compare_all(polygons: Sequence[shapely.Polygon]) -> None:
 
 @pytest.mark.parametrize("name", HAND)
 def test_hand_made_outlines_have_the_nodes_of_cgal(name: str) -> None:
-    if not name.startswith("courtyard at"):  # it takes no courtyard that touches the outline
+    if not name.startswith("courtyard at"):  # polygons that the peer splits differently
         compare_nodes(HAND[name])
     check_faces(HAND[name], straight_skeleton(HAND[name]), 0.005)
 

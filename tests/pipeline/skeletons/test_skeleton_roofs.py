@@ -8,10 +8,10 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.data.roof_forms import ROOF_SHAPES
 from pipeline.data.roofs import is_flat, roof_heights
 from pipeline.skeletons.part_cycles import LevelCuts, join_cycles
 from pipeline.skeletons.skeleton_roofs import (
-    ROOF_SHAPES,
     RoofForm,
     ShapedRoof,
     find_gables,
@@ -246,3 +246,27 @@ def test_forms_that_are_none_are_refused(form: RoofForm) -> None:
 def test_roofs_over_footprints_are_closed(shared_data: Path, shape: str) -> None:
     for polygon in read_footprints(shared_data)[::3]:
         check_roof(polygon, skeleton_roofs(polygon, 10.0, RoofForm(shape, height=3.0)))
+
+
+@pytest.mark.parametrize(
+    ("form", "ridge"),
+    [
+        (RoofForm("gabled"), [(0, 3), (10, 3)]),
+        (RoofForm("gabled", across=True), [(5, 0), (5, 6)]),
+        (RoofForm("gabled", direction=80), [(5, 0), (5, 6)]),  # looks to the east and to the west
+        (RoofForm("gabled", direction=190, across=True), [(0, 3), (10, 3)]),
+    ],
+)
+def test_the_ridge_of_a_gabled_roof_over_four_sides_runs_as_told(
+    form: RoofForm, ridge: list[tuple[float, float]]
+) -> None:
+    outline = shapely.Polygon([(0, 0), (4, 0), (10, 0), (10, 6), (0, 6)])  # one side in two pieces
+    roof = skeleton_roofs(outline, 0.0, form)
+    highest = roof.nodes[roof.height > roof.height.max() - 1e-9]
+    np.testing.assert_allclose(sorted(highest.round(9).tolist())[:: len(highest) - 1], ridge, atol=1e-9)
+    check_roof(outline, roof)
+
+
+def test_an_orientation_says_nothing_over_more_than_four_sides() -> None:
+    one, two = (skeleton_roofs(HAND["L"], 0.0, RoofForm("gabled", across=across)) for across in (False, True))
+    assert one.height.tolist() == two.height.tolist()

@@ -38,6 +38,7 @@ def make_houses() -> Houses:
         flat_roofs(np.array([np.nan, 4.0, 6.0])),
         np.array([3, 0], np.int8),
         np.array([True, False]),
+        np.array([4, -2], np.int8),
         BuildingPoints(*roof, *ground),
     )
 
@@ -53,6 +54,7 @@ def test_houses_come_back_whole() -> None:
     assert found.roofs.plane[1:].tolist() == [[0.0, 0.0, 4.0], [0.0, 0.0, 6.0]]
     assert found.method.tolist() == [3, 0]
     assert found.too_few.tolist() == [True, False]
+    assert found.form.tolist() == [4, -2]
 
 
 @pytest.mark.parametrize("names", [ARRAYS_TO_SHAPE, ARRAYS_TO_RAISE])
@@ -64,6 +66,7 @@ def test_houses_are_taken_and_joined_without_what_was_not_read(names: tuple[str,
     assert found.parts.house.tolist() == [0, 0, 1]
     assert found.roofs.plane[:2, 2].tolist() == [4.0, 6.0]
     assert found.method.tolist() == [0, 3]
+    assert found.form.tolist() == [-2, 4]
     if names == ARRAYS_TO_SHAPE:
         assert (found.parts.polygons == houses.parts.polygons[[1, 2, 0]]).all()
         assert unpack_houses(packed).points.roof_start.tolist() == [0, 0, 0, 0]
@@ -90,6 +93,7 @@ def make_town() -> Buildings:
         HouseFidelity(rows, *np.zeros((5, len(rows)))),
         (rows % 4).astype(np.int8),
         (rows % 3).astype(np.int8),
+        (rows % 5 - 1).astype(np.int8),
     )
 
 

@@ -12,6 +12,7 @@ import shapely
 
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.errors import InputError
+from pipeline.data.roof_forms import NO_FORM
 from pipeline.data.roofs import NOT_FITTED, flat_roofs
 from pipeline.quality.point_fidelity import HouseFidelity
 from tests.helpers.cityjson_rules import file_faults, solid_faults
@@ -52,7 +53,16 @@ def make_town(n: int, *, seed: int = 4) -> Buildings:
     zeros = np.zeros(len(ids), np.int8)
     methods = np.full(len(ids), NOT_FITTED, np.int8)
     return Buildings(
-        model, zeros, ground + 8.5, ground, np.arange(len(ids)), zeros.astype(np.int32), fit, methods, zeros
+        model,
+        zeros,
+        ground + 8.5,
+        ground,
+        np.arange(len(ids)),
+        zeros.astype(np.int32),
+        fit,
+        methods,
+        zeros,
+        np.full(len(ids), NO_FORM, np.int8),
     )
 
 

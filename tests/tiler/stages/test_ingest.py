@@ -61,6 +61,7 @@ def take_rows(rows: FootprintRows, first: int, stop: int) -> FootprintRows:
         rows.wkb_start[first : stop + 1],
         rows.ids[first:stop],
         rows.given_height[first:stop],
+        rows.forms[first:stop],
         rows.box[first:stop],
     )
 
@@ -394,6 +395,7 @@ def notes_of(blocks: list[FootprintBlock]) -> list[Note]:
 def assert_same(one: Footprints, two: Footprints) -> None:
     assert one.ids.tolist() == two.ids.tolist()
     np.testing.assert_array_equal(one.given_height, two.given_height)
+    np.testing.assert_array_equal(one.forms, two.forms)
     assert shapely.equals_identical(shapely.normalize(one.polygons), shapely.normalize(two.polygons)).all()
 
 
@@ -430,6 +432,7 @@ def test_a_tile_reads_the_rows_of_its_cells_alone(tmp_path: Path, monkeypatch: p
         layer="",
         id_attribute="",
         height_attribute="h",
+        roof_attribute="",
     )
     context = SimpleNamespace(crs=RD.to_wkt(), bounds=REGION)
     layout = Layout(tiles=tiles, bounds=REGION)
@@ -441,10 +444,12 @@ def test_a_tile_reads_the_rows_of_its_cells_alone(tmp_path: Path, monkeypatch: p
     engine.run(outlines)
     for name, box in tiles.items():
         arrays, _ = engine.store.read("outlines", name)
-        found = Footprints(unpack_polygons(arrays, "outline"), arrays["ids"], arrays["given_height"])
+        found = Footprints(
+            unpack_polygons(arrays, "outline"), arrays["ids"], arrays["given_height"], arrays["forms"]
+        )
         assert_same(found, read_footprints(path, crs=RD, bounds=box, height_attribute="h")[0])
         assert (len(found.ids) > 3) == (name != "4_4")
-    assert {array for array, _ in asked} == {"wkb", "wkb_end", "id", "id_end", "given_height", "box"}
+    assert {array for array, _ in asked} == {"wkb", "wkb_end", "id", "id_end", "given_height", "forms", "box"}
     assert max(count for array, count in asked if array.endswith("_end")) < 100
 
 

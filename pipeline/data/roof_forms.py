@@ -1,0 +1,26 @@
+"""What attributes of footprints say of their roofs, in numbers: one row a footprint (step 1.2)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+# The shapes that a roof may be given, in the words of ``roof:shape`` of OpenStreetMap.
+ROOF_SHAPES = ("flat", "skillion", "hipped", "pyramidal", "gabled", "half-hipped", "mansard", "gambrel")
+# Columns of an array of forms, float64 (n, 6); NaN where nothing is said, in all columns where there is no shape:
+# the index into `ROOF_SHAPES`; the height of the roof from the eaves to its highest ridge (m); its slope;
+# where it looks downhill (degrees clockwise from north); 1 for a ridge along the shorter side, 0 for the longer;
+# 1 where the height of the footprint is that of the eaves, as levels count, and not that of the ridge.
+SHAPE, HEIGHT, SLOPE, DIRECTION, ACROSS, TO_EAVES = range(6)
+N_COLUMNS = 6
+# What became of the form of a house, besides the index of its shape where the house has it: negative codes.
+NO_FORM = -1
+POINTS_TELL, TOO_LOW, NO_SKELETON, NO_HEIGHT = -2, -3, -4, -5
+
+
+def no_forms(n: int) -> NDArray[np.float64]:
+    """Give n footprints no form, float64 (n, 6)."""
+    return np.full((n, N_COLUMNS), np.nan)
+
+
+def form_order(forms: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Columns of forms as keys for `numpy.lexsort`: they tell footprints apart that differ in nothing else."""
+    return [forms[:, column] for column in range(N_COLUMNS)]
