@@ -15,7 +15,9 @@ ONE = np.array([shapely.box(0, 0, 10, 10)], object)
 def refit_one(plane: tuple[float, float, float], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """The plane of one face after it."""
     roofs = Roofs(np.array([plane]), np.zeros((1, 2)), np.array([[-99.0, 99.0]]))
-    return refit_roofs(roofs, ONE, make_roof_points(np.array([0, len(xyz)]), xyz), max_slope=1.7).plane[0]
+    found = refit_roofs(roofs, ONE, make_roof_points(np.array([0, len(xyz)]), xyz), max_slope=1.7)
+    row: NDArray[np.float64] = found.plane[0]
+    return row
 
 
 def test_roofs_of_faces_move_to_their_points() -> None:
