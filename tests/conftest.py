@@ -40,6 +40,16 @@ def shared_data() -> Path:
     return SHARED
 
 
+@pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw pictures and those of reports of few pixels, for time."""
+    from tiler.pictures.render import SIZES
+
+    monkeypatch.setattr("tiler.report.pictures.SIZE", (112, 70))
+    for what in SIZES:
+        monkeypatch.setitem(SIZES, what, (300, 150))
+
+
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Finished run of a synthetic city on four tiles, not to be changed."""

@@ -225,18 +225,17 @@ def test_patterns_do_not_follow_links_in_circles(city: Path, capsys: Capture) ->
 
 def test_nested_geometries_do_not_end_the_process(city: Path) -> None:
     """GEOS recurses and ends the process by a signal where the stack ends."""
-    for levels, kind in ((100_000, 6), (100_000, 7), (2_000_000, 6)):
-        put_wkb(city / "house.gpkg", nested_wkb(levels, kind))
-        found = call_apart(*arguments(city, "--overwrite"), megabytes=900)
-        check_call(found)
-        assert found.code == 1, found  # no building was meshed
-        notes = json.loads((city / "out" / "run.json").read_text())["notes"]
-        assert notes["footprint-unreadable"]["count"] == 1
-    write_parquet(city / "house.parquet", [nested_wkb(100_000), shapely.to_wkb(HOUSE)])
+    put_wkb(city / "house.gpkg", nested_wkb(2_000_000, 6))
+    found = call_apart(*arguments(city), megabytes=900)
+    check_call(found)
+    assert found.code == 1, found  # no building was meshed
+    notes = json.loads((city / "out" / "run.json").read_text())["notes"]
+    assert notes["footprint-unreadable"]["count"] == 1
+    write_parquet(city / "house.parquet", [nested_wkb(100_000, 7), nested_wkb(100_000), shapely.to_wkb(HOUSE)])
     found = call_apart(*arguments(city, "--overwrite", houses="house.parquet"), megabytes=900)
     assert found.code == 3, found
     record = json.loads((city / "out" / "run.json").read_text())
-    assert record["counts"]["buildings"] == record["notes"]["footprint-unreadable"]["count"] == 1
+    assert (record["counts"]["buildings"], record["notes"]["footprint-unreadable"]["count"]) == (1, 2)
 
 
 def circle(n: int) -> shapely.Polygon:
@@ -256,9 +255,8 @@ def test_a_footprint_of_a_million_vertices_is_left_out_and_told(city: Path, caps
     assert record["counts"]["buildings"] == 1
 
 
-@pytest.mark.parametrize("n", [20_000, 99_000])
-def test_a_ragged_footprint_of_many_vertices_takes_seconds(city: Path, n: int) -> None:
-    write_houses(city / "house.gpkg", [circle(n)])
+def test_a_ragged_footprint_of_many_vertices_takes_seconds(city: Path) -> None:
+    write_houses(city / "house.gpkg", [circle(99_000)])
     found = call_apart(*arguments(city, "--allow-empty"), megabytes=700, timeout=90)
     check_call(found)
     assert found.code == 0, found
