@@ -504,7 +504,7 @@ def test_real_data_with_finite_elements_is_the_same_city(shared_data: Path, tmp_
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", rounds(range(6), range(6, 20)))
+@pytest.mark.parametrize("seed", rounds(range(3), range(3, 20)))
 def test_random_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
     """Synthetic cities of any density and relief, from files to files."""
     rng = np.random.default_rng(seed)

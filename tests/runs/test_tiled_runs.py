@@ -419,7 +419,7 @@ def prove_straight(out: Path, tiles: list[str]) -> None:
 
 
 REAL = [
-    ("amsterdam_no_building_class", "amsterdam/footprints.shp", (200.0, 370.0)),
+    ("amsterdam_no_building_class", "amsterdam/footprints.shp", (200.0,)),
     ("amsterdam_west_small", "amsterdam_west_small/footprints.gpkg", (150.0, 260.0)),
 ]
 
@@ -530,7 +530,7 @@ def test_the_model_of_real_blocks_knows_no_tiles_and_no_workers(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", rounds(range(10), range(10, 50)))
+@pytest.mark.parametrize("seed", rounds(range(6), range(6, 50)))
 def test_random_tiled_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
     """Cities of any density, size of blocks and relief in 9 to 25 tiles, from files to files."""
     rng = np.random.default_rng(seed)

@@ -20,6 +20,7 @@ from pipeline.simplification.labels import Territories
 from pipeline.simplification.planar import COUNTS, PlanarCity, find_clusters, simplify_planar
 from pipeline.simplification.snap import node_crossings, straighten
 from pipeline.simplification.square_cells import draw_cells
+from tests.helpers.campaigns import examples
 
 EPS, MIN_AREA, MIN_COURTYARD = 0.5, 5.0, 5.0
 
@@ -398,7 +399,7 @@ def streets(draw: st.DrawFn) -> list[Polygon]:
     return houses
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(streets(), st.sampled_from([0.3, 0.5, 1.0]), st.booleans(), st.randoms(use_true_random=False))
 def test_promises_hold_for_any_street_in_any_order(
     houses: list[Polygon], clearance: float, manifold: bool, shuffler: object
