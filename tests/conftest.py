@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT.parent / "shared" / "data"
 
 
 def pytest_configure() -> None:
@@ -25,11 +26,17 @@ def pytest_configure() -> None:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile kernels before tests begin, once: the first of those with a time limit would have to."""
+    """Compile kernels before tests begin, on two cores: the first test with a time limit would have to."""
     from tiler.executors.kernels import are_compiled
 
     if not hasattr(session.config, "workerinput") and not are_compiled():
-        subprocess.run([sys.executable, "-m", "tiler.cli.main", "kernels"], check=False, stdout=subprocess.DEVNULL)
+        commands = (["tiler.cli.main", "kernels"], ["tests.helpers.compile_roofs"])
+        started = [
+            subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.DEVNULL, cwd=ROOT)
+            for words in commands
+        ]
+        for process in started:
+            process.wait()
 
 
 @pytest.fixture(scope="session")

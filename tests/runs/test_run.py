@@ -291,7 +291,7 @@ def test_buildings_in_the_cloud_without_footprints_end_with_three(city: Path, tm
     assert main([*command, "--allow-empty"]) == 3
 
 
-@pytest.mark.parametrize("size", ["20", "30", "40"])
+@pytest.mark.parametrize("size", ["20", "40"])
 def test_coarse_meshes_keep_exact_roofs(tmp_path: Path, size: str) -> None:
     """A real block: roofs closer than the least spacing are grouped and raised before they are meshed."""
     block = Path(__file__).resolve().parents[2] / "tiler" / "demo_block"
