@@ -367,17 +367,19 @@ REGIONS = [
     hole, ell, corner_to_corner, single_row, one_tile, one_house, lake, hall, on_corners, negative, odd_sizes,
     clipped, clipped_at_hole, merged_at_hole, manifold, combs, no_houses,
 ]  # fmt: skip
+OF_HOUSES = [clipped, clipped_at_hole, merged_at_hole, manifold, combs, one_house]
 EVERYDAY = [
     (ell, "adaptive"), (ell, "layered"), (lake, "adaptive"), (negative, "layered"),
-    (merged_at_hole, "adaptive"), ("layered"), (corner_to_corner, "adaptive"),
+    (merged_at_hole, "adaptive"), (corner_to_corner, "adaptive"),
 ]  # fmt: skip
 
 
 def region_cases() -> list[Any]:
-    """All regions with either mesher, most of them long."""
-    cases = [(case, mesher) for case in REGIONS for mesher in ("adaptive", "layered")]
+    """All regions with either mesher, most of them long; those of houses with one of them."""
+    some = [(make, mesher) for make in REGIONS for mesher in ("adaptive", "layered")]
+    others = [(make, "layered") for make in OF_HOUSES]
     found = []
-    for make, mesher in cases:
+    for make, mesher in rounds([case for case in some if case not in others], others):
         marks = [] if (make, mesher) in EVERYDAY else [pytest.mark.long]
         found.append(pytest.param(make, mesher, marks=marks, id=f"{make.__name__}-{mesher}"))
     return found
