@@ -192,10 +192,13 @@ def test_amsterdam_without_touching_corners(amsterdam: NDArray[np.object_]) -> N
 
 @pytest.mark.shared
 def test_amsterdam_is_the_same_shuffled_and_cluster_by_cluster(amsterdam: NDArray[np.object_]) -> None:
-    city = simplify(amsterdam, 0.5)
-    order = np.random.default_rng(3).permutation(len(amsterdam))
-    shuffled = simplify(amsterdam[order], 0.5)
+    middle = shapely.get_coordinates(shapely.centroid(amsterdam))
+    houses = amsterdam[(middle < np.median(middle, axis=0)).all(axis=1)]
+    assert len(houses) > 250
+    city = simplify(houses, 0.5)
+    order = np.random.default_rng(3).permutation(len(houses))
+    shuffled = simplify(houses[order], 0.5)
     assert blobs(shuffled) == blobs(city)
     assert np.array_equal(order[shuffled.house], city.house)
-    alone = [simplify(amsterdam[city.cluster == name], 0.5) for name in np.unique(city.cluster)]
+    alone = [simplify(houses[city.cluster == name], 0.5) for name in np.unique(city.cluster)]
     assert sorted(pair for part in alone for pair in blobs(part)) == sorted(blobs(city))
