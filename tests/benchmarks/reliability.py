@@ -73,11 +73,7 @@ def kills_table(record: Any) -> list[str]:
     shares = [find_share(k, TENTHS) for k in range(TENTHS + 1)]
     cells = Counter({(share, kind): found[share, kind] for share in shares for kind in kinds})
     seeds = ", ".join(f"{run['round']} {run['seed']}" for run in record)
-    return [
-        *cross_table(cells, "results there"),
-        "",
-        f"{len(record)} runs ended, by kind and seed: {seeds}.",
-    ]
+    return [*cross_table(cells, "results there"), "", f"{len(record)} runs ended, by kind and seed: {seeds}."]
 
 
 def faults_table(record: Any) -> list[str]:

@@ -10,11 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 # What each package may import of ours.
-ALLOWED = {
-    "pipeline": {"pipeline"},
-    "stitch": {"stitch", "pipeline"},
-    "tiler": {"tiler", "stitch", "pipeline"},
-}
+ALLOWED = {"pipeline": {"pipeline"}, "stitch": {"stitch", "pipeline"}, "tiler": {"tiler", "stitch", "pipeline"}}
 # The steps of the pipeline that stitch may not see: it takes data rooms and steps, never the composition.
 COMPOSING = {"pipeline.city_model.city_steps", "pipeline.simplification.simplify"}
 # Libraries with a clock, a disk or a process, and the only places that may import them.
@@ -28,10 +24,7 @@ HOMES = {
     "meshio": ("tiler/",),
     "rich": ("tiler/",),
     "triangle": ("pipeline/plane_mesh/plane.py",),
-    "numba": (
-        "pipeline/data/kernel.py",
-        "tiler/executors/kernels.py",
-    ),
+    "numba": ("pipeline/data/kernel.py", "tiler/executors/kernels.py"),
 }
 
 

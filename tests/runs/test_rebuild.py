@@ -290,15 +290,9 @@ def test_rings_and_coarse_nodes_are_kept_only_where_a_lake_is_deep(nine: Town) -
     ("change", "first"),
     [
         ({"stagger": 0.5}, {"seams", "columns", "pieces", "report"}),
+        pytest.param({"mesh_size": 9.0}, {"seams", "columns", "pieces", "report"}, marks=pytest.mark.long),
         pytest.param(
-            {"mesh_size": 9.0},
-            {"seams", "columns", "pieces", "report"},
-            marks=pytest.mark.long,
-        ),
-        pytest.param(
-            {"domain_height": 75.0},
-            {"domain", "seams", "columns", "pieces", "report"},
-            marks=pytest.mark.long,
+            {"domain_height": 75.0}, {"domain", "seams", "columns", "pieces", "report"}, marks=pytest.mark.long
         ),
     ],
 )

@@ -540,7 +540,11 @@ REAL = [
     pytest.param("amsterdam_no_building_class", "amsterdam/footprints.shp", QUARTER, 300, marks=LONG),
     pytest.param("amsterdam", "amsterdam/footprints.shp", {"manifold": True}, 1400, marks=LONG),
     pytest.param(
-        "amsterdam", "amsterdam/footprints.shp", {"mesher": "layered", "layer_height": 5.0}, 1400, marks=LONG
+        "amsterdam",
+        "amsterdam/footprints.shp",
+        QUARTER | {"mesher": "layered", "layer_height": 5.0},
+        300,
+        marks=LONG,
     ),
     pytest.param("amsterdam_no_building_class", "amsterdam/footprints.shp", PAPER, 40, marks=LONG),
 ]

@@ -241,11 +241,7 @@ def ell() -> Case:
 def corner_to_corner() -> Case:
     """Two files that touch in a corner."""
     region = box(280, 280, west=WEST, south=SOUTH)
-    return (
-        make_town(region, crowded_blocks(region, 50, seed=5), relief=20),
-        without(2, 2, [(0, 1), (1, 0)]),
-        {},
-    )
+    return (make_town(region, crowded_blocks(region, 50, seed=5), relief=20), without(2, 2, [(0, 1), (1, 0)]), {})
 
 
 def single_row() -> Case:
@@ -356,10 +352,7 @@ def no_houses() -> Case:
     return (
         make_town(region, [shapely.box(X + 10, Y + 10, X + 20, Y + 20)], relief=20),
         {},
-        {
-            "bounds": bounds,
-            "allow_empty": True,
-        },
+        {"bounds": bounds, "allow_empty": True},
     )
 
 

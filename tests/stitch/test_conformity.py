@@ -92,10 +92,7 @@ def test_faces_are_those_of_a_brute_force_count(cells: list[list[int]]) -> None:
     same_side = sorted(face for face in faces if count[tuple(sorted(face))] == 2 and oriented[face] == 2)
     array = np.array(cells, np.int32).reshape(-1, 4)
 
-    for pairs in (
-        pair_cell_faces(array, 8),
-        pair_faces(np.array(faces, np.int32).reshape(-1, 3)),
-    ):
+    for pairs in (pair_cell_faces(array, 8), pair_faces(np.array(faces, np.int32).reshape(-1, 3))):
         assert names(pairs.exterior) == exterior
         assert names(pairs.shared) == shared
         assert names(pairs.same_side) == same_side

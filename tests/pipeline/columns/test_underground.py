@@ -256,12 +256,7 @@ def four(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
 
 @pytest.mark.parametrize(
     ("tiles", "mesher"),
-    [
-        (1, "adaptive"),
-        (1, "layered"),
-        (2, "layered"),
-        pytest.param(3, "adaptive", marks=pytest.mark.long),
-    ],
+    [(1, "adaptive"), (1, "layered"), (2, "layered"), pytest.param(3, "adaptive", marks=pytest.mark.long)],
 )
 def test_soil_is_proved(tiles: int, mesher: str, tmp_path: Path) -> None:
     size = SIZE * max(tiles, 2)

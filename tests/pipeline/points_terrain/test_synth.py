@@ -49,7 +49,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SynthFiles]
 
 
 def test_same_seed_same_bytes(tmp_path: Path) -> None:
-    first, city = tmp_path / "first", {"size": 600, "buildings": 60, "density": 0.1}
+    first = tmp_path / "first"
+    city: Any = {"size": 600, "buildings": 60, "density": 0.1}
     write_city(first, **city)
     time.sleep(1.1)  # a clock in a file would show
     write_city(tmp_path / "again", **city)

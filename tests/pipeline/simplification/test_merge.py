@@ -224,10 +224,7 @@ UNSOUND = {
         Polygon([(0, 0), (10, 0), (10, 4), (3, 4), (3, 4.05), (10, 4.05), (10, 9), (0, 9)]),
         "repaired-simplify",
     ),
-    "thin neck": (
-        box(0, 0, 9, 9).union(box(12, 0, 21, 9)).union(box(5, 4, 15, 4.06)),
-        "repaired-buffer",
-    ),
+    "thin neck": (box(0, 0, 9, 9).union(box(12, 0, 21, 9)).union(box(5, 4, 15, 4.06)), "repaired-buffer"),
     "thin wall beside a court": (box(0, 0, 20, 20).difference(box(0.06, 5, 15, 15)), "repaired-buffer"),
     "sharp corner": (Polygon([(0, 0), (40, 0), (40, 3)]), "repaired-buffer"),
     "sharp notch": (

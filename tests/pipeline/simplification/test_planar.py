@@ -321,10 +321,7 @@ def test_crossings_are_noded_on_the_grid_but_in_spared_clusters() -> None:
     square = np.array([[0, 0], [1000, 1001], [0, 1000], [1000, 0.0]])
     edges = np.array([[0, 1], [2, 3], [0, 2], [1, 3]])
     graph = make_graph(
-        np.concatenate((square, square)),
-        np.repeat([0, 1], 4),
-        np.concatenate((edges, edges + 4)),
-        np.zeros(8),
+        np.concatenate((square, square)), np.repeat([0, 1], 4), np.concatenate((edges, edges + 4)), np.zeros(8)
     )
     noded, where = node_crossings(graph, np.array([1]))
     assert where.tolist() == [0]

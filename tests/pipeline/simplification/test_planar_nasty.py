@@ -26,11 +26,7 @@ GROUPS = [*range(1, 20), *range(57, 99), *range(141, 189), *range(199, 214)]
 
 def simplify(polygons: NDArray[np.object_], clearance: float, *, manifold: bool = False) -> PlanarCity:
     return simplify_planar(
-        polygons,
-        clearance=clearance,
-        min_area=MIN_AREA,
-        min_courtyard_area=MIN_COURTYARD,
-        manifold=manifold,
+        polygons, clearance=clearance, min_area=MIN_AREA, min_courtyard_area=MIN_COURTYARD, manifold=manifold
     )
 
 

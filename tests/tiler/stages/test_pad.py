@@ -318,8 +318,7 @@ def edit_record(out: Path, **region: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("region", "kind"),
-    [({"rim": 1.0}, "rim-uneven"), ({"core": [CORE[0] + 90.0, *CORE[1:]]}, "house-in-pad")],
+    ("region", "kind"), [({"rim": 1.0}, "rim-uneven"), ({"core": [CORE[0] + 90.0, *CORE[1:]]}, "house-in-pad")]
 )
 def test_the_check_tells_a_rim_that_is_uneven_and_a_house_in_the_pad(
     region: dict[str, Any], kind: str, padded: tuple[dict[str, Any], Path], tmp_path: Path

@@ -370,27 +370,9 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
     ("shapefile without index", shapefile_without(".shx"), "house.shp", 1, "SHAPE_RESTORE_SHX"),
     ("shapefile without table", shapefile_without(".dbf"), "house.shp", 0, ""),
     ("shapefile without CRS", shapefile_without(".prj"), "house.shp", 0, "the footprint file states no CRS"),
-    (
-        "NaN",
-        raw(polygon_wkb([*CORNERS[:2], (float("nan"), 0.0), CORNERS[3]])),
-        "house.gpkg",
-        1,
-        NO_NUMBER,
-    ),
-    (
-        "infinite",
-        raw(polygon_wkb([*CORNERS[:2], (float("inf"), 0.0), CORNERS[3]])),
-        "house.gpkg",
-        1,
-        NO_NUMBER,
-    ),
-    (
-        "huge",
-        raw(polygon_wkb([*CORNERS[:2], (1e300, 1e300), CORNERS[3]])),
-        "house.gpkg",
-        1,
-        NO_NUMBER,
-    ),
+    ("NaN", raw(polygon_wkb([*CORNERS[:2], (float("nan"), 0.0), CORNERS[3]])), "house.gpkg", 1, NO_NUMBER),
+    ("infinite", raw(polygon_wkb([*CORNERS[:2], (float("inf"), 0.0), CORNERS[3]])), "house.gpkg", 1, NO_NUMBER),
+    ("huge", raw(polygon_wkb([*CORNERS[:2], (1e300, 1e300), CORNERS[3]])), "house.gpkg", 1, NO_NUMBER),
     (
         "large",
         raw(polygon_wkb([*CORNERS[:2], (9e7, 9e7), CORNERS[3]])),
@@ -399,13 +381,7 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
         "1 footprint on the region's border was clipped",
     ),
     ("claimed vertices", raw(polygon_wkb(CORNERS, 2**31)), "house.gpkg", 1, UNREADABLE),
-    (
-        "claimed polygons",
-        raw(struct.pack("<BII", 1, 6, 2**32 - 1)),
-        "house.gpkg",
-        1,
-        UNREADABLE,
-    ),
+    ("claimed polygons", raw(struct.pack("<BII", 1, 6, 2**32 - 1)), "house.gpkg", 1, UNREADABLE),
     (
         "an id that is no UTF-8",
         written(geojson(CORNERS).encode().replace(b'"a"', b'"\xe1"'), "a.geojson"),
@@ -415,13 +391,7 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
     ),
     ("a curve", raw(struct.pack("<BIII", 1, 10, 1, 0)), "house.gpkg", 1, "no building was meshed"),
     ("no geometry at all", raw(b""), "house.gpkg", 1, "no building was meshed"),
-    (
-        "an unknown kind",
-        raw(struct.pack("<BII", 1, 999, 1)),
-        "house.gpkg",
-        1,
-        UNREADABLE,
-    ),
+    ("an unknown kind", raw(struct.pack("<BII", 1, 999, 1)), "house.gpkg", 1, UNREADABLE),
 ]
 
 
@@ -429,13 +399,7 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
     ("damage", "name", "code", "text"), [case[1:] for case in FOOTPRINTS], ids=[case[0] for case in FOOTPRINTS]
 )
 def test_footprints(
-    city: Path,
-    capsys: Capture,
-    monkeypatch: pytest.MonkeyPatch,
-    damage: Damage,
-    name: str,
-    code: int,
-    text: str,
+    city: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch, damage: Damage, name: str, code: int, text: str
 ) -> None:
     monkeypatch.setattr("tiler.objects.requests.FIRST_PATIENCE", 0.1)
     trust_addresses(True)  # as after an earlier run
