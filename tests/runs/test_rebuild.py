@@ -349,22 +349,6 @@ def test_the_record_says_that_a_run_is_at_work_before_anything_goes(
             run(town.config(town.out, overwrite=overwrite))
 
 
-def test_tiles_that_are_gone_leave_nothing(nine: Town, tmp_path: Path) -> None:
-    town = nine.copy(tmp_path)
-    _, ran = update(town, tile_size=2 * TILE)
-    assert stages(ran).isdisjoint({"points", "footprints"})
-    prove_fresh(town, tmp_path / "fresh", tile_size=2 * TILE)
-    assert len(list((town.out / "mesh").iterdir())) == 1
-
-
-def test_overwrite_starts_anew(nine: Town, tmp_path: Path) -> None:
-    town = nine.copy(tmp_path)
-    record, ran = update(town, overwrite=True)
-    assert record["reused"] == {}
-    assert ran == set(results(nine.out))
-    assert hashes(town.out) == hashes(nine.out)
-
-
 def test_a_folder_whose_record_is_not_ours_is_refused_and_so_is_one_at_work(nine: Town, tmp_path: Path) -> None:
     town = nine.copy(tmp_path)
     with only_run(town.out), pytest.raises(ConfigError, match="another run is at work there"):

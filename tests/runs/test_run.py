@@ -147,6 +147,9 @@ def test_a_run_says_how_many_tasks_ran_and_leaves_other_files_alone(
     assert main(arguments(city, out)) == 0
     assert f"0 of {tasks} tasks ran, {tasks} results were there\n" in capsys.readouterr().out
     assert hashes(out).items() >= before.items()
+    assert main(arguments(city, out, "--overwrite")) == 0
+    assert f"{tasks} of {tasks} tasks ran, 0 results were there\n" in capsys.readouterr().out
+    assert {name: value for name, value in hashes(out).items() if name != "mine.txt"} == before
     assert main(arguments(city, out, "--overwrite", "--mesh-size", "20")) == 0
     assert f"{tasks} of {tasks} tasks ran, 0 results were there\n" in capsys.readouterr().out
     assert (out / "mine.txt").read_text() == "keep"
