@@ -1,5 +1,6 @@
 """Fixtures that all tests share."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -8,21 +9,34 @@ from typing import Any
 
 import pytest
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT.parent / "shared" / "data"
 
 
 def pytest_configure() -> None:
-    """Let interrupts through: what a shell starts in the background ignores them, and so do its children."""
+    """Write bytecode and let interrupts through, whatever the shell says.
+
+    Without bytecode each of the many processes that tests start would compile all packages anew: 0.8 s of
+    processor time each. What a shell starts in the background ignores interrupts, and so do its children.
+    """
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile kernels before tests begin, once: the first of those with a time limit would have to."""
+    """Compile kernels before tests begin, on two cores: the first test with a time limit would have to."""
     from tiler.executors.kernels import are_compiled
 
     if not hasattr(session.config, "workerinput") and not are_compiled():
-        subprocess.run([sys.executable, "-m", "tiler.cli.main", "kernels"], check=False, stdout=subprocess.DEVNULL)
+        commands = (["tiler.cli.main", "kernels"], ["tests.helpers.compile_roofs"])
+        started = [
+            subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.DEVNULL, cwd=ROOT)
+            for words in commands
+        ]
+        for process in started:
+            process.wait()
 
 
 @pytest.fixture(scope="session")
@@ -31,6 +45,16 @@ def shared_data() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"no real data at {SHARED}")
     return SHARED
+
+
+@pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw pictures and those of reports of few pixels, for time."""
+    from tiler.pictures.render import SIZES
+
+    monkeypatch.setattr("tiler.report.pictures.SIZE", (112, 70))
+    for what in SIZES:
+        monkeypatch.setitem(SIZES, what, (300, 150))
 
 
 @pytest.fixture(scope="session")

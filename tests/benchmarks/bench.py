@@ -24,14 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.benchmarks.bench_report import (
-    AT_ONCE,
-    CHOICE,
-    DOCS,
-    MEASURED,
-    step_seconds,
-    write_report,
-)
+from tests.benchmarks.bench_report import AT_ONCE, CHOICE, DOCS, MEASURED, step_seconds, write_report
 from tests.benchmarks.runs import COMMAND, citystitch, record_of, set_aside
 from tiler.monitoring.events import read_events
 
@@ -44,10 +37,7 @@ TILES_A_SIDE = (8, 16, 32)
 TILES = (250, 500, 850, 1250, 2500)  # m, on 2.5 km
 # What a run is called, its command, its workers and further options.
 Kind = tuple[str, str, int, tuple[str, ...]]
-KINDS: tuple[Kind, ...] = (
-    ("one process", "run", 0, ()),
-    ("2 workers", "run", 2, ()),
-)
+KINDS: tuple[Kind, ...] = (("one process", "run", 0, ()), ("2 workers", "run", 2, ()))
 ONE_WORKER: Kind = ("1 worker", "run", 1, ())
 PACKAGES = ("pipeline", "stitch", "tiler")
 WAYS = (

@@ -217,12 +217,7 @@ def _workers(rows: Rows) -> list[str]:
     lines = []
     for side in dict.fromkeys(row["side"] for row in rows):
         lines += [*_runs([row for row in rows if row["side"] == side], "run as"), ""]
-    return [
-        *lines,
-        *_speedups(rows, "side", "km", 1000, "2 workers"),
-        "",
-        *_limit(rows),
-    ]
+    return [*lines, *_speedups(rows, "side", "km", 1000, "2 workers"), "", *_limit(rows)]
 
 
 def _limit(rows: Rows) -> list[str]:
@@ -248,11 +243,7 @@ def _waits(rows: Rows) -> list[str]:
 
 def _fine(rows: Rows) -> list[str]:
     two = [row for row in rows if row["run as"] == "2 workers"]
-    return [
-        *_runs(two, "mesh size", "mesh size (m)"),
-        "",
-        *_speedups(rows, "mesh size", "m", 1, "2 workers"),
-    ]
+    return [*_runs(two, "mesh size", "mesh size (m)"), "", *_speedups(rows, "mesh size", "m", 1, "2 workers")]
 
 
 def _profile(rows: Rows) -> list[str]:

@@ -133,12 +133,4 @@ def _describe(engine: Engine, seconds: float, found: Record) -> Recorded:
         x, y, _, _ = engine.layout.tiles[found.name]
         facts["extent"] = [value - low for value, low in zip(facts["extent"], (x, y, x, y), strict=True)]
     sizes = [entry[0] if isinstance(entry, list) else entry["size"] for entry in written.values()]
-    return Recorded(
-        seconds,
-        file.stat().st_size,
-        1,
-        sum(sizes),
-        len(sizes),
-        facts,
-        sum(found.notes.values()),
-    )
+    return Recorded(seconds, file.stat().st_size, 1, sum(sizes), len(sizes), facts, sum(found.notes.values()))

@@ -95,12 +95,7 @@ def survey(country: str, n_tiles: int, folder: Path) -> tuple[Config, Plan, dict
 
 
 def drive(
-    config: Config,
-    plan: Plan,
-    executor: Executor,
-    *,
-    stand_in: StandInStore | None = None,
-    stop_after: int = 0,
+    config: Config, plan: Plan, executor: Executor, *, stand_in: StandInStore | None = None, stop_after: int = 0
 ) -> dict[str, Any]:
     """Run all stages of a region and what follows them, as `tiler.workflow.run` does, but for the index files."""
     out = Path(config.out)

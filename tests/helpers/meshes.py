@@ -206,12 +206,7 @@ def _mark(
     corners: NDArray[np.float64], model: CityModel, bounds: tuple[float, float, float, float]
 ) -> tuple[Marker, int]:
     west, south, east, north = bounds
-    sides = {
-        Marker.WEST: (0, west),
-        Marker.EAST: (0, east),
-        Marker.SOUTH: (1, south),
-        Marker.NORTH: (1, north),
-    }
+    sides = {Marker.WEST: (0, west), Marker.EAST: (0, east), Marker.SOUTH: (1, south), Marker.NORTH: (1, north)}
     for marker, (axis, value) in sides.items():
         if np.all(corners[:, axis] == value):
             return marker, -1

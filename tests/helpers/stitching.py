@@ -100,11 +100,7 @@ def amsterdam_scene(folder: Path, bounds: Bounds, simplify: Literal["clearance",
 def select_houses(scene: Scene, chosen: NDArray[np.integer]) -> Scene:
     """Take some houses, in any order."""
     model = scene.model
-    return Scene(
-        take_model(model, chosen),
-        scene.group[chosen],
-        scene.dtm,
-    )
+    return Scene(take_model(model, chosen), scene.group[chosen], scene.dtm)
 
 
 def reach_of(options: Options) -> float:

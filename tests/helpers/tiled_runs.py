@@ -13,14 +13,7 @@ from pipeline.columns.cell_blocks import CellBlocks, UsedPoints, number_used
 from pipeline.columns.columns import find_used_points, split_boundary
 from pipeline.data.mesh import Boundary, ColumnMesh, SeamEdges, TetMesh
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
-from stitch.pieces.numbering import (
-    count_all_points,
-    count_by_part,
-    first_id,
-    number_columns,
-    seam_ids,
-    tile_part,
-)
+from stitch.pieces.numbering import count_all_points, count_by_part, first_id, number_columns, seam_ids, tile_part
 from stitch.seams.facets import Side, find_seam_edges
 from stitch.seams.seam_columns import tile_columns
 from stitch.seams.seams import find_vertices

@@ -160,11 +160,7 @@ def write_town(
 
 
 def write_laz(
-    path: Path,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-    classes: NDArray[np.uint8],
+    path: Path, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64], classes: NDArray[np.uint8]
 ) -> None:
     """Write points in `CRS`, whole centimetres."""
     header = laspy.LasHeader(point_format=6, version="1.4")
@@ -268,10 +264,5 @@ def shuffle_inputs(values: dict[str, Any], folder: Path, *, seed: int) -> dict[s
 def write_footprints(path: Path, polygons: NDArray[np.object_], ids: NDArray[np.object_]) -> None:
     """Write footprints in `CRS`."""
     pyogrio.raw.write(
-        path,
-        geometry=shapely.to_wkb(polygons),
-        field_data=[ids],
-        fields=["id"],
-        geometry_type="Polygon",
-        crs=CRS,
+        path, geometry=shapely.to_wkb(polygons), field_data=[ids], fields=["id"], geometry_type="Polygon", crs=CRS
     )

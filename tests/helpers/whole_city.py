@@ -22,12 +22,7 @@ class TileMesh:
 
 
 def mesh_city(
-    city: City,
-    dtm: Dtm,
-    bounds: Bounds,
-    options: LayeredOptions | AdaptiveOptions,
-    *,
-    min_angle: float = 0.0,
+    city: City, dtm: Dtm, bounds: Bounds, options: LayeredOptions | AdaptiveOptions, *, min_angle: float = 0.0
 ) -> TileMesh:
     """Mesh a city; the bound on the angles of the plane mesh is in degrees, 0 takes the mesher's own."""
     adaptive = isinstance(options, AdaptiveOptions)

@@ -76,10 +76,13 @@ def command(city: SparseCity, out: Path) -> list[str]:
     return city.command(out)[3:]
 
 
-def count_calls(city: SparseCity, out: Path) -> Counter[str]:
+@pytest.fixture(scope="module")
+def calls(small: SparseCity, tmp_path_factory: pytest.TempPathFactory) -> Counter[str]:
+    """Calls of a run to the disk, by kind."""
+    out = tmp_path_factory.mktemp("count") / "out"
     disk = Disk(out, "none", 0, 0)
     with refusing(disk):
-        run(city.config(out))
+        run(small.config(out))
     assert set(CALLS) <= set(disk.calls)
     return disk.calls
 
@@ -90,10 +93,9 @@ SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 6)
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_disk_that_refuses_ends_the_run_with_one_line(
-    small: SparseCity, tmp_path: Path, seed: int, capsys: pytest.CaptureFixture[str]
+    small: SparseCity, calls: Counter[str], tmp_path: Path, seed: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(seed)
-    calls = count_calls(small, tmp_path / "count")
     out = tmp_path / "out"
     for number in ERRORS:
         kind = CALLS[rng.integers(len(CALLS))]

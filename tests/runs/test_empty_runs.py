@@ -36,11 +36,7 @@ def far(xy: NDArray[np.float64]) -> NDArray[np.float64]:
 WAYS = {
     "x and y exchanged": ((swap,), "EPSG:3006", "With x and y exchanged they lie in the region"),
     "latitude first": ((to_degrees, swap), "EPSG:4326", "With x and y exchanged they lie in the region"),
-    "degrees without a CRS": (
-        (to_degrees,),
-        None,
-        "Taken as degrees they lie in the region",
-    ),
+    "degrees without a CRS": ((to_degrees,), None, "Taken as degrees they lie in the region"),
     "latitude first without a CRS": ((to_degrees, swap), None, "Taken as degrees, latitude first"),
     "another place": ((far,), "EPSG:3006", "check --crs"),
 }

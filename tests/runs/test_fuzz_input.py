@@ -28,7 +28,7 @@ from tests.tiler.stages.test_ingest import write_copc
 from tiler.config.config import Config
 
 LIMIT = 30.0  # s a call may take on a busy machine; most take half a second
-FEW, MANY = 10, 60 if ALL_ROUNDS else 25  # cases of a family in the everyday tests and in the campaign
+FEW, MANY = 10, 60 if ALL_ROUNDS else 12  # cases of a family in the everyday tests and in the campaign
 Rng = np.random.Generator
 
 # Fixed fields of a LAS header: place and form.

@@ -290,15 +290,9 @@ def test_rings_and_coarse_nodes_are_kept_only_where_a_lake_is_deep(nine: Town) -
     ("change", "first"),
     [
         ({"stagger": 0.5}, {"seams", "columns", "pieces", "report"}),
+        pytest.param({"mesh_size": 9.0}, {"seams", "columns", "pieces", "report"}, marks=pytest.mark.long),
         pytest.param(
-            {"mesh_size": 9.0},
-            {"seams", "columns", "pieces", "report"},
-            marks=pytest.mark.long,
-        ),
-        pytest.param(
-            {"domain_height": 75.0},
-            {"domain", "seams", "columns", "pieces", "report"},
-            marks=pytest.mark.long,
+            {"domain_height": 75.0}, {"domain", "seams", "columns", "pieces", "report"}, marks=pytest.mark.long
         ),
     ],
 )
@@ -353,22 +347,6 @@ def test_the_record_says_that_a_run_is_at_work_before_anything_goes(
     for overwrite in (False, True):
         with pytest.raises(KeyboardInterrupt):
             run(town.config(town.out, overwrite=overwrite))
-
-
-def test_tiles_that_are_gone_leave_nothing(nine: Town, tmp_path: Path) -> None:
-    town = nine.copy(tmp_path)
-    _, ran = update(town, tile_size=2 * TILE)
-    assert stages(ran).isdisjoint({"points", "footprints"})
-    prove_fresh(town, tmp_path / "fresh", tile_size=2 * TILE)
-    assert len(list((town.out / "mesh").iterdir())) == 1
-
-
-def test_overwrite_starts_anew(nine: Town, tmp_path: Path) -> None:
-    town = nine.copy(tmp_path)
-    record, ran = update(town, overwrite=True)
-    assert record["reused"] == {}
-    assert ran == set(results(nine.out))
-    assert hashes(town.out) == hashes(nine.out)
 
 
 def test_a_folder_whose_record_is_not_ours_is_refused_and_so_is_one_at_work(nine: Town, tmp_path: Path) -> None:

@@ -24,7 +24,6 @@ from tiler.check.check import check_run
 from tiler.cli.main import main
 from tiler.config.config import make_config
 from tiler.interface.synth import write_city
-from tiler.pictures.render import SIZES
 from tiler.store.results import StoredTerrain, read_columns
 from tiler.store.store import Store
 from tiler.workflow.run import run
@@ -148,6 +147,9 @@ def test_a_run_says_how_many_tasks_ran_and_leaves_other_files_alone(
     assert main(arguments(city, out)) == 0
     assert f"0 of {tasks} tasks ran, {tasks} results were there\n" in capsys.readouterr().out
     assert hashes(out).items() >= before.items()
+    assert main(arguments(city, out, "--overwrite")) == 0
+    assert f"{tasks} of {tasks} tasks ran, 0 results were there\n" in capsys.readouterr().out
+    assert {name: value for name, value in hashes(out).items() if name != "mine.txt"} == before
     assert main(arguments(city, out, "--overwrite", "--mesh-size", "20")) == 0
     assert f"{tasks} of {tasks} tasks ran, 0 results were there\n" in capsys.readouterr().out
     assert (out / "mine.txt").read_text() == "keep"
@@ -292,7 +294,7 @@ def test_buildings_in_the_cloud_without_footprints_end_with_three(city: Path, tm
     assert main([*command, "--allow-empty"]) == 3
 
 
-@pytest.mark.parametrize("size", ["20", "30", "40"])
+@pytest.mark.parametrize("size", ["20", "40"])
 def test_coarse_meshes_keep_exact_roofs(tmp_path: Path, size: str) -> None:
     """A real block: roofs closer than the least spacing are grouped and raised before they are meshed."""
     block = Path(__file__).resolve().parents[2] / "tiler" / "demo_block"
@@ -505,7 +507,7 @@ def test_real_data_with_finite_elements_is_the_same_city(shared_data: Path, tmp_
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", rounds(range(6), range(6, 20)))
+@pytest.mark.parametrize("seed", rounds(range(3), range(3, 20)))
 def test_random_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
     """Synthetic cities of any density and relief, from files to files."""
     rng = np.random.default_rng(seed)
@@ -531,17 +533,22 @@ def test_random_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
 
 
 PAPER = {"simplify": "paper", "mesher": "layered", "roof_height": "percentile"}
+QUARTER = {"bounds": [120_700.0, 486_000.0, 121_000.0, 486_300.0]}
 LONG = pytest.mark.long
 REAL = [
-    ("amsterdam", "amsterdam/footprints.shp", {}, 1400),
+    ("amsterdam", "amsterdam/footprints.shp", QUARTER, 300),
     ("amsterdam_west_small", "amsterdam_west_small/footprints.gpkg", {}, 300),
     ("amsterdam_west_small", "amsterdam_west_small/footprints.gpkg", PAPER, 25),
-    pytest.param("amsterdam_no_building_class", "amsterdam/footprints.shp", {}, 1900, marks=LONG),
+    pytest.param("amsterdam", "amsterdam/footprints.shp", {}, 1400, marks=LONG),
+    pytest.param("amsterdam_no_building_class", "amsterdam/footprints.shp", QUARTER, 300, marks=LONG),
     pytest.param("amsterdam", "amsterdam/footprints.shp", {"manifold": True}, 1400, marks=LONG),
     pytest.param(
-        "amsterdam", "amsterdam/footprints.shp", {"mesher": "layered", "layer_height": 5.0}, 1400, marks=LONG
+        "amsterdam",
+        "amsterdam/footprints.shp",
+        QUARTER | {"mesher": "layered", "layer_height": 5.0},
+        300,
+        marks=LONG,
     ),
-    pytest.param("amsterdam", "amsterdam/footprints.shp", PAPER, 40, marks=LONG),
     pytest.param("amsterdam_no_building_class", "amsterdam/footprints.shp", PAPER, 40, marks=LONG),
 ]
 
@@ -566,7 +573,7 @@ def test_real_data_gives_a_mesh_that_its_check_proves(
         # What is left are roofs that touch crosswise over lower ones: their houses share walls in the plan.
         assert record["counts"]["planar corner-touches"] == 0
         assert report.facts["non_manifold_edges"] < 50
-    if not options and clouds == "amsterdam":
+    if clouds == "amsterdam" and (not options or options == QUARTER):
         # What the design asks of real blocks, with room for the machine's last digit.
         ratio, angle = record["quality"]["radius_ratio"], record["quality"]["min_dihedral"]
         bounds = {"0": 0.22, "0.1": 0.42, "1": 0.50, "5": 0.58, "50": 0.78}
@@ -577,14 +584,11 @@ def test_real_data_gives_a_mesh_that_its_check_proves(
         assert record["fidelity"]["roof"]["rmse"] < 3.4
 
 
-def test_the_demo_makes_two_meshes_and_three_pictures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for what in SIZES:
-        monkeypatch.setitem(SIZES, what, (600, 300))
+@pytest.mark.usefixtures("small_pictures")
+def test_the_demo_makes_two_meshes_and_three_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--out", str(tmp_path), "--size", "300", "--buildings", "15"]) == 0
     assert capsys.readouterr().out.count("everything is proved") == 2
     record = json.loads((tmp_path / "result" / "run.json").read_text())
     assert (len(record["tiles"]), record["parameters"]["workers"]) == (4, 2)
     for picture in ("demo.png", "tiles.png", "block.png"):
-        assert (tmp_path / picture).stat().st_size > 50_000
+        assert (tmp_path / picture).stat().st_size > 10_000

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.data.mesh import Marker
 from stitch.tiling.grid import Bounds
-from tests.helpers.campaigns import keep_outcome
+from tests.helpers.campaigns import keep_outcome, rounds
 from tests.helpers.cities import crowded_blocks
 from tests.helpers.tiles import make_town, put_roofs, run_of, terraces, write_town
 from tests.helpers.walls import prove_walls, sum_walls, wall_edges
@@ -107,7 +107,7 @@ def test_a_tile_of_sloped_roofs_depends_on_its_surroundings_alone(tmp_path: Path
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(50))
+@pytest.mark.parametrize("seed", rounds(range(10), range(10, 50)))
 def test_random_sloped_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
     """Rows and blocks of any density and relief in 9 to 25 tiles, from files to files."""
     rng = np.random.default_rng([seed, 3])

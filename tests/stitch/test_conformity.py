@@ -19,6 +19,7 @@ from stitch.pieces.conformity import (
     pair_edges,
     pair_faces,
 )
+from tests.helpers.campaigns import examples
 from tests.helpers.meshes import make_city
 
 # The corner of a cube: volume 1/6, its faces outwards.
@@ -80,7 +81,7 @@ def test_a_cell_twice_shows_in_all_its_faces() -> None:
     assert len(pairs.exterior) == 0
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(st.lists(st.lists(st.integers(0, 7), min_size=4, max_size=4, unique=True), min_size=0, max_size=12))
 def test_faces_are_those_of_a_brute_force_count(cells: list[list[int]]) -> None:
     faces = [turn(face) for cell in cells for face in outward_faces(tuple(cell))]
@@ -91,10 +92,7 @@ def test_faces_are_those_of_a_brute_force_count(cells: list[list[int]]) -> None:
     same_side = sorted(face for face in faces if count[tuple(sorted(face))] == 2 and oriented[face] == 2)
     array = np.array(cells, np.int32).reshape(-1, 4)
 
-    for pairs in (
-        pair_cell_faces(array, 8),
-        pair_faces(np.array(faces, np.int32).reshape(-1, 3)),
-    ):
+    for pairs in (pair_cell_faces(array, 8), pair_faces(np.array(faces, np.int32).reshape(-1, 3))):
         assert names(pairs.exterior) == exterior
         assert names(pairs.shared) == shared
         assert names(pairs.same_side) == same_side

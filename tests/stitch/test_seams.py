@@ -22,6 +22,7 @@ from stitch.tiling.corners import place_corner
 from stitch.tiling.grid import Key, SeamKey, is_border, make_grid, seam_keys, tile_keys
 from stitch.tiling.strips import CORRIDOR, Strip, improve_around, mesh_strip
 from stitch.tiling.walls import cut_walls, split_walls
+from tests.helpers.campaigns import rounds
 from tests.helpers.cities import Bounds, crowded_blocks, tilted_dtm
 from tests.helpers.stitching import (
     OPTIONS,
@@ -53,7 +54,7 @@ def test_open_ground_is_cut_straight_and_glued() -> None:
     prove_volume(tiles, scene, SQUARE)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", rounds([0, 5, 7], [1, 2, 3, 4, 6]))
 def test_random_cities_are_one_mesh(seed: int) -> None:
     scene = random_scene(SQUARE, 40 + 20 * seed, seed=seed, relief=20.0 * (seed % 3))
     tiles = mesh_all(scene, NINE)

@@ -9,13 +9,14 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from stitch.tiling.shortest import find_shortest
+from tests.helpers.campaigns import examples
 
 
 def all_usable(n: int) -> NDArray[np.bool_]:
     return np.ones(n, np.bool_)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(2, 60), st.integers(0, 2**32 - 1))
 def test_paths_are_as_short_as_those_of_scipy(n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -14,6 +14,7 @@ from pipeline.city_model.footprints import clean_footprints
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note, count_notes
 from pipeline.geometry.rings import compute_sharpest_corners, make_canonical
+from tests.helpers.campaigns import examples
 
 HOUSE = shapely.box(0, 0, 10, 8)
 
@@ -208,7 +209,7 @@ shapes = st.tuples(rings, st.lists(rings, max_size=2)).map(lambda r: shapely.Pol
 names = st.lists(st.sampled_from(["a", "b", "a-1", "c"]), min_size=6, max_size=6)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(st.lists(shapes, max_size=6), names, st.integers(0, 99))
 def test_cleaning_is_idempotent_valid_and_blind_to_order(
     polygons: list[shapely.Polygon], ids: list[str], seed: int

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.city_model.groups import adjacent_houses, group_roofs
+from tests.helpers.campaigns import examples
 
 Array = NDArray[np.float64]
 NO_PAIRS = np.empty((0, 2), np.int64)
@@ -119,7 +120,7 @@ def random_city(seed: int, n: int) -> tuple[Array, Array, NDArray[np.int64]]:
     return roof, area, np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 40))
 def test_promises_on_random_cities(seed: int, n: int) -> None:
     roof, area, pairs = random_city(seed, n)
@@ -135,7 +136,7 @@ def test_promises_on_random_cities(seed: int, n: int) -> None:
     assert (heights[alone] == roof[alone]).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 40))
 def test_order_of_houses_and_pairs_does_not_matter(seed: int, n: int) -> None:
     roof, area, pairs = random_city(seed, n)

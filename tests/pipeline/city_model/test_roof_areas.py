@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from pipeline.city_model.roof_areas import block_heights, measure_roof_areas
 from pipeline.data.citymodel import CityModel
 from pipeline.data.roofs import Roofs, flat_roofs, join_roofs, roof_heights
+from tests.helpers.campaigns import examples
 
 
 def one_roof(plane: list[float], low: float, high: float, origin: tuple[float, float] = (0.0, 0.0)) -> Roofs:
@@ -37,7 +38,7 @@ def test_flat_roofs_keep_their_height_to_the_last_bit() -> None:
     assert found.at_low.tolist() == found.at_high.tolist() == [0, 0, 0]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_a_fine_raster_gives_the_same(seed: int) -> None:
     rng = np.random.default_rng(seed)

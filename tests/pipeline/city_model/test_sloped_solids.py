@@ -17,6 +17,7 @@ from pipeline.city_model.solids import build_solids
 from pipeline.data.citymodel import CityModel
 from pipeline.data.notes import Note
 from pipeline.data.roofs import Roofs
+from tests.helpers.campaigns import examples
 from tests.helpers.cityjson_rules import file_faults, solid_faults
 from tiler.citymodels.cityjson import write_city_model
 
@@ -120,7 +121,7 @@ def test_a_roof_that_meets_the_ground_is_kept_over_it(tmp_path: Path) -> None:
     assert "shell not a closed 2-manifold" not in solid_faults(town)["b"]
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_any_house_is_a_valid_solid(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -49,10 +49,7 @@ TRIANGLE = PlaneMesh(
 
 
 def mesh_of(
-    city: CityModel,
-    dtm: Dtm,
-    bounds: Bounds,
-    options: AdaptiveOptions = OPTIONS,
+    city: CityModel, dtm: Dtm, bounds: Bounds, options: AdaptiveOptions = OPTIONS
 ) -> tuple[ColumnMesh, AdaptiveReport]:
     plane, _ = mesh_plane(
         bounds, city.polygons, mesh_size=options.mesh_size, min_angle=28, refinements=1, passes=4

@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.columns.cell_blocks import (
-    UNUSED,
-    CellBlocks,
-    QualityMeter,
-    UsedPoints,
-    number_used,
-)
+from pipeline.columns.cell_blocks import UNUSED, CellBlocks, QualityMeter, UsedPoints, number_used
 from pipeline.columns.columns import count_cells, expand_cells, find_used_points
 from pipeline.data.mesh import ColumnMesh, MergeOrder, PlaneMesh, TetMesh
 from pipeline.plane_mesh.plane import mesh_plane

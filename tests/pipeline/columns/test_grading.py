@@ -199,11 +199,23 @@ def open_town(folder: Path) -> dict[str, Any]:
     return values | {"tile_size": SIZE, "bounds": region, "open_size": 25.0, "dtm_spacing": 2.0}
 
 
+TownRun = tuple[dict[str, Any], Path, dict[str, Any]]  # parameters, folder and record
+
+
+@pytest.fixture(scope="module")
+def town_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TownRun]:
+    """The open town meshed by either mesher."""
+    folder, found = tmp_path_factory.mktemp("town"), {}
+    city = open_town(folder / "city")
+    for mesher in ("adaptive", "layered"):
+        values = city | {"mesher": mesher, "domain_height": 60.0}
+        found[mesher] = values, folder / mesher, run_of(values, folder / mesher)
+    return found
+
+
 @pytest.mark.parametrize("mesher", ["adaptive", "layered"])
-def test_a_graded_run_is_proved(mesher: str, tmp_path: Path) -> None:
-    values = open_town(tmp_path / "city") | {"mesher": mesher}
-    run_of(values, tmp_path / "out")
-    report = check_run(tmp_path / "out", StoredTerrain)
+def test_a_graded_run_is_proved(town_runs: dict[str, TownRun], mesher: str) -> None:
+    report = check_run(town_runs[mesher][1], StoredTerrain)
     assert report.ok, "\n".join(report.lines())
 
 
@@ -219,11 +231,10 @@ def test_a_tile_of_a_graded_run_is_the_same_in_a_smaller_region(tmp_path: Path) 
     assert all(found[0][0][name].tobytes() == array.tobytes() for name, array in found[1][0].items())
 
 
-def test_workers_leave_the_same_files(tmp_path: Path) -> None:
-    values = open_town(tmp_path / "city")
-    run_of(values, tmp_path / "one")
-    run_of(values, tmp_path / "two", workers=2)
-    assert hash_files(tmp_path / "one") == hash_files(tmp_path / "two")
+def test_workers_leave_the_same_files(town_runs: dict[str, TownRun], tmp_path: Path) -> None:
+    values, out, _ = town_runs["adaptive"]
+    run_of(values, tmp_path, workers=2)
+    assert hash_files(tmp_path) == hash_files(out)
 
 
 def test_tiles_that_are_too_small_for_the_open_size_are_refused(tmp_path: Path) -> None:
@@ -234,12 +245,9 @@ def test_tiles_that_are_too_small_for_the_open_size_are_refused(tmp_path: Path) 
         survey_inputs(make_config(values), lambda _: None)
 
 
-def test_the_plan_counts_the_cells_of_graded_sizes(tmp_path: Path) -> None:
-    values = open_town(tmp_path / "city")
-    for mesher in ("adaptive", "layered"):
-        given = values | {"mesher": mesher, "domain_height": 60.0}
-        record = run_of(given, tmp_path / mesher)
-        config = make_config(given)
+def test_the_plan_counts_the_cells_of_graded_sizes(town_runs: dict[str, TownRun]) -> None:
+    for values, _, record in town_runs.values():
+        config = make_config(values)
         survey = survey_inputs(config, lambda _: None)
         cells = forecast_run(survey, sample_footprints(config, survey.region), config).loads.cells.sum()
         assert 0.7 < cells / record["counts"]["cells"] < 1.4

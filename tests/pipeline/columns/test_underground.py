@@ -256,13 +256,7 @@ def four(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
 
 @pytest.mark.parametrize(
     ("tiles", "mesher"),
-    [
-        (1, "adaptive"),
-        (1, "layered"),
-        (2, "layered"),
-        (3, "adaptive"),
-        pytest.param(3, "layered", marks=pytest.mark.long),
-    ],
+    [(1, "adaptive"), (1, "layered"), (2, "layered"), pytest.param(3, "adaptive", marks=pytest.mark.long)],
 )
 def test_soil_is_proved(tiles: int, mesher: str, tmp_path: Path) -> None:
     size = SIZE * max(tiles, 2)
@@ -286,7 +280,10 @@ def test_four_tiles_with_houses_on_seams_are_proved(four: tuple[dict[str, Any], 
     assert sum(int((~is_grounded(levels)).sum()) for levels in air) > 0
 
 
-def test_the_air_is_that_of_a_run_without_soil(four: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
+def test_soil_leaves_the_air_of_a_run_that_goes_on_with_it(
+    four: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    """Houses and terrain are taken over from a run without soil; the result is that of a new folder."""
     values, out = four
     run_of(values, tmp_path / "out")
     for path in sorted((tmp_path / "out" / "mesh").iterdir()):
@@ -301,12 +298,6 @@ def test_the_air_is_that_of_a_run_without_soil(four: tuple[dict[str, Any], Path]
                 piece.points[piece.boundary.facets[piece.boundary.marker == marker]] for piece in (boundary, both)
             )
             assert one.tobytes() == two.tobytes()
-
-
-def test_a_run_goes_on_with_soil(four: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
-    """Houses and terrain are taken over from a run without soil; the result is that of a new folder."""
-    values, out = four
-    run_of(values, tmp_path / "out")
     record = run_of(values, tmp_path / "out", underground=DEPTH)
     assert record["ran"].keys().isdisjoint({"points", "terrain", "houses", "model"})
     assert hash_files(tmp_path / "out") == hash_files(out)

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from pipeline.columns.weld import least_steps, weld_heights
 from pipeline.data.roofs import Weld
+from tests.helpers.campaigns import examples
 
 NONE = -np.inf
 
@@ -61,7 +62,7 @@ def test_steps_follow_the_spacing_within_limits() -> None:
     assert least_steps(None, np.array([0.5, 2.0])).tolist() == [0.0, 0.0]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(st.lists(st.floats(0, 30), min_size=1, max_size=7), st.floats(0.5, 3.0))
 def test_nodes_keep_the_step_and_the_order_and_move_roofs_little(heights: list[float], step: float) -> None:
     z, of = weld_one(heights, step=step, gap=0.1)

@@ -7,9 +7,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.geometry.components import join_pairs
+from tests.helpers.campaigns import examples
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(1, 80), st.integers(0, 80), st.integers(0, 2**32 - 1))
 def test_components_are_those_of_scipy_named_by_their_first(n: int, n_pairs: int, seed: int) -> None:
     pairs = np.random.default_rng(seed).integers(0, n, (n_pairs, 2))

@@ -17,6 +17,7 @@ from pipeline.geometry.inside import (
     find_owner,
     index_polygons,
 )
+from tests.helpers.campaigns import examples
 
 Array = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ def star(rng: np.random.Generator, *, whole: bool) -> shapely.Polygon:
     return max(shapely.get_parts(found), key=shapely.area, default=shapely.Polygon())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(seed=st.integers(0, 10**6), whole=st.booleans(), far=st.sampled_from([0.0, 6_400_000.0]))
 def test_points_are_where_geos_says(seed: int, whole: bool, far: float) -> None:
     rng = np.random.default_rng(seed)
@@ -95,7 +96,7 @@ def test_many_points_in_wide_polygons() -> None:
     check(np.array([[2000.0, 500.0]]), polygons)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_owners_are_those_of_geos(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -108,7 +109,7 @@ def test_owners_are_those_of_geos(seed: int) -> None:
     assert (expected >= 0).any()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(seed=st.integers(0, 10**6), levels=st.sampled_from([1, 3, 1000]), most=st.sampled_from([40, 400]))
 def test_groups_are_sorted_as_by_numpy(seed: int, levels: int, most: int) -> None:
     rng = np.random.default_rng(seed)
@@ -121,7 +122,7 @@ def test_groups_are_sorted_as_by_numpy(seed: int, levels: int, most: int) -> Non
     assert sort_values(start, xyz[:, 2]).tolist() == xyz[np.lexsort((xyz[:, 2], group)), 2].tolist()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(seed=st.integers(0, 10**6), whole=st.booleans())
 def test_a_cover_has_all_that_is_inside_and_nothing_far(seed: int, whole: bool) -> None:
     rng = np.random.default_rng(seed)

@@ -23,6 +23,7 @@ from pipeline.geometry.segments import (
 )
 from pipeline.roofs import lines
 from pipeline.roofs.lines import MIN_GAIN, _sum_pairwise
+from tests.helpers.campaigns import examples
 
 Array = NDArray[np.float64]
 SEEDS = st.integers(0, 10**6)
@@ -86,7 +87,7 @@ def outline(rng: np.random.Generator, n: int = 12) -> Array:
     return np.concatenate((xy, xy[:1]))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(seed=SEEDS)
 def test_distances_are_those_of_arrays(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -98,7 +99,7 @@ def test_distances_are_those_of_arrays(seed: int) -> None:
     assert 0 < len(beside) < len(xyz)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(seed=SEEDS, clearance=st.sampled_from([0.2, 1.0]))
 def test_walls_have_room_as_arrays_say(seed: int, clearance: float) -> None:
     rng = np.random.default_rng(seed)
@@ -129,7 +130,7 @@ def test_walls_from_corner_to_corner_are_clear_or_not() -> None:
     assert are_clear(start, end, ring[:-1], ring[1:], 1.0).tolist() == [True, True, False, True]
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(seed=SEEDS, levels=st.sampled_from([5, 10**6]))
 def test_the_best_lines_are_those_of_arrays(seed: int, levels: int) -> None:
     rng = np.random.default_rng(seed)
@@ -163,7 +164,7 @@ def test_sums_are_numpys(n: int) -> None:
         assert _sum_pairwise(values) == values.sum()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(seed=SEEDS)
 def test_directions_are_those_with_most_wall(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -201,7 +202,7 @@ def test_edges_are_divided_where_walls_end() -> None:
     assert segments[6:].tolist() == walls.tolist()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(seed=SEEDS)
 def test_places_are_added_in_order_and_once(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -211,7 +212,7 @@ def test_places_are_added_in_order_and_once(seed: int) -> None:
     assert add_places(places, more).tolist() == np.unique(np.concatenate((first, more)), axis=0).tolist()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(seed=SEEDS)
 def test_walls_go_from_node_to_node_inside_the_outline(seed: int) -> None:
     rng = np.random.default_rng(seed)

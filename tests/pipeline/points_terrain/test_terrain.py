@@ -43,6 +43,7 @@ from pipeline.points_terrain.terrain_fill import (
     flood_terrain,
     merge_coarse,
 )
+from tests.helpers.campaigns import examples
 from tests.helpers.cities import tilted_dtm
 
 
@@ -94,7 +95,7 @@ def test_no_ground_point_is_an_error_with_a_next_move() -> None:
         compute_dtm(cloud([(0.0, 0.0, 1.0, BUILDING)]), (0.0, 0.0, 2.0, 2.0))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(st.floats(-1, 1), st.floats(-1, 1), st.lists(st.tuples(st.floats(100, 120), st.floats(-7, 9)), min_size=1))
 def test_sampling_reproduces_a_plane(slope_x: float, slope_y: float, places: list[tuple[float, float]]) -> None:
     dtm = tilted_dtm((100.0, -7.0, 120.0, 9.0), slope_x=slope_x, slope_y=slope_y, height=3.0)

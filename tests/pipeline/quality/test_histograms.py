@@ -32,6 +32,7 @@ from pipeline.quality.point_fidelity import (
 )
 from pipeline.quality.quality import PERCENTILES, Quality, measure_cells, quality_percentiles
 from pipeline.quality.residuals import Residuals, conclude, merge_residuals, sum_residuals, summarise
+from tests.helpers.campaigns import examples
 from tests.helpers.cities import city_of, random_blocks, tilted_dtm
 
 
@@ -51,7 +52,7 @@ def test_bins_by_hand() -> None:
     assert (counted.minimum, counted.maximum) == (-3.0, 1.5)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=40), st.floats(0, 100))
 def test_a_percentile_is_within_a_bin_of_that_of_the_values(values: list[float], percent: float) -> None:
     counted = count_values(np.array(values), (0.0, 1.0), 50)

@@ -18,6 +18,7 @@ from pipeline.geometry.clearance import has_clearance, is_sound, make_sound
 from pipeline.geometry.rings import make_canonical
 from pipeline.simplification.merge import MergedFootprints, merge_footprints
 from pipeline.simplification.patches import merge_polygons, project_vertices
+from tests.helpers.campaigns import examples
 
 CLEARANCE, MIN_HOLE_AREA, FLOOR, TOLERANCE = 1.0, 10.0, 0.1, 0.01
 
@@ -223,10 +224,7 @@ UNSOUND = {
         Polygon([(0, 0), (10, 0), (10, 4), (3, 4), (3, 4.05), (10, 4.05), (10, 9), (0, 9)]),
         "repaired-simplify",
     ),
-    "thin neck": (
-        box(0, 0, 9, 9).union(box(12, 0, 21, 9)).union(box(5, 4, 15, 4.06)),
-        "repaired-buffer",
-    ),
+    "thin neck": (box(0, 0, 9, 9).union(box(12, 0, 21, 9)).union(box(5, 4, 15, 4.06)), "repaired-buffer"),
     "thin wall beside a court": (box(0, 0, 20, 20).difference(box(0.06, 5, 15, 15)), "repaired-buffer"),
     "sharp corner": (Polygon([(0, 0), (40, 0), (40, 3)]), "repaired-buffer"),
     "sharp notch": (
@@ -324,7 +322,7 @@ def random_houses(rng: np.random.Generator, n: int, width: float) -> NDArray[np.
     return houses
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 25), st.sampled_from([20.0, 60.0]))
 def test_promises_hold_in_any_order(seed: int, n: int, width: float) -> None:
     rng = np.random.default_rng(seed)
@@ -348,7 +346,7 @@ def random_shapes(rng: np.random.Generator, n: int) -> NDArray[np.object_]:
     return np.array([Polygon(a, [b]) for a, b in zip(rings, courts, strict=True)], dtype=object)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 6))
 def test_promises_hold_for_ragged_shapes(seed: int, n: int) -> None:
     shapes = random_shapes(np.random.default_rng(seed), n)

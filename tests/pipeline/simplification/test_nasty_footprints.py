@@ -100,9 +100,7 @@ def test_the_groups_are_those_of_the_file(nasty: tuple[NDArray[np.object_], NDAr
     assert len(nasty[0]) == 352
 
 
-def test_all_groups_together_merge_as_they_do_alone(
-    nasty: tuple[NDArray[np.object_], NDArray[np.int32]],
-) -> None:
+def test_all_groups_together_merge_as_they_do_alone(nasty: tuple[NDArray[np.object_], NDArray[np.int32]]) -> None:
     clean, notes, merged = simplify(nasty[0])
     assert_promises(clean, merged)
     assert_nothing_lost(nasty[0], notes, merged)

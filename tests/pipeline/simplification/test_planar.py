@@ -20,6 +20,7 @@ from pipeline.simplification.labels import Territories
 from pipeline.simplification.planar import COUNTS, PlanarCity, find_clusters, simplify_planar
 from pipeline.simplification.snap import node_crossings, straighten
 from pipeline.simplification.square_cells import draw_cells
+from tests.helpers.campaigns import examples
 
 EPS, MIN_AREA, MIN_COURTYARD = 0.5, 5.0, 5.0
 
@@ -320,10 +321,7 @@ def test_crossings_are_noded_on_the_grid_but_in_spared_clusters() -> None:
     square = np.array([[0, 0], [1000, 1001], [0, 1000], [1000, 0.0]])
     edges = np.array([[0, 1], [2, 3], [0, 2], [1, 3]])
     graph = make_graph(
-        np.concatenate((square, square)),
-        np.repeat([0, 1], 4),
-        np.concatenate((edges, edges + 4)),
-        np.zeros(8),
+        np.concatenate((square, square)), np.repeat([0, 1], 4), np.concatenate((edges, edges + 4)), np.zeros(8)
     )
     noded, where = node_crossings(graph, np.array([1]))
     assert where.tolist() == [0]
@@ -398,7 +396,7 @@ def streets(draw: st.DrawFn) -> list[Polygon]:
     return houses
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(streets(), st.sampled_from([0.3, 0.5, 1.0]), st.booleans(), st.randoms(use_true_random=False))
 def test_promises_hold_for_any_street_in_any_order(
     houses: list[Polygon], clearance: float, manifold: bool, shuffler: object

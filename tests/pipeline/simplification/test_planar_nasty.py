@@ -15,6 +15,7 @@ from pipeline.data.citymodel import Footprints
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.simplification.fidelity import measure_simplification
 from pipeline.simplification.planar import PlanarCity, simplify_planar
+from tests.helpers.campaigns import rounds
 from tests.pipeline.simplification.test_planar import assert_promises, blobs
 
 MIN_AREA, TOLERANCE, MIN_COURTYARD = 5.0, 0.01, 5.0
@@ -25,11 +26,7 @@ GROUPS = [*range(1, 20), *range(57, 99), *range(141, 189), *range(199, 214)]
 
 def simplify(polygons: NDArray[np.object_], clearance: float, *, manifold: bool = False) -> PlanarCity:
     return simplify_planar(
-        polygons,
-        clearance=clearance,
-        min_area=MIN_AREA,
-        min_courtyard_area=MIN_COURTYARD,
-        manifold=manifold,
+        polygons, clearance=clearance, min_area=MIN_AREA, min_courtyard_area=MIN_COURTYARD, manifold=manifold
     )
 
 
@@ -108,7 +105,7 @@ def mess(seed: int) -> NDArray[np.object_]:
     return np.array(shapes, dtype=object)
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", rounds(range(24), range(24, 60)))
 def test_promises_hold_for_any_mess(seed: int) -> None:
     polygons = mess(seed)
     clearance, manifold = (0.25, 0.5, 1.0, 2.0)[seed % 4], seed % 3 == 0
@@ -191,10 +188,13 @@ def test_amsterdam_without_touching_corners(amsterdam: NDArray[np.object_]) -> N
 
 @pytest.mark.shared
 def test_amsterdam_is_the_same_shuffled_and_cluster_by_cluster(amsterdam: NDArray[np.object_]) -> None:
-    city = simplify(amsterdam, 0.5)
-    order = np.random.default_rng(3).permutation(len(amsterdam))
-    shuffled = simplify(amsterdam[order], 0.5)
+    middle = shapely.get_coordinates(shapely.centroid(amsterdam))
+    houses = amsterdam[(middle < np.median(middle, axis=0)).all(axis=1)]
+    assert len(houses) > 250
+    city = simplify(houses, 0.5)
+    order = np.random.default_rng(3).permutation(len(houses))
+    shuffled = simplify(houses[order], 0.5)
     assert blobs(shuffled) == blobs(city)
     assert np.array_equal(order[shuffled.house], city.house)
-    alone = [simplify(amsterdam[city.cluster == name], 0.5) for name in np.unique(city.cluster)]
+    alone = [simplify(houses[city.cluster == name], 0.5) for name in np.unique(city.cluster)]
     assert sorted(pair for part in alone for pair in blobs(part)) == sorted(blobs(city))

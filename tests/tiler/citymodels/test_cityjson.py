@@ -20,6 +20,7 @@ from pipeline.data.citymodel import CityModel, number_ids, take_model
 from pipeline.data.errors import ConfigError, InputError, OutputError
 from pipeline.data.notes import Note
 from pipeline.data.roofs import flat_roofs
+from tests.helpers.campaigns import examples
 from tests.helpers.cityjson_rules import area_vector, broken, file_faults, solid_faults, volume
 from tiler.citymodels import cityjson
 from tiler.citymodels.cityjson import read_city_model, write_city_blocks, write_city_model
@@ -414,7 +415,7 @@ def test_the_solid_rules_see_each_fault(town: dict[str, Any], place: list[Any], 
     assert found["b0"] == found["b2"] == set()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     corners=st.integers(3, 9),
@@ -437,7 +438,7 @@ def test_any_star_shaped_house_is_a_valid_solid(
         assert solid_faults(town) == {"b0": set()}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), grid=st.sampled_from([0.001, 0.05, 0.25]), steps=st.booleans())
 def test_corners_are_where_the_noded_overlay_rounds_them_to(seed: int, grid: float, steps: bool) -> None:
     rng = np.random.default_rng(seed)

@@ -56,8 +56,7 @@ def interrupt(process: "subprocess.Popen[str]", number: int = signal.SIGINT) -> 
     os.killpg(process.pid, number)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize(("workers", "number"), [(0, signal.SIGTERM), (2, signal.SIGINT)])
 def test_one_ctrl_c_lets_what_runs_end(workers: int, number: int, town: Town, tmp_path: Path) -> None:
     out = tmp_path / "out"
     process = start(town, out, workers)

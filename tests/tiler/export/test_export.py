@@ -201,11 +201,7 @@ def cut_piece(folder: Path) -> None:
     ],
 )
 def test_what_is_no_finished_run_is_refused(
-    copy: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    damage: Callable[[Path], None],
-    message: str,
+    copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None], message: str
 ) -> None:
     damage(copy)
     assert main(["export", str(copy), "--format", "vtu", "-o", str(tmp_path / "all.vtu")]) == 1

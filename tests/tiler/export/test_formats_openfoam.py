@@ -15,14 +15,7 @@ from pipeline.data.errors import ConfigError, InputError, OutputError
 from pipeline.data.mesh import Marker
 from stitch.pieces import cell_faces
 from stitch.pieces.cell_faces import find_cell_faces
-from tests.helpers.foam_reader import (
-    PolyMesh,
-    read_field,
-    read_header,
-    read_labels,
-    read_poly_mesh,
-    read_zones,
-)
+from tests.helpers.foam_reader import PolyMesh, read_field, read_header, read_labels, read_poly_mesh, read_zones
 from tests.helpers.hand_pieces import HandPieces, box_pieces
 from tests.helpers.programs import mesh_is_ok, read_check, run_foam
 from tiler.cli.main import main

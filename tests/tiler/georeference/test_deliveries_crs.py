@@ -49,12 +49,7 @@ IN_FEET = {
     ),
     # Arizona Central, international feet.
     "state-plane-international": Delivery(
-        NO_ROOFS,
-        crs="EPSG:2223+8228",
-        corner=(700000, 900000),
-        record="wkt1",
-        unit=FEET,
-        unit_z=FEET,
+        NO_ROOFS, crs="EPSG:2223+8228", corner=(700000, 900000), record="wkt1", unit=FEET, unit_z=FEET
     ),
     "heights-alone-wkt": Delivery(
         NO_ROOFS, crs="EPSG:6347+6360", corner=(323000, 4306000), record="wkt1", unit_z=SURVEY_FEET

@@ -80,6 +80,7 @@ def test_the_check_counts_the_same_parts_from_the_files(islands: Path) -> None:
     assert report.lines()[-1].endswith("everything is proved, but see the note")
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_the_report_tells_of_parts(islands: Path) -> None:
     assert "2 parts that share no face" in write_report(islands).read_text()
 

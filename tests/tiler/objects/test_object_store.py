@@ -4,6 +4,7 @@ import json
 import pickle
 import time
 from collections.abc import Callable, Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, cast
 
@@ -77,6 +78,7 @@ def server() -> Iterator[S3Server]:
 def proxy(server: S3Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[FlakyProxy]:
     """A real server, behind a proxy that fails on demand; nothing has answered to this process so far."""
     monkeypatch.setattr(object_requests, "_known", set())
+    monkeypatch.setitem(object_requests.BACKOFF, "init_backoff", timedelta(milliseconds=5))
     with flaky_proxy(server.port) as found:
         for name, value in environment(found.url).items():
             monkeypatch.setenv(name, value)

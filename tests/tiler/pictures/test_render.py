@@ -115,9 +115,7 @@ def test_tiles_have_the_same_outlines_in_other_colours(pictures: dict[str, NDArr
     assert np.nonzero(western)[1].mean() < np.nonzero(eastern)[1].mean() - 0.2 * SIZE[0]
 
 
-def test_the_sky_gets_bluer_upwards_and_nothing_touches_the_frame(
-    pictures: dict[str, NDArray[np.int64]],
-) -> None:
+def test_the_sky_gets_bluer_upwards_and_nothing_touches_the_frame(pictures: dict[str, NDArray[np.int64]]) -> None:
     for image in pictures.values():
         rim = np.concatenate([image[:, :1], image[:, -1:]], axis=1)
         assert np.ptp(rim, axis=1).max() <= 1
@@ -393,11 +391,7 @@ def test_a_lost_file_is_named(
 
 @pytest.mark.parametrize("damage", ["index", "cut", "garbage", "array"])
 def test_damage_is_named(
-    copy: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-    damage: str,
+    copy: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
     piece = copy / "boundary" / "1_0.vtp"
     blob = piece.read_bytes()

@@ -4,10 +4,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.helpers.campaigns import examples
 from tiler.pointclouds.cells import order_by_cell
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(seed=st.integers(0, 10**6), n=st.integers(0, 60), size=st.sampled_from([0.3, 64.0]), wide=st.booleans())
 def test_rows_are_ordered_as_by_numpy(seed: int, n: int, size: float, wide: bool) -> None:
     rng = np.random.default_rng(seed)

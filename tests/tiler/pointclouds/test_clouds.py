@@ -73,8 +73,7 @@ def test_brackets_in_a_name_are_no_pattern(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "message"),
-    [("gone.laz", "no such file"), ("empty", "holds no .las"), ("*.laz", "matches no file")],
+    ("source", "message"), [("gone.laz", "no such file"), ("empty", "holds no .las"), ("*.laz", "matches no file")]
 )
 def test_missing_sources_are_named(tmp_path: Path, source: str, message: str) -> None:
     (tmp_path / "empty").mkdir()

@@ -25,6 +25,7 @@ from tiler.report.timeline import BINS, read_timeline
 from tiler.stages.domain import LOW_DOMAIN
 from tiler.words.note_words import GROUPS, WORDS, group_of, say_notes
 
+pytestmark = pytest.mark.usefixtures("small_pictures")  # `test_report_page` has those of a user
 ROOT = Path(__file__).resolve().parents[3]
 SAME_FOR_ALL: set[str] = set()
 VOID = {"meta", "link", "img"}

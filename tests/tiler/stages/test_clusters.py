@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from stitch.tiling.grid import Key
+from tests.helpers.campaigns import examples
 from tiler.citymodels.clusters import pack_clusters, place_in_grid, unpack_clusters
 from tiler.config.declared import Declared
 from tiler.engine.stage import Scope
@@ -79,7 +80,7 @@ def test_a_tile_reads_its_own_rows_alone(tmp_path: Path) -> None:
     assert "is damaged" in str(found["2_0"].error)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3), st.integers(1, 4)), min_size=1), st.data())
 def test_clusters_come_back_as_they_were_given(tiles: list[tuple[int, int, int]], data: st.DataObject) -> None:
     n_houses = {(i, j): n for i, j, n in tiles}

@@ -318,8 +318,7 @@ def edit_record(out: Path, **region: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("region", "kind"),
-    [({"rim": 1.0}, "rim-uneven"), ({"core": [CORE[0] + 90.0, *CORE[1:]]}, "house-in-pad")],
+    ("region", "kind"), [({"rim": 1.0}, "rim-uneven"), ({"core": [CORE[0] + 90.0, *CORE[1:]]}, "house-in-pad")]
 )
 def test_the_check_tells_a_rim_that_is_uneven_and_a_house_in_the_pad(
     region: dict[str, Any], kind: str, padded: tuple[dict[str, Any], Path], tmp_path: Path
@@ -343,9 +342,9 @@ def test_with_a_pad_alone_sizes_count_from_the_region_and_with_an_open_size_from
 
 @pytest.mark.long
 def test_absent_tiles_of_the_region_stay_absent_in_its_pad(tmp_path: Path) -> None:
-    region = (318_080.0, 6_399_120.0, 318_640.0, 6_399_680.0)
-    town = make_town(region, crowded_blocks(region, 40, seed=4), relief=10)
-    values = write_town(tmp_path / "town", town, files=(4, 4), without=[(0, 3), (3, 2), (2, 1)], spacing=1.5)
+    region = (318_080.0, 6_399_120.0, 318_500.0, 6_399_540.0)
+    town = make_town(region, crowded_blocks(region, 25, seed=4), relief=10)
+    values = write_town(tmp_path / "town", town, files=(3, 3), without=[(0, 2), (2, 1), (1, 0)], spacing=1.5)
     for mesher in ("adaptive", "layered"):
         record = run_of(values, tmp_path / mesher, tile_size=140.0, mesher=mesher, pad=[90.0])
         assert len(record["region"]["absent"]) >= 3
@@ -389,12 +388,12 @@ def test_a_pad_goes_with_all_options_and_any_workers_and_openfoam_is_content(
         "underground": 20.0,
     }
     hashes = []
-    for workers in (0, 1, 2):
+    for workers in (0, 2):
         out = tmp_path / f"{workers}"
         record = run(make_config(given | {"out": str(out), "workers": workers}))
         assert record["exit_code"] == 0
         hashes.append(hash_files(out))
-    assert hashes[0] == hashes[1] == hashes[2]
+    assert hashes[0] == hashes[1]
     prove(tmp_path / "0")
     tallest = record["domain"]["tallest building (m)"]
     widths = [math.ceil(n * tallest) for n in (4, 6, 3)]

@@ -20,12 +20,7 @@ Rows = list[tuple[int, int, int, int]]  # x, y, z in centimetres, and class
 def a_task(**files: tuple[Rows, bool]) -> Any:
     """Task that reads files of one cell each: rows, and whether the file marks buildings; none is unreadable."""
     facts = {
-        name: {
-            "unreadable": not file[0],
-            "scale": (0.01,) * 3,
-            "offset": (0.0,) * 3,
-            "marks_buildings": file[1],
-        }
+        name: {"unreadable": not file[0], "scale": (0.01,) * 3, "offset": (0.0,) * 3, "marks_buildings": file[1]}
         for name, file in files.items()
     }
 

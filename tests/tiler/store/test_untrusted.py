@@ -225,18 +225,17 @@ def test_patterns_do_not_follow_links_in_circles(city: Path, capsys: Capture) ->
 
 def test_nested_geometries_do_not_end_the_process(city: Path) -> None:
     """GEOS recurses and ends the process by a signal where the stack ends."""
-    for levels, kind in ((100_000, 6), (100_000, 7), (2_000_000, 6)):
-        put_wkb(city / "house.gpkg", nested_wkb(levels, kind))
-        found = call_apart(*arguments(city, "--overwrite"), megabytes=900)
-        check_call(found)
-        assert found.code == 1, found  # no building was meshed
-        notes = json.loads((city / "out" / "run.json").read_text())["notes"]
-        assert notes["footprint-unreadable"]["count"] == 1
-    write_parquet(city / "house.parquet", [nested_wkb(100_000), shapely.to_wkb(HOUSE)])
+    put_wkb(city / "house.gpkg", nested_wkb(2_000_000, 6))
+    found = call_apart(*arguments(city), megabytes=900)
+    check_call(found)
+    assert found.code == 1, found  # no building was meshed
+    notes = json.loads((city / "out" / "run.json").read_text())["notes"]
+    assert notes["footprint-unreadable"]["count"] == 1
+    write_parquet(city / "house.parquet", [nested_wkb(100_000, 7), nested_wkb(100_000), shapely.to_wkb(HOUSE)])
     found = call_apart(*arguments(city, "--overwrite", houses="house.parquet"), megabytes=900)
     assert found.code == 3, found
     record = json.loads((city / "out" / "run.json").read_text())
-    assert record["counts"]["buildings"] == record["notes"]["footprint-unreadable"]["count"] == 1
+    assert (record["counts"]["buildings"], record["notes"]["footprint-unreadable"]["count"]) == (1, 2)
 
 
 def circle(n: int) -> shapely.Polygon:
@@ -256,9 +255,8 @@ def test_a_footprint_of_a_million_vertices_is_left_out_and_told(city: Path, caps
     assert record["counts"]["buildings"] == 1
 
 
-@pytest.mark.parametrize("n", [20_000, 99_000])
-def test_a_ragged_footprint_of_many_vertices_takes_seconds(city: Path, n: int) -> None:
-    write_houses(city / "house.gpkg", [circle(n)])
+def test_a_ragged_footprint_of_many_vertices_takes_seconds(city: Path) -> None:
+    write_houses(city / "house.gpkg", [circle(99_000)])
     found = call_apart(*arguments(city, "--allow-empty"), megabytes=700, timeout=90)
     check_call(found)
     assert found.code == 0, found
@@ -372,27 +370,9 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
     ("shapefile without index", shapefile_without(".shx"), "house.shp", 1, "SHAPE_RESTORE_SHX"),
     ("shapefile without table", shapefile_without(".dbf"), "house.shp", 0, ""),
     ("shapefile without CRS", shapefile_without(".prj"), "house.shp", 0, "the footprint file states no CRS"),
-    (
-        "NaN",
-        raw(polygon_wkb([*CORNERS[:2], (float("nan"), 0.0), CORNERS[3]])),
-        "house.gpkg",
-        1,
-        NO_NUMBER,
-    ),
-    (
-        "infinite",
-        raw(polygon_wkb([*CORNERS[:2], (float("inf"), 0.0), CORNERS[3]])),
-        "house.gpkg",
-        1,
-        NO_NUMBER,
-    ),
-    (
-        "huge",
-        raw(polygon_wkb([*CORNERS[:2], (1e300, 1e300), CORNERS[3]])),
-        "house.gpkg",
-        1,
-        NO_NUMBER,
-    ),
+    ("NaN", raw(polygon_wkb([*CORNERS[:2], (float("nan"), 0.0), CORNERS[3]])), "house.gpkg", 1, NO_NUMBER),
+    ("infinite", raw(polygon_wkb([*CORNERS[:2], (float("inf"), 0.0), CORNERS[3]])), "house.gpkg", 1, NO_NUMBER),
+    ("huge", raw(polygon_wkb([*CORNERS[:2], (1e300, 1e300), CORNERS[3]])), "house.gpkg", 1, NO_NUMBER),
     (
         "large",
         raw(polygon_wkb([*CORNERS[:2], (9e7, 9e7), CORNERS[3]])),
@@ -401,13 +381,7 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
         "1 footprint on the region's border was clipped",
     ),
     ("claimed vertices", raw(polygon_wkb(CORNERS, 2**31)), "house.gpkg", 1, UNREADABLE),
-    (
-        "claimed polygons",
-        raw(struct.pack("<BII", 1, 6, 2**32 - 1)),
-        "house.gpkg",
-        1,
-        UNREADABLE,
-    ),
+    ("claimed polygons", raw(struct.pack("<BII", 1, 6, 2**32 - 1)), "house.gpkg", 1, UNREADABLE),
     (
         "an id that is no UTF-8",
         written(geojson(CORNERS).encode().replace(b'"a"', b'"\xe1"'), "a.geojson"),
@@ -417,13 +391,7 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
     ),
     ("a curve", raw(struct.pack("<BIII", 1, 10, 1, 0)), "house.gpkg", 1, "no building was meshed"),
     ("no geometry at all", raw(b""), "house.gpkg", 1, "no building was meshed"),
-    (
-        "an unknown kind",
-        raw(struct.pack("<BII", 1, 999, 1)),
-        "house.gpkg",
-        1,
-        UNREADABLE,
-    ),
+    ("an unknown kind", raw(struct.pack("<BII", 1, 999, 1)), "house.gpkg", 1, UNREADABLE),
 ]
 
 
@@ -431,13 +399,7 @@ FOOTPRINTS: list[tuple[str, Damage, str, int, str]] = [
     ("damage", "name", "code", "text"), [case[1:] for case in FOOTPRINTS], ids=[case[0] for case in FOOTPRINTS]
 )
 def test_footprints(
-    city: Path,
-    capsys: Capture,
-    monkeypatch: pytest.MonkeyPatch,
-    damage: Damage,
-    name: str,
-    code: int,
-    text: str,
+    city: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch, damage: Damage, name: str, code: int, text: str
 ) -> None:
     monkeypatch.setattr("tiler.objects.requests.FIRST_PATIENCE", 0.1)
     trust_addresses(True)  # as after an earlier run
