@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from stitch.tiling.grid import Key
+from tests.helpers.told import Told
 from tiler.config.config import Config
 from tiler.engine.engine import Engine
 from tiler.engine.executor import serial
@@ -105,7 +106,7 @@ def record(config: Config) -> dict[str, Any]:
     for folder in ("mesh", "boundary"):
         (out / folder).mkdir(parents=True)
     with serial() as executor:
-        engine = make_engine(config, out, plan, executor, OwnStages(), keep)
+        engine = make_engine(config, out, plan, executor, OwnStages(), Told(keep))
         rounds = run_stages(engine, config)
     stages = {}
     for stage, tasks in done.items():

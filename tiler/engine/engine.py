@@ -9,12 +9,12 @@ knows Dask: see `tiler.engine.executor`.
 
 import heapq
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,28 +45,11 @@ from tiler.engine.task_graph import (
     readers,
     reads_everything,
 )
+from tiler.engine.watcher import Watcher
 from tiler.store.store import Store
 from tiler.words.stage_groups import place_of_item
 
 SMALL_ONES = 8  # small tasks of a stage that are submitted together, at most
-Progress = Callable[[str, int, int, Record], None]
-
-
-@runtime_checkable
-class Watch(Protocol):
-    """What else a progress may want to know."""
-
-    def laid_out(self, layout: Layout) -> None:
-        """Take note of the items of another layout."""
-
-    def planned(self, stage: str, scope: Scope, total: int) -> None:
-        """Take note of how many items a stage has."""
-
-    def submitted(self, stage: str, name: str) -> None:
-        """Take note of an item that was given to a worker."""
-
-    def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
-        """Take note of an item that failed, or that is not run because it needs one that is not there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +85,8 @@ class Engine:
     Parameters
     ----------
     store_path : Path
-        Folder of the store; one engine at a time may write to it.
+        Folder of the store; one engine at a time may write to it. Files that results state as the fact
+        ``"files"`` are beside it.
     layout : Layout
         The items of every scope.
     parameters : object
@@ -111,13 +95,8 @@ class Engine:
         Given to every task as it is; small and picklable.
     executor : Executor
         Where tasks run, see `tiler.engine.executor`.
-    window : int, optional
-        Largest number of submissions in flight; what the executor wants by default.
-    folder : Path, optional
-        Where the files are that results state as the fact ``"files"``; beside the store by default.
-    progress : callable, optional
-        Called with stage, number of items done, number of items in all, and the record of each item; if it is a
-        `Watch` too, with what is planned, submitted and failed.
+    watcher : Watcher, optional
+        Is told what is planned, submitted, done and failed.
     policy : Policy
         What becomes of items that fail; the first ends the run by default.
 
@@ -141,9 +120,7 @@ class Engine:
         parameters: Any,
         context: Any = None,
         executor: Executor,
-        window: int | None = None,
-        folder: Path | None = None,
-        progress: Progress | None = None,
+        watcher: Watcher | None = None,
         policy: Policy | None = None,
     ) -> None:
         self.store = Store(store_path)
@@ -155,21 +132,10 @@ class Engine:
         self._stop = False
         self._gaps = Gaps(layout.absent)
         self._parameters, self.context = parameters, context
-        self._executor, self._progress = executor, progress
-        watch: object = progress
-        self._watch = watch if isinstance(watch, Watch) else None
-        self._folder = store_path.parent if folder is None else folder
-        self._given_window = window
-        if self._window < 1:
-            raise ValueError(f"window {self._window}, expected 1 or more")
+        self._executor, self._watcher = executor, watcher or Watcher()
         self._items: dict[str, tuple[Scope, Items]] = {}
         self._laid_out: dict[str, tuple[Layout, Any]] = {}
         self._whole: dict[tuple[int, Scope], tuple[Layout, Items]] = {}
-
-    @property
-    def _window(self) -> int:
-        """Submissions in flight: more when workers come."""
-        return self._executor.window if self._given_window is None else self._given_window
 
     def run(self, *stages: Stage, items: Mapping[str, Collection[str]] | None = None) -> None:
         """Run stages whose reads are among them or were run before.
@@ -237,9 +203,8 @@ class Engine:
         self._gaps = Gaps(layout.absent)
 
     def describe_layout(self) -> None:
-        """Tell a `Watch` the items of the layout, where they are not those that the run began with."""
-        if self._watch is not None:
-            self._watch.laid_out(self.layout)
+        """Tell the watcher the items of the layout, where they are not those that the run began with."""
+        self._watcher.laid_out(self.layout)
 
     def laid_out(self, stage: str) -> tuple[Layout, Any]:
         """Layout and context that a stage was run with, for `lay_out`."""
@@ -417,10 +382,9 @@ class _Run:
         self.open: set[int] = set()  # of these, whose key a worker finds
         self.tried: Counter[int] = Counter()
         self.lost: defaultdict[str, set[str]] = defaultdict(set)  # names of what failed or was not run, by stage
-        if engine._watch is not None:
-            for planned in plan:
-                if planned.items.names:
-                    engine._watch.planned(planned.stage.name, planned.stage.scope, len(planned.items.names))
+        for planned in plan:
+            if planned.items.names:
+                engine._watcher.planned(planned.stage.name, planned.stage.scope, len(planned.items.names))
 
     def _order(self) -> NDArray[np.int32]:
         """Where each task stands among those that may run: later stages first, then larger tiles, then names.
@@ -447,7 +411,7 @@ class _Run:
             while self.ready or self.in_flight:
                 if self.engine._stop:
                     raise StoppedError("stopped as asked, all that was done is kept; the same command goes on")
-                while self.ready and len(self.in_flight) < self.engine._window:
+                while self.ready and len(self.in_flight) < executor.window:
                     self._begin(self._next())
                 if self.in_flight:
                     ticket, outcomes = executor.wait()
@@ -498,9 +462,8 @@ class _Run:
         engine._executor.submit(tickets[0], list(parts.values()), int(self.order[tickets[0]]))
         self.in_flight[tickets[0]] = tickets
         self.begun[tickets] = True
-        if engine._watch is not None:
-            for item in parts:
-                engine._watch.submitted(*item)
+        for item in parts:
+            engine._watcher.submitted(*item)
 
     def _item(self, ticket: int) -> Item:
         planned = self.plan[self.rank[ticket]]
@@ -545,7 +508,7 @@ class _Run:
         key = None if made.awaited() else made.close({}, engine.store)[0]
         task = Task(
             *(stage, name, scope, box, planned.parameters, engine.context, path, engine.store, refs, key or ""),
-            *(engine._folder, frame),
+            *(engine.store.path.parent, frame),
         )
         return Part(planned.stage.function, task, made if key is None else None)
 
@@ -630,8 +593,7 @@ class _Run:
         planned = self.plan[rank]
         self.engine.records.add(record)
         self.n_done[rank] += 1
-        if self.engine._progress is not None:
-            self.engine._progress(planned.stage.name, self.n_done[rank], len(planned.items.names), record)
+        self.engine._watcher.done(planned.stage.name, self.n_done[rank], len(planned.items.names), record)
         self._settle_one(ticket)
 
     def _put_back(self, ticket: int) -> None:
@@ -655,8 +617,7 @@ class _Run:
             return
         reason = describe_reason(failure.error)
         if ends_the_run(failure, stage.scope, engine._policy):
-            if engine._watch is not None:
-                engine._watch.failed(stage.name, name, reason)
+            engine._watcher.failed(stage.name, name, reason, ends_run=True)
             raise _named(failure.error, stage, name)
         refs, _ = self._find_reads(ticket, {})
         path, _, _ = file_identity(engine.layout, stage.scope, name)
@@ -669,8 +630,7 @@ class _Run:
         """Go on without an item."""
         stage, name = self._item(ticket)
         self.lost[stage].add(name)
-        if self.engine._watch is not None:
-            self.engine._watch.failed(stage, name, reason, needs)
+        self.engine._watcher.failed(stage, name, reason, needs)
         self._settle_one(ticket)
 
     def _settle_one(self, ticket: int) -> None:

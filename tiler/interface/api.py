@@ -179,9 +179,9 @@ def _show(progress: bool) -> dict[str, Any]:
         return {}
     if in_notebook():
         return {"watchers": [NotebookProgress()]}
-    from tiler.monitoring.terminal import make_views
+    from tiler.monitoring.terminal import make_view
 
-    return {"watchers": make_views()}
+    return {"watchers": [make_view()]}
 
 
 def _configure(pointcloud: Source | Sequence[Source], footprints: Source, parameters: Mapping[str, Any]) -> Config:

@@ -22,12 +22,13 @@ from tiler.engine.stage import Stage
 from tiler.engine.stopping import stops
 from tiler.engine.task import peak_memory
 from tiler.engine.task_limits import limit_workers, machine_memory
+from tiler.engine.watcher import Watcher
 from tiler.executors.kernels import prepare
 from tiler.jobs.cluster import read_cluster
 from tiler.jobs.submission import JOB
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
-from tiler.monitoring.progress import Announce
-from tiler.monitoring.watchers import Listener, Watcher, Watchers
+from tiler.monitoring.run_log import RunLog
+from tiler.monitoring.watchers import Watchers
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.planning.forecast import warn_of_memory
 from tiler.planning.pad import Pad
@@ -94,8 +95,6 @@ class _Means:
 def run(
     config: Config,
     *,
-    announce: Announce | None = None,
-    say: Callable[[str], None] | None = None,
     stages: Sequence[Stage] = (),
     parameters: Mapping[str, Any] | None = None,
     watchers: Sequence[Watcher] = (),
@@ -107,10 +106,6 @@ def run(
     ----------
     config : Config
         Parameters of the run.
-    announce : callable, optional
-        Called with the name of each stage and the seconds of all its items when it is done.
-    say : callable, optional
-        Called with sentences that the user should read.
     stages : sequence of Stage, optional
         Further stages, run after ours; they may read these and each other.
     parameters : mapping, optional
@@ -119,7 +114,7 @@ def run(
         Told what is planned, begun, done and said; of the end too, if the run fails before it has begun.
     dashboard : str, optional
         Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
-        default. `say` is told its URL.
+        default. Watchers are told its URL.
 
     Returns
     -------
@@ -140,8 +135,10 @@ def run(
     same key, is not computed again. Results are those of a run into an empty folder, byte for byte. Every byte
     that is used again is held against its checksum first; what is damaged is computed anew and noted
     (``damaged-artefact``).
+
+    What happens is logged, too: see `tiler.monitoring.run_log`.
     """
-    told = Watchers(watchers if say is None else [*watchers, Listener(say)])
+    told = Watchers([RunLog(), *watchers])
     config = use_absolute_paths(config)
     made: list[Path] = []
     try:
@@ -160,7 +157,7 @@ def run(
             with _connect(config) as cluster:
                 means = _Means(dashboard, shown, cluster)
                 try:
-                    return _run(config, out, earlier, damage, own, announce, told, means)
+                    return _run(config, out, earlier, damage, own, told, means)
                 except StoppedError:
                     raise
                 except Exception:
@@ -179,7 +176,6 @@ def _run(
     earlier: list[str],
     damage: Mapping[str, str],
     own: OwnStages,
-    announce: Announce | None,
     watchers: Watchers,
     means: _Means,
 ) -> dict[str, Any]:
@@ -204,7 +200,7 @@ def _run(
                 sync_meanwhile(out / RUN_RECORD)
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(config, out)
-        progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=means.shown)
+        progress = begin_watching(config, out, plan, own, watchers, shown=means.shown)
         record |= _mesh_region(config, out, plan, own, watchers, damage, means)
         record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:

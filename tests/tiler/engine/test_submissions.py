@@ -142,9 +142,9 @@ def test_of_small_ones_several_go_together_while_all_workers_have_some(
     workers: int, most: int, tmp_path: Path
 ) -> None:
     executor = Counted()
-    executor.workers = workers
+    executor.workers, executor.window = workers, 1
     small = Stage("small", Scope.TILE, puts, small=True)
-    engine = make(tmp_path, executor, layout=grid_layout(6), window=1)
+    engine = make(tmp_path, executor, layout=grid_layout(6))
     engine.run(small)
     assert max(map(len, executor.given)) == most
     assert len({name for given in executor.given for name in given}) == 36
@@ -279,7 +279,7 @@ def test_what_is_put_off_is_run_by_a_later_call(tmp_path: Path) -> None:
 def test_events_and_times_are_told_by_stage(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     log = EventLog(path, begin_file(path), every=0.0)
-    engine = make(tmp_path, progress=log)
+    engine = make(tmp_path, watcher=log)
     engine.run(FIRST, replace(SECOND, function=takes_time))
     log.end("done")
     events = [event for event in read_events(path) if event.get("name") == "1.1"]

@@ -19,6 +19,7 @@ from tiler.cli.main import main
 from tiler.config.config import load_config, make_config
 from tiler.engine.stage import Scope
 from tiler.engine.task import Task, run_task
+from tiler.monitoring.watchers import Listener
 from tiler.objects import path as object_path
 from tiler.objects import requests as object_requests
 from tiler.objects.path import ObjectPath, RangeFile
@@ -435,7 +436,7 @@ def test_a_run_in_a_bucket_has_the_bytes_of_one_on_a_disk(
     town: Town, memory: Memory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said: list[str] = []
-    record = run(make_config({**vars(town.config(tmp_path)), "out": URL}), say=said.append)
+    record = run(make_config({**vars(town.config(tmp_path)), "out": URL}), watchers=[Listener(said.append)])
     assert record["exit_code"] == 0
     assert main(["status", URL]) == 0
     assert "done" in capsys.readouterr().out
