@@ -31,6 +31,10 @@ NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mar
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
 
+class Above(float):
+    """A lower bound that is itself too low."""
+
+
 def _parameter(
     default: Any,
     section: str,
@@ -39,16 +43,12 @@ def _parameter(
     unit: str = "",
     source: str = "",
     choices: tuple[str, ...] = (),
-    above: float | None = None,
     least: float | None = None,
     most: float | None = None,
 ) -> Any:
     """Declare a parameter: its section in TOML, its bounds, and all that a user should know of it."""
-    metadata = {
-        "section": section, "text": text, "unit": unit, "source": source,
-        "choices": choices, "above": above, "least": least, "most": most,
-    }  # fmt: skip
-    return field(default=default, metadata=metadata)
+    metadata = {"section": section, "text": text, "unit": unit, "source": source, "choices": choices}
+    return field(default=default, metadata=metadata | {"least": least, "most": most})
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Config:
         False, "input", "leave out point-cloud files that cannot be read, list them, and end with exit code 3"
     )
     dtm_spacing: float = _parameter(
-        1.0, "terrain", "spacing of the terrain grid", unit="m", source="paper, step 1.3", above=0
+        1.0, "terrain", "spacing of the terrain grid", unit="m", source="paper, step 1.3", least=Above(0)
     )
     ground_filter: bool = _parameter(
         False, "terrain", "find ground points by an own filter, for clouds without ground classes"
@@ -110,11 +110,11 @@ class Config:
     min_building_area: float = _parameter(5.0, "buildings", "smaller footprints are dropped", unit="m2", least=0)
     vertex_tolerance: float = _parameter(
         0.01, "buildings", "vertices closer than this are one; also the bound for needless ones", unit="m",
-        source="paper, step 1.4", above=0, most=0.5,
+        source="paper, step 1.4", least=Above(0), most=0.5,
     )  # fmt: skip
     ground_margin: float = _parameter(
         1.0, "buildings", "ground points lie within this distance of a footprint", unit="m",
-        source="paper, step 1.5", above=0,
+        source="paper, step 1.5", least=Above(0),
     )  # fmt: skip
     ground_percentile: float = _parameter(
         10.0, "buildings", "ground height of a building, percentile of its ground points", unit="%",
@@ -134,7 +134,7 @@ class Config:
     )  # fmt: skip
     roof_clearance: float = _parameter(
         2.0, "buildings", "roofs are raised to this height above the highest terrain at their walls", unit="m",
-        above=0,
+        least=Above(0),
     )  # fmt: skip
     border: str = _parameter(
         "clip", "buildings", "buildings on the region's border are clipped to it less the clearance, or dropped",
@@ -150,7 +150,7 @@ class Config:
     )  # fmt: skip
     clearance_floor: float = _parameter(
         0.1, "simplify", "with simplify = paper: finer details of one building are repaired", unit="m",
-        above=0,
+        least=Above(0),
     )  # fmt: skip
     min_courtyard_area: float = _parameter(5.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
     roofs: str = _parameter(
@@ -177,8 +177,8 @@ class Config:
         "mesh_size everywhere", unit="m", least=0,
     )  # fmt: skip
     grading: float = _parameter(
-        0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size or pad", above=0,
-        most=1,
+        0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size or pad",
+        least=Above(0), most=1,
     )  # fmt: skip
     pad: tuple[float | str, ...] = _parameter(
         (), "mesh", "width of a margin of bare ground around the region, which flattens outwards and has coarser "
@@ -191,7 +191,7 @@ class Config:
     )  # fmt: skip
     domain_height: float | str = _parameter(
         100.0, "mesh", "height of the domain above the terrain: metres, or 6H for six times the height of the "
-        "tallest building", unit="m", source="paper, step 3.2", above=0,
+        "tallest building", unit="m", source="paper, step 3.2", least=Above(0),
     )  # fmt: skip
     top: str = _parameter(
         "terrain", "mesh", "top of the domain: it follows the smoothed terrain, or is flat, domain_height above "
@@ -213,10 +213,10 @@ class Config:
         source="paper, steps 3.2-3.5", choices=("adaptive", "layered"),
     )  # fmt: skip
     least_spacing: float = _parameter(
-        0.1, "mesh", "least vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=1
+        0.1, "mesh", "least vertical spacing with mesher = adaptive, in mesh sizes", least=Above(0), most=1
     )
     most_spacing: float = _parameter(
-        0.8, "mesh", "largest vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=5
+        0.8, "mesh", "largest vertical spacing with mesher = adaptive, in mesh sizes", least=Above(0), most=5
     )
     stagger: float = _parameter(
         0.8, "mesh", "shift of neighbouring columns with mesher = adaptive; 0 for none, 1 for thirds of a step",
@@ -239,10 +239,10 @@ class Config:
         "largest residual over the diagonal with smoother = columns; heights are then within about "
         "ten times this of the exact solution",
         unit="m",
-        above=0,
+        least=Above(0),
     )
     fem_tolerance: float = _parameter(
-        1e-8, "mesh", "relative residual of the linear systems with smoother = fem", above=0, most=1e-2
+        1e-8, "mesh", "relative residual of the linear systems with smoother = fem", least=Above(0), most=1e-2
     )
     tile_size: float = _parameter(
         0.0,
@@ -588,11 +588,11 @@ def _check_bounds(name: str, value: Any, data: Mapping[str, Any]) -> None:
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return
     unit = f" {data['unit']}" if data["unit"] else ""
-    above, least, most = data["above"], data["least"], data["most"]
+    least, most = data["least"], data["most"]
     if not math.isfinite(value):
         raise ConfigError(f"{name} = {value}: must be a finite number")
-    if above is not None and not value > above:
-        raise ConfigError(f"{name} = {value:g}{unit}: must be above {above:g}{unit}")
+    if isinstance(least, Above) and not value > least:
+        raise ConfigError(f"{name} = {value:g}{unit}: must be above {least:g}{unit}")
     if least is not None and not value >= least:
         raise ConfigError(f"{name} = {value:g}{unit}: must be at least {least:g}{unit}")
     if most is not None and not value <= most:
