@@ -9,6 +9,7 @@ import pyproj
 
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
+from tiler.config.config import Config
 from tiler.georeference.crs import crs_name, horizontal_crs, is_on_its_place, is_one, parse_crs, utm_crs
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.georeference.las_crs import height_unit_of
@@ -18,25 +19,6 @@ from tiler.georeference.words import box_words, directions_of, fault_of, like_de
 from tiler.pointclouds.clouds import CloudHeader
 
 Box = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What the user says of the CRS.
-
-    Attributes
-    ----------
-    crs : str
-        Value of ``--crs``, ``""`` for none.
-    reproject : bool
-        Whether clouds in another CRS are reprojected.
-    height_unit : str
-        Unit of heights, one of `UNITS`; ``""`` for what the files state.
-    """
-
-    crs: str = ""
-    reproject: bool = False
-    height_unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -52,13 +34,7 @@ class CloudGroup:
 
     @property
     def box(self) -> Box:
-        boxes = [cloud.bounds for cloud in self.clouds]
-        return (
-            min(box[0] for box in boxes),
-            min(box[1] for box in boxes),
-            max(box[2] for box in boxes),
-            max(box[3] for box in boxes),
-        )
+        return box_around([cloud.bounds for cloud in self.clouds])
 
     @property
     def label(self) -> str:
@@ -94,7 +70,7 @@ def group_clouds(clouds: Sequence[CloudHeader]) -> list[CloudGroup]:
     return [CloudGroup(members, horizontal_crs(members[0].crs)) for members in groups.values()]
 
 
-def read_wish(asked: Asked, groups: Sequence[CloudGroup]) -> tuple[pyproj.CRS, MetricCrs] | None:
+def read_wish(asked: Config, groups: Sequence[CloudGroup]) -> tuple[pyproj.CRS, MetricCrs] | None:
     """Parse ``--crs``, and find its metric form."""
     if not asked.crs:
         return None
@@ -119,7 +95,7 @@ def read_wish(asked: Asked, groups: Sequence[CloudGroup]) -> tuple[pyproj.CRS, M
 
 
 def choose_plan(
-    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Asked, told: Told
+    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Config, told: Told
 ) -> PlanCrs | None:
     """Decide which CRS a group's coordinates have; None where neither file nor user says."""
     stated = group.stated
@@ -182,7 +158,7 @@ def _choose_for_degrees(
     group: CloudGroup,
     stated: pyproj.CRS,
     wish: tuple[pyproj.CRS, MetricCrs] | None,
-    asked: Asked,
+    asked: Config,
     told: Told,
 ) -> PlanCrs:
     if asked.reproject and is_on_its_place(group.box, stated):
@@ -290,7 +266,7 @@ def choose_fallback(
 
 
 def _assume_degrees(
-    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Asked, told: Told
+    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Config, told: Told
 ) -> PlanCrs:
     """Take coordinates that look like degrees for those of WGS 84, where they may be reprojected."""
     wgs84 = pyproj.CRS("EPSG:4326")
@@ -310,7 +286,7 @@ def _assume_degrees(
     )
 
 
-def choose_height_unit(group: CloudGroup, plan: PlanCrs, asked: Asked, told: Told) -> float:
+def choose_height_unit(group: CloudGroup, plan: PlanCrs, asked: Config, told: Told) -> float:
     """Metres of a unit of height: asked for, stated, or that of plan."""
     stated, name = group.first.height_unit, group.first.path.name
     if asked.height_unit:

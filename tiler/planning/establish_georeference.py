@@ -9,6 +9,7 @@ import pyproj
 
 from pipeline.data.errors import InputError
 from pipeline.data.notes import Note
+from tiler.config.config import Config
 from tiler.georeference.crs import (
     SAME_PLACE,
     crs_name,
@@ -27,7 +28,6 @@ from tiler.georeference.operation import Operation, find_operation
 from tiler.georeference.units import unit_name
 from tiler.georeference.words import axes_words, boxes_meet
 from tiler.planning.cloud_crs import (
-    Asked,
     CloudGroup,
     PlanCrs,
     Told,
@@ -79,14 +79,14 @@ class Georeference:
 
 
 def establish_georeference(
-    asked: Asked, clouds: Sequence[CloudHeader], footprints: pyproj.CRS | None, extent: Box | None
+    asked: Config, clouds: Sequence[CloudHeader], footprints: pyproj.CRS | None, extent: Box | None
 ) -> Georeference:
     """Establish where a region lies, from the headers of its input alone.
 
     Parameters
     ----------
-    asked : Asked
-        What the user says.
+    asked : Config
+        Parameters: what the user says of CRS, unit of heights, and reprojection.
     clouds : sequence of CloudHeader
         All point clouds, at least one of them with points; those without have no say.
     footprints : pyproj.CRS or None
@@ -160,7 +160,10 @@ def find_inexact(found: Georeference, bound: float) -> list[Note]:
 
 
 def _choose_target(
-    groups: Sequence[CloudGroup], plans: Sequence[PlanCrs], wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Asked
+    groups: Sequence[CloudGroup],
+    plans: Sequence[PlanCrs],
+    wish: tuple[pyproj.CRS, MetricCrs] | None,
+    asked: Config,
 ) -> pyproj.CRS:
     """Choose the region's CRS; a UTM zone where clouds are to be reprojected from one without true lengths."""
     if wish is not None:
@@ -200,7 +203,7 @@ def _registered(
 
 
 def _frame(
-    group: CloudGroup, plan: PlanCrs, crs: pyproj.CRS, asked: Asked, told: Told
+    group: CloudGroup, plan: PlanCrs, crs: pyproj.CRS, asked: Config, told: Told
 ) -> tuple[Frame, Operation | None]:
     """Say how a group's coordinates become those of the region."""
     metric = plan.metric
@@ -237,7 +240,7 @@ def _frame(
     return frame, operation
 
 
-def _check_scale(crs: pyproj.CRS, clouds: Sequence[CloudHeader], asked: Asked) -> float:
+def _check_scale(crs: pyproj.CRS, clouds: Sequence[CloudHeader], asked: Config) -> float:
     """Refuse a projection whose lengths are not those on the ground."""
     box = box_around([cloud.bounds for cloud in clouds])
     scale = scale_of(box, crs)

@@ -9,6 +9,7 @@ from pipeline.data.errors import CityError, InputError
 from pipeline.data.notes import Note, count_notes
 from tiler.config.config import Config
 from tiler.georeference.crs import is_on_its_place
+from tiler.georeference.words import boxes_meet
 from tiler.objects.places import place
 from tiler.planning.region import Region
 from tiler.vectors.features import Box
@@ -100,7 +101,12 @@ def find_place(layer: Layer, region: Region) -> str:
             if _meets(extent, pyproj.CRS.from_user_input(stated), region):
                 return f"{told}. {_describe_move(exchanged=exchanged, degrees=degrees and not own.is_geographic)}"
     code = own.to_authority()
-    if code and own.is_projected and _overlap(layer.extent, region.bounds) and is_on_its_place(layer.extent, own):
+    if (
+        code
+        and own.is_projected
+        and boxes_meet(layer.extent, region.bounds)
+        and is_on_its_place(layer.extent, own)
+    ):
         return (
             f"{told}. The point clouds have such coordinates too, so their CRS may be that of the footprints: "
             f"--crs {':'.join(code)}"
@@ -137,11 +143,7 @@ def _meets(extent: Box, crs: pyproj.CRS, region: Region) -> bool:
     west, south, east, north = forward.transform_bounds(*extent, densify_pts=21, errcheck=False)
     if not np.isfinite((west, south, east, north)).all():
         return False
-    return _overlap((west, south, east, north), region.bounds)
-
-
-def _overlap(one: Box, other: Box) -> bool:
-    return one[0] <= other[2] and one[2] >= other[0] and one[1] <= other[3] and one[3] >= other[1]
+    return boxes_meet((west, south, east, north), region.bounds)
 
 
 def _short(crs: str) -> str:

@@ -376,7 +376,7 @@ def _foresee(plan: Plan, config: Config) -> list[str]:
     """Say which roofs stay flat against what was asked, and which tiles may not fit into this machine's memory."""
     stay_flat = config.roofs != "flat" and roofs_stay_flat(config.mesher, config.simplify)
     flat = [warn_of_flat_roofs(config)] if stay_flat else []
-    return flat + ([] if config.on_cluster else warn_of_memory(plan.survey, config, memory=machine_memory()))
+    return flat + ([] if config.on_cluster else warn_of_memory(plan, config, memory=machine_memory()))
 
 
 def warn_of_flat_roofs(config: Config) -> str:
