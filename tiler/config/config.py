@@ -14,12 +14,18 @@ from typing import Any, get_args, get_origin, get_type_hints
 from pipeline.data.classes import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
 from pipeline.data.errors import ConfigError
 from stitch.tiling.smallest_tile import LEAST_TILE
-from tiler.config.domain_height import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
-from tiler.config.pad_widths import check_widths
-from tiler.config.tile_size import LEAST_SIDE, choose_tile_size
+from tiler.config.domain_height import (
+    EXPECTED_TALLEST,
+    LEAST_SIDE,
+    ROUNDING,
+    Height,
+    check_widths,
+    choose_tile_size,
+    height_in_metres,
+    read_height,
+)
 from tiler.objects.places import check_url, is_url
-from tiler.words.did_you_mean import suggest
-from tiler.words.plain_text import shorten
+from tiler.words.plain_text import shorten, suggest
 
 MAX_CONFIG_BYTES = 1_000_000
 MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000

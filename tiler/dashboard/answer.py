@@ -5,8 +5,8 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
-from tiler.dashboard.codes import State
 from tiler.dashboard.follow import Follower
+from tiler.dashboard.items import State
 from tiler.dashboard.map_view import Question, describe_map
 from tiler.dashboard.model import SEAM, TILE, RunModel
 from tiler.monitoring.tally import StageTally, estimate_share, estimate_time

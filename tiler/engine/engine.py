@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import CityError
 from tiler.config.declared import Declared
-from tiler.engine.absent_tiles import Gaps
 from tiler.engine.executor import Executor
 from tiler.engine.failures import Policy, SetAside, describe_reason, ends_the_run, tries
 from tiler.engine.keys import OpenKey, declared_values, file_identity, stage_digest
@@ -30,6 +29,7 @@ from tiler.engine.stage import Box, Layout, Scope, Stage
 from tiler.engine.submission import Item, Outcome, Part
 from tiler.engine.task import Failure, Later, Record, Task
 from tiler.engine.task_graph import (
+    Gaps,
     Items,
     Refs,
     chain_seams,

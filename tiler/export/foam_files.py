@@ -7,7 +7,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.export.rows import blocks_of, slices
+from tiler.export.pieces import blocks_of, slices
 
 BANNER = "// Written by citystitch.\n"
 LABEL_LIMIT = 2**31 - 1  # numbers that a 32 bit label can hold

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from tiler.export.foam_patches import PATCHES, patch_keys
-from tiler.export.rows import blocks_of
+from tiler.export.pieces import blocks_of
 from tiler.mesh_files.merged import VERTEX_ID, number_piece
 from tiler.mesh_files.mesh_pieces import MeshPieces, mark_sides, open_pieces
 from tiler.mesh_files.run_files import RunSource

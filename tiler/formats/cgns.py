@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
-from tiler.export.pieces import Pieces
-from tiler.export.rows import blocks_of
+from tiler.export.pieces import Pieces, blocks_of
 from tiler.formats.xdmf import as_output_error
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from pipeline.data.mesh import Marker, Region
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
-from tiler.export.pieces import Pieces
-from tiler.export.rows import blocks_of, slices
+from tiler.export.pieces import Pieces, blocks_of, slices
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
 from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import facets_by_key, patch_of_key
-from tiler.export.rows import slices
+from tiler.export.pieces import slices
 from tiler.export.surface import Surface, keys_asked, open_surface, survey_surface
 from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import OutputError
 from tiler.export.export import LARGEST_PART, Format
-from tiler.export.pieces import Pieces
-from tiler.export.rows import blocks_of
+from tiler.export.pieces import Pieces, blocks_of
 from tiler.mesh_files.mesh_pieces import MeshPieces, open_pieces
 from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing

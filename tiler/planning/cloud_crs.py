@@ -10,12 +10,23 @@ import pyproj
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
 from tiler.config.config import Config
-from tiler.georeference.crs import crs_name, horizontal_crs, is_on_its_place, is_one, parse_crs, utm_crs
+from tiler.georeference.crs import (
+    box_words,
+    crs_name,
+    directions_of,
+    fault_of,
+    horizontal_crs,
+    is_on_its_place,
+    is_one,
+    like_degrees,
+    parse_crs,
+    pdal_command,
+    utm_crs,
+)
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.georeference.las_crs import height_unit_of
 from tiler.georeference.metric import MetricCrs, find_metric
 from tiler.georeference.units import UNITS, same_unit, unit_name
-from tiler.georeference.words import box_words, directions_of, fault_of, like_degrees, pdal_command
 from tiler.pointclouds.clouds import CloudHeader
 
 Box = tuple[float, float, float, float]

@@ -12,6 +12,7 @@ from pipeline.data.notes import Note
 from tiler.config.config import Config
 from tiler.georeference.crs import (
     SAME_PLACE,
+    boxes_meet,
     crs_name,
     crs_text,
     horizontal_crs,
@@ -23,10 +24,9 @@ from tiler.georeference.crs import (
 )
 from tiler.georeference.footprints import find_shown_axes, footprint_frame
 from tiler.georeference.frame import Frame, box_to_region
-from tiler.georeference.metric import LIKELY, MetricCrs, find_metric
+from tiler.georeference.metric import LIKELY, MetricCrs, axes_words, find_metric
 from tiler.georeference.operation import Operation, find_operation
 from tiler.georeference.units import unit_name
-from tiler.georeference.words import axes_words, boxes_meet
 from tiler.planning.cloud_crs import (
     CloudGroup,
     PlanCrs,

@@ -13,9 +13,8 @@ from stitch.tiling.grid import TileGrid, make_grid, tiles_present
 from tiler.config.config import Config, idle_parameters
 from tiler.engine.run_context import choose_tiles, make_layout, tile_key
 from tiler.engine.stage import FileItem, Layout
-from tiler.georeference.crs import crs_text
+from tiler.georeference.crs import boxes_meet, crs_text
 from tiler.georeference.operation import Operation
-from tiler.georeference.words import boxes_meet
 from tiler.objects.places import identify, place
 from tiler.objects.requests import trust_addresses
 from tiler.planning.establish_georeference import FOOTPRINTS, Georeference, establish_georeference, find_inexact

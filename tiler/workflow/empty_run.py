@@ -8,8 +8,7 @@ import pyproj
 from pipeline.data.errors import CityError, InputError
 from pipeline.data.notes import Note, count_notes
 from tiler.config.config import Config
-from tiler.georeference.crs import is_on_its_place
-from tiler.georeference.words import boxes_meet
+from tiler.georeference.crs import boxes_meet, is_on_its_place
 from tiler.objects.places import place
 from tiler.planning.region import Region
 from tiler.vectors.features import Box

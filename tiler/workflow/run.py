@@ -31,9 +31,8 @@ from tiler.monitoring.run_log import RunLog
 from tiler.monitoring.watchers import Watchers
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.planning.forecast import warn_of_memory
-from tiler.planning.pad import Pad
 from tiler.planning.plan import Plan, check_sources, make_plan
-from tiler.report.kept_report import give_back_report
+from tiler.planning.region import Pad
 from tiler.stages.own_stages import OwnStages, check_own, run_own_stages
 from tiler.store.atomic import replacing, sync_meanwhile
 from tiler.store.checksums import seal, state_files
@@ -46,6 +45,7 @@ from tiler.store.out_folder import (
     TASKS,
     check_folder,
     clear_folder,
+    give_back_report,
     refuse_inputs_within,
     remove_strangers,
 )
@@ -65,8 +65,8 @@ from tiler.workflow.other_region import (
     remove_folders,
     remove_if_useless,
 )
-from tiler.workflow.padded_layout import pad_plan
 from tiler.workflow.run_watchers import LeaseWatch, begin_watching
+from tiler.workflow.settled_domain import pad_plan
 from tiler.workflow.stage_sequence import make_engine, run_stages
 from tiler.workflow.summary import describe_tasks, summarise_run
 

@@ -17,8 +17,7 @@ from tiler.store.folder_lock import only_run
 from tiler.store.out_folder import PIECES
 from tiler.words.plain_text import say_nothing
 from tiler.workflow.failed_tiles import config_alone
-from tiler.workflow.padded_layout import plan_alone
-from tiler.workflow.settled_domain import domain_of_run, take_domain
+from tiler.workflow.settled_domain import domain_of_run, plan_alone, take_domain
 from tiler.workflow.stage_sequence import make_engine, run_city_stages
 
 

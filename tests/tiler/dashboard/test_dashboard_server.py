@@ -20,8 +20,8 @@ from tests.helpers.simulated_runs import simulate, write_events
 from tests.helpers.told import StageEnds
 from tiler.cli.main import main
 from tiler.config.config import make_config
-from tiler.dashboard.codes import State
 from tiler.dashboard.follow import Follower
+from tiler.dashboard.items import State
 from tiler.dashboard.server import read_address, serve
 from tiler.interface.synth import write_city
 from tiler.monitoring.watchers import Listener
