@@ -21,3 +21,13 @@ class StageEnds(Told):
 
     def __init__(self, tell: Callable[[str], object]) -> None:
         super().__init__(lambda stage, n_done, total, _: tell(stage) if n_done == total else None)
+
+
+class Listener(Watcher):
+    """Hears what the user should read, and nothing else."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+
+    def say(self, text: str) -> None:
+        self._say(text)

@@ -55,7 +55,7 @@ def write_merged_volume(path: Path, pieces: Sequence[Path], *, scalars: bool = F
     path : Path
         The file; it appears whole or not at all. While it is written, coordinates wait in a file beside it.
     pieces : sequence of at least one Path
-        VTU pieces (`write_vtu`) with the int64 point array `VERTEX_ID`: each id for one place.
+        VTU pieces (`tiler.mesh_files.vtk_files`) with the int64 point array `VERTEX_ID`: each id for one place.
     scalars : bool
         Add cell arrays to colour by: `TILE`, and `RADIUS_RATIO` as `pipeline.quality.quality` measures it.
 
@@ -88,7 +88,7 @@ def write_merged_boundary(
     path : Path
         The file.
     pieces : sequence of at least one Path
-        VTP pieces (`write_vtp`).
+        VTP pieces.
     volumes : sequence of Path
         The VTU pieces of all tiles.
     scalars : bool

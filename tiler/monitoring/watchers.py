@@ -1,6 +1,6 @@
 """Watchers of a run: all of them as one, one that hands on sentences, and the command that shows a failure."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import ExitStack
 
 from stitch.tiling.grid import tiles_of_seam
@@ -10,16 +10,6 @@ from tiler.engine.submission import Item
 from tiler.engine.task import Record
 from tiler.engine.watcher import RunStart, Watcher
 from tiler.store.out_folder import command_alone
-
-
-class Listener(Watcher):
-    """Hears what the user should read, and nothing else."""
-
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
-
-    def say(self, text: str) -> None:
-        self._say(text)
 
 
 class Watchers(Watcher):

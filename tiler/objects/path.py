@@ -208,11 +208,9 @@ class ObjectPath:
         return ask(self, self.patience, request, self.root)
 
 
-def delete_below(path: ObjectPath, first: str = "") -> None:
-    """Delete an object and all below it; those named `first` before the others."""
-    paths = [*path.rglob("*"), path]
-    path.delete([one for one in paths if one.name == first])
-    path.delete([one for one in paths if one.name != first])
+def delete_below(path: ObjectPath) -> None:
+    """Delete an object and all below it."""
+    path.delete([*path.rglob("*"), path])
 
 
 class RangeFile(io.RawIOBase):

@@ -17,14 +17,13 @@ import pytest
 
 from pipeline.data.errors import ConfigError
 from tests.helpers.simulated_runs import simulate, write_events
-from tests.helpers.told import StageEnds
+from tests.helpers.told import Listener, StageEnds
 from tiler.cli.main import main
 from tiler.config.config import make_config
 from tiler.dashboard.follow import Follower
 from tiler.dashboard.items import State
 from tiler.dashboard.server import read_address, serve
 from tiler.interface.synth import write_city
-from tiler.monitoring.watchers import Listener
 from tiler.workflow.run import run
 
 

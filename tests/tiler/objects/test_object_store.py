@@ -13,13 +13,13 @@ import pytest
 from pipeline.data.errors import ConfigError, InputError, OutputError
 from tests.helpers.flaky_proxy import FlakyProxy, flaky_proxy
 from tests.helpers.object_servers import BUCKET, S3Server, environment, s3_server
+from tests.helpers.told import Listener
 from tests.helpers.towns import Town, make_town
 from tests.runs.test_run import hashes
 from tiler.cli.main import main
 from tiler.config.config import load_config, make_config
 from tiler.engine.stage import Scope
 from tiler.engine.task import Task, run_task
-from tiler.monitoring.watchers import Listener
 from tiler.objects import path as object_path
 from tiler.objects import requests as object_requests
 from tiler.objects.path import ObjectPath, RangeFile

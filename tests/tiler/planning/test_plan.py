@@ -19,12 +19,12 @@ from rich.console import Console
 
 from pipeline.data.errors import ConfigError
 from stitch.tiling.grid import has_tile, make_grid, seam_keys, seam_line, tile_box, tile_keys, tiles_of_seam
+from tests.helpers.told import Listener
 from tiler.cli import main as cli
 from tiler.config.config import Config, make_config
 from tiler.engine.run_context import absent_tiles, choose_tiles, make_layout, seam_name, tile_name
 from tiler.georeference.frame import AS_IT_IS
 from tiler.interface.synth import write_city
-from tiler.monitoring.watchers import Listener
 from tiler.planning.establish_georeference import Georeference
 from tiler.planning.footprint_sample import FootprintSample, measure_detail, sample_footprints
 from tiler.planning.forecast import Forecast, forecast_run, spread_points, warn_of_memory
