@@ -1,7 +1,7 @@
 """What writers ask of a mesh: its pieces, one at a time, dealt out to processes, and rows of long arrays."""
 
 from collections.abc import Iterator
-from typing import Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,3 +117,10 @@ def _bisect(
     cuts = np.arange(low, len(rows) - high + 1)
     heaviest = np.maximum(total[cuts - 1] / low, (total[-1] - total[cuts - 1]) / high)
     return rows, int(cuts[heaviest.argmin()])
+
+
+def write_lines(file: BinaryIO, line: str, rows: NDArray[Any]) -> None:
+    """Write rows (n, k) as text, each by the format ``line`` of k numbers."""
+    for some in slices(len(rows)):
+        part = rows[some]
+        file.write((line * len(part) % tuple(part.ravel().tolist())).encode())
