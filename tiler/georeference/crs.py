@@ -9,6 +9,7 @@ import numpy as np
 import pyproj
 
 from pipeline.data.errors import ConfigError
+from tiler.words.plain_text import printable
 
 _ALIKE = 20  # confidence (%) above which PROJ names a candidate, which is then compared in full
 SAME_PLACE = 0.1  # m; CRSs between which a region moves by less are one
@@ -82,6 +83,11 @@ def crs_name(crs: pyproj.CRS) -> str:
     """
     authority = crs.to_authority()
     return ":".join(authority) if authority else crs.name
+
+
+def short_crs(text: str) -> str:
+    """Write a CRS as a message can hold it: WKT is too long."""
+    return printable(text) if len(text) < 40 else "a CRS of its own"
 
 
 def same_crs(one: pyproj.CRS, other: pyproj.CRS) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.errors import InputError, OutputError
+from pipeline.data.errors import InputError
 from pipeline.data.mesh import TetMesh
 from pipeline.quality.quality import measure_cells
 from stitch.pieces.numbering import Numbering, collect_ids, number_without_gaps
@@ -27,6 +27,7 @@ from tiler.mesh_files.vtk_xml import (
     stream_items,
     write_data_file,
 )
+from tiler.store.atomic import disk_errors
 
 VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide ids, see `stitch.pieces.numbering`
 TILE = "tile"  # cell array on request: which tile a cell is of, counted from 0 by name
@@ -146,14 +147,9 @@ def number_piece(path: Path, ids: NDArray[Any] | None, numbering: Numbering) -> 
 def _write(path: Path, pieces: Sequence[Path], volumes: Sequence[Path], kind: str, *, scalars: bool) -> None:
     if not pieces:
         raise ValueError("a merged file needs at least one piece")
-    try:
-        with TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-            gathered = _gather(pieces, read_numbering(volumes), kind, Path(folder))
-            _write_file(path, kind, *gathered, scalars=scalars)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
-        ) from error
+    with disk_errors(path), TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
+        gathered = _gather(pieces, read_numbering(volumes), kind, Path(folder))
+        _write_file(path, kind, *gathered, scalars=scalars)
 
 
 def _write_file(

@@ -232,10 +232,18 @@ def _is_at(path: Path, file: int) -> bool:
 def _read_owner(path: Path) -> Owner | None:
     """Read who holds a folder; None where the file says nothing, as one does that is just being written."""
     try:
-        found = json.loads(path.read_bytes())
+        return parse_owner(path.read_bytes())
+    except OSError:
+        return None
+
+
+def parse_owner(text: bytes) -> Owner | None:
+    """Parse who holds a folder; None where the text does not say so."""
+    try:
+        found = json.loads(text)
         words = {name: str(found[name]) for name in ("host", "place", "began", "token")}
         return Owner(pid=int(found["pid"]), **words)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         return None
 
 

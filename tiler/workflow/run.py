@@ -16,7 +16,7 @@ from pipeline.data.errors import CityError, OutputError
 from tiler.config.config import ANYWHERE, Config, roofs_stay_flat
 from tiler.dashboard.server import read_address, watched
 from tiler.engine.engine import StoppedError
-from tiler.engine.executor import Executor, serial
+from tiler.engine.executor import Executor, Serial
 from tiler.engine.keys import code_versions
 from tiler.engine.stage import Stage
 from tiler.engine.stopping import stops
@@ -349,8 +349,7 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
         with local(config.workers, limit_workers(config), dashboard=means.dashboard or ANYWHERE) as executor:
             yield executor
     else:
-        with serial() as executor:
-            yield executor
+        yield Serial()
 
 
 @contextmanager
