@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from pipeline.data.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
 from tiler.cli.parser import EXPORT_OPTION, Handler, build_parser
-from tiler.config.config import Config, annotated_defaults, make_config
-from tiler.config.config_file import with_file
+from tiler.config.config import Config, make_config
+from tiler.config.config_file import annotated_defaults, with_file
 from tiler.jobs.submission import describe_job, find_run, job_line
 from tiler.mesh_files.run_files import refuse_strangers
 from tiler.objects.places import place, refuse_bucket

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import ConfigError, InputError
-from tiler.config.config import Config, make_config, write_config
+from tiler.config.config import Config, make_config
+from tiler.config.config_file import write_config
 from tiler.jobs.cluster import LOGS, SYSTEMS, WORKER_JOBS, WORKER_NAME, Cluster, QueueError, read_cluster
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.store.atomic import replacing

@@ -17,7 +17,8 @@ from tests.helpers.told import Listener
 from tests.helpers.towns import Town, make_town
 from tests.runs.test_run import hashes
 from tiler.cli.main import main
-from tiler.config.config import load_config, make_config
+from tiler.config.config import make_config
+from tiler.config.config_file import load_config
 from tiler.engine.stage import Scope
 from tiler.engine.task import Task, run_task
 from tiler.objects import path as object_path

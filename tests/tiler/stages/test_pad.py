@@ -22,7 +22,8 @@ from tests.helpers.programs import mesh_is_ok, read_check, run_foam
 from tests.helpers.tiles import hash_files, make_town, run_of, write_footprints, write_town
 from tiler.check.check import check_run
 from tiler.cli.main import main
-from tiler.config.config import Config, check_height, load_config, make_config
+from tiler.config.config import Config, check_height, make_config
+from tiler.config.config_file import load_config
 from tiler.config.domain_height import widths_in_metres
 from tiler.engine.run_context import absent_tiles, choose_tiles
 from tiler.engine.stage import Facts, Read, Scope, Stage
