@@ -293,7 +293,7 @@ class _ExportHelp(argparse.Action):
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:
-    """Add the options of all formats; which of them a format takes is told by it."""
+    """Add the options of all formats; each format names those that it takes."""
     export.add_argument("-h", "--help", nargs=0, action=_ExportHelp, help="show this help message and exit")
     export.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
     export.add_argument("--format", choices=list_formats(), metavar="NAME", required=True, help="see below")

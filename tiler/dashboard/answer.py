@@ -60,7 +60,7 @@ def tell(follower: Follower, question: Question) -> dict[str, Any]:
 
 
 def describe_head(model: RunModel, *, alive: bool) -> dict[str, Any]:
-    """Tell what run it is, how it stands, and how long it may take still (s), None where nobody knows."""
+    """Describe which run it is, its state, and how long it may still take (s), None where unknown."""
     status = model.standing(alive=alive)
     taken = {name: model.head.get(name) for name in ("error", "command", "bounds", "crs", "tile_size", "workers")}
     end = time.time() if status == "running" else model.last

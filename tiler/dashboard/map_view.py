@@ -44,7 +44,7 @@ class Question:
 
 
 def describe_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
-    """Tell a map.
+    """Describe a map for the page.
 
     Parameters
     ----------

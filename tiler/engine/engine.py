@@ -203,7 +203,7 @@ class Engine:
         self._gaps = Gaps(layout.absent)
 
     def describe_layout(self) -> None:
-        """Tell the watcher the items of the layout, where they are not those that the run began with."""
+        """Hand the watcher the items of the layout, where they differ from those at the start of the run."""
         self._watcher.laid_out(self.layout)
 
     def laid_out(self, stage: str) -> tuple[Layout, Any]:
@@ -470,7 +470,7 @@ class _Run:
         return planned.stage.name, planned.items.names[ticket - planned.first]
 
     def _are_together(self, one: int, other: int) -> bool:
-        """Tell whether two tasks are of the same item, or of seams of the same owner."""
+        """Return whether two tasks are of the same item, or of seams of the same owner."""
         scope, owners = self.plan[self.rank[one]].stage.scope, self.engine.layout.owners
         if self.plan[self.rank[other]].stage.scope is not scope:
             return False
@@ -562,7 +562,7 @@ class _Run:
         return tuple(names[k] for k in refs.of(item).tolist())
 
     def _end(self, tickets: list[int], outcomes: list[Outcome | None]) -> None:
-        """Keep what came of a submission; what of it was not run is submitted again when it may run."""
+        """Record the outcomes of a submission; tasks of it that did not run are submitted again when they may."""
         for ticket, outcome in zip(tickets, outcomes, strict=True):
             open_key = ticket in self.open
             self.open.discard(ticket)
@@ -678,7 +678,7 @@ def _among(found: Refs, reach: Items, run: Items, stage: Stage) -> Refs:
 
 
 def _named(error: Exception, stage: Stage, name: str) -> Exception:
-    """Say stage and item in an error: in the message where it is ours, in a note otherwise."""
+    """Name stage and item in an error: in the message where it is ours, in a note otherwise."""
     place = place_of_item(stage.name, stage.scope.value, name)
     if isinstance(error, CityError):
         return type(error)(f"{place}: {error}")

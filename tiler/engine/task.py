@@ -329,7 +329,7 @@ def notes_from_json(rows: Iterable[list[Any]]) -> list[Note]:
 
 
 def peak_memory() -> int:
-    """Tell the peak resident memory of this process (bytes)."""
+    """Return the peak resident memory of this process (bytes)."""
     try:  # VmHWM where the system tells it, as ru_maxrss survives a fork.
         status = Path("/proc/self/status").read_text()
         return int(status.split("VmHWM:")[1].split()[0]) * 1024
@@ -374,7 +374,7 @@ def _note_from_json(values: list[Any]) -> Note:
 
 
 def describe_trace(error: Exception) -> str:
-    """Say where in the code an error arose."""
+    """Describe where in the code an error arose."""
     return "".join(traceback.format_exception(error))
 
 

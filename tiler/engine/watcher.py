@@ -1,4 +1,4 @@
-"""Watchers: whoever wants to know what a run does is told here."""
+"""Watchers: the calls by which the engine reports what a run does."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -157,7 +157,7 @@ class VertexSet:
         return int(counts.sum())
 
     def places(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Tell the places of points that are in the set, (k,) to (k,), in the order of their ids."""
+        """Return the places of points that are in the set, (k,) to (k,), in the order of their ids."""
         word = ids // WORD
         lower = self._words[word] & (_bit(ids) - np.uint64(1))
         return self._before[word] + np.bitwise_count(lower)

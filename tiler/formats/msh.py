@@ -204,7 +204,7 @@ def _write_entities(file: BinaryIO, survey: _Survey) -> None:
 
 
 def _bounds(key: int, group: int) -> bool:
-    """Tell whether a surface bounds a volume: those of buildings and the top that of air alone."""
+    """Return whether a surface bounds a volume: those of buildings and the top that of air alone."""
     return key not in OF_SOIL if group == AIR else key < FIRST_BUILDING and key not in OF_AIR
 
 

@@ -297,14 +297,14 @@ def like_degrees(box: Box) -> bool:
 
 
 def fault_of(crs: pyproj.CRS) -> str:
-    """Say why lengths in a CRS are not lengths on the ground; ``""`` for a projected one."""
+    """Explain why lengths in a CRS are not lengths on the ground; ``""`` for a projected one."""
     if crs.is_geographic:
         return "is geographic (degrees)"
     return "" if crs.is_projected else f"is no projected CRS ({crs.type_name})"
 
 
 def directions_of(crs: pyproj.CRS) -> str:
-    """Say where the axes of a CRS point."""
+    """Describe where the axes of a CRS point."""
     return " and ".join(axis.direction.lower() for axis in crs.axis_info[:2])
 
 

@@ -17,7 +17,7 @@ Box = tuple[float, float, float, float]
 def footprint_frame(
     stated: pyproj.CRS, crs: pyproj.CRS, box: Box, say: Callable[[str, str, str], None] | None = None
 ) -> tuple[Frame, Operation | None]:
-    """Say how coordinates of footprints become those of a region.
+    """Describe how coordinates of footprints become those of a region.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ LISTED = 5  # failures and messages that are shown
 
 
 def in_notebook() -> bool:
-    """Tell whether output goes to a notebook: IPython has a kernel then."""
+    """Return whether output goes to a notebook: IPython has a kernel then."""
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     return shell is not None and hasattr(shell, "kernel")
 

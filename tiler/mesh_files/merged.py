@@ -97,7 +97,7 @@ def write_merged_boundary(
 
     Notes
     -----
-    Only the vertices of facets are written, in the order of their ids. The array ``vertex`` tells which vertex of
+    Only the vertices of facets are written, in the order of their ids. The array ``vertex`` names which vertex of
     the merged volume each is.
     """
     _write(path, pieces, volumes, "PolyData", scalars=scalars)

@@ -317,7 +317,7 @@ def _items(rows: Rows) -> Callable[[int, int], NDArray[Any]]:
 
 
 def stream_offsets(n_rows: int, width: int) -> Stream:
-    """Make the stream that tells where rows of so many numbers end in the connectivity."""
+    """Make the stream of where rows of so many numbers end in the connectivity."""
     dtype = np.dtype(np.int32 if n_rows * width < 2**31 else np.int64)
     return Stream("offsets", dtype, 1, n_rows, partial(_give_ends, width, dtype, n_rows))
 

@@ -89,7 +89,7 @@ class LiveView(Tally):
 
 
 def is_plain(console: Console) -> bool:
-    """Tell whether a terminal shows ASCII alone."""
+    """Return whether a terminal shows ASCII alone."""
     return not console.encoding.lower().startswith("utf")
 
 

@@ -28,7 +28,7 @@ SHARES = {
     "pieces": 0.10,
 }
 SMALL_SHARE = 0.003  # of every other stage
-LEAST_SHARE = 0.1  # of all work that must be measured before the time left is told
+LEAST_SHARE = 0.1  # of all work that must be measured before the time left is shown
 LEAST_TIME = 3.0  # s, likewise
 REUSE = 0.005  # s to look at a result that is taken as it is
 

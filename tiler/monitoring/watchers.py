@@ -13,12 +13,12 @@ from tiler.store.out_folder import command_alone
 
 
 class Watchers(Watcher):
-    """Several watchers, told one after the other.
+    """Several watchers, called one after the other.
 
     Parameters
     ----------
     watchers : iterable of Watcher
-        Those who are there from the start; others may come when the run begins, and are told then what was said.
+        Those present from the start; later ones may join when the run begins, and get the earlier calls then.
     """
 
     def __init__(self, watchers: Iterable[Watcher] = ()) -> None:
@@ -68,7 +68,7 @@ class Watchers(Watcher):
             watcher.say(text)
 
     def end(self, status: str, error: str = "") -> None:
-        """Tell all, once; where one raises, the others are told all the same."""
+        """Call all, once; where one raises, the others are called all the same."""
         if self._ended:
             return
         self._ended = True

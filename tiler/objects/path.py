@@ -115,7 +115,7 @@ class ObjectPath:
             return False
 
     def is_symlink(self) -> bool:
-        """Tell that it is none."""
+        """Return False: there are no links."""
         return False
 
     def exists(self) -> bool:
@@ -240,11 +240,11 @@ class RangeFile(io.RawIOBase):
         self.n_bytes = self.n_requests = 0
 
     def readable(self) -> bool:
-        """Tell that it can be read."""
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
-        """Tell that it can be sought in."""
+        """Return True."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:

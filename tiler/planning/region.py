@@ -146,7 +146,7 @@ def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Boun
 
 
 def describe_pad(core: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
-    """Say how many files have points beyond a region, where its pad takes no account of them."""
+    """Describe how many files have points beyond a region, where its pad takes no account of them."""
     boxes = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
     beyond = sum(
         min(box[0] - core[0], box[1] - core[1], core[2] - box[2], core[3] - box[3]) <= -PAST for box in boxes
@@ -160,7 +160,7 @@ def describe_pad(core: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
 
 
 def describe_overhang(bounds: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
-    """Say by how much the region reaches beyond the point clouds; nothing where it does not."""
+    """State by how much the region reaches beyond the point clouds; nothing where it does not."""
     extents = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
     beyond = {
         "west": min(extent[0] for extent in extents) - bounds[0],

@@ -105,7 +105,7 @@ def shift_of_run(config: Config) -> tuple[float, float]:
 
 
 def describe_alignment(records: Records, config: Config) -> tuple[Facts, list[Note], list[str]]:
-    """Tell the shift between footprints and roofs: for the record, as notes, and in words."""
+    """Return the shift between footprints and roofs: for the record, as notes, and in words."""
     if not config.footprints:
         return {}, [], []
     facts = records["shift", REGION_ITEM].facts

@@ -403,7 +403,7 @@ def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
 class _Gathered:
     """Houses of a tile's clusters, and whether roofs are of other classes than that of buildings.
 
-    ``place`` (p, 4) tells of each part its house's tile, row there, and number.
+    ``place`` (p, 4) holds of each part its house's tile, row there, and number.
     """
 
     houses: Houses

@@ -112,7 +112,7 @@ def _find_roofs(
 
 
 def _note_each(kind: str, footprints: Footprints, rows: Rows, details: Sequence[str]) -> list[Note]:
-    """Tell of some houses, ascending."""
+    """Make a note on each of some houses, ascending."""
     chosen = np.zeros(len(footprints.ids), np.bool_)
     chosen[rows] = True
     places = (place for _, place in find_places(footprints, chosen))

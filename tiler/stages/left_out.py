@@ -44,7 +44,7 @@ def left_out_stage(config: Config) -> Stage:
 def find_left_out(task: Task) -> Facts:
     """Find the footprints of a tile of which less than half is under a building, whatever the reason.
 
-    Of each part of a footprint within the region it tells area and place, how many building points lie in it, and
+    Of each part of a footprint within the region it gives area and place, how many building points lie in it, and
     the height of its highest part above the ground, measured as that of every other building; NaN for those that
     are smaller than buildings are.
     """

@@ -374,7 +374,7 @@ def _add_straight_borders(
 
 
 def _on_sides(xy: NDArray[np.float64], bounds: Bounds) -> bool:
-    """Tell whether all places are on one side of the region's box."""
+    """Return whether all places are on one side of the region's box."""
     return any(bool((xy[:, k % 2] == bounds[k]).all()) for k in range(4))
 
 

@@ -53,7 +53,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
 def sync_meanwhile(path: Path) -> None:
     """Let the disk take a file and its name, and go on: it may take a second where much else was written.
 
-    Nobody is told if it cannot: for a file that is written again, and waited for, in the end.
+    A failure is ignored: for a file that is written again, and waited for, in the end.
     """
 
     def sync() -> None:

@@ -88,7 +88,7 @@ def only_run_in_bucket(folder: ObjectPath, say: Callable[[str], None]) -> Iterat
 
 
 def is_held_in_bucket(folder: ObjectPath) -> bool:
-    """Tell whether a run is at work there; one elsewhere is listened for."""
+    """Return whether a run is at work there; one elsewhere is listened for."""
     path = folder / LOCK
     found = _read(path)
     return found is not None and _lives(path, *found)

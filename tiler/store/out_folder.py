@@ -196,12 +196,12 @@ def _list_results(out: Path) -> list[Path]:
 
 
 def _is_ours(out: Place) -> bool:
-    """Tell whether a run has been in a folder: a lost record is mended."""
+    """Return whether a run has been in a folder: a lost record is mended."""
     return any((out / name).is_file() for name in (RUN_RECORD, PROGRESS, MANIFEST_PATH))
 
 
 def _has_record(out: Place) -> bool:
-    """Tell whether some file says what run it was; a damaged one is mended."""
+    """Return whether some file says what run it was; a damaged one is mended."""
     if (out / MANIFEST_PATH).is_file():
         return True
     return any(

@@ -32,7 +32,7 @@ def is_empty(config: Config, counts: dict[str, int]) -> bool:
 
 
 def explain_empty(config: Config, region: Region, counts: dict[str, int], notes: Sequence[Note]) -> str:
-    """Say why there is no building, and the next move.
+    """Explain why there is no building, and the next move.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def _format_number(layer: Layer | None, within: int, box: str, crs: str) -> str:
 
 
 def find_place(layer: Layer, region: Region) -> str:
-    """Say where the footprints of a layer lie, and whether they would lie in the region if read otherwise.
+    """Describe where the footprints of a layer lie, and whether they would lie in the region if read otherwise.
 
     Looked at are x and y exchanged, in metres or degrees, and degrees in a file that does not say so.
 

@@ -111,10 +111,10 @@ def run(
     parameters : mapping, optional
         Parameters that further stages declare, besides those of `config`.
     watchers : sequence of Watcher
-        Told what is planned, begun, done and said; of the end too, if the run fails before it has begun.
+        Called for what is planned, begun, done and said; at the end too, if the run fails before it has begun.
     dashboard : str, optional
         Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
-        default. Watchers are told its URL.
+        default. Watchers get its URL.
 
     Returns
     -------
@@ -218,7 +218,7 @@ def _run(
         raise
     finally:
         record["seconds_total"] = round(time.perf_counter() - start, 3)
-        # Where an error is told already, that its record cannot be written either would only hide it.
+        # A failure to write the record must not hide the error that ended the run.
         with suppress(OutputError) if failed else nullcontext():
             if not untouched:
                 _write_record(out, record)
@@ -364,22 +364,22 @@ def _beside(out: Path, check: Callable[[], None], watchers: Watchers) -> Iterato
 
 
 def _find_damage(out: Path) -> dict[str, str]:
-    """Say what is wrong with the files of a finished run that belong to no result.
+    """Describe what is wrong with the files of a finished run that belong to no result.
 
-    Of results and their files it is told by who makes them anew.
+    Damaged results and their files are reported where they are made anew.
     """
     return {found.path: found.what for found in Audit(out, deep=False).check_top()}
 
 
 def _foresee(plan: Plan, config: Config) -> list[str]:
-    """Say which roofs stay flat against what was asked, and which tiles may not fit into this machine's memory."""
+    """Name the roofs that stay flat against what was asked, and the tiles that may not fit into memory."""
     stay_flat = config.roofs != "flat" and roofs_stay_flat(config.mesher, config.simplify)
     flat = [warn_of_flat_roofs(config)] if stay_flat else []
     return flat + ([] if config.on_cluster else warn_of_memory(plan, config, memory=machine_memory()))
 
 
 def warn_of_flat_roofs(config: Config) -> str:
-    """Say why roofs are flat although sloped ones were asked for."""
+    """Explain why roofs are flat although sloped ones were asked for."""
     why = f"mesher = {config.mesher}" if config.mesher != "adaptive" else f"simplify = {config.simplify}"
     return f"roofs are flat, not {config.roofs}: {why} has no sloped ones"
 
