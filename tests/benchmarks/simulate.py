@@ -21,9 +21,10 @@ from tests.benchmarks.recorded import PATH as RECORDED
 from tests.benchmarks.recorded import record
 from tests.benchmarks.virtual import StandInStore, VirtualWorkers, instant
 from tiler.config.config import Config, make_config
-from tiler.engine.engine import Engine, StoppedError
+from tiler.engine.engine import Engine
 from tiler.engine.executor import Executor
 from tiler.engine.records import Records
+from tiler.engine.schedule import StoppedError
 from tiler.engine.task import Record
 from tiler.executors.local_cluster import local
 from tiler.monitoring.progress import RunProgress

@@ -15,9 +15,9 @@ from typing import Any
 from pipeline.data.errors import CityError, OutputError
 from tiler.config.config import ANYWHERE, Config, roofs_stay_flat
 from tiler.dashboard.server import read_address, watched
-from tiler.engine.engine import StoppedError
 from tiler.engine.executor import Executor, Serial
 from tiler.engine.keys import code_versions
+from tiler.engine.schedule import StoppedError
 from tiler.engine.stage import Stage
 from tiler.engine.stopping import stops
 from tiler.engine.task import peak_memory

@@ -564,7 +564,7 @@ def test_some_items_now_and_others_later(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"reader reads 1 items of source that are not run, first 1\.1"):
         engine.run(reader, items={"reader": ["0.0"]})
     told: list[str] = []
-    engine._watcher = Told(lambda stage, done, total, record: told.append(f"{stage} {record.name} {done}/{total}"))
+    engine.watcher = Told(lambda stage, done, total, record: told.append(f"{stage} {record.name} {done}/{total}"))
     engine.run(source, reader, items={"source": ["1.1"], "reader": ["0.0"]})
     assert told == ["source 1.1 4/4", "reader 0.0 1/1"]
     assert engine.records["reader", "0.0"].facts["source"] == ["0.0", "0.1", "1.0", "1.1"]

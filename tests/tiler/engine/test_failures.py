@@ -13,9 +13,10 @@ from pipeline.data.errors import GeometryError, OutputError
 from tests.helpers.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
 from tests.helpers.told import Told
 from tests.tiler.engine.test_engine import contents, grid_layout, make, nothing, one_at_a_time, seen, told
-from tiler.engine.engine import Engine, StoppedError
+from tiler.engine.engine import Engine
 from tiler.engine.executor import Executor, Serial
 from tiler.engine.failures import Policy
+from tiler.engine.schedule import StoppedError
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Failure, Record, Task
 from tiler.engine.task_limits import Limits

@@ -13,10 +13,11 @@ from pipeline.data.errors import GeometryError
 from stitch.tiling.grid import make_grid
 from tests.helpers.faults import Faulty, Once, is_killed, raises, segfaults
 from tests.tiler.engine.test_engine import contents, grid_layout, make, nothing, rerun, seen
-from tiler.engine.engine import SMALL_ONES, Engine
+from tiler.engine.engine import Engine
 from tiler.engine.executor import Executor, Serial
 from tiler.engine.failures import Policy
 from tiler.engine.run_context import make_layout
+from tiler.engine.schedule import SMALL_ONES
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.submission import Outcome, Part, run_parts
 from tiler.engine.task import Failure, Record, Task, run_task
