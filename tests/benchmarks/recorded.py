@@ -3,15 +3,17 @@
 import json
 import zlib
 from collections import defaultdict
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from stitch.tiling.grid import Key
+from tests.helpers.told import Told
 from tiler.config.config import Config
 from tiler.engine.engine import Engine
-from tiler.engine.executor import serial
+from tiler.engine.executor import Serial
 from tiler.engine.run_context import tile_key, tile_name
 from tiler.engine.stage import Box, Facts, Scope
 from tiler.engine.task import Record
@@ -104,8 +106,8 @@ def record(config: Config) -> dict[str, Any]:
     out = Path(config.out)
     for folder in ("mesh", "boundary"):
         (out / folder).mkdir(parents=True)
-    with serial() as executor:
-        engine = make_engine(config, out, plan, executor, OwnStages(), keep)
+    with nullcontext(Serial()) as executor:
+        engine = make_engine(config, out, plan, executor, OwnStages(), Told(keep))
         rounds = run_stages(engine, config)
     stages = {}
     for stage, tasks in done.items():

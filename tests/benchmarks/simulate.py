@@ -21,9 +21,10 @@ from tests.benchmarks.recorded import PATH as RECORDED
 from tests.benchmarks.recorded import record
 from tests.benchmarks.virtual import StandInStore, VirtualWorkers, instant
 from tiler.config.config import Config, make_config
-from tiler.engine.engine import Engine, StoppedError
+from tiler.engine.engine import Engine
 from tiler.engine.executor import Executor
 from tiler.engine.records import Records
+from tiler.engine.schedule import StoppedError
 from tiler.engine.task import Record
 from tiler.executors.local_cluster import local
 from tiler.monitoring.progress import RunProgress
@@ -57,19 +58,19 @@ class Meter(RunProgress):
 
     def __init__(self, out: Path, config: Config, plan: Plan, *, stop_after: int = 0) -> None:
         super().__init__(out, config, {s.name: len(plan.layout.boxes(s.scope)) for s in list_stages(config)})
-        self.peak, self.done, self.stop_after = memory(), 0, stop_after
+        self.peak, self.n_done, self.stop_after = memory(), 0, stop_after
         self.samples: list[tuple[int, float]] = []  # tasks done, and memory (MB)
         self.stop: Callable[[], None] = lambda: None
 
-    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
+    def done(self, stage: str, n_done: int, total: int, record: Record) -> None:
         """Take note of an item that is done."""
-        super().__call__(stage, done, total, record)
-        self.done += 1
-        if self.done % SAMPLED == 0:
-            self.samples.append((self.done, memory()))
+        super().done(stage, n_done, total, record)
+        self.n_done += 1
+        if self.n_done % SAMPLED == 0:
+            self.samples.append((self.n_done, memory()))
             self.peak = max(self.peak, self.samples[-1][1])
-            print(f"{stage}: {self.done} tasks, {self.samples[-1][1]:.1f} MB", file=sys.stderr, flush=True)
-        if self.done == self.stop_after:
+            print(f"{stage}: {self.n_done} tasks, {self.samples[-1][1]:.1f} MB", file=sys.stderr, flush=True)
+        if self.n_done == self.stop_after:
             self.stop()
 
 
@@ -148,7 +149,7 @@ def _told(meter: Meter, engine: Engine, begin: float) -> dict[str, Any]:
     gc.collect()
     return {
         "run_seconds": time.perf_counter() - begin,
-        "tasks": meter.done,
+        "tasks": meter.n_done,
         "records": len(engine.records),
         "memory_run": now,
         "peak": max(meter.peak, now),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.columns.columns import expand_cells
 from pipeline.quality.quality import Quality, measure_cells
 from tests.benchmarks.runs import citystitch
-from tiler.store.results import read_columns
+from tests.helpers.columns import read_columns
 from tiler.store.store import Store
 
 SIZE = 1200

@@ -25,16 +25,18 @@ from rich.console import Console
 from tiler.config.config import Config, make_config
 from tiler.engine.stage import Scope
 from tiler.engine.task import Record
+from tiler.engine.watcher import RunStart, Watcher
 from tiler.interface.synth import write_city
 from tiler.monitoring.events import EventLog, begin_file
 from tiler.monitoring.live_view import LiveView
-from tiler.monitoring.terminal import make_views
-from tiler.monitoring.watchers import RunStart, Watcher, Watchers
+from tiler.monitoring.run_log import RunLog
+from tiler.monitoring.terminal import make_view
+from tiler.monitoring.watchers import Watchers
 from tiler.workflow.run import run
 
 SIZE, BUILDINGS, TILE = 600.0, 220, 150.0  # m, number, m: 16 tiles
 PAIRS = 12
-CALLS = ("begin", "laid_out", "planned", "submitted", "__call__", "failed", "say", "end")
+CALLS = ("begin", "laid_out", "planned", "submitted", "done", "failed", "say", "end")
 TILES = 100_000
 FACTS = {
     "counts": {"cells": 8938, "facets": 1212, "seam faces": 542},
@@ -108,7 +110,7 @@ def measure_pairs(pairs: int, folder: Path) -> tuple[list[tuple[float, float]], 
 
     def views() -> list[Watcher]:
         environment = {"TERM": "xterm-256color", "COLUMNS": "120", "LINES": "40"}
-        return make_views(console=Console(file=terminal, _environ=environment))
+        return [make_view(console=Console(file=terminal, _environ=environment))]
 
     found = []
     for k in range(pairs):
@@ -125,7 +127,7 @@ def measure_items(folder: Path) -> tuple[float, float]:
     """Processor time (s) of an item that is submitted and done, and bytes of it, of 100,000."""
     path = folder / "events.jsonl"
     log = EventLog(path, begin_file(path))
-    watchers = Watchers([make_views(console=Console(file=open(os.devnull, "w")))[0], log])  # noqa: SIM115
+    watchers = Watchers([RunLog(), log])
     tiles = {f"{k % 317}_{k // 317}": (float(k), 0.0, k + 1.0, 1.0) for k in range(TILES)}
     expected = {"pieces": (Scope.TILE, TILES)}
     start = RunStart(folder, "citystitch", (0.0, 0.0, 1.0, 1.0), "EPSG:28992", 1.0, 2, tiles, {}, expected)
@@ -133,7 +135,7 @@ def measure_items(folder: Path) -> tuple[float, float]:
     watchers.begin(start)
     for k, tile in enumerate(tiles):
         watchers.submitted("pieces", tile)
-        watchers("pieces", k + 1, TILES, Record("pieces", tile, "", "", FACTS, {}, {"all": 1.25}, 10**9))
+        watchers.done("pieces", k + 1, TILES, Record("pieces", tile, "", "", FACTS, {}, {"all": 1.25}, 10**9))
     watchers.end("done")
     return (time.process_time() - began) / TILES, path.stat().st_size / TILES
 

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.mesh import Boundary, Marker, TetMesh
 from pipeline.data.roofs import flat_roofs
+from tests.helpers.vtk_writers import write_vtp, write_vtu
 from tiler.citymodels.cityjson import write_city_model
-from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
+from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
 
 Square = tuple[int, int]
 # Squares of the grid that each building stands on, and the level of its roof.

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from shapely.affinity import rotate, translate
 
 from pipeline.data.mesh import Boundary, TetMesh
-from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
+from tests.helpers.vtk_writers import write_vtp, write_vtu
+from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
 
 # Far from zero, as in a national CRS: single precision has steps of 0.03 m here.
 ORIGIN = np.array([121000.0, 487000.0, 0.0])

@@ -19,9 +19,10 @@ from stitch.seams.seam_columns import tile_columns
 from stitch.seams.seams import find_vertices
 from stitch.tiling.grid import Key, SeamKey, TileGrid, seams_of_tile
 from tests.helpers.stitching import OPTIONS, Scene, Tile, clip_scene, mesh_all
+from tests.helpers.vtk_writers import write_vtp, write_vtu
 from tiler.citymodels.cityjson import write_city_model
 from tiler.mesh_files.merged import VERTEX_ID
-from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu, write_vtp, write_vtu
+from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
 
 Split = tuple[ColumnMesh, Boundary, NDArray[np.int32]]
 Pieces = dict[Key, tuple[TetMesh, Boundary]]

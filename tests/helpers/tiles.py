@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +23,7 @@ from stitch.tiling.grid import Bounds
 from tiler.config.config import Config, make_config
 from tiler.config.step_options import derived_parameters
 from tiler.engine.engine import Engine
-from tiler.engine.executor import serial
+from tiler.engine.executor import Serial
 from tiler.engine.run_context import RunContext, pack_tiles
 from tiler.engine.stage import REGION_ITEM
 from tiler.objects.places import identify
@@ -193,7 +193,7 @@ def open_engine(config: Config) -> Iterator[tuple[Engine, Plan]]:
         footprints_frame=dataclasses.astuple(plan.georeference.footprints),
         footprints_shift=(0.0, 0.0),
     )
-    with serial() as executor:
+    with nullcontext(Serial()) as executor:
         yield (
             Engine(out / "store.zarr", plan.layout, parameters=parameters, context=context, executor=executor),
             plan,

@@ -23,7 +23,8 @@ from tests.helpers.loopback import free_ports
 from tests.helpers.sparse_city import ROOT, make_city
 from tests.runs.test_run import hashes
 from tiler.cli.main import make_parser
-from tiler.config.config import Config, check_reach, load_config
+from tiler.config.config import Config
+from tiler.config.config_file import check_reach, load_config
 from tiler.executors.dask_settings import BOTH, ENVIRONMENT, SCHEDULER, WORKER, as_variables
 from tiler.executors.remote_cluster import PATIENCE
 from tiler.objects.places import is_url

@@ -208,7 +208,7 @@ def test_a_tile_alone_must_be_one_of_the_region(town: Town, tmp_path: Path) -> N
 
 
 def test_the_configuration_of_a_run_is_kept(town: Town) -> None:
-    from tiler.config.config import load_config
+    from tiler.config.config_file import load_config
 
     assert make_config(load_config(town.out / "config.toml")) == town.config(town.out)
 

@@ -20,6 +20,7 @@ from shapely import affinity
 from pipeline.data.errors import ConfigError
 from stitch.tiling.grid import tiles_of_seam
 from tests.helpers.campaigns import keep_outcome
+from tests.helpers.told import StageEnds
 from tests.runs.test_run import hashes
 from tiler.check.check import check_run
 from tiler.config.config import Config, make_config
@@ -313,14 +314,14 @@ def test_an_update_that_is_cut_off_states_no_finished_mesh_and_goes_on(nine: Tow
     town = nine.copy(tmp_path)
     seen: list[tuple[str, bool]] = []
 
-    def look(stage: str, _: float) -> None:
+    def look(stage: str) -> None:
         status = json.loads((town.out / "run.json").read_text())["status"]
         seen.append((status, (town.out / "mesh.pvtu").exists() or (town.out / "boundary.pvtp").exists()))
-        if stage.startswith("columns"):
+        if stage == "columns":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(town.config(town.out, stagger=0.5), announce=look)
+        run(town.config(town.out, stagger=0.5), watchers=[StageEnds(look)])
     assert set(seen) == {("running", False)}
     assert json.loads((town.out / "run.json").read_text())["status"] == "failed"
     assert not (town.out / "mesh.pvtu").exists()

@@ -12,6 +12,7 @@ import pytest
 import shapely
 
 from pipeline.data.errors import ConfigError
+from tests.helpers.told import StageEnds
 from tests.runs.test_run import hashes
 from tiler.check.check import check_run
 from tiler.config.config import Config, make_config
@@ -70,14 +71,14 @@ def anew(town: Town, record: dict[str, Any]) -> dict[str, int]:
 def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(town: Town, tmp_path: Path) -> None:
     done: list[str] = []
 
-    def stop(stage: str, _: float) -> None:
-        done.append(stage.split(" ", maxsplit=1)[0])
+    def stop(stage: str) -> None:
+        done.append(stage)
         if done[-1] == "seams":
             raise KeyboardInterrupt
 
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        run(town.config(out), announce=stop)
+        run(town.config(out), watchers=[StageEnds(stop)])
     assert json.loads((out / "run.json").read_text())["status"] == "failed"
     committed = Store(out / "store.zarr")
     there = {stage: len(committed.names(stage)) for stage in committed.stages()}

@@ -20,11 +20,12 @@ from pipeline.data.classes import BUILDING, GROUND
 from pipeline.data.errors import CityError
 from tests.helpers.campaigns import keep_outcome, rounds
 from tests.helpers.cities import Bounds, cloud_over
+from tests.helpers.columns import read_columns
 from tiler.check.check import check_run
 from tiler.cli.main import main
 from tiler.config.config import make_config
 from tiler.interface.synth import write_city
-from tiler.store.results import StoredTerrain, read_columns
+from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
 from tiler.workflow.run import run
 

@@ -177,7 +177,7 @@ def test_any_order_of_files_and_tasks_leaves_the_same_files(
 ) -> None:
     values, hashes = city
     order = AnyOrder(1)
-    monkeypatch.setattr("tiler.engine.engine.heapq", order)
+    monkeypatch.setattr("tiler.engine.schedule.heapq", order)
     files = sorted(Path(values["pointcloud"][0]).iterdir(), reverse=True)
     run_of(values | {"pointcloud": [str(path) for path in files]}, tmp_path)
     assert hash_files(tmp_path) == hashes

@@ -50,9 +50,10 @@ from tests.helpers.tiled_runs import (
     write_numbered,
     write_tiled_run,
 )
+from tests.helpers.vtk_writers import write_vtu
 from tiler.check.check import CheckReport, check_run
 from tiler.mesh_files.merged import VERTEX_ID, write_merged_boundary, write_merged_volume
-from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_vtu
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu
 from tiler.stages.pieces import prove_seams
 
 SQUARE: Bounds = (0.0, 0.0, 420.0, 420.0)

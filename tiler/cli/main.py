@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from pipeline.data.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
 from tiler.cli.parser import EXPORT_OPTION, Handler, build_parser
-from tiler.config.config import Config, annotated_defaults, make_config
-from tiler.config.config_file import with_file
+from tiler.config.config import Config, make_config
+from tiler.config.config_file import annotated_defaults, with_file
 from tiler.jobs.submission import describe_job, find_run, job_line
 from tiler.mesh_files.run_files import refuse_strangers
 from tiler.objects.places import place, refuse_bucket
@@ -25,6 +25,7 @@ from tiler.words.plain_text import printable
 from tiler.words.std_streams import guard_streams
 
 if TYPE_CHECKING:
+    from tiler.engine.watcher import Watcher
     from tiler.interface.synth import SynthFiles
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
@@ -131,17 +132,18 @@ def _run_config(
         start_fork_server()
     gc.set_threshold(GARBAGE)
     from tiler.monitoring.events import EventLog, open_log
-    from tiler.monitoring.terminal import make_views, print_last_line, print_summary
+    from tiler.monitoring.terminal import make_view, print_last_line, print_summary
     from tiler.store.out_folder import refuse_result
     from tiler.workflow.run import run
 
     if report:
         refuse_bucket(config.out, "--report")
     out = place(config.out)
-    watchers = make_views(quiet=quiet, verbose=verbose)
+    watchers: list[Watcher] = []
     if log is not None:
         refuse_result(out, log)
         watchers.append(EventLog(log, open_log(log), every=0.0))
+    watchers.append(make_view(quiet=quiet, verbose=verbose))
     record = run(config, watchers=watchers, dashboard=dashboard)
     if report:
         _report_run(out, quiet=quiet)

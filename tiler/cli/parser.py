@@ -3,9 +3,11 @@
 import argparse
 import dataclasses
 import importlib.metadata
+import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, NoReturn, get_args, get_origin, get_type_hints
 
 from pipeline.data.errors import ConfigError
 from tiler.config.config import ANYWHERE, Config
@@ -14,7 +16,7 @@ from tiler.config.domain_height import Height
 from tiler.export.export import list_formats, load_format
 from tiler.jobs.submission import add_job_commands
 from tiler.objects.places import place, refuse_bucket
-from tiler.words.did_you_mean import Parser
+from tiler.words.plain_text import suggest
 
 Handler = Callable[[argparse.Namespace], int]
 Group = Any  # of options, as `ArgumentParser.add_argument_group` makes it
@@ -29,6 +31,7 @@ KINDS = {
     **{"out": "DIR", "crs": "EPSG", "layer": "LAYER", "scheduler": "ADDRESS"},
     **dict.fromkeys(("id_attribute", "height_attribute", "roof_attribute"), "ATTRIBUTE"),
 }
+WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
 # What a first run needs stands first in the help of a run, what is for studies of the method last.
 ESSENTIAL = (
@@ -52,6 +55,27 @@ TITLES = {
     "watch": "what it shows and writes",
     "research": "research: other ways of the method, and their tolerances",
 }
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors offer what was meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit code 2, the error, and what was meant."""
+        if found := WRONG_CHOICE.search(message):
+            known = [name.strip("'") for name in found[2].split(", ")]
+            message += suggest(found[1], known)
+        self.print_usage(sys.stderr)
+        self.exit(2, f"{self.prog}: error: {message}\n")
+
+    def refuse_unknown(self, words: Sequence[str]) -> NoReturn:
+        """End with exit code 2 because of words that are no options of this parser."""
+        known = re.findall(r"--[a-z][a-z-]*", self.format_help())
+        for word in words:
+            name = word.partition("=")[0]
+            if name.startswith("-"):
+                self.error(f"unknown option {name}{suggest(name, known)}")
+        self.error(f"unrecognized arguments: {' '.join(words)}")
 
 
 def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
@@ -269,7 +293,7 @@ class _ExportHelp(argparse.Action):
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:
-    """Add the options of all formats; which of them a format takes is told by it."""
+    """Add the options of all formats; each format names those that it takes."""
     export.add_argument("-h", "--help", nargs=0, action=_ExportHelp, help="show this help message and exit")
     export.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
     export.add_argument("--format", choices=list_formats(), metavar="NAME", required=True, help="see below")

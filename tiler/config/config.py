@@ -1,27 +1,28 @@
 """Every parameter of a run, once: default, unit, meaning, source. The command line and TOML follow it."""
 
 import dataclasses
-import json
 import math
-import os
-import tomllib
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.data.classes import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
 from pipeline.data.errors import ConfigError
 from stitch.tiling.smallest_tile import LEAST_TILE
-from tiler.config.domain_height import EXPECTED_TALLEST, ROUNDING, Height, height_in_metres, read_height
-from tiler.config.pad_widths import check_widths
-from tiler.config.tile_size import LEAST_SIDE, choose_tile_size
+from tiler.config.domain_height import (
+    EXPECTED_TALLEST,
+    LEAST_SIDE,
+    ROUNDING,
+    Height,
+    check_widths,
+    choose_tile_size,
+    height_in_metres,
+    read_height,
+)
 from tiler.objects.places import check_url, is_url
-from tiler.words.did_you_mean import suggest
 from tiler.words.plain_text import shorten
 
-MAX_CONFIG_BYTES = 1_000_000
 MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
 MAX_INT = 2**53
 UNSET = ""
@@ -29,6 +30,10 @@ ANYWHERE = "127.0.0.1:0"  # a free port of this machine, for this machine
 PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is given for the open
 NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
+
+
+class Above(float):
+    """A lower bound that is itself too low."""
 
 
 def _parameter(
@@ -39,16 +44,12 @@ def _parameter(
     unit: str = "",
     source: str = "",
     choices: tuple[str, ...] = (),
-    above: float | None = None,
     least: float | None = None,
     most: float | None = None,
 ) -> Any:
     """Declare a parameter: its section in TOML, its bounds, and all that a user should know of it."""
-    metadata = {
-        "section": section, "text": text, "unit": unit, "source": source,
-        "choices": choices, "above": above, "least": least, "most": most,
-    }  # fmt: skip
-    return field(default=default, metadata=metadata)
+    metadata = {"section": section, "text": text, "unit": unit, "source": source, "choices": choices}
+    return field(default=default, metadata=metadata | {"least": least, "most": most})
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class Config:
         False, "input", "leave out point-cloud files that cannot be read, list them, and end with exit code 3"
     )
     dtm_spacing: float = _parameter(
-        1.0, "terrain", "spacing of the terrain grid", unit="m", source="paper, step 1.3", above=0
+        1.0, "terrain", "spacing of the terrain grid", unit="m", source="paper, step 1.3", least=Above(0)
     )
     ground_filter: bool = _parameter(
         False, "terrain", "find ground points by an own filter, for clouds without ground classes"
@@ -114,11 +115,11 @@ class Config:
     min_building_area: float = _parameter(5.0, "buildings", "smaller footprints are dropped", unit="m2", least=0)
     vertex_tolerance: float = _parameter(
         0.01, "buildings", "vertices closer than this are one; also the bound for needless ones", unit="m",
-        source="paper, step 1.4", above=0, most=0.5,
+        source="paper, step 1.4", least=Above(0), most=0.5,
     )  # fmt: skip
     ground_margin: float = _parameter(
         1.0, "buildings", "ground points lie within this distance of a footprint", unit="m",
-        source="paper, step 1.5", above=0,
+        source="paper, step 1.5", least=Above(0),
     )  # fmt: skip
     ground_percentile: float = _parameter(
         10.0, "buildings", "ground height of a building, percentile of its ground points", unit="%",
@@ -138,7 +139,7 @@ class Config:
     )  # fmt: skip
     roof_clearance: float = _parameter(
         2.0, "buildings", "roofs are raised to this height above the highest terrain at their walls", unit="m",
-        above=0,
+        least=Above(0),
     )  # fmt: skip
     border: str = _parameter(
         "clip", "buildings", "buildings on the region's border are clipped to it less the clearance, or dropped",
@@ -154,7 +155,7 @@ class Config:
     )  # fmt: skip
     clearance_floor: float = _parameter(
         0.1, "simplify", "with simplify = paper: finer details of one building are repaired", unit="m",
-        above=0,
+        least=Above(0),
     )  # fmt: skip
     min_courtyard_area: float = _parameter(5.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
     roofs: str = _parameter(
@@ -181,8 +182,8 @@ class Config:
         "mesh_size everywhere", unit="m", least=0,
     )  # fmt: skip
     grading: float = _parameter(
-        0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size or pad", above=0,
-        most=1,
+        0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size or pad",
+        least=Above(0), most=1,
     )  # fmt: skip
     pad: tuple[float | str, ...] = _parameter(
         (), "mesh", "width of a margin of bare ground around the region, which flattens outwards and has coarser "
@@ -195,7 +196,7 @@ class Config:
     )  # fmt: skip
     domain_height: float | str = _parameter(
         100.0, "mesh", "height of the domain above the terrain: metres, or 6H for six times the height of the "
-        "tallest building", unit="m", source="paper, step 3.2", above=0,
+        "tallest building", unit="m", source="paper, step 3.2", least=Above(0),
     )  # fmt: skip
     top: str = _parameter(
         "terrain", "mesh", "top of the domain: it follows the smoothed terrain, or is flat, domain_height above "
@@ -217,10 +218,10 @@ class Config:
         source="paper, steps 3.2-3.5", choices=("adaptive", "layered"),
     )  # fmt: skip
     least_spacing: float = _parameter(
-        0.1, "mesh", "least vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=1
+        0.1, "mesh", "least vertical spacing with mesher = adaptive, in mesh sizes", least=Above(0), most=1
     )
     most_spacing: float = _parameter(
-        0.8, "mesh", "largest vertical spacing with mesher = adaptive, in mesh sizes", above=0, most=5
+        0.8, "mesh", "largest vertical spacing with mesher = adaptive, in mesh sizes", least=Above(0), most=5
     )
     stagger: float = _parameter(
         0.8, "mesh", "shift of neighbouring columns with mesher = adaptive; 0 for none, 1 for thirds of a step",
@@ -243,10 +244,10 @@ class Config:
         "largest residual over the diagonal with smoother = columns; heights are then within about "
         "ten times this of the exact solution",
         unit="m",
-        above=0,
+        least=Above(0),
     )
     fem_tolerance: float = _parameter(
-        1e-8, "mesh", "relative residual of the linear systems with smoother = fem", above=0, most=1e-2
+        1e-8, "mesh", "relative residual of the linear systems with smoother = fem", least=Above(0), most=1e-2
     )
     tile_size: float = _parameter(
         0.0,
@@ -392,76 +393,6 @@ def idle_parameters(config: Config) -> list[str]:
     return idle
 
 
-def load_config(path: Path) -> dict[str, Any]:
-    """Read the parameters that a TOML file gives.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is no TOML, or has an unknown section or parameter.
-
-    Notes
-    -----
-    Relative paths of inputs and of the output folder are taken from the file's folder.
-    """
-    document = _read_toml(path)
-    values: dict[str, Any] = {}
-    sections = {entry.name: entry.metadata["section"] for entry in dataclasses.fields(Config)}
-    for section, table in document.items():
-        if section not in sections.values() or not isinstance(table, dict):
-            offer = suggest(section, sections.values())
-            raise ConfigError(
-                f"{path}: unknown section [{shorten(section, 100)}]{offer}; `citystitch config` lists all"
-            )
-        for name, value in table.items():
-            if sections.get(name) != section:
-                offer = f"; it stands in [{sections[name]}]" if name in sections else suggest(name, sections)
-                raise ConfigError(
-                    f"{path}: unknown parameter {shorten(name, 100)} in [{section}]{offer}; `citystitch config` "
-                    "lists all"
-                )
-            values[name] = _relative_to(path.parent, name, value)
-    return values
-
-
-def check_reach(path: Path, values: Mapping[str, Any]) -> None:
-    """Refuse what a configuration file may not decide, as it may come from someone else.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    values : mapping
-        The parameters that it gives, less those that the command line gives.
-
-    Raises
-    ------
-    ConfigError
-        If the output folder lies outside the file's folder, by ``..``, an absolute path or a symbolic link; or if
-        it names a scheduler, or a cluster: who connects to one runs what it sends.
-    """
-    out = values.get("out", UNSET)
-    if isinstance(out, str) and "\0" not in out:
-        if is_url(out):
-            raise ConfigError(f"{path}: out leads to {out}; give it on the command line, with --out")
-        home, target = (Path(os.path.realpath(place)) for place in (path.parent, out or "."))
-        if out and not target.is_relative_to(home):
-            raise ConfigError(
-                f"{path}: out leads to {target}, outside the folder of the file; give it on the command line, "
-                "with --out"
-            )
-    if values.get("scheduler"):
-        raise ConfigError(
-            f"{path}: a file may not name a scheduler, as its address is trusted with this machine; give it on "
-            "the command line, with --scheduler"
-        )
-    if values.get("cluster"):
-        raise ConfigError(
-            f"{path}: a file may not name a cluster, as the lines of its jobs are run; give it on the command "
-            "line, with --cluster"
-        )
-
-
 def make_config(values: Mapping[str, Any]) -> Config:
     """Check the values of parameters and fill in defaults.
 
@@ -480,60 +411,6 @@ def make_config(values: Mapping[str, Any]) -> Config:
     config = Config(**checked)
     _check_together(config)
     return config
-
-
-def annotated_defaults() -> str:
-    """Write all parameters with their defaults, meaning, unit and source as TOML."""
-    return write_config(Config(), "all parameters with their defaults")
-
-
-def write_config(config: Config, title: str = "the parameters of a run") -> str:
-    """Write all parameters with their values, meaning, unit and source as TOML."""
-    lines = [f"# citystitch configuration: {title}.", ""]
-    section = ""
-    for entry in dataclasses.fields(Config):
-        data = entry.metadata
-        if data["section"] != section:
-            section = data["section"]
-            lines += [f"[{section}]"]
-        facts = [data["text"]]
-        facts += [f"unit: {data['unit']}"] if data["unit"] else []
-        facts += [f"one of: {', '.join(data['choices'])}"] if len(data["choices"]) > 1 else []
-        facts += [f"({data['source']})"] if data["source"] else []
-        lines += [f"# {'; '.join(facts)}", f"{entry.name} = {_toml(getattr(config, entry.name))}", ""]
-    return "\n".join(lines)
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        if path.exists() and not path.is_file():
-            raise ConfigError(f"{path}: is no regular file; give a configuration file")
-        with path.open("rb") as file:
-            content = file.read(MAX_CONFIG_BYTES + 1)
-        if len(content) > MAX_CONFIG_BYTES:
-            raise ConfigError(
-                f"{path}: {path.stat().st_size} bytes > {MAX_CONFIG_BYTES}; this is no configuration"
-            )
-        return tomllib.loads(content.decode())
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-    except RecursionError as error:
-        raise ConfigError(f"{path}: its values are nested too deep; this is no configuration") from error
-    except ValueError as error:
-        raise ConfigError(f"{path}: not valid TOML ({error}); see `citystitch config` for a template") from error
-
-
-def _relative_to(folder: Path, name: str, value: Any) -> Any:
-    if name == "pointcloud" and isinstance(value, (str, list)):
-        value = [value] if isinstance(value, str) else value
-        return [_below(folder, item) if isinstance(item, str) else item for item in value]
-    if name in ("footprints", "out", *TLS) and isinstance(value, str) and value:
-        return _below(folder, value)
-    return value
-
-
-def _below(folder: Path, text: str) -> str:
-    return text if is_url(text) else str(folder / text)
 
 
 def _convert(name: str, value: Any, wanted: Any) -> Any:
@@ -592,11 +469,11 @@ def _check_bounds(name: str, value: Any, data: Mapping[str, Any]) -> None:
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return
     unit = f" {data['unit']}" if data["unit"] else ""
-    above, least, most = data["above"], data["least"], data["most"]
+    least, most = data["least"], data["most"]
     if not math.isfinite(value):
         raise ConfigError(f"{name} = {value}: must be a finite number")
-    if above is not None and not value > above:
-        raise ConfigError(f"{name} = {value:g}{unit}: must be above {above:g}{unit}")
+    if isinstance(least, Above) and not value > least:
+        raise ConfigError(f"{name} = {value:g}{unit}: must be above {least:g}{unit}")
     if least is not None and not value >= least:
         raise ConfigError(f"{name} = {value:g}{unit}: must be at least {least:g}{unit}")
     if most is not None and not value <= most:
@@ -726,11 +603,3 @@ def check_height(config: Config, height: float) -> None:
         f"vertical spacing of up to {spacing:g} m (most_spacing x {name}): at most half of {shown}; {move}, or "
         "raise --domain-height"
     )
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return f"[{', '.join(_toml(item) for item in value)}]"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)

@@ -6,19 +6,27 @@ Franke et al., *Best practice guideline for the CFD simulation of flows in the u
 around buildings*, J. Wind Eng. Ind. Aerodyn. 96 (2008), 1749-1761.
 """
 
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pipeline.data.errors import ConfigError
+from stitch.tiling.smallest_tile import LEAST_TILE
 
 MULTIPLE = re.compile(r"([0-9]*\.?[0-9]+)\s*[hH]")
 EXPECTED_TALLEST = 20.0  # m; the tallest building where a forecast needs one before there is a city model
 GUIDELINE = 6.0  # heights of the tallest building: least height of the domain (COST 732, AIJ)
 ROUNDING = 1e-9
-
 Height = float | str
+LEAST_SIDE = 10.0  # m
+LARGE_SIDE = 1250.0  # m; for meshes of the size below, and coarser ones
+LARGE_SIDE_SIZE = 10.0  # m
+POWER = 0.9  # of the mesh size: cells in a tile grow somewhat as it falls
+STEP = 10.0  # m; sides that are chosen are multiples of it
+SIDES = ("west", "east", "south", "north")
+LEAST_NODES = 4  # of the terrain's grid, across a pad: the outermost ones are level
 
 
 @dataclass(frozen=True)
@@ -108,3 +116,70 @@ def is_low(height: float, tallest: float) -> bool:
     (True, False, False)
     """
     return height < GUIDELINE * tallest * (1 - ROUNDING)
+
+
+def choose_tile_size(mesh_size: float, largest_size: float) -> float:
+    """Choose the side of tiles (m) so that seams are few, and a worker takes some 300 to 450 MB.
+
+    Parameters
+    ----------
+    mesh_size, largest_size : float
+        Target edge length at walls, and the largest one in the region (m).
+
+    Notes
+    -----
+    Nothing else counts, so that a larger region has the same tiles. Larger tiles have fewer seams and tasks,
+    smaller ones take less memory and leave no worker idle: `docs/scaling.md` has the measurements.
+
+    Examples
+    --------
+    >>> [choose_tile_size(size, size) for size in (20.0, 10.0, 5.0, 2.5)]
+    [1250.0, 1250.0, 660.0, 350.0]
+    """
+    fine = min(mesh_size / LARGE_SIDE_SIZE, 1.0)
+    side = math.floor(LARGE_SIDE * math.pow(fine, POWER) / STEP) * STEP
+    return max(side, LEAST_SIDE, LEAST_TILE * largest_size)
+
+
+def widths_in_metres(pad: Sequence[Height], tallest: float) -> tuple[float, float, float, float]:
+    """Widths of a pad to the west, east, south and north (m), given the height of the tallest building (m).
+
+    Raises
+    ------
+    ConfigError
+        If one is a multiple of the tallest building's height, and there is none.
+
+    Notes
+    -----
+    Multiples are rounded up to whole metres.
+
+    Examples
+    --------
+    >>> widths_in_metres(("5H",), 21.5), widths_in_metres((200.0, "15H", 0.0, 0.0), 21.5)
+    ((108.0, 108.0, 108.0, 108.0), (200.0, 323.0, 0.0, 0.0))
+    """
+    if tallest <= 0 and any(isinstance(width, str) for width in pad):
+        shown = " ".join(map(str, pad))
+        raise ConfigError(f"pad = {shown}: there are no buildings in the region; give it in metres")
+    metres = [
+        float(math.ceil(height_in_metres(width, tallest))) if isinstance(width, str) else width for width in pad
+    ]
+    west, east, south, north = metres * (4 // len(metres))
+    return west, east, south, north
+
+
+def check_widths(widths: Sequence[Height], *, mesh_size: float, dtm_spacing: float) -> None:
+    """Refuse a pad that is narrower than a cell, or too narrow for its ground.
+
+    Raises
+    ------
+    ConfigError
+        With the width against its bound (m); multiples of a height that is not known are not looked at.
+    """
+    least = max(mesh_size, LEAST_NODES * dtm_spacing)
+    for width in widths:
+        if not isinstance(width, str) and width != 0 and not (math.isfinite(width) and width >= least):
+            raise ConfigError(
+                f"pad = {width:g} m: must be 0 for none, or at least {least:g} m (mesh_size, and {LEAST_NODES} "
+                "times dtm_spacing)"
+            )

@@ -149,8 +149,10 @@ def size_rule(given: Any, largest: float) -> SizeRule:
     return SizeRule(given.mesh_size, largest, given.grading)
 
 
-def soil_options(given: Any) -> SoilOptions:
-    """Options of the soil, the same with both meshers."""
+def soil_options(given: Any) -> SoilOptions | None:
+    """Options of the soil, the same with both meshers; None without soil."""
+    if not _optional(given, "underground", 0.0):
+        return None
     limits = SpacingLimits(given.least_spacing, given.most_spacing)
     return SoilOptions(given.underground, given.mesh_size, limits, given.stagger)
 

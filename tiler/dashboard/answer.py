@@ -5,8 +5,8 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
-from tiler.dashboard.codes import State
 from tiler.dashboard.follow import Follower
+from tiler.dashboard.items import State
 from tiler.dashboard.map_view import Question, describe_map
 from tiler.dashboard.model import SEAM, TILE, RunModel
 from tiler.monitoring.tally import StageTally, estimate_share, estimate_time
@@ -60,7 +60,7 @@ def tell(follower: Follower, question: Question) -> dict[str, Any]:
 
 
 def describe_head(model: RunModel, *, alive: bool) -> dict[str, Any]:
-    """Tell what run it is, how it stands, and how long it may take still (s), None where nobody knows."""
+    """Describe which run it is, its state, and how long it may still take (s), None where unknown."""
     status = model.standing(alive=alive)
     taken = {name: model.head.get(name) for name in ("error", "command", "bounds", "crs", "tile_size", "workers")}
     end = time.time() if status == "running" else model.last

@@ -56,7 +56,7 @@ class Follower:
         self.run = f"{time.time_ns():x}"
 
     def alive(self) -> bool:
-        """Tell whether the run is at work."""
+        """Return whether the run is at work."""
         if self._alive is not None:
             return self._alive()
         try:
@@ -102,7 +102,7 @@ class Follower:
                 self.model.fold(_parse(line))
 
     def _from_record(self) -> None:
-        """Tell of a run that wrote no events what its record says."""
+        """Show a run that wrote no events by its record."""
         path = self.folder / RUN_RECORD
         try:
             stat = path.stat()
@@ -122,7 +122,7 @@ class Follower:
 
 
 def events_of_record(record: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Tell the record of a run, ``run.json``, as events: tiles that are there, and tiles that are missing."""
+    """Return the record of a run, ``run.json``, as events: tiles that are there, and tiles that are missing."""
     region = record.get("region", {})
     head = {name: region.get(name) for name in ("bounds", "crs", "tile_size") if name in region}
     yield {"event": "run", "t": 0.0, "status": record["status"], "error": record.get("error", "")} | head

@@ -58,7 +58,7 @@ class Base(RequestHandler):
         self.follower, self.loopback, self.dask = follower, loopback, dask
 
     def set_default_headers(self) -> None:
-        """Say what the browser may do."""
+        """Add the headers on what the browser may do."""
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
@@ -68,7 +68,7 @@ class Base(RequestHandler):
             raise HTTPError(403, reason="ask by 127.0.0.1 or localhost")
 
     def write_error(self, status_code: int, **others: Any) -> None:
-        """Say what is wrong in one line of plain text."""
+        """Describe what is wrong in one line of plain text."""
         error = others.get("exc_info", (None, None, None))[1]
         reason = getattr(error, "reason", None) or responses.get(status_code, "unknown")
         self.set_header("Content-Type", "text/plain; charset=utf-8")

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.dashboard.codes import Codes, State, combine, tally
-from tiler.dashboard.items import Items
+from tiler.dashboard.items import Codes, Items, State, combine, tally
 from tiler.dashboard.model import SEAM, TILE, RunModel
 
 KEPT_VIEWS = 8
@@ -45,7 +44,7 @@ class Question:
 
 
 def describe_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
-    """Tell a map.
+    """Describe a map for the page.
 
     Parameters
     ----------

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.data.errors import CityError
-from tiler.dashboard.codes import STATES, State
 from tiler.dashboard.follow import Follower
-from tiler.dashboard.items import Items
+from tiler.dashboard.items import STATES, Items, State
 from tiler.dashboard.map_view import LOWEST
 from tiler.dashboard.model import SEAM, TILE, RunModel
 

@@ -1,8 +1,7 @@
 """The interface of executors, and the one that runs tasks in this process; see `tiler.executors.dask_executor`."""
 
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Protocol
 
 from tiler.engine.submission import Function, Outcome, Part, run_parts
@@ -67,9 +66,3 @@ def _run(function: Function, task: Task) -> Outcome:
     if isinstance(outcome, Failure) and outcome.kind == "memory":
         return describe_memory(outcome, Limits())
     return outcome
-
-
-@contextmanager
-def serial() -> Iterator[Executor]:
-    """Run tasks in this process."""
-    yield Serial()

@@ -153,7 +153,7 @@ def seam_key(name: str) -> SeamKey:
 
 
 def find_owned(box: Box, bounds: Bounds, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which places are a tile's own: in its half-open box, places beyond the region taken to its border.
+    """Return which places are a tile's own: in its half-open box, places beyond the region taken to its border.
 
     Parameters
     ----------

@@ -180,24 +180,21 @@ class Task:
 
     def read_rows(self, stage: str, name: str, array: str, start: int, stop: int) -> NDArray[Any]:
         """Read some rows of one array of one result that is among ``refs``; errors as for `read`."""
-        if name not in self._declared(stage):
-            raise ValueError(f"stage {self.stage}, {self.name}: {name} of {stage} is beyond its reach")
+        self._check_reach(stage, name)
         return self.store.read_rows(stage, name, array, start, stop)
 
     def read_ranges(
         self, stage: str, name: str, names: Collection[str], ranges: Sequence[tuple[int, int]]
     ) -> dict[str, NDArray[Any]]:
         """Read ranges of rows of some arrays, ascending, put one after the other; errors as for `read`."""
-        if name not in self._declared(stage):
-            raise ValueError(f"stage {self.stage}, {self.name}: {name} of {stage} is beyond its reach")
+        self._check_reach(stage, name)
         return self.store.read_ranges(stage, name, names, ranges)
 
     def read_window(
         self, stage: str, name: str, array: str, rows: tuple[int, int], columns: tuple[int, int]
     ) -> NDArray[Any]:
         """Read a window of an array that was put by `put_rasters`; errors as for `read`."""
-        if name not in self._declared(stage):
-            raise ValueError(f"stage {self.stage}, {self.name}: {name} of {stage} is beyond its reach")
+        self._check_reach(stage, name)
         return self.store.read_window(stage, name, array, rows, columns)
 
     def put(self, **arrays: ArrayLike) -> None:
@@ -238,6 +235,10 @@ class Task:
         """Give the folder for files that the result states; in a bucket they are put when all are written."""
         with files_for(self.folder) as folder:
             yield folder
+
+    def _check_reach(self, stage: str, name: str) -> None:
+        if name not in self._declared(stage):
+            raise ValueError(f"stage {self.stage}, {self.name}: {name} of {stage} is beyond its reach")
 
     def _declared(self, stage: str) -> tuple[str, ...]:
         if stage not in self.refs:
@@ -328,7 +329,7 @@ def notes_from_json(rows: Iterable[list[Any]]) -> list[Note]:
 
 
 def peak_memory() -> int:
-    """Tell the peak resident memory of this process (bytes)."""
+    """Return the peak resident memory of this process (bytes)."""
     try:  # VmHWM where the system tells it, as ru_maxrss survives a fork.
         status = Path("/proc/self/status").read_text()
         return int(status.split("VmHWM:")[1].split()[0]) * 1024
@@ -373,7 +374,7 @@ def _note_from_json(values: list[Any]) -> Note:
 
 
 def describe_trace(error: Exception) -> str:
-    """Say where in the code an error arose."""
+    """Describe where in the code an error arose."""
     return "".join(traceback.format_exception(error))
 
 

@@ -98,7 +98,7 @@ def _watched(path: Path, file: TextIO, seconds: float) -> Iterator[None]:
 
 
 def describe_death(task: Task, limits: Limits) -> Failure | None:
-    """Tell from its file how a task ended whose process died; None if it had not begun.
+    """Find out from its file how a task ended whose process died; None if it had not begun.
 
     The file goes.
     """

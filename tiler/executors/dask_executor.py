@@ -62,11 +62,11 @@ class DaskExecutor:
     Notes
     -----
     Where a worker dies, Dask blames all that it had. Here a task is blamed if it had begun, which its trace
-    file tells (`tiler.engine.task_limits`); the others are sent again, and so are those before it in its
+    file shows (`tiler.engine.task_limits`); the others are sent again, and so are those before it in its
     submission, whose results are found in the store.
 
-    What a submission comes to is told by an event of Dask, in the stream of messages that says that it is done: to
-    fetch the result of a future takes a connection and four messages each.
+    Outcomes of a submission come as an event of Dask, in the stream of messages that reports it done: fetching
+    the result of a future takes a connection and four messages each.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class DaskExecutor:
                 )
 
     def _take(self, key: str, error: BaseException | None) -> None:
-        """Take what came of a submission; one that had not begun when its worker died is sent again."""
+        """Take the outcomes of a submission; one that had not begun when its worker died is sent again."""
         future, given = self._sent.pop(key)
         outcomes = self._outcomes(key, error, given)
         self._over.append(future)
@@ -270,7 +270,7 @@ class DaskExecutor:
         return Failure(WorkerError(f"{BYSTANDER} workers died before they began it; look at their logs"))
 
     def _forgives(self, task: Task, death: Failure) -> bool:
-        """Tell whether a task is sent again as if it had not begun, whose worker died with it."""
+        """Return whether a task is sent again as if it had not begun, whose worker died with it."""
         return False
 
     def _has_workers(self) -> bool:
@@ -302,7 +302,7 @@ class DaskExecutor:
             )
 
     def _is_lost(self) -> bool:
-        """Tell whether the client has lost its scheduler since it sent what is in flight."""
+        """Return whether the client has lost its scheduler since it sent what is in flight."""
         return self._lost or self._client.status != "running"
 
     @property

@@ -52,7 +52,7 @@ def prepare(mesher: str, workers: int, say: Callable[[str], None]) -> None:
 
 
 def are_compiled(ways: Iterable[str] = WAYS) -> bool:
-    """Tell whether `compile_kernels` has done its work with these versions for such a processor."""
+    """Return whether `compile_kernels` has done its work with these versions for such a processor."""
     folder = cache_folder()
     stamped = folder is not None and all(_stamp(folder, way).exists() for way in ways)
     return stamped or bool(numba.config.DISABLE_JIT)

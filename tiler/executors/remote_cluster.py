@@ -40,7 +40,7 @@ def connect_run(config: Config) -> Iterator[Executor]:
     """
     given = [str(path) for path in (*find_clouds(config.pointcloud), config.footprints) if str(path)]
     files = [Path(path) for path in given if not is_url(path)]
-    # Who reaches a bucket reaches the same one, and is told in its first task if it does not.
+    # Who reaches a bucket reaches the same one, and its first task fails if it does not.
     with (
         nullcontext(own_requirements())
         if is_url(config.out)
@@ -102,7 +102,7 @@ def connect(
             raise CityError(
                 f"{address}: no Dask scheduler answers ({error}); start one, or check the address"
             ) from error
-        # A lost scheduler is told once, by us.
+        # We report a lost scheduler, once.
         stack.enter_context(silence_logging_cmgr(logging.CRITICAL))
         stack.enter_context(client)
         threads = list(client.nthreads().values())

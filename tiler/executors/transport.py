@@ -1,7 +1,7 @@
 """The way to a scheduler: certificates for TLS, and whether one answers by the protocol of its address.
 
 Dask tries again until its time is up, whatever the reason, and says no more than that: so one connection is made
-here first, whose errors can be told.
+here first, so that its errors can be shown.
 """
 
 import socket

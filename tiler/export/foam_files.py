@@ -7,16 +7,14 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.export.rows import blocks_of, slices
+from tiler.export.pieces import blocks_of, slices
 
 BANNER = "// Written by citystitch.\n"
 LABEL_LIMIT = 2**31 - 1  # numbers that a 32 bit label can hold
 COUNT_WIDTH = 20  # characters of a count that is known when its list is whole
 
 
-def foam_header(
-    name: str, kind: str, *, location: str, binary: bool = False, label: int = 32, note: str = ""
-) -> str:
+def foam_header(name: str, kind: str, *, location: str, binary: bool = False, label: int = 32) -> str:
     """Make the head of a file.
 
     Parameters
@@ -27,14 +25,10 @@ def foam_header(
         Folder of it within the case.
     binary : bool
         Whether the lists in it are binary: little-endian, ``label`` bits an integer, 64 bits a float.
-    note : str
-        What some programs print; no quotes in it.
     """
     lines = ["FoamFile", "{", "    version     2.0;", f"    format      {'binary' if binary else 'ascii'};"]
     if binary:
         lines.append(f'    arch        "LSB;label={label};scalar=64";')
-    if note:
-        lines.append(f'    note        "{note}";')
     lines += [f"    class       {kind};", f'    location    "{location}";', f"    object      {name};", "}", ""]
     return BANNER + "\n".join(lines) + "\n"
 

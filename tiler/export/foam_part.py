@@ -267,7 +267,7 @@ class _PartWriter:
             self._zones.write(k, np.full(len(rows), GROUND_ZONE), rows)
 
     def _add_block(self, k: int, own: OwnFaces, face: int, local: Ints) -> NDArray[np.bool_]:
-        """Write faces of piece `k` from number `face` of the region on; tells which are inside the part."""
+        """Write faces of piece `k` from number `face` of the region on; returns which are inside the part."""
         region, part, start = self._plan.region, self._plan.part, self.numbers.start
         beyond = region.piece_of(own.neighbour)
         other = part[beyond]

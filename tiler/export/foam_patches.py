@@ -52,7 +52,7 @@ class Patch:
 
 
 def patch_of_key(key: int) -> Patch:
-    """Tell the patch of a key: a marker, or `FIRST_BUILDING` and the number of a building.
+    """Return the patch of a key: a marker, or `FIRST_BUILDING` and the number of a building.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def facets_by_key(keys: Iterable[int], of_facet: Ints) -> list[tuple[int, Ints]]
 
 
 def is_house(marker: NDArray[np.int32], building: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which facets (f,) are walls and roofs of a building that has a number; see `patch_keys`."""
+    """Return which facets (f,) are walls and roofs of a building that has a number; see `patch_keys`."""
     return np.isin(marker, HOUSE) & (building >= 0)
 
 
@@ -187,7 +187,7 @@ class ZonesFile:
     Parameters
     ----------
     path : Path
-        The file; its name tells what is in the zones.
+        The file; its name says what is in the zones.
     sets : FacetSets
         Zones by key.
     pieces : sequence of int

@@ -95,7 +95,7 @@ class RegionFaces:
         return int(self.face_start[-1])
 
     def piece_of(self, cell: Ints) -> Ints:
-        """Tell which piece has each cell, by their numbers over the region."""
+        """Return which piece has each cell, by their numbers over the region."""
         found: Ints = np.searchsorted(self.cell_start, cell, side="right") - 1
         return found
 
@@ -201,7 +201,7 @@ def faces_of_piece(piece: MeshPiece) -> CellFaces:
 
 
 def find_outer(piece: MeshPiece) -> NDArray[np.bool_]:
-    """Tell which facets of a piece bound its cells, bool (f,): all, but for the ground with soil below it."""
+    """Return which facets of a piece bound its cells, bool (f,): all, but for the ground with soil below it."""
     if piece.region is None:
         return np.ones(len(piece.facets), np.bool_)
     outer: NDArray[np.bool_] = piece.marker != Marker.GROUND
@@ -232,7 +232,7 @@ def own_faces(region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces) -
 
 
 def find_ground(region: RegionFaces, k: int, piece: MeshPiece, own: OwnFaces) -> NDArray[np.bool_]:
-    """Tell which faces of a block of piece `k` are the ground between air and soil.
+    """Return which faces of a block of piece `k` are the ground between air and soil.
 
     Raises
     ------

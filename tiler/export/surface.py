@@ -2,46 +2,36 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from tiler.export.foam_patches import PATCHES, patch_keys
-from tiler.export.rows import blocks_of
+from tiler.export.pieces import blocks_of
 from tiler.mesh_files.merged import VERTEX_ID, number_piece
-from tiler.mesh_files.mesh_pieces import MeshPieces, mark_sides, open_pieces
+from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces, mark_sides, open_pieces
 from tiler.mesh_files.run_files import RunSource
 from tiler.mesh_files.vtk_files import read_vtp
+from tiler.store.atomic import replacing
 
 WORD = 64  # points in a word of `VertexSet`
 
 
-class SurfacePiece(Protocol):
-    """The part of the boundary that one tile holds, as `tiler.mesh_files.mesh_pieces.MeshPiece` has it too."""
+@dataclass(frozen=True, eq=False)
+class BoundaryPart:
+    """The part of the boundary that one tile holds; arrays as of `MeshPiece`, which will do too."""
 
-    @property
-    def points(self) -> NDArray[np.float64]:
-        """Points (n, 3), in metres; some may have no facet."""
-
-    @property
-    def facets(self) -> NDArray[np.int32]:
-        """Facets (f, 3) as rows of `points`, counter-clockwise seen from outside the air."""
-
-    @property
-    def marker(self) -> NDArray[np.int32]:
-        """`pipeline.data.mesh.Marker` of each facet."""
-
-    @property
-    def building(self) -> NDArray[np.int64]:
-        """Number of each facet's building, -1 where there is none."""
-
-    @property
-    def ids(self) -> NDArray[np.int64]:
-        """Number of each point over the whole mesh."""
+    points: NDArray[np.float64]
+    facets: NDArray[np.int32]
+    marker: NDArray[np.int32]
+    building: NDArray[np.int64]
+    ids: NDArray[np.int64]
 
 
+SurfacePiece = MeshPiece | BoundaryPart
 # Given a piece, the key of each of its facets' sets, (f,), 0 or more: patches, say.
 KeysOf = Callable[[SurfacePiece], NDArray[np.int64]]
 
@@ -59,17 +49,6 @@ class Surface(Protocol):
 
     def read(self, k: int) -> SurfacePiece:
         """Read piece `k`."""
-
-
-@dataclass(frozen=True, eq=False)
-class BoundaryPart:
-    """A `SurfacePiece` of a run."""
-
-    points: NDArray[np.float64]
-    facets: NDArray[np.int32]
-    marker: NDArray[np.int32]
-    building: NDArray[np.int64]
-    ids: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +97,29 @@ def open_surface(source: RunSource) -> RunSurface:
     return RunSurface(open_pieces(source))
 
 
+def write_surface(write: Callable[..., None]) -> Callable[..., None]:
+    """Make of a function that writes a `Surface` one that writes that of a finished run.
+
+    Parameters
+    ----------
+    write : callable
+        ``write(path, surface, **options)``.
+
+    Returns
+    -------
+    callable
+        ``export(output, source, **options)``: the file appears whole or not at all. InputError if the run is not
+        finished, or a file of it is missing or damaged.
+    """
+
+    def export(output: Path, source: RunSource, **options: Any) -> None:
+        surface = open_surface(source)
+        with replacing(output) as part:
+            write(part, surface, **options)
+
+    return export
+
+
 class VertexSet:
     """Which points of a mesh are vertices of its boundary, and the place of each among these.
 
@@ -155,7 +157,7 @@ class VertexSet:
         return int(counts.sum())
 
     def places(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Tell the places of points that are in the set, (k,) to (k,), in the order of their ids."""
+        """Return the places of points that are in the set, (k,) to (k,), in the order of their ids."""
         word = ids // WORD
         lower = self._words[word] & (_bit(ids) - np.uint64(1))
         return self._before[word] + np.bitwise_count(lower)

@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
-from tiler.export.pieces import Pieces
-from tiler.export.rows import blocks_of
-from tiler.formats.xdmf import as_output_error
+from tiler.export.pieces import Pieces, blocks_of
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
-from tiler.store.atomic import replacing
+from tiler.store.atomic import disk_errors, replacing
 from tiler.store.run_folder import read_crs
 
 VERSION = 3.3  # of CGNS, the first in which all that is written has today's meaning
@@ -75,7 +73,7 @@ def export_cgns(output: Path, source: RunSource, *, buildings: str | None = None
     """
     pieces = open_pieces(source)
     crs = read_crs((source.directory if isinstance(source, RunFiles) else source) / RUN_RECORD)
-    with replacing(output) as part, as_output_error(output):
+    with replacing(output) as part, disk_errors(output):
         write_cgns(part, pieces, crs=crs, buildings=buildings)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from pipeline.data.errors import InputError
 from tiler.citymodels.building_index import Vertices, has_parts, read_objects, spool_vertices
 from tiler.export.export import Format
-from tiler.mesh_files.run_files import RunFiles
 from tiler.store.atomic import replacing
 from tiler.store.out_folder import CITY_MODEL
 from tiler.store.run_folder import WRONG_FIELD, broken_field
@@ -145,8 +144,8 @@ def _line(document: Any) -> bytes:
     return (json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n").encode("ascii")
 
 
-def _write(path: Path, files: RunFiles) -> None:
-    export_cityjsonseq(path, files.directory)
-
-
-FORMAT = Format("the simplified city model as CityJSONSeq, one feature a building", _write, suffix=".jsonl")
+FORMAT = Format(
+    "the simplified city model as CityJSONSeq, one feature a building",
+    lambda path, files: export_cityjsonseq(path, files.directory),
+    suffix=".jsonl",
+)

@@ -135,7 +135,7 @@ def _by_building_and_marker(piece: SurfacePiece) -> NDArray[np.int64]:
 
 
 def _of_key(key: int) -> tuple[int, Marker]:
-    """Tell number of building, -1 for none, and marker of a key."""
+    """Return number of building, -1 for none, and marker of a key."""
     if key < FIRST_BUILDING:
         return -1, Marker(key)
     number, roof = divmod(key - FIRST_BUILDING, 2)

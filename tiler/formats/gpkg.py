@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import OutputError
 from tiler.citymodels.building_index import has_parts, read_building, read_objects, spool_vertices
 from tiler.export.export import Format
-from tiler.mesh_files.run_files import RUN_RECORD, RunFiles
+from tiler.mesh_files.run_files import RUN_RECORD
 from tiler.store.atomic import replacing
 from tiler.store.out_folder import CITY_MODEL
 from tiler.store.run_folder import read_crs
@@ -151,8 +151,8 @@ def _fixed_time() -> Iterator[None]:
         pyogrio.set_gdal_config_options(dict.fromkeys(TIME))
 
 
-def _write(path: Path, files: RunFiles) -> None:
-    export_gpkg(path, files.directory)
-
-
-FORMAT = Format("the simplified footprints with heights as GeoPackage", _write, suffix=".gpkg")
+FORMAT = Format(
+    "the simplified footprints with heights as GeoPackage",
+    lambda path, files: export_gpkg(path, files.directory),
+    suffix=".gpkg",
+)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from pipeline.data.mesh import Marker, Region
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
-from tiler.export.pieces import Pieces
-from tiler.export.rows import blocks_of, slices
+from tiler.export.pieces import Pieces, blocks_of, slices, write_lines
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
 from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
@@ -140,13 +139,13 @@ def export_msh2(output: Path, source: RunSource, *, buildings: str | None = None
             for kind, rows, groups_of_rows in kinds:
                 for some in slices(len(rows)):
                     lines = _numbered(tag, piece.ids[rows[some]] + 1, kind, groups_of_rows[some])
-                    _write_lines(file, " ".join(["%d"] * lines.shape[1]) + "\n", lines)
+                    write_lines(file, " ".join(["%d"] * lines.shape[1]) + "\n", lines)
                     tag += len(lines)
             end = file.tell()
             line = f"%{digits}d {TEXT_FLOAT} {TEXT_FLOAT} {TEXT_FLOAT}\n"
             for start, chosen in blocks_of(piece.ids):
                 file.seek(nodes + start * width)
-                _write_lines(file, line, np.column_stack((piece.ids[chosen] + 1, piece.points[chosen])))
+                write_lines(file, line, np.column_stack((piece.ids[chosen] + 1, piece.points[chosen])))
             file.seek(end)
         file.write(b"$EndElements\n")
 
@@ -205,7 +204,7 @@ def _write_entities(file: BinaryIO, survey: _Survey) -> None:
 
 
 def _bounds(key: int, group: int) -> bool:
-    """Tell whether a surface bounds a volume: those of buildings and the top that of air alone."""
+    """Return whether a surface bounds a volume: those of buildings and the top that of air alone."""
     return key not in OF_SOIL if group == AIR else key < FIRST_BUILDING and key not in OF_AIR
 
 
@@ -245,12 +244,6 @@ def _numbered(tag: int, nodes: NDArray[np.int64], kind: int, group: NDArray[np.i
     """Make the lines of elements: number, type, two tags (group and entity), nodes."""
     n = len(nodes)
     return np.column_stack((tag + np.arange(n), np.full(n, kind), np.full(n, 2), group, group, nodes))
-
-
-def _write_lines(file: BinaryIO, line: str, rows: NDArray[Any]) -> None:
-    for some in slices(len(rows)):
-        numbers = rows[some].ravel().tolist()
-        file.write((line * (some.stop - some.start) % tuple(numbers)).encode())
 
 
 FORMAT = Format("Gmsh's MSH 4.1, binary", export_msh, options=PER_BUILDING, suffix=".msh")

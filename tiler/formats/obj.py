@@ -1,43 +1,14 @@
 """Wavefront OBJ: the boundary with shared vertices, one group a patch."""
 
 from pathlib import Path
-from typing import Any, BinaryIO
-
-from numpy.typing import NDArray
 
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import facets_by_key, patch_of_key
-from tiler.export.rows import slices
-from tiler.export.surface import Surface, keys_asked, open_surface, place_vertices, survey_surface
-from tiler.mesh_files.run_files import RunSource
-from tiler.store.atomic import replacing
+from tiler.export.pieces import write_lines
+from tiler.export.surface import Surface, keys_asked, place_vertices, survey_surface, write_surface
 
 VERTEX = "v" + " %24.16e" * 3 + "\n"
 VERTEX_BYTES = len(VERTEX % ((0.0,) * 3))
-
-
-def export_obj(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
-    """Write the boundary of a finished run as OBJ.
-
-    Parameters
-    ----------
-    output : Path
-        The file; it appears whole or not at all.
-    source : Path or RunFiles
-        Folder of the run.
-    buildings : {"patches"}, optional
-        Give each building, walls and roofs, a group of its own instead of the two.
-
-    Raises
-    ------
-    InputError
-        If the run is not finished, or a file of it is missing or damaged.
-    OutputError
-        If the file cannot be written.
-    """
-    surface = open_surface(source)
-    with replacing(output) as part:
-        write_obj(part, surface, buildings=buildings)
 
 
 def write_obj(path: Path, surface: Surface, *, buildings: str | None = None) -> None:
@@ -50,7 +21,7 @@ def write_obj(path: Path, surface: Surface, *, buildings: str | None = None) -> 
     surface : Surface
         The boundary; facets are counter-clockwise seen from outside the air.
     buildings : {"patches"}, optional
-        See `export_obj`.
+        Give each building, walls and roofs, a group of its own instead of the two.
 
     Notes
     -----
@@ -77,19 +48,16 @@ def write_obj(path: Path, surface: Surface, *, buildings: str | None = None) -> 
             runs, facets = place_vertices(piece, survey.vertices)
             for first, points in runs:
                 file.seek(start + first * VERTEX_BYTES)
-                _write_lines(file, VERTEX, points)
+                write_lines(file, VERTEX, points)
             for key, rows in facets_by_key(places, keys_of(piece)):
                 file.seek(places[key])
-                _write_lines(file, line, facets[rows] + 1)
+                write_lines(file, line, facets[rows] + 1)
                 places[key] += len(rows) * width
 
 
-def _write_lines(file: BinaryIO, line: str, rows: NDArray[Any]) -> None:
-    for some in slices(len(rows)):
-        part = rows[some]
-        file.write((line * len(part) % tuple(part.ravel().tolist())).encode())
-
-
 FORMAT = Format(
-    "the boundary as Wavefront OBJ, one group a patch", export_obj, options=PER_BUILDING, suffix=".obj"
+    "the boundary as Wavefront OBJ, one group a patch",
+    write_surface(write_obj),
+    options=PER_BUILDING,
+    suffix=".obj",
 )

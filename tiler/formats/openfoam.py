@@ -19,8 +19,7 @@ from tiler.export.foam_case import INLET, OUTLET, write_system, write_wind_case
 from tiler.export.foam_files import LABEL_LIMIT
 from tiler.export.foam_part import FoamPlan, PartCounts, PointPlaces, write_part
 from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, is_house
-from tiler.export.partition import split_pieces
-from tiler.export.pieces import Pieces
+from tiler.export.pieces import Pieces, split_pieces
 from tiler.export.region_faces import Ints, find_outer, survey_faces
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
 from tiler.mesh_files.run_files import RunFiles, RunSource

@@ -7,36 +7,12 @@ import numpy as np
 from pipeline.data.errors import InputError
 from tiler.export.export import LARGEST_PART, Format
 from tiler.export.foam_patches import patch_of_key
-from tiler.export.surface import Surface, SurfaceSurvey, open_surface, place_vertices, survey_surface
-from tiler.mesh_files.run_files import RunSource
-from tiler.store.atomic import replacing
+from tiler.export.surface import Surface, SurfaceSurvey, place_vertices, survey_surface, write_surface
 
 VERTEX_BYTES = 24
 # PLY has no integers of 64 bits; the number of a building is below 2^53, so a double holds it exactly.
 FACE = np.dtype([("n", "u1"), ("vertex", "<i4", 3), ("marker", "<i4"), ("building", "<f8")])
 MOST_VERTICES = 2**31
-
-
-def export_ply(output: Path, source: RunSource) -> None:
-    """Write the boundary of a finished run as PLY, binary.
-
-    Parameters
-    ----------
-    output : Path
-        The file; it appears whole or not at all.
-    source : Path or RunFiles
-        Folder of the run.
-
-    Raises
-    ------
-    InputError
-        If the run is not finished, or a file of it is missing or damaged; if it has too many vertices for PLY.
-    OutputError
-        If the file cannot be written.
-    """
-    surface = open_surface(source)
-    with replacing(output) as part:
-        write_ply(part, surface)
 
 
 def write_ply(path: Path, surface: Surface) -> None:
@@ -99,5 +75,8 @@ def _header(survey: SurfaceSurvey) -> bytes:
 
 
 FORMAT = Format(
-    "the boundary as PLY, binary, with marker and building", export_ply, options=(LARGEST_PART,), suffix=".ply"
+    "the boundary as PLY, binary, with marker and building",
+    write_surface(write_ply),
+    options=(LARGEST_PART,),
+    suffix=".ply",
 )

@@ -12,39 +12,13 @@ from numpy.typing import NDArray
 
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import facets_by_key, patch_of_key
-from tiler.export.rows import slices
-from tiler.export.surface import Surface, keys_asked, open_surface, survey_surface
-from tiler.mesh_files.run_files import RunSource
-from tiler.store.atomic import replacing
+from tiler.export.pieces import slices
+from tiler.export.surface import Surface, keys_asked, survey_surface, write_surface
 
 _CORNER = "      vertex" + " %23.16e" * 3 + "\n"
 # Each number has the same width, so that the place of every facet is known from counts.
 FACET = "  facet normal" + " %13.6e" * 3 + "\n    outer loop\n" + _CORNER * 3 + "    endloop\n  endfacet\n"
 FACET_BYTES = len(FACET % ((0.0,) * 12))
-
-
-def export_stl(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
-    """Write the boundary of a finished run as STL, text.
-
-    Parameters
-    ----------
-    output : Path
-        The file; it appears whole or not at all.
-    source : Path or RunFiles
-        Folder of the run.
-    buildings : {"patches"}, optional
-        Give each building, walls and roofs, a solid of its own instead of the two.
-
-    Raises
-    ------
-    InputError
-        If the run is not finished, or a file of it is missing or damaged.
-    OutputError
-        If the file cannot be written.
-    """
-    surface = open_surface(source)
-    with replacing(output) as part:
-        write_stl(part, surface, buildings=buildings)
 
 
 def write_stl(path: Path, surface: Surface, *, buildings: str | None = None) -> None:
@@ -57,7 +31,7 @@ def write_stl(path: Path, surface: Surface, *, buildings: str | None = None) -> 
     surface : Surface
         The boundary; normals point out of the air.
     buildings : {"patches"}, optional
-        See `export_stl`.
+        Give each building, walls and roofs, a solid of its own instead of the two.
 
     Notes
     -----
@@ -97,4 +71,6 @@ def _wide_enough(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.abs(values) < 1e-99, 0.0, values)
 
 
-FORMAT = Format("the boundary as STL, text, one solid a patch", export_stl, options=PER_BUILDING, suffix=".stl")
+FORMAT = Format(
+    "the boundary as STL, text, one solid a patch", write_surface(write_stl), options=PER_BUILDING, suffix=".stl"
+)

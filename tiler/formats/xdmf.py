@@ -4,8 +4,6 @@ The first grid, ``mesh``, has the tetrahedra, the second, ``facets``, the bounda
 ``building``: what `XDMFFile.read_mesh` and `read_meshtags` of DOLFINx take. With soil, ``mesh`` has ``region``.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -13,13 +11,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.errors import OutputError
 from tiler.export.export import LARGEST_PART, Format
-from tiler.export.pieces import Pieces
-from tiler.export.rows import blocks_of
+from tiler.export.pieces import Pieces, blocks_of
 from tiler.mesh_files.mesh_pieces import MeshPieces, open_pieces
 from tiler.mesh_files.run_files import RunSource
-from tiler.store.atomic import replacing
+from tiler.store.atomic import disk_errors, replacing
 
 DATA = ".h5"  # suffix of the second file
 ARRAYS = {
@@ -60,7 +56,7 @@ def export_xdmf(output: Path, source: RunSource) -> None:
     n_cells, n_facets = count_rows(pieces)
     data = output.with_suffix(DATA)
     with replacing(output) as text_part, replacing(data) as data_part:
-        with as_output_error(data):
+        with disk_errors(data):
             _write_data(data_part, pieces, n_cells, n_facets)
         tags = ("region",) if pieces.files.depth else ()
         text_part.write_text(_render(data.name, pieces.n_points, n_cells, n_facets, tags))
@@ -76,16 +72,6 @@ def count_rows(pieces: Pieces) -> tuple[int, int]:
         n_cells += len(piece.cells)
         n_facets += len(piece.facets)
     return n_cells, n_facets
-
-
-@contextmanager
-def as_output_error(path: Path) -> Iterator[None]:
-    """Take what HDF5 says when it cannot write, often without a reason of the system."""
-    try:
-        yield
-    except OSError as error:
-        reason = " ".join(str(error).split())
-        raise OutputError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
 
 
 def _write_data(path: Path, pieces: MeshPieces, n_cells: int, n_facets: int) -> None:

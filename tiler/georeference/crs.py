@@ -3,15 +3,18 @@
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pyproj
 
 from pipeline.data.errors import ConfigError
+from tiler.words.plain_text import printable
 
 _ALIKE = 20  # confidence (%) above which PROJ names a candidate, which is then compared in full
 SAME_PLACE = 0.1  # m; CRSs between which a region moves by less are one
 _PLACE_SLACK = 1.0  # degrees that a cloud may lie outside the area that a CRS is meant for
+Box = tuple[float, float, float, float]
 
 
 def parse_crs(text: str) -> pyproj.CRS:
@@ -80,6 +83,11 @@ def crs_name(crs: pyproj.CRS) -> str:
     """
     authority = crs.to_authority()
     return ":".join(authority) if authority else crs.name
+
+
+def short_crs(text: str) -> str:
+    """Write a CRS as a message can hold it: WKT is too long."""
+    return printable(text) if len(text) < 40 else "a CRS of its own"
 
 
 def same_crs(one: pyproj.CRS, other: pyproj.CRS) -> bool:
@@ -281,3 +289,40 @@ def _lon_lat(bounds: Sequence[float], crs: pyproj.CRS) -> tuple[float, float] | 
 def _to_degrees(crs: pyproj.CRS) -> pyproj.Transformer:
     """Make the transformer to longitude and latitude, once for all clouds: that takes PROJ a tenth of a second."""
     return pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+
+
+def like_degrees(box: Box) -> bool:
+    """Whether coordinates can be longitude and latitude, in either order: no projected region is so small."""
+    return max(abs(value) for value in box) <= 360 and max(box[2] - box[0], box[3] - box[1]) < 5
+
+
+def fault_of(crs: pyproj.CRS) -> str:
+    """Explain why lengths in a CRS are not lengths on the ground; ``""`` for a projected one."""
+    if crs.is_geographic:
+        return "is geographic (degrees)"
+    return "" if crs.is_projected else f"is no projected CRS ({crs.type_name})"
+
+
+def directions_of(crs: pyproj.CRS) -> str:
+    """Describe where the axes of a CRS point."""
+    return " and ".join(axis.direction.lower() for axis in crs.axis_info[:2])
+
+
+def box_words(box: Sequence[float]) -> str:
+    """Write a box for a message."""
+    return " ".join(f"{value:.6g}" for value in box)
+
+
+def pdal_command(cloud: Path, crs: pyproj.CRS, target: str | None) -> str:
+    """Give the command of PDAL that reprojects a cloud."""
+    name = cloud.name.split(".")[0]
+    source = f" --filters.reprojection.in_srs={crs_name(crs)}" if crs.to_authority() else ""
+    return (
+        f'pdal translate "{cloud}" "{cloud.with_name(f"{name}_metric.laz")}" reprojection{source} '
+        f"--filters.reprojection.out_srs={target or 'EPSG:<a projected CRS in metres>'}"
+    )
+
+
+def boxes_meet(one: Sequence[float], other: Sequence[float]) -> bool:
+    """Whether two boxes have a place in common."""
+    return one[0] <= other[2] and one[2] >= other[0] and one[1] <= other[3] and one[3] >= other[1]

@@ -6,11 +6,10 @@ from dataclasses import replace
 import pyproj
 
 from pipeline.data.errors import InputError
-from tiler.georeference.crs import crs_name, crs_text, is_one
+from tiler.georeference.crs import boxes_meet, crs_name, crs_text, directions_of, is_one
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.georeference.metric import MetricCrs, find_metric
 from tiler.georeference.operation import Operation, find_operation
-from tiler.georeference.words import boxes_meet, directions_of
 
 Box = tuple[float, float, float, float]
 
@@ -18,7 +17,7 @@ Box = tuple[float, float, float, float]
 def footprint_frame(
     stated: pyproj.CRS, crs: pyproj.CRS, box: Box, say: Callable[[str, str, str], None] | None = None
 ) -> tuple[Frame, Operation | None]:
-    """Say how coordinates of footprints become those of a region.
+    """Describe how coordinates of footprints become those of a region.
 
     Parameters
     ----------

@@ -80,7 +80,7 @@ def find_metric(crs: pyproj.CRS) -> MetricCrs | None:
 
 
 def _axes(crs: pyproj.CRS) -> tuple[Axis, Axis]:
-    """Say which coordinate is the easting and which the northing, with metres of a unit and direction."""
+    """Name which coordinate is the easting and which the northing, with metres of a unit and direction."""
     first, second = crs.axis_info[:2]
     x, y = first.direction.lower(), second.direction.lower()
     scale, other = (exact_unit(axis.unit_conversion_factor) for axis in (first, second))
@@ -203,3 +203,10 @@ def _places(crs: pyproj.CRS) -> NDArray[np.float64]:
 def _in_order(base: pyproj.CRS, degrees: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     lon, lat = degrees.T
     return (lat, lon) if base.axis_info[0].direction.lower() == "north" else (lon, lat)
+
+
+def axes_words(metric: MetricCrs) -> str:
+    """State that axes were turned or exchanged, ``""`` where they were not."""
+    if metric.east[0] == 1 and min(metric.east[1], metric.north[1]) > 0:
+        return ", northing before easting,"
+    return ", axes to the west and south," if metric.east[1] < 0 or metric.north[1] < 0 else ""

@@ -36,11 +36,11 @@ class Operation:
 
     @property
     def exact(self) -> str:
-        """Say how exact it is."""
+        """Describe how exact it is."""
         return "accuracy unknown" if self.accuracy is None else f"accurate to {self.accuracy:g} m"
 
     def describe(self) -> str:
-        """Say in a sentence which operation it is, how exact, and what a better one needs."""
+        """Describe in a sentence which operation it is, how exact, and what a better one needs."""
         text = f"from {self.source} to {self.target} by {self.description!r}, {self.exact}"
         if self.missing_grids:
             grids = ", ".join(self.missing_grids)

@@ -86,7 +86,7 @@ def mesh(
 
 
 def plan(pointcloud: Source | Sequence[Source], footprints: Source = "", **parameters: Any) -> "RunPlan":
-    """Tell what a run would do and take, from headers alone: `citystitch plan`.
+    """Forecast what a run would do and take, from headers alone: `citystitch plan`.
 
     Parameters
     ----------
@@ -172,16 +172,16 @@ def _check_script(workers: int) -> None:
 
 
 def _show(progress: bool) -> dict[str, Any]:
-    """Choose who tells how far a run is."""
+    """Choose the watcher that shows the progress of a run."""
     from tiler.interface.notebook_progress import NotebookProgress, in_notebook
 
     if not progress:
         return {}
     if in_notebook():
         return {"watchers": [NotebookProgress()]}
-    from tiler.monitoring.terminal import make_views
+    from tiler.monitoring.terminal import make_view
 
-    return {"watchers": make_views()}
+    return {"watchers": [make_view()]}
 
 
 def _configure(pointcloud: Source | Sequence[Source], footprints: Source, parameters: Mapping[str, Any]) -> Config:

@@ -5,23 +5,24 @@ import sys
 import time
 from typing import Any
 
-from tiler.engine.stage import Scope
+from tiler.engine.submission import Item
 from tiler.engine.task import Record
-from tiler.monitoring.watchers import Item, RunStart, Watcher
-from tiler.words.stage_groups import group_stages, title_of_stage
+from tiler.engine.watcher import RunStart
+from tiler.monitoring.tally import Tally
+from tiler.words.stage_groups import title_of_stage
 
 EVERY = 0.25  # s between two updates of the output
 LISTED = 5  # failures and messages that are shown
 
 
 def in_notebook() -> bool:
-    """Tell whether output goes to a notebook: IPython has a kernel then."""
+    """Return whether output goes to a notebook: IPython has a kernel then."""
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     return shell is not None and hasattr(shell, "kernel")
 
 
-class NotebookProgress(Watcher):
-    """Watches a run, and shows it in the output of the cell that runs.
+class NotebookProgress(Tally):
+    """Shows how far a run is in the output of the cell that runs.
 
     Notes
     -----
@@ -30,40 +31,35 @@ class NotebookProgress(Watcher):
     """
 
     def __init__(self) -> None:
-        self._begun, self._drawn = time.perf_counter(), 0.0
-        self._totals: dict[str, int] = {}
-        self._done: dict[str, int] = {}
-        self._running: dict[str, int] = {}
-        self._failures: list[str] = []
+        super().__init__()
+        self._drawn = 0.0
+        self._failed: list[str] = []
         self._said: list[str] = []
         self._end = ""
         self._display: Any = None
 
     def begin(self, start: RunStart) -> None:
         """Show all stages that are known."""
-        self._totals = {stage: total for stage, (_, total) in start.expected.items()}
+        super().begin(start)
         self._draw()
-
-    def planned(self, stage: str, scope: Scope, total: int) -> None:
-        """Take note of how many items a stage has."""
-        self._totals[stage] = total
 
     def submitted(self, stage: str, name: str) -> None:
         """Take note of an item that was given to a worker."""
-        self._running[stage] = self._running.get(stage, 0) + 1
+        super().submitted(stage, name)
         self._draw_sometimes()
 
-    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
+    def done(self, stage: str, n_done: int, total: int, record: Record) -> None:
         """Take note of an item that is done."""
-        self._done[stage], self._totals[stage] = done, total
-        self._running[stage] = max(0, self._running.get(stage, 0) - 1)
+        super().done(stage, n_done, total, record)
         self._draw_sometimes()
 
-    def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
+    def failed(
+        self, stage: str, name: str, reason: str, needs: Item | None = None, *, ends_run: bool = False
+    ) -> None:
         """Take note of an item that failed."""
-        self._running[stage] = max(0, self._running.get(stage, 0) - 1)
+        super().failed(stage, name, reason, needs)
         if needs is None:
-            self._failures.append(f"{title_of_stage(stage)} {name}: {reason}")
+            self._failed.append(f"{title_of_stage(stage)} {name}: {reason}")
         self._draw_sometimes()
 
     def say(self, text: str) -> None:
@@ -90,19 +86,23 @@ class NotebookProgress(Watcher):
             self._display.update(data, raw=True)
 
     def _line(self) -> str:
-        done, total = sum(self._done.values()), sum(self._totals.values())
-        failed = f", {len(self._failures):,} failed" if self._failures else ""
+        done, total = self._counts()
+        failed = f", {len(self._failed):,} failed" if self._failed else ""
         state = f" - {self._end}" if self._end else ""
-        return f"{done:,} of {total:,} tasks, {time.perf_counter() - self._begun:.0f} s{failed}{state}"
+        return f"{done:,} of {total:,} tasks, {self.elapsed:.0f} s{failed}{state}"
+
+    def _counts(self) -> tuple[int, int]:
+        stages = self.stages.values()
+        return sum(stage.done for stage in stages), sum(stage.total for stage in stages)
 
     def _page(self) -> str:
-        done, total = sum(self._done.values()), sum(self._totals.values())
-        rows = [_bar("all tasks", done, total)]
-        for group, stages in group_stages(self._totals).items() if not self._end else ():
-            if any(self._running.get(stage) for stage in stages):
-                counts = (sum(numbers.get(stage, 0) for stage in stages) for numbers in (self._done, self._totals))
-                rows.append(_bar(group, *counts))
-        lists = [("failed", self._failures), ("", self._said)]
+        rows = [_bar("all tasks", *self._counts())]
+        rows += [
+            _bar(name, group.done, group.total)
+            for name, group in self.groups().items()
+            if group.running and not self._end
+        ]
+        lists = [("failed", self._failed), ("", self._said)]
         told = "".join(_list(title, lines) for title, lines in lists if lines)
         return f"<div><table>{''.join(rows)}</table><p>{html.escape(self._line())}</p>{told}</div>"
 

@@ -207,7 +207,7 @@ def _truth(city: SyntheticCity, buildings: int, relief: float) -> dict[str, obje
 
 
 def _shapes(city: SyntheticCity) -> list[dict[str, object]]:
-    """Tell type, eaves and planes of each roof, but for a city of flat ones."""
+    """Describe type, eaves and planes of each roof, but for a city of flat ones."""
     shapes = city.shapes
     if city.roofs == "flat":
         return [{}] * len(shapes)

@@ -36,9 +36,9 @@ def run_job(out: Path) -> int:
     folder = out / JOB
     cluster = read_cluster(folder / DESCRIPTION)
     end = time.monotonic() + cluster.controller.walltime - cluster.controller.margin
-    told: list[int] = []  # signals
+    received: list[int] = []  # signals
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda number, _: told.append(number))
+        signal.signal(number, lambda number, _: received.append(number))
     if is_cancelled(out) or not _makes_progress(out, cluster.controller.resubmissions):
         return FAILED
     _submit_next(out, cluster)
@@ -46,9 +46,9 @@ def run_job(out: Path) -> int:
     driver = subprocess.Popen([sys.executable, "-m", "tiler.cli.main", *map(str, words)])
     reason = ""  # why the driver was asked to stop
     while driver.poll() is None:
-        if not reason and (told or time.monotonic() >= end):
-            reason = "told" if told else "time"
-            if told:
+        if not reason and (received or time.monotonic() >= end):
+            reason = "signal" if received else "time"
+            if received:
                 _cancel_next(out, cluster)  # now: a system that kills this job soon must not begin the next one
             driver.terminate()
         time.sleep(POLL)

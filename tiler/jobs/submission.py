@@ -1,4 +1,4 @@
-"""A run as a job of a batch system: `citystitch submit | cancel | logs`, and what `status` tells of jobs."""
+"""A run as a job of a batch system: `citystitch submit | cancel | logs`, and what `status` shows of jobs."""
 
 import argparse
 import dataclasses
@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import ConfigError, InputError
-from tiler.config.config import Config, make_config, write_config
+from tiler.config.config import Config, make_config
+from tiler.config.config_file import write_config
 from tiler.jobs.cluster import LOGS, SYSTEMS, WORKER_JOBS, WORKER_NAME, Cluster, QueueError, read_cluster
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.store.atomic import replacing
@@ -130,7 +131,7 @@ def read_record(out: Path) -> JobRecord:
 
 
 def is_cancelled(out: Path) -> bool:
-    """Tell whether `cancel` was asked for."""
+    """Return whether `cancel` was asked for."""
     return (out / JOB / CANCELLED).exists()
 
 
@@ -154,20 +155,20 @@ def living_jobs(record: JobRecord) -> list[str]:
 
 
 def describe_job(out: Path) -> dict[str, Any] | None:
-    """Tell how the job of a run stands: its record, its state in the ``queue``, ``workers``; None without one."""
+    """Describe the job of a run: its record, its state in the ``queue``, ``workers``; None without one."""
     if in_bucket(out) or not (out / JOB / RECORD).exists():
         return None
     record = read_record(out)
-    told = dataclasses.asdict(record) | {"job": record.job}
+    described = dataclasses.asdict(record) | {"job": record.job}
     try:
         states = SYSTEMS[record.type].states()
     except QueueError as error:
-        return told | {"queue": "", "workers": None, "error": str(error)}
-    return told | {"queue": states.get(record.job, ""), "workers": len(read_worker_jobs(out) & states.keys())}
+        return described | {"queue": "", "workers": None, "error": str(error)}
+    return described | {"queue": states.get(record.job, ""), "workers": len(read_worker_jobs(out) & states.keys())}
 
 
 def job_line(job: dict[str, Any]) -> str:
-    """Write one line on a job, as `describe_job` tells it."""
+    """Write one line on a job, as `describe_job` describes it."""
     error = job.get("error")
     queue = f"its queue does not answer: {error}" if error else f"in the queue {job['queue'] or 'no more'}"
     words = [f"job {job['job']} ({job['type']}): {job['state']}", queue]

@@ -31,7 +31,7 @@ SETTINGS = {
     "distributed.scheduler.worker-ttl": "10 minutes",
     "distributed.deploy.lost-worker-timeout": "15 s",  # a job's nanny may start its worker anew
 }
-# What a worker's own process is told; as variables, since its job has no other settings of Dask.
+# Settings of a worker's own process; as variables, since its job has no other settings of Dask.
 VARIABLES = {**ENVIRONMENT, **as_variables({**WORKER, **BOTH}), "PYTHONWARNINGS": "ignore"}
 
 
@@ -52,7 +52,7 @@ class WorkerJobs(Adaptive):  # type: ignore[misc]  # distributed has no types
         super().__init__(cluster, **options)
 
     async def target(self) -> int:
-        """Tell how many workers there should be, in whole jobs."""
+        """Return how many workers there should be, in whole jobs."""
         if self.loop.time() - self.asked >= ASK:
             self.asked = self.loop.time()
             await self.look()
@@ -117,7 +117,7 @@ def worker_jobs(
     """Run tasks, of `seconds` at most (0: any), on workers that are jobs; these are cancelled with the context.
 
     `folder` is seen by all nodes and takes logs and certificates; the scheduler's HTTP server listens at
-    `dashboard`, ``HOST:PORT``; `say` is told how many tasks were lost with their nodes.
+    `dashboard`, ``HOST:PORT``; `say` gets the number of tasks lost with their nodes.
     """
     worker, memory = cluster.worker, int(cluster.worker.memory * 2**30) - NANNY
     (folder / LOGS).mkdir(parents=True, exist_ok=True)
@@ -128,7 +128,7 @@ def worker_jobs(
             scheduler_options={"dashboard_address": dashboard},
             security=cluster.tls or None,
             shared_temp_directory=str(folder),
-            silence_logs="critical",  # what matters is told by us
+            silence_logs="critical",  # we report what matters
             **worker_options(cluster, folder),
         ) as started,
         Client(started) as client,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.errors import InputError, OutputError
+from pipeline.data.errors import InputError
 from pipeline.data.mesh import TetMesh
 from pipeline.quality.quality import measure_cells
 from stitch.pieces.numbering import Numbering, collect_ids, number_without_gaps
@@ -27,6 +27,7 @@ from tiler.mesh_files.vtk_xml import (
     stream_items,
     write_data_file,
 )
+from tiler.store.atomic import disk_errors
 
 VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide ids, see `stitch.pieces.numbering`
 TILE = "tile"  # cell array on request: which tile a cell is of, counted from 0 by name
@@ -55,7 +56,7 @@ def write_merged_volume(path: Path, pieces: Sequence[Path], *, scalars: bool = F
     path : Path
         The file; it appears whole or not at all. While it is written, coordinates wait in a file beside it.
     pieces : sequence of at least one Path
-        VTU pieces (`write_vtu`) with the int64 point array `VERTEX_ID`: each id for one place.
+        VTU pieces (`tiler.mesh_files.vtk_files`) with the int64 point array `VERTEX_ID`: each id for one place.
     scalars : bool
         Add cell arrays to colour by: `TILE`, and `RADIUS_RATIO` as `pipeline.quality.quality` measures it.
 
@@ -88,7 +89,7 @@ def write_merged_boundary(
     path : Path
         The file.
     pieces : sequence of at least one Path
-        VTP pieces (`write_vtp`).
+        VTP pieces.
     volumes : sequence of Path
         The VTU pieces of all tiles.
     scalars : bool
@@ -96,7 +97,7 @@ def write_merged_boundary(
 
     Notes
     -----
-    Only the vertices of facets are written, in the order of their ids. The array ``vertex`` tells which vertex of
+    Only the vertices of facets are written, in the order of their ids. The array ``vertex`` names which vertex of
     the merged volume each is.
     """
     _write(path, pieces, volumes, "PolyData", scalars=scalars)
@@ -146,14 +147,9 @@ def number_piece(path: Path, ids: NDArray[Any] | None, numbering: Numbering) -> 
 def _write(path: Path, pieces: Sequence[Path], volumes: Sequence[Path], kind: str, *, scalars: bool) -> None:
     if not pieces:
         raise ValueError("a merged file needs at least one piece")
-    try:
-        with TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-            gathered = _gather(pieces, read_numbering(volumes), kind, Path(folder))
-            _write_file(path, kind, *gathered, scalars=scalars)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
-        ) from error
+    with disk_errors(path), TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
+        gathered = _gather(pieces, read_numbering(volumes), kind, Path(folder))
+        _write_file(path, kind, *gathered, scalars=scalars)
 
 
 def _write_file(

@@ -178,7 +178,7 @@ def _as_edges(ends: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def describe_parts(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Tell the parts of a mesh for its record: their number, and of several the largest with their tiles."""
+    """Return the parts of a mesh for its record: their number, and of several the largest with their tiles."""
     return {"n": len(parts)} | ({"largest": list(parts[:LISTED_PARTS])} if len(parts) > 1 else {})
 
 

@@ -18,7 +18,6 @@ from pipeline.data.mesh import Boundary, TetMesh
 from tiler.mesh_files.vtk_xml import (
     INDEX_BYTES,
     THOROUGH,
-    VTK_TYPES,
     Stream,
     compress_block,
     damaged,
@@ -33,7 +32,6 @@ from tiler.mesh_files.vtk_xml import (
 TETRA = 10  # VTK_TETRA
 KEPT_ROWS = 1 << 24  # whose offsets are kept once they are compressed: 20 MB where a piece has so many cells
 Arrays = Mapping[str, NDArray[Any]]
-NO_ARRAYS: Arrays = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +79,6 @@ class Values:
     dtype: np.dtype[Any]
     take: Callable[[NDArray[Any]], NDArray[Any]]
 
-    @classmethod
-    def of(cls, array: NDArray[Any]) -> Self:
-        """Take the values of an array (n,) or (n, width)."""
-        return cls(array.shape[1] if array.ndim == 2 else 1, array.dtype, lambda index: array[index])
-
     def rows(self, n_rows: int, index: Callable[[int, int], NDArray[Any]]) -> Rows:
         """Make rows of them: those of the points ``index(i, j)`` are rows ``i`` to before ``j``."""
         return Rows(n_rows, self.width, self.dtype, lambda i, j: self.take(index(i, j)))
@@ -93,7 +86,6 @@ class Values:
 
 RowArrays = Mapping[str, Rows]
 ValueArrays = Mapping[str, Values]
-VERTEX = Values(1, np.dtype(np.int64), np.asarray)  # index of each point
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,38 +127,6 @@ class BoundaryPiece:
     point_data: Arrays
 
 
-def write_vtu(path: Path, mesh: TetMesh, *, point_data: Arrays = NO_ARRAYS, cell_data: Arrays = NO_ARRAYS) -> None:
-    """Write a volume mesh as a VTU file.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it appears whole or not at all.
-    mesh : TetMesh
-        The tetrahedra; coordinates are written as they are, float64 (m).
-    point_data, cell_data : mapping of name to array, first axis (n_points,) or (n_cells,)
-        Further arrays: float64, float32, int64, int32 or uint8.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    ValueError
-        If an array has another length or type.
-
-    Notes
-    -----
-    Same input, same bytes. Beside the input, memory holds one block.
-    """
-    write_vtu_blocks(
-        path,
-        Rows.of(mesh.points),
-        Rows.of(mesh.cells),
-        point_data=_rows_of(point_data, len(mesh.points)),
-        cell_data=_rows_of(cell_data, len(mesh.cells)),
-    )
-
-
 def write_vtu_blocks(
     path: Path, points: Rows, cells: Rows, *, point_data: RowArrays, cell_data: RowArrays
 ) -> None:
@@ -196,35 +156,6 @@ def write_vtu_blocks(
     }
     counts = {"NumberOfPoints": points.n_rows, "NumberOfCells": cells.n_rows}
     write_data_file(path, "UnstructuredGrid", counts, sections)
-
-
-def write_vtp(
-    path: Path, points: NDArray[np.float64], boundary: Boundary, *, point_data: Arrays = NO_ARRAYS
-) -> None:
-    """Write the boundary of a volume mesh as a VTP file, with the points that it uses alone.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it appears whole or not at all.
-    points : float64, (n, 3)
-        Points of the volume mesh (m).
-    boundary : Boundary
-        Marked facets; `marker` and `building` become cell arrays.
-    point_data : mapping of name to array, first axis (n,)
-        Further arrays on the volume mesh's points. The array ``vertex``, each point's index among
-        `points`, is always there.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    ValueError
-        If an array has another length or type.
-    """
-    checked = _checked(point_data, len(points))
-    data = {"vertex": VERTEX} | {name: Values.of(array) for name, array in checked.items()}
-    write_vtp_blocks(path, len(points), boundary, Values.of(points), point_data=data)
 
 
 def write_vtp_blocks(
@@ -299,7 +230,7 @@ def write_pvtp(path: Path, pieces: Sequence[Path]) -> None:
 
 
 def read_vtu(path: Path) -> VolumePiece:
-    """Read a VTU file that `write_vtu` wrote.
+    """Read a VTU file that `write_vtu_blocks` wrote.
 
     Raises
     ------
@@ -315,7 +246,7 @@ def read_vtu(path: Path) -> VolumePiece:
 
 
 def read_vtp(path: Path) -> BoundaryPiece:
-    """Read a VTP file that `write_vtp` wrote.
+    """Read a VTP file that `write_vtp_blocks` wrote.
 
     Raises
     ------
@@ -386,7 +317,7 @@ def _items(rows: Rows) -> Callable[[int, int], NDArray[Any]]:
 
 
 def stream_offsets(n_rows: int, width: int) -> Stream:
-    """Make the stream that tells where rows of so many numbers end in the connectivity."""
+    """Make the stream of where rows of so many numbers end in the connectivity."""
     dtype = np.dtype(np.int32 if n_rows * width < 2**31 else np.int64)
     return Stream("offsets", dtype, 1, n_rows, partial(_give_ends, width, dtype, n_rows))
 
@@ -412,19 +343,6 @@ def stream_types(n_cells: int) -> Stream:
 @lru_cache(maxsize=2)  # a full block, and the last one
 def _compress_types(n_cells: int) -> bytes:
     return compress_block(np.full(n_cells, TETRA, np.uint8), np.dtype(np.uint8))
-
-
-def _rows_of(arrays: Arrays, n_rows: int) -> RowArrays:
-    return {name: Rows.of(array) for name, array in _checked(arrays, n_rows).items()}
-
-
-def _checked(arrays: Arrays, n_rows: int) -> Arrays:
-    for name, array in arrays.items():
-        if array.dtype.name not in VTK_TYPES or array.ndim not in (1, 2) or len(array) != n_rows:
-            raise ValueError(
-                f"array {name!r} is {array.dtype} {array.shape}; expected {n_rows} rows of {list(VTK_TYPES)}"
-            )
-    return arrays
 
 
 def _read_rows(path: Path, arrays: Arrays, width: int, n_points: int) -> NDArray[np.int32]:

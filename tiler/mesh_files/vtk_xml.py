@@ -66,13 +66,6 @@ class _Head:
     start: int
 
 
-def make_stream(name: str, array: NDArray[Any], dtype: Any) -> Stream:
-    """Make a stream of an array (n,) or (n, components), to be written as `dtype`."""
-    flat = np.ascontiguousarray(array).reshape(-1)
-    components = array.shape[1] if array.ndim == 2 else 1
-    return stream_items(name, np.dtype(dtype), components, flat.size, lambda i, j: flat[i:j])
-
-
 def stream_items(
     name: str, dtype: np.dtype[Any], components: int, n_items: int, items: Callable[[int, int], NDArray[Any]]
 ) -> Stream:

@@ -13,8 +13,10 @@ from typing import Any
 
 from pipeline.data.errors import ConfigError, InputError, OutputError
 from tiler.engine.stage import Box, Facts, Layout, Scope
+from tiler.engine.submission import Item
 from tiler.engine.task import Record
-from tiler.monitoring.watchers import Item, RunStart, Watcher, describe_command
+from tiler.engine.watcher import RunStart, Watcher
+from tiler.monitoring.watchers import describe_command
 from tiler.store.atomic import replacing
 from tiler.store.checksums import FILES
 
@@ -98,13 +100,13 @@ class EventLog(Watcher):
         """Write that an item was given to a worker."""
         self._add("submitted", stage=stage, name=name)
 
-    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
+    def done(self, stage: str, n_done: int, total: int, record: Record) -> None:
         """Write that an item is done."""
         self._add(
             "done",
             stage=stage,
             name=record.name,
-            done=done,
+            done=n_done,
             total=total,
             seconds=round(record.seconds.get("all", 0.0), 3),
             memory=record.peak_memory,
@@ -114,7 +116,9 @@ class EventLog(Watcher):
             **({"ago": record.ago} if record.ago else {}),
         )
 
-    def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
+    def failed(
+        self, stage: str, name: str, reason: str, needs: Item | None = None, *, ends_run: bool = False
+    ) -> None:
         """Write that an item failed, or is not run."""
         command = ""
         if needs is None and self._start is not None:

@@ -1,19 +1,19 @@
 """The live view of a run on a terminal: stages at work, workers, memory, warnings, time left."""
 
+import logging
 import threading
 import time
-from collections import deque
 from itertools import islice
+from logging.handlers import QueueHandler
+from queue import SimpleQueue
 
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from tiler.engine.stage import Scope
-from tiler.engine.task import Record
-from tiler.monitoring.plain_view import Line, Lines
+from tiler.engine.watcher import RunStart
+from tiler.monitoring.run_log import PROGRESS, LogView
 from tiler.monitoring.tally import StageTally, Tally, format_duration
-from tiler.monitoring.watchers import Item, RunStart, Watcher
 from tiler.words.note_words import say_notes
 from tiler.words.plain_text import printable
 
@@ -26,53 +26,40 @@ REST = 4  # rows of the view besides them, and the cursor's
 FULL, EMPTY, PLAIN_FULL, PLAIN_EMPTY = "━", "─", "#", "-"
 
 
-class LiveView(Watcher):
-    """Shows a run in the last rows of a terminal.
+class LiveView(Tally):
+    """Shows a run in the last rows of a terminal, and above them what it logs.
 
     Parameters
     ----------
     console : Console
         The terminal.
-    tally : Tally
-        Told before this one.
     verbose : bool
         A line for each item too.
 
     Notes
     -----
-    A thread of its own draws, and prints the lines that wait in a queue: what tells it something, a signal's
-    handler too, never waits. It draws as often as `SHARE` of the time allows.
+    A thread of its own draws, and prints the lines that wait in a queue: who logs, a signal handler too, never
+    waits. It draws as often as `SHARE` of the time allows.
     """
 
-    def __init__(self, console: Console, tally: Tally, *, verbose: bool = False) -> None:
-        self._console, self._tally = console, tally
-        self._waiting: deque[Line] = deque()
-        self._lines = Lines(self._waiting.append, verbose=verbose)
+    def __init__(self, console: Console, *, verbose: bool = False) -> None:
+        super().__init__()
+        self._console, self._waiting = console, SimpleQueue[logging.LogRecord]()
+        handler = QueueHandler(self._waiting)
+        handler.addFilter(lambda record: record.name != PROGRESS.name)  # the bars show that
+        self._log = LogView(handler, logging.DEBUG if verbose else logging.INFO)
         self._live = Live(console=console, auto_refresh=False, transient=True, vertical_overflow="crop")
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._draw_now_and_then, name="view", daemon=True)
 
     def begin(self, start: RunStart) -> None:
         """Begin to draw."""
-        self._lines.begin(start)
+        super().begin(start)
         self._live.start()
         self._thread.start()
 
-    def planned(self, stage: str, scope: Scope, total: int) -> None:
-        """Take note of how many items a stage has."""
-        self._lines.planned(stage, scope, total)
-
-    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
-        """Tell a finished group of stages, or each item."""
-        self._lines(stage, done, total, record)
-
-    def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
-        """Tell a failure."""
-        self._lines.failed(stage, name, reason, needs)
-
     def say(self, text: str) -> None:
-        """Tell it, above the view."""
-        self._lines.say(text)
+        """Print at once what was logged before the view begins."""
         if not self._thread.is_alive():
             self._print_lines()
 
@@ -83,6 +70,7 @@ class LiveView(Watcher):
             self._thread.join()
         self._live.stop()
         self._print_lines()
+        self._log.end(status, error)
 
     def _draw_now_and_then(self) -> None:
         pause = 0.0
@@ -90,20 +78,18 @@ class LiveView(Watcher):
             began = time.thread_time()
             self._print_lines()
             size = self._console.size
-            self._live.update(
-                draw(self._tally, size.width, size.height, plain=is_plain(self._console)), refresh=True
-            )
+            self._live.update(draw(self, size.width, size.height, plain=is_plain(self._console)), refresh=True)
             pause = max(LEAST_EVERY, (time.thread_time() - began) / SHARE)
 
     def _print_lines(self) -> None:
-        lines = [self._waiting.popleft() for _ in range(len(self._waiting))]
-        if lines:
-            texts = (Text(printable(line.text), "red" if line.bad else "") for line in lines)
+        records = [self._waiting.get() for _ in range(self._waiting.qsize())]
+        if records:
+            texts = (Text(one.getMessage(), "red" if one.levelno >= logging.ERROR else "") for one in records)
             self._console.print(Text("\n").join(texts))
 
 
 def is_plain(console: Console) -> bool:
-    """Tell whether a terminal shows ASCII alone."""
+    """Return whether a terminal shows ASCII alone."""
     return not console.encoding.lower().startswith("utf")
 
 

@@ -7,48 +7,25 @@ import shlex
 import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from tiler.config.config import Config
-from tiler.engine.stage import Scope
+from tiler.engine.submission import Item
 from tiler.engine.task import Record
-from tiler.monitoring.watchers import Item, Watcher
+from tiler.monitoring.tally import StageTally, Tally
 from tiler.store.atomic import replacing
 from tiler.store.out_folder import PROGRESS
 
 SCHEMA = 1  # of progress.json
 EVERY = 2.0  # s between two writes of it
 LISTED = 100  # items in hand that it lists, those first that have waited longest
-Announce = Callable[[str, float], None]
 
 
-@dataclasses.dataclass
-class StageProgress:
-    """How far a stage is.
-
-    Attributes
-    ----------
-    total, done, reused, failed : int
-        Its items; those done, those of them that an earlier run had done, and those that ended in an error.
-    seconds : float
-        Wall time of all items done (s).
-    finished : float or None
-        When its last item was done (s after the start).
-    """
-
-    total: int
-    done: int = 0
-    reused: int = 0
-    failed: int = 0
-    seconds: float = 0.0
-    finished: float | None = None
-
-
-class RunProgress(Watcher):
-    """The progress of a run, given to an `Engine`, which tells it what begins, ends and fails.
+class RunProgress(Tally):
+    """Keeps how far a run is, and writes it to a file.
 
     Parameters
     ----------
@@ -58,10 +35,13 @@ class RunProgress(Watcher):
         Its parameters.
     expected : mapping of str to int
         Number of items of the stages that are known from the start, in order; others come as they are planned.
-    announce : callable, optional
-        Called with the name of each stage and the seconds of all its items when it is done.
     command : str, optional
         What a user gives to go on with the run; made of `config` by default.
+
+    Attributes
+    ----------
+    finished : dict of str to float
+        Seconds after the start at which each finished stage was done.
 
     Notes
     -----
@@ -69,20 +49,13 @@ class RunProgress(Watcher):
     """
 
     def __init__(
-        self,
-        out: Path,
-        config: Config,
-        expected: Mapping[str, int],
-        *,
-        announce: Announce | None = None,
-        command: str | None = None,
+        self, out: Path, config: Config, expected: Mapping[str, int], *, command: str | None = None
     ) -> None:
-        self.stages = {stage: StageProgress(total) for stage, total in expected.items()}
-        self._path, self._announce = out / PROGRESS, announce
-        self._begin, self._started = time.perf_counter(), time.time()
-        self._written = -EVERY
-        self._in_hand: dict[tuple[str, str], float] = {}
-        self._notes: Counter[str] = Counter()
+        super().__init__(time.perf_counter)
+        self.stages = {stage: StageTally(total) for stage, total in expected.items()}
+        self.finished: dict[str, float] = {}
+        self._path, self._written = out / PROGRESS, -EVERY
+        self._since: dict[Item, float] = {}  # when items in hand were given to workers
         self._head = {
             "schema": SCHEMA,
             "pid": os.getpid(),
@@ -90,43 +63,31 @@ class RunProgress(Watcher):
             "directory": os.getcwd(),
             "command": command_line(config) if command is None else command,
             "parameters": dataclasses.asdict(config),
-            "started": format_time(self._started),
+            "started": format_time(time.time()),
         }
         self.write("running")
 
-    @property
-    def finished(self) -> dict[str, float]:
-        """Seconds after the start at which each finished stage was done."""
-        return {name: stage.finished for name, stage in self.stages.items() if stage.finished is not None}
-
-    def planned(self, stage: str, scope: Scope, total: int) -> None:
-        """Take note of how many items a stage has."""
-        self._stage(stage).total = total
-
     def submitted(self, stage: str, name: str) -> None:
         """Take note of an item that was given to a worker."""
-        self._in_hand[stage, name] = time.time()
+        super().submitted(stage, name)
+        self._since[stage, name] = time.time()
         self._write_sometimes()
 
-    def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
-        """Take note of an item that ended in an error."""
-        self._in_hand.pop((stage, name), None)
-        self._stage(stage).failed += 1
-        self._write_sometimes()
-
-    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
+    def done(self, stage: str, n_done: int, total: int, record: Record) -> None:
         """Take note of an item that is done."""
-        self._in_hand.pop((stage, record.name), None)
-        state = self._stage(stage)
-        state.done, state.total = done, total
-        state.reused += record.reused
-        state.seconds += record.seconds.get("all", 0.0)
-        self._notes.update(record.notes)
-        if done == total:
-            state.finished = round(time.perf_counter() - self._begin, 3)
+        super().done(stage, n_done, total, record)
+        self._since.pop((stage, record.name), None)
+        if n_done == total:
+            self.finished[stage] = round(self.elapsed, 3)
         self._write_sometimes()
-        if done == total and self._announce is not None:
-            self._announce(f"{stage} ({total})", state.seconds)
+
+    def failed(
+        self, stage: str, name: str, reason: str, needs: Item | None = None, *, ends_run: bool = False
+    ) -> None:
+        """Take note of an item that failed."""
+        super().failed(stage, name, reason, needs)
+        self._since.pop((stage, name), None)
+        self._write_sometimes()
 
     def end(self, status: str, error: str = "") -> None:
         """Write how the run ended."""
@@ -147,19 +108,19 @@ class RunProgress(Watcher):
         OutputError
             If it cannot be written.
         """
-        in_hand = sorted(self._in_hand.items(), key=lambda item: item[1])
-        running = Counter(stage for stage, _ in self._in_hand)
+        in_hand = sorted(self._since.items(), key=lambda item: item[1])
+        running = Counter(stage for stage, _ in self._since)
         content = self._head | {
             "updated": format_time(time.time()),
             "status": status,
             "error": error,
-            "stages": {name: _tell(stage, running[name]) for name, stage in self.stages.items()},
+            "stages": {name: self._describe(name, running[name]) for name in self.stages},
             "n_running": len(in_hand),
             "running": [
                 {"stage": stage, "name": name, "since": format_time(since)}
                 for (stage, name), since in in_hand[:LISTED]
             ],
-            "notes": dict(sorted(self._notes.items())),
+            "notes": dict(sorted(self.warnings.items())),
         }
         with replacing(self._path) as part:
             part.write_text(json.dumps(content, indent=1, default=str) + "\n")
@@ -169,13 +130,11 @@ class RunProgress(Watcher):
         if time.perf_counter() - self._written >= EVERY:
             self.write("running")
 
-    def _stage(self, name: str) -> StageProgress:
-        return self.stages.setdefault(name, StageProgress(0))
-
-
-def _tell(stage: StageProgress, running: int) -> dict[str, Any]:
-    told = dataclasses.asdict(stage) | {"running": running, "seconds": round(stage.seconds, 3)}
-    return {name: value for name, value in told.items() if value is not None}
+    def _describe(self, stage: str, running: int) -> dict[str, Any]:
+        state = self.stages[stage]
+        counts = {count: getattr(state, count) for count in ("total", "done", "reused", "failed")}
+        finished = {"finished": self.finished[stage]} if stage in self.finished else {}
+        return counts | {"running": running, "seconds": round(state.seconds, 3)} | finished
 
 
 def format_time(seconds: float) -> str:

@@ -23,7 +23,7 @@ COUNTS = ("total", "done", "reused", "running", "failed")
 
 
 def read_status(directory: Path) -> dict[str, Any]:
-    """Tell how far the run in a folder is.
+    """Return how far the run in a folder is.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _headline(status: dict[str, Any]) -> str:
 
 
 def _is_of_holder(status: dict[str, Any]) -> bool:
-    """Tell whether the process that wrote the progress may be the one that holds the folder."""
+    """Return whether the process that wrote the progress may be the one that holds the folder."""
     if status["status"] != "running":
         return False
     if status["host"] != socket.gethostname():

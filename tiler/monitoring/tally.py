@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from tiler.engine.stage import Scope
+from tiler.engine.submission import Item
 from tiler.engine.task import Record
-from tiler.monitoring.watchers import Item, RunStart, Watcher
+from tiler.engine.watcher import RunStart, Watcher
 from tiler.words.stage_groups import group_stages
 
 # Parts of a run's work by stage, means over cities of 4 to 210 tiles; a round's number is left out. They count for
@@ -27,7 +28,7 @@ SHARES = {
     "pieces": 0.10,
 }
 SMALL_SHARE = 0.003  # of every other stage
-LEAST_SHARE = 0.1  # of all work that must be measured before the time left is told
+LEAST_SHARE = 0.1  # of all work that must be measured before the time left is shown
 LEAST_TIME = 3.0  # s, likewise
 REUSE = 0.005  # s to look at a result that is taken as it is
 
@@ -115,17 +116,19 @@ class Tally(Watcher):
         state.began = state.began or now
         state.running += 1
 
-    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
+    def done(self, stage: str, n_done: int, total: int, record: Record) -> None:
         """Count an item that is done."""
         state = self._stage(stage)
-        state.done, state.total = done, total
+        state.done, state.total = n_done, total
         state.running = max(state.running - 1, 0)
         state.reused += record.reused
         state.seconds += record.seconds.get("all", 0.0)
         self.warnings.update(record.notes)
         self.peak_memory = max(self.peak_memory, record.peak_memory)
 
-    def failed(self, stage: str, name: str, reason: str, needs: Item | None = None) -> None:
+    def failed(
+        self, stage: str, name: str, reason: str, needs: Item | None = None, *, ends_run: bool = False
+    ) -> None:
         """Count an item that failed, or is not run."""
         state = self._stage(stage)
         state.failed += 1

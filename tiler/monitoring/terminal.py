@@ -1,6 +1,8 @@
 """What a run shows while it is at work, and at its end: what was made, how good it is, what next."""
 
+import logging
 import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,10 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from tiler.engine.watcher import Watcher
 from tiler.monitoring.live_view import LiveView
-from tiler.monitoring.plain_view import PlainView, QuietView
-from tiler.monitoring.tally import Tally
-from tiler.monitoring.watchers import Watcher
+from tiler.monitoring.run_log import LogView
 from tiler.objects.places import Place, in_bucket
 from tiler.store.run_folder import PARTS
 from tiler.words.note_words import say_notes
@@ -28,25 +29,24 @@ def plain(text: str) -> str:
     return escape(printable(text))
 
 
-def make_views(*, quiet: bool = False, verbose: bool = False, console: Console | None = None) -> list[Watcher]:
-    """Make the watchers that show a run: a live view on a terminal, lines where there is none.
+def make_view(*, quiet: bool = False, verbose: bool = False, console: Console | None = None) -> Watcher:
+    """Make the watcher that shows a run until it ends: a live view on a terminal, lines where there is none.
 
     Parameters
     ----------
     quiet : bool
-        Failures alone.
+        Failures alone, on standard error.
     verbose : bool
         A line for each item too.
     console : Console, optional
         Where; standard output by default.
     """
     if quiet:
-        return [QuietView()]
+        return LogView(logging.StreamHandler(sys.stderr), logging.ERROR)
     console = console or Console(highlight=False)
-    tally = Tally()
     if console.file.isatty() and not console.is_dumb_terminal:
-        return [tally, LiveView(console, tally, verbose=verbose)]
-    return [tally, PlainView(tally, verbose=verbose)]
+        return LiveView(console, verbose=verbose)
+    return LogView(logging.StreamHandler(sys.stdout), logging.DEBUG if verbose else logging.INFO)
 
 
 def print_last_line(record: dict[str, Any], out: Path) -> None:

@@ -115,7 +115,7 @@ class ObjectPath:
             return False
 
     def is_symlink(self) -> bool:
-        """Tell that it is none."""
+        """Return False: there are no links."""
         return False
 
     def exists(self) -> bool:
@@ -208,11 +208,9 @@ class ObjectPath:
         return ask(self, self.patience, request, self.root)
 
 
-def delete_below(path: ObjectPath, first: str = "") -> None:
-    """Delete an object and all below it; those named `first` before the others."""
-    paths = [*path.rglob("*"), path]
-    path.delete([one for one in paths if one.name == first])
-    path.delete([one for one in paths if one.name != first])
+def delete_below(path: ObjectPath) -> None:
+    """Delete an object and all below it."""
+    path.delete([*path.rglob("*"), path])
 
 
 class RangeFile(io.RawIOBase):
@@ -242,11 +240,11 @@ class RangeFile(io.RawIOBase):
         self.n_bytes = self.n_requests = 0
 
     def readable(self) -> bool:
-        """Tell that it can be read."""
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
-        """Tell that it can be sought in."""
+        """Return True."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:

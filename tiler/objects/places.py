@@ -50,7 +50,7 @@ class Place(Protocol):
 
 
 def is_url(text: str) -> bool:
-    """Tell whether a text names an object or a file of a server.
+    """Return whether a text names an object or a file of a server.
 
     Examples
     --------
@@ -61,7 +61,7 @@ def is_url(text: str) -> bool:
 
 
 def in_bucket(path: object) -> TypeGuard[ObjectPath]:
-    """Tell whether a place is an `ObjectPath`: what is written there is put whole, and nothing is renamed."""
+    """Return whether a place is an `ObjectPath`: what is written there is put whole, and nothing is renamed."""
     return isinstance(path, ObjectPath)
 
 
@@ -161,7 +161,7 @@ def identify(path: Path | ObjectPath) -> str:
 
 
 def is_missing(path: Path) -> bool:
-    """Tell whether a path of a disk names nothing; of an object, its first reader tells."""
+    """Return whether a path of a disk names nothing; of an object, its first reader tells."""
     return not in_bucket(path) and not os.path.exists(path)  # Path.exists raises where a name is too long
 
 

@@ -38,7 +38,7 @@ class ChangedError(Exception):
 
 
 def trust_addresses(trusted: bool) -> None:
-    """Say whether this process does tasks: their driver has reached all stores, so they are worth waiting for."""
+    """Return whether this process does tasks: their driver has reached all stores, so waiting is worth it."""
     (_known.add if trusted else _known.discard)(EVERY)
 
 

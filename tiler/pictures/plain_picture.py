@@ -25,7 +25,7 @@ window.Render()
 
 @cache
 def has_graphics() -> bool:
-    """Tell whether VTK can draw here; asked in a process of its own, which VTK brings down where it cannot."""
+    """Return whether VTK can draw here; asked in a process of its own, which VTK brings down where it cannot."""
     done = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120, check=False)
     return done.returncode == 0
 

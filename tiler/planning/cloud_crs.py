@@ -9,34 +9,27 @@ import pyproj
 
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
-from tiler.georeference.crs import crs_name, horizontal_crs, is_on_its_place, is_one, parse_crs, utm_crs
+from tiler.config.config import Config
+from tiler.georeference.crs import (
+    box_words,
+    crs_name,
+    directions_of,
+    fault_of,
+    horizontal_crs,
+    is_on_its_place,
+    is_one,
+    like_degrees,
+    parse_crs,
+    pdal_command,
+    utm_crs,
+)
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.georeference.las_crs import height_unit_of
 from tiler.georeference.metric import MetricCrs, find_metric
 from tiler.georeference.units import UNITS, same_unit, unit_name
-from tiler.georeference.words import box_words, directions_of, fault_of, like_degrees, pdal_command
 from tiler.pointclouds.clouds import CloudHeader
 
 Box = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What the user says of the CRS.
-
-    Attributes
-    ----------
-    crs : str
-        Value of ``--crs``, ``""`` for none.
-    reproject : bool
-        Whether clouds in another CRS are reprojected.
-    height_unit : str
-        Unit of heights, one of `UNITS`; ``""`` for what the files state.
-    """
-
-    crs: str = ""
-    reproject: bool = False
-    height_unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -52,13 +45,7 @@ class CloudGroup:
 
     @property
     def box(self) -> Box:
-        boxes = [cloud.bounds for cloud in self.clouds]
-        return (
-            min(box[0] for box in boxes),
-            min(box[1] for box in boxes),
-            max(box[2] for box in boxes),
-            max(box[3] for box in boxes),
-        )
+        return box_around([cloud.bounds for cloud in self.clouds])
 
     @property
     def label(self) -> str:
@@ -76,7 +63,7 @@ class PlanCrs:
 
 
 @dataclass(frozen=True)
-class Told:
+class Findings:
     messages: list[str]
     notes: list[Note]
 
@@ -94,7 +81,7 @@ def group_clouds(clouds: Sequence[CloudHeader]) -> list[CloudGroup]:
     return [CloudGroup(members, horizontal_crs(members[0].crs)) for members in groups.values()]
 
 
-def read_wish(asked: Asked, groups: Sequence[CloudGroup]) -> tuple[pyproj.CRS, MetricCrs] | None:
+def read_wish(asked: Config, groups: Sequence[CloudGroup]) -> tuple[pyproj.CRS, MetricCrs] | None:
     """Parse ``--crs``, and find its metric form."""
     if not asked.crs:
         return None
@@ -119,25 +106,25 @@ def read_wish(asked: Asked, groups: Sequence[CloudGroup]) -> tuple[pyproj.CRS, M
 
 
 def choose_plan(
-    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Asked, told: Told
+    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Config, findings: Findings
 ) -> PlanCrs | None:
     """Decide which CRS a group's coordinates have; None where neither file nor user says."""
     stated = group.stated
     if like_degrees(group.box) and (stated is None or stated.is_projected):
-        return _assume_degrees(group, wish, asked, told)
+        return _assume_degrees(group, wish, asked, findings)
     if stated is None:
         unread = f": {group.first.unread}" if group.first.unread else ""
         if wish is None:
             return None
-        told.say(
+        findings.say(
             "cloud-without-crs",
             group.first.path.name,
             f"{group.label} {states_of(group)} no CRS that is understood{unread}; taken as {crs_name(wish[0])} "
             "of --crs",
         )
-        return PlanCrs(wish[0], _with_unit(group, wish[0], wish[1], told))
+        return PlanCrs(wish[0], _with_unit(group, wish[0], wish[1], findings))
     if stated.is_geographic:
-        return _choose_for_degrees(group, stated, wish, asked, told)
+        return _choose_for_degrees(group, stated, wish, asked, findings)
     if not stated.is_projected:
         raise InputError(
             f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}; reproject the cloud to a "
@@ -153,11 +140,13 @@ def choose_plan(
             f"has it with axes east and north; reproject the cloud: {pdal_command(group.first.path, stated, zone)}"
         )
     if wish is None or asked.reproject or is_one(metric.crs, wish[1].crs, metric_box(group, metric)):
-        return PlanCrs(stated, _with_unit(group, stated, metric, told))
-    return _overrule(group, stated, wish, told)
+        return PlanCrs(stated, _with_unit(group, stated, metric, findings))
+    return _overrule(group, stated, wish, findings)
 
 
-def _overrule(group: CloudGroup, stated: pyproj.CRS, wish: tuple[pyproj.CRS, MetricCrs], told: Told) -> PlanCrs:
+def _overrule(
+    group: CloudGroup, stated: pyproj.CRS, wish: tuple[pyproj.CRS, MetricCrs], findings: Findings
+) -> PlanCrs:
     """Take ``--crs`` for what a file states, where its coordinates are plausible for that."""
     flat, metric = wish
     if not is_on_its_place(metric_box(group, metric), metric.crs):
@@ -168,7 +157,7 @@ def _overrule(group: CloudGroup, stated: pyproj.CRS, wish: tuple[pyproj.CRS, Met
             "the cloud, "
             f"or leave out --crs"
         )
-    told.say(
+    findings.say(
         "cloud-crs-overruled",
         group.first.path.name,
         f"{group.label} {states_of(group)} {crs_name(stated)}; taken as {crs_name(flat)} of --crs (--reproject "
@@ -182,13 +171,13 @@ def _choose_for_degrees(
     group: CloudGroup,
     stated: pyproj.CRS,
     wish: tuple[pyproj.CRS, MetricCrs] | None,
-    asked: Asked,
-    told: Told,
+    asked: Config,
+    findings: Findings,
 ) -> PlanCrs:
     if asked.reproject and is_on_its_place(group.box, stated):
         return PlanCrs(stated, MetricCrs(stated, (0, 1.0), (1, 1.0)), degrees=True)
     if wish is not None and not like_degrees(group.box):
-        return _overrule(group, stated, wish, told)
+        return _overrule(group, stated, wish, findings)
     if not like_degrees(group.box) and not is_on_its_place(group.box, stated):
         raise InputError(
             f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}, but its coordinates, "
@@ -203,7 +192,7 @@ def _choose_for_degrees(
     )
 
 
-def _with_unit(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, told: Told) -> MetricCrs:
+def _with_unit(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, findings: Findings) -> MetricCrs:
     """Take the unit that a key states beside a CRS, and the axes that the coordinates show."""
     unit = group.first.plan_unit
     sizes = abs(metric.east[1]), abs(metric.north[1])
@@ -215,17 +204,17 @@ def _with_unit(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, told: Told
         )
         by_key, by_crs = (is_on_its_place(metric_box(group, one), one.crs) for one in (keyed, metric))
         taken = keyed if by_key or not by_crs else metric
-        told.say(
+        findings.say(
             "cloud-unit-of-key",
             group.first.path.name,
             f"{group.label}: {crs_name(crs)} is in {unit_name(sizes[0])}, but GeoTIFF key 3076 says "
             f"{unit_name(unit)}; coordinates are taken in {unit_name(unit if taken is keyed else sizes[0])}",
         )
         return taken
-    return _with_axes(group, crs, metric, told)
+    return _with_axes(group, crs, metric, findings)
 
 
-def _with_axes(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, told: Told) -> MetricCrs:
+def _with_axes(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, findings: Findings) -> MetricCrs:
     """Take the axes that the coordinates show, where those of the CRS put them off its area of use."""
     if is_on_its_place(metric_box(group, metric), metric.crs):
         return metric
@@ -240,7 +229,7 @@ def _with_axes(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, told: Told
     }
     for words, other in others.items():
         if other != metric and is_on_its_place(metric_box(group, other), other.crs):
-            told.say(
+            findings.say(
                 "cloud-axes", group.first.path.name, f"{group.label}: {words}; taken as {crs_name(metric.crs)}"
             )
             return other
@@ -251,7 +240,7 @@ def choose_fallback(
     groups: Sequence[CloudGroup],
     plans: Sequence[PlanCrs | None],
     footprints: pyproj.CRS | None,
-    told: Told,
+    findings: Findings,
 ) -> PlanCrs:
     """What is taken for clouds that state nothing: what the others state, else the footprints' CRS."""
     silent = [group for group, plan in zip(groups, plans, strict=True) if plan is None]
@@ -262,7 +251,7 @@ def choose_fallback(
     unread = next((f" ({group.first.unread})" for group in silent if group.first.unread), "")
     if known:
         group, plan = known[0]
-        told.say(
+        findings.say(
             "cloud-without-crs",
             silent[0].first.path.name,
             f"{n_silent} of {n_all} point clouds state no CRS{unread}; taken as {crs_name(plan.source)} of "
@@ -281,22 +270,22 @@ def choose_fallback(
             f"the point clouds state no CRS{unread}, and that of the footprints, {crs_name(flat)}, "
             f"{fault_of(flat) or f'has axes to the {directions_of(flat)}'}; give the CRS of the clouds with --crs"
         )
-    told.say(
+    findings.say(
         "cloud-without-crs",
         first.first.path.name,
         f"the point cloud states no CRS{unread}; using {crs_name(flat)} of the footprints",
     )
-    return PlanCrs(flat, _with_unit(first, flat, metric, told))
+    return PlanCrs(flat, _with_unit(first, flat, metric, findings))
 
 
 def _assume_degrees(
-    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Asked, told: Told
+    group: CloudGroup, wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Config, findings: Findings
 ) -> PlanCrs:
     """Take coordinates that look like degrees for those of WGS 84, where they may be reprojected."""
     wgs84 = pyproj.CRS("EPSG:4326")
     states = f"{states_of(group)} {'no CRS' if group.stated is None else crs_name(group.stated)}"
     if asked.reproject:
-        told.say(
+        findings.say(
             "cloud-without-crs",
             group.first.path.name,
             f"{group.label} {states}, and the coordinates look like degrees; taken as EPSG:4326 (WGS 84)",
@@ -310,13 +299,13 @@ def _assume_degrees(
     )
 
 
-def choose_height_unit(group: CloudGroup, plan: PlanCrs, asked: Asked, told: Told) -> float:
+def choose_height_unit(group: CloudGroup, plan: PlanCrs, asked: Config, findings: Findings) -> float:
     """Metres of a unit of height: asked for, stated, or that of plan."""
     stated, name = group.first.height_unit, group.first.path.name
     if asked.height_unit:
         unit = UNITS[asked.height_unit]
         if stated is not None and not same_unit(stated, unit):
-            told.say(
+            findings.say(
                 "cloud-height-unit",
                 name,
                 f"{group.label}: states heights in {unit_name(stated)}; taken in {unit_name(unit)} by "
@@ -329,14 +318,14 @@ def choose_height_unit(group: CloudGroup, plan: PlanCrs, asked: Asked, told: Tol
     else:
         unit = 1.0 if plan.degrees else abs(plan.metric.east[1])
         if unit != 1.0:
-            told.say(
+            findings.say(
                 "cloud-height-unit",
                 name,
                 f"{group.label}: no record states the unit of heights; taken in {unit_name(unit)} as plan is, "
                 "--height-unit m says otherwise",
             )
     if unit != 1.0:
-        told.say(
+        findings.say(
             "cloud-height-converted", name, f"{group.label}: heights in {unit_name(unit)} converted to metres"
         )
     return unit

@@ -9,8 +9,10 @@ import pyproj
 
 from pipeline.data.errors import InputError
 from pipeline.data.notes import Note
+from tiler.config.config import Config
 from tiler.georeference.crs import (
     SAME_PLACE,
+    boxes_meet,
     crs_name,
     crs_text,
     horizontal_crs,
@@ -22,15 +24,13 @@ from tiler.georeference.crs import (
 )
 from tiler.georeference.footprints import find_shown_axes, footprint_frame
 from tiler.georeference.frame import Frame, box_to_region
-from tiler.georeference.metric import LIKELY, MetricCrs, find_metric
+from tiler.georeference.metric import LIKELY, MetricCrs, axes_words, find_metric
 from tiler.georeference.operation import Operation, find_operation
 from tiler.georeference.units import unit_name
-from tiler.georeference.words import axes_words, boxes_meet
 from tiler.planning.cloud_crs import (
-    Asked,
     CloudGroup,
+    Findings,
     PlanCrs,
-    Told,
     box_around,
     choose_fallback,
     choose_height_unit,
@@ -62,7 +62,7 @@ class Georeference:
     operations : dict of str to Operation
         Those that reproject, by what they reproject.
     messages : list of str
-        What the user must be told.
+        Messages for the user.
     notes : list of Note
         The same for the record, by kind.
     record : dict
@@ -79,14 +79,14 @@ class Georeference:
 
 
 def establish_georeference(
-    asked: Asked, clouds: Sequence[CloudHeader], footprints: pyproj.CRS | None, extent: Box | None
+    asked: Config, clouds: Sequence[CloudHeader], footprints: pyproj.CRS | None, extent: Box | None
 ) -> Georeference:
     """Establish where a region lies, from the headers of its input alone.
 
     Parameters
     ----------
-    asked : Asked
-        What the user says.
+    asked : Config
+        Parameters: what the user says of CRS, unit of heights, and reprojection.
     clouds : sequence of CloudHeader
         All point clouds, at least one of them with points; those without have no say.
     footprints : pyproj.CRS or None
@@ -112,18 +112,18 @@ def establish_georeference(
     east and north: coordinates in feet, or along axes to the west or south, are converted exactly. Clouds in
     another CRS are reprojected where that is asked for.
     """
-    told = Told([], [])
+    findings = Findings([], [])
     groups = group_clouds(clouds)
     wish = read_wish(asked, groups)
-    stated = [choose_plan(group, wish, asked, told) for group in groups]
-    fallback = choose_fallback(groups, stated, footprints, told)
+    stated = [choose_plan(group, wish, asked, findings) for group in groups]
+    fallback = choose_fallback(groups, stated, footprints, findings)
     plans = [found or fallback for found in stated]
     crs = _registered(_choose_target(groups, plans, wish, asked), groups, plans, footprints)
     placed: dict[int, CloudHeader] = {}
     described: list[dict[str, Any]] = []
     operations: dict[str, Operation] = {}
     for group, plan in zip(groups, plans, strict=True):
-        frame, operation = _frame(group, plan, crs, asked, told)
+        frame, operation = _frame(group, plan, crs, asked, findings)
         described.append(_describe_clouds(group, plan, frame, operation))
         operations |= {} if operation is None else {group.first.path.name: operation}
         for cloud in group.clouds:
@@ -133,9 +133,9 @@ def establish_georeference(
             )
     scale = _check_scale(crs, [placed[id(cloud)] for group in groups for cloud in group.clouds], asked)
     region = box_around([cloud.bounds for cloud in placed.values()])
-    frame, operation = _place_footprints(footprints, extent, crs, region, plans, groups, placed, told)
+    frame, operation = _place_footprints(footprints, extent, crs, region, plans, groups, placed, findings)
     operations |= {} if operation is None else {FOOTPRINTS: operation}
-    _describe_stray(list(placed.values()), crs, told)
+    _describe_stray(list(placed.values()), crs, findings)
     record = {
         "crs": crs_name(crs),
         "scale of the projection": round(scale, 6),
@@ -147,7 +147,7 @@ def establish_georeference(
             **_describe_frame(frame, operation),
         }
     everything = [placed.get(id(cloud), cloud) for cloud in clouds]
-    return Georeference(crs, everything, frame, operations, told.messages, told.notes, record)
+    return Georeference(crs, everything, frame, operations, findings.messages, findings.notes, record)
 
 
 def find_inexact(found: Georeference, bound: float) -> list[Note]:
@@ -160,7 +160,10 @@ def find_inexact(found: Georeference, bound: float) -> list[Note]:
 
 
 def _choose_target(
-    groups: Sequence[CloudGroup], plans: Sequence[PlanCrs], wish: tuple[pyproj.CRS, MetricCrs] | None, asked: Asked
+    groups: Sequence[CloudGroup],
+    plans: Sequence[PlanCrs],
+    wish: tuple[pyproj.CRS, MetricCrs] | None,
+    asked: Config,
 ) -> pyproj.CRS:
     """Choose the region's CRS; a UTM zone where clouds are to be reprojected from one without true lengths."""
     if wish is not None:
@@ -200,17 +203,17 @@ def _registered(
 
 
 def _frame(
-    group: CloudGroup, plan: PlanCrs, crs: pyproj.CRS, asked: Asked, told: Told
+    group: CloudGroup, plan: PlanCrs, crs: pyproj.CRS, asked: Config, findings: Findings
 ) -> tuple[Frame, Operation | None]:
-    """Say how a group's coordinates become those of the region."""
+    """Describe how a group's coordinates become those of the region."""
     metric = plan.metric
-    height = choose_height_unit(group, plan, asked, told)
+    height = choose_height_unit(group, plan, asked, findings)
     plain = Frame(metric.east, metric.north, height)
     box = group_box(group, plan)
     name = group.first.path.name
     if is_one(metric.crs, crs, box):
         if not same_crs(metric.crs, crs):
-            told.say(
+            findings.say(
                 "cloud-crs-alike",
                 name,
                 f"{group.label}: {crs_name(metric.crs)} is taken as {crs_name(crs)}, as the region moves by "
@@ -218,7 +221,7 @@ def _frame(
                 f"{SAME_PLACE:g} m between them",
             )
         if plain.changes_plan:
-            told.say(
+            findings.say(
                 "cloud-converted",
                 name,
                 f"{group.label}: {crs_name(plan.source)} in {unit_name(abs(metric.east[1]))}"
@@ -233,11 +236,11 @@ def _frame(
         )
     frame = replace(plain, source=crs_text(metric.crs), target=crs_text(crs))
     operation = find_operation(metric.crs, crs, box_to_region(frame, group.box))
-    told.say("cloud-reprojected", name, f"{group.label}: reprojected {operation.describe()}")
+    findings.say("cloud-reprojected", name, f"{group.label}: reprojected {operation.describe()}")
     return frame, operation
 
 
-def _check_scale(crs: pyproj.CRS, clouds: Sequence[CloudHeader], asked: Asked) -> float:
+def _check_scale(crs: pyproj.CRS, clouds: Sequence[CloudHeader], asked: Config) -> float:
     """Refuse a projection whose lengths are not those on the ground."""
     box = box_around([cloud.bounds for cloud in clouds])
     scale = scale_of(box, crs)
@@ -272,16 +275,16 @@ def _place_footprints(
     plans: Sequence[PlanCrs],
     groups: Sequence[CloudGroup],
     placed: dict[int, CloudHeader],
-    told: Told,
+    findings: Findings,
 ) -> tuple[Frame, Operation | None]:
-    """Say how coordinates of the footprints become those of the region."""
+    """Describe how coordinates of the footprints become those of the region."""
     flat = horizontal_crs(stated)
     if flat is None:
         if extent is None:
             return Frame(), None
         like = placed[id(groups[0].first)].frame
         if like.changes_plan and boxes_meet(extent, groups[0].box) and not boxes_meet(extent, box):
-            told.say(
+            findings.say(
                 "footprints-without-crs",
                 "footprints",
                 f"the footprints state no CRS; taken as {crs_name(plans[0].source)}, as their coordinates are "
@@ -292,16 +295,16 @@ def _place_footprints(
         return Frame(), None
     shown = find_shown_axes(flat, crs, extent, box, [cloud.frame for cloud in placed.values()])
     if shown is not None:
-        told.say("footprints-axes", "footprints", f"the footprints: {shown[1]}; taken as {crs_name(crs)}")
+        findings.say("footprints-axes", "footprints", f"the footprints: {shown[1]}; taken as {crs_name(crs)}")
         return shown[0], None
-    return footprint_frame(flat, crs, box, told.say)
+    return footprint_frame(flat, crs, box, findings.say)
 
 
-def _describe_stray(clouds: Sequence[CloudHeader], crs: pyproj.CRS, told: Told) -> None:
+def _describe_stray(clouds: Sequence[CloudHeader], crs: pyproj.CRS, findings: Findings) -> None:
     stray = [cloud for cloud in clouds if not is_on_its_place(cloud.bounds, crs)]
     if stray:
         more = f" and {len(stray) - 1} more point clouds lie" if len(stray) > 1 else " lies"
-        told.say(
+        findings.say(
             "cloud-off-its-crs",
             stray[0].path.name,
             f"{stray[0].path.name}{more} outside the area of use of "

@@ -283,7 +283,7 @@ def _house_sums(
 def _memory_warnings(
     tile_memory: NDArray[np.float64], area: NDArray[np.float64], config: Config, memory: float
 ) -> list[str]:
-    """Say which tiles do not fit into a worker's share of memory, and which tile size would."""
+    """Name which tiles do not fit into a worker's share of memory, and which tile size would."""
     workers = max(config.workers, 1)
     share = config.memory_limit * 2**30 if config.memory_limit and config.workers else memory / workers
     limit = MEMORY_SHARE * share
@@ -303,7 +303,7 @@ def _memory_warnings(
 
 
 def warn_of_memory(survey: Survey, config: Config, *, memory: float) -> list[str]:
-    """Say before a run which tiles may not fit into memory, from headers alone; see `forecast_run`.
+    """Warn before a run which tiles may not fit into memory, from headers alone; see `forecast_run`.
 
     Notes
     -----

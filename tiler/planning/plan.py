@@ -13,11 +13,10 @@ from stitch.tiling.grid import TileGrid, make_grid, tiles_present
 from tiler.config.config import Config, idle_parameters
 from tiler.engine.run_context import choose_tiles, make_layout, tile_key
 from tiler.engine.stage import FileItem, Layout
-from tiler.georeference.crs import crs_text
+from tiler.georeference.crs import boxes_meet, crs_text
 from tiler.georeference.operation import Operation
 from tiler.objects.places import identify, place
 from tiler.objects.requests import trust_addresses
-from tiler.planning.cloud_crs import Asked
 from tiler.planning.establish_georeference import FOOTPRINTS, Georeference, establish_georeference, find_inexact
 from tiler.planning.region import (
     Region,
@@ -31,42 +30,6 @@ from tiler.planning.region import (
 )
 from tiler.pointclouds.clouds import CloudHeader, find_clouds, read_header
 from tiler.vectors.layers import describe_layer
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What is known before any point is read.
-
-    Attributes
-    ----------
-    region : Region
-        What is meshed.
-    headers : list of CloudHeader
-        All point-cloud files that can be read.
-    messages : list of str
-        Sentences that the user should read.
-    unreadable : dict
-        Files left out, with the reason.
-    grid : TileGrid
-        Tiles, those without any point cloud left out.
-    layout : Layout
-        Items of every scope.
-    survey : Survey
-        What it was made of, all tiles included.
-    """
-
-    region: Region
-    headers: list[CloudHeader]
-    messages: list[str]
-    unreadable: dict[str, str]
-    grid: TileGrid
-    layout: Layout
-    survey: "Survey"
-
-    @property
-    def georeference(self) -> Georeference:
-        """Where the region lies."""
-        return self.survey.georeference
 
 
 @dataclass(frozen=True)
@@ -104,6 +67,13 @@ class Survey:
     meshed: TileGrid
 
 
+@dataclass(frozen=True)
+class Plan(Survey):
+    """What is known before any point is read: a survey, and the items of every scope by name."""
+
+    layout: Layout
+
+
 def check_sources(config: Config) -> None:
     """Raise ConfigError if no point cloud is named."""
     if not config.pointcloud:
@@ -128,7 +98,7 @@ def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
     trust_addresses(False)  # whatever this process did before
     found = survey_inputs(config, say)
     layout = make_layout(found.grid, file_items(found.clouds), identity=found.region.crs)
-    return Plan(found.region, found.headers, found.messages, found.unreadable, found.grid, layout, found)
+    return Plan(**vars(found), layout=layout)
 
 
 def leave_out(plan: Plan, tiles: Collection[str], files: Collection[str]) -> Plan:
@@ -156,7 +126,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     region = Region(choose_bounds(config.bounds, headers), crs_text(found.crs), config.tile_size_or_default)
     check_region(region, config.largest_size, headers, kind="open" if config.open_size else "mesh")
     check_sizes(region, config)
-    clouds = [header for header in headers if header.n_points and _meets(header, region)]
+    clouds = [header for header in headers if header.n_points and boxes_meet(header.bounds, region.bounds)]
     whole = make_grid(
         region.bounds,
         tile_size=config.tile_size_or_default,
@@ -186,10 +156,9 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
 def find_georeference(config: Config, headers: Sequence[CloudHeader]) -> Georeference:
     """Establish where the region lies, of headers of clouds and of the footprints' layer."""
     check_points(headers)
-    asked = Asked(config.crs, config.reproject, config.height_unit)
     layer = describe_layer(place(config.footprints), config.layer) if config.footprints else None
     crs, extent = (None, None) if layer is None else (layer.crs, layer.extent)
-    found = establish_georeference(asked, headers, crs, extent)
+    found = establish_georeference(config, headers, crs, extent)
     inexact = find_inexact(found, config.clearance)
     words = [_describe_inexact(found.operations[note.subject], note.subject, config) for note in inexact]
     void = [
@@ -235,10 +204,3 @@ def _read_headers(paths: Sequence[Path], *, skip: bool) -> tuple[list[CloudHeade
                 raise
             unreadable[str(path)] = str(error)
     return headers, unreadable
-
-
-def _meets(header: CloudHeader, region: Region) -> bool:
-    xmin, ymin, xmax, ymax = region.bounds
-    return not (
-        header.bounds[0] > xmax or header.bounds[2] < xmin or header.bounds[1] > ymax or header.bounds[3] < ymin
-    )

@@ -1,18 +1,20 @@
-"""The region to mesh: chosen, and checked against its tiles."""
+"""The region to mesh and the pad around it: chosen, laid out in tiles, and checked against these."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, InputError
 from stitch.pieces.numbering import MOST_TILES
-from stitch.tiling.grid import TileGrid
+from stitch.tiling.grid import Bounds, TileGrid, make_grid, tiles_present
 from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.config.config import Config
-from tiler.config.domain_height import EXPECTED_TALLEST
-from tiler.config.pad_widths import check_widths, widths_in_metres
+from tiler.config.domain_height import EXPECTED_TALLEST, check_widths, widths_in_metres
 from tiler.config.step_options import expected_levels
-from tiler.planning.pad import Pad, pad_bounds, pad_grid
+from tiler.engine.run_context import SHARED
 from tiler.pointclouds.clouds import CloudHeader
 
 ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray points ...
@@ -22,7 +24,76 @@ MOST_CELLS = 2**31  # of one tile, whose local indices have 32 bits
 PAST = 1.0  # m that a file reaches beyond a region before anything is said of it
 SPARSEST = 100.0  # m2; ... where it has fewer points than one in this area
 
-Bounds = tuple[float, float, float, float]
+
+@dataclass(frozen=True)
+class Pad:
+    """A region within its pad, a margin of bare ground.
+
+    Attributes
+    ----------
+    core : (xmin, ymin, xmax, ymax)
+        The region that was asked for, with its buildings and points (m).
+    grid : TileGrid
+        Tiles of core and pad.
+
+    Notes
+    -----
+    Guidelines keep the sides of the domain away from buildings: five times the height of the tallest one towards
+    the inlet and the sides, fifteen times behind (Franke et al., COST action 732, 2007), or ten (Tominaga et al.,
+    AIJ, 2008); both are cited in full in `tiler.config.domain_height`.
+    """
+
+    core: Bounds
+    grid: TileGrid
+
+
+def pad_bounds(core: Bounds, widths: Sequence[float]) -> Bounds:
+    """Grow a region by the widths of its pad: west, east, south, north (m).
+
+    Examples
+    --------
+    >>> pad_bounds((0.0, 0.0, 10.0, 20.0), (1.0, 2.0, 3.0, 4.0))
+    (-1.0, -3.0, 12.0, 24.0)
+    """
+    west, east, south, north = widths
+    return core[0] - west, core[1] - south, core[2] + east, core[3] + north
+
+
+def pad_grid(core: TileGrid, bounds: Bounds, *, mesh_size: float, open_size: float) -> TileGrid:
+    """Lay tiles over a region and its pad.
+
+    Parameters
+    ----------
+    core : TileGrid
+        Tiles of the region.
+    bounds : (xmin, ymin, xmax, ymax)
+        Region and pad (m).
+    mesh_size, open_size : float
+        As in `make_grid`.
+
+    Returns
+    -------
+    TileGrid
+        Tiles between multiples of the tile size, as any. One that shares area with an absent tile of the region is
+        absent too; all others are there.
+
+    Notes
+    -----
+    Every line within the region is a line of the larger grid: no tile of this has parts of two of the region's.
+    """
+    whole = make_grid(bounds, tile_size=core.tile_size, mesh_size=mesh_size, open_size=open_size)
+    column, row = (_tiles_below(outer, inner) for outer, inner in zip(whole.lines, core.lines, strict=True))
+    meets = np.logical_and.outer(column >= 0, row >= 0)
+    present = ~meets | tiles_present(core)[np.ix_(np.maximum(column, 0), np.maximum(row, 0))]
+    return replace(whole, present=None if present.all() else present)
+
+
+def _tiles_below(outer: NDArray[np.float64], inner: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Which interval of some lines each interval of finer ones meets; -1 where it meets none."""
+    low, high = np.maximum(outer[:-1], inner[0]), np.minimum(outer[1:], inner[-1])
+    at = np.searchsorted(inner, (low + high) / 2, side="right") - 1
+    found: NDArray[np.int64] = np.where(high - low > SHARED, np.clip(at, 0, len(inner) - 2), -1)
+    return found
 
 
 @dataclass(frozen=True)
@@ -75,7 +146,7 @@ def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Boun
 
 
 def describe_pad(core: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
-    """Say how many files have points beyond a region, where its pad takes no account of them."""
+    """Describe how many files have points beyond a region, where its pad takes no account of them."""
     boxes = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
     beyond = sum(
         min(box[0] - core[0], box[1] - core[1], core[2] - box[2], core[3] - box[3]) <= -PAST for box in boxes
@@ -89,7 +160,7 @@ def describe_pad(core: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
 
 
 def describe_overhang(bounds: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
-    """Say by how much the region reaches beyond the point clouds; nothing where it does not."""
+    """State by how much the region reaches beyond the point clouds; nothing where it does not."""
     extents = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
     beyond = {
         "west": min(extent[0] for extent in extents) - bounds[0],

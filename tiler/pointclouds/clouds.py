@@ -95,7 +95,7 @@ def read_header(path: str | Path) -> CloudHeader:
 
     Notes
     -----
-    A CRS that cannot be parsed counts as none: the user must then state it, and is told so. Where the box in the
+    A CRS that cannot be parsed counts as none, and a message asks the user to state it. Where the box in the
     header is void, all points are read once for their box.
     """
     path = as_place(path)

@@ -124,7 +124,7 @@ def read_cells(
 
 
 def select_usable(chunk: PointChunk, bounds: Box, counts: dict[str, int]) -> NDArray[np.bool_]:
-    """Tell the usable points of a chunk in a box (m), bool (n,), and add to the counts of a `PointBlock`."""
+    """Return the usable points of a chunk in a box (m), bool (n,), and add to the counts of a `PointBlock`."""
     verdict = judge_points(
         chunk.x, chunk.y, chunk.z, chunk.scale, chunk.offset, chunk.classification, chunk.withheld, bounds
     )

@@ -83,7 +83,7 @@ def box_of_header(header: laspy.LasHeader) -> Box3:
 
 
 def has_void_box(header: laspy.LasHeader) -> bool:
-    """Tell a box that cannot be that of the points: laspy gives what is written.
+    """Return whether the box of a header cannot be that of its points: laspy gives it as written.
 
     An end is exactly 0, as writers leave what they did not know, or the ends are no interval.
     """

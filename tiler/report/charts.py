@@ -106,7 +106,7 @@ def draw_gantt(
     busy : float64, (n, bins)
         Tasks at work in each slice of time.
     tips : sequence of str
-        What is told of each stage where a pointer rests on it.
+        The text of each stage where a pointer rests on it.
     """
     scale = (WIDTH - GANTT_LEFT - RIGHT) / duration
     foot = len(names) * GANTT_ROW + 4

@@ -19,7 +19,7 @@ NO_HISTOGRAM = np.empty(0, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """What the store tells of all tiles.
+    """Figures of all tiles, from the store.
 
     Attributes
     ----------

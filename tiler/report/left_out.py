@@ -50,7 +50,7 @@ def describe_left_out(engine: Engine, notes: Sequence[Note]) -> dict[str, Any]:
 
 
 def find_reason(building: str, notes: Sequence[Note]) -> str:
-    """Say why a footprint is not in the mesh, by the notes on it or on its parts.
+    """Explain why a footprint is not in the mesh, by the notes on it or on its parts.
 
     Examples
     --------

@@ -20,7 +20,7 @@ FOOTPRINTS = "footprints"  # id of the image that further maps show again
 
 @dataclass(frozen=True, eq=False)
 class Mapped:
-    """Tiles, or blocks of tiles, with what is told of them.
+    """Tiles, or blocks of tiles, with their texts.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ def draw_map(
     footprints : uint8, (rows, columns), or None
         To draw over the tiles, row 0 in the north; None to show those of the page's first map again.
     missing : sequence of (box, words)
-        Tiles that failed, and what is told of them. Where there is no tile the ground is hatched.
+        Tiles that failed, and their texts. Where there is no tile the ground is hatched.
     marks : sequence of (places, class)
         Places (n, 2) to mark (m).
     """

@@ -102,9 +102,9 @@ def table(
     )
 
 
-def folded(summary: str, content: str, *, opened: bool = False) -> str:
+def folded(summary: str, content: str) -> str:
     """Make a part that opens on a click."""
-    return f"<details{' open' if opened else ''}><summary>{text(summary)}</summary>\n{content}\n</details>"
+    return f"<details><summary>{text(summary)}</summary>\n{content}\n</details>"
 
 
 def figure(content: str, caption: str) -> str:

@@ -34,7 +34,7 @@ LABEL = 11
 def plan_run(
     config: Config, *, json_file: Path | None = None, picture: Path | None = None, console: Console | None = None
 ) -> dict[str, Any]:
-    """Tell what a run would do and take; the output folder is not touched.
+    """Forecast what a run would do and take; the output folder is not touched.
 
     Parameters
     ----------

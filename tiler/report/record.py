@@ -63,7 +63,7 @@ class TileTable:
 
 @dataclass(frozen=True, eq=False)
 class RunFacts:
-    """A run as its record tells it.
+    """A run as its record describes it.
 
     Attributes
     ----------

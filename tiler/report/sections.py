@@ -74,7 +74,7 @@ SURFACES = {
 
 
 def describe_summary(facts: RunFacts) -> Iterator[str]:
-    """Say how the run ended, and its key figures."""
+    """Describe how the run ended, and its key figures."""
     members = facts.members
     status, counts, bounds = members["status"], members.get("counts", {}), facts.bounds
     if status != "done":

@@ -27,7 +27,7 @@ from tiler.engine.run_context import find_owned
 from tiler.engine.stage import REGION_ITEM, Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.stages.inputs import halo_of_points
-from tiler.stages.readers import grow, read_cloud, read_outlines, read_own_outlines
+from tiler.stages.readers import extent_of, grow, read_cloud, read_outlines, read_own_outlines
 from tiler.store.out_folder import STORE
 from tiler.store.store import Store
 
@@ -52,14 +52,14 @@ def alignment_stages(config: Config) -> list[Stage]:
 def score_tile(task: Task) -> Facts:
     """Score shifts of some footprints of a tile."""
     polygons = _sample(task)
-    if len(polygons) == 0:
-        return {"houses": 0, "roof_points": 0}
     areas = shapely.buffer(shapely.envelope(polygons), REACH + 2 * STEP, cap_style="square", join_style="mitre")
-    xmin, ymin, xmax, ymax = shapely.total_bounds(areas).tolist()
+    extent = extent_of(areas)
+    if extent is None:
+        return {"houses": 0, "roof_points": 0}
     cover = cover_polygons(areas)
     cloud = read_cloud(
         task,
-        (xmin, ymin, xmax, ymax),
+        extent,
         classes=(GROUND, BUILDING),
         ground_filter=task.parameters.ground_filter,
         cover=cover,
@@ -105,7 +105,7 @@ def shift_of_run(config: Config) -> tuple[float, float]:
 
 
 def describe_alignment(records: Records, config: Config) -> tuple[Facts, list[Note], list[str]]:
-    """Tell the shift between footprints and roofs: for the record, as notes, and in words."""
+    """Return the shift between footprints and roofs: for the record, as notes, and in words."""
     if not config.footprints:
         return {}, [], []
     facts = records["shift", REGION_ITEM].facts

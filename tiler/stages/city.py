@@ -50,9 +50,9 @@ from tiler.config.step_options import CITY_PARAMETERS, city_options, layer_param
 from tiler.engine.run_context import find_owned, region_around, tile_key
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Result, Task
-from tiler.stages.house_points import add_unmarked, extent_of, find_surfaces, points_near
+from tiler.stages.house_points import add_unmarked, find_surfaces, points_near
 from tiler.stages.inputs import halo_of_points
-from tiler.stages.readers import grow, read_known_terrain, read_own_outlines
+from tiler.stages.readers import extent_of, grow, hull, read_known_terrain, read_own_outlines
 from tiler.store.run_folder import PARTS
 
 TERRAIN = ("dtm_spacing", "ground_filter")
@@ -152,8 +152,8 @@ def make_houses(task: Task) -> Facts:
     grid, bounds = task.context.grid, task.context.bounds
     with task.step("1.4 clean footprints"):
         read = read_own_outlines(task)
-        around = tuple(shapely.total_bounds(read.polygons).tolist()) if len(read.polygons) else task.box
-        inner, notes = prepare_footprints(read, region_around(grid, _hull(task.box, around)), options)
+        around = hull(task.box, extent_of(read.polygons))
+        inner, notes = prepare_footprints(read, region_around(grid, around), options)
         own = _owned(task, inner)
     places = np.array([(note.x, note.y) for note in notes]).reshape(-1, 2)
     task.notes(note for note, mine in zip(notes, find_owned(task.box, bounds, places), strict=True) if mine)
@@ -177,7 +177,8 @@ def make_houses(task: Task) -> Facts:
         full = make_buildings(city, fidelity, np.zeros(len(city.model), np.int32))
     task.notes(houses.notes)
     task.put(**pack_houses(houses), **pack_buildings(full, "full_"), unmarked=others)
-    counts = {"buildings before merging": len(houses), **_count_parts(houses), **_count_forms(houses)}
+    parts = {"house parts": len(houses.parts.polygons)}
+    counts = {"buildings before merging": len(houses), **parts, **_count_forms(houses)}
     counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
     return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts}
 
@@ -405,7 +406,7 @@ def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
 class _Gathered:
     """Houses of a tile's clusters, and whether roofs are of other classes than that of buildings.
 
-    ``place`` (p, 4) tells of each part its house's tile, row there, and number.
+    ``place`` (p, 4) holds of each part its house's tile, row there, and number.
     """
 
     houses: Houses
@@ -446,10 +447,6 @@ def _find_rows(among: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.
     return found
 
 
-def _hull(one: Box, other: Box) -> Box:
-    return min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
-
-
 def _count_forms(houses: Houses) -> dict[str, int]:
     """Houses with the roof of a given form, and those whose points tell it instead; nothing without any."""
     counts = {
@@ -457,7 +454,3 @@ def _count_forms(houses: Houses) -> dict[str, int]:
         "given forms of roofs with points": int((houses.form == POINTS_TELL).sum()),
     }
     return {name: n for name, n in counts.items() if n}
-
-
-def _count_parts(houses: Houses) -> dict[str, int]:
-    return {"house parts": len(houses.parts.polygons)}

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.city import find_places
@@ -24,7 +23,7 @@ from pipeline.points_terrain.raster import Dtm
 from pipeline.roofs.roof_points import RoofPoints, add_roof_points, keep_roof_points
 from tiler.engine.stage import Box
 from tiler.engine.task import Task
-from tiler.stages.readers import grow, read_cloud
+from tiler.stages.readers import extent_of, grow, read_cloud
 
 Rows = NDArray[np.int64]
 
@@ -43,14 +42,6 @@ def points_near(
             ground_filter=task.parameters.ground_filter,
             cover=cover_polygons(areas),
         )
-
-
-def extent_of(polygons: NDArray[np.object_]) -> Box | None:
-    """Box of polygons (m); None without any."""
-    if len(polygons) == 0:
-        return None
-    xmin, ymin, xmax, ymax = shapely.total_bounds(polygons).tolist()
-    return xmin, ymin, xmax, ymax
 
 
 def add_unmarked(
@@ -121,7 +112,7 @@ def _find_roofs(
 
 
 def _note_each(kind: str, footprints: Footprints, rows: Rows, details: Sequence[str]) -> list[Note]:
-    """Tell of some houses, ascending."""
+    """Make a note on each of some houses, ascending."""
     chosen = np.zeros(len(footprints.ids), np.bool_)
     chosen[rows] = True
     places = (place for _, place in find_places(footprints, chosen))

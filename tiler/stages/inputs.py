@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pyproj
-import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.classes import GROUND, KEY_POINT, WATER
@@ -32,13 +31,13 @@ from stitch.tiling.grid import Key, has_tile
 from tiler.citymodels.tables import pack_polygons
 from tiler.config.config import Config
 from tiler.engine.run_context import tile_key
-from tiler.engine.stage import Box, Facts, Read, Scope, Stage
+from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.footprints.footprint_index import scan_footprints
 from tiler.georeference.frame import Frame
 from tiler.objects.places import place
 from tiler.pointclouds.ingest import CELL, KEY_POINTS, read_cells
-from tiler.stages.readers import clip, grow, join_rasters, read_bands, read_outlines, read_units
+from tiler.stages.readers import clip, extent_of, grow, join_rasters, read_bands, read_outlines, read_units
 
 
 def input_stages(config: Config) -> list[Stage]:
@@ -218,12 +217,10 @@ def take_outlines(task: Task) -> Facts:
         given_height=footprints.given_height,
         forms=footprints.forms,
     )
-    extent: Box | None = None
-    if len(footprints.ids):
-        # A house keeps within its footprint, and within the region.
-        xmin, ymin, xmax, ymax = shapely.total_bounds(footprints.polygons).tolist()
-        extent = clip((xmin, ymin, xmax, ymax), task.context.bounds)
-    return {"n": len(footprints.ids), "extent": extent}
+    extent = extent_of(footprints.polygons)
+    # A house keeps within its footprint, and within the region.
+    inside = None if extent is None else clip(extent, task.context.bounds)
+    return {"n": len(footprints.ids), "extent": inside}
 
 
 def list_reserved(task: Task) -> Facts:

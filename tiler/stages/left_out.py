@@ -20,10 +20,10 @@ from tiler.citymodels.tables import pack_polygons, unpack_polygons
 from tiler.config.config import Config
 from tiler.config.step_options import CITY_PARAMETERS, city_options
 from tiler.engine.run_context import find_owned, region_around
-from tiler.engine.stage import Box, Facts, Read, Scope, Stage
+from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.stages.inputs import halo_of_points
-from tiler.stages.readers import grow, read_cloud, read_known_terrain
+from tiler.stages.readers import extent_of, grow, hull, read_cloud, read_known_terrain
 
 LEFT_OUT = "left-out"
 COVERED = 0.5  # share of a footprint's area from which on the mesh has a building for it
@@ -44,7 +44,7 @@ def left_out_stage(config: Config) -> Stage:
 def find_left_out(task: Task) -> Facts:
     """Find the footprints of a tile of which less than half is under a building, whatever the reason.
 
-    Of each part of a footprint within the region it tells area and place, how many building points lie in it, and
+    Of each part of a footprint within the region it gives area and place, how many building points lie in it, and
     the height of its highest part above the ground, measured as that of every other building; NaN for those that
     are smaller than buildings are.
     """
@@ -60,12 +60,8 @@ def find_left_out(task: Task) -> Facts:
     ids, given = found["ids"][row], found["given_height"][row]
     n_points, height = _measure(task, polygons, given)
     task.put(**pack_polygons(polygons, "polygon"), id=ids, area=bare, points=n_points, height=height, place=place)
-    extent: Box | None = None
-    if len(polygons):
-        xmin, ymin, xmax, ymax = shapely.total_bounds(polygons).tolist()
-        extent = xmin, ymin, xmax, ymax
     sums = {"footprints": len(np.unique(row)), "area": float(bare.sum()), "points": int(n_points.sum())}
-    return {"extent": extent, "left_out": sums}
+    return {"extent": extent_of(polygons), "left_out": sums}
 
 
 def _parts_in_region(
@@ -83,7 +79,7 @@ def _parts_in_region(
     polygons, row = read_polygons(outlines, row)
     if not len(row):
         return polygons, row
-    region = region_around(task.context.grid, _hull_of(task.box, polygons))
+    region = region_around(task.context.grid, hull(task.box, extent_of(polygons)))
     return take_polygons(shapely.intersection(polygons, region), row)
 
 
@@ -134,10 +130,10 @@ def _measure(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Building points in each polygon, and the height of its highest part (m)."""
     n_points, height = np.zeros(len(polygons), np.int64), np.full(len(polygons), np.nan)
-    if not len(polygons):
+    box = extent_of(polygons)
+    if box is None:
         return n_points, height
     options, spacing = city_options(task.parameters), task.parameters.dtm_spacing
-    box = _hull_of(None, polygons)
     cloud = read_cloud(
         task,
         grow(box, options.ground_margin),
@@ -167,12 +163,3 @@ def _highest_parts(city: City, cloud: PointCloud, terrain: Dtm, options: CityOpt
     highest = city.model.roof - city.model.ground
     np.fmax.at(highest, part, heights.roof - city.model.ground[part])
     return highest
-
-
-def _hull_of(box: Box | None, polygons: NDArray[np.object_]) -> Box:
-    """Box around polygons, at least one, and another box."""
-    bounds = shapely.total_bounds(polygons)
-    if box is not None:
-        bounds = np.concatenate((np.fmin(bounds[:2], box[:2]), np.fmax(bounds[2:], box[2:])))
-    xmin, ymin, xmax, ymax = bounds.tolist()
-    return xmin, ymin, xmax, ymax

@@ -1,7 +1,7 @@
 """Stages 3.1 to 3.5: the seams between tiles, and the columns of each tile between its seams."""
 
-import dataclasses
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
 from pipeline.columns.columns import count_cells, lowest_gap
 from pipeline.columns.layered import mesh_layers
-from pipeline.columns.nodes import Levels
-from pipeline.columns.underground import SoilOptions
+from pipeline.columns.nodes import Levels, SeamColumns, join_levels, take_columns
+from pipeline.columns.underground import SoilMesh, SoilOptions, add_soil, count_soil_cells
 from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.data.notes import Note
@@ -54,9 +54,10 @@ from tiler.stages.seam_tables import (
     pack_seam,
     unpack_levels,
     unpack_pinched,
+    unpack_pinched_soil,
     unpack_seam,
+    unpack_soil,
 )
-from tiler.stages.soil import lay_soil, unpack_pinched_soil, unpack_soil
 from tiler.stages.surroundings import find_sizes, halos, read_surroundings, terrain_around, terrain_halo
 
 
@@ -73,38 +74,18 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     parameters += SIZE_PARAMETERS if config.graded_size else ()
     parameters += PAD_PARAMETERS if config.padded else ()
     parameters += SOIL_PARAMETERS if config.underground else ()
-    seams, columns = (
-        (make_seam_with_soil, make_columns_with_soil) if config.underground else (make_seam, make_columns)
-    )
     version = 7 if config.mesher == "layered" else 5
     return [
-        Stage("seams", Scope.SEAM, seams, tuple(reads), parameters, version=version),
-        Stage("columns", Scope.TILE, columns, (*reads, Read("seams", beside=True)), parameters, version=version),
+        Stage("seams", Scope.SEAM, make_seam, tuple(reads), parameters, version=version),
+        Stage(
+            "columns", Scope.TILE, make_columns, (*reads, Read("seams", beside=True)), parameters, version=version
+        ),
     ]
 
 
 def make_seam(task: Task) -> Facts:
-    """Find a seam and fill its columns."""
-    return _make_seam(task, None)
-
-
-def make_seam_with_soil(task: Task) -> Facts:
-    """Find a seam and fill its columns, with soil below them."""
-    return _make_seam(task, soil_options(task.parameters))
-
-
-def make_columns(task: Task) -> Facts:
-    """Mesh a tile between its seams, and fill its columns (steps 3.1 to 3.5)."""
-    return _make_columns(task, None)
-
-
-def make_columns_with_soil(task: Task) -> Facts:
-    """Mesh a tile as `make_columns` does, with soil below it."""
-    return _make_columns(task, soil_options(task.parameters))
-
-
-def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
-    given, grid = task.parameters, task.context.grid
+    """Find a seam, and fill its columns; with soil below them where that is asked for."""
+    given, grid, soil = task.parameters, task.context.grid, soil_options(task.parameters)
     key = seam_key(task.name)
     buildings, dtm = read_surroundings(task)
     polygons = buildings.model.polygons
@@ -152,8 +133,9 @@ def _make_seam(task: Task, soil: SoilOptions | None) -> Facts:
     return facts
 
 
-def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
-    given = task.parameters
+def make_columns(task: Task) -> Facts:
+    """Mesh a tile between its seams, and fill its columns (steps 3.1 to 3.5), and its soil if any."""
+    given, soil = task.parameters, soil_options(task.parameters)
     options = mesh_options(given)
     buildings, dtm = read_surroundings(task)
     model = buildings.model
@@ -191,9 +173,12 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
         below += [part for name in names for part in unpack_pinched_soil(found[name])]
         with task.step("soil"):
             ground = sample_dtm(terrain, plane.xy)
-            columns, edges, n_cells = lay_soil(
-                columns, ground, edges, shared, seam_columns, below, soil, sizes, task
-            )
+            mesh, edges, lowered = _lay_soil(columns, ground, edges, shared, seam_columns, below, soil, sizes)
+        for x, y in plane.xy[lowered].tolist():
+            detail = "the terrain inside the house reaches its roof"
+            task.note(Note("soil-lowered-under-roof", task.name, x, y, detail))
+        task.put(soil=mesh.top)
+        columns, n_cells = mesh.columns, count_soil_cells(mesh)
         given_columns = [
             (seam, join_seam(part, levels))
             for (seam, levels), part in zip(given_columns, below[: len(inner)], strict=True)
@@ -223,7 +208,7 @@ def _make_columns(task: Task, soil: SoilOptions | None) -> Facts:
     underground = {} if soil is None else {"soil": {"depth (m)": soil.depth, "cells": n_cells}}
     return underground | {
         "order": columns.order,
-        "facts": {"smallest gap (m)": round(gap, 4)} | dataclasses.asdict(report),
+        "facts": {"smallest gap (m)": round(gap, 4)} | asdict(report),
         "counts": {
             "cells": cells + n_cells,
             "triangles": len(plane.triangles),
@@ -319,6 +304,52 @@ def _mesh(
     )
 
 
+def _lay_soil(
+    columns: ColumnMesh,
+    terrain: NDArray[np.float64],
+    edges: SeamEdges,
+    shared: Sequence[NDArray[np.int32]],
+    air: SeamColumns,
+    soil: Sequence[Levels],
+    options: SoilOptions,
+    sizes: SizeField | None,
+) -> tuple[SoilMesh, SeamEdges, NDArray[np.int64]]:
+    """Put a tile's columns of air on columns of soil.
+
+    Parameters
+    ----------
+    columns : ColumnMesh
+        The air.
+    terrain : float64, (n,)
+        Terrain at its vertices (m).
+    edges : SeamEdges
+        Its seams, with levels of the air.
+    shared : sequence of int32, (k,)
+        Vertices of each seam, and of each end of one that is given alone.
+    air : SeamColumns
+        Their columns of air, each once.
+    soil : sequence of Levels
+        Their columns of soil, in the order of `shared`.
+    options : SoilOptions
+        Parameters.
+    sizes : SizeField, optional
+        Sizes in the plane, where they are graded.
+
+    Returns
+    -------
+    SoilMesh
+        Columns of both.
+    SeamEdges
+        The seams, with levels of these.
+    int64, (k,)
+        Vertices at which terrain inside a house was lowered.
+    """
+    vertex, first = np.unique(np.concatenate([np.empty(0, np.int32), *shared]), return_index=True)
+    below = SeamColumns(vertex, take_columns(join_levels(soil), first.astype(np.int32)))
+    mesh, raised, lowered = add_soil(columns, terrain, air, below, options, sizes=sizes)
+    return mesh, replace(edges, bottom=edges.bottom + raised[edges.vertices]), lowered
+
+
 def _add_straight_borders(
     plane: PlaneMesh, edges: SeamEdges, sides: Sequence[Seam], inner: Sequence[int], task: Task
 ) -> tuple[SeamEdges, NDArray[np.int32]]:
@@ -343,7 +374,7 @@ def _add_straight_borders(
 
 
 def _on_sides(xy: NDArray[np.float64], bounds: Bounds) -> bool:
-    """Tell whether all places are on one side of the region's box."""
+    """Return whether all places are on one side of the region's box."""
     return any(bool((xy[:, k % 2] == bounds[k]).all()) for k in range(4))
 
 

@@ -267,7 +267,7 @@ def _residuals(result: Result, kind: str) -> ResidualSums:
 
 
 def _there(task: Task, key: Key) -> NDArray[np.bool_]:
-    """Tell beyond which sides of a tile there is another one: south, east, north, west."""
+    """Return beyond which sides of a tile there is another one: south, east, north, west."""
     around = set(task.refs["columns"])
     i, j = key
     return np.array(

@@ -49,6 +49,21 @@ def clip(box: Box, bounds: Box) -> Box:
     return max(box[0], bounds[0]), max(box[1], bounds[1]), min(box[2], bounds[2]), min(box[3], bounds[3])
 
 
+def extent_of(polygons: NDArray[np.object_]) -> Box | None:
+    """Box of polygons (m); None without any."""
+    if len(polygons) == 0:
+        return None
+    xmin, ymin, xmax, ymax = shapely.total_bounds(polygons).tolist()
+    return xmin, ymin, xmax, ymax
+
+
+def hull(one: Box, other: Box | None) -> Box:
+    """Box around two boxes; the first where there is no other one."""
+    if other is None:
+        return one
+    return min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
+
+
 def read_cloud(
     task: Task,
     box: Box,

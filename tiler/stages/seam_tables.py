@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns.nodes import Levels, Surfaces
+from pipeline.columns.nodes import Levels, Surfaces, bare_levels
 from pipeline.data.mesh import ColumnMesh, PlaneMesh
 from stitch.seams.seams import Seam
 from tiler.engine.task import Result
@@ -92,3 +92,17 @@ def pack_columns(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> dict[str, NDAr
         "z": mesh.z,
         "bottom": mesh.bottom,
     }
+
+
+def unpack_soil(arrays: dict[str, NDArray[Any]]) -> Levels:
+    """Read the columns of soil of a seam within the region."""
+    return bare_levels(arrays["soil_start"], arrays["soil_z"])
+
+
+def unpack_pinched_soil(result: Result) -> list[Levels]:
+    """Read the columns of soil of the ends of a border in which two tiles meet alone, as `unpack_pinched` does."""
+    arrays = result.arrays
+    return [
+        bare_levels(arrays[f"end{k}_soil_start"], arrays[f"end{k}_soil_z"])
+        for k in result.facts.get("pinched", [])
+    ]

@@ -14,6 +14,16 @@ from tiler.objects.places import in_bucket
 
 
 @contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Make an OutputError of what the system says against writing."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or " ".join(str(error).split())  # HDF5 often gives no reason of the system
+        raise OutputError(f"{path}: cannot be written ({reason}); free space or choose another folder") from error
+
+
+@contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Give a path beside `path` to write to; the file takes its place when all went well.
 
@@ -25,7 +35,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
         part = Path(tempfile.gettempdir()) / f"citystitch-{uuid.uuid4().hex}.part{path.suffix}"
     else:
         part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part{path.suffix}")
-    try:
+    with disk_errors(path):
         try:
             yield part
             if in_bucket(path):
@@ -38,16 +48,12 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
                 _sync(path.parent)
         finally:
             part.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
-        ) from error
 
 
 def sync_meanwhile(path: Path) -> None:
     """Let the disk take a file and its name, and go on: it may take a second where much else was written.
 
-    Nobody is told if it cannot: for a file that is written again, and waited for, in the end.
+    A failure is ignored: for a file that is written again, and waited for, in the end.
     """
 
     def sync() -> None:
@@ -75,7 +81,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     """
     stem = f".{path.name}.{uuid.uuid4().hex}"
     part, old = path.with_name(f"{stem}.part"), path.with_name(f"{stem}.old")
-    try:
+    with disk_errors(path):
         try:
             part.mkdir()
             yield part
@@ -90,7 +96,3 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         finally:
             shutil.rmtree(part, ignore_errors=True)
             shutil.rmtree(old, ignore_errors=True)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
-        ) from error

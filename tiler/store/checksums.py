@@ -49,7 +49,7 @@ def seal(text: bytes) -> bytes:
 
 
 def is_sealed(text: bytes) -> bool:
-    """Tell whether a text is as `seal` has left it; one without a checksum is not.
+    """Return whether a text is as `seal` has left it; one without a checksum is not.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def seal_file(path: Path) -> None:
 
 
 def find_file_damage(path: Path) -> str:
-    """Say what is wrong with a file that `seal_file` has left; nothing if every byte is as it was."""
+    """Describe what is wrong with a file that `seal_file` has left; nothing if every byte is as it was."""
     try:
         with open_binary(path) as file:
             size = file.seek(0, 2) - TAIL
@@ -99,7 +99,7 @@ def check_files(stage: str, facts: Mapping[str, Any]) -> None:
 
 
 def find_changed_files(folder: Path, files: Mapping[str, Any]) -> dict[str, str]:
-    """Say what is wrong with stated files, by their path below a folder; every byte is read.
+    """Describe what is wrong with stated files, by their path below a folder; every byte is read.
 
     Examples
     --------
@@ -111,7 +111,7 @@ def find_changed_files(folder: Path, files: Mapping[str, Any]) -> dict[str, str]
 
 
 def find_change(path: Path, stated: Any) -> str:
-    """Say how a file differs from its stated size and CRC-32, nothing if it does not."""
+    """Describe how a file differs from its stated size and CRC-32, nothing if it does not."""
     if not _is_statement(stated):
         return "no size and checksum of it are stated"
     try:

@@ -96,7 +96,7 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
 
 
 def is_held(folder: Path) -> bool:
-    """Tell whether a run is at work in a folder; InputError if its lock file cannot be read."""
+    """Return whether a run is at work in a folder; InputError if its lock file cannot be read."""
     if in_bucket(folder):
         from tiler.store.lease import is_held_in_bucket
 
@@ -232,15 +232,23 @@ def _is_at(path: Path, file: int) -> bool:
 def _read_owner(path: Path) -> Owner | None:
     """Read who holds a folder; None where the file says nothing, as one does that is just being written."""
     try:
-        found = json.loads(path.read_bytes())
+        return parse_owner(path.read_bytes())
+    except OSError:
+        return None
+
+
+def parse_owner(text: bytes) -> Owner | None:
+    """Parse who holds a folder; None where the text does not say so."""
+    try:
+        found = json.loads(text)
         words = {name: str(found[name]) for name in ("host", "place", "began", "token")}
         return Owner(pid=int(found["pid"]), **words)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         return None
 
 
 def describe_owner(owner: Owner) -> str:
-    """Say who has a folder."""
+    """Name who has a folder."""
     return f"process {owner.pid} on {owner.host}"
 
 
@@ -260,7 +268,7 @@ def _place() -> str:
 
 
 def _began(pid: int) -> str:
-    """Tell when a process began, in ticks after the boot (field 22 of its ``stat``)."""
+    """Return when a process began, in ticks after the boot (field 22 of its ``stat``)."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
     except (OSError, IndexError):
@@ -272,7 +280,7 @@ def _is_elsewhere(owner: Owner) -> bool:
 
 
 def is_alive(owner: Owner) -> bool | None:
-    """Tell whether an owner lives; None if it is elsewhere and cannot be asked for."""
+    """Return whether an owner lives; None if it is elsewhere and cannot be asked for."""
     if _is_elsewhere(owner):
         return None
     try:

@@ -88,7 +88,7 @@ def only_run_in_bucket(folder: ObjectPath, say: Callable[[str], None]) -> Iterat
 
 
 def is_held_in_bucket(folder: ObjectPath) -> bool:
-    """Tell whether a run is at work there; one elsewhere is listened for."""
+    """Return whether a run is at work there; one elsewhere is listened for."""
     path = folder / LOCK
     found = _read(path)
     return found is not None and _lives(path, *found)
@@ -120,14 +120,10 @@ def _find_tag(path: ObjectPath, owner: Owner) -> str:
 def _read(path: ObjectPath) -> tuple[Owner | None, str] | None:
     """Read owner and tag of a lease; None where there is none."""
     try:
-        state = path.stat()
-        found = json.loads(path.read_bytes())
-        words = {name: str(found[name]) for name in ("host", "place", "began", "token")}
-        return Owner(pid=int(found["pid"]), **words), state.e_tag
+        tag = path.stat().e_tag
+        return folder_lock.parse_owner(path.read_bytes()), tag
     except FileNotFoundError:
         return None
-    except (ValueError, KeyError, TypeError):
-        return None, state.e_tag
 
 
 def _lives(path: ObjectPath, owner: Owner | None, e_tag: str, say: Callable[[str], None] = say_nothing) -> bool:

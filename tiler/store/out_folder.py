@@ -10,6 +10,7 @@ from typing import Any
 
 from pipeline.data.errors import ConfigError, OutputError
 from tiler.objects.places import Place, find_within, in_bucket, remove
+from tiler.store.atomic import replacing
 from tiler.store.store import MANIFEST
 
 # What a run writes, and all that --overwrite removes; the record is replaced.
@@ -22,7 +23,7 @@ PROBE = ".cluster.json"  # as long as the tasks of a run are on a cluster
 RUN_RECORD, PROGRESS, EVENTS, STORE = "run.json", "progress.json", "events.jsonl", "store.zarr"
 MANIFEST_PATH = f"{STORE}/{MANIFEST}"
 REPORT = "report.html"
-EARLIER_REPORT = ".report.earlier.html"  # set aside while a run is at work: see `tiler.report.kept_report`
+EARLIER_REPORT = ".report.earlier.html"  # set aside while a run is at work: see `tiler.store.out_folder`
 STALE = (*INDEXES, REPORT)  # what an earlier run said of all of its mesh
 RESULTS = (
     *(RUN_RECORD, PROGRESS, EVENTS, REPORT, EARLIER_REPORT, CONFIG, CITY_MODEL, FULL_CITY_MODEL),
@@ -30,6 +31,11 @@ RESULTS = (
 )
 # A file on its way to its place, of a writer that was killed: see `tiler.store.atomic`.
 PART = ".{stem}.*.part{suffix}"
+OLD = (
+    '<p class="bad" role="note">This report is old: it tells of an earlier run in this folder, and the mesh was '
+    "changed since. citystitch report writes a new one.</p>\n"
+)
+PLACE = "</header>"  # where the page says so
 
 
 def check_folder(out: Path, *, overwrite: bool) -> list[str]:
@@ -190,12 +196,12 @@ def _list_results(out: Path) -> list[Path]:
 
 
 def _is_ours(out: Place) -> bool:
-    """Tell whether a run has been in a folder: a lost record is mended."""
+    """Return whether a run has been in a folder: a lost record is mended."""
     return any((out / name).is_file() for name in (RUN_RECORD, PROGRESS, MANIFEST_PATH))
 
 
 def _has_record(out: Place) -> bool:
-    """Tell whether some file says what run it was; a damaged one is mended."""
+    """Return whether some file says what run it was; a damaged one is mended."""
     if (out / MANIFEST_PATH).is_file():
         return True
     return any(
@@ -216,3 +222,32 @@ def _read_object(path: Place) -> dict[str, Any]:
 def command_alone(out: Path, tile: str) -> str:
     """The command that runs one tile alone."""
     return shlex.join(["citystitch", "run", str(out / CONFIG), "--only", tile, "--traceback"])
+
+
+def give_back_report(out: Path, *, changed: bool) -> None:
+    """Put the report of an earlier run back, which `out_folder.clear_folder` has set aside.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of a run that is done.
+    changed : bool
+        Whether the run has changed anything: the report then says that it is old, once.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    earlier, report = out / EARLIER_REPORT, out / REPORT
+    try:
+        if not earlier.is_file():
+            return
+        if changed:
+            page = earlier.read_text(encoding="utf-8", errors="replace")
+            if OLD not in page:
+                with replacing(earlier) as part:
+                    part.write_text(page.replace(PLACE, OLD + PLACE, 1), encoding="utf-8")
+        earlier.replace(report)
+    except OSError as error:
+        raise OutputError(f"{report}: cannot be written ({error.strerror}); check its permissions") from error

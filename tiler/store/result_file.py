@@ -158,7 +158,7 @@ class ResultFile:
             yield self.read(name, [(start, min(start + array.chunks[0], array.shape[0]))])
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Tell the shape of an array."""
+        """Return the shape of an array."""
         return tuple(self._open(name).shape)
 
     def _open(self, name: str) -> "NDArray[Any] | zarr.Array[Any]":

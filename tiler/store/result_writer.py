@@ -4,8 +4,7 @@ import json
 import shutil
 import tempfile
 import uuid
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -15,9 +14,8 @@ import numpy as np
 from blake3 import blake3
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.data.errors import OutputError
 from tiler.objects.places import in_bucket
-from tiler.store.atomic import replacing
+from tiler.store.atomic import disk_errors, replacing
 from tiler.store.checksums import TAIL, seal_file
 from tiler.store.result_file import GROUP, KINDS, MANY_CHUNKS, NPY, rows_per_chunk
 
@@ -54,7 +52,7 @@ class Writer:
         self._hashes: dict[str, blake3] = {}
 
     def __enter__(self) -> Self:
-        with self._disk():
+        with disk_errors(self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
         return self
 
@@ -150,7 +148,7 @@ class Writer:
         digest = hash_content(arrays, {name: value for name, value in kept.items() if name not in apart})
         group = {"attributes": dict(sorted((kept | {DIGEST: digest}).items()))}
         text = json.dumps(group | {"zarr_format": 3, "node_type": "group"}).encode()
-        with self._disk(), replacing(self._path) as part:
+        with disk_errors(self._path), replacing(self._path) as part:
             self._write_zip(part, text)
         return digest
 
@@ -196,7 +194,7 @@ class Writer:
             self._create(name, rows, (rows_per_chunk(rows), *rows.shape[1:]))
         else:
             self._large[name].append(rows)
-        with self._disk():
+        with disk_errors(self._path):
             for key in [key for key in self._parts if key.startswith(f"{name}/c/")]:
                 (self._chunks / key).parent.mkdir(parents=True, exist_ok=True)
                 (self._chunks / key).write_bytes(self._parts.pop(key).to_bytes())
@@ -217,15 +215,6 @@ class Writer:
                 zarr_format=3,
                 config={"write_empty_chunks": True},
             )
-
-    @contextmanager
-    def _disk(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise OutputError(
-                f"{self._path}: cannot be written ({error}); free space there or choose another folder"
-            ) from error
 
 
 def plain_array(name: str, values: ArrayLike) -> NDArray[Any]:

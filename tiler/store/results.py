@@ -18,8 +18,8 @@ APPROACH = "approach"
 KEPT_CHUNKS = 9  # tiles of terrain that stay in memory
 
 
-def read_columns(store: Store, tile: str) -> tuple[ColumnMesh, NDArray[np.int64]]:
-    """Read the columns of a tile.
+def unpack_columns(arrays: Mapping[str, NDArray[Any]], order: Any) -> tuple[ColumnMesh, NDArray[np.int64]]:
+    """Make columns of the arrays of the stage ``columns``.
 
     Returns
     -------
@@ -28,12 +28,6 @@ def read_columns(store: Store, tile: str) -> tuple[ColumnMesh, NDArray[np.int64]
     int64, (b,)
         Numbers of the buildings that the tile meets, ascending.
     """
-    arrays, attributes = store.read("columns", tile, names=COLUMN_ARRAYS)
-    return unpack_columns(arrays, attributes["facts"]["order"])
-
-
-def unpack_columns(arrays: Mapping[str, NDArray[Any]], order: Any) -> tuple[ColumnMesh, NDArray[np.int64]]:
-    """Make columns of the arrays of the stage ``columns``, as `read_columns` does."""
     numbers, row = np.unique(arrays["building"], return_inverse=True)
     outside = int(len(numbers) > 0 and numbers[0] < 0)
     rows: NDArray[np.int32] = (row.reshape(-1) - outside).astype(np.int32)

@@ -33,7 +33,7 @@ class Store:
         self.path = path
 
     def file(self, stage: str, name: str) -> Path:
-        """Say where a result lies; ValueError for a name that is no plain file name."""
+        """Describe where a result lies; ValueError for a name that is no plain file name."""
         for part in (stage, name):
             if not part or part[0] == "." or any(sign in part for sign in "/\\\0"):
                 raise ValueError(f"{part!r} cannot name a result of the store")
@@ -111,7 +111,7 @@ class Store:
             return result.attributes, result.digest
 
     def shapes(self, stage: str, name: str) -> dict[str, tuple[int, ...]]:
-        """Tell the shape of every array of a result; InputError as for `read`."""
+        """Return the shape of every array of a result; InputError as for `read`."""
         with self.open(stage, name) as result:
             return {array: result.shape(array) for array in result.names}
 
@@ -159,7 +159,7 @@ class Store:
                 _delete(path)
 
     def find_damage(self, stage: str, name: str) -> str:
-        """Say what is wrong with the file of a result; nothing if every byte is as it was written."""
+        """Describe what is wrong with the file of a result; nothing if every byte is as it was written."""
         return find_file_damage(self.file(stage, name))
 
     def compute_digest(self, stage: str, name: str, *, apart: Collection[str] = ()) -> str:

@@ -10,7 +10,7 @@ CHOICE = re.compile(r"\[([^]|]*)(?:\|([^]]*))?\]")
 
 @dataclass(frozen=True)
 class Words:
-    """How a kind of note is told.
+    """The words for a kind of note.
 
     Attributes
     ----------
@@ -218,9 +218,9 @@ WORDS: dict[str, Words] = {
 
 
 def say_notes(kind: str, n: int) -> str:
-    """Tell how many notes of a kind there are, in a sentence without a full stop.
+    """Return how many notes of a kind there are, in a sentence without a full stop.
 
-    A kind that is not known, as of stages of the user's own, is told by its name.
+    A kind that is not known, as of stages of the user's own, is named as it is.
 
     Examples
     --------
@@ -256,7 +256,7 @@ def group_of(kind: str) -> str:
 
 
 def is_drop(kind: str) -> bool:
-    """Tell whether a kind of note says that something of the input was dropped.
+    """Return whether a kind of note says that something of the input was dropped.
 
     Examples
     --------

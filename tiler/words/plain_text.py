@@ -2,13 +2,15 @@
 
 import hashlib
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 # Unicode categories that move a cursor, hide or reorder text, or cannot be written as UTF-8: control, format,
 # surrogate, line and paragraph separators. A terminal obeys the first, a reader is misled by the second.
 _UNSAFE = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
+CLOSE = 0.6  # likeness from which on a name is suggested
 ID_LENGTH = 200  # characters of a building's id; registers have some 20, a URI some 100
 
 
@@ -89,3 +91,15 @@ def replace_surrogates(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {name: replace_surrogates(one) for name, one in value.items()}
     return [replace_surrogates(one) for one in value] if isinstance(value, (list, tuple)) else value
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Offer the known name that is most like one that is not; an empty text where none is.
+
+    Examples
+    --------
+    >>> suggest("--meshsize", ["--mesh-size", "--mesher"]), suggest("--colour", ["--mesh-size"])
+    ('; did you mean --mesh-size?', '')
+    """
+    found = get_close_matches(name, list(known), n=1, cutoff=CLOSE)
+    return f"; did you mean {found[0]}?" if found else ""

@@ -55,7 +55,7 @@ def group_of_stage(stage: str) -> str:
 
 
 def title_of_stage(stage: str) -> str:
-    """Tell what a stage does, in the words of its group; one of the user's own by its name.
+    """Describe what a stage does, in the words of its group; one of the user's own by its name.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def title_of_stage(stage: str) -> str:
 
 
 def place_of_item(stage: str, scope: str, name: str) -> str:
-    """Say in an error where it arose: what the stage does, or the name of one of the user's own, and the item.
+    """Name in an error where it arose: what the stage does, or the name of one of the user's own, and the item.
 
     Examples
     --------

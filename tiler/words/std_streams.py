@@ -29,7 +29,7 @@ class _PatientWriter(io.RawIOBase):
         return self._file
 
     def isatty(self) -> bool:
-        """Tell whether it is a terminal."""
+        """Return whether it is a terminal."""
         return os.isatty(self._file)
 
     def write(self, data: "bytes | bytearray | memoryview", /) -> int:  # type: ignore[override]

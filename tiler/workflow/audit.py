@@ -274,6 +274,6 @@ def audit_run(directory: Path, tell: Callable[[str], None]) -> bool:
 
 
 def _reason(error: InputError, path: Path) -> str:
-    """Take place and next move out of the message of a reader: both are told otherwise."""
+    """Take place and next move out of the message of a reader: the audit prints both itself."""
     text = str(error).removeprefix(f"{path}: ")
     return text.rsplit("; ", 1)[0]

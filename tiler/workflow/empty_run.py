@@ -8,13 +8,13 @@ import pyproj
 from pipeline.data.errors import CityError, InputError
 from pipeline.data.notes import Note, count_notes
 from tiler.config.config import Config
-from tiler.georeference.crs import is_on_its_place
+from tiler.georeference.crs import boxes_meet, is_on_its_place, short_crs
 from tiler.objects.places import place
 from tiler.planning.region import Region
 from tiler.vectors.features import Box
 from tiler.vectors.layers import Layer, describe_layer
 from tiler.words.note_words import is_drop, say_notes
-from tiler.words.plain_text import format_box, printable
+from tiler.words.plain_text import format_box
 
 DEGREES = "EPSG:4326"
 # What was assumed of the coordinates, and may be wrong.
@@ -32,7 +32,7 @@ def is_empty(config: Config, counts: dict[str, int]) -> bool:
 
 
 def explain_empty(config: Config, region: Region, counts: dict[str, int], notes: Sequence[Note]) -> str:
-    """Say why there is no building, and the next move.
+    """Explain why there is no building, and the next move.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def explain_empty(config: Config, region: Region, counts: dict[str, int], notes:
         layer = describe_layer(place(config.footprints), config.layer)
     except CityError:  # it was read before; what it says now does not matter
         layer = None
-    seen = _format_number(layer, within, format_box(region.bounds), _short(region.crs))
+    seen = _format_number(layer, within, format_box(region.bounds), short_crs(region.crs))
     dropped = "; ".join(say_notes(kind, n) for kind, n in count_notes(notes).items() if is_drop(kind))
     told = [seen, dropped]
     if within:
@@ -71,7 +71,7 @@ def _format_number(layer: Layer | None, within: int, box: str, crs: str) -> str:
 
 
 def find_place(layer: Layer, region: Region) -> str:
-    """Say where the footprints of a layer lie, and whether they would lie in the region if read otherwise.
+    """Describe where the footprints of a layer lie, and whether they would lie in the region if read otherwise.
 
     Looked at are x and y exchanged, in metres or degrees, and degrees in a file that does not say so.
 
@@ -86,7 +86,7 @@ def find_place(layer: Layer, region: Region) -> str:
     """
     if layer.extent is None or not np.isfinite(layer.extent).all():
         return f"The file does not say where they lie: {UNKNOWN}"
-    crs = "no CRS stated" if layer.crs is None else _short(layer.crs.to_string())
+    crs = "no CRS stated" if layer.crs is None else short_crs(layer.crs.to_string())
     told = f"They lie in {format_box(layer.extent)} ({crs})"
     own = layer.crs or pyproj.CRS.from_user_input(region.crs)
     if _meets(layer.extent, own, region):
@@ -100,7 +100,12 @@ def find_place(layer: Layer, region: Region) -> str:
             if _meets(extent, pyproj.CRS.from_user_input(stated), region):
                 return f"{told}. {_describe_move(exchanged=exchanged, degrees=degrees and not own.is_geographic)}"
     code = own.to_authority()
-    if code and own.is_projected and _overlap(layer.extent, region.bounds) and is_on_its_place(layer.extent, own):
+    if (
+        code
+        and own.is_projected
+        and boxes_meet(layer.extent, region.bounds)
+        and is_on_its_place(layer.extent, own)
+    ):
         return (
             f"{told}. The point clouds have such coordinates too, so their CRS may be that of the footprints: "
             f"--crs {':'.join(code)}"
@@ -137,12 +142,4 @@ def _meets(extent: Box, crs: pyproj.CRS, region: Region) -> bool:
     west, south, east, north = forward.transform_bounds(*extent, densify_pts=21, errcheck=False)
     if not np.isfinite((west, south, east, north)).all():
         return False
-    return _overlap((west, south, east, north), region.bounds)
-
-
-def _overlap(one: Box, other: Box) -> bool:
-    return one[0] <= other[2] and one[2] >= other[0] and one[1] <= other[3] and one[3] >= other[1]
-
-
-def _short(crs: str) -> str:
-    return printable(crs) if len(crs) < 40 else "a CRS of its own"
+    return boxes_meet((west, south, east, north), region.bounds)

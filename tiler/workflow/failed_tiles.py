@@ -9,7 +9,8 @@ import numpy as np
 
 from pipeline.data.errors import CityError, ConfigError
 from stitch.tiling.grid import Bounds, Key
-from tiler.config.config import Config, write_config
+from tiler.config.config import Config
+from tiler.config.config_file import write_config
 from tiler.engine.engine import Engine
 from tiler.engine.failures import SetAside
 from tiler.engine.run_context import SHARED, tile_key, tile_name

@@ -8,7 +8,7 @@ import pyproj
 
 from pipeline.data.errors import CityError, ConfigError
 from tiler.engine.stage import Box
-from tiler.georeference.crs import same_crs
+from tiler.georeference.crs import same_crs, short_crs
 from tiler.objects.places import absolute, in_bucket
 from tiler.planning.region import Region
 from tiler.store.json_stream import read_members
@@ -45,7 +45,7 @@ def refuse_other_region(out: Path, region: Region, inputs: Sequence[str]) -> Non
     move = "give another --out, or --overwrite to remove that run"
     holds = f"{out}: holds the run of another region"
     if not _same(crs, region.crs):
-        raise ConfigError(f"{holds}, in {_short(crs)}; this one is in {_short(region.crs)}; {move}")
+        raise ConfigError(f"{holds}, in {short_crs(crs)}; this one is in {short_crs(region.crs)}; {move}")
     share = _common_area(bounds, region.bounds) / max(_area(bounds), _area(region.bounds))
     here = {absolute(path) for path in inputs}
     if share <= 0 or (share < COMMON and here.isdisjoint(map(absolute, known))):
@@ -80,10 +80,6 @@ def _same(one: str, other: str) -> bool:
         return same_crs(pyproj.CRS.from_user_input(one), pyproj.CRS.from_user_input(other))
     except pyproj.exceptions.CRSError:
         return False
-
-
-def _short(crs: str) -> str:
-    return crs if len(crs) < 40 else "a CRS of its own"
 
 
 def _area(box: Sequence[float]) -> float:

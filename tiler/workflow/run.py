@@ -15,24 +15,24 @@ from typing import Any
 from pipeline.data.errors import CityError, OutputError
 from tiler.config.config import ANYWHERE, Config, roofs_stay_flat
 from tiler.dashboard.server import read_address, watched
-from tiler.engine.engine import StoppedError
-from tiler.engine.executor import Executor, serial
+from tiler.engine.executor import Executor, Serial
 from tiler.engine.keys import code_versions
+from tiler.engine.schedule import StoppedError
 from tiler.engine.stage import Stage
 from tiler.engine.stopping import stops
 from tiler.engine.task import peak_memory
 from tiler.engine.task_limits import limit_workers, machine_memory
+from tiler.engine.watcher import Watcher
 from tiler.executors.kernels import prepare
 from tiler.jobs.cluster import read_cluster
 from tiler.jobs.submission import JOB
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
-from tiler.monitoring.progress import Announce
-from tiler.monitoring.watchers import Listener, Watcher, Watchers
+from tiler.monitoring.run_log import RunLog
+from tiler.monitoring.watchers import Watchers
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.planning.forecast import warn_of_memory
-from tiler.planning.pad import Pad
 from tiler.planning.plan import Plan, check_sources, make_plan
-from tiler.report.kept_report import give_back_report
+from tiler.planning.region import Pad
 from tiler.stages.own_stages import OwnStages, check_own, run_own_stages
 from tiler.store.atomic import replacing, sync_meanwhile
 from tiler.store.checksums import seal, state_files
@@ -45,6 +45,7 @@ from tiler.store.out_folder import (
     TASKS,
     check_folder,
     clear_folder,
+    give_back_report,
     refuse_inputs_within,
     remove_strangers,
 )
@@ -64,8 +65,8 @@ from tiler.workflow.other_region import (
     remove_folders,
     remove_if_useless,
 )
-from tiler.workflow.padded_layout import pad_plan
 from tiler.workflow.run_watchers import LeaseWatch, begin_watching
+from tiler.workflow.settled_domain import pad_plan
 from tiler.workflow.stage_sequence import make_engine, run_stages
 from tiler.workflow.summary import describe_tasks, summarise_run
 
@@ -94,8 +95,6 @@ class _Means:
 def run(
     config: Config,
     *,
-    announce: Announce | None = None,
-    say: Callable[[str], None] | None = None,
     stages: Sequence[Stage] = (),
     parameters: Mapping[str, Any] | None = None,
     watchers: Sequence[Watcher] = (),
@@ -107,19 +106,15 @@ def run(
     ----------
     config : Config
         Parameters of the run.
-    announce : callable, optional
-        Called with the name of each stage and the seconds of all its items when it is done.
-    say : callable, optional
-        Called with sentences that the user should read.
     stages : sequence of Stage, optional
         Further stages, run after ours; they may read these and each other.
     parameters : mapping, optional
         Parameters that further stages declare, besides those of `config`.
     watchers : sequence of Watcher
-        Told what is planned, begun, done and said; of the end too, if the run fails before it has begun.
+        Called for what is planned, begun, done and said; at the end too, if the run fails before it has begun.
     dashboard : str, optional
         Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
-        default. `say` is told its URL.
+        default. Watchers get its URL.
 
     Returns
     -------
@@ -140,8 +135,10 @@ def run(
     same key, is not computed again. Results are those of a run into an empty folder, byte for byte. Every byte
     that is used again is held against its checksum first; what is damaged is computed anew and noted
     (``damaged-artefact``).
+
+    What happens is logged, too: see `tiler.monitoring.run_log`.
     """
-    told = Watchers(watchers if say is None else [*watchers, Listener(say)])
+    told = Watchers([RunLog(), *watchers])
     config = use_absolute_paths(config)
     made: list[Path] = []
     try:
@@ -160,7 +157,7 @@ def run(
             with _connect(config) as cluster:
                 means = _Means(dashboard, shown, cluster)
                 try:
-                    return _run(config, out, earlier, damage, own, announce, told, means)
+                    return _run(config, out, earlier, damage, own, told, means)
                 except StoppedError:
                     raise
                 except Exception:
@@ -179,7 +176,6 @@ def _run(
     earlier: list[str],
     damage: Mapping[str, str],
     own: OwnStages,
-    announce: Announce | None,
     watchers: Watchers,
     means: _Means,
 ) -> dict[str, Any]:
@@ -204,7 +200,7 @@ def _run(
                 sync_meanwhile(out / RUN_RECORD)
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(config, out)
-        progress = begin_watching(config, out, plan, own, watchers, announce=announce, shown=means.shown)
+        progress = begin_watching(config, out, plan, own, watchers, shown=means.shown)
         record |= _mesh_region(config, out, plan, own, watchers, damage, means)
         record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:
@@ -222,7 +218,7 @@ def _run(
         raise
     finally:
         record["seconds_total"] = round(time.perf_counter() - start, 3)
-        # Where an error is told already, that its record cannot be written either would only hide it.
+        # A failure to write the record must not hide the error that ended the run.
         with suppress(OutputError) if failed else nullcontext():
             if not untouched:
                 _write_record(out, record)
@@ -353,8 +349,7 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
         with local(config.workers, limit_workers(config), dashboard=means.dashboard or ANYWHERE) as executor:
             yield executor
     else:
-        with serial() as executor:
-            yield executor
+        yield Serial()
 
 
 @contextmanager
@@ -369,22 +364,22 @@ def _beside(out: Path, check: Callable[[], None], watchers: Watchers) -> Iterato
 
 
 def _find_damage(out: Path) -> dict[str, str]:
-    """Say what is wrong with the files of a finished run that belong to no result.
+    """Describe what is wrong with the files of a finished run that belong to no result.
 
-    Of results and their files it is told by who makes them anew.
+    Damaged results and their files are reported where they are made anew.
     """
     return {found.path: found.what for found in Audit(out, deep=False).check_top()}
 
 
 def _foresee(plan: Plan, config: Config) -> list[str]:
-    """Say which roofs stay flat against what was asked, and which tiles may not fit into this machine's memory."""
+    """Name the roofs that stay flat against what was asked, and the tiles that may not fit into memory."""
     stay_flat = config.roofs != "flat" and roofs_stay_flat(config.mesher, config.simplify)
     flat = [warn_of_flat_roofs(config)] if stay_flat else []
-    return flat + ([] if config.on_cluster else warn_of_memory(plan.survey, config, memory=machine_memory()))
+    return flat + ([] if config.on_cluster else warn_of_memory(plan, config, memory=machine_memory()))
 
 
 def warn_of_flat_roofs(config: Config) -> str:
-    """Say why roofs are flat although sloped ones were asked for."""
+    """Explain why roofs are flat although sloped ones were asked for."""
     why = f"mesher = {config.mesher}" if config.mesher != "adaptive" else f"simplify = {config.simplify}"
     return f"roofs are flat, not {config.roofs}: {why} has no sloped ones"
 

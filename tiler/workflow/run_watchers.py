@@ -10,9 +10,10 @@ from pipeline.data.errors import OutputError
 from tiler.config.config import Config
 from tiler.engine.run_context import make_layout
 from tiler.engine.task import Record
+from tiler.engine.watcher import RunStart, Watcher
 from tiler.monitoring.events import EventLog, begin_file
-from tiler.monitoring.progress import Announce, RunProgress, command_line
-from tiler.monitoring.watchers import RunStart, Watcher, Watchers
+from tiler.monitoring.progress import RunProgress, command_line
+from tiler.monitoring.watchers import Watchers
 from tiler.planning.plan import Plan
 from tiler.planning.region import foresee_pad
 from tiler.stages.own_stages import OwnStages, list_stages, stages_of_pad
@@ -68,7 +69,7 @@ class LeaseWatch(Watcher):
     def __init__(self, check: Callable[[], None]) -> None:
         self._check = check
 
-    def __call__(self, stage: str, done: int, total: int, record: Record) -> None:
+    def done(self, stage: str, n_done: int, total: int, record: Record) -> None:
         """Look at the lease whenever an item is done."""
         self._check()
 
@@ -80,7 +81,6 @@ def begin_watching(
     own: OwnStages,
     watchers: Watchers,
     *,
-    announce: Announce | None = None,
     shown: Path | None = None,
 ) -> RunProgress:
     """Begin to tell how far a run is, with all stages that are known from the start.
@@ -97,8 +97,6 @@ def begin_watching(
         Stages of the user's own.
     watchers : Watchers
         Those that the caller brings; the files' are added.
-    announce : callable, optional
-        As for `RunProgress`.
     shown : Path, optional
         Folder on a disk where the events are written first, of a run in a bucket.
 
@@ -117,7 +115,7 @@ def begin_watching(
             layout = padded
     command = "" if own.stages else command_line(config)  # stages of the user's own are not given by a command
     totals = {name: total for name, (_, total) in expected.items()}
-    progress = RunProgress(out, config, totals, announce=announce, command=command)
+    progress = RunProgress(out, config, totals, command=command)
     watchers.add(progress)
     events = out / EVENTS
     if shown is not None and shown != out:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from stitch.tiling.grid import seams_of_tile
 from tiler.config.config import Config
-from tiler.engine.executor import serial
+from tiler.engine.executor import Serial
 from tiler.engine.run_context import seam_name, tile_key
 from tiler.objects.places import refuse_bucket
 from tiler.planning.plan import check_sources, make_plan
@@ -17,8 +17,7 @@ from tiler.store.folder_lock import only_run
 from tiler.store.out_folder import PIECES
 from tiler.words.plain_text import say_nothing
 from tiler.workflow.failed_tiles import config_alone
-from tiler.workflow.padded_layout import plan_alone
-from tiler.workflow.settled_domain import domain_of_run, take_domain
+from tiler.workflow.settled_domain import domain_of_run, plan_alone, take_domain
 from tiler.workflow.stage_sequence import make_engine, run_city_stages
 
 
@@ -60,12 +59,11 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
         plan = make_plan(alone, say or say_nothing)
         for folder in PIECES:
             (out / folder).mkdir(exist_ok=True)
-        with serial() as executor:
-            engine = make_engine(alone, out, plan, executor, OwnStages(), set_aside=False)
-            run_city_stages(engine, alone, shift=shift)
-            seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
-            take_domain(engine, alone, domain, pad, store)
-            engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
-            (pieces,) = (stage for stage in piece_stages() if stage.name == "pieces")
-            engine.run(pieces, items={"pieces": [tile]})
+        engine = make_engine(alone, out, plan, Serial(), OwnStages(), set_aside=False)
+        run_city_stages(engine, alone, shift=shift)
+        seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
+        take_domain(engine, alone, domain, pad, store)
+        engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
+        (pieces,) = (stage for stage in piece_stages() if stage.name == "pieces")
+        engine.run(pieces, items={"pieces": [tile]})
     return out / "mesh" / f"{tile}.vtu"

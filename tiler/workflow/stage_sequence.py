@@ -6,11 +6,12 @@ from types import SimpleNamespace
 
 from tiler.config.config import Config
 from tiler.config.step_options import derived_parameters
-from tiler.engine.engine import Engine, Progress
+from tiler.engine.engine import Engine
 from tiler.engine.executor import Executor
 from tiler.engine.failures import Policy
 from tiler.engine.run_context import RunContext, pack_tiles
 from tiler.engine.stage import REGION_ITEM
+from tiler.engine.watcher import Watcher
 from tiler.objects.places import identify, place
 from tiler.planning.plan import Plan
 from tiler.stages.alignment import alignment_stages, shift_of
@@ -116,7 +117,7 @@ def make_engine(
     plan: Plan,
     executor: Executor,
     own: OwnStages,
-    progress: Progress | None = None,
+    watcher: Watcher | None = None,
     *,
     set_aside: bool = True,
 ) -> Engine:
@@ -144,6 +145,6 @@ def make_engine(
         parameters=parameters,
         context=context,
         executor=executor,
-        progress=progress,
+        watcher=watcher,
         policy=Policy(retries=config.retries, set_aside=set_aside),
     )

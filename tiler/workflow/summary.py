@@ -136,19 +136,19 @@ def summarise_run(
 
 
 def _roof_fit(records: Records) -> dict[str, Any]:
-    """Tell how roofs of planes fit their points."""
+    """Describe how roofs of planes fit their points."""
     facts = records["citymodel", REGION_ITEM].facts
     return {name: facts[name] for name in ("roof_fit", "worst_roofs") if name in facts}
 
 
 def _describe_pad(engine: Engine) -> dict[str, Any]:
-    """Tell the region without its pad, and the height of the ground at the outer sides."""
+    """Return the region without its pad, and the height of the ground at the outer sides."""
     core, _ = engine.laid_out(CORE_STAGE)
     return {"core": list(core.bounds), "rim": engine.records[RIM, REGION_ITEM].facts["rim"]}
 
 
 def describe_tasks(tasks: Mapping[str, int]) -> str:
-    """Say how many tasks ran, and how many results were taken as they were.
+    """Describe how many tasks ran, and how many results were taken as they were.
 
     Examples
     --------

@@ -16,7 +16,8 @@ from pipeline.quality.histograms import quality_histograms
 from pipeline.quality.quality import measure_cells
 from stitch.pieces.conformity import compute_cell_volumes
 from tests.helpers.cities import city_of
-from tiler.mesh_files.vtk_files import Rows, Values, read_vtu, write_vtu, write_vtu_blocks
+from tests.helpers.vtk_writers import write_vtu
+from tiler.mesh_files.vtk_files import Rows, Values, read_vtu, write_vtu_blocks
 
 
 def uneven_columns(order: MergeOrder, seed: int = 5) -> ColumnMesh:

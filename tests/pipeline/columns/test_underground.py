@@ -42,11 +42,12 @@ from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, 
 from stitch.pieces.conformity import compute_cell_volumes, pair_cell_faces
 from tests.helpers.cities import Bounds, crowded_blocks
 from tests.helpers.tiles import hash_files, make_town, run_of, write_town
+from tests.helpers.vtk_writers import write_vtp, write_vtu
 from tests.runs.test_tiled_runs import prove_local, put_beside
 from tiler.check.check import CheckReport, check_run
 from tiler.config.config import Config, idle_parameters, make_config
 from tiler.export.export import export_run
-from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu, write_vtp, write_vtu
+from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
 

@@ -17,8 +17,8 @@ from pipeline.data.errors import ConfigError
 from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, make_city, terrain_height
 from tests.helpers.footprint_reading import read_footprint_crs, read_footprints
 from tests.helpers.whole_clouds import read_points
+from tiler.config.config import Config
 from tiler.interface.synth import SynthFiles, write_city
-from tiler.planning.cloud_crs import Asked
 from tiler.planning.establish_georeference import establish_georeference
 from tiler.pointclouds.clouds import find_clouds, read_header
 
@@ -75,7 +75,7 @@ def test_the_readers_get_back_what_was_made(written: tuple[Path, SynthFiles]) ->
         f"{x}_{y}.laz" for x in (318000, 318400) for y in (6399000, 6399400)
     ]
     headers = [read_header(path) for path in files.clouds]
-    found = establish_georeference(Asked(), headers, read_footprint_crs(files.footprints), None)
+    found = establish_georeference(Config(), headers, read_footprint_crs(files.footprints), None)
     assert (found.crs, found.messages) == (SWEREF, [])
     bounds = box(800)
     for path in (files.footprints, files.shapefile):

@@ -35,10 +35,10 @@ from tests.helpers.meshes import (
     with_mesh,
     write_run,
 )
+from tests.helpers.vtk_writers import make_stream, write_vtp, write_vtu
 from tiler.check.check import CheckReport, _Sums, check_run
 from tiler.check.proofs import Dtm, Fault, merge_faults
-from tiler.mesh_files.vtk_files import write_vtp, write_vtu
-from tiler.mesh_files.vtk_xml import make_stream, write_data_file
+from tiler.mesh_files.vtk_xml import write_data_file
 
 Tamper = Callable[[TinyCity], TinyCity]
 N_PROOFS = 16

@@ -10,8 +10,8 @@ import pytest
 from pipeline.data.errors import ConfigError
 from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.cli.main import make_parser
-from tiler.config.config import Config, annotated_defaults, load_config, make_config
-from tiler.config.config_file import with_file
+from tiler.config.config import Config, make_config
+from tiler.config.config_file import annotated_defaults, load_config, with_file
 from tiler.config.step_options import derived_parameters
 from tiler.interface.synth import write_city
 from tiler.planning.plan import survey_inputs

@@ -11,12 +11,11 @@ import pytest
 from pipeline.data.errors import InputError
 from tests.helpers.simulated_runs import simulate, write_events
 from tiler.dashboard.answer import _describe_step, tell
-from tiler.dashboard.codes import STATES, State
 from tiler.dashboard.follow import Follower
+from tiler.dashboard.items import STATES, State
 from tiler.dashboard.map_view import MOST_SHOWN, Question, describe_map
 from tiler.dashboard.metrics import families, write_text
-from tiler.dashboard.model import TILE, RunModel
-from tiler.dashboard.series import MOST, Series
+from tiler.dashboard.model import MOST, TILE, RunModel, Series
 from tiler.store.out_folder import EVENTS
 from tiler.words.stage_groups import group_stages
 

@@ -17,10 +17,11 @@ import pytest
 
 from pipeline.data.errors import ConfigError
 from tests.helpers.simulated_runs import simulate, write_events
+from tests.helpers.told import Listener, StageEnds
 from tiler.cli.main import main
 from tiler.config.config import make_config
-from tiler.dashboard.codes import State
 from tiler.dashboard.follow import Follower
+from tiler.dashboard.items import State
 from tiler.dashboard.server import read_address, serve
 from tiler.interface.synth import write_city
 from tiler.workflow.run import run
@@ -185,13 +186,13 @@ def test_a_run_shows_its_page_and_its_bytes_stay(tmp_path: Path, small_run: Path
     def say(text: str) -> None:
         told.append(text)
 
-    def announce(stage: str, _: float) -> None:
+    def announce(stage: str) -> None:
         port = int(told[0].split(":")[3].split("/")[0])
-        time.sleep(1.1 if stage.startswith("model ") else 0.0)  # what happened is written once a second
+        time.sleep(1.1 if stage == "model" else 0.0)  # what happened is written once a second
         answers.append(json.loads(ask(port, "/citystitch/api/state")[2]))
         metrics.append(ask(port, "/metrics")[2].decode())
 
-    run(make_config(given), announce=announce, say=say, dashboard="127.0.0.1:0")
+    run(make_config(given), watchers=[Listener(say), StageEnds(announce)], dashboard="127.0.0.1:0")
     assert told[0].startswith("dashboard: http://127.0.0.1:")
     assert {answer["head"]["status"] for answer in answers} == {"running"}
     assert {answer["dask"] for answer in answers} == {workers > 0}

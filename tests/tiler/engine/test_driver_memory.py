@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tiler.engine.absent_tiles import Gaps
 from tiler.engine.records import Records
 from tiler.engine.stage import Facts
 from tiler.engine.task import Record
+from tiler.engine.task_graph import Gaps
 from tiler.store.store import Store
 
 BYTES = 250  # that a record with an extent and names may take, dictionaries included

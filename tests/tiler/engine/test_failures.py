@@ -11,10 +11,12 @@ import pytest
 
 from pipeline.data.errors import GeometryError, OutputError
 from tests.helpers.faults import Faulty, Once, hangs_in_c, is_killed, raises, segfaults, swallows_memory
-from tests.tiler.engine.test_engine import contents, grid_layout, make, nothing, seen, told
-from tiler.engine.engine import Engine, StoppedError
+from tests.helpers.told import Told
+from tests.tiler.engine.test_engine import contents, grid_layout, make, nothing, one_at_a_time, seen, told
+from tiler.engine.engine import Engine
 from tiler.engine.executor import Executor, Serial
 from tiler.engine.failures import Policy
+from tiler.engine.schedule import StoppedError
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Failure, Record, Task
 from tiler.engine.task_limits import Limits
@@ -103,7 +105,7 @@ def test_what_took_a_failed_item_to_be_there_is_run_again(tile: str, tmp_path: P
         ran.extend([] if record.reused else [f"{stage} {record.name}"])
 
     failing = faulty(A, **{f"t{tile.replace('.', '_')}": raises})
-    engine = make(tmp_path, policy=ASIDE, window=1, progress=tell)
+    engine = make(tmp_path, policy=ASIDE, executor=one_at_a_time(), watcher=Told(tell))
     engine.run(failing, BY_NAME, OF_THESE)
     assert ran[1].startswith("by-name")  # it does not wait for its neighbours
     waited = make(tmp_path / "waited", policy=ASIDE)
@@ -219,7 +221,7 @@ def test_a_stop_keeps_what_ran(where: str, workers: Executor, tmp_path: Path) ->
             engine.stop()
 
     layout = grid_layout(6)
-    engine: Engine = make(tmp_path, Serial() if where == "serial" else workers, progress=stop, layout=layout)
+    engine: Engine = make(tmp_path, Serial() if where == "serial" else workers, watcher=Told(stop), layout=layout)
     with pytest.raises(StoppedError) as caught:
         engine.run(A, B)
     assert caught.value.exit_code == 130

@@ -13,10 +13,11 @@ from pipeline.data.errors import GeometryError
 from stitch.tiling.grid import make_grid
 from tests.helpers.faults import Faulty, Once, is_killed, raises, segfaults
 from tests.tiler.engine.test_engine import contents, grid_layout, make, nothing, rerun, seen
-from tiler.engine.engine import SMALL_ONES, Engine
+from tiler.engine.engine import Engine
 from tiler.engine.executor import Executor, Serial
 from tiler.engine.failures import Policy
 from tiler.engine.run_context import make_layout
+from tiler.engine.schedule import SMALL_ONES
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.submission import Outcome, Part, run_parts
 from tiler.engine.task import Failure, Record, Task, run_task
@@ -142,9 +143,9 @@ def test_of_small_ones_several_go_together_while_all_workers_have_some(
     workers: int, most: int, tmp_path: Path
 ) -> None:
     executor = Counted()
-    executor.workers = workers
+    executor.workers, executor.window = workers, 1
     small = Stage("small", Scope.TILE, puts, small=True)
-    engine = make(tmp_path, executor, layout=grid_layout(6), window=1)
+    engine = make(tmp_path, executor, layout=grid_layout(6))
     engine.run(small)
     assert max(map(len, executor.given)) == most
     assert len({name for given in executor.given for name in given}) == 36
@@ -279,7 +280,7 @@ def test_what_is_put_off_is_run_by_a_later_call(tmp_path: Path) -> None:
 def test_events_and_times_are_told_by_stage(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     log = EventLog(path, begin_file(path), every=0.0)
-    engine = make(tmp_path, progress=log)
+    engine = make(tmp_path, watcher=log)
     engine.run(FIRST, replace(SECOND, function=takes_time))
     log.end("done")
     events = [event for event in read_events(path) if event.get("name") == "1.1"]

@@ -14,7 +14,7 @@ import pytest
 from pipeline.quality import quality
 from tests.helpers.sparse_city import SparseCity, make_city
 from tiler.cli.main import main
-from tiler.engine.engine import StoppedError
+from tiler.engine.schedule import StoppedError
 from tiler.executors import kernels
 from tiler.executors.kernels import UNCACHED, WAYS, are_compiled, compile_kernels, prepare
 from tiler.interface.synth import write_city

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.hand_pieces import HandPieces, box_pieces
-from tiler.export import region_faces, rows
+from tiler.export import region_faces
 from tiler.formats import msh
 from tiler.formats.openfoam import write_openfoam
 
@@ -45,7 +45,7 @@ def test_export_takes_few_bytes_a_cell(
     block: HandPieces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, export: Export, most: int
 ) -> None:
     monkeypatch.setattr(region_faces, "BLOCK_CELLS", BLOCK)
-    monkeypatch.setattr(rows, "ROWS", BLOCK)
+    monkeypatch.setattr("tiler.export.pieces.ROWS", BLOCK)
     small = box_pieces((1, 1))
     pieces = small
     monkeypatch.setattr(msh, "open_pieces", lambda _: pieces)

@@ -22,8 +22,7 @@ from tiler.cli.main import main
 from tiler.export import region_faces
 from tiler.export.export import export_run
 from tiler.export.foam_patches import PATCHES
-from tiler.export.partition import split_pieces
-from tiler.export.pieces import Pieces
+from tiler.export.pieces import Pieces, split_pieces
 from tiler.formats import openfoam
 from tiler.formats.openfoam import write_openfoam
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu

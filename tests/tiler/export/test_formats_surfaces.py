@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import CityError
 from pipeline.data.mesh import Boundary, Marker
 from tests.helpers.hand_pieces import HandPieces, box_pieces
+from tests.helpers.vtk_writers import write_vtp
 from tiler.cli.main import main
 from tiler.export.export import export_run
 from tiler.export.foam_patches import PATCHES
@@ -22,7 +23,7 @@ from tiler.formats.obj import write_obj
 from tiler.formats.ply import write_ply
 from tiler.formats.stl import write_stl
 from tiler.mesh_files.mesh_pieces import open_pieces
-from tiler.mesh_files.vtk_files import read_vtp, write_vtp
+from tiler.mesh_files.vtk_files import read_vtp
 
 FORMATS = ["stl", "obj", "ply"]
 NUMBERS = {name: int(marker) for marker, name in PATCHES.items()}

@@ -19,6 +19,7 @@ from stitch.pieces.conformity import compute_cell_volumes, pair_edges
 from tests.helpers.foam_reader import PolyMesh, read_poly_mesh, read_zones
 from tests.helpers.hand_pieces import HandPieces
 from tests.helpers.programs import mesh_is_ok, read_check, run_foam, run_program
+from tests.helpers.vtk_writers import write_vtu
 from tests.tiler.export.test_formats_openfoam import MESH, assert_in_order, volumes_of
 from tiler.cli.main import main
 from tiler.config.config import make_config
@@ -27,7 +28,7 @@ from tiler.export.foam_patches import PATCHES
 from tiler.formats.openfoam import write_openfoam
 from tiler.interface.synth import write_city
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
-from tiler.mesh_files.vtk_files import read_vtu, write_vtu
+from tiler.mesh_files.vtk_files import read_vtu
 from tiler.workflow.run import run
 
 DEPTH = 20.0

@@ -10,11 +10,11 @@ import pyproj
 import pytest
 
 from pipeline.data.errors import ConfigError, InputError
+from tiler.config.config import Config
 from tiler.georeference.frame import AS_IT_IS, Frame, box_to_file, box_to_region, to_region
 from tiler.georeference.metric import find_metric
 from tiler.georeference.operation import find_operation
 from tiler.planning import cloud_crs
-from tiler.planning.cloud_crs import Asked
 from tiler.planning.establish_georeference import FOOTPRINTS, Georeference, establish_georeference, find_inexact
 from tiler.pointclouds.clouds import CloudHeader
 
@@ -45,7 +45,7 @@ def establish(
     *clouds: CloudHeader, footprints: pyproj.CRS | str | None = None, extent: Any = None, **asked: Any
 ) -> Georeference:
     crs = pyproj.CRS(footprints) if isinstance(footprints, str) else footprints
-    found = establish_georeference(Asked(**asked), clouds, crs, extent)
+    found = establish_georeference(Config(**asked), clouds, crs, extent)
     assert json.loads(json.dumps(found.record)) == found.record
     assert found.messages == [note.detail for note in found.notes]
     return found

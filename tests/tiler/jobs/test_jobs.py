@@ -456,7 +456,7 @@ def test_submit_keeps_what_jobs_run_and_refuses_a_second_one(
 
 
 def jobs_values(out: Path) -> dict[str, Any]:
-    from tiler.config.config import load_config
+    from tiler.config.config_file import load_config
 
     return load_config(out / "job" / "run.toml")
 

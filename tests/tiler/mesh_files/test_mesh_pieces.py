@@ -11,10 +11,11 @@ import pytest
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker
 from stitch.pieces.conformity import pair_cell_faces
+from tests.helpers.vtk_writers import write_vtu
 from tiler.config.config import make_config
 from tiler.interface.synth import write_city
 from tiler.mesh_files.mesh_pieces import open_pieces
-from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_vtu
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu
 from tiler.workflow.run import run
 
 

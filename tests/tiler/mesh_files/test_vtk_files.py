@@ -21,17 +21,10 @@ from vtkmodules.vtkIOXML import (
 from pipeline.data.errors import InputError, OutputError
 from pipeline.data.mesh import Boundary, TetMesh
 from tests.helpers.meshes import TinyCity, make_city, split_city
+from tests.helpers.vtk_writers import make_stream, write_vtp, write_vtu
 from tiler.mesh_files import vtk_files, vtk_xml
-from tiler.mesh_files.vtk_files import (
-    read_piece_paths,
-    read_vtp,
-    read_vtu,
-    write_pvtp,
-    write_pvtu,
-    write_vtp,
-    write_vtu,
-)
-from tiler.mesh_files.vtk_xml import make_stream, write_data_file
+from tiler.mesh_files.vtk_files import read_piece_paths, read_vtp, read_vtu, write_pvtp, write_pvtu
+from tiler.mesh_files.vtk_xml import write_data_file
 
 
 @pytest.fixture(scope="module")

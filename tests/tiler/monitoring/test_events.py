@@ -20,8 +20,9 @@ from tiler.config.config import make_config
 from tiler.config.config_file import with_file
 from tiler.engine.stage import Facts, Scope
 from tiler.engine.task import Record
+from tiler.engine.watcher import RunStart, Watcher
 from tiler.monitoring.events import EventLog, begin_file, numbers, open_log, read_events
-from tiler.monitoring.watchers import RunStart, Watcher, Watchers, describe_command
+from tiler.monitoring.watchers import Watchers, describe_command
 from tiler.workflow.run import run
 
 BOX = (0.0, 0.0, 10.0, 10.0)
@@ -73,8 +74,8 @@ def test_every_event_has_its_line(tmp_path: Path) -> None:
     log.begin(start_of(tmp_path))
     log.submitted("columns", "0_0")
     facts: Facts = {"counts": {"cells": 7, "facets": 0}, "order": "heights", "seams": {"x0_0": {"faces": 3}}}
-    log("columns", 1, 2, record_of("columns", "0_0", facts=facts, notes={"odd": 2}, seconds={"all": 1.23456}))
-    log("columns", 2, 2, record_of("columns", "1_0", reused=True, peak_memory=2**30))
+    log.done("columns", 1, 2, record_of("columns", "0_0", facts=facts, notes={"odd": 2}, seconds={"all": 1.23456}))
+    log.done("columns", 2, 2, record_of("columns", "1_0", reused=True, peak_memory=2**30))
     log.failed("columns", "1_0", "it is too wet")
     log.failed("pieces", "1_0", "not run: columns 1_0 is not there", ("columns", "1_0"))
     log.say("a 'line'\nand \udcff another")

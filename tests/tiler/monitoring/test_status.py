@@ -35,12 +35,16 @@ KILLED = """
 import os, signal, sys
 import tiler.monitoring.progress
 from tiler.config.config import make_config
+from tiler.monitoring.progress import RunProgress
 from tiler.workflow.run import run
 tiler.monitoring.progress.EVERY = 0.0
-def stop(stage, seconds):
-    if stage.startswith("columns"):
+done = RunProgress.done
+def stop(self, stage, n_done, total, record):
+    done(self, stage, n_done, total, record)
+    if stage == "columns" and n_done == total:
         os.kill(os.getpid(), signal.SIGKILL)
-run(make_config(eval(sys.argv[1])), announce=stop)
+RunProgress.done = stop
+run(make_config(eval(sys.argv[1])))
 """
 
 
@@ -88,11 +92,15 @@ def test_a_run_at_work(
     out = tmp_path / "out"
     seen: dict[str, Any] = {}
 
-    def look(stage: str, _: float) -> None:
-        if stage.startswith("seams"):
+    done = RunProgress.done
+
+    def look(self: RunProgress, stage: str, n_done: int, total: int, record: Record) -> None:
+        done(self, stage, n_done, total, record)
+        if stage == "seams" and n_done == total:
             seen["status"], seen["text"] = read_status(out), show(out, capsys)
 
-    run(town.config(out), announce=look)
+    monkeypatch.setattr(RunProgress, "done", look)
+    run(town.config(out))
     status = seen["status"]
     assert (status["state"], status["held"], status["pid"]) == ("running", True, os.getpid())
     stages = status["stages"]
@@ -221,7 +229,9 @@ def test_the_file_is_written_now_and_then(tmp_path: Path, monkeypatch: pytest.Mo
     begin = path.read_text()
     for k in range(2):
         progress.submitted("first", f"{k}")
-        progress("first", k + 1, 2, Record("first", f"{k}", "", "", {}, {"odd": 2}, {"all": 1.5}, reused=k == 0))
+        progress.done(
+            "first", k + 1, 2, Record("first", f"{k}", "", "", {}, {"odd": 2}, {"all": 1.5}, reused=k == 0)
+        )
     assert path.read_text() == begin
     now = time.perf_counter()
     monkeypatch.setattr("time.perf_counter", lambda: now + 2.1)

@@ -1,6 +1,7 @@
 """What a run shows: a live view on a terminal, lines elsewhere, and the options that change it."""
 
 import io
+import logging
 import os
 import pty
 import re
@@ -14,21 +15,25 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from rich.console import Console
 
+from pipeline.data.errors import GeometryError, InputError
 from tests.helpers.programs import run_program
 from tests.helpers.towns import Town, make_town
 from tests.tiler.monitoring.test_events import kinds, record_of, start_of
 from tiler.cli.main import main
 from tiler.engine.stage import Scope
+from tiler.engine.watcher import RunStart
 from tiler.monitoring.events import read_events
 from tiler.monitoring.live_view import LiveView, draw
-from tiler.monitoring.plain_view import LISTED_FAILURES, Line, Lines, PlainView
+from tiler.monitoring.run_log import LISTED_FAILURES, LOGGER, LogView, RunLog
 from tiler.monitoring.tally import Tally
-from tiler.monitoring.terminal import make_views
-from tiler.monitoring.watchers import RunStart, Watchers
+from tiler.monitoring.terminal import make_view
+from tiler.monitoring.watchers import Watchers
+from tiler.workflow.run import run
 
 ROOT = Path(__file__).resolve().parents[3]
 HIDE, SHOW = "\x1b[?25l", "\x1b[?25h"
@@ -58,7 +63,7 @@ def start_with(out: Path, **totals: int) -> RunStart:
 def do(watcher: Any, stage: str, names: range, total: int, seconds: float = 1.0, **others: Any) -> None:
     for k in names:
         watcher.submitted(stage, f"{k}_0")
-        watcher(stage, k + 1, total, record_of(stage, f"{k}_0", seconds={"all": seconds}, **others))
+        watcher.done(stage, k + 1, total, record_of(stage, f"{k}_0", seconds={"all": seconds}, **others))
 
 
 def test_time_left_is_that_of_what_is_measured_and_typical_of_the_rest(tmp_path: Path) -> None:
@@ -149,32 +154,34 @@ def test_a_view_by_hand(tmp_path: Path) -> None:
     ]
 
 
-def collect(**options: Any) -> tuple[Lines, list[Line]]:
-    lines: list[Line] = []
-    return Lines(lines.append, **options), lines
+def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records]
 
 
-def test_lines_tell_stages_failures_and_what_is_said() -> None:
-    lines, found = collect()
+def test_the_log_tells_stages_failures_and_what_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "citystitch")
+    lines = RunLog()
     do(lines, "columns", range(3), 3, seconds=1.5)
     lines.say("so it is")
     for k in range(LISTED_FAILURES + 5):
         lines.failed("columns", f"{k}", "wet")
         lines.failed("pieces", f"{k}", "not run", ("columns", f"{k}"))
-    texts = [line.text for line in found]
+    texts = logged(caplog)
     assert texts[:2] == ["  mesh              3 tasks      4.50 s", "so it is"]
     assert texts[2] == "failed: mesh: columns of cells 0: wet"
     assert len(texts) == 2 + LISTED_FAILURES + 1
     assert "run.json will list all" in texts[-1]
-    assert [line.bad for line in found] == [False, False] + [True] * (LISTED_FAILURES + 1)
+    errors = [record.levelno == logging.ERROR for record in caplog.records]
+    assert errors == [False, False] + [True] * (LISTED_FAILURES + 1)
 
 
-def test_each_item_is_told_where_it_is_asked_for() -> None:
-    lines, found = collect(verbose=True)
+def test_each_item_is_told_where_it_is_asked_for(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, "citystitch")
+    lines = RunLog()
     do(lines, "columns", range(1), 2, seconds=1.5, notes={"odd": 2})
     do(lines, "columns", range(1, 2), 2, seconds=0.0, reused=True)
     lines.failed("pieces", "0_0", "not run: columns", ("columns", "0_0"))
-    assert [line.text for line in found] == [
+    assert logged(caplog) == [
         "    mesh: columns of cells 0_0  1.50 s, 2 notes: odd",
         "    mesh: columns of cells 1_0  was there",
         "  mesh              2 tasks      1.50 s",
@@ -183,13 +190,46 @@ def test_each_item_is_told_where_it_is_asked_for() -> None:
 
 
 def test_a_long_stage_says_now_and_then_how_far_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    tally = Tally(Clock())
     for every, expected in ((60.0, ""), (0.0, "  mesh: 1 of 10 tasks\n  mesh: 2 of 10 tasks\n")):
-        view = PlainView(tally, every=every)
-        for k in range(2):
-            do(tally, "columns", range(k, k + 1), 10)
-            do(view, "columns", range(k, k + 1), 10)
+        view = make_view(console=Console(file=io.StringIO()))
+        do(RunLog(every=every), "columns", range(2), 10)
+        view.end("done")
         assert capsys.readouterr().out == expected
+
+
+def test_who_configures_logging_hears_of_a_run_without_a_view(
+    town: Town, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "citystitch")
+    run(town.config(town.copy(tmp_path / "out")))
+    assert "  mesh              4 tasks      0.00 s" in logged(caplog)
+    assert re.fullmatch(r"0 of \d+ tasks ran, \d+ results were there", logged(caplog)[-1])
+    assert {record.name for record in caplog.records} == {"citystitch"}
+
+
+def test_a_view_leaves_logging_as_it_was() -> None:
+    before = LOGGER.handlers.copy(), LOGGER.level
+    for options in ({}, {"quiet": True}, {"verbose": True}):
+        view = make_view(console=Console(file=io.StringIO()), **options)
+        assert len(LOGGER.handlers) == len(before[0]) + 1
+        view.end("done")
+        assert (LOGGER.handlers, LOGGER.level) == before
+
+
+def test_quietly_a_failure_that_ends_the_run_is_told_once(
+    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = run_words(town, tmp_path / "out", "--quiet")
+    with patch("tiler.stages.domain.is_low", side_effect=InputError("wet; dry it")):
+        assert main(words) == 1
+    captured = capsys.readouterr()
+    assert captured.err == "citystitch: seams: height of the domain: wet; dry it\n"
+    assert captured.out == ""
+    (event,) = [event for event in read_events(tmp_path / "out" / "events.jsonl") if event["event"] == "failed"]
+    assert event["reason"] == "wet; dry it"
+    with patch("tiler.stages.mesh.mesh_tile", side_effect=GeometryError("too thin")):
+        assert main(words) == 1  # no tile is left
+    assert capsys.readouterr().err.count("failed: mesh: columns of cells") == 4
 
 
 @contextmanager
@@ -225,7 +265,7 @@ def terminal(term: str = "xterm-256color", **others: str) -> Iterator[tuple[Cons
 
 def show(console: Console, tmp_path: Path, **options: bool) -> None:
     """A short run, with all that can happen."""
-    watchers = Watchers(make_views(console=console, **options))
+    watchers = Watchers([RunLog(), make_view(console=console, **options)])
     watchers.say("before it begins")
     watchers.begin(start_of(tmp_path))
     do(watchers, "points", range(1), 1)
@@ -275,13 +315,15 @@ def test_a_dumb_terminal_gets_lines_alone(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_no_terminal_gets_lines_alone(tmp_path: Path) -> None:
-    assert isinstance(make_views(console=Console(file=io.StringIO(), force_terminal=True))[1], PlainView)
+    view = make_view(console=Console(file=io.StringIO(), force_terminal=True))
+    assert isinstance(view, LogView)
+    view.end("done")
 
 
 def test_a_view_that_is_told_by_a_signal_does_not_wait(tmp_path: Path) -> None:
     """A handler speaks while the main thread holds the console: the line waits for the drawing thread."""
     with terminal() as (console, shown):
-        view = LiveView(console, Tally())
+        view = Watchers([RunLog(), LiveView(console)])
         view.begin(start_of(tmp_path))
         handler = signal.signal(signal.SIGUSR1, lambda *_: view.say("from the handler"))
         try:

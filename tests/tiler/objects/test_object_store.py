@@ -14,10 +14,12 @@ import pytest
 from pipeline.data.errors import ConfigError, InputError, OutputError
 from tests.helpers.flaky_proxy import FlakyProxy, flaky_proxy
 from tests.helpers.object_servers import BUCKET, S3Server, environment, s3_server
+from tests.helpers.told import Listener
 from tests.helpers.towns import Town, make_town
 from tests.runs.test_run import hashes
 from tiler.cli.main import main
-from tiler.config.config import load_config, make_config
+from tiler.config.config import make_config
+from tiler.config.config_file import load_config
 from tiler.engine.stage import Scope
 from tiler.engine.task import Task, run_task
 from tiler.objects import path as object_path
@@ -437,7 +439,7 @@ def test_a_run_in_a_bucket_has_the_bytes_of_one_on_a_disk(
     town: Town, memory: Memory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said: list[str] = []
-    record = run(make_config({**vars(town.config(tmp_path)), "out": URL}), say=said.append)
+    record = run(make_config({**vars(town.config(tmp_path)), "out": URL}), watchers=[Listener(said.append)])
     assert record["exit_code"] == 0
     assert main(["status", URL]) == 0
     assert "done" in capsys.readouterr().out

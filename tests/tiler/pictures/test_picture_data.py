@@ -13,11 +13,11 @@ from pipeline.data.errors import InputError
 from pipeline.data.mesh import Boundary, Marker
 from pipeline.quality.quality import measure_cells
 from tests.helpers.scene import PIECES, write_scene
+from tests.helpers.vtk_writers import write_vtp
 from tiler.mesh_files.facet_quality import measure_facets
-from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp
 from tiler.pictures.city_model_data import DEEP, load_blocks
-from tiler.pictures.coarsening import Facets, coarsen, join_facets
-from tiler.pictures.picture_data import find_middle, load_city
+from tiler.pictures.picture_data import Facets, coarsen, find_middle, join_facets, load_city
 from tiler.pictures.picture_parts import QUALITY_COLOURS, blend, heights_above_ground
 from tiler.pictures.render import render_run
 

@@ -18,10 +18,10 @@ from PIL import Image
 from pipeline.data.errors import ConfigError, InputError, OutputError
 from pipeline.data.mesh import Boundary, Marker
 from tests.helpers.scene import PIECES, write_scene
+from tests.helpers.vtk_writers import write_vtp
 from tiler.cli.main import main
-from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp, write_vtp
+from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp
 from tiler.pictures import render
-from tiler.pictures.camera import fit_camera
 from tiler.pictures.picture_data import City, load_air, load_city
 from tiler.pictures.picture_parts import (
     TILE_COLOURS,
@@ -31,7 +31,7 @@ from tiler.pictures.picture_parts import (
     make_skirt,
     tile_colours,
 )
-from tiler.pictures.render import SIZES, draw_city, render_run
+from tiler.pictures.render import SIZES, draw_city, fit_camera, render_run
 
 SIDE = 240.0
 SIZE = (400, 250)

@@ -19,6 +19,7 @@ from rich.console import Console
 
 from pipeline.data.errors import ConfigError
 from stitch.tiling.grid import has_tile, make_grid, seam_keys, seam_line, tile_box, tile_keys, tiles_of_seam
+from tests.helpers.told import Listener
 from tiler.cli import main as cli
 from tiler.config.config import Config, make_config
 from tiler.engine.run_context import absent_tiles, choose_tiles, make_layout, seam_name, tile_name
@@ -376,7 +377,8 @@ def test_a_run_says_before_it_starts_which_tiles_may_not_fit(
         monkeypatch.setattr("tiler.workflow.run.machine_memory", lambda memory=memory: memory * 2**30)
         said: list[str] = []
         values = {"pointcloud": [str(tmp_path / "city" / "tiles")], "out": str(tmp_path / str(memory))}
-        record = run(make_config(values | {"tile_size": 100.0, "mesh_size": 5.0}), say=said.append)
+        config = make_config(values | {"tile_size": 100.0, "mesh_size": 5.0})
+        record = run(config, watchers=[Listener(said.append)])
         warned = [message for message in record["messages"] if "may not fit into memory" in message]
         assert bool(warned) is (memory < 1)
         assert set(warned) <= set(said)

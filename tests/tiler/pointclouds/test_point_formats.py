@@ -18,7 +18,8 @@ from tests.helpers.whole_clouds import read_points
 from tests.tiler.georeference.test_deliveries import DELIVERIES
 from tests.tiler.pointclouds.test_clouds import EVERYWHERE, ORIGIN
 from tiler.cli.main import main
-from tiler.config.config import load_config, make_config, write_config
+from tiler.config.config import make_config
+from tiler.config.config_file import load_config, write_config
 from tiler.pointclouds.clouds import find_clouds, read_header
 from tiler.pointclouds.ingest import read_cells
 from tiler.store.out_folder import command_alone

@@ -14,9 +14,9 @@ from pipeline.plane_mesh.surface_points import measure_surface
 from pipeline.quality.histograms import quality_histograms
 from pipeline.quality.quality import Quality, measure_cells
 from pipeline.quality.residuals import conclude
+from tests.helpers.columns import read_columns
 from tiler.report import samples
 from tiler.report.samples import NEAR, Samples, measure_samples
-from tiler.store.results import read_columns
 from tiler.store.store import Store
 
 

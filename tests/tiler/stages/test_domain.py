@@ -17,7 +17,8 @@ from tests.helpers.cities import crowded_blocks
 from tests.helpers.tiles import Town, hash_files, make_town, write_town
 from tests.runs.test_tiled_runs import SIZE, TILE, around, prove, prove_local
 from tiler.cli.main import main
-from tiler.config.config import Config, idle_parameters, load_config, make_config
+from tiler.config.config import Config, idle_parameters, make_config
+from tiler.config.config_file import load_config
 from tiler.config.domain_height import Domain, read_height, settle
 from tiler.config.step_options import expected_levels
 from tiler.mesh_files.vtk_files import read_vtu

@@ -22,15 +22,15 @@ from tests.helpers.programs import mesh_is_ok, read_check, run_foam
 from tests.helpers.tiles import hash_files, make_town, run_of, write_footprints, write_town
 from tiler.check.check import check_run
 from tiler.cli.main import main
-from tiler.config.config import Config, check_height, load_config, make_config
-from tiler.config.pad_widths import widths_in_metres
+from tiler.config.config import Config, check_height, make_config
+from tiler.config.config_file import load_config
+from tiler.config.domain_height import widths_in_metres
 from tiler.engine.run_context import absent_tiles, choose_tiles
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.export.export import export_run
 from tiler.mesh_files.vtk_files import read_vtu
-from tiler.planning.pad import pad_bounds, pad_grid
-from tiler.planning.region import find_pad
+from tiler.planning.region import find_pad, pad_bounds, pad_grid
 from tiler.report.plan_report import plan_run
 from tiler.stages.own_stages import list_stages
 from tiler.stages.surroundings import find_sizes

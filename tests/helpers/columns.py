@@ -1,0 +1,22 @@
+"""Columns of a tile, from the store of a run."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data.mesh import ColumnMesh
+from tiler.store.results import COLUMN_ARRAYS, unpack_columns
+from tiler.store.store import Store
+
+
+def read_columns(store: Store, tile: str) -> tuple[ColumnMesh, NDArray[np.int64]]:
+    """Read the columns of a tile.
+
+    Returns
+    -------
+    ColumnMesh
+        The mesh; `PlaneMesh.building` has rows of the second result.
+    int64, (b,)
+        Numbers of the buildings that the tile meets, ascending.
+    """
+    arrays, attributes = store.read("columns", tile, names=COLUMN_ARRAYS)
+    return unpack_columns(arrays, attributes["facts"]["order"])
