@@ -30,13 +30,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     from tiler.executors.kernels import are_compiled
 
     if not hasattr(session.config, "workerinput") and not are_compiled():
-        commands = (["tiler.cli.main", "kernels"], ["tests.helpers.compile_roofs"])
-        started = [
-            subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.DEVNULL, cwd=ROOT)
-            for words in commands
-        ]
-        for process in started:
-            process.wait()
+        command = [sys.executable, "-m", "tiler.cli.main", "kernels"]
+        subprocess.run(command, stdout=subprocess.DEVNULL, cwd=ROOT, check=False)
 
 
 @pytest.fixture(scope="session")

@@ -268,11 +268,18 @@ def _demo(options: argparse.Namespace) -> int:
     files = _write_city(out / "city", options)
     clouds, footprints = [str(path) for path in files.clouds], str(files.shapefile)
     tile_size = max(options.size / DEMO_TILES, LEAST_DEMO_TILE)
-    city = {"pointcloud": clouds, "footprints": footprints, "tile_size": tile_size, "workers": 2}
+    city = {
+        "pointcloud": clouds,
+        "footprints": footprints,
+        "tile_size": tile_size,
+        "workers": 2,
+        "roofs": "planes",
+    }
     block = {
         "pointcloud": [str(BLOCK / "cloud.laz")],
         "footprints": str(BLOCK / "footprints.geojson"),
         "mesh_size": 5.0,
+        "roofs": "planes",
     }
     pictures = {out / "demo.png": "overview", out / "tiles.png": "tiles"}
     codes = [
@@ -324,12 +331,11 @@ def _export(options: argparse.Namespace) -> int:
 
 
 def _kernels(_: argparse.Namespace) -> int:
-    from tiler.executors.kernels import WAYS, cache_folder, compile_kernels
+    from tiler.executors.kernels import cache_folder, compile_all
 
-    for way in WAYS:
-        if error := compile_kernels(way):
-            print(f"citystitch: kernels are not compiled: {printable(error)}", file=sys.stderr)
-            return EXIT_FAILED
+    if failed := compile_all():
+        print(f"citystitch: kernels are not compiled: {printable(failed[0])}", file=sys.stderr)
+        return EXIT_FAILED
     say(f"kernels are compiled for this machine, kept in {cache_folder()} and the like")
     return 0
 

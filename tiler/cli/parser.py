@@ -177,7 +177,7 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
     demo.add_argument(
         "--out", type=Path, default=Path("demo"), metavar="DIR", help="folder to write to (default: demo)"
     )
-    _add_city(demo, size=600.0, buildings=220)
+    _add_city(demo, size=600.0, buildings=220, roofs="mixed")
 
 
 def _add_inputs(parser: argparse.ArgumentParser) -> Group:
@@ -256,7 +256,7 @@ def _help(entry: "dataclasses.Field[Any]") -> str:
     return f"{data['text']} ({facts})".replace("%", "%%") if facts else data["text"]
 
 
-def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int) -> None:
+def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int, roofs: str = "flat") -> None:
     parser.add_argument("--size", type=float, default=size, help=f"side of the city in m (default: {size:g})")
     parser.add_argument("--buildings", type=int, default=buildings, help=f"their number (default: {buildings})")
     parser.add_argument("--density", type=float, default=1.5, help="points per m2 (default: 1.5)")
@@ -265,8 +265,8 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int) -
     parser.add_argument(
         "--roofs",
         choices=("flat", "mixed"),
-        default="flat",
-        help="roofs of the city; mixed: flat, shed, gable, hip, pyramid and mansard ones (default: flat)",
+        default=roofs,
+        help=f"roofs of the city; mixed: flat, shed, gable, hip, pyramid and mansard ones (default: {roofs})",
     )
 
 

@@ -1,7 +1,7 @@
 """Kernels are compiled by runs of a built-in block of houses, once for a machine and a version of the code.
 
 numba compiles a kernel at its first call and keeps it on disk. Left to that, each worker of a first run compiles
-nearly all of its 100 kernels for itself: 100 s of processor time.
+nearly all of its kernels for itself: 100 s of processor time.
 """
 
 import hashlib
@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,22 +23,24 @@ from tiler.engine.keys import code_versions
 
 BLOCK = Path(__file__).parents[1] / "demo_block"
 TILES = ("--mesh-size", "7", "--tile-size", "100")  # the block is four tiles, with seams
-# Options that have kernels of their own; a run of either mesher by default needs those of the way of that name.
+# Options that have kernels of their own; a run of either mesher by default needs those of the way of that name, one with
+# sloped roofs those of planes.
 WAYS: dict[str, tuple[str, ...]] = {
     "adaptive": (),
+    "planes": ("--roofs", "planes"),
     "layered": ("--mesher", "layered"),
     "other": ("--simplify", "paper", "--ground-filter", "--first-layer", "1", "--pad", "100", "--report"),
 }
 UNCACHED = "compiled kernels are not kept: set NUMBA_CACHE_DIR to a folder that can be written"
 
 
-def prepare(mesher: str, workers: int, say: Callable[[str], None]) -> None:
+def prepare(way: str, workers: int, say: Callable[[str], None]) -> None:
     """Compile what a run with workers needs, in a process of its own, unless that was done on this machine.
 
     Parameters
     ----------
-    mesher : str
-        Mesher of the run.
+    way : str
+        Which kernels the run needs: one of `WAYS`.
     workers : int
         Workers of the run; with none, kernels are compiled as they are called.
     say : callable
@@ -45,9 +48,9 @@ def prepare(mesher: str, workers: int, say: Callable[[str], None]) -> None:
     """
     if not numba.config.DISABLE_JIT and cache_folder() is None:
         say(UNCACHED)
-    elif workers and not are_compiled([mesher]):
+    elif workers and not are_compiled([way]):
         say("compiling kernels for this machine, once")
-        if error := compile_kernels(mesher):
+        if error := compile_kernels(way):
             say(f"kernels are compiled as they are called: {error}")
 
 
@@ -73,6 +76,14 @@ def compile_kernels(way: str) -> str:
     with suppress(OSError):  # compiled kernels are looked for again the next time
         _stamp(folder, way).touch()
     return ""
+
+
+def compile_all() -> list[str]:
+    """Compile the kernels of all ways, after the first one two at a time; gives what failed."""
+    first, *others = WAYS
+    with ThreadPoolExecutor(2) as pool:  # each waits for a process
+        failed = [compile_kernels(first), *pool.map(compile_kernels, others)]
+    return [error for error in failed if error]
 
 
 def cache_folder() -> Path | None:

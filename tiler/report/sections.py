@@ -216,11 +216,13 @@ def describe_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
         if kind in samples.points and samples.points[kind].n
     ]
     head = ["points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "99 % below (m)", "bias (m)"]
+    sloped = "roof_fit" in facts.members["fidelity"]
+    shape = "A part's roof is one plane, so chimneys" if sloped else "A part's roof has one height, so slopes"
     yield heading("The mesh's surface")
     yield paragraph(
         f"Height of ground and roofs of the mesh over LiDAR points by class{_chosen(samples)}{_thinned(samples)}; "
-        "percentiles are of absolute values, outliers count. A roof is one height a part, so slopes and dormers "
-        "show here."
+        "percentiles are of absolute values, outliers count. "
+        f"{shape} and dormers show here."
     )
     yield table("Heights of the mesh over LiDAR points", head, rows)
     found = facts.members["fidelity"]

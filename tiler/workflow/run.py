@@ -304,8 +304,9 @@ def _describe(config: Config) -> dict[str, Any]:
 
 
 def _prepare(config: Config, say: Callable[[str], None]) -> None:
+    sloped = config.roofs != "flat" and not roofs_stay_flat(config.mesher, config.simplify)
     try:
-        prepare(config.mesher, config.workers, say)
+        prepare("planes" if sloped else config.mesher, config.workers, say)
     except KeyboardInterrupt:
         raise StoppedError("stopped before the first task; the same command begins again") from None
 

@@ -154,19 +154,21 @@ def test_a_run_prepares_the_workers_of_this_machine_alone(
 ) -> None:
     asked: list[tuple[str, int]] = []
 
-    def note(mesher: str, workers: int, say: Callable[[str], None]) -> None:
-        asked.append((mesher, workers))
+    def note(way: str, workers: int, say: Callable[[str], None]) -> None:
+        asked.append((way, workers))
 
     monkeypatch.setattr("tiler.workflow.run.prepare", note)
     run(city.config(tmp_path / "0", workers=0, mesher="layered"))
     run(city.config(tmp_path / "1", workers=1))
-    assert asked == [("layered", 0), ("adaptive", 1)]
+    run(city.config(tmp_path / "2", workers=0, roofs="skeleton"))
+    run(city.config(tmp_path / "3", workers=0, roofs="planes", mesher="layered"))
+    assert asked == [("layered", 0), ("adaptive", 1), ("planes", 0), ("layered", 0)]
 
 
 def test_ctrl_c_while_kernels_are_compiled_stops_a_run(
     city: SparseCity, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def interrupted(mesher: str, workers: int, say: Any) -> None:
+    def interrupted(way: str, workers: int, say: Any) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("tiler.workflow.run.prepare", interrupted)
