@@ -23,8 +23,7 @@ from tiler.engine.keys import code_versions
 
 BLOCK = Path(__file__).parents[1] / "demo_block"
 TILES = ("--mesh-size", "7", "--tile-size", "100")  # the block is four tiles, with seams
-# Options that have kernels of their own; a run of either mesher by default needs those of the way of that name, one with
-# sloped roofs those of planes.
+# Options that have kernels of their own; a run needs those of its mesher, or of planes where its roofs are sloped.
 WAYS: dict[str, tuple[str, ...]] = {
     "adaptive": (),
     "planes": ("--roofs", "planes"),
