@@ -110,6 +110,9 @@ def cut_face(
 ) -> bool:
     """Cut a face along a line, as `walls_along` places walls; tell whether it was divided.
 
+    Where a wall would have the same face on both sides (it ends at a courtyard, say, and nothing goes on beyond),
+    everything stays as it was: later walls would pass through it.
+
     Parameters
     ----------
     half, place, count
@@ -125,7 +128,7 @@ def cut_face(
     along = np.empty(2)
     along[0], along[1] = line[0], line[1]
     walls, crossed = walls_along(a, b, along, line[2], clearance)
-    n_faces = count[FACES]
+    before, half_before = count.copy(), half[: count[HALVES]].copy()
     if count[HALVES] + WALL_ROWS * len(walls) > len(half):
         return False
     for w in range(len(walls)):
@@ -134,7 +137,13 @@ def cut_face(
         end = _find_end(half, place, count, walls[w, 1], (-dx, -dy), rows[crossed[w, 1]], crossed[w, 1] >= 0)
         if start >= 0 and end >= 0 and start != end and half[start, FACE] == half[end, FACE]:
             _add_wall(half, place, count, start, end)
-    return bool(count[FACES] > n_faces)
+    divided = count[FACES] > before[FACES]
+    for h in range(before[HALVES], count[HALVES]):
+        divided &= half[h, TWIN] < 0 or half[half[h, TWIN], FACE] != half[h, FACE]
+    if not divided:
+        half[: before[HALVES]] = half_before
+        count[:] = before
+    return bool(divided)
 
 
 @kernel

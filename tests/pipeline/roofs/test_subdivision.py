@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import shapely
 from numpy.typing import NDArray
+from shapely import affinity
 
-from pipeline.roofs.subdivision import FACES, cut_face, open_subdivision, outline_regions
+from pipeline.roofs.subdivision import FACES, HALVES, cut_face, open_subdivision, outline_regions
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -93,3 +94,24 @@ def test_a_courtyard_goes_with_the_piece_around_it() -> None:
         found = sorted(outline(net, house, [0, 1]), key=lambda piece: float(piece.centroid.x))
         assert [len(piece.interiors) for piece in found] == [1, 0]
         assert [piece.area for piece in found] == [30 * x - 100, 30 * (40 - x)]
+
+
+def test_walls_around_courtyards_leave_valid_faces_that_cover_the_house() -> None:
+    """A wall that ends at a courtyard and divides nothing would be crossed by later ones."""
+    rng = np.random.default_rng(4)
+    for _ in range(60):
+        x, y = rng.uniform(4, 10, 2)
+        yard = affinity.rotate(shapely.box(x, y, x + rng.uniform(2, 6), y + rng.uniform(2, 6)), rng.uniform(0, 90))
+        house = shapely.Polygon(shapely.box(0, 0, 22, 20).exterior, [yard.exterior])
+        net = open_net(house)
+        for _ in range(14):
+            angle, face = rng.choice([0.1, 0.9, 0.1 + np.pi / 2]), int(rng.integers(net[2][FACES]))
+            line = (np.cos(angle), np.sin(angle), rng.uniform(-22, 22))
+            n_faces, n_halves = net[2][FACES], net[2][HALVES]
+            divided = cut_face(*net, face, line, 1.5)
+            assert divided == (net[2][FACES] > n_faces)
+            assert divided or net[2][HALVES] == n_halves
+        pieces = outline(net, house, list(range(net[2][FACES])))
+        assert all(piece.is_valid for piece in pieces)
+        assert sum(piece.area for piece in pieces) == pytest.approx(house.area)
+        assert shapely.union_all(pieces).area == pytest.approx(house.area)
