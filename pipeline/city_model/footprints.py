@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
-from pipeline.data.roof_forms import form_order
 from pipeline.geometry.holes import fill_holes, list_holes
 from pipeline.geometry.rings import drop_needless_vertices, make_canonical, sort_canonically
 
@@ -207,7 +206,7 @@ def _drop_small(parts: _Parts, min_area: float, notes: list[Note]) -> _Parts:
 
 def _drop_duplicates(parts: _Parts, notes: list[Note]) -> _Parts:
     """Keep of bitwise equal polygons the one with the smallest id, then the smallest known height and form."""
-    ordered = parts.take(np.lexsort((*form_order(parts.forms), parts.given_height, parts.ids)))
+    ordered = parts.take(np.lexsort((*parts.forms.T, parts.given_height, parts.ids)))
     blobs = np.array(shapely.to_wkb(ordered.polygons, byte_order=1), dtype=object)
     _, first, group = (
         np.unique(blobs, return_index=True, return_inverse=True) if len(blobs) else 3 * (np.zeros(0, int),)

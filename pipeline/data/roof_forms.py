@@ -19,8 +19,3 @@ POINTS_TELL, TOO_LOW, NO_SKELETON, NO_HEIGHT = -2, -3, -4, -5
 def no_forms(n: int) -> NDArray[np.float64]:
     """Give n footprints no form, float64 (n, 6)."""
     return np.full((n, N_COLUMNS), np.nan)
-
-
-def form_order(forms: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Columns of forms as keys for `numpy.lexsort`: they tell footprints apart that differ in nothing else."""
-    return [forms[:, column] for column in range(N_COLUMNS)]

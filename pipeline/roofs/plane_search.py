@@ -203,7 +203,7 @@ def regularise(xyz: Array, plane: tuple[float, float, float], along: Array) -> t
         return plane
     slope = math.hypot(a, b)
     if slope < FLAT:
-        return 0.0, 0.0, _height_along(xyz, weight, 0.0, 0.0)[1]
+        return 0.0, 0.0, slope_along(xyz, weight, 0.0, 0.0)[1]
     best, up_x, up_y = SNAP, 0.0, 0.0
     for d in range(len(along)):
         for x, y in ((-along[d, 1], along[d, 0]), (along[d, 0], along[d, 1])):
@@ -212,13 +212,13 @@ def regularise(xyz: Array, plane: tuple[float, float, float], along: Array) -> t
                 best, up_x, up_y = q, x, y
     if up_x == 0 and up_y == 0:
         return plane
-    s, height = _height_along(xyz, weight, up_x, up_y)
+    s, height, _ = slope_along(xyz, weight, up_x, up_y)
     return s * up_x, s * up_y, height
 
 
 @kernel
-def _height_along(xyz: Array, weight: Array, up_x: float, up_y: float) -> tuple[float, float]:
-    """Slope along a direction and height at the origin of weighted points, by least squares."""
+def slope_along(xyz: Array, weight: Array, up_x: float, up_y: float) -> tuple[float, float, float]:
+    """Slope along a direction and height at the origin of weighted points, by least squares; variance along it."""
     w = wt = wtt = wz = wtz = 0.0
     for p in range(len(xyz)):
         t, z, u = up_x * xyz[p, 0] + up_y * xyz[p, 1], xyz[p, 2], weight[p]
@@ -229,4 +229,4 @@ def _height_along(xyz: Array, weight: Array, up_x: float, up_y: float) -> tuple[
         wtz += u * t * z
     spread = wtt - wt * wt / w
     slope = (wtz - wt * wz / w) / spread if spread > 1e-9 else 0.0
-    return slope, (wz - slope * wt) / w
+    return slope, (wz - slope * wt) / w, spread / w

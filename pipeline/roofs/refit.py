@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pipeline.data.kernel import kernel
 from pipeline.data.roofs import Roofs
 from pipeline.geometry.group_order import order_values, percentile_by_group, sort_points
-from pipeline.roofs.plane_search import BAND
+from pipeline.roofs.plane_search import BAND, slope_along
 from pipeline.roofs.roof_points import RoofPoints
 
 LIMIT_SHARE = 0.02  # of a part's points may lie beyond its limits, on either side
@@ -115,28 +115,20 @@ def _refit_slope(
 ) -> tuple[float, float]:
     """Slope along a direction and height at the origin, by the points near the plane."""
     found_slope, found_height, least = slope, height, math.inf
+    weight = np.empty(len(xyz))
     for _ in range(ROUNDS + 1):
-        n = mean_t = mean_z = far = 0.0
+        n, far = 0.0, 0.0
         for p in range(len(xyz)):
-            t, z = up[0] * xyz[p, 0] + up[1] * xyz[p, 1], xyz[p, 2]
-            r = abs(z - slope * t - height)
+            r = abs(xyz[p, 2] - slope * (up[0] * xyz[p, 0] + up[1] * xyz[p, 1]) - height)
             far += min(r, NEAR) ** 2
-            if r < NEAR:
-                n, mean_t, mean_z = n + 1, mean_t + t, mean_z + z
+            weight[p] = 1.0 if r < NEAR else 0.0
+            n += weight[p]
         if far >= least:
             break
         found_slope, found_height, least = slope, height, far
         if n < max(MIN_REFIT, LEAST_SHARE * len(xyz)):
             break
-        mean_t, mean_z = mean_t / n, mean_z / n
-        tt = tz = 0.0
-        for p in range(len(xyz)):
-            t, z = up[0] * xyz[p, 0] + up[1] * xyz[p, 1], xyz[p, 2]
-            if abs(z - slope * t - height) < NEAR:
-                tt += (t - mean_t) ** 2
-                tz += (t - mean_t) * (z - mean_z)
-        if tt < n * LEAST_SPREAD**2 or not 0 < tz <= max_slope * tt:
+        slope, height, variance = slope_along(xyz, weight, up[0], up[1])
+        if variance < LEAST_SPREAD**2 or not 0 < slope <= max_slope:
             break
-        slope = tz / tt
-        height = mean_z - slope * mean_t
     return found_slope, found_height

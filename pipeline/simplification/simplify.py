@@ -195,7 +195,8 @@ def _raise_planar(
         made = _settle_flat(shapes, heights, wall_ground, ids, options)
     else:
         made = _fit_sloped(
-            (take_roofs(houses.roofs, shapes.member), houses.form[row] >= 0),
+            take_roofs(houses.roofs, shapes.member),
+            houses.form[row] >= 0,
             shapes,
             heights,
             wall_ground,
@@ -249,7 +250,8 @@ def _settle_flat(
 
 
 def _fit_sloped(
-    houses: tuple[Roofs, NDArray[np.bool_]],
+    roofs: Roofs,
+    formed: NDArray[np.bool_],
     shapes: Shapes,
     heights: Heights,
     wall_ground: NDArray[np.float64],
@@ -258,9 +260,8 @@ def _fit_sloped(
 ) -> _Raised:
     """Every part keeps its plane, fitted to the points of its face; where it has none, one height.
 
-    Roofs of forms that are given, as the second of `houses` tells, keep theirs as a whole.
+    Roofs of a given form (`formed`) stay as they are, as a whole.
     """
-    roofs, formed = houses
     if roof_points is not None:
         fitted = refit_roofs(roofs, shapes.polygons, roof_points, max_slope=RoofOptions.max_slope)
         roofs = choose_roofs(formed, roofs, fitted)

@@ -9,14 +9,6 @@ from tiler.store.store import Store
 
 
 def read_columns(store: Store, tile: str) -> tuple[ColumnMesh, NDArray[np.int64]]:
-    """Read the columns of a tile.
-
-    Returns
-    -------
-    ColumnMesh
-        The mesh; `PlaneMesh.building` has rows of the second result.
-    int64, (b,)
-        Numbers of the buildings that the tile meets, ascending.
-    """
+    """Read the columns of a tile, as `unpack_columns` gives them."""
     arrays, attributes = store.read("columns", tile, names=COLUMN_ARRAYS)
     return unpack_columns(arrays, attributes["facts"]["order"])

@@ -1,5 +1,6 @@
 """Ids and heights of footprints by the attributes of a file (step 1.2)."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,17 @@ def find_attribute(info: Layer, asked: str) -> str:
     """
     tags = find_osm_tags(info.fields)
     known = {*info.fields, info.fid_name} | ({"height", "building:levels"} if tags else set())
+    return known_attribute(info, asked, known)
+
+
+def known_attribute(info: Layer, asked: str, known: Collection[str]) -> str:
+    """Give the attribute that is asked for if it is a known one, ``""`` for a layer without features.
+
+    Raises
+    ------
+    ConfigError
+        If it is none of these.
+    """
     if asked and asked not in known:
         if info.n_features == 0:
             return ""

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.errors import ConfigError
 from pipeline.data.roof_forms import ACROSS, DIRECTION, HEIGHT, ROOF_SHAPES, SHAPE, SLOPE, no_forms
+from tiler.footprints.footprint_attributes import known_attribute
 from tiler.vectors.features import Features
-from tiler.vectors.gdal_layer import list_some
 from tiler.vectors.layers import Layer
 from tiler.vectors.lengths import metres_of, number_of
 from tiler.vectors.osm_tags import STOREY, find_osm_tags, tags_of
@@ -79,13 +78,12 @@ def find_roof_attributes(layer: Layer, asked: str) -> dict[str, str]:
     ConfigError
         If there is no such attribute.
     """
-    if asked and asked not in layer.fields and layer.n_features != 0:
-        raise ConfigError(f"{layer.path}: has no attribute {asked!r}; it has: {list_some(layer.fields)}")
+    asked = known_attribute(layer, asked, layer.fields)
     plain = {_plain(field): field for field in reversed(layer.fields)}
     short = {_plain(field): field for field in reversed(layer.fields) if len(field) == _SHP_NAME}
     names = {key: plain.get(_plain(key), short.get(_plain(key[:_SHP_NAME]), "")) for key in ROOF_KEYS}
     found = {key: name for key, name in names.items() if name}
-    if asked in layer.fields:
+    if asked:
         return found | {"roof:shape": asked}
     if "roof:shape" in found:
         return found

@@ -314,35 +314,11 @@ def _lay_soil(
     options: SoilOptions,
     sizes: SizeField | None,
 ) -> tuple[SoilMesh, SeamEdges, NDArray[np.int64]]:
-    """Put a tile's columns of air on columns of soil.
+    """Put a tile's columns of air on columns of soil, as `add_soil` does with those that seams give.
 
-    Parameters
-    ----------
-    columns : ColumnMesh
-        The air.
-    terrain : float64, (n,)
-        Terrain at its vertices (m).
-    edges : SeamEdges
-        Its seams, with levels of the air.
-    shared : sequence of int32, (k,)
-        Vertices of each seam, and of each end of one that is given alone.
-    air : SeamColumns
-        Their columns of air, each once.
-    soil : sequence of Levels
-        Their columns of soil, in the order of `shared`.
-    options : SoilOptions
-        Parameters.
-    sizes : SizeField, optional
-        Sizes in the plane, where they are graded.
-
-    Returns
-    -------
-    SoilMesh
-        Columns of both.
-    SeamEdges
-        The seams, with levels of these.
-    int64, (k,)
-        Vertices at which terrain inside a house was lowered.
+    `shared` has the vertices of each seam, and of each end of one that is given alone; `air` has their columns,
+    each once, and `soil` those of soil in the order of `shared`. Gives the columns of both, the seams with levels
+    of these, and the vertices at which terrain inside a house was lowered.
     """
     vertex, first = np.unique(np.concatenate([np.empty(0, np.int32), *shared]), return_index=True)
     below = SeamColumns(vertex, take_columns(join_levels(soil), first.astype(np.int32)))
