@@ -14,9 +14,9 @@ from pipeline.roofs.roof_points import RoofPoints
 LIMIT_SHARE = 0.02  # of a part's points may lie beyond its limits, on either side
 LIMIT_ROOM = 0.5  # m, between these points and the limits
 MIN_REFIT = 6  # points that move a face
-MIN_SLOPED = 12  # points that change its slope
-MAX_MOVE = 1.0  # m, from the median to where points are densest
-LEAST_SHARE = 0.3  # of the points are there
+MIN_SLOPED = 12  # points of a face that change its slope
+MAX_MOVE = 1.0  # m, from the median to the mean of the densest points
+LEAST_SHARE = 0.3  # of a face's points, in the densest band and near a plane whose slope is fitted
 NEAR = 0.5  # m, from the plane: points that a slope is fitted to
 ROUNDS = 4
 LEAST_SPREAD = 0.5  # m, standard deviation of these points along the slope
@@ -47,10 +47,10 @@ def refit_roofs(roofs: Roofs, polygons: NDArray[np.object_], points: RoofPoints,
     Notes
     -----
     1. The plane moves by the median of the points over it.
-    2. It moves on to where points are densest (half of them may be another roof, or a façade): the middle of
-       those in the band of `plane_search` that holds most, if these are `LEAST_SHARE` and within `MAX_MOVE`.
-    3. A slope is fitted to the points near the plane, along its own direction, so ridges stay level; again as long
-       as the squares of distances, up to `NEAR` each, fall. `MIN_SLOPED` points are needed.
+    2. It moves on to the mean of the densest points, since a façade or another roof pulls the median: those in the
+       band of ``2 * BAND`` that holds most, if it holds `LEAST_SHARE` of all and its mean is within `MAX_MOVE`.
+    3. With `MIN_SLOPED` points, the slope is fitted to the points within `NEAR` of the plane. Its direction stays,
+       so that ridges stay level. This is repeated as long as the sum of squared distances, each up to `NEAR`, falls.
 
     O(n log n) for the n points of a face.
     """
