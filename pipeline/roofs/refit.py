@@ -50,7 +50,8 @@ def refit_roofs(roofs: Roofs, polygons: NDArray[np.object_], points: RoofPoints,
     2. It moves on to the mean of the densest points, since a façade or another roof pulls the median: those in the
        band of ``2 * BAND`` that holds most, if it holds `LEAST_SHARE` of all and its mean is within `MAX_MOVE`.
     3. With `MIN_SLOPED` points, the slope is fitted to the points within `NEAR` of the plane. Its direction stays,
-       so that ridges stay level. This is repeated as long as the sum of squared distances, each up to `NEAR`, falls.
+       so that ridges stay level. This is repeated as long as the sum of squared distances, each up to `NEAR`,
+       falls.
 
     O(n log n) for the n points of a face.
     """
