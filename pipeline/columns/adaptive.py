@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.columns.growth import Growth, movable_height
-from pipeline.columns.improve_columns import improve_columns
+from pipeline.columns.improve_columns import WORST, improve_columns
 from pipeline.columns.levels import fill_levels, stagger_columns
 from pipeline.columns.nodes import (
     FREE,
@@ -36,6 +36,7 @@ from pipeline.plane_mesh.sizes import SizeField, local_sizes
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 
 HEADROOM = 0.5  # of the largest spacing: least air between a roof and the domain's top
+WORST_SLOPED = 0.55  # as `WORST`, where roofs slope
 MOVED = 1e-9  # m; a roof that a node is closer to than this is exact
 
 
@@ -54,7 +55,7 @@ class AdaptiveOptions:
     stagger : float
         By how much neighbouring columns are shifted against each other: 0 for none, 1 for thirds of a step.
     passes : int
-        Rounds of moving levels at the worst cells.
+        Rounds of moving levels at the worst cells; one more where roofs slope, whose keys change by it.
     growth : Growth or None
         How the vertical spacing grows from the ground up to the limits; None: it is the same at all heights.
     top : float or None
@@ -87,6 +88,8 @@ class AdaptiveReport:
         Roofs that stand higher or lower in a column than they should: joined with others or parted from them.
     largest_move : float
         By how much at most (m).
+    eased_nodes : int
+        Roofs that were moved in a column for its cells, by `Weld.slack` at most.
     joined_for_order : int
         Roofs that were joined at one end of an edge, since they change order along it.
     crossed_edges : int
@@ -106,6 +109,7 @@ class AdaptiveReport:
     shared_columns: int
     moved_nodes: int
     largest_move: float
+    eased_nodes: int
     joined_for_order: int
     crossed_edges: int
     keyed_levels: int
@@ -134,7 +138,8 @@ def mesh_adaptive(
         Terrain, as far beyond the plane mesh as `top_reach` says.
     roofs : Roofs
         Roof of each building, row by row those of `PlaneMesh.building`. Where two of them meet in a vertex at less
-        than the least step of `AdaptiveOptions.weld`, both are moved there. All others are exact.
+        than the least step of `AdaptiveOptions.weld`, both are moved there, and at outlines one may be moved where
+        cells would be bad. All others are exact.
     ids : str, (b,)
         Building ids, for messages.
     options : AdaptiveOptions
@@ -155,30 +160,42 @@ def mesh_adaptive(
     seam = no_seam() if seam is None else seam
     levels, bottom, moves = _fill_columns(plane, dtm, roofs, ids, options, seam, sizes)
     mesh = ColumnMesh(plane, levels.start, levels.z, bottom, "heights")
-    free = levels.kind == FREE
-    count, n_shared = np.diff(levels.start), _count_shared(levels)
     given = np.zeros(len(plane.xy), np.bool_)
     given[seam.vertex] = True
-    free &= ~np.repeat(given, count)
     size = local_sizes(sizes, plane.xy, mesh_size=options.mesh_size)
     spacing = vertical_spacing(mean_edges(plane), size, options.limits)
-    if options.growth is not None:
-        lowest = sample_dtm(dtm, plane.xy) + movable_height(spacing, options.growth)
-        free &= levels.z > np.repeat(lowest, count)
+    surfaces = collect_surfaces(plane, bottom)
+    outline = np.diff(surfaces.start) > 1
+    slack = _level_slack(levels, outline, given, sample_dtm(dtm, plane.xy), spacing, options)
+    surface = levels.start[:-1].repeat(np.diff(surfaces.start)) + surfaces.level
+    n_shared, home = _count_shared(levels), levels.z
     del levels  # its kinds are of no use any more
     # Level tops of walls are never passed by: without sloped roofs there is nothing to see to.
     gates = np.empty((0, 2, 2), np.int64) if options.weld is None else wall_gates(mesh)
-    mesh, _ = _key_columns(mesh, seam, given, gates)
+
+    def key_anew(mesh: ColumnMesh) -> ColumnMesh:
+        return _key_columns(replace(mesh, key=None), seam, given, gates)[0]
+
+    sloped = options.weld is not None
     mesh, worst, improved = improve_columns(
-        mesh, free, spacing, passes=options.passes, flat_cells=options.growth is not None
+        key_anew(mesh),
+        home,
+        slack,
+        spacing,
+        passes=options.passes + (sloped and options.passes > 0),
+        worst=WORST_SLOPED if sloped else WORST,
+        rekey=key_anew if sloped else None,
+        flat_cells=options.growth is not None,
     )
     mesh, passed = _key_columns(mesh, seam, given, gates)  # levels beside walls moved
+    eased = mesh.z[surface] - home[surface]
     report = AdaptiveReport(
         n_columns=len(plane.xy),
         n_levels=len(mesh.z),
         shared_columns=n_shared,
-        moved_nodes=int((np.abs(moves.distance) > MOVED).sum()),
-        largest_move=float(np.abs(moves.distance).max(initial=0.0)),
+        moved_nodes=int((np.abs(moves.distance + eased) > MOVED).sum()),
+        largest_move=float(np.abs(moves.distance + eased).max(initial=0.0)),
+        eased_nodes=int((eased != 0).sum()),
         joined_for_order=moves.joined_for_order,
         crossed_edges=moves.crossed,
         keyed_levels=0 if mesh.key is None else int((mesh.key != mesh.z).sum()),
@@ -258,6 +275,29 @@ def highest_roofs(plane: PlaneMesh, roofs: Roofs) -> NDArray[np.float64]:
     highest = np.full(len(roofs), -np.inf)
     np.maximum.at(highest, building, roof_heights(roofs, building, plane.xy[plane.triangles[inside].ravel()]))
     return highest
+
+
+def _level_slack(
+    levels: Levels,
+    outline: NDArray[np.bool_],
+    given: NDArray[np.bool_],
+    ground: NDArray[np.float64],
+    spacing: NDArray[np.float64],
+    options: AdaptiveOptions,
+) -> NDArray[np.float64]:
+    """How far each level may be moved for its cells (m): free ones anywhere, roofs a little at their outlines.
+
+    Columns that are given stay, and so do roofs that stand as low over the terrain as they may, and thin layers.
+    """
+    column = np.repeat(np.arange(len(given)), np.diff(levels.start))
+    slack = np.where(levels.kind == FREE, np.inf, 0.0)
+    if options.weld is not None:
+        high = levels.z >= ground[column] + options.weld.clearance + options.weld.slack
+        slack[(levels.kind == ROOF_LEVEL) & outline[column] & high] = options.weld.slack
+    slack[given[column]] = 0.0
+    if options.growth is not None:
+        slack[levels.z <= (ground + movable_height(spacing, options.growth))[column]] = 0.0
+    return slack
 
 
 def _key_columns(

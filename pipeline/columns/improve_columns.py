@@ -1,10 +1,12 @@
-"""Optimisation of adaptive columns: free levels near the worst cells move up or down (ours, after step 3.5).
+"""Optimisation of adaptive columns: levels near the worst cells move up or down (ours, after step 3.5).
 
-Plane coordinates, ground, roofs, top and seams stay, so the pass cannot open a mesh. A cell's worth is its
-radius ratio; what is minimised around a level is the sum of its inverse's eighth powers, which the worst
-cell dominates. Then the columns are merged anew at their new heights.
+Plane coordinates, ground, top and seams stay, so the pass cannot open a mesh. A cell's worth is its radius ratio;
+what is minimised around a level is the sum of its inverse's eighth powers, which the worst cell dominates. Where
+sloped roofs meet, their levels may move too, a little way and at a price. Then the columns are merged anew at
+their new heights; columns whose cells have become worse by that go back.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -17,35 +19,48 @@ from pipeline.data.mesh import ColumnMesh
 from pipeline.plane_mesh.plane import signed_areas
 
 WORST = 0.5  # levels of cells with a radius ratio below this may move
+WORST_ROOF = 0.2  # roofs of cells below this may move
+BAD = 0.3  # cells below this must not be worse than the worst one around them was
 SEARCH_SWEEPS = 10
 FIRST_STEP = 0.15  # of the column's spacing
 LAST_STEP = 0.02  # of the first step
+HALF_RETURNS, RETURNS = 2, 10  # times that columns go back half of their way, and at all
+PULL = 1000.0  # what a move by all of a level's slack costs: as a cell with a radius ratio of 0.42
 MOST_LEVELS = 20_000  # that are searched together: some 400 bytes each, for the cells around them
 
 
 def improve_columns(
     mesh: ColumnMesh,
-    free: NDArray[np.bool_],
+    home: NDArray[np.float64],
+    slack: NDArray[np.float64],
     spacing: NDArray[np.float64],
     *,
     passes: int,
+    worst: float = WORST,
+    rekey: Callable[[ColumnMesh], ColumnMesh] | None = None,
     flat_cells: bool = False,
 ) -> tuple[ColumnMesh, tuple[float, float], int]:
-    """Move free levels at the worst cells along their columns.
+    """Move levels at the worst cells along their columns.
 
     Parameters
     ----------
     mesh : ColumnMesh
         Columns that ascend.
-    free : bool, (z_start[-1],)
-        Levels that may move.
+    home : float64, (z_start[-1],)
+        Where each level should be (m).
+    slack : float64, (z_start[-1],)
+        How far each may be from there (m): 0 for those that stay, inf for those that are free.
     spacing : float64, (n,)
         Distance of levels in each column (m), which scales the search.
     passes : int
         Rounds of searching and merging; 0 returns the mesh as it is.
+    worst : float
+        Levels of cells with a radius ratio below this may move.
+    rekey : callable, optional
+        Gives a mesh whose levels moved the keys of the next round; without it keys move with their levels.
     flat_cells : bool
-        Cells without a free level are flat on purpose, as those of a thin first layer: they do not count where the
-        rounds are compared.
+        Cells without a level that moves are flat on purpose, as those of a thin first layer: they do not count
+        where the meshes before and after are compared.
 
     Returns
     -------
@@ -58,22 +73,25 @@ def improve_columns(
 
     Notes
     -----
-    Keys move with their levels. Merging anew changes cells beside those that were looked at; of all rounds, the
-    mesh with the least sum over all its cells is kept. Memory is that of the levels, and of the cells around those
-    that may move, an area after the other where they are many: all others are made and measured a triangle at a
-    time.
+    Merging anew changes cells beside those that were looked at: where a cell below `BAD` is worse than all around
+    it were, the columns of its triangle go back, half of the way first. A round after which the sum over all cells
+    is no less is the last one, and is dropped. Memory is that of the levels, and of the cells around those that
+    may move, an area after the other where they are many: all others are made and measured a triangle at a time.
     """
-    survey = ColumnSurvey(mesh, free, flat_cells)
-    best, least_cost = mesh, survey.cost
-    before = after = survey.worst
-    n_moved = 0
+    survey = ColumnSurvey(mesh, home, slack, flat_cells, worst)
+    before, n_moved = survey.worst, 0
     for k in range(passes):
+        cost, least = survey.cost, survey.worst
         z, moved = survey.search(FIRST_STEP * spacing)
         n_moved += moved
-        survey.move(z, last=k == passes - 1)
-        if survey.cost < least_cost:
-            best, least_cost, after = replace(mesh, z=z, key=survey.key), survey.cost, survey.worst
-    return best, (before, after), n_moved
+        survey.move(z)
+        if not survey.cost < cost:
+            return mesh, (before, least), n_moved
+        mesh = replace(mesh, z=survey.z, key=survey.key)
+        if k < passes - 1:
+            mesh = mesh if rekey is None else rekey(mesh)
+            survey = ColumnSurvey(mesh, home, slack, flat_cells, worst)
+    return mesh, (before, survey.worst), n_moved
 
 
 def split_columns(xy: NDArray[np.float64], count: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:
@@ -118,26 +136,36 @@ class ColumnSurvey:
 
     Parameters
     ----------
-    mesh, free, flat_cells
+    mesh, home, slack, flat_cells, worst
         As for `improve_columns`.
 
     Attributes
     ----------
+    z : float64, (z_start[-1],)
+        Heights of the levels (m).
     of_cells : float64, (m,)
         What the search minimises, of the cells over each triangle that count.
     least : float64, (m,)
         Smallest radius ratio over each triangle; negative where a cell is inverted.
     bad : bool, (z_start[-1],)
-        Levels of cells that are worse than `WORST`.
+        Levels of cells that are worse than `worst`; roofs of those that are worse than `WORST_ROOF`.
     """
 
-    def __init__(self, mesh: ColumnMesh, free: NDArray[np.bool_], flat_cells: bool) -> None:
+    def __init__(
+        self,
+        mesh: ColumnMesh,
+        home: NDArray[np.float64],
+        slack: NDArray[np.float64],
+        flat_cells: bool,
+        worst: float = WORST,
+    ) -> None:
         m = len(mesh.plane.triangles)
-        self._mesh, self._free, self._flat_cells = mesh, free, flat_cells
+        self._mesh, self._home, self._slack, self._flat_cells = mesh, home, slack, flat_cells
+        self._worst = worst
         self._clockwise = signed_areas(mesh.plane) < 0
         self._n_cells = count_by_triangle(mesh)
         self._most = int(self._n_cells.max(initial=0))
-        self._z = mesh.z
+        self.z = mesh.z
         self._lift = None if mesh.key is None else mesh.key - mesh.z
         self.of_cells, self.least = np.empty(m), np.empty(m)
         self._measure(np.ones(m, np.bool_))
@@ -145,7 +173,7 @@ class ColumnSurvey:
     @property
     def key(self) -> NDArray[np.float64] | None:
         """Keys of the mesh at its heights, None where these are its keys."""
-        return None if self._lift is None else self._z + self._lift
+        return None if self._lift is None else self.z + self._lift
 
     @property
     def cost(self) -> float:
@@ -158,10 +186,10 @@ class ColumnSurvey:
         return float(self.least.min())
 
     def search(self, first_step: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-        """Move free levels of bad cells, by first steps of each column (m): all heights, and how many moved."""
+        """Move levels of bad cells, by first steps of each column (m): all heights, and how many moved."""
         xy, triangles = self._mesh.plane.xy, self._mesh.plane.triangles
-        z, n_moved = self._z.copy(), 0
-        level = np.flatnonzero(self.bad & self._free)
+        z, n_moved = self.z.copy(), 0
+        level = np.flatnonzero(self.bad & (self._slack > 0))
         column = self._columns_of(level)
         count = np.bincount(column, minlength=len(xy))
         place = np.full(len(z), -1, np.int32)  # of each level among those that are searched together
@@ -175,19 +203,32 @@ class ColumnSurvey:
             cells, over = _gather(*self._merged(), wanted, self._most, self._clockwise, place, room)
             around = _cells_of_levels(cells, place, len(searched))
             place[searched] = -1
-            step = first_step[column[part]]
-            n_moved += _search(xy, triangles, self._clockwise, z, cells, over, searched, *around, step)
+            way = (first_step[column[part]], self._home[searched], self._slack[searched])
+            n_moved += _search(xy, triangles, self._clockwise, z, cells, over, searched, *around, *way)
         return z, n_moved
 
-    def move(self, z: NDArray[np.float64], *, last: bool) -> None:
-        """Take other heights; after the last search nobody asks which levels are bad."""
+    def move(self, z: NDArray[np.float64]) -> None:
+        """Take other heights, but for columns where a bad cell is worse than all around it were."""
+        triangles, old_z = self._mesh.plane.triangles, self.z
+        around = np.full(len(self._mesh.plane.xy), np.inf)
+        np.minimum.at(around, triangles.ravel(), np.repeat(self.least, 3))
+        least = np.minimum(around[triangles].min(axis=1), BAD)
+        self._take(z)
+        for k in range(RETURNS):
+            worse = self.least < least
+            if not worse.any():
+                break
+            back = np.zeros(len(self._mesh.plane.xy), np.bool_)
+            back[triangles[worse]] = True
+            way = 0.5 * (old_z + self.z) if k < HALF_RETURNS else old_z
+            self._take(np.where(np.repeat(back, np.diff(self._mesh.z_start)), way, self.z))
+
+    def _take(self, z: NDArray[np.float64]) -> None:
+        """Take other heights and measure the cells around those that moved."""
         moved = np.zeros(len(self._mesh.plane.xy), np.bool_)
-        moved[self._columns_of(np.flatnonzero(z != self._z))] = True
-        again = self._touch(moved)
-        self._z = z
-        if not last:
-            again |= self.least < WORST
-        self._measure(again)
+        moved[self._columns_of(np.flatnonzero(z != self.z))] = True
+        self.z = z
+        self._measure(self._touch(moved))
 
     def _columns_of(self, level: NDArray[np.int64]) -> NDArray[np.int64]:
         """Column of each of some levels (k,)."""
@@ -200,20 +241,21 @@ class ColumnSurvey:
 
     def _merged(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64], NDArray[np.float64], bool]:
         mesh, key = self._mesh, self.key
-        key = self._z if key is None else key
+        key = self.z if key is None else key
         return mesh.plane.triangles, mesh.bottom, mesh.z_start, key, mesh.order == "heights"
 
     def _measure(self, wanted: NDArray[np.bool_]) -> None:
-        self.bad = np.zeros(len(self._z), np.bool_)
+        self.bad = np.zeros(len(self.z), np.bool_)
         _survey(
             *self._merged(),
             wanted,
             self._most,
             self._clockwise,
             self._mesh.plane.xy,
-            self._z,
-            self._free,
+            self.z,
+            self._slack,
             self._flat_cells,
+            self._worst,
             self.of_cells,
             self.least,
             self.bad,
@@ -303,8 +345,9 @@ def _survey(
     clockwise: NDArray[np.bool_],
     xy: NDArray[np.float64],
     z: NDArray[np.float64],
-    free: NDArray[np.bool_],
+    slack: NDArray[np.float64],
     flat_cells: bool,
+    worst: float,
     of_cells: NDArray[np.float64],
     least: NDArray[np.float64],
     bad: NDArray[np.bool_],
@@ -323,10 +366,11 @@ def _survey(
         for i in range(n):
             least[t] = min(least[t], ratio[i])
             a, b, c, d = cells[i]
-            if not flat_cells or free[a] or free[b] or free[c] or free[d]:
+            if not flat_cells or slack[a] > 0 or slack[b] > 0 or slack[c] > 0 or slack[d] > 0:
                 of_cells[t] += _inverse_power(ratio[i])
-            if ratio[i] < WORST:
-                bad[a] = bad[b] = bad[c] = bad[d] = True
+            if ratio[i] < worst:
+                for level in (a, b, c, d):
+                    bad[level] |= ratio[i] < WORST_ROOF or slack[level] == np.inf
 
 
 @kernel
@@ -404,6 +448,13 @@ def _cost(at: NDArray[np.float64], row: NDArray[np.int64], z: float, n: int, rat
 
 
 @kernel
+def _price(way: float, slack: float) -> float:
+    """What it costs that a level is so far from home: nothing where it is free."""
+    part = way / slack
+    return float(PULL * part * part) if abs(part) <= 1 else np.inf
+
+
+@kernel
 def _search(
     xy: NDArray[np.float64],
     triangles: NDArray[np.int32],
@@ -415,8 +466,13 @@ def _search(
     start: NDArray[np.int64],
     of_level: NDArray[np.int32],
     first_step: NDArray[np.float64],
+    home: NDArray[np.float64],
+    slack: NDArray[np.float64],
 ) -> int:
-    """Try a step up or down at each level in turn, the last good direction first; heights are moved in place."""
+    """Try a step up or down at each level in turn, the last good direction first; heights are moved in place.
+
+    Level ``level[k]`` may be ``slack[k]`` from ``home[k]``, and the way there has a price.
+    """
     step = first_step.copy()
     moved = np.zeros(len(level), np.bool_)
     most = 0
@@ -437,14 +493,15 @@ def _search(
                     if cell[c] == p:
                         row[i] = 3 * c + 2
             height = z[p]
-            here = _cost(at, row, height, n, ratio)
-            if _cost(at, row, height + step[k], n, ratio) < here:
-                z[p] = height + step[k]
+            here = _cost(at, row, height, n, ratio) + _price(height - home[k], slack[k])
+            up, down = height + step[k], height - step[k]
+            if _cost(at, row, up, n, ratio) + _price(up - home[k], slack[k]) < here:
+                z[p] = up
                 step[k] *= 1.25
                 moved[k] = True
                 continue
-            if _cost(at, row, height - step[k], n, ratio) < here:
-                z[p] = height - step[k]
+            if _cost(at, row, down, n, ratio) + _price(down - home[k], slack[k]) < here:
+                z[p] = down
                 step[k] *= -1.25
                 moved[k] = True
                 continue

@@ -49,12 +49,15 @@ class Weld:
         Limits of that step (m).
     clearance : float
         Least height of a roof above the terrain at a wall (m).
+    slack : float
+        How far roofs may be moved at a vertex where cells would be bad (m).
     """
 
     factor: float = 0.7
     least: float = 1.0
     most: float = 2.5
     clearance: float = 2.0
+    slack: float = 1.0
 
 
 def flat_roofs(height: NDArray[np.float64]) -> Roofs:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
+from pipeline.columns.adaptive import AdaptiveOptions, AdaptiveReport, mesh_adaptive
 from pipeline.columns.columns import count_cells, lowest_gap
 from pipeline.columns.layered import mesh_layers
 from pipeline.columns.nodes import Levels, SeamColumns, join_levels, take_columns
@@ -59,6 +59,7 @@ from tiler.stages.seam_tables import (
     unpack_soil,
 )
 from tiler.stages.surroundings import find_sizes, halos, read_surroundings, terrain_around, terrain_halo
+from tiler.store.run_folder import EASED
 
 
 def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
@@ -206,11 +207,13 @@ def make_columns(task: Task) -> Facts:
         shared_id=np.concatenate([np.empty(0, np.int64), *lowest]),
     )
     underground = {} if soil is None else {"soil": {"depth (m)": soil.depth, "cells": n_cells}}
+    eased = {EASED: report.eased_nodes} if isinstance(report, AdaptiveReport) and report.eased_nodes else {}
     return underground | {
         "order": columns.order,
         "facts": {"smallest gap (m)": round(gap, 4)} | asdict(report),
         "counts": {
             "cells": cells + n_cells,
+            **eased,
             "triangles": len(plane.triangles),
             "columns": len(plane.xy),
         },

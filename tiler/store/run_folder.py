@@ -20,6 +20,7 @@ from tiler.store.json_stream import iterate_members, read_members
 SCHEMA = 1  # of run.json
 RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")
 TILES = "tiles"
+EASED = "roof nodes moved for cells"  # a count: roofs at vertices of outlines
 PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
 REGION = "region"  # cell array of a piece with soil
 # How a field that is missing, or of another type, or too large, shows when it is used.
@@ -51,6 +52,8 @@ class RoofRules:
         Roofs closer than this are always joined (m).
     lifts : bool
         Whether the least distance of two nodes may be more than the step, so that the upper one is raised.
+    slack : float
+        How far it moves a roof besides, where cells would be bad (m).
     """
 
     sloped: bool = False
@@ -58,6 +61,7 @@ class RoofRules:
     clearance: float = 0.0
     joined: float = 0.0
     lifts: bool = False
+    slack: float = 0.0
 
 
 FLAT_ROOFS = RoofRules()
@@ -90,6 +94,8 @@ class RunRecord:
         where the record does not tell.
     roofs : RoofRules
         How far the mesher may move roofs.
+    eased : int
+        Vertices at which it moved one for the sake of cells, counted for each roof.
     """
 
     status: str
@@ -102,6 +108,7 @@ class RunRecord:
     rim: float = math.nan
     parts: tuple[MeshPart, ...] = ()
     roofs: RoofRules = FLAT_ROOFS
+    eased: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +163,7 @@ def read_run_record(path: Path) -> RunRecord:
         counts = {name: int(record["counts"][name]) for name in ("cells", "points", "facets")}
         # A record of an earlier version counts parts as buildings.
         counts[PARTS] = int(record["counts"][PARTS if PARTS in record["counts"] else "buildings"])
+        eased = int(record["counts"].get(EASED, 0))
         status = str(record["status"])
         depth = float(record.get("parameters", {}).get("underground", 0.0))
         core, rim = _read_pad(record["region"])
@@ -168,7 +176,7 @@ def read_run_record(path: Path) -> RunRecord:
     if not 0 <= depth < math.inf:
         raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
     return RunRecord(
-        status, (west, south, east, north), top, counts, record[TILES], depth, core, rim, parts, roofs
+        status, (west, south, east, north), top, counts, record[TILES], depth, core, rim, parts, roofs, eased
     )
 
 
@@ -182,6 +190,7 @@ def _read_roof_rules(parameters: Mapping[str, Any]) -> RoofRules:
         clearance=max(float(parameters["roof_clearance"]), least),
         joined=Weld.least / 2,
         lifts=least > Weld.least,
+        slack=Weld.slack,
     )
 
 
