@@ -81,8 +81,8 @@ def build_solids(
     grid : float
         Spacing of the grid (m).
     blocks : float64, (n, m), optional
-        Heights of flat roofs (m) of `m` levels, after which comes one with the model's own roofs. By default
-        there is one level, with the highest place of each roof.
+        Heights of flat roofs (m) of `m` levels, also 0, after which comes one with the model's own roofs. By
+        default there is one level, with the highest place of each roof.
 
     Returns
     -------
@@ -134,7 +134,7 @@ def build_solids(
         notes += _sunk(model, polygons)
     has_solid = np.all([level.has_solid for level in raised], axis=0)
     vertices, solids = _number_levels(raised)
-    notes += [*_flat(model, has_solid), *_touching(model, rings.owner, solids[0].low)]
+    notes += [*_flat(model, has_solid), *_touching(model, raised[0].rings.owner, solids[0].low)]
     return Levels(vertices, solids), tuple(notes)
 
 
