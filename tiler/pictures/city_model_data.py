@@ -50,8 +50,8 @@ def load_blocks(directory: Path) -> tuple[City, int, int]:
 
     Notes
     -----
-    Buildings are their solids of LoD2.2, flat roofs are level. The terrain has at most `TERRAIN_NODES` nodes along
-    a side; of more than `MOST_BLOCKS` buildings the largest are read. Memory is that of these, whatever the region.
+    Buildings are their solids of LoD2.2. The terrain has at most `TERRAIN_NODES` nodes along a side; of more than
+    `MOST_BLOCKS` buildings the largest are read. Memory is that of these, whatever the region.
     """
     west, south, east, north = read_run_record(directory / RUN_RECORD).bounds
     store = Store(directory / STORE)
