@@ -117,7 +117,10 @@ WORDS: dict[str, Words] = {
     "solid-into-ground": Words(
         REPAIRED, "{n} sloped roof[s] [meets|meet] the ground; [its solid is|their solids are] cut off there"
     ),
-    "solid-touching": Words(REPAIRED, "{n} solid[s] of the CityJSON [touches itself|touch themselves]"),
+    "solid-touching": Words(
+        REPAIRED,
+        "{n} outline[s] that [touches itself|touch themselves] [was|were] parted for [its solid|their solids]",
+    ),
     "building-ground-from-dtm": Words(
         DEFAULTED, "{n} building part[s] without ground points took the ground height of the terrain"
     ),
