@@ -96,7 +96,7 @@ def _check_face(rings: list[list[int]], places: Ints) -> tuple[list[tuple[int, .
     xyz = places[corners] * SNAP
     middle = xyz.mean(axis=0)
     normal = np.linalg.svd(xyz - middle)[2][2]
-    normal *= 1 if sum(_newell(places[ring] * SNAP) for ring in rings[:1]) @ normal > 0 else -1
+    normal *= 1 if _newell(places[rings[0]] * SNAP) @ normal > 0 else -1
     faults = {"203 not planar"} if np.abs((xyz - middle) @ normal).max() > PLANARITY else set()
     east = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     east /= np.linalg.norm(east)
@@ -116,7 +116,7 @@ def _check_face(rings: list[list[int]], places: Ints) -> tuple[list[tuple[int, .
     return triangles, faults
 
 
-def _newell(corners: Floats) -> Floats:
+def _newell(corners: NDArray[np.floating]) -> Floats:
     moved = corners - corners[0]
     area: Floats = np.cross(moved, np.roll(moved, -1, axis=0)).sum(axis=0) / 2
     return area
@@ -181,9 +181,9 @@ def _edges_cross(triangles: Ints, places: Ints, pairs: Ints) -> bool:
         face = triangles[pairs[:, 1]]
         apart = ~((a[:, None] == face) | (b[:, None] == face)).any(axis=1)
         p, q = places[a[apart]], places[b[apart]]
-        t = places[face[apart]].swapaxes(0, 1)
-        side_p, side_q = _side(*t, p), _side(*t, q)
-        around = np.stack([_side(p, q, t[i], t[(i + 1) % 3]) for i in range(3)])
+        t, u, v = places[face[apart]].swapaxes(0, 1)
+        side_p, side_q = _side(t, u, v, p), _side(t, u, v, q)
+        around = np.stack([_side(p, q, one, other) for one, other in ((t, u), (u, v), (v, t))])
         inside = (around >= 0).all(axis=0) | (around <= 0).all(axis=0)
         level = (side_p == 0) & (side_q == 0)
         if (inside & ~level & (side_p * side_q <= 0)).any():
@@ -200,7 +200,8 @@ def _side(a: Ints, b: Ints, c: Ints, d: Ints) -> Ints:
 def _overlap(triangles: Ints, places: Ints, pairs: Ints) -> bool:
     """Whether two triangles of one plane have an area in common."""
     one, other = places[triangles[pairs[:, 0]]], places[triangles[pairs[:, 1]]]
-    level = np.all([_side(*one.swapaxes(0, 1), other[:, k]) == 0 for k in range(3)], axis=0)
+    a, b, c = one.swapaxes(0, 1)
+    level = np.all([_side(a, b, c, other[:, k]) == 0 for k in range(3)], axis=0)
     for first, second in zip(one[level], other[level], strict=True):
         normal = np.cross(first[1] - first[0], first[2] - first[0])
         kept = [axis for axis in range(3) if axis != np.argmax(np.abs(normal))]

@@ -263,7 +263,8 @@ def _away_from(met: Vertices, places: Vertices) -> Vertices:
     if not len(met):
         return places
     near = shapely.dwithin(shapely.points(places), shapely.multipoints(met), PARTING)
-    return places[~near]
+    away: Vertices = places[~near]
+    return away
 
 
 def _same_places(one: Vertices, other: Vertices) -> bool:
