@@ -73,6 +73,27 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def sloped_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished run of a synthetic city with roofs of all types on four tiles, not to be changed."""
+    from tiler.config.config import make_config
+    from tiler.interface.synth import write_city
+    from tiler.workflow.run import run
+
+    folder = tmp_path_factory.mktemp("sloped")
+    files = write_city(folder / "city", size=280, buildings=24, density=3.0, relief=6, seed=5, roofs="mixed")
+    given = {
+        "pointcloud": [str(path) for path in files.clouds],
+        "footprints": str(files.footprints),
+        "out": str(folder / "out"),
+        "roofs": "planes",
+        "tile_size": 150.0,
+        "domain_height": 60.0,
+    }
+    run(make_config(given))
+    return folder / "out"
+
+
+@pytest.fixture(scope="session")
 def amsterdam_run(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Finished run of central Amsterdam on four tiles, not to be changed."""
     return run_amsterdam(shared_data, tmp_path_factory.mktemp("amsterdam") / "out", tile_size=300.0)

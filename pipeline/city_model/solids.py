@@ -13,6 +13,8 @@ from pipeline.data.notes import Note
 from pipeline.data.roofs import is_flat, roof_heights
 from pipeline.geometry.rounding import round_corners
 
+PARTED = 5  # steps of the grid by which corners of courtyards are moved for solids where they meet other rings
+
 
 @dataclass(frozen=True, eq=False)
 class Solids:
@@ -29,7 +31,7 @@ class Solids:
     ring_start : int64, (r + 1,)
         First corner of each ring.
     low, high : int64, (k,)
-        Vertex of each corner at its building's ground and roof; ``high`` is -1 where there is no solid.
+        Vertex of each corner at its building's ground and roof; -1 where there is no solid.
     walls : int64, (k, 4)
         Vertices of the wall from each corner to the next of its ring, counter-clockwise seen from outside.
     has_solid : bool, (n,)
@@ -55,11 +57,14 @@ class Levels:
     ----------
     vertices : int64, (v, 3)
         Grid coordinates, each vertex once, ascending by x, y, z.
+    footprints : Solids
+        The outlines at their ground: `low` alone, no building has a solid.
     solids : tuple of Solids
-        A level each.
+        A level each. Their outlines differ from `footprints` where rings meet, and under sloped roofs.
     """
 
     vertices: NDArray[np.int64]
+    footprints: Solids
     solids: tuple[Solids, ...]
 
 
@@ -81,8 +86,8 @@ def build_solids(
     grid : float
         Spacing of the grid (m).
     blocks : float64, (n, m), optional
-        Heights of flat roofs (m) of `m` levels, after which comes one with the model's own roofs. By default
-        there is one level, with the highest place of each roof.
+        Heights of flat roofs (m) of `m` levels, also 0, after which comes one with the model's own roofs. By
+        default there is one level, with the highest place of each roof.
 
     Returns
     -------
@@ -92,8 +97,8 @@ def build_solids(
         ``footprint-lost``: a footprint vanishes on the grid. ``footprint-split``: the grid cuts it at a
         neck, the largest part is taken. ``solid-flat``: the highest place of the roof is not above the ground on
         the grid, there is no solid at some level. ``solid-touching``: a ring meets itself or another one in a
-        point, so four walls share a vertical edge. ``solid-into-ground``: a sloped roof meets the ground, it is
-        raised over that.
+        point, where four walls would share a vertical edge; courtyards end `PARTED` steps of the grid before it.
+        ``solid-into-ground``: a sloped roof meets the ground, it is raised over that.
 
     Raises
     ------
@@ -120,6 +125,8 @@ def build_solids(
     """
     _check(model)
     polygons, notes = _round(model, grid)
+    footprints = _list_rings(polygons, origin, grid)
+    notes += _part_touching(model, polygons, grid)
     rings = _list_rings(polygons, origin, grid)
     ground = _to_grid(model.ground, origin[2], grid)
     tops = model.roof[:, None] if blocks is None else blocks
@@ -133,9 +140,25 @@ def build_solids(
         raised.append(_raise(outline, ground, _to_grid(model.roof, origin[2], grid), top, others))
         notes += _sunk(model, polygons)
     has_solid = np.all([level.has_solid for level in raised], axis=0)
-    vertices, solids = _number_levels(raised)
-    notes += [*_flat(model, has_solid), *_touching(model, rings.owner, solids[0].low)]
-    return Levels(vertices, solids), tuple(notes)
+    on_ground = _raise(footprints, ground, ground, ground[footprints.owner])
+    vertices, (outlines, *solids) = _number_levels([on_ground, *raised])
+    notes += _flat(model, has_solid)
+    return Levels(vertices, outlines, tuple(solids)), tuple(notes)
+
+
+def repeated_corners(polygon: shapely.Polygon) -> NDArray[np.float64]:
+    """Places where rings of a polygon meet each other or themselves, float64 (k, 2).
+
+    Examples
+    --------
+    >>> hole = [(1, 2), (2, 1), (0, 0)]
+    >>> repeated_corners(shapely.Polygon([(0, 0), (5, 0), (5, 5), (0, 5)], [hole])).tolist()
+    [[0.0, 0.0]]
+    """
+    xy, ring = shapely.get_coordinates(shapely.get_rings(polygon), return_index=True)
+    corners, times = np.unique(xy[np.diff(ring, prepend=-1) == 0], axis=0, return_counts=True)
+    repeated: NDArray[np.float64] = corners[times > 1]
+    return repeated
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +215,7 @@ def _raise(
 
 
 def _number_levels(levels: Sequence[_Raised]) -> tuple[NDArray[np.int64], tuple[Solids, ...]]:
-    """Number the vertices of all levels, each once."""
+    """Number the vertices of all levels, each once; the first one has no solids but all feet."""
     used = []
     for level in levels:
         raised = level.has_solid[level.rings.owner]
@@ -200,14 +223,14 @@ def _number_levels(levels: Sequence[_Raised]) -> tuple[NDArray[np.int64], tuple[
         used.append(raised)
     tables = [np.empty((0, 3), np.int64)]
     for level, raised in zip(levels, used, strict=True):
-        floors = level.low if level is levels[0] else level.low[raised]
-        tables += [floors, level.high[raised], *(vertices for _, vertices in level.others.values())]
+        standing = raised | (level is levels[0])
+        tables += [level.low[standing], level.high[raised], *(vertices for _, vertices in level.others.values())]
     vertices, index = _number_rows(np.concatenate(tables))
     numbers = iter(np.split(index, np.cumsum([len(table) for table in tables[1:]])[:-1]))
     solids = []
     for level, raised in zip(levels, used, strict=True):
         low, high = np.full((2, len(raised)), -1)
-        low[slice(None) if level is levels[0] else raised] = next(numbers)
+        low[raised | (level is levels[0])] = next(numbers)
         high[raised] = next(numbers)
         rings, others = level.rings, {}
         for row, (faces, _) in level.others.items():
@@ -248,6 +271,42 @@ def _round(model: CityModel, grid: float) -> tuple[NDArray[np.object_], list[Not
         for i in np.flatnonzero(shapely.is_empty(polygons))
     ]
     return shapely.orient_polygons(polygons), notes
+
+
+def _part_touching(model: CityModel, polygons: NDArray[np.object_], grid: float) -> list[Note]:
+    """Part outlines in place where their rings meet, so that no solid has four walls there."""
+    notes = []
+    for i in np.flatnonzero(shapely.get_num_interior_rings(polygons) > 0):
+        places = repeated_corners(polygons[i])
+        if len(places):
+            polygons[i] = _part(polygons[i], places, grid)
+            notes.append(_note("solid-touching", model, i, f"touches itself in {len(places)} points, expected 0"))
+    return notes
+
+
+def _part(polygon: shapely.Polygon, places: NDArray[np.float64], grid: float) -> shapely.Polygon:
+    """Move the corners of courtyards at some places into these; the outline as it is if it became invalid."""
+    holes = [shapely.get_coordinates(ring)[:-1] for ring in polygon.interiors]
+    for hole in holes:
+        met = (hole[:, None] == places).all(axis=2).any(axis=1)
+        before, after = np.roll(hole, 1, axis=0)[met] - hole[met], np.roll(hole, -1, axis=0)[met] - hole[met]
+        hole[met] = np.rint(hole[met] / grid + PARTED * _look_right(before, after)) * grid
+    parted = shapely.Polygon(polygon.exterior, holes)
+    return parted if parted.is_valid and not len(repeated_corners(parted)) else polygon
+
+
+def _look_right(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions that halve the angles on the right of corners, from which `before` and `after` lead on (k, 2)."""
+    u, v = _unit(after), _unit(before)
+    to_left = u[:, 0] * v[:, 1] > u[:, 1] * v[:, 0]  # the smaller angle is on the left
+    across = np.column_stack((u[:, 1] - v[:, 1], v[:, 0] - u[:, 0]))  # right of the way from one to the other
+    wide = (u * v).sum(axis=1) < 0
+    return _unit(np.where(wide[:, None], across, np.where(to_left[:, None], -u - v, u + v)))
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    scaled: NDArray[np.float64] = vectors / np.sqrt((vectors * vectors).sum(axis=1, keepdims=True))
+    return scaled
 
 
 def _begin_earlier(polygons: NDArray[np.object_]) -> NDArray[np.object_]:
@@ -291,15 +350,6 @@ def _sunk(model: CityModel, polygons: NDArray[np.object_]) -> list[Note]:
     return [
         _note("solid-into-ground", model, i, f"roof {lowest[i]:.2f} m above ground; least: {ROOM:g} m")
         for i in np.flatnonzero(~is_flat(model.roofs) & (lowest < ROOM))
-    ]
-
-
-def _touching(model: CityModel, owner: NDArray[np.int64], low: NDArray[np.int64]) -> list[Note]:
-    pairs, times = np.unique(np.column_stack([owner, low]), axis=0, return_counts=True)
-    touching, points = np.unique(pairs[times > 1, 0], return_counts=True)
-    return [
-        _note("solid-touching", model, i, f"touches itself in {count} points, expected 0")
-        for i, count in zip(touching, points, strict=True)
     ]
 
 

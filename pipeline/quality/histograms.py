@@ -116,6 +116,27 @@ def merge_histograms(parts: Sequence[Histogram]) -> Histogram:
     )
 
 
+def share_below(histogram: Histogram, value: float) -> float:
+    """Share of the values below one that parts two bins; NaN without values.
+
+    Raises
+    ------
+    ValueError
+        If `value` is within a bin, or not in the range.
+
+    Examples
+    --------
+    >>> share_below(count_values(np.array([0.1, 0.24, 0.25, 7.0]), (0.0, 1.0), 4), 0.25)
+    0.5
+    """
+    width = (histogram.high - histogram.low) / len(histogram.counts)
+    place = round((value - histogram.low) / width)
+    if not 0 < place < len(histogram.counts) or abs(histogram.low + place * width - value) > 1e-6 * width:
+        raise ValueError(f"{value} is no border of bins of {width:g} from {histogram.low:g} to {histogram.high:g}")
+    n = int(histogram.counts.sum())
+    return int(histogram.counts[:place].sum()) / n if n else float("nan")
+
+
 def percentile(histogram: Histogram, percent: float) -> float:
     """Estimate a percentile of the values that were counted, as `numpy.percentile` defines it.
 

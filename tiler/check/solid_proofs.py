@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.city_model.roof_areas import measure_roof_areas
 from pipeline.city_model.sloped_solids import LEVEL_TOLERANCE, ROOM, STRAIGHT
+from pipeline.city_model.solids import repeated_corners
 from pipeline.data.errors import InputError
 from pipeline.data.roofs import Roofs, roof_heights
 from tiler.check.proofs import N_PLACES, Fault, Proof, Vertices
@@ -22,6 +23,7 @@ HEIGHT_STEP = 1e-3  # m: CityJSON rounds coordinates to 1 mm, the heights among 
 ROOF_TOLERANCE = LEVEL_TOLERANCE + HEIGHT_STEP  # m, up or down, of a corner of a sloped roof
 PLAN_TOLERANCE = STRAIGHT + HEIGHT_STEP  # m, in the plane, of a corner under a sloped roof
 PLANARITY = 0.01  # m, of the corners of a face along its normal: what val3dity takes by default
+PARTING = 0.008  # m, from a place where rings of a footprint meet, within which its solid is parted
 FLOOR, ROOF, SIDE = KINDS = ("GroundSurface", "RoofSurface", "WallSurface")
 LOD12, LOD13 = BLOCK_HEIGHTS["1.2"], BLOCK_HEIGHTS["1.3"]
 DETAILS = {
@@ -182,11 +184,13 @@ def _find_faults(solid: _Solid, ground: float, roof: float, footprint: Any) -> l
     found = ["solid-height"] if off.any() else []
     if not _is_closed(solid.corner, solid.after):
         found.append("solid-open")
-    floor = shapely.get_coordinates(footprint)
-    if any(not _same_places(solid.place[solid.kinds == k, :2], floor) for k in (0, 1)):
+    met = _repeated_corners(footprint)
+    floor = _away_from(met, shapely.get_coordinates(footprint))
+    if any(not _same_places(_away_from(met, solid.place[solid.kinds == k, :2]), floor) for k in (0, 1)):
         found.append("solid-plan")
     wanted = footprint.area * (roof - ground)
     slack = 2 * HEIGHT_STEP * footprint.area + 1e-6 * abs(wanted)
+    slack += PARTING * footprint.length * (roof - ground) if len(met) else 0.0
     if abs(solid.measure_volume() - wanted) > slack:
         found.append("solid-volume")
     return found
@@ -213,9 +217,12 @@ def _find_sloped_faults(solid: _Solid, building: BuildingRow, roofs: Roofs, mean
     length = np.bincount(solid.face, np.linalg.norm(solid.onward - solid.place, axis=1))
     turned = np.where(np.abs(areas[:, 2]) <= HEIGHT_STEP * HEIGHT_STEP * length, 2, (areas[:, 2] > 0).astype(int))
     found += ["solid-semantics"] if (turned != kinds).any() else []
-    outline, slack = shapely.boundary(footprint), PLAN_TOLERANCE * footprint.length
+    met = _repeated_corners(footprint)
+    outline = shapely.boundary(footprint)
+    slack = (PARTING if len(met) else PLAN_TOLERANCE) * footprint.length
     plan = np.array([-areas[kinds == 0, 2].sum(), areas[kinds == 1, 2].sum()])
-    astray = shapely.distance(outline, shapely.points(solid.place[floor, :2])) > PLAN_TOLERANCE
+    corners = shapely.points(_away_from(met, solid.place[floor, :2]))
+    astray = shapely.distance(outline, corners) > PLAN_TOLERANCE
     found += ["solid-plan"] if astray.any() or (np.abs(plan - footprint.area) > slack).any() else []
     slack = (ROOF_TOLERANCE + HEIGHT_STEP) * footprint.area + slack * (roofs.limits[0, 1] - ground)
     found += ["solid-volume"] if abs(solid.measure_volume() - footprint.area * (mean - ground)) > slack else []
@@ -241,6 +248,23 @@ def _is_closed(start: NDArray[np.int64], end: NDArray[np.int64]) -> bool:
     """Tell whether each edge is used as often in one direction as in the other."""
     n = int(max(start.max(), end.max())) + 1
     return np.array_equal(np.sort(start * n + end), np.sort(end * n + start))
+
+
+def _repeated_corners(footprint: Any) -> Vertices:
+    """Places (k, 2) where rings of a footprint meet: solids are parted there."""
+    polygons = shapely.get_parts(footprint)
+    if not (shapely.get_num_interior_rings(polygons) > 0).any():
+        return np.empty((0, 2))
+    return np.concatenate([repeated_corners(polygon) for polygon in polygons])
+
+
+def _away_from(met: Vertices, places: Vertices) -> Vertices:
+    """Leave out the places (n, 2) within `PARTING` of some others."""
+    if not len(met):
+        return places
+    near = shapely.dwithin(shapely.points(places), shapely.multipoints(met), PARTING)
+    away: Vertices = places[~near]
+    return away
 
 
 def _same_places(one: Vertices, other: Vertices) -> bool:

@@ -377,7 +377,7 @@ def _geometry_texts(levels: Levels, first: int) -> list[str]:
     Text is put together here: of a million lists, Python's encoder would take twice as long as all else.
     """
     lods = (*BLOCK_HEIGHTS, "2.2")[: len(levels.solids)]
-    texts = [_floor_texts(levels.solids[0], first)]
+    texts = [_floor_texts(levels.footprints, first)]
     texts += [_solid_texts(solids, lod, first) for solids, lod in zip(levels.solids, lods, strict=True)]
     return [f"[{','.join(filter(None, row))}]" for row in zip(*texts, strict=True)]
 

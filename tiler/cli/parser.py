@@ -163,7 +163,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
         choices=("boundary", "mesh", "overview", "tiles", "sizes", "quality", "citymodel"),
         default="boundary",
         help="what to draw; sizes: triangles from above, by the length of their edges; quality: the boundary by "
-        "the cells behind it; citymodel: blocks on the terrain",
+        "the cells behind it; citymodel: its solids on the terrain",
     )
     add_job_commands(add, _add_inputs)
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.roof_forms import no_forms
+from tiler.footprints.building_parts import find_building_parts
 from tiler.footprints.footprint_source import FootprintSource, count_notes_of, make_footprints, open_source
 from tiler.footprints.repeated_ids import find_repeated_ids
 from tiler.georeference.frame import Frame
@@ -122,7 +123,8 @@ def scan_footprints(
     Notes
     -----
     A file with a spatial index is read by query, another from end to end. The ids are read once more before
-    that, see `find_repeated_ids`: an id is the same whatever box is asked for.
+    that, see `find_repeated_ids`: an id is the same whatever box is asked for. So are parts of buildings of OSM
+    data, see `find_building_parts`.
     """
     source = open_source(
         as_place(path),
@@ -135,10 +137,11 @@ def scan_footprints(
         frame=frame,
     )
     repeated = find_repeated_ids(source.layer, source.id_name, batch=batch)
+    parts = find_building_parts(source.layer, source.frame, bounds, height_name=source.height_name, batch=batch)
     n_found, notes, warned = 0, [*source.layer.notes, *source.notes], set[str]()
     counts: Counter[str] = Counter()
     for features in scan_layer(source.layer, source.columns, source.box, batch=batch):
-        footprints, found = make_footprints(source, features, repeated, counts)
+        footprints, found = make_footprints(source, features, repeated, counts, parts)
         notes += [*_warnings(source, features, warned), *found]
         n_found += len(footprints.ids)
         if len(footprints.ids) or notes:

@@ -15,6 +15,7 @@ from pipeline.data.citymodel import Footprints, make_ids
 from pipeline.data.errors import InputError
 from pipeline.data.notes import Note
 from pipeline.data.roof_forms import ROOF_SHAPES, SHAPE, TO_EAVES
+from tiler.footprints.building_parts import BuildingParts, Shares, share_places
 from tiler.footprints.footprint_attributes import (
     explain_repeated,
     find_attribute,
@@ -32,10 +33,11 @@ from tiler.georeference.frame import Frame, box_to_file, to_region
 from tiler.pointclouds.las_header import COORDINATE_LIMIT
 from tiler.vectors.features import Box, Features
 from tiler.vectors.layers import Layer, describe_layer
-from tiler.vectors.osm_tags import STOREY, find_osm_tags, is_building
+from tiler.vectors.osm_tags import STOREY, OsmTags, find_osm_tags, is_building, is_part, is_raised
 
 # Kinds of the notes of forms, before the shape: that of each is counted.
 GIVEN_FORMS, UNKNOWN_FORMS = "footprint-roof-forms:", "footprint-roof-forms-unknown:"
+FORM_SHARE = 0.8  # of a footprint's area that parts must leave to it for its attributes of roofs to hold
 MOST_SHAPES = 12  # that a note lists
 _NOWHERE = (float("nan"),) * 4
 
@@ -135,7 +137,11 @@ def open_source(
 
 
 def make_footprints(
-    source: FootprintSource, features: Features, repeated: Set[str], counts: Counter[str]
+    source: FootprintSource,
+    features: Features,
+    repeated: Set[str],
+    counts: Counter[str],
+    parts: BuildingParts | None = None,
 ) -> tuple[Footprints, list[Note]]:
     """Make footprints of features.
 
@@ -149,6 +155,8 @@ def make_footprints(
         Ids that several different geometries of the file carry: they are completed by the geometry.
     counts : Counter of str
         Numbers of features, by the kind of the note that a file gets for all of them: see `count_notes_of`.
+    parts : BuildingParts, optional
+        Parts of buildings in and around the region, so that no place has two footprints; by default all overlap.
 
     Returns
     -------
@@ -175,16 +183,24 @@ def make_footprints(
         [finding for finding in _not_finite(rows[wrong]) if wanted[finding.row]], source, features, names
     )
     geometry, rows = geometry[keep], rows[keep]
+    height, by_levels, bad = read_heights(source.layer, source.height_name, features)
+    if tags is not None and parts is not None:
+        shares = share_places(parts, geometry, is_part(tags, features.columns)[rows], height[rows])
+        _count_parts(shares, rows, tags, features, counts)
+        left = ~shapely.is_empty(shares.geometry)
+        geometry, rows, share = shares.geometry[left], rows[left], shares.share[left]
+    else:
+        share = np.ones(len(rows))
     ids, told = _ids(source, geometry, np.array([names[row] for row in rows], np.str_), repeated)
     notes += told
-    height, by_levels, bad = read_heights(source.layer, source.height_name, features)
     counts["footprint-heights-by-levels"] += int(by_levels[rows].sum())
     none = np.array([bool(bad[row]) for row in rows], np.bool_)
     notes += _notes("footprint-height-missing", geometry[none], [bad[row] for row in rows[none]], ids[none])
     roofs = read_roofs(source.layer, source.roof_name, features)
     roofs.forms[by_levels & np.isfinite(roofs.forms[:, SHAPE]), TO_EAVES] = 1.0
     notes += _tell_roofs(roofs, rows, geometry, ids, counts)
-    return Footprints(geometry, ids, height[rows], roofs.forms[rows]), notes
+    forms = np.where((share < FORM_SHARE)[:, None], np.nan, roofs.forms[rows])
+    return Footprints(geometry, ids, height[rows], forms), notes
 
 
 def count_notes_of(source: FootprintSource, counts: Counter[str]) -> list[Note]:
@@ -192,6 +208,11 @@ def count_notes_of(source: FootprintSource, counts: Counter[str]) -> list[Note]:
     details = {
         "footprints-without-geometry": "{} features have no geometry",
         "footprints-not-buildings": "{} polygons without building=* or building:part=* are left out",
+        "footprint-parts": "{} parts of buildings (building:part) are taken one by one",
+        "footprint-outlines-of-parts": "{} outlines keep what no part of theirs covers",
+        "footprint-outlines-replaced": "{} of these keep nothing: their parts stand for them",
+        "footprint-parts-covered": "{} parts lie below higher ones and are left out",
+        "footprint-parts-raised": "{} parts begin above the ground (min_height): they are taken down to it",
         "footprint-heights-by-levels": f"{{}} heights are building:levels x {STOREY:g} m",
         "footprint-roofs-by-levels": f"{{}} heights of roofs are roof:levels x {STOREY:g} m",
     }
@@ -209,6 +230,19 @@ def count_notes_of(source: FootprintSource, counts: Counter[str]) -> list[Note]:
         if named:
             notes.append(Note(kind[:-1], name, detail=told + (f", {rest} others" if rest else "")))
     return notes
+
+
+def _count_parts(
+    shares: Shares, rows: NDArray[np.int64], tags: OsmTags, features: Features, counts: Counter[str]
+) -> None:
+    """Count parts of buildings, and the outlines and parts that lost something to them."""
+    part, raised = is_part(tags, features.columns)[rows], is_raised(tags, features.columns)[rows]
+    gone = shapely.is_empty(shares.geometry)
+    counts["footprint-parts"] += int((part & ~gone).sum())
+    counts["footprint-parts-covered"] += int((part & gone).sum())
+    counts["footprint-parts-raised"] += int((part & raised & ~gone).sum())
+    counts["footprint-outlines-of-parts"] += int((~part & (shares.share < 1)).sum())
+    counts["footprint-outlines-replaced"] += int((~part & gone).sum())
 
 
 def _tell_roofs(

@@ -1,14 +1,18 @@
-"""The city model of a run as blocks (LoD1) on its terrain, from the run's store, for a picture."""
+"""The city model of a run on its terrain, with the roofs that it has, from the run's store, for a picture."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.city_model.sloped_solids import ROOF, WALL
+from pipeline.city_model.solids import Levels, Solids, build_solids
+from pipeline.data.citymodel import CityModel, take_model
 from pipeline.data.mesh import Marker
-from tiler.citymodels.tables import unpack_polygons
+from tiler.citymodels.tables import ROOF_ARRAYS, unpack_polygons, unpack_roofs
 from tiler.pictures.picture_data import City, sew
 from tiler.store.out_folder import RUN_RECORD, STORE
 from tiler.store.results import StoredTerrain
@@ -18,12 +22,14 @@ from tiler.store.store import Store
 DEEP = 3.0  # m that walls reach below the ground, which is not level
 TERRAIN_NODES = 450  # along the longer side of the terrain
 MOST_BLOCKS = 60_000  # buildings of a picture: the largest; of more, the smaller ones would be smaller than pixels
+GRID = 0.001  # m, of the corners of buildings
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 def load_blocks(directory: Path) -> tuple[City, int, int]:
-    """Read the blocks of the city model and the terrain below them.
+    """Read the buildings of the city model and the terrain below them.
 
     Parameters
     ----------
@@ -44,8 +50,8 @@ def load_blocks(directory: Path) -> tuple[City, int, int]:
 
     Notes
     -----
-    The terrain has at most `TERRAIN_NODES` nodes along a side; of more than `MOST_BLOCKS` buildings the largest
-    are read. Memory is that of these, whatever the region.
+    Buildings are their solids of LoD2.2. The terrain has at most `TERRAIN_NODES` nodes along a side; of more than
+    `MOST_BLOCKS` buildings the largest are read. Memory is that of these, whatever the region.
     """
     west, south, east, north = read_run_record(directory / RUN_RECORD).bounds
     store = Store(directory / STORE)
@@ -58,15 +64,17 @@ def load_blocks(directory: Path) -> tuple[City, int, int]:
     corners, marker, building = [ground], [np.full(len(ground), Marker.GROUND)], [np.full(len(ground), -1)]
     least, n_buildings = _find_least(store)
     n_shown = 0
-    for polygons, foot, roof in _read_blocks(store, least):
+    for model in _read_blocks(store, least):
+        lowest = np.array([west, south, model.ground.min()])
+        levels, _ = build_solids(model, np.floor(lowest), grid=GRID, blocks=np.empty((len(model), 0)))
         for kind, (triangles, owner) in (
-            (Marker.ROOF, _find_roofs(polygons, roof)),
-            (Marker.WALL, _find_walls(polygons, foot - DEEP, roof)),
+            (Marker.ROOF, _find_roofs(levels)),
+            (Marker.WALL, _find_walls(levels, round(DEEP / GRID))),
         ):
-            corners.append(triangles)
+            corners.append(triangles * GRID + np.floor(lowest))
             marker.append(np.full(len(owner), kind))
             building.append(owner + n_shown)
-        n_shown += len(polygons)
+        n_shown += len(model)
     points = np.concatenate(corners).reshape(-1, 3)
     xyz, facets = sew(points, np.arange(len(points)).reshape(-1, 3))
     origin = np.array([(west + east) / 2, (south + north) / 2, ground[..., 2].min(initial=np.inf)])
@@ -117,31 +125,71 @@ def _find_least(store: Store) -> tuple[float, int]:
     return float(np.partition(area, len(area) - MOST_BLOCKS)[len(area) - MOST_BLOCKS]), len(area)
 
 
-def _read_blocks(store: Store, least: float) -> Iterator[tuple[NDArray[np.object_], Floats, Floats]]:
+def _read_blocks(store: Store, least: float) -> Iterator[CityModel]:
+    """Read the buildings of each tile that are drawn, without their members."""
+    wanted = ("polygon", "polygon_start", "id", "number", "house", "ground", *ROOF_ARRAYS)
     for name in store.names("model"):
-        arrays, _ = store.read("model", name, names=("polygon", "polygon_start", "ground", "roof"))
+        arrays, _ = store.read("model", name, names=wanted)
         polygons = unpack_polygons(arrays, "polygon")
-        kept = shapely.area(polygons).astype(np.float32) >= least
-        if kept.any():
-            yield polygons[kept], arrays["ground"][kept], arrays["roof"][kept]
+        model = CityModel(
+            polygons,
+            arrays["id"],
+            arrays["number"],
+            arrays["ground"],
+            unpack_roofs(arrays),
+            ((),) * len(polygons),
+            arrays["house"],
+        )
+        kept = np.flatnonzero(shapely.area(polygons).astype(np.float32) >= least)
+        if len(kept):
+            yield take_model(model, kept)
 
 
-def _find_roofs(polygons: NDArray[np.object_], roof: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Triangles (k, 3, 3) of roofs, counter-clockwise from above, and the building of each."""
-    triangles, owner = shapely.get_parts(shapely.constrained_delaunay_triangles(polygons), return_index=True)
-    flat = shapely.get_coordinates(shapely.orient_polygons(triangles)).reshape(-1, 4, 2)[:, :3]
-    return np.concatenate([flat, np.repeat(roof[owner], 3).reshape(-1, 3, 1)], axis=2), owner
-
-
-def _find_walls(polygons: NDArray[np.object_], foot: Floats, roof: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Two triangles below each edge of outlines and courtyards, and the building of each."""
-    parts, of_part = shapely.get_parts(shapely.orient_polygons(polygons), return_index=True)
-    rings, of_ring = shapely.get_rings(parts, return_index=True)
-    xy, ring = shapely.get_coordinates(rings, return_index=True)
-    edge = np.flatnonzero(ring[1:] == ring[:-1])
-    owner = of_part[of_ring[ring[edge]]]
-    (a, b), (low_a, low_b) = (
-        (np.column_stack([xy[edge], z[owner]]), np.column_stack([xy[edge + 1], z[owner]])) for z in (roof, foot)
+def _find_roofs(levels: Levels) -> tuple[Ints, Ints]:
+    """Triangles (k, 3, 3) of roofs on the grid, counter-clockwise from above, and the building of each."""
+    faces = list(_list_roofs(levels.solids[0]))
+    owner = np.array([building for building, _ in faces], np.int64)
+    rings = [ring for _, face in faces for ring in face]
+    of_ring = np.repeat(np.arange(len(faces)), [len(face) for _, face in faces])
+    size = [len(ring) for ring in rings]
+    corners = levels.vertices[np.concatenate([np.empty(0, np.int64), *rings])]
+    outlines = shapely.linearrings(
+        corners[:, :2].astype(np.float64), indices=np.repeat(np.arange(len(rings)), size)
     )
-    walls = np.concatenate([np.stack([a, low_a, low_b], axis=1), np.stack([a, low_b, b], axis=1)])
-    return walls, np.tile(owner, 2)
+    triangles, face = shapely.get_parts(
+        shapely.constrained_delaunay_triangles(shapely.polygons(outlines, indices=of_ring)), return_index=True
+    )
+    xy = shapely.get_coordinates(shapely.orient_polygons(triangles)).reshape(-1, 4, 2)[:, :3].reshape(-1, 2)
+    # Each corner of a triangle is one of its face's, whose height it has.
+    known = np.column_stack([np.repeat(of_ring, size), corners[:, :2]])
+    wanted = np.column_stack([np.repeat(face, 3), np.rint(xy).astype(np.int64)])
+    places, row = np.unique(np.concatenate([known, wanted]), axis=0, return_inverse=True)
+    row = row.reshape(-1)
+    height = np.empty(len(places), np.int64)
+    height[row[: len(known)]] = corners[:, 2]
+    found = np.column_stack([wanted[:, 1:], height[row[len(known) :]]])
+    return found.reshape(-1, 3, 3), owner[face]
+
+
+def _list_roofs(solids: Solids) -> Iterator[tuple[int, tuple[Ints, ...]]]:
+    """Give each face of a roof: its building, and the vertices of its rings."""
+    start = solids.ring_start.tolist()
+    for row, (first, last) in enumerate(pairwise(solids.building_start.tolist())):
+        if row in solids.others:
+            yield from ((row, rings) for kind, rings in solids.others[row] if kind == ROOF)
+        elif first < last and solids.has_solid[row]:
+            yield row, tuple(solids.high[a:b] for a, b in pairwise(start[first : last + 1]))
+
+
+def _find_walls(levels: Levels, deep: int) -> tuple[Ints, Ints]:
+    """Two triangles of each wall, which reaches below the ground, and the building of each."""
+    (solids,) = levels.solids
+    n_corners = np.diff(solids.ring_start[solids.building_start])
+    of_prism = np.repeat(np.arange(len(n_corners)), n_corners)
+    raised = solids.high >= 0
+    others = [(row, rings[0]) for row, faces in solids.others.items() for kind, rings in faces if kind == WALL]
+    owner = np.concatenate([of_prism[raised], np.array([row for row, _ in others], np.int64)])
+    walls = np.concatenate([solids.walls[raised], np.array([wall for _, wall in others], np.int64).reshape(-1, 4)])
+    corners = levels.vertices[walls]
+    corners[:, :2, 2] -= deep  # the first two corners of a wall are at its foot
+    return np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]), np.tile(owner, 2)

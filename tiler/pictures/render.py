@@ -114,7 +114,7 @@ def render_run(
         ``"tiles"``: as ``"boundary"``, but coloured by tile: neighbours differ.
         ``"sizes"``: triangles from above, coloured by the length of their edges, and by tile.
         ``"quality"``: as ``"boundary"``, but coloured by the radius ratio of the cell behind each facet.
-        ``"citymodel"``: the city model as blocks on its terrain, from the run's store.
+        ``"citymodel"``: the city model with its roofs on its terrain, from the run's store.
     size : (int, int), optional
         Width and height (pixels), at least 2; `SIZES` by default.
     say : callable, optional

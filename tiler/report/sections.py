@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.quality.histograms import Histogram, percentile
+from pipeline.quality.histograms import Histogram, percentile, share_below
 from pipeline.quality.point_fidelity import KINDS
 from pipeline.quality.residuals import ResidualSums, conclude
 from stitch.tiling.grid import make_grid, tile_box
@@ -48,6 +48,8 @@ MEASURES = {
 SHORTEST = 0.01  # s, of a stage that has a bar
 WORST_SHADE = 0.7  # radius ratio of the lightest shade of the map
 CHART_BINS = 40
+WITHIN = 0.25  # m; the share of points that are closer is told
+CLOSE = f"share within {WITHIN:g} m"
 POINT_KINDS = {
     "roof": "roof points inside buildings, against the roof",
     "missed": "roof points of footprints where the model has no building, against the terrain",
@@ -211,11 +213,16 @@ def format_heights(facts: RunFacts, numbers: Numbers) -> Iterator[str]:
 def describe_fidelity(facts: RunFacts, samples: Samples) -> Iterator[str]:
     """Show how far points are from the mesh and from the city model, and outlines from the footprints."""
     rows = [
-        [words, number(samples.points[kind].n), *_residuals(samples.points[kind])]
+        [
+            words,
+            number(samples.points[kind].n),
+            *_residuals(samples.points[kind]),
+            number(share_below(samples.points[kind].absolute, WITHIN)),
+        ]
         for kind, words in SURFACES.items()
         if kind in samples.points and samples.points[kind].n
     ]
-    head = ["points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "99 % below (m)", "bias (m)"]
+    head = ["points", "number", "RMSE (m)", "median (m)", "95 % below (m)", "99 % below (m)", "bias (m)", CLOSE]
     sloped = "roof_fit" in facts.members["fidelity"]
     shape = "A part's roof is one plane, so chimneys" if sloped else "A part's roof has one height, so slopes"
     yield heading("The mesh's surface")
@@ -252,7 +259,8 @@ def _describe_roof_fit(found: dict[str, Any]) -> Iterator[str]:
             [METHODS[method], *(number(fit.get(name)) for name in names)]
             for method, fit in found["roof_fit"].items()
         ]
-        head = ["roof", "building parts", "points", "RMSE (m)", "median of medians (m)", "within 0.25 m"]
+        head = ["roof", "building parts", "points", "RMSE (m)", "median of medians (m)", CLOSE]
+        rows.append(["all", *(number(value) for value in _sum_fits(found["roof_fit"]))])
         yield heading("Roofs by method")
         yield table("Roofs over their points, façade points and what stands on roofs too", head, rows)
     if found.get("worst_roofs"):
@@ -271,10 +279,19 @@ def _describe_roof_fit(found: dict[str, Any]) -> Iterator[str]:
             "parts",
             "points",
             "RMSE (m)",
-            "within 0.25 m",
+            CLOSE,
             "worst part, and what is known of it",
         ]
         yield folded("The houses whose roofs fit worst", table("Roofs of largest RMSE", head, rows))
+
+
+def _sum_fits(fits: dict[str, dict[str, Any]]) -> tuple[Any, ...]:
+    """Building parts and points of all methods, RMSE (m) and share of the points within `WITHIN`; no median."""
+    seen = [fit for fit in fits.values() if "rmse" in fit]
+    n = sum(fit["points"] for fit in seen)
+    rmse = (sum(fit["points"] * fit["rmse"] ** 2 for fit in seen) / n) ** 0.5 if n else None
+    within = sum(fit["points"] * fit["within"] for fit in seen) / n if n else None
+    return sum(fit["buildings"] for fit in fits.values()), n, rmse, None, within
 
 
 def format_time(facts: RunFacts, timeline: Timeline | None) -> Iterator[str]:

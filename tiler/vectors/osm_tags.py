@@ -19,7 +19,7 @@ STOREY = 3.0  # m; height of a level where a building has only their number
 _MARKS = ("osm_id", "osm_way_id", "@id", "full_id", "osmid")
 _TAGS = ("other_tags", "all_tags")  # all further tags in one text: hstore, or JSON from GDAL 3.7 on
 _PAIR = re.compile(r'"((?:[^"\\]|\\.)*)"\s*(?:=>|:)\s*"((?:[^"\\]|\\.)*)"')
-_KEYS = ("building", "building:part", "height", "building:levels")
+_KEYS = ("building", "building:part", "height", "building:levels", "min_height", "building:min_level")
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def find_osm_tags(fields: Sequence[str]) -> OsmTags | None:
     True
     """
     lower = {field.lower().replace("_", ":") if field[:1] != "@" else field: field for field in reversed(fields)}
-    column = {key: lower[key] for key in _KEYS if key in lower}
+    column = {key: lower[key.replace("_", ":")] for key in _KEYS if key.replace("_", ":") in lower}
     more = next((lower[name.replace("_", ":")] for name in _TAGS if name.replace("_", ":") in lower), "")
     if not any(mark.replace("_", ":") in lower for mark in _MARKS) or not (more or "building" in column):
         return None
@@ -89,6 +89,17 @@ def is_building(tags: OsmTags, columns: Mapping[str, NDArray[Any]]) -> NDArray[n
     """
     house, part = (values_of(tags, key, columns) for key in ("building", "building:part"))
     return np.array([_is_set(a) or _is_set(b) for a, b in zip(house, part, strict=True)], np.bool_)
+
+
+def is_part(tags: OsmTags, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """Tell the features with ``building:part=*``, whose value is not ``no``; parameters as of `is_building`."""
+    return np.array([_is_set(value) for value in values_of(tags, "building:part", columns)], np.bool_)
+
+
+def is_raised(tags: OsmTags, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """Tell the features that begin above the ground by ``min_height`` or ``building:min_level``."""
+    height, level = (values_of(tags, key, columns) for key in ("min_height", "building:min_level"))
+    return np.array([metres_of(a) > 0 or number_of(b) > 0 for a, b in zip(height, level, strict=True)], np.bool_)
 
 
 def osm_ids(tags: OsmTags, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.object_]:

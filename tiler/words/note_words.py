@@ -117,7 +117,10 @@ WORDS: dict[str, Words] = {
     "solid-into-ground": Words(
         REPAIRED, "{n} sloped roof[s] [meets|meet] the ground; [its solid is|their solids are] cut off there"
     ),
-    "solid-touching": Words(REPAIRED, "{n} solid[s] of the CityJSON [touches itself|touch themselves]"),
+    "solid-touching": Words(
+        REPAIRED,
+        "{n} outline[s] that [touches itself|touch themselves] [was|were] parted for [its solid|their solids]",
+    ),
     "building-ground-from-dtm": Words(
         DEFAULTED, "{n} building part[s] without ground points took the ground height of the terrain"
     ),
@@ -201,6 +204,11 @@ WORDS: dict[str, Words] = {
     "footprint-heights-by-levels": Words(DEFAULTED, "heights were taken from numbers of levels, 3 m each"),
     "footprints-without-metadata": Words(DEFAULTED, "the Parquet file has no metadata of geometries"),
     "footprints-layer-chosen": Words(OTHER, "the layer of polygons was taken of data of OpenStreetMap"),
+    "footprint-outlines-of-parts": Words(OTHER, "outlines of buildings keep what their parts do not cover"),
+    "footprint-outlines-replaced": Words(OTHER, "outlines of buildings were left out: their parts cover them"),
+    "footprint-parts": Words(OTHER, "parts of buildings (building:part) were taken one by one"),
+    "footprint-parts-covered": Words(OTHER, "parts of buildings below higher parts were left out"),
+    "footprint-parts-raised": Words(OTHER, "parts of buildings that begin above the ground were taken down to it"),
     "footprints-not-buildings": Words(OTHER, "polygons of OpenStreetMap that are no buildings were left out"),
     "footprints-of-osm": Words(OTHER, "tags of OpenStreetMap say which polygons are buildings, and how high"),
     "footprints-without-geometry": Words(OTHER, "the footprints have features without a geometry"),

@@ -20,6 +20,7 @@ from pipeline.quality.histograms import (
     merge_histograms,
     percentile,
     quality_histograms,
+    share_below,
 )
 from pipeline.quality.point_fidelity import (
     KINDS,
@@ -138,6 +139,16 @@ def test_sums_of_residuals_conclude_what_the_residuals_do() -> None:
     residual = rng.normal(-0.1, 2, 30_000)
     parts = [sum_residuals(part) for part in (residual[:100], residual[100:100], residual[100:])]
     close(conclude(merge_residuals(parts)), summarise(residual))
+
+
+def test_the_share_of_small_residuals_is_exact() -> None:
+    residual = np.random.default_rng(4).normal(0, 0.4, 5000)
+    sums = sum_residuals(residual)
+    assert share_below(sums.absolute, 0.25) == np.mean(np.abs(residual) < 0.25)
+    assert np.isnan(share_below(sum_residuals(np.empty(0)).absolute, 0.25))
+    for value in (0.255, 0.0, 50.0, 51.0):
+        with pytest.raises(ValueError, match="no border of bins"):
+            share_below(sums.absolute, value)
 
 
 def test_sums_of_residuals_are_order_free() -> None:

@@ -12,9 +12,10 @@ import shapely
 from pipeline.city_model.roof_areas import block_heights
 from pipeline.data.citymodel import CityModel
 from pipeline.data.roofs import Roofs
+from tests.helpers.iso19107 import check_solids
 from tiler.check.solid_proofs import SolidProofs
 from tiler.citymodels.building_index import index_buildings
-from tiler.citymodels.cityjson import write_city_model
+from tiler.citymodels.cityjson import read_city_model, write_city_model
 
 Json = dict[str, Any]
 
@@ -40,6 +41,30 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Json:
     assert write_city_model(file, model, crs="EPSG:28992", bounds=bounds, attributes=columns) == ()
     found: Json = json.loads(file.read_text())
     return found
+
+
+@pytest.mark.parametrize("plane", [(0.0, 0.0, 9.0), (0.2, -0.1, 9.0)])
+def test_a_courtyard_that_touches_a_wall_is_parted_from_it(tmp_path: Path, plane: tuple[float, ...]) -> None:
+    hole = [(0.0, 5.0), (6.0, 2.0), (8.0, 5.0), (6.0, 8.0)]
+    polygons = np.array([shapely.Polygon([(0, 0), (10, 0), (10, 10), (0, 10)], [hole])])
+    sloped = plane[0] != 0
+    roofs = Roofs(np.array([plane]), np.array([[5.0, 5.0]]), np.array([[8.0, 12.0] if sloped else [9.0, 9.0]]))
+    ids = np.array(["a"])
+    model = CityModel(polygons, ids, np.arange(1), np.zeros(1), roofs, ((),), ids)
+    blocks = block_heights(model)
+    columns = {"lod12_height": blocks[:, 0].tolist(), "lod13_height": blocks[:, 1].tolist()}
+    file = tmp_path / "a.city.json"
+    (note,) = write_city_model(file, model, crs="EPSG:28992", bounds=(0, 0, 0, 99, 99, 50), attributes=columns)
+    assert (note.kind, note.detail) == ("solid-touching", "touches itself in 1 points, expected 0")
+    document = json.loads(file.read_text())
+    assert check_solids(document) == {("a", lod): set() for lod in ("1.2", "1.3", "2.2")}
+    assert prove(tmp_path, document)[1] == set()
+    xy = np.array(document["vertices"])[:, :2].tolist()
+    assert [5, 5000] in xy  # the corner of the courtyard, 5 mm into it
+    assert shapely.equals(read_city_model(file).polygons[0], polygons[0])
+    away = json.loads(json.dumps(document))
+    away["vertices"] = [[x + 20 * (x == 5), y, z] for x, y, z in away["vertices"]]
+    assert prove(tmp_path, away)[1] == {"solid-plan"}
 
 
 def prove(folder: Path, model: Json) -> tuple[str, set[str]]:

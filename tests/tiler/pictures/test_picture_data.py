@@ -3,23 +3,28 @@
 import json
 import shutil
 import tracemalloc
-from itertools import product
+from collections import Counter
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Boundary, Marker
+from pipeline.data.roofs import roof_heights
 from pipeline.quality.quality import measure_cells
 from tests.helpers.scene import PIECES, write_scene
 from tests.helpers.vtk_writers import write_vtp
+from tiler.citymodels.cityjson import read_city_model
 from tiler.mesh_files.facet_quality import measure_facets
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp
 from tiler.pictures.city_model_data import DEEP, load_blocks
 from tiler.pictures.picture_data import Facets, coarsen, find_middle, join_facets, load_city
 from tiler.pictures.picture_parts import QUALITY_COLOURS, blend, heights_above_ground
 from tiler.pictures.render import render_run
+from tiler.store.out_folder import CITY_MODEL
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +134,30 @@ def test_blocks_stand_on_the_terrain(small_run: Path, tmp_path: Path, monkeypatc
     said: list[str] = []
     render_run(small_run, tmp_path / "x.png", what="citymodel", size=(160, 100), say=said.append)
     assert said == [f"the largest 5 of {n_buildings} building parts are drawn"]
+
+
+def test_the_city_model_is_drawn_with_its_roofs(sloped_run: Path) -> None:
+    model = read_city_model(sloped_run / CITY_MODEL)
+    city, n_buildings, _ = load_blocks(sloped_run)
+    assert n_buildings == len(model)
+    points = city.points + city.origin
+    triangles = points[city.facets[city.marker == Marker.ROOF]]
+    centre = triangles.mean(axis=1)
+    found, row = shapely.STRtree(model.polygons).query(shapely.points(centre[:, :2]), predicate="within")
+    assert np.array_equal(found, np.arange(len(centre)))  # each lies in one building
+    heights = [roof_heights(model.roofs, row, triangles[:, k, :2]) for k in range(3)]
+    assert np.abs(np.stack(heights, axis=1) - triangles[..., 2]).max() < 0.01
+    assert (np.ptp(triangles[..., 2], axis=1) > 0.5).sum() > 20
+    area = np.bincount(row, shapely.area(shapely.polygons(triangles[..., :2])))
+    assert np.allclose(area, shapely.area(model.polygons), rtol=1e-3)
+    # Roofs and walls of a building enclose it, but for its bottom: open edges are at the feet of walls.
+    for building in range(n_buildings):
+        edges = Counter(
+            edge for face in city.facets[city.building == building].tolist() for edge in pairwise([*face, face[0]])
+        )
+        assert max(edges.values()) == 1
+        rim = [edge for edge in edges if edge[::-1] not in edges]
+        assert len(set(points[np.array(rim), 2].ravel().tolist())) == 1
 
 
 def test_what_is_missing_is_one_error(small_run: Path, tmp_path: Path) -> None:

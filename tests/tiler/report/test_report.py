@@ -14,12 +14,14 @@ from PIL import Image
 
 from pipeline.city_model.heights import ROOF_SOURCES
 from pipeline.data.errors import InputError
+from pipeline.quality.histograms import share_below
 from tests.helpers.tiles import hash_files
 from tiler.cli.main import main
 from tiler.report import write_report
 from tiler.report.charts import Series, draw_gantt, draw_histogram
 from tiler.report.maps import draw_map, gather_tiles, shade
 from tiler.report.record import SHOWN, read_run_facts
+from tiler.report.samples import measure_samples
 from tiler.report.svg_map import encode_png
 from tiler.report.timeline import BINS, read_timeline
 from tiler.stages.domain import LOW_DOMAIN
@@ -90,6 +92,20 @@ def test_the_report_says_what_the_run_made(copy: Path) -> None:
         attributes for tag, attributes in page.elements if tag == "rect" and "shade" in (attributes["class"] or "")
     ]
     assert len(tiles) == 3 * len(record["tiles"])  # by quality, cells and time
+
+
+def test_the_report_tells_how_many_roof_points_are_close_to_the_mesh(
+    sloped_run: Path, tmp_path: Path, small_pictures: None
+) -> None:
+    copy = shutil.copytree(sloped_run, tmp_path / "run")
+    page = read(write_report(copy))
+    bounds = json.loads((copy / "run.json").read_text())["region"]["bounds"]
+    samples = measure_samples(copy, tuple(bounds), ground_filter=False)
+    share = share_below(samples.points["roof on roof"].absolute, 0.25)
+    assert 0.7 < share < 1.0
+    row = page.words[page.words.index("roof points over roofs") :]
+    assert row[7] == f"{share:.3f}"
+    assert page.words.count("share within 0.25 m") == 3
 
 
 def test_the_report_needs_no_other_file(copy: Path) -> None:
@@ -338,6 +354,7 @@ def test_roofs_of_planes_are_told_by_method_and_the_worst_are_listed(copy: Path)
     assert "roof_fit" not in record["fidelity"]
     fit = {
         "planes": {"buildings": 1234, "points": 56789, "rmse": 1.25, "median": 0.125, "within": 0.75},
+        "family": {"buildings": 5, "points": 3 * 56789, "rmse": 0.25, "median": 0.5, "within": 0.5},
         "flat": {"buildings": 4321, "points": 0},
     }
     worst = {
@@ -348,4 +365,6 @@ def test_roofs_of_planes_are_told_by_method_and_the_worst_are_listed(copy: Path)
     words = read(write_report(copy)).words
     for told in ("1,234", "56,789", "1.250", "0.125", "0.750", "4,321", "<h1>", "9.875"):
         assert told in words
+    total = words[words.index("all") + 1 :]
+    assert total[:5] == ["5,560", "227,156", f"{(1.75 / 4) ** 0.5:.3f}", "-", f"{2.25 / 4:.3f}"]
     assert "h1-part2 at 12.5, 7.0: few & far" in words
