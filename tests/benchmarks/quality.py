@@ -69,6 +69,7 @@ def amsterdam(name: str, out: Path, **options: Any) -> dict[str, Any]:
         "crs": "EPSG:28992",
         "out": str(out),
         "overwrite": True,
+        "roofs": "flat",
     }
     return run(make_config(values | options))
 
@@ -78,7 +79,7 @@ def synthetic(folder: Path, out: Path, *, seed: int, relief: float = 20.0, **opt
     city = folder / f"city-{seed}-{relief:g}"
     files = write_city(city, size=1000, buildings=500, relief=relief, seed=seed)
     values = {"pointcloud": [str(p) for p in files.clouds], "footprints": str(files.footprints), "out": str(out)}
-    return run(make_config(values | {"overwrite": True} | options))
+    return run(make_config(values | {"overwrite": True, "roofs": "flat"} | options))
 
 
 def union_error(out: Path) -> float:

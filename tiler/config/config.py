@@ -159,7 +159,7 @@ class Config:
     )  # fmt: skip
     min_courtyard_area: float = _parameter(5.0, "simplify", "smaller courtyards are filled", unit="m2", least=0)
     roofs: str = _parameter(
-        "flat", "simplify", "roofs of houses: planes found in their points, hipped ones by the skeleton of the "
+        "planes", "simplify", "roofs of houses: planes found in their points, hipped ones by the skeleton of the "
         "outline, or flat; always flat with mesher = layered or simplify = paper",
         choices=("planes", "skeleton", "flat"),
     )  # fmt: skip
@@ -365,6 +365,7 @@ CONDITIONS = {
     "fem_tolerance": ("mesher", "layered"),
 }
 TLS = ("tls_ca", "tls_cert", "tls_key")
+OF_FLAT_ROOFS = ("split_levels", "roof_group")
 SOIL = ("least_spacing", "most_spacing", "stagger")  # of these, those that count for soil with either mesher
 
 
@@ -384,6 +385,12 @@ def idle_parameters(config: Config) -> list[str]:
         and getattr(config, other) != value
         and not (config.underground and name in SOIL)
     ]
+    if config.roofs != "flat" and not roofs_stay_flat(config.mesher, config.simplify):
+        idle += [
+            f"{name} = {getattr(config, name)} has no effect: it counts with roofs = flat"
+            for name in OF_FLAT_ROOFS
+            if getattr(config, name) != getattr(default, name)
+        ]
     if config.grading != default.grading and not config.graded_size:
         idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
     if config.layer_growth != default.layer_growth and not config.first_layer:
