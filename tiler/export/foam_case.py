@@ -15,6 +15,7 @@ SPEED, HEIGHT, ROUGHNESS = 5.0, 10.0, 0.5  # m/s at m above the inlet's lowest p
 KAPPA, C_MU = 0.41, 0.09
 AIR = 1.5e-5  # kinematic viscosity, m2/s
 ITERATIONS = 500
+PROCESSES = 4  # of decomposePar, where the mesh is written whole
 INLET, OUTLET = "west", "east"
 WALLS = '"(walls|roofs|building_.*)"'
 SLIP = '"(south|north|top|missing)"'
@@ -103,8 +104,7 @@ def write_system(folder: Path, *, parts: int | None, case: str | None) -> None:
         "fvSchemes": SCHEMES,
         "fvSolution": SOLUTION,
     }
-    if parts is not None:
-        texts["decomposeParDict"] = f"numberOfSubdomains {parts};\nmethod scotch;\n"
+    texts["decomposeParDict"] = f"numberOfSubdomains {parts or PROCESSES};\nmethod scotch;\n"
     (folder / "system").mkdir()
     for name, text in texts.items():
         (folder / "system" / name).write_text(foam_header(name, "dictionary", location="system") + text)

@@ -1,8 +1,8 @@
 """OpenFOAM's polyMesh, whole or decomposed, written from the pieces one by one.
 
 Faces stand in upper triangular order, then patch by patch. A decomposed mesh is written straight from the
-tiles, as `decomposePar` would: tiles are grouped, faces between two groups become processor patches in the same
-order on both sides, and the addressing to the whole mesh lies beside it for `reconstructPar`.
+tiles, as `decomposePar` would: columns of cells are grouped, faces between two groups become processor patches in
+the same order on both sides, and the addressing to the whole mesh lies beside it for `reconstructPar`.
 """
 
 import json
@@ -10,16 +10,18 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from pipeline.data.errors import CityError, ConfigError, InputError
+from tiler.export.cell_parts import ColumnsFile, divide_cells, take_whole
 from tiler.export.export import EXPORT_RECORD, LARGEST_PART, Format
 from tiler.export.foam_case import INLET, OUTLET, write_system, write_wind_case
 from tiler.export.foam_files import LABEL_LIMIT
 from tiler.export.foam_part import FoamPlan, PartCounts, PointPlaces, write_part
-from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, is_house
-from tiler.export.pieces import Pieces, split_pieces
+from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, interface_name, is_house
+from tiler.export.pieces import Pieces
 from tiler.export.region_faces import Ints, find_outer, survey_faces
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
 from tiler.mesh_files.run_files import RunFiles, RunSource
@@ -50,8 +52,8 @@ def export_openfoam(
     Raises
     ------
     ConfigError
-        If there are fewer tiles than parts, no side for the wind to come from, soil where it should blow, or a
-        mesh of several parts that share no face.
+        If there are too few columns for so many parts, no side for the wind to come from, soil where it should
+        blow, or a mesh of several parts that share no face.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
@@ -93,7 +95,16 @@ def _refuse_parts(case: str, files: RunFiles) -> CityError:
 
 
 def _record(counts: Sequence[PartCounts], parts: int | None) -> str:
-    record = {"schema": 1, "format": "openfoam", "decomposed": parts is not None}
+    record: dict[str, Any] = {"schema": 1, "format": "openfoam", "decomposed": parts is not None}
+    if parts is not None:
+        cells = [part.cells for part in counts]
+        record["balance"] = round(max(cells) * len(cells) / sum(cells), 6)  # the largest part over the mean
+        record["interfaces"] = [
+            [number, other, n]
+            for number, part in enumerate(counts)
+            for other in range(number + 1, parts)
+            if (n := part.patches.get(interface_name(number, other), 0))
+        ]
     return json.dumps({**record, "meshes": [asdict(part) for part in counts]}, indent=1) + "\n"
 
 
@@ -121,7 +132,7 @@ def write_openfoam(
     Raises
     ------
     ConfigError
-        If there are fewer tiles than parts.
+        If there are too few columns for so many parts.
     InputError
         If a piece is damaged, or pieces do not fit together.
 
@@ -129,29 +140,34 @@ def write_openfoam(
     -----
     Memory: one piece with its faces (some 80 bytes a cell), the faces between one part and the others (some
     60 bytes each), and what `survey_faces` holds. Files beside the result, gone at the end: 40 bytes a face
-    between two tiles; for parts also 8 bytes a point. Each piece is read twice.
+    between two tiles; for parts also 8 bytes a point, 12 a cell and 24 a column. Each piece is read twice; for
+    parts twice, and once more for each part that has cells of it.
     """
-    n = len(pieces.names)
-    if parts is not None and not 1 <= parts <= n:
-        raise ConfigError(
-            f"--parts {parts}: the mesh has {n} tiles, and each part takes whole ones; "
-            f"give 1 to {n} parts, or mesh with a smaller --tile-size"
-        )
+    if parts is not None and parts < 1:
+        raise ConfigError(f"--parts {parts}: must be 1 or more")
     sets_of = _by_building if buildings == "patches" else _by_marker
     zones_of = _by_zone if buildings == "zones" else _by_ground
-    with TemporaryDirectory(dir=folder, prefix=".faces.") as scratch:
+    with TemporaryDirectory(dir=folder, prefix=".faces.") as name:
+        scratch = Path(name)
+        columns = ColumnsFile(scratch / "columns")
+        look = None if parts is None else columns.add
         region, (patches, zones, volumes) = survey_faces(
-            pieces, Path(scratch), kinds=(sets_of, zones_of, _by_region)
+            pieces, scratch, kinds=(sets_of, zones_of, _by_region), look=look
         )
-        weight = np.diff(region.cell_start)
-        part = np.zeros(n, np.int64) if parts is None else split_pieces(region.centre, weight, parts)
-        n_faces = region.n_inner + int(patches.first(range(n))[1].sum())
+        if parts is None:
+            divided = take_whole(region, (patches, zones, volumes))
+        else:
+            kinds = ((sets_of, patches), (zones_of, zones))
+            divided = divide_cells(
+                pieces, region, columns, scratch, n_parts=parts, kinds=kinds, volumes=(_by_region, volumes)
+            )
+        n_faces = region.n_inner + int(patches.first(range(len(pieces.names)))[1].sum())
         label = 32 if max(3 * n_faces, pieces.n_points, int(region.cell_start[-1])) <= LABEL_LIMIT else 64
-        found = zones if buildings == "zones" or len(zones.keys) else None
-        plan = FoamPlan(pieces, region, patches, found, volumes, sets_of, zones_of, part, label)
+        zoned = buildings == "zones" or len(zones.keys) > 0
+        plan = FoamPlan(pieces, region, patches, volumes, zoned, sets_of, zones_of, divided, label)
         if parts is None:
             return [write_part(folder, plan, 0, None)]
-        places = PointPlaces(Path(scratch) / "places", pieces.n_points)
+        places = PointPlaces(scratch / "places", pieces.n_points)
         return [write_part(folder / f"processor{number}", plan, number, places) for number in range(parts)]
 
 
