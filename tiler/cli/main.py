@@ -325,7 +325,9 @@ def _export(options: argparse.Namespace) -> int:
         for name, value in vars(options).items()
         if name.startswith(EXPORT_OPTION)
     }
-    export_run(options.directory, options.output, name=options.format, overwrite=options.overwrite, options=given)
+    words = {"name": options.format, "overwrite": options.overwrite, "options": given}
+    for line in export_run(options.directory, options.output, **words):
+        say(line)
     say(str(options.output))
     return 0
 

@@ -302,6 +302,28 @@ def _add_export(export: argparse.ArgumentParser) -> None:
     given: dict[str, dict[str, Any]] = {
         "parts": {"type": int, "metavar": "N", "help": "decomposed for N processes instead of whole"},
         "case": {"choices": ("wind",), "help": "add the files of a simulation"},
+        "direction": {
+            "type": float,
+            "action": "append",
+            "metavar": "DEGREES",
+            "help": "where the wind comes from, degrees clockwise from north (default: 270); several: a case each",
+        },
+        "wind_speed": {"type": float, "metavar": "M/S", "help": "of the undisturbed wind (default: 5)"},
+        "wind_height": {
+            "type": float,
+            "metavar": "M",
+            "help": "height of that speed above the inlet's lowest ground (default: 10)",
+        },
+        "roughness": {
+            "type": float,
+            "metavar": "M",
+            "help": "roughness length z0 upstream and of the ground (default: 0.5)",
+        },
+        "patch_roughness": {
+            "action": "append",
+            "metavar": "PATCH=M",
+            "help": "roughness length of a patch of ground, walls or roofs that differs; repeat for others",
+        },
         "buildings": {
             "choices": ("patches", "zones"),
             "help": "one patch a building instead of walls and roofs; zones: one face zone beside them",

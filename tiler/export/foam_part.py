@@ -36,6 +36,8 @@ from tiler.export.region_faces import (
 )
 from tiler.mesh_files.mesh_pieces import MeshPiece
 
+DISTANCES = np.logspace(-4, 3, 281)  # m; bins of 6 %
+
 
 @dataclass(frozen=True)
 class PartCounts:
@@ -49,6 +51,9 @@ class PartCounts:
         Faces of each patch, processor patches included.
     lowest, highest : mapping of str to float
         Lowest and highest point (m) of each patch of the region's boundary that has faces here.
+    near : mapping of str to int64 (len(DISTANCES) + 1,)
+        Of each patch that is a wall, for how many faces the centre of their cell is within `DISTANCES` of their
+        plane.
     """
 
     cells: int
@@ -58,6 +63,7 @@ class PartCounts:
     patches: Mapping[str, int]
     lowest: Mapping[str, float]
     highest: Mapping[str, float]
+    near: Mapping[str, Ints]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +87,8 @@ class FoamPlan:
         Part of each cell.
     label : int
         Bits of an integer.
+    heights : Path, optional
+        A folder for the heights of the centres of cells (m), float64, a file for each part by its number.
     """
 
     pieces: Pieces
@@ -92,6 +100,7 @@ class FoamPlan:
     zone_keys: Callable[[MeshPiece], Ints]
     parts: CellParts
     label: int
+    heights: Path | None = None
 
 
 class PointPlaces:
@@ -186,6 +195,7 @@ class _PartWriter:
         self._across: list[_Across] = []
         self._lowest: dict[str, float] = {}
         self._highest: dict[str, float] = {}
+        self._near: dict[str, Ints] = {}
         n = numbers.n_faces
         self._faces = stack.enter_context(FoamFaces(folder / "faces", location=POLY_MESH, label=plan.label, n=n))
         n_points = plan.pieces.n_points if places is None else None
@@ -205,6 +215,9 @@ class _PartWriter:
         if len(plan.volumes.keys):
             cells = ZonesFile(folder / "cellZones", volumes, numbers.pieces, cell_zone_name)
             self._volumes = stack.enter_context(cells)
+        self._heights = None
+        if plan.heights is not None:
+            self._heights = stack.enter_context((plan.heights / str(number)).open("wb"))
 
     def add(self, k: int) -> None:
         """Write what is in the part of piece `k`."""
@@ -221,6 +234,11 @@ class _PartWriter:
             number = np.arange(cells.start, cells.stop) if isinstance(cells, slice) else cells
             region = piece.region[number - start].astype(np.int64)
             self._volumes.write(k, region, self._plan.parts.place_of(number))
+        if self._heights is not None:
+            rows = slice(0, len(piece.cells)) if isinstance(cells, slice) else cells - start
+            z = piece.points[:, 2]
+            low, high = (z[piece.cells[rows, k]] + z[piece.cells[rows, k + 1]] for k in (0, 2))
+            ((low + high) / 4).tofile(self._heights)
 
     def finish(self) -> PartCounts:
         """Write what stands behind the pieces."""
@@ -238,7 +256,14 @@ class _PartWriter:
         )
         n_points = self._points.n
         return PartCounts(
-            numbers.n_cells, n_points, numbers.n_faces, numbers.n_inner, counts, self._lowest, self._highest
+            numbers.n_cells,
+            n_points,
+            numbers.n_faces,
+            numbers.n_inner,
+            counts,
+            self._lowest,
+            self._highest,
+            self._near,
         )
 
     def _open(
@@ -347,9 +372,13 @@ class _PartWriter:
             if self._places is not None:
                 first, _, start = self._whole
                 self._face_to.write(at, int(start[row]) + first[k][row] + 1 + in_piece)
-            name, height = patch_of_key(int(keys[row])).name, piece.points[facets[chosen], 2]
+            patch, height = patch_of_key(int(keys[row])), piece.points[facets[chosen], 2]
+            name = patch.name
             self._lowest[name] = min(self._lowest.get(name, np.inf), float(height.min()))
             self._highest[name] = max(self._highest.get(name, -np.inf), float(height.max()))
+            if patch.kind == "wall":
+                near = count_distances(piece.points, piece.cells[faces.facet_cell[chosen]], facets[chosen])
+                self._near[name] = self._near.get(name, 0) + near
         if self._zones is not None:
             self._zones.write(k, np.where(mine, self._plan.zone_keys(piece)[outer], -1), face)
 
@@ -364,6 +393,26 @@ class _PartWriter:
         self._faces.write(at, corners[order])
         self._owner.write(at, owner[order])
         self._face_to.write(at, (np.where(turned, -1, 1) * (face + 1))[order])
+
+
+def count_distances(points: NDArray[np.float64], cells: NDArray[np.int32], facets: NDArray[np.int32]) -> Ints:
+    """Count how far centres of cells (k, 4) are from the planes of their facets (k, 3): bins of `DISTANCES`.
+
+    Examples
+    --------
+    A cell of 4 m over the ground has its centre 1 m above it:
+
+    >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 4]])
+    >>> counts = count_distances(points, np.array([[0, 1, 2, 3]]), np.array([[0, 2, 1]]))
+    >>> bool(DISTANCES[counts.argmax() - 1] <= 1.0 <= DISTANCES[counts.argmax()])
+    True
+    """
+    a, b, c = (points[facets[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    area = np.sqrt((normal**2).sum(axis=1))
+    offset = points[cells].mean(axis=1) - a
+    distance = np.abs((offset * normal).sum(axis=1)) / area
+    return np.bincount(np.searchsorted(DISTANCES, distance), minlength=len(DISTANCES) + 1)
 
 
 def _number_part(plan: FoamPlan, number: int) -> _Numbers:
