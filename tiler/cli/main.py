@@ -332,6 +332,16 @@ def _export(options: argparse.Namespace) -> int:
     return 0
 
 
+def _wind(options: argparse.Namespace) -> int:
+    from tiler.wind.study import WindMaps, assess_wind
+
+    maps = WindMaps(options.rose, options.rose_height, options.resolution)
+    for line in assess_wind(options.directory, options.output, maps, overwrite=options.overwrite):
+        say(line)
+    say(str(options.output))
+    return 0
+
+
 def _kernels(_: argparse.Namespace) -> int:
     from tiler.executors.kernels import cache_folder, compile_all
 
@@ -359,6 +369,7 @@ HANDLERS: Mapping[str, Handler] = {
     "demo": _demo,
     "render": _render,
     "export": _export,
+    "wind": _wind,
     "kernels": _kernels,
     "config": _config,
 }

@@ -167,6 +167,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     )
     add_job_commands(add, _add_inputs)
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
+    _add_wind(command("wind", "map mean wind and comfort from results of a wind case and a wind rose"))
     command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
     command("config", "print all parameters of a run, annotated, as a configuration file")
     return parser
@@ -273,6 +274,28 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int, r
 def _add_fetch(fetch: argparse.ArgumentParser) -> None:
     fetch.add_argument("source", metavar="s3://BUCKET/NAME", help="what --out of the run was")
     fetch.add_argument("directory", type=Path, metavar="DIR", help="folder to write")
+
+
+def _add_wind(wind: argparse.ArgumentParser) -> None:
+    wind.add_argument("directory", type=_on_disk, metavar="DIR", help="an exported wind case that has run")
+    wind.add_argument(
+        "--rose",
+        type=Path,
+        required=True,
+        metavar="FILE.csv",
+        help="wind rose: columns direction, share, scale, shape (Weibull), or direction, speed, share",
+    )
+    wind.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
+    wind.add_argument("--overwrite", action="store_true", help="replace it if it exists")
+    wind.add_argument(
+        "--rose-height",
+        type=float,
+        metavar="M",
+        help="height at which the rose's speeds are (default: that of --wind-height)",
+    )
+    wind.add_argument(
+        "--resolution", type=float, default=1.0, metavar="M", help="size of a pixel in m (default: 1)"
+    )
 
 
 class _ExportHelp(argparse.Action):

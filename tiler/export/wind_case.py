@@ -62,8 +62,8 @@ SAMPLING = """// Wind {height} m above the ground: one value a triangle of it, t
 {{
     type            surfaces;
     libs            ("libsampling.so");
-    executeControl  writeTime;
-    writeControl    writeTime;
+    executeControl  onEnd;
+    writeControl    onEnd;
     surfaceFormat   raw;
     fields          (U k);
     interpolationScheme cell;

@@ -32,8 +32,8 @@ from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
 from tiler.store.atomic import replacing_folder
 from tiler.store.run_folder import read_crs
 
-# Roughness lengths between rough ground and the centres of its cells: over bare ground the profile stays within 2 %
-# at 3 of them, and is 19 % off at 0.6 (docs/wind.md).
+# Roughness lengths between rough ground and the centres of its cells. Over bare ground the profile stays within
+# 2 % at 3 of them, and is 19 % off at 0.6: docs/wind.md.
 LEAST_DISTANCE = 2.5
 WIND_OPTIONS = ("direction", "wind_speed", "wind_height", "roughness", "patch_roughness")
 
