@@ -170,6 +170,15 @@ def _check(options: argparse.Namespace) -> int:
         return 0 if audit_run(options.directory, print) else EXIT_FAILED
     refuse_bucket(options.directory, "check without --store")
     refuse_strangers(options.directory)
+    if options.cfd:
+        from tiler.check.cfd_guidelines import check_guidelines
+        from tiler.export.wind_profile import WEST
+
+        report = check_guidelines(options.directory, options.direction or [WEST])
+        print("\n".join(map(printable, report.lines())))
+        return 0 if report.ok else EXIT_FAILED
+    if options.direction:
+        raise ConfigError("--direction: is for check --cfd; give that too")
     return _check_folder(options.directory)
 
 

@@ -132,11 +132,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
     plan.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw tiles, files and footprints")
     _add_inputs(plan)
-    check = command("check", "prove from the written files that a mesh is right")
-    check.add_argument("directory", type=place, metavar="DIR", help="folder of a run")
-    check.add_argument(
-        "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
-    )
+    _add_check(command("check", "prove from the written files that a mesh is right"))
     status = command("status", "tell how far a run is, whether it is alive, and how to go on")
     status.add_argument("job", metavar="DIR|JOB", help="folder of a run, or number of its job")
     status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
@@ -274,6 +270,26 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int, r
 def _add_fetch(fetch: argparse.ArgumentParser) -> None:
     fetch.add_argument("source", metavar="s3://BUCKET/NAME", help="what --out of the run was")
     fetch.add_argument("directory", type=Path, metavar="DIR", help="folder to write")
+
+
+def _add_check(check: argparse.ArgumentParser) -> None:
+    check.add_argument("directory", type=place, metavar="DIR", help="folder of a run")
+    what = check.add_mutually_exclusive_group()
+    what.add_argument(
+        "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
+    )
+    what.add_argument(
+        "--cfd",
+        action="store_true",
+        help="instead hold domain and cells against the guidelines for wind simulations of COST 732 and AIJ",
+    )
+    check.add_argument(
+        "--direction",
+        type=float,
+        action="append",
+        metavar="DEGREES",
+        help="with --cfd: where the wind comes from, degrees clockwise from north (default: 270); several: repeat",
+    )
 
 
 def _add_wind(wind: argparse.ArgumentParser) -> None:

@@ -157,11 +157,11 @@ def run_wind(run: Path, case: Path, iterations: int, **options: Any) -> Path:
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("direction", [270.0, 240.0])
 def test_the_profile_at_the_outlet_is_that_of_the_inlet(flat_run: Path, tmp_path: Path, direction: float) -> None:
-    """Over bare ground the mean profile stays within 2 % above 2 m, and k within 10 %."""
+    """Over bare ground the mean profile stays within 2 % from 1 m on, and k within 12 %."""
     case = tmp_path / "case"
-    end = run_wind(flat_run, case, 200, direction=[direction], roughness=0.1)
+    end = run_wind(flat_run, case, 200, direction=[direction], roughness=0.03)
     assert mesh_is_ok(run_foam("checkMesh", case))
-    mesh, wind = read_poly_mesh(case / MESH), Wind((direction,), roughness=0.1)
+    mesh, wind = read_poly_mesh(case / MESH), Wind((direction,), roughness=0.03)
     centre, (low, high) = centres_of(mesh), (mesh.points.min(axis=0), mesh.points.max(axis=0))
     flow = np.array([*flow_of(direction), 0.0])
     at_outlet = high[0] - centre[:, 0] < 15.0
@@ -169,11 +169,11 @@ def test_the_profile_at_the_outlet_is_that_of_the_inlet(flat_run: Path, tmp_path
         at_outlet |= high[1] - centre[:, 1] < 15.0
     height, speed = centre[:, 2] - low[2], read_field(end / "U", 3) @ flow
     k = read_field(end / "k", 1)[:, 0]
-    limits = [2.0, 4.0, 6.0, 10.0, 15.0, 25.0, 40.0, 60.0]
+    limits = [1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 15.0, 25.0, 40.0, 60.0]
     for lower, upper in pairwise(limits):
         chosen = at_outlet & (height >= lower) & (height < upper)
         assert (speed[chosen] / wind.speed_at(height[chosen])).mean() == pytest.approx(1.0, abs=0.02), lower
-        assert k[chosen].mean() == pytest.approx(wind.k, rel=0.1), lower
+        assert k[chosen].mean() == pytest.approx(wind.k, rel=0.12), lower
 
 
 @pytest.mark.long

@@ -21,7 +21,7 @@ def case(tmp_path: Path) -> Path:
     """An export of 8 x 4 m in four triangles, of which one has no sample; wind from 0 and 90 degrees has run."""
     folder = tmp_path / "case"
     (folder / "constant" / "triSurface").mkdir(parents=True)
-    points = np.add([[0.0, 0], [4, 0], [8, 0], [0, 4], [4, 4], [8, 4]], [WEST, SOUTH])
+    points = np.array([[x, y] for y in (SOUTH, SOUTH + 4) for x in (WEST, WEST + 4, WEST + 8)])
     corners = np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]])
     lines = [f"v {x:.17g} {y:.17g} 1.75" for x, y in points]
     lines += [f"f {a} {b} {c}" for a, b, c in corners + 1]
