@@ -18,7 +18,7 @@ HOMES = {
     "dask": ("tiler/",),
     "distributed": ("tiler/",),
     "zarr": ("tiler/store/",),
-    "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py"),
+    "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py", "tiler/formats/vtkhdf.py"),
     "laspy": ("tiler/",),
     "pyogrio": ("tiler/",),
     "meshio": ("tiler/",),

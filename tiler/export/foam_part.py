@@ -88,7 +88,8 @@ class FoamPlan:
     label : int
         Bits of an integer.
     heights : Path, optional
-        A folder for the heights of the centres of cells (m), float64, a file for each part by its number.
+        A folder for the heights of the centres of cells (m), float64: a file for each part by its number, and for
+        two parts ``a`` and ``b`` that meet a file ``a-b`` of the cells of ``a`` at their faces, in their order.
     """
 
     pieces: Pieces
@@ -393,6 +394,12 @@ class _PartWriter:
         self._faces.write(at, corners[order])
         self._owner.write(at, owner[order])
         self._face_to.write(at, (np.where(turned, -1, 1) * (face + 1))[order])
+        if self._heights is not None and self._plan.heights is not None:
+            self._heights.flush()
+            height = np.fromfile(self._plan.heights / str(self.numbers.number))[owner[order]]
+            for beyond in self.numbers.others:
+                place = self._plan.heights / f"{self.numbers.number}-{beyond}"
+                height[other[order] == beyond].tofile(place)
 
 
 def count_distances(points: NDArray[np.float64], cells: NDArray[np.int32], facets: NDArray[np.int32]) -> Ints:

@@ -7,6 +7,7 @@ top that drives the flow by the shear of the profile.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from tiler.export.foam_case import write_system
 from tiler.export.foam_files import foam_header
+from tiler.export.foam_patches import interface_name
 from tiler.export.pieces import ROWS
 from tiler.export.wind_profile import (
     C_1,
@@ -100,7 +102,8 @@ class Domain:
     lowest, highest : mapping of str to float
         Lowest and highest point of each (m).
     heights : sequence of Path
-        For each part a file of the heights of the centres of its cells (m), float64.
+        For each part a file of the heights of the centres of its cells (m), float64; beside them those of cells at
+        faces between two parts, see `tiler.export.foam_part.FoamPlan`.
     """
 
     patches: Mapping[str, int]
@@ -347,7 +350,7 @@ def _fields(domain: Domain, wind: Wind, flow: tuple[float, float], top: float, r
         conditions[PARTS] = f"type processor; value {inside};"
         rows = "\n".join(f"    {patch} {{ {text} }}" for patch, text in conditions.items())
         head = f"dimensions      {dimensions};\n"
-        fields[name] = Field(kind, head, inside, inner.get(name), f"boundaryField\n{{\n{rows}\n}}\n")
+        fields[name] = Field(kind, head, inside, inner.get(name), f"{rows}\n")
     return fields
 
 
@@ -358,17 +361,32 @@ def _write_field(path: Path, field: Field, heights: Path, ground: float) -> None
         header = foam_header(path.name, field.kind, location="0", binary=binary)
         file.write((header + field.dimensions).encode())
         if field.profile is None:
-            file.write(f"internalField   {field.start};\n".encode())
-        else:
-            n = heights.stat().st_size // 8
-            kind = field.kind.removeprefix("vol").removesuffix("Field").lower()
-            file.write(f"internalField   nonuniform List<{kind}> {n}\n(".encode())
-            with heights.open("rb") as rows:
-                while len(z := np.fromfile(rows, "<f8", ROWS)):
-                    values = np.round(field.profile(np.maximum(z - ground, 0.0)), 9)
-                    file.write(values.astype("<f8").tobytes())
-            file.write(b")\n;\n")
-        file.write(field.conditions.encode())
+            file.write(f"internalField   {field.start};\nboundaryField\n{{\n{field.conditions}}}\n".encode())
+            return
+        file.write(b"internalField   ")
+        _write_values(file, field, heights, ground)
+        file.write(f"boundaryField\n{{\n{field.conditions}".encode())
+        # A solver begins with what stands here, without asking the process beyond.
+        for beyond in sorted(heights.parent.glob(f"*-{heights.name}")):
+            name = interface_name(int(heights.name), int(beyond.name.split("-")[0]))
+            file.write(f"    {name} {{ type processor; value ".encode())
+            _write_values(file, field, beyond, ground)
+            file.write(b"}\n")
+        file.write(b"}\n")
+
+
+def _write_values(file: BinaryIO, field: Field, heights: Path, ground: float) -> None:
+    """Write the profile at the heights in a file."""
+    if field.profile is None:
+        return
+    n = heights.stat().st_size // 8
+    kind = field.kind.removeprefix("vol").removesuffix("Field").lower()
+    file.write(f"nonuniform List<{kind}> {n}\n(".encode())
+    with heights.open("rb") as rows:
+        while len(z := np.fromfile(rows, "<f8", ROWS)):
+            values = np.round(field.profile(np.maximum(z - ground, 0.0)), 9)
+            file.write(values.astype("<f8").tobytes())
+    file.write(b")\n;\n")
 
 
 def _rough(z0: float) -> str:

@@ -51,7 +51,7 @@ def small_wind(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 def conditions(path: Path) -> dict[str, str]:
     """Read the type of each patch of a field."""
-    text = path.read_bytes().split(b"boundaryField")[1].decode()
+    text = path.read_bytes().split(b"boundaryField")[1].decode("latin1")
     return dict(re.findall(r"^    (\S+) \{ type (\w+);", text, re.MULTILINE))
 
 
@@ -104,7 +104,20 @@ def test_cells_start_with_the_profile(small_run: Path, tmp_path: Path) -> None:
     export_run(small_run, parts, name="openfoam", options={"case": "wind", "direction": [180.0], "parts": 3})
     for n in range(3):
         cell = read_labels(parts / f"processor{n}" / MESH / "cellProcAddressing")
-        assert np.array_equal(read_field(parts / f"processor{n}" / "0" / "U", 3), velocity[cell])
+        start = parts / f"processor{n}" / "0" / "U"
+        assert np.array_equal(read_field(start, 3), velocity[cell])
+        # On faces towards another part stand the values of its cells.
+        part = read_poly_mesh(parts / f"processor{n}" / MESH)
+        for name, patch in part.patches.items():
+            if patch.kind == "processor":
+                beyond = int(patch.words["neighbProcNo"])
+                other = read_poly_mesh(parts / f"processor{beyond}" / MESH)
+                owner = other.owner[other.patch_of(f"procBoundary{beyond}to{n}")]
+                to = read_labels(parts / f"processor{beyond}" / MESH / "cellProcAddressing")
+                data = start.read_bytes()
+                at = data.index(f"{name} {{ type processor; value nonuniform List<vector> {patch.n}\n(".encode())
+                values = np.frombuffer(data, "<f8", 3 * patch.n, data.index(b"(", at) + 1).reshape(-1, 3)
+                assert np.array_equal(values, velocity[to[owner]])
 
 
 def test_what_the_mesh_does_not_allow_is_said(
