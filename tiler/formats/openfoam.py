@@ -88,7 +88,7 @@ def export_openfoam(
         )
     if case is not None and pieces.files.parts != 1:
         raise _refuse_parts(case, pieces.files)
-    with replacing_folder(output) as folder, TemporaryDirectory(dir=output.parent, prefix=".heights.") as name:
+    with replacing_folder(output) as folder, TemporaryDirectory(dir=folder, prefix=".heights.") as name:
         heights = None if case is None else Path(name)
         counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings, heights=heights)
         notes = []

@@ -433,7 +433,7 @@ def test_folders_appear_whole_or_not_at_all(tmp_path: Path) -> None:
 
 TIGHT = """solvers
 {
-    "(p|Phi|T)" { solver GAMG; smoother GaussSeidel; tolerance 1e-9; relTol 0; maxIter 100; }
+    "(p|Phi|T)" { solver PCG; preconditioner DIC; tolerance 1e-11; relTol 0; maxIter 3000; }
     "(U|k|epsilon)" { solver PBiCGStab; preconditioner DILU; tolerance 1e-10; relTol 0; }
 }
 SIMPLE { nNonOrthogonalCorrectors 0; }
@@ -523,7 +523,7 @@ def gather(case: Path, name: str, width: int, n_cells: int, *, parts: int = 2) -
 def assert_solvers_agree(one: Path, two: Path) -> None:
     solve(one, None)
     solve(two, 2)
-    for name, width, bound in (("T", 1, 1e-8), ("2/U", 3, 1e-4), ("2/p", 1, 1e-4), ("2/k", 1, 1e-4)):
+    for name, width, bound in (("T", 1, 1e-8), ("2/U", 3, 1e-3), ("2/p", 1, 1e-3), ("2/k", 1, 2e-3)):
         serial = read_field(one / name, width)
         parallel = gather(two, name, width, len(serial))
         assert np.ptp(serial) > 0
@@ -590,11 +590,40 @@ def test_openfoam_reads_and_solves_a_small_city(small_run: Path, tmp_path: Path)
     assert_reconstructed(one, two)
 
 
+def assert_decompose_par_does_the_same(start: Path, ours: Path, case: Path, parts: int) -> None:
+    """Hold parts against those that OpenFOAM makes of the whole mesh with the same cells: lists, and results.
+
+    Serial results differ by more: OpenFOAM takes distances of walls from the faces of a process alone.
+    """
+    shutil.copytree(start, case)
+    cells = [read_labels(ours / f"processor{n}" / MESH / "cellProcAddressing") for n in range(parts)]
+    part = np.empty(sum(map(len, cells)), np.int64)
+    for number, rows in enumerate(cells):
+        part[rows] = number
+    lines = "\n".join(map(str, part.tolist()))
+    (case / "constant" / "cells").write_text(HEAD % ("labelList", "cells") + f"{len(part)}\n(\n{lines}\n)\n")
+    words = f'numberOfSubdomains {parts}; method manual; manualCoeffs {{ dataFile "cells"; }}\n'
+    (case / "system" / "decomposeParDict").write_text(HEAD % ("dictionary", "decomposeParDict") + words)
+    (case / "system" / "fvSolution").write_text(HEAD % ("dictionary", "fvSolution") + TIGHT)
+    set_control(case, endTime=2, writeInterval=2)
+    run_foam("decomposePar", case)
+    run_foam("simpleFoam", case, parts=parts)
+    for number in range(parts):
+        for name in ("owner", "neighbour", "faceProcAddressing"):
+            place = Path(f"processor{number}") / MESH / name
+            assert np.array_equal(read_labels(ours / place), read_labels(case / place)), (number, name)
+        for name, width in (("2/U", 3), ("2/p", 1), ("2/k", 1)):
+            values = read_field(case / f"processor{number}" / name, width)
+            difference = read_field(ours / f"processor{number}" / name, width) - values
+            assert np.linalg.norm(difference) <= 1e-6 * np.linalg.norm(values), (number, name)
+
+
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 def test_openfoam_solves_one_tile_in_any_number_of_parts(one_tile_run: Path, tmp_path: Path) -> None:
     one = tmp_path / "one"
     export_run(one_tile_run, one, name="openfoam", options={"case": "wind"})
+    shutil.copytree(one, tmp_path / "start")
     solve(one, None)
     serial = {name: read_field(one / name, width) for name, width in (("T", 1), ("2/U", 3), ("2/p", 1))}
     for parts in (2, 3, 4):
@@ -608,8 +637,9 @@ def test_openfoam_solves_one_tile_in_any_number_of_parts(one_tile_run: Path, tmp
         solve(case, parts)
         for name, values in serial.items():
             parallel = gather(case, name, values.shape[1], len(values), parts=parts)
-            bound = 1e-8 if name == "T" else 1e-4
+            bound = 1e-8 if name == "T" else 1e-3
             assert np.linalg.norm(parallel - values) <= bound * np.linalg.norm(values), (parts, name)
+        assert_decompose_par_does_the_same(tmp_path / "start", case, tmp_path / f"decomposed_{parts}", parts)
 
 
 @pytest.mark.long
