@@ -69,7 +69,7 @@ def _label(path: Path) -> np.dtype[np.signedinteger]:
 
 
 def _one_list(data: bytes, at: int, dtype: np.dtype, width: int) -> tuple[NDArray, int]:  # type: ignore[type-arg]
-    found = re.compile(rb"\s*(\d+)\s*\(").match(data, at)
+    found = re.compile(rb"(?:\s|//[^\n]*\n)*(\d+)\s*\(").match(data, at)
     assert found, data[at : at + 40]
     count = int(found[1]) * width
     end = found.end() + count * dtype.itemsize
@@ -92,10 +92,10 @@ def read_list(path: Path, width: int) -> NDArray:  # type: ignore[type-arg]
 
 
 def read_labels(path: Path) -> Ints:
-    """Read one binary list of integers."""
+    """Read one binary list of integers, ours or one that OpenFOAM wrote."""
     data, at = _begin(path)
     rows, end = _one_list(data, at, _label(path), 1)
-    assert not data[end:].strip()
+    assert not re.sub(rb"//[^\n]*", b"", data[end:]).strip()
     return rows[:, 0].astype(np.int64)
 
 

@@ -18,7 +18,7 @@ HOMES = {
     "dask": ("tiler/",),
     "distributed": ("tiler/",),
     "zarr": ("tiler/store/",),
-    "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py"),
+    "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py", "tiler/formats/vtkhdf.py"),
     "laspy": ("tiler/",),
     "pyogrio": ("tiler/",),
     "meshio": ("tiler/",),
@@ -70,8 +70,8 @@ ORDER = {
     "tiler": [
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
         "pointclouds", "footprints", "citymodels", "mesh_files", "stages", "planning", "dashboard",
-        "executors", "jobs", "pictures", "report", "workflow", "export", "check", "formats", "interface",
-        "cli",
+        "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats",
+        "interface", "cli",
     ],
     "pipeline": [
         "data", "geometry", "points_terrain", "skeletons", "roofs", "city_model", "simplification",

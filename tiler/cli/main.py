@@ -170,6 +170,15 @@ def _check(options: argparse.Namespace) -> int:
         return 0 if audit_run(options.directory, print) else EXIT_FAILED
     refuse_bucket(options.directory, "check without --store")
     refuse_strangers(options.directory)
+    if options.cfd:
+        from tiler.check.cfd_guidelines import check_guidelines
+        from tiler.export.wind_profile import WEST
+
+        report = check_guidelines(options.directory, options.direction or [WEST])
+        print("\n".join(map(printable, report.lines())))
+        return 0 if report.ok else EXIT_FAILED
+    if options.direction:
+        raise ConfigError("--direction: is for check --cfd; give that too")
     return _check_folder(options.directory)
 
 
@@ -325,7 +334,19 @@ def _export(options: argparse.Namespace) -> int:
         for name, value in vars(options).items()
         if name.startswith(EXPORT_OPTION)
     }
-    export_run(options.directory, options.output, name=options.format, overwrite=options.overwrite, options=given)
+    words = {"name": options.format, "overwrite": options.overwrite, "options": given}
+    for line in export_run(options.directory, options.output, **words):
+        say(line)
+    say(str(options.output))
+    return 0
+
+
+def _wind(options: argparse.Namespace) -> int:
+    from tiler.wind.study import WindMaps, assess_wind
+
+    maps = WindMaps(options.rose, options.rose_height, options.resolution)
+    for line in assess_wind(options.directory, options.output, maps, overwrite=options.overwrite):
+        say(line)
     say(str(options.output))
     return 0
 
@@ -357,6 +378,7 @@ HANDLERS: Mapping[str, Handler] = {
     "demo": _demo,
     "render": _render,
     "export": _export,
+    "wind": _wind,
     "kernels": _kernels,
     "config": _config,
 }

@@ -132,11 +132,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
     plan.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw tiles, files and footprints")
     _add_inputs(plan)
-    check = command("check", "prove from the written files that a mesh is right")
-    check.add_argument("directory", type=place, metavar="DIR", help="folder of a run")
-    check.add_argument(
-        "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
-    )
+    _add_check(command("check", "prove from the written files that a mesh is right"))
     status = command("status", "tell how far a run is, whether it is alive, and how to go on")
     status.add_argument("job", metavar="DIR|JOB", help="folder of a run, or number of its job")
     status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
@@ -167,6 +163,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     )
     add_job_commands(add, _add_inputs)
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
+    _add_wind(command("wind", "map mean wind and comfort from results of a wind case and a wind rose"))
     command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
     command("config", "print all parameters of a run, annotated, as a configuration file")
     return parser
@@ -275,6 +272,48 @@ def _add_fetch(fetch: argparse.ArgumentParser) -> None:
     fetch.add_argument("directory", type=Path, metavar="DIR", help="folder to write")
 
 
+def _add_check(check: argparse.ArgumentParser) -> None:
+    check.add_argument("directory", type=place, metavar="DIR", help="folder of a run")
+    what = check.add_mutually_exclusive_group()
+    what.add_argument(
+        "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
+    )
+    what.add_argument(
+        "--cfd",
+        action="store_true",
+        help="instead hold domain and cells against the guidelines for wind simulations of COST 732 and AIJ",
+    )
+    check.add_argument(
+        "--direction",
+        type=float,
+        action="append",
+        metavar="DEGREES",
+        help="with --cfd: where the wind comes from, degrees clockwise from north (default: 270); several: repeat",
+    )
+
+
+def _add_wind(wind: argparse.ArgumentParser) -> None:
+    wind.add_argument("directory", type=_on_disk, metavar="DIR", help="an exported wind case that has run")
+    wind.add_argument(
+        "--rose",
+        type=Path,
+        required=True,
+        metavar="FILE.csv",
+        help="wind rose: columns direction, share, scale, shape (Weibull), or direction, speed, share",
+    )
+    wind.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write")
+    wind.add_argument("--overwrite", action="store_true", help="replace it if it exists")
+    wind.add_argument(
+        "--rose-height",
+        type=float,
+        metavar="M",
+        help="height at which the rose's speeds are (default: that of --wind-height)",
+    )
+    wind.add_argument(
+        "--resolution", type=float, default=1.0, metavar="M", help="size of a pixel in m (default: 1)"
+    )
+
+
 class _ExportHelp(argparse.Action):
     """Print help with the table of formats, which is made of their modules."""
 
@@ -302,6 +341,28 @@ def _add_export(export: argparse.ArgumentParser) -> None:
     given: dict[str, dict[str, Any]] = {
         "parts": {"type": int, "metavar": "N", "help": "decomposed for N processes instead of whole"},
         "case": {"choices": ("wind",), "help": "add the files of a simulation"},
+        "direction": {
+            "type": float,
+            "action": "append",
+            "metavar": "DEGREES",
+            "help": "where the wind comes from, degrees clockwise from north (default: 270); several: a case each",
+        },
+        "wind_speed": {"type": float, "metavar": "M/S", "help": "of the undisturbed wind (default: 5)"},
+        "wind_height": {
+            "type": float,
+            "metavar": "M",
+            "help": "height of that speed above the inlet's lowest ground (default: 10)",
+        },
+        "roughness": {
+            "type": float,
+            "metavar": "M",
+            "help": "roughness length z0 upstream and of the ground (default: 0.5)",
+        },
+        "patch_roughness": {
+            "action": "append",
+            "metavar": "PATCH=M",
+            "help": "roughness length of a patch of ground, walls or roofs that differs; repeat for others",
+        },
         "buildings": {
             "choices": ("patches", "zones"),
             "help": "one patch a building instead of walls and roofs; zones: one face zone beside them",

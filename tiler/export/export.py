@@ -37,7 +37,8 @@ class Format:
     description : str
         What it holds, in a few words.
     write : callable
-        Given a path and the files of a run, and the options as keywords, writes that file or folder.
+        Given a path and the files of a run, and the options as keywords, writes that file or folder. It may return
+        what must be known of it, a list of str.
     options : tuple of str
         Options of the command line that it takes, without dashes.
     buildings : tuple of str
@@ -51,7 +52,7 @@ class Format:
     """
 
     description: str
-    write: Callable[..., None]
+    write: Callable[..., list[str] | None]
     options: tuple[str, ...] = ()
     buildings: tuple[str, ...] = ("patches",)
     folder: bool = False
@@ -77,7 +78,7 @@ NO_OPTIONS: Mapping[str, Any] = {}
 
 def export_run(
     directory: Path, output: Path, *, name: str, overwrite: bool = False, options: Mapping[str, Any] = NO_OPTIONS
-) -> None:
+) -> list[str]:
     """Write a run's mesh for other programs.
 
     Parameters
@@ -92,6 +93,11 @@ def export_run(
         Whether a file of that name may be replaced, or a folder that was exported; one of the run's own never is.
     options : mapping of str to value
         What the format takes; see docs/formats.md.
+
+    Returns
+    -------
+    list of str
+        What must be known of the file, a line each: most have nothing.
 
     Raises
     ------
@@ -125,7 +131,7 @@ def export_run(
         raise ConfigError(f"{output}: holds no {EXPORT_RECORD}, so it was not exported; give another --output")
     if given.pop(LARGEST_PART, False):
         files = take_largest_part(files)
-    kind.write(output, files, **given)
+    return kind.write(output, files, **given) or []
 
 
 def _check_target(output: Path, files: RunFiles, *, overwrite: bool) -> None:

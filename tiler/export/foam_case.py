@@ -1,24 +1,11 @@
-"""Case files of OpenFOAM around a mesh: enough for `checkMesh`, or a wind simulation to start from.
+"""The folder ``system`` of an OpenFOAM case: enough for `checkMesh`, or a solver's schemes and solvers."""
 
-The wind case is steady flow of air at constant density (simpleFoam, k-epsilon) from the west: a logarithmic
-profile at the inlet (Richards and Hoxey, 1993), slip at the other sides and the top, rough ground, smooth walls.
-"""
-
-import math
-from collections.abc import Mapping
 from pathlib import Path
 
 from tiler.export.foam_files import foam_header
 
-CASES = ("wind",)
-SPEED, HEIGHT, ROUGHNESS = 5.0, 10.0, 0.5  # m/s at m above the inlet's lowest point; m
-KAPPA, C_MU = 0.41, 0.09
-AIR = 1.5e-5  # kinematic viscosity, m2/s
 ITERATIONS = 500
-INLET, OUTLET = "west", "east"
-WALLS = '"(walls|roofs|building_.*)"'
-SLIP = '"(south|north|top|missing)"'
-PARTS = '"procBoundary.*"'
+PROCESSES = 4  # of decomposePar, where the mesh is written whole
 
 CONTROL = """application     {application};
 startFrom       latestTime;
@@ -30,18 +17,19 @@ writeControl    timeStep;
 writeInterval   100;
 purgeWrite      2;
 writeFormat     binary;
-writePrecision  10;
+writePrecision  12;
 timeFormat      general;
 runTimeModifiable true;
 {libs}"""
 
-# Limited throughout: a few faces of a city are more than 70 degrees from orthogonal.
+# A few faces of a city are more than 70 degrees from orthogonal, so Laplacians are limited, and gradients where
+# they are convected. Limited gradients in the production of k would take half of the turbulence from bare ground.
 SCHEMES = """ddtSchemes { default steadyState; }
-gradSchemes { default cellLimited Gauss linear 1; }
+gradSchemes { default Gauss linear; limited cellLimited Gauss linear 1; }
 divSchemes
 {
     default none;
-    div(phi,U) bounded Gauss linearUpwind grad(U);
+    div(phi,U) bounded Gauss linearUpwind limited;
     div(phi,k) bounded Gauss upwind;
     div(phi,epsilon) bounded Gauss upwind;
     div((nuEff*dev2(T(grad(U))))) Gauss linear;
@@ -72,18 +60,8 @@ relaxationFactors
 }
 """
 
-CONDITIONS = """// Wind at the inlet: change it here, for all parts.
-Uref    {speed};  // m/s, at the height Zref above the inlet's lowest point
-Zref    {height};  // m
-zDir    (0 0 1);
-flowDir (1 0 0);
-z0      uniform {roughness};  // m, roughness length upstream
-zGround uniform {ground};  // m, the inlet's lowest point; OpenFOAM v2006 and later find it themselves
-d       uniform 0;
-"""
 
-
-def write_system(folder: Path, *, parts: int | None, case: str | None) -> None:
+def write_system(folder: Path, *, parts: int | None, application: str | None = None, functions: str = "") -> None:
     """Write ``system``, without which no program of OpenFOAM starts.
 
     Parameters
@@ -92,126 +70,19 @@ def write_system(folder: Path, *, parts: int | None, case: str | None) -> None:
         The case.
     parts : int, optional
         Number of processes.
-    case : {"wind"}, optional
-        What to simulate.
+    application : str, optional
+        The solver; `checkMesh` if there is none.
+    functions : str
+        Function objects to run with it.
     """
-    libs = 'libs ("libatmosphericModels.so");\n' if case else ""
+    ends = {"application": application or "checkMesh", "end": ITERATIONS if application else 0}
+    words = f'libs ("libatmosphericModels.so");\nfunctions\n{{\n{functions}}}\n' if application else ""
     texts = {
-        "controlDict": CONTROL.format(
-            application="simpleFoam" if case else "checkMesh", end=ITERATIONS if case else 0, libs=libs
-        ),
+        "controlDict": CONTROL.format(**ends, libs=words),
         "fvSchemes": SCHEMES,
         "fvSolution": SOLUTION,
+        "decomposeParDict": f"numberOfSubdomains {parts or PROCESSES};\nmethod scotch;\n",
     }
-    if parts is not None:
-        texts["decomposeParDict"] = f"numberOfSubdomains {parts};\nmethod scotch;\n"
-    (folder / "system").mkdir()
+    (folder / "system").mkdir(parents=True)
     for name, text in texts.items():
         (folder / "system" / name).write_text(foam_header(name, "dictionary", location="system") + text)
-
-
-def write_wind_case(folder: Path, starts: list[Path], *, ground: float) -> None:
-    """Write ``constant`` and ``0`` of the wind case.
-
-    Parameters
-    ----------
-    folder : Path
-        The case.
-    starts : list of Path
-        Where to put the fields at the start: the case itself, or the folder of each process.
-    ground : float
-        Lowest point of the inlet (m).
-
-    References
-    ----------
-    P. J. Richards, R. P. Hoxey, "Appropriate boundary conditions for computational wind engineering models
-    using the k-epsilon turbulence model", J. Wind Eng. Ind. Aerodyn. 46-47, 145-153, 1993.
-    """
-    constants = {
-        "transportProperties": f"transportModel Newtonian;\nnu {AIR};\n",
-        "turbulenceProperties": "simulationType RAS;\nRAS { RASModel kEpsilon; turbulence on; printCoeffs on; }\n",
-    }
-    (folder / "constant").mkdir(exist_ok=True)
-    for name, text in constants.items():
-        (folder / "constant" / name).write_text(foam_header(name, "dictionary", location="constant") + text)
-    values = {"speed": SPEED, "height": HEIGHT, "roughness": ROUGHNESS, "ground": ground}
-    (folder / "constant" / "wind").write_text(CONDITIONS.format(**values))
-    for start in starts:
-        (start / "0").mkdir(parents=True)
-        for name, (kind, text) in _fields().items():
-            (start / "0" / name).write_text(foam_header(name, kind, location="0") + text)
-
-
-def _fields() -> dict[str, tuple[str, str]]:
-    """Make the fields at the start, by name, with their classes."""
-    friction = KAPPA * SPEED / math.log((HEIGHT + ROUGHNESS) / ROUGHNESS)
-    wind, still = f"uniform ({SPEED} 0 0)", "uniform (0 0 0)"
-    k = f"uniform {friction**2 / math.sqrt(C_MU):.6g}"
-    epsilon = f"uniform {friction**3 / (KAPPA * (HEIGHT + ROUGHNESS)):.6g}"
-    inflow = '#include "$FOAM_CASE/constant/wind"'
-    return {
-        "U": _field(
-            "volVectorField",
-            "[0 1 -1 0 0 0 0]",
-            wind,
-            {
-                INLET: f"type atmBoundaryLayerInletVelocity; {inflow}",
-                OUTLET: f"type inletOutlet; inletValue {still}; value {wind};",
-                "ground": "type noSlip;",
-                WALLS: "type noSlip;",
-            },
-        ),
-        "p": _field(
-            "volScalarField",
-            "[0 2 -2 0 0 0 0]",
-            "uniform 0",
-            {
-                INLET: "type zeroGradient;",
-                OUTLET: "type fixedValue; value uniform 0;",
-                "ground": "type zeroGradient;",
-                WALLS: "type zeroGradient;",
-            },
-        ),
-        "k": _field(
-            "volScalarField",
-            "[0 2 -2 0 0 0 0]",
-            k,
-            {
-                INLET: f"type atmBoundaryLayerInletK; {inflow}",
-                OUTLET: f"type inletOutlet; inletValue {k}; value {k};",
-                "ground": f"type kqRWallFunction; value {k};",
-                WALLS: f"type kqRWallFunction; value {k};",
-            },
-        ),
-        "epsilon": _field(
-            "volScalarField",
-            "[0 2 -3 0 0 0 0]",
-            epsilon,
-            {
-                INLET: f"type atmBoundaryLayerInletEpsilon; {inflow}",
-                OUTLET: f"type inletOutlet; inletValue {epsilon}; value {epsilon};",
-                "ground": f"type epsilonWallFunction; value {epsilon};",
-                WALLS: f"type epsilonWallFunction; value {epsilon};",
-            },
-        ),
-        "nut": _field(
-            "volScalarField",
-            "[0 2 -1 0 0 0 0]",
-            "uniform 0",
-            {
-                INLET: "type calculated; value uniform 0;",
-                OUTLET: "type calculated; value uniform 0;",
-                "ground": f"type nutkAtmRoughWallFunction; z0 uniform {ROUGHNESS}; value uniform 0;",
-                WALLS: "type nutkWallFunction; value uniform 0;",
-            },
-        ),
-    }
-
-
-def _field(kind: str, dimensions: str, start: str, conditions: Mapping[str, str]) -> tuple[str, str]:
-    others = {SLIP: "type slip;", PARTS: f"type processor; value {start};"}
-    lines = [f"    {patch} {{ {text} }}" for patch, text in {**conditions, **others}.items()]
-    # An include ends with its line.
-    rows = "\n".join(lines).replace('wind" }', 'wind"\n    }')
-    head = f"dimensions      {dimensions};\ninternalField   {start};\n"
-    return kind, f"{head}boundaryField\n{{\n{rows}\n}}\n"

@@ -1,6 +1,5 @@
 """One polyMesh of OpenFOAM: the whole mesh, or the part of one process."""
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch.pieces.cell_faces import CellFaces
+from tiler.export.cell_parts import CellParts
 from tiler.export.foam_files import FoamFaces, FoamList, foam_header
 from tiler.export.foam_patches import (
     GROUND_ZONE,
@@ -36,6 +36,8 @@ from tiler.export.region_faces import (
 )
 from tiler.mesh_files.mesh_pieces import MeshPiece
 
+DISTANCES = np.logspace(-4, 3, 281)  # m; bins of 6 %
+
 
 @dataclass(frozen=True)
 class PartCounts:
@@ -47,8 +49,11 @@ class PartCounts:
         Their numbers.
     patches : mapping of str to int
         Faces of each patch, processor patches included.
-    lowest : mapping of str to float
-        Lowest point (m) of each patch of the region's boundary that has faces here.
+    lowest, highest : mapping of str to float
+        Lowest and highest point (m) of each patch of the region's boundary that has faces here.
+    near : mapping of str to int64 (len(DISTANCES) + 1,)
+        Of each patch that is a wall, for how many faces the centre of their cell is within `DISTANCES` of their
+        plane.
     """
 
     cells: int
@@ -57,6 +62,8 @@ class PartCounts:
     inner_faces: int
     patches: Mapping[str, int]
     lowest: Mapping[str, float]
+    highest: Mapping[str, float]
+    near: Mapping[str, Ints]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,25 +76,32 @@ class FoamPlan:
         The mesh.
     region : RegionFaces
         Numbers of cells and faces.
-    patches, zones, volumes : FacetSets
-        Patches by key (`patch_of_key`); face zones by key (`face_zone_name`), or None; cell zones by region.
+    patches, volumes : FacetSets
+        Patches by key (`patch_of_key`) and cell zones by region, of the whole mesh. `parts` has those of each
+        part, in this order: patches, face zones by key (`face_zone_name`), cell zones.
+    zoned : bool
+        Whether face zones are written.
     patch_keys, zone_keys : callable
         Give the key of each facet of a piece, -1 for none.
-    part : int64, (k,)
-        Part of each piece.
+    parts : CellParts
+        Part of each cell.
     label : int
         Bits of an integer.
+    heights : Path, optional
+        A folder for the heights of the centres of cells (m), float64: a file for each part by its number, and for
+        two parts ``a`` and ``b`` that meet a file ``a-b`` of the cells of ``a`` at their faces, in their order.
     """
 
     pieces: Pieces
     region: RegionFaces
     patches: FacetSets
-    zones: FacetSets | None
     volumes: FacetSets
+    zoned: bool
     patch_keys: Callable[[MeshPiece], Ints]
     zone_keys: Callable[[MeshPiece], Ints]
-    part: Ints
+    parts: CellParts
     label: int
+    heights: Path | None = None
 
 
 class PointPlaces:
@@ -120,11 +134,10 @@ class PointPlaces:
 
 @dataclass(frozen=True, eq=False)
 class _Numbers:
-    """The numbers of a part: where cells of each piece, faces of each patch begin, faces towards other parts."""
+    """The numbers of a part: its cells, where faces of each patch begin, faces towards other parts."""
 
     number: int
     pieces: Sequence[int]
-    start: Ints
     n_cells: int
     n_inner: int
     others: dict[int, int]
@@ -182,6 +195,8 @@ class _PartWriter:
         self._row = 0
         self._across: list[_Across] = []
         self._lowest: dict[str, float] = {}
+        self._highest: dict[str, float] = {}
+        self._near: dict[str, Ints] = {}
         n = numbers.n_faces
         self._faces = stack.enter_context(FoamFaces(folder / "faces", location=POLY_MESH, label=plan.label, n=n))
         n_points = plan.pieces.n_points if places is None else None
@@ -191,26 +206,40 @@ class _PartWriter:
             places.begin_part()
             self._point_to, self._cell_to = self._open("pointProcAddressing"), self._open("cellProcAddressing")
             self._face_to = self._open("faceProcAddressing", n=n)
-            self._whole = _number_facets(plan.patches, range(len(plan.part)), plan.region.n_inner)
+            self._whole = _number_facets(plan.patches, range(len(plan.pieces.names)), plan.region.n_inner)
+        _, zones, volumes = (sets[number] for sets in plan.parts.sets)
         self._zones = None
-        if plan.zones is not None:
-            faces = ZonesFile(folder / "faceZones", plan.zones, numbers.pieces, face_zone_name)
+        if plan.zoned:
+            faces = ZonesFile(folder / "faceZones", zones, numbers.pieces, face_zone_name)
             self._zones = stack.enter_context(faces)
         self._volumes = None
         if len(plan.volumes.keys):
-            cells = ZonesFile(folder / "cellZones", plan.volumes, numbers.pieces, cell_zone_name)
+            cells = ZonesFile(folder / "cellZones", volumes, numbers.pieces, cell_zone_name)
             self._volumes = stack.enter_context(cells)
+        self._heights = None
+        if plan.heights is not None:
+            self._heights = stack.enter_context((plan.heights / str(number)).open("wb"))
 
     def add(self, k: int) -> None:
-        """Write piece `k`."""
+        """Write what is in the part of piece `k`."""
         piece = self._plan.pieces.read(k)
         faces = faces_of_piece(piece)
-        local = self._add_points(k, piece)
+        start = int(self._plan.region.cell_start[k])
+        cells: slice | Ints = slice(start, start + len(piece.cells))
+        if self._places is not None and self._plan.parts.part is not None:
+            cells = start + np.flatnonzero(self._plan.parts.part[cells] == self.numbers.number)
+        local = self._add_points(k, piece, cells)
         self._add_inner(k, piece, faces, local)
         self._add_facets(k, piece, faces, local)
         if self._volumes is not None and piece.region is not None:
-            cells = self.numbers.start[k] + np.arange(len(piece.cells))
-            self._volumes.write(k, piece.region.astype(np.int64), cells)
+            number = np.arange(cells.start, cells.stop) if isinstance(cells, slice) else cells
+            region = piece.region[number - start].astype(np.int64)
+            self._volumes.write(k, region, self._plan.parts.place_of(number))
+        if self._heights is not None:
+            rows = slice(0, len(piece.cells)) if isinstance(cells, slice) else cells - start
+            z = piece.points[:, 2]
+            low, high = (z[piece.cells[rows, k]] + z[piece.cells[rows, k + 1]] for k in (0, 2))
+            ((low + high) / 4).tofile(self._heights)
 
     def finish(self) -> PartCounts:
         """Write what stands behind the pieces."""
@@ -226,7 +255,17 @@ class _PartWriter:
         counts = write_boundary(
             self._folder / "boundary", patches, start=numbers.n_inner, number=numbers.number, others=numbers.others
         )
-        return PartCounts(numbers.n_cells, self._points.n, numbers.n_faces, numbers.n_inner, counts, self._lowest)
+        n_points = self._points.n
+        return PartCounts(
+            numbers.n_cells,
+            n_points,
+            numbers.n_faces,
+            numbers.n_inner,
+            counts,
+            self._lowest,
+            self._highest,
+            self._near,
+        )
 
     def _open(
         self, name: str, *, n: int | None = None, kind: str = "labelList", dtype: str = "", width: int = 1
@@ -235,87 +274,114 @@ class _PartWriter:
         file = FoamList(self._folder / name, header, dtype or f"i{self._plan.label // 8}", width=width, n=n)
         return self._stack.enter_context(file)
 
-    def _add_points(self, k: int, piece: MeshPiece) -> Ints:
-        """Write the points of a piece; returns their numbers in this part."""
+    def _add_points(self, k: int, piece: MeshPiece, cells: slice | Ints) -> Ints:
+        """Write the points of a piece; returns their numbers in this part, -1 for those that it has not."""
         if self._places is None:
             self._points.scatter(piece.ids, piece.points)
             return piece.ids
-        local, fresh = self._places.add(piece.ids)
-        self._points.append(piece.points[fresh])
-        self._point_to.append(piece.ids[fresh])
-        self._cell_to.append(np.arange(*self._plan.region.cell_start[k : k + 2]))
+        start = self._plan.region.cell_start[k]
+        if isinstance(cells, slice):
+            cells = np.arange(cells.start, cells.stop)
+        is_used = np.zeros(len(piece.points), np.bool_)
+        is_used[piece.cells[cells - start]] = True
+        used = np.flatnonzero(is_used)
+        number, fresh = self._places.add(piece.ids[used])
+        self._points.append(piece.points[used[fresh]])
+        self._point_to.append(piece.ids[used[fresh]])
+        self._cell_to.append(cells)
+        local = np.full(len(piece.points), -1, np.int64)
+        local[used] = number
         return local
 
     def _add_inner(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> None:
-        """Write the faces whose lower cell is in the piece and whose other cell is in the part."""
-        region = self._plan.region
-        ground, face = [np.empty(0, np.int64)], int(region.face_start[k])
-        for own in own_faces(region, k, piece, faces):
+        """Write the faces whose lower cell is in the piece and one of whose cells is in the part."""
+        region, number = self._plan.region, self.numbers.number
+        part_of, end = self._plan.parts.part_of, region.cell_start[k + 1]
+
+        def is_mine(owner: Ints, neighbour: Ints) -> NDArray[np.bool_]:
+            # Turned ones between two pieces are found in the piece of their upper cell.
+            turned = (part_of(neighbour) == number) & (neighbour < end)
+            mine: NDArray[np.bool_] = (part_of(owner) == number) | turned
+            return mine
+
+        ground = [np.empty(0, np.int64)]
+        for own in own_faces(region, k, piece, faces, None if self._places is None else is_mine):
             is_ground = find_ground(region, k, piece, own)
-            inside = self._add_block(k, own, face, local)
+            inside = self._add_block(own, local)
             ground.append(self._row + np.cumsum(inside)[is_ground] - 1)
             self._row += int(inside.sum())
-            face += len(inside)
         if self._places is not None:
             self._across.append(self._find_turned(k, piece, faces, local))
         if piece.region is None:
             return
         rows = np.concatenate(ground)
-        if len(rows) != int((~find_outer(piece)).sum()):
+        if self._places is None and len(rows) != int((~find_outer(piece)).sum()):
             raise wrong_ground(piece)
         if self._zones is not None and len(rows):
             self._zones.write(k, np.full(len(rows), GROUND_ZONE), rows)
 
-    def _add_block(self, k: int, own: OwnFaces, face: int, local: Ints) -> NDArray[np.bool_]:
-        """Write faces of piece `k` from number `face` of the region on; returns which are inside the part."""
-        region, part, start = self._plan.region, self._plan.part, self.numbers.start
-        beyond = region.piece_of(own.neighbour)
-        other = part[beyond]
-        owner, corners = own.owner - region.cell_start[k] + start[k], local[own.corners]
-        inside: NDArray[np.bool_] = other == self.numbers.number
+    def _add_block(self, own: OwnFaces, local: Ints) -> NDArray[np.bool_]:
+        """Write faces of a piece; returns which are inside the part."""
+        parts, number = self._plan.parts, self.numbers.number
+        low, high = parts.part_of(own.owner), parts.part_of(own.neighbour)
+        corners = local[own.corners]
+        inside: NDArray[np.bool_] = (low == number) & (high == number)
         self._faces.write(self._row, corners[inside])
-        self._owner.write(self._row, owner[inside])
-        within = beyond[inside]
-        self._neighbour.write(self._row, own.neighbour[inside] - region.cell_start[within] + start[within])
+        self._owner.write(self._row, parts.place_of(own.owner[inside]))
+        self._neighbour.write(self._row, parts.place_of(own.neighbour[inside]))
         if self._places is not None:
-            number = face + np.arange(len(inside))
-            self._face_to.write(self._row, number[inside] + 1)
+            self._face_to.write(self._row, own.number[inside] + 1)
             out = ~inside
-            turned = np.zeros(int(out.sum()), np.bool_)
-            self._across.append(_Across(other[out], number[out], turned, owner[out], corners[out]))
+            # Of a face whose lower cell is in another part the upper one is the owner here, so it is turned.
+            turned = high[out] == number
+            corners = np.where(turned[:, None], corners[out][:, [0, 2, 1]], corners[out])
+            owner = parts.place_of(np.where(turned, own.neighbour[out], own.owner[out]))
+            other = np.where(turned, low[out], high[out]).astype(np.int64)
+            self._across.append(_Across(other, own.number[out], turned, owner, corners))
         return inside
 
     def _find_turned(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> _Across:
-        """Find the faces of a piece whose lower cell is in another part."""
-        region = self._plan.region
+        """Find the faces of the part's cells in a piece whose lower cell is in another part, and another piece."""
+        region, parts, number = self._plan.region, self._plan.parts, self.numbers.number
         rows = np.arange(*region.shared_start[k : k + 2])
-        cell, lower = region.cell[rows], region.cell[region.mate[rows]]
-        other = self._plan.part[region.piece_of(lower)]
-        turned = (lower < cell) & (other != self.numbers.number)
+        cell, lower = np.asarray(region.cell[rows]), np.asarray(region.cell[np.asarray(region.mate[rows])])
+        turned = np.flatnonzero(lower < cell)
+        other = parts.part_of(lower[turned])
+        chosen = (parts.part_of(cell[turned]) == number) & (other != number)
+        turned, other = turned[chosen], other[chosen].astype(np.int64)
         corners = local[lowest_first(faces.shared[turned], piece.ids)]
-        owner = cell[turned] - region.cell_start[k] + self.numbers.start[k]
-        face = region.face[rows[turned]]
-        return _Across(other[turned], face, np.ones(len(face), np.bool_), owner, corners)
+        face = np.asarray(region.face[rows[turned]])
+        return _Across(other, face, np.ones(len(face), np.bool_), parts.place_of(cell[turned]), corners)
 
     def _add_facets(self, k: int, piece: MeshPiece, faces: CellFaces, local: Ints) -> None:
-        """Write the facets of a piece, each where its patch has room for them."""
+        """Write the facets of the part's cells in a piece, each where its patch has room for them."""
         numbers, keys = self.numbers, self._plan.patches.keys
         outer = find_outer(piece)
-        facets, owner = piece.facets[outer], faces.facet_cell + numbers.start[k]
-        corners = local[facets]
-        face = np.empty(len(owner), np.int64)
-        for row, chosen in runs_of(keys, self._plan.patch_keys(piece)[outer]):
+        facets, cell = piece.facets[outer], faces.facet_cell + self._plan.region.cell_start[k]
+        mine = self._plan.parts.part_of(cell) == numbers.number
+        owner, corners = self._plan.parts.place_of(cell), local[facets]
+        face = np.full(len(owner), -1, np.int64)
+        for row, of_patch in runs_of(keys, self._plan.patch_keys(piece)[outer]):
+            in_piece = np.flatnonzero(mine[of_patch])
+            if not len(in_piece):
+                continue
+            chosen = of_patch[in_piece]
             at = int(numbers.patch_start[row]) + numbers.first[k][row]
             self._faces.write(at, corners[chosen])
             self._owner.write(at, owner[chosen])
             face[chosen] = at + np.arange(len(chosen))
             if self._places is not None:
                 first, _, start = self._whole
-                self._face_to.write(at, int(start[row]) + first[k][row] + 1 + np.arange(len(chosen)))
-            name, lowest = patch_of_key(int(keys[row])).name, float(piece.points[facets[chosen], 2].min())
-            self._lowest[name] = min(self._lowest.get(name, lowest), lowest)
+                self._face_to.write(at, int(start[row]) + first[k][row] + 1 + in_piece)
+            patch, height = patch_of_key(int(keys[row])), piece.points[facets[chosen], 2]
+            name = patch.name
+            self._lowest[name] = min(self._lowest.get(name, np.inf), float(height.min()))
+            self._highest[name] = max(self._highest.get(name, -np.inf), float(height.max()))
+            if patch.kind == "wall":
+                near = count_distances(piece.points, piece.cells[faces.facet_cell[chosen]], facets[chosen])
+                self._near[name] = self._near.get(name, 0) + near
         if self._zones is not None:
-            self._zones.write(k, self._plan.zone_keys(piece)[outer], face)
+            self._zones.write(k, np.where(mine, self._plan.zone_keys(piece)[outer], -1), face)
 
     def _add_across(self) -> None:
         """Write the faces towards other parts: by part, then by number over the region, so in its order too."""
@@ -328,27 +394,40 @@ class _PartWriter:
         self._faces.write(at, corners[order])
         self._owner.write(at, owner[order])
         self._face_to.write(at, (np.where(turned, -1, 1) * (face + 1))[order])
+        if self._heights is not None and self._plan.heights is not None:
+            self._heights.flush()
+            height = np.fromfile(self._plan.heights / str(self.numbers.number))[owner[order]]
+            for beyond in self.numbers.others:
+                place = self._plan.heights / f"{self.numbers.number}-{beyond}"
+                height[other[order] == beyond].tofile(place)
+
+
+def count_distances(points: NDArray[np.float64], cells: NDArray[np.int32], facets: NDArray[np.int32]) -> Ints:
+    """Count how far centres of cells (k, 4) are from the planes of their facets (k, 3): bins of `DISTANCES`.
+
+    Examples
+    --------
+    A cell of 4 m over the ground has its centre 1 m above it:
+
+    >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 4]])
+    >>> counts = count_distances(points, np.array([[0, 1, 2, 3]]), np.array([[0, 2, 1]]))
+    >>> bool(DISTANCES[counts.argmax() - 1] <= 1.0 <= DISTANCES[counts.argmax()])
+    True
+    """
+    a, b, c = (points[facets[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    area = np.sqrt((normal**2).sum(axis=1))
+    offset = points[cells].mean(axis=1) - a
+    distance = np.abs((offset * normal).sum(axis=1)) / area
+    return np.bincount(np.searchsorted(DISTANCES, distance), minlength=len(DISTANCES) + 1)
 
 
 def _number_part(plan: FoamPlan, number: int) -> _Numbers:
-    region, part = plan.region, plan.part
-    chosen = np.flatnonzero(part == number)
-    n_cells = np.diff(region.cell_start)
-    start = np.full(len(part), -1, np.int64)
-    start[chosen] = np.cumsum(n_cells[chosen]) - n_cells[chosen]
-    n_inner = int(np.diff(region.face_start)[chosen].sum())
-    others: Counter[int] = Counter()
-    for (k, beyond), count in region.between.items():
-        own, other = int(part[k]), int(part[beyond])
-        if own != other and number in (own, other):
-            others[own + other - number] += count
-            n_inner -= count if own == number else 0
-    pieces = chosen.tolist()
-    first, patch_n, patch_start = _number_facets(plan.patches, pieces, n_inner)
-    towards = dict(sorted(others.items()))
-    return _Numbers(
-        number, pieces, start, int(n_cells[chosen].sum()), n_inner, towards, first, patch_n, patch_start
-    )
+    parts = plan.parts
+    others = {a + b - number: n for (a, b), n in parts.between.items() if number in (a, b)}
+    n_cells, n_inner, pieces = int(parts.n_cells[number]), int(parts.n_inner[number]), parts.pieces[number]
+    first, patch_n, patch_start = _number_facets(parts.sets[0][number], pieces, n_inner)
+    return _Numbers(number, pieces, n_cells, n_inner, dict(sorted(others.items())), first, patch_n, patch_start)
 
 
 def _number_facets(

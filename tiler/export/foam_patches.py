@@ -134,6 +134,11 @@ def cell_zone_name(key: int) -> str:
     return Region(key).name.lower()
 
 
+def interface_name(number: int, other: int) -> str:
+    """Name the processor patch that a part has towards another one."""
+    return f"procBoundary{number}to{other}"
+
+
 def write_boundary(
     path: Path, patches: Mapping[Patch, int], *, start: int, number: int, others: Mapping[int, int]
 ) -> dict[str, int]:
@@ -169,7 +174,7 @@ def write_boundary(
             f"myProcNo        {number};",
             f"neighbProcNo    {other};",
         ]
-        entries.append((f"procBoundary{number}to{other}", "processor", n, words))
+        entries.append((interface_name(number, other), "processor", n, words))
     lines = [str(len(entries)), "("]
     for name, kind, n, words in entries:
         own = [f"type            {kind};", *words, f"nFaces          {n};", f"startFace       {start};"]

@@ -7,7 +7,7 @@ first of them to the second; what is known of it then stands in files.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +24,8 @@ from tiler.mesh_files.mesh_pieces import MeshPiece
 Ints = NDArray[np.int64]
 # Given a piece, the key of a set of facets, or of cells, for each of them; several sets may have one.
 SetsOf = Callable[[MeshPiece], Ints]
+# Given owners and neighbours of faces, by their numbers over the region, which faces are wanted.
+Wanted = Callable[[Ints, Ints], NDArray[np.bool_]]
 BLOCK_CELLS = 2**17  # whose faces are put in order together
 
 
@@ -35,12 +37,12 @@ class FacetSets:
     ----------
     keys : int64, (p,)
         Keys of the sets, ascending.
-    counts : list of dict of int to int
-        For each piece, how many of its facets a set has, by row in `keys`.
+    counts : mapping of int to dict of int to int
+        For each piece that has any, how many of its facets a set has, by row in `keys`.
     """
 
     keys: Ints
-    counts: list[dict[int, int]]
+    counts: Mapping[int, dict[int, int]]
 
     def first(self, pieces: Sequence[int]) -> tuple[dict[int, dict[int, int]], Ints]:
         """Put the facets of some pieces, in their order, set by set.
@@ -54,8 +56,9 @@ class FacetSets:
         """
         n, first = np.zeros(len(self.keys), np.int64), {}
         for k in pieces:
-            first[k] = {row: int(n[row]) for row in self.counts[k]}
-            for row, count in self.counts[k].items():
+            counts = self.counts.get(k, {})
+            first[k] = {row: int(n[row]) for row in counts}
+            for row, count in counts.items():
                 n[row] += count
         return first, n
 
@@ -111,11 +114,14 @@ class OwnFaces:
     corners : int32, (n, 3)
         Vertices as rows of the piece's points, that of the lowest number over the region first; the normal points
         out of the owner.
+    number : int64, (n,)
+        Number of each among the faces of the region.
     """
 
     owner: Ints
     neighbour: Ints
     corners: NDArray[np.int32]
+    number: Ints
 
 
 @dataclass
@@ -127,7 +133,7 @@ class _Waiting:
 
 
 def survey_faces(
-    pieces: Pieces, folder: Path, *, kinds: tuple[SetsOf, ...]
+    pieces: Pieces, folder: Path, *, kinds: tuple[SetsOf, ...], look: Callable[[MeshPiece], None] | None = None
 ) -> tuple[RegionFaces, list[FacetSets]]:
     """Read all pieces once, and number cells, faces and facets.
 
@@ -139,6 +145,8 @@ def survey_faces(
         An existing folder for files; they must stay as long as the result is used.
     kinds : tuple of callable
         Each gives a key for every facet of a piece, or for every cell, or -1 for none.
+    look : callable, optional
+        Is given each piece too.
 
     Returns
     -------
@@ -166,6 +174,8 @@ def survey_faces(
     with paths[0].open("wb") as cells_file, paths[1].open("wb") as before_file, paths[2].open("wb") as mates_file:
         for k in range(n):
             piece = pieces.read(k)
+            if look is not None:
+                look(piece)
             faces = faces_of_piece(piece)
             n_cells[k], n_faces[k], n_shared[k] = len(piece.cells), len(faces.owner), len(faces.shared)
             centre[k] = (piece.points[:, :2].min(axis=0) + piece.points[:, :2].max(axis=0)) / 2
@@ -208,8 +218,23 @@ def find_outer(piece: MeshPiece) -> NDArray[np.bool_]:
     return outer
 
 
-def own_faces(region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces) -> Iterator[OwnFaces]:
+def own_faces(
+    region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces, wanted: Wanted | None = None
+) -> Iterator[OwnFaces]:
     """Take the faces that piece `k` has of the region's list: rows ``face_start[k]`` to ``face_start[k + 1]``.
+
+    Parameters
+    ----------
+    region : RegionFaces
+        Numbers of cells and faces.
+    k : int
+        Which piece.
+    piece : MeshPiece
+        The piece.
+    faces : CellFaces
+        Its faces.
+    wanted : callable, optional
+        Which of them to give; all if it is left out.
 
     Yields
     ------
@@ -226,9 +251,13 @@ def own_faces(region: RegionFaces, k: int, piece: MeshPiece, faces: CellFaces) -
         inner, beyond = (slice(*np.searchsorted(some, ends).tolist()) for some in (faces.owner, cell))
         owner = np.concatenate([faces.owner[inner], cell[beyond]]).astype(np.int64) + start
         neighbour = np.concatenate([faces.neighbour[inner].astype(np.int64) + start, other[beyond]])
-        order = np.lexsort((neighbour, owner))
+        # Faces inside and those to later pieces are counted together, by owner: see `_number_faces`.
+        before = np.arange(inner.start, inner.stop) + np.searchsorted(cell, faces.owner[inner])
+        number = np.concatenate([region.face_start[k] + before, region.face[rows.start + later[beyond]]])
+        chosen = np.arange(len(owner)) if wanted is None else np.flatnonzero(wanted(owner, neighbour))
+        order = chosen[np.argsort(number[chosen])]
         corners = np.concatenate([faces.inner[inner], faces.shared[later[beyond]]])[order]
-        yield OwnFaces(owner[order], neighbour[order], lowest_first(corners, piece.ids))
+        yield OwnFaces(owner[order], neighbour[order], lowest_first(corners, piece.ids), number[order])
 
 
 def find_ground(region: RegionFaces, k: int, piece: MeshPiece, own: OwnFaces) -> NDArray[np.bool_]:
@@ -320,7 +349,9 @@ def _number_faces(
 def _collect(counts: list[dict[int, int]]) -> FacetSets:
     keys = sorted(set().union(*counts))
     row = {key: i for i, key in enumerate(keys)}
-    return FacetSets(np.array(keys, np.int64), [{row[key]: n for key, n in found.items()} for found in counts])
+    return FacetSets(
+        np.array(keys, np.int64), {k: {row[key]: n for key, n in found.items()} for k, found in enumerate(counts)}
+    )
 
 
 def _starts(counts: Ints) -> Ints:

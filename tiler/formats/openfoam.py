@@ -1,29 +1,41 @@
 """OpenFOAM's polyMesh, whole or decomposed, written from the pieces one by one.
 
 Faces stand in upper triangular order, then patch by patch. A decomposed mesh is written straight from the
-tiles, as `decomposePar` would: tiles are grouped, faces between two groups become processor patches in the same
-order on both sides, and the addressing to the whole mesh lies beside it for `reconstructPar`.
+tiles, as `decomposePar` would: columns of cells are grouped, faces between two groups become processor patches in
+the same order on both sides, and the addressing to the whole mesh lies beside it for `reconstructPar`.
 """
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, Unpack
 
 import numpy as np
 
 from pipeline.data.errors import CityError, ConfigError, InputError
+from tiler.export.cell_parts import ColumnsFile, divide_cells, take_whole
 from tiler.export.export import EXPORT_RECORD, LARGEST_PART, Format
-from tiler.export.foam_case import INLET, OUTLET, write_system, write_wind_case
+from tiler.export.foam_case import write_system
 from tiler.export.foam_files import LABEL_LIMIT
-from tiler.export.foam_part import FoamPlan, PartCounts, PointPlaces, write_part
-from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, is_house
-from tiler.export.pieces import Pieces, split_pieces
+from tiler.export.foam_part import DISTANCES, FoamPlan, PartCounts, PointPlaces, write_part
+from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, interface_name, is_house
+from tiler.export.pedestrian_surface import write_pedestrian_surface
+from tiler.export.pieces import Pieces
 from tiler.export.region_faces import Ints, find_outer, survey_faces
+from tiler.export.wind_case import PEDESTRIAN, PEDESTRIAN_HEIGHT, Domain, write_wind_cases
+from tiler.export.wind_profile import Wind, WindWords, make_wind
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
-from tiler.mesh_files.run_files import RunFiles, RunSource
+from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
 from tiler.store.atomic import replacing_folder
+from tiler.store.run_folder import read_crs
+
+# Roughness lengths between rough ground and the centres of its cells. Over bare ground the profile stays within
+# 2 % at 3 of them, and is 19 % off at 0.6: docs/wind.md.
+LEAST_DISTANCE = 2.5
+WIND_OPTIONS = ("direction", "wind_speed", "wind_height", "roughness", "patch_roughness")
 
 
 def export_openfoam(
@@ -33,7 +45,8 @@ def export_openfoam(
     parts: int | None = None,
     case: str | None = None,
     buildings: str | None = None,
-) -> None:
+    **wind: Unpack[WindWords],
+) -> list[str]:
     """Write a case folder of OpenFOAM from a finished run.
 
     Parameters
@@ -46,17 +59,27 @@ def export_openfoam(
         See `write_openfoam`.
     case : {"wind"}, optional
         Add the files of a simulation.
+    **wind
+        See `tiler.export.wind_profile.Wind`.
+
+    Returns
+    -------
+    list of str
+        What must be known of the case: sides for each direction of the wind, and where the mesh does not suit it.
 
     Raises
     ------
     ConfigError
-        If there are fewer tiles than parts, no side for the wind to come from, soil where it should blow, or a
-        mesh of several parts that share no face.
+        If there are too few columns for so many parts, no side for the wind to come from, soil where it should
+        blow, or a mesh of several parts that share no face.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
         If the folder cannot be written.
     """
+    if case is None and wind:
+        raise ConfigError(f"--{min(wind).replace('_', '-')}: is for --case wind; give that too")
+    blowing = make_wind(wind)
     pieces = open_pieces(source)
     if case is not None and pieces.files.depth:
         raise ConfigError(
@@ -65,20 +88,52 @@ def export_openfoam(
         )
     if case is not None and pieces.files.parts != 1:
         raise _refuse_parts(case, pieces.files)
-    with replacing_folder(output) as folder:
-        counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings)
-        write_system(folder, parts=parts, case=case)
-        if case is not None:
-            inlet = [part.lowest[INLET] for part in counts if INLET in part.lowest]
-            if not inlet or not any(part.patches.get(OUTLET) for part in counts):
-                raise ConfigError(
-                    f"--case {case}: the mesh has no facets on its {INLET} or {OUTLET} side; leave --case out"
-                )
-            starts = [folder] if parts is None else [folder / f"processor{n}" for n in range(parts)]
-            write_wind_case(folder, starts, ground=min(inlet))
+    with replacing_folder(output) as folder, TemporaryDirectory(dir=folder, prefix=".heights.") as name:
+        heights = None if case is None else Path(name)
+        counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings, heights=heights)
+        notes = []
+        if heights is None:
+            write_system(folder, parts=parts)
+        else:
+            surface = folder / "constant" / "triSurface" / f"{PEDESTRIAN}.obj"
+            write_pedestrian_surface(surface, pieces.files, height=PEDESTRIAN_HEIGHT)
+            notes = write_wind_cases(folder, _describe_domain(counts, heights), blowing, parts=parts)
+            notes += _tell_near_walls(counts, blowing)
         # ParaView opens a case by an empty file.
         (folder / "case.foam").touch()
-        (folder / EXPORT_RECORD).write_text(_record(counts, parts))
+        record = _record(counts, parts)
+        if case is not None:
+            crs = read_crs(pieces.files.directory / RUN_RECORD)
+            record |= {"crs": crs, "wind": asdict(blowing), "notes": notes}
+        (folder / EXPORT_RECORD).write_text(json.dumps(record, indent=1) + "\n")
+    return notes
+
+
+def _describe_domain(counts: Sequence[PartCounts], heights: Path) -> Domain:
+    patches: Counter[str] = Counter()
+    lowest: dict[str, float] = {}
+    highest: dict[str, float] = {}
+    for part in counts:
+        patches.update({name: n for name, n in part.patches.items() if name in part.lowest})
+        lowest |= {name: min(z, lowest.get(name, z)) for name, z in part.lowest.items()}
+        highest |= {name: max(z, highest.get(name, z)) for name, z in part.highest.items()}
+    return Domain(patches, lowest, highest, tuple(heights / str(n) for n in range(len(counts))))
+
+
+def _tell_near_walls(counts: Sequence[PartCounts], wind: Wind) -> list[str]:
+    """Tell where cells at rough walls are thinner than their roughness allows."""
+    lines = []
+    for patch, z0 in {"ground": wind.roughness, **wind.patches}.items():
+        near = sum((part.near[patch] for part in counts if patch in part.near), np.zeros(len(DISTANCES) + 1, int))
+        least = LEAST_DISTANCE * z0
+        below, n = int(near[: np.searchsorted(DISTANCES, least)].sum()), int(near.sum())
+        if below:
+            lines.append(
+                f"warning: {below:,} of {n:,} cells on {patch} ({below / n:.0%}) have their centre within "
+                f"{least:g} m of it, where the wall function of a roughness length of {z0:g} m does not hold; "
+                f"give a smaller --roughness or --patch-roughness {patch}=..., or mesh with a larger --first-layer"
+            )
+    return lines
 
 
 def _refuse_parts(case: str, files: RunFiles) -> CityError:
@@ -92,13 +147,30 @@ def _refuse_parts(case: str, files: RunFiles) -> CityError:
     )
 
 
-def _record(counts: Sequence[PartCounts], parts: int | None) -> str:
-    record = {"schema": 1, "format": "openfoam", "decomposed": parts is not None}
-    return json.dumps({**record, "meshes": [asdict(part) for part in counts]}, indent=1) + "\n"
+def _record(counts: Sequence[PartCounts], parts: int | None) -> dict[str, Any]:
+    record: dict[str, Any] = {"schema": 1, "format": "openfoam", "decomposed": parts is not None}
+    if parts is not None:
+        cells = [part.cells for part in counts]
+        record["balance"] = round(max(cells) * len(cells) / sum(cells), 6)  # the largest part over the mean
+        record["interfaces"] = [
+            [number, other, n]
+            for number, part in enumerate(counts)
+            for other in range(number + 1, parts)
+            if (n := part.patches.get(interface_name(number, other), 0))
+        ]
+    meshes = [asdict(part) for part in counts]
+    for mesh in meshes:
+        del mesh["near"]
+    return {**record, "meshes": meshes}
 
 
 def write_openfoam(
-    folder: Path, pieces: Pieces, *, parts: int | None = None, buildings: str | None = None
+    folder: Path,
+    pieces: Pieces,
+    *,
+    parts: int | None = None,
+    buildings: str | None = None,
+    heights: Path | None = None,
 ) -> list[PartCounts]:
     """Write a mesh as OpenFOAM reads it.
 
@@ -112,6 +184,8 @@ def write_openfoam(
         Write ``processor0`` to ``processorN-1`` instead of the whole mesh.
     buildings : {"patches", "zones"}, optional
         Give each building, walls and roofs, a patch of its own, or a face zone beside the patches.
+    heights : Path, optional
+        An existing folder to write the heights of the centres of cells to; see `FoamPlan`.
 
     Returns
     -------
@@ -121,7 +195,7 @@ def write_openfoam(
     Raises
     ------
     ConfigError
-        If there are fewer tiles than parts.
+        If there are too few columns for so many parts.
     InputError
         If a piece is damaged, or pieces do not fit together.
 
@@ -129,29 +203,34 @@ def write_openfoam(
     -----
     Memory: one piece with its faces (some 80 bytes a cell), the faces between one part and the others (some
     60 bytes each), and what `survey_faces` holds. Files beside the result, gone at the end: 40 bytes a face
-    between two tiles; for parts also 8 bytes a point. Each piece is read twice.
+    between two tiles; for parts also 8 bytes a point, 12 a cell and 24 a column. Each piece is read twice; for
+    parts twice, and once more for each part that has cells of it.
     """
-    n = len(pieces.names)
-    if parts is not None and not 1 <= parts <= n:
-        raise ConfigError(
-            f"--parts {parts}: the mesh has {n} tiles, and each part takes whole ones; "
-            f"give 1 to {n} parts, or mesh with a smaller --tile-size"
-        )
+    if parts is not None and parts < 1:
+        raise ConfigError(f"--parts {parts}: must be 1 or more")
     sets_of = _by_building if buildings == "patches" else _by_marker
     zones_of = _by_zone if buildings == "zones" else _by_ground
-    with TemporaryDirectory(dir=folder, prefix=".faces.") as scratch:
+    with TemporaryDirectory(dir=folder, prefix=".faces.") as name:
+        scratch = Path(name)
+        columns = ColumnsFile(scratch / "columns")
+        look = None if parts is None else columns.add
         region, (patches, zones, volumes) = survey_faces(
-            pieces, Path(scratch), kinds=(sets_of, zones_of, _by_region)
+            pieces, scratch, kinds=(sets_of, zones_of, _by_region), look=look
         )
-        weight = np.diff(region.cell_start)
-        part = np.zeros(n, np.int64) if parts is None else split_pieces(region.centre, weight, parts)
-        n_faces = region.n_inner + int(patches.first(range(n))[1].sum())
+        if parts is None:
+            divided = take_whole(region, (patches, zones, volumes))
+        else:
+            kinds = ((sets_of, patches), (zones_of, zones))
+            divided = divide_cells(
+                pieces, region, columns, scratch, n_parts=parts, kinds=kinds, volumes=(_by_region, volumes)
+            )
+        n_faces = region.n_inner + int(patches.first(range(len(pieces.names)))[1].sum())
         label = 32 if max(3 * n_faces, pieces.n_points, int(region.cell_start[-1])) <= LABEL_LIMIT else 64
-        found = zones if buildings == "zones" or len(zones.keys) else None
-        plan = FoamPlan(pieces, region, patches, found, volumes, sets_of, zones_of, part, label)
+        zoned = buildings == "zones" or len(zones.keys) > 0
+        plan = FoamPlan(pieces, region, patches, volumes, zoned, sets_of, zones_of, divided, label, heights)
         if parts is None:
             return [write_part(folder, plan, 0, None)]
-        places = PointPlaces(Path(scratch) / "places", pieces.n_points)
+        places = PointPlaces(scratch / "places", pieces.n_points)
         return [write_part(folder / f"processor{number}", plan, number, places) for number in range(parts)]
 
 
@@ -179,7 +258,7 @@ def _by_region(piece: MeshPiece) -> Ints:
 FORMAT = Format(
     "a case folder of OpenFOAM",
     export_openfoam,
-    options=("parts", "case", "buildings", LARGEST_PART),
+    options=("parts", "case", *WIND_OPTIONS, "buildings", LARGEST_PART),
     buildings=("patches", "zones"),
     folder=True,
 )

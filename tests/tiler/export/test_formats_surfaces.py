@@ -18,8 +18,8 @@ from tests.helpers.vtk_writers import write_vtp
 from tiler.cli.main import main
 from tiler.export.export import export_run
 from tiler.export.foam_patches import PATCHES
+from tiler.export.obj_file import write_obj
 from tiler.export.surface import VertexSet, open_surface
-from tiler.formats.obj import write_obj
 from tiler.formats.ply import write_ply
 from tiler.formats.stl import write_stl
 from tiler.mesh_files.mesh_pieces import open_pieces

@@ -1,0 +1,211 @@
+"""Wind cases: a folder a direction on one mesh, the profile kept over bare ground, the surface sampled."""
+
+import json
+import os
+import re
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.data.errors import ConfigError
+from tests.helpers.foam_reader import PolyMesh, read_field, read_labels, read_poly_mesh
+from tests.helpers.programs import mesh_is_ok, run_foam
+from tiler.cli.main import main
+from tiler.export.export import export_run
+from tiler.export.foam_part import DISTANCES, count_distances
+from tiler.export.wind_profile import Wind, flow_of
+
+MESH = "constant/polyMesh"
+Floats = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def flat_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished run of 240 x 80 m of bare level ground, 60 m high, with thin cells at the ground."""
+    from tiler.config.config import make_config
+    from tiler.interface.synth import write_city
+    from tiler.workflow.run import run
+
+    folder = tmp_path_factory.mktemp("flat")
+    files = write_city(folder / "city", size=300, buildings=1, density=0.5, relief=0.0)
+    west, south = 318000.0, 6399000.0
+    given = {"pointcloud": [str(path) for path in files.clouds], "out": str(folder / "out")}
+    mesh = {"mesh_size": 8.0, "first_layer": 1.0, "domain_height": 60.0, "top": "flat", "tile_size": 1000.0}
+    run(make_config(given | mesh | {"bounds": [west + 30, south + 30, west + 270, south + 110]}))
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def small_wind(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Export of three directions for two processes."""
+    case = tmp_path_factory.mktemp("wind") / "case"
+    words = ["--direction", "240", "--direction", "0", "--direction", "22.5", "--parts", "2"]
+    command = ["export", str(small_run), "--format", "openfoam", "-o", str(case), "--case", "wind", *words]
+    assert main(command) == 0
+    return case
+
+
+def conditions(path: Path) -> dict[str, str]:
+    """Read the type of each patch of a field."""
+    text = path.read_bytes().split(b"boundaryField")[1].decode("latin1")
+    return dict(re.findall(r"^    (\S+) \{ type (\w+);", text, re.MULTILINE))
+
+
+def test_directions_share_one_mesh(small_wind: Path) -> None:
+    assert sorted(path.name for path in small_wind.iterdir()) == [
+        "Allrun", "case.foam", "constant", "export.json", "processor0", "processor1", "system",
+        "wind_0", "wind_22.5", "wind_240",
+    ]  # fmt: skip
+    for name in ("wind_0", "wind_22.5", "wind_240"):
+        for n in range(2):
+            link = small_wind / name / f"processor{n}" / MESH
+            assert link.is_symlink()
+            assert link.resolve() == (small_wind / f"processor{n}" / MESH).resolve()
+        assert (small_wind / name / "constant" / "triSurface" / "pedestrian.obj").is_file()
+        assert os.access(small_wind / name / "Allrun", os.X_OK)
+        assert "mpirun -np 2" in (small_wind / name / "Allrun").read_text()
+    size = sum(path.stat().st_size for path in small_wind.rglob("*") if path.is_file())
+    record = json.loads((small_wind / "export.json").read_text())
+    assert record["wind"]["directions"] == [240.0, 0.0, 22.5]
+    assert record["crs"].startswith("EPSG")
+    assert size > 0
+
+
+def test_conditions_are_those_of_the_direction(small_wind: Path) -> None:
+    oblique = conditions(small_wind / "wind_240" / "processor0" / "0" / "U")
+    inlet = {name for name, kind in oblique.items() if kind == "atmBoundaryLayerInletVelocity"}
+    outlet = {name for name, kind in oblique.items() if kind == "inletOutlet"}
+    assert (inlet, outlet) == ({"west", "south"}, {"east", "north"})
+    straight = conditions(small_wind / "wind_0" / "processor1" / "0" / "U")
+    assert straight["north"] == "atmBoundaryLayerInletVelocity"
+    assert straight["south"] == "inletOutlet"
+    assert straight["west"] == straight["east"] == "slip"
+    text = (small_wind / "wind_240" / "constant" / "wind").read_text()
+    assert "flowDir (0.866025403784 0.5 0);" in text
+    nut = conditions(small_wind / "wind_240" / "processor0" / "0" / "nut")
+    assert (nut["ground"], nut["walls"]) == ("nutkAtmRoughWallFunction", "nutkWallFunction")
+
+
+def test_cells_start_with_the_profile(small_run: Path, tmp_path: Path) -> None:
+    case = tmp_path / "case"
+    export_run(small_run, case, name="openfoam", options={"case": "wind", "direction": [180.0]})
+    mesh = read_poly_mesh(case / MESH)
+    ground = mesh.points[mesh.faces[mesh.patch_of("south")]][..., 2].min()
+    height = np.maximum(centres_of(mesh)[:, 2] - ground, 0.0)
+    velocity = read_field(case / "0" / "U", 3)
+    assert np.allclose(velocity[:, 1], Wind().speed_at(height), atol=1e-6)
+    assert np.all(velocity[:, [0, 2]] == 0)
+    assert np.allclose(read_field(case / "0" / "epsilon", 1)[:, 0], Wind().epsilon_at(height), atol=1e-6)
+    parts = tmp_path / "parts"
+    export_run(small_run, parts, name="openfoam", options={"case": "wind", "direction": [180.0], "parts": 3})
+    for n in range(3):
+        cell = read_labels(parts / f"processor{n}" / MESH / "cellProcAddressing")
+        start = parts / f"processor{n}" / "0" / "U"
+        assert np.array_equal(read_field(start, 3), velocity[cell])
+        # On faces towards another part stand the values of its cells.
+        part = read_poly_mesh(parts / f"processor{n}" / MESH)
+        for name, patch in part.patches.items():
+            if patch.kind == "processor":
+                beyond = int(patch.words["neighbProcNo"])
+                other = read_poly_mesh(parts / f"processor{beyond}" / MESH)
+                owner = other.owner[other.patch_of(f"procBoundary{beyond}to{n}")]
+                to = read_labels(parts / f"processor{beyond}" / MESH / "cellProcAddressing")
+                data = start.read_bytes()
+                at = data.index(f"{name} {{ type processor; value nonuniform List<vector> {patch.n}\n(".encode())
+                values = np.frombuffer(data, "<f8", 3 * patch.n, data.index(b"(", at) + 1).reshape(-1, 3)
+                assert np.array_equal(values, velocity[to[owner]])
+
+
+def test_what_the_mesh_does_not_allow_is_said(
+    small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["export", str(small_run), "--format", "openfoam", "-o", str(tmp_path / "case")]
+    assert main([*command, "--direction", "240"]) == 2
+    assert "--direction: is for --case wind; give that too" in capsys.readouterr().err
+    assert main([*command, "--case", "wind", "--patch-roughness", "water=0.001"]) == 2
+    assert (
+        "--patch-roughness water: the mesh has no such patch that is solid; it has ground"
+        in capsys.readouterr().err
+    )
+    assert list(tmp_path.iterdir()) == []
+    assert main([*command, "--case", "wind", "--roughness", "0.001", "--patch-roughness", "ground=20"]) == 0
+    said = capsys.readouterr().out
+    assert "wind from 270 degrees: in by west, out by east; slip along south, north; slip at the top" in said
+    assert "the top follows the terrain and is a slip wall" in said
+    assert re.search(r"warning: [\d,]+ of [\d,]+ cells on ground \(100%\) have their centre within 50 m", said)
+    assert "z0 uniform 20.0;" in (tmp_path / "case" / "0" / "nut").read_text()
+
+
+def test_distances_of_first_cells_by_hand() -> None:
+    # A cell of 4 m over the ground, and one of 0.4 m at a slope of 45 degrees: centres 1 m and 0.1/sqrt(2) m off.
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 4], [1, 0, 1], [0, 0, 0.4]])
+    counts = count_distances(points, np.array([[0, 1, 2, 3], [0, 4, 2, 5]]), np.array([[0, 2, 1], [0, 2, 4]]))
+    found = np.flatnonzero(counts)
+    assert counts.sum() == 2
+    assert [DISTANCES[k - 1] <= d <= DISTANCES[k] for k, d in zip(found, (0.0707, 1.0), strict=True)] == [True] * 2
+
+
+def centres_of(mesh: PolyMesh) -> Floats:
+    """Centre of each tetrahedron: the mean of the centres of its faces."""
+    middle = mesh.points[mesh.faces].mean(axis=1)
+    total = np.zeros((mesh.n_cells, 3))
+    for cells in (mesh.owner, mesh.neighbour):
+        np.add.at(total, cells, middle[: len(cells)])
+    return total / 4
+
+
+def run_wind(run: Path, case: Path, iterations: int, **options: Any) -> Path:
+    export_run(run, case, name="openfoam", options={"case": "wind", **options})
+    control = case / "system" / "controlDict"
+    control.write_text(re.sub(r"endTime +\d+;", f"endTime {iterations};", control.read_text()))
+    run_foam("simpleFoam", case)
+    return case / str(max(int(path.name) for path in case.iterdir() if path.name.isdigit()))
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("direction", [270.0, 240.0])
+def test_the_profile_at_the_outlet_is_that_of_the_inlet(flat_run: Path, tmp_path: Path, direction: float) -> None:
+    """Over bare ground the mean profile stays within 2 % from 1 m on, and k within 12 %."""
+    case = tmp_path / "case"
+    end = run_wind(flat_run, case, 200, direction=[direction], roughness=0.03)
+    assert mesh_is_ok(run_foam("checkMesh", case))
+    mesh, wind = read_poly_mesh(case / MESH), Wind((direction,), roughness=0.03)
+    centre, (low, high) = centres_of(mesh), (mesh.points.min(axis=0), mesh.points.max(axis=0))
+    flow = np.array([*flow_of(direction), 0.0])
+    at_outlet = high[0] - centre[:, 0] < 15.0
+    if flow[1]:
+        at_outlet |= high[1] - centre[:, 1] < 15.0
+    height, speed = centre[:, 2] - low[2], read_field(end / "U", 3) @ flow
+    k = read_field(end / "k", 1)[:, 0]
+    limits = [1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 15.0, 25.0, 40.0, 60.0]
+    for lower, upper in pairwise(limits):
+        chosen = at_outlet & (height >= lower) & (height < upper)
+        assert (speed[chosen] / wind.speed_at(height[chosen])).mean() == pytest.approx(1.0, abs=0.02), lower
+        assert k[chosen].mean() == pytest.approx(wind.k, rel=0.12), lower
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_the_wind_is_sampled_above_each_triangle_of_the_ground(small_run: Path, tmp_path: Path) -> None:
+    case = tmp_path / "case"
+    run_wind(small_run, case, 3, direction=[240.0])
+    table = np.loadtxt(case / "postProcessing" / "pedestrian" / "3" / "U_pedestrian.raw")
+    mesh = read_poly_mesh(case / MESH)
+    ground = mesh.points[mesh.faces[mesh.patch_of("ground")]].mean(axis=1)
+    assert len(table) == len(ground)
+    expected = ground[np.lexsort(ground.T)] + np.array([0.0, 0.0, 1.75])
+    assert np.allclose(table[np.lexsort(table[:, :3].T), :3], expected, atol=1e-3)
+
+
+def test_a_direction_without_a_side_to_leave_by_is_refused(small_run: Path, tmp_path: Path) -> None:
+    from tiler.export.wind_case import Domain, write_wind_cases
+
+    heights = {"west": 0.0, "top": 50.0, "ground": 0.0}
+    domain = Domain({"west": 4, "top": 4, "ground": 8}, heights, heights, ())
+    with pytest.raises(ConfigError, match="--direction 270: the mesh has no side by which the wind could leave"):
+        write_wind_cases(tmp_path, domain, Wind(), parts=None)
