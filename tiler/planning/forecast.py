@@ -238,7 +238,7 @@ def _thinning(survey: Survey, sample: FootprintSample | None, config: Config) ->
     """
     x, y = survey.meshed.lines
     shape = len(x) - 1, len(y) - 1
-    known = sample.complete if sample is not None else not config.footprints
+    known = sample.complete if sample is not None else not config.has_buildings
     if not config.graded_size or (config.open_size and not known):
         return np.ones(shape)
     side = int(np.clip(np.sqrt(MOST_LOOKS / (shape[0] * shape[1])), 2, LOOKS_A_SIDE))
