@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from tiler.cityinput.rasters import Lattice
 
 FINE = 0.5  # spacings of the terrain's nodes; smaller cells are averaged around each node
+TIE = 1e-9  # share of a cell; cells that are as near as that to a node are equally near
 
 Array = NDArray[np.float64]
 Box = tuple[float, float, float, float]
@@ -89,16 +90,18 @@ def interpolate_cells(cells: Cells, x: Array, y: Array, spacing: float) -> Array
     if max(cells.dx, cells.dy) < FINE * spacing:
         return _average(cells, x, y, spacing)
     (c, s), (r, t) = _split(x, cells.x, cells.dx, cells.z.shape[1]), _split(y, cells.y, cells.dy, cells.z.shape[0])
-    total, weight = np.zeros((len(y), len(x))), np.zeros((len(y), len(x)))
+    total, weight, nearest, most = (np.zeros((len(y), len(x))) for _ in range(4))
     for dj, wj in ((0, 1 - t), (1, t)):
         for di, wi in ((0, 1 - s), (1, s)):
             z = cells.z[np.ix_(r + dj, c + di)]
-            w = np.where(np.isfinite(z), wj[:, np.newaxis] * wi[np.newaxis, :], 0.0)
+            w = wj[:, np.newaxis] * wi[np.newaxis, :]
+            most = np.maximum(most, w)
+            w = np.where(np.isfinite(z), w, 0.0)
+            nearest = np.maximum(nearest, w)
             total += w * np.where(np.isfinite(z), z, 0.0)
             weight += w
-    nearest = cells.z[np.ix_(r + (t >= 0.5), c + (s >= 0.5))]
     with np.errstate(invalid="ignore", divide="ignore"):
-        found: Array = np.where(np.isfinite(nearest), total / weight, np.nan)
+        found: Array = np.where(nearest >= most - TIE, total / weight, np.nan)
     return found
 
 

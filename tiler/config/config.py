@@ -607,8 +607,8 @@ def _check_way(config: Config) -> None:
 def _check_sources(config: Config) -> None:
     if config.footprints and config.buildings:
         raise ConfigError(
-            f"footprints = {_shown(config.footprints)} and buildings = {_shown(config.buildings[0])}: outlines are "
-            "of one or the other; leave one out"
+            f"footprints = {_shown(config.footprints)} and buildings = {_shown(config.buildings[0])}: outlines "
+            "are of one or the other; leave one out"
         )
     if config.ground_filter and not config.pointcloud and (config.buildings or config.terrain):
         raise ConfigError("ground_filter = true without a point cloud, in which it finds the ground; leave it out")
