@@ -47,12 +47,15 @@ class Wanted:
         Whether to make points on roofs.
     ground_points : bool
         Whether to make points of the ground: of the terrain, and along outlines at the foot of buildings.
+    shift : float
+        Added to all heights (m).
     """
 
     lod: str
     height: str
     roof_points: bool
     ground_points: bool
+    shift: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +121,7 @@ def read_model_blocks(path: Path, frame: Frame, bounds: Box, wanted: Wanted) -> 
                 yield _make_block(batch, frame, bounds, wanted)
                 batch, given = [], True
         elif isinstance(each, Relief) and wanted.ground_points:
-            yield from _make_relief(each.faces, frame, bounds)
+            yield from _make_relief(each.faces, frame, bounds, wanted.shift)
             given = True
     if batch or not given:
         yield _make_block(batch, frame, bounds, wanted)
@@ -126,7 +129,7 @@ def read_model_blocks(path: Path, frame: Frame, bounds: Box, wanted: Wanted) -> 
 
 def _make_block(batch: Sequence[ModelBuilding], frame: Frame, bounds: Box, wanted: Wanted) -> ModelBlock:
     counts: Counter[str] = Counter()
-    rows, notes = make_rows(batch, frame, wanted.lod, counts)
+    rows, notes = make_rows(batch, frame, wanted.lod, counts, wanted.shift)
     near = shapely.intersects(rows.outlines, shapely.box(*bounds)) if len(rows) else np.zeros(0, np.bool_)
     counts["model buildings outside the region"] += int((~near).sum())
     rows = take_rows(rows, np.flatnonzero(near))
@@ -179,9 +182,9 @@ def _sample_feet(rows: ModelRows) -> Array:
     return np.column_stack((xy, rows.base[known][row]))
 
 
-def _make_relief(faces: Faces, frame: Frame, bounds: Box) -> Iterator[ModelBlock]:
+def _make_relief(faces: Faces, frame: Frame, bounds: Box, shift: float) -> Iterator[ModelBlock]:
     """Points on triangles of the terrain, some of them at a time."""
-    xyz = np.column_stack((to_region(frame, faces.xyz[:, :2]), faces.xyz[:, 2] * frame.height))
+    xyz = np.column_stack((to_region(frame, faces.xyz[:, :2]), faces.xyz[:, 2] * frame.height + shift))
     placed = Faces(xyz, faces.ring_start, faces.face_start, faces.kind)
     planes = find_planes(placed)
     count = np.diff(faces.face_start)

@@ -22,10 +22,10 @@ STEEPEST = 10.0  # slope from which a face is a wall
 LEAST_FACE = 0.01  # m2 in plan; smaller faces are no roofs
 ROOM = 0.5  # m, that a roof may reach beyond the heights of its surface
 NOT_PLANAR = 0.1  # m; vertices farther than this from the plane of their roof are told
-NO_HEIGHT = np.nan
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Placing = tuple[Frame, float]  # how coordinates of a file become those of the region, and what is added to heights
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def join_rows(several: Sequence[ModelRows]) -> ModelRows:
 
 
 def make_rows(
-    buildings: Sequence[ModelBuilding], frame: Frame, asked: str, counts: Counter[str]
+    buildings: Sequence[ModelBuilding], frame: Frame, asked: str, counts: Counter[str], shift: float = 0.0
 ) -> tuple[ModelRows, list[Note]]:
     """Make rows of buildings.
 
@@ -122,6 +122,8 @@ def make_rows(
         Which level of detail is wanted, one of `levels.CHOICES`.
     counts : Counter of str
         Numbers for the record are added, by name.
+    shift : float
+        Added to all heights (m).
 
     Returns
     -------
@@ -142,12 +144,12 @@ def make_rows(
     left = [k for k, tries in enumerate(attempts) if tries]
     done: dict[int, _Found] = {}
     while left:
-        tried = _find_roofs([(k, *attempts[k][place[k]]) for k in left], frame)
+        tried = _find_roofs([(k, *attempts[k][place[k]]) for k in left], (frame, shift))
         done |= {k: found for k, found in tried.items() if len(found.surfaces)}
         place[left] += 1
         left = [k for k in left if k not in done and place[k] < len(attempts[k])]
     outlines = [(k, 0.0, find_outline(one)) for k, one in enumerate(buildings) if k not in done]
-    places = _find_outlines([each for each in outlines if len(each[2])], frame)
+    places = _find_outlines([each for each in outlines if len(each[2])], (frame, shift))
     notes: list[Note] = []
     kept = [k for k in range(len(buildings)) if k in done or k in places]
     _count(buildings, attempts, place, (done, places), counts)
@@ -171,16 +173,17 @@ class _Found:
     residual: Array
 
 
-def _to_region(faces: Faces, frame: Frame) -> Faces:
+def _to_region(faces: Faces, placing: Placing) -> Faces:
+    frame, shift = placing
     xy = np.round(to_region(frame, faces.xyz[:, :2]) / ROUNDING) * ROUNDING
     # A whole number of millimetres as the nearest float, whatever the multiplication gave.
-    xyz = np.column_stack((np.round(xy, 3), faces.xyz[:, 2] * frame.height))
+    xyz = np.column_stack((np.round(xy, 3), faces.xyz[:, 2] * frame.height + shift))
     return Faces(xyz, faces.ring_start, faces.face_start, faces.kind)
 
 
-def _find_roofs(tries: Sequence[tuple[int, float, Faces]], frame: Frame) -> dict[int, _Found]:
+def _find_roofs(tries: Sequence[tuple[int, float, Faces]], placing: Placing) -> dict[int, _Found]:
     """Find outlines and roofs of buildings, all faces at a time; none for those without roof surfaces."""
-    faces = _to_region(join_faces(one for _, _, one in tries), frame)
+    faces = _to_region(join_faces(one for _, _, one in tries), placing)
     owner = np.repeat(np.arange(len(tries)), [len(one) for _, _, one in tries])
     planes = find_planes(faces)
     up = np.abs(planes.normal[:, 2])
@@ -211,10 +214,10 @@ def _find_roofs(tries: Sequence[tuple[int, float, Faces]], frame: Frame) -> dict
     return {k: each for k, each in found.items() if not each.outline.is_empty}
 
 
-def _find_outlines(tries: Sequence[tuple[int, float, Faces]], frame: Frame) -> dict[int, shapely.Geometry]:
+def _find_outlines(tries: Sequence[tuple[int, float, Faces]], placing: Placing) -> dict[int, shapely.Geometry]:
     found = {}
     for k, _, faces in tries:
-        placed = _to_region(faces, frame)
+        placed = _to_region(faces, placing)
         outline = _areas_of(shapely.union_all(_make_polygons(placed, np.arange(len(placed)))))
         if not outline.is_empty:
             found[k] = outline

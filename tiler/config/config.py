@@ -86,6 +86,10 @@ class Config:
         UNSET, "input", "which coordinate comes first in city models: xy for the easting, yx for the northing; "
         "empty: what they show", choices=(UNSET, "xy", "yx"),
     )  # fmt: skip
+    shift_z: float = _parameter(
+        0.0, "input", "added to all heights of city models, where they are not those of the terrain", unit="m",
+        least=-10_000, most=10_000,
+    )  # fmt: skip
     layer: str = _parameter(UNSET, "input", "layer of the footprint file; empty: its only or first one")
     id_attribute: str = _parameter(
         UNSET, "input", "attribute that holds building ids; empty: a well-known name, else ids from geometry"

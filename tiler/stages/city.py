@@ -51,7 +51,7 @@ from tiler.config.step_options import CITY_PARAMETERS, city_options, layer_param
 from tiler.engine.run_context import find_owned, region_around, tile_key
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Result, Task
-from tiler.stages.city_files import read_surfaces
+from tiler.stages.city_files import count_feet, note_feet, read_surfaces
 from tiler.stages.house_points import add_unmarked, find_surfaces, points_near
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.readers import extent_of, grow, hull, read_known_terrain, read_own_outlines
@@ -67,7 +67,7 @@ def house_stage(config: Config) -> Stage:
         Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
-    models = ("buildings_given",) if config.buildings else ()
+    models = ("buildings_given", "ground_of_models") if config.buildings else ()
     return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN, *models), version=6)
 
 
@@ -172,10 +172,14 @@ def make_houses(task: Task) -> Facts:
     task.notes(city.notes)
     roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
     others = np.isin(city.model.ids, own.ids[unmarked])
-    surfaces = None
+    surfaces, feet = None, {}
     if task.parameters.get("buildings_given", False):
         with task.step("1.2 roof surfaces"):
-            surfaces = read_surfaces(task, city.model.polygons, city.model.ids)
+            surfaces, base = read_surfaces(task, city.model.polygons, city.model.ids)
+        if not task.parameters.ground_of_models:
+            houses_of = Footprints(city.model.polygons, city.model.ids, city.given_height)
+            task.notes(note_feet(houses_of, base, city.model.ground))
+            feet = {"feet": count_feet(base, city.model.ground)}
     with task.step("2.0 split levels"):
         houses = divide_houses(
             city, cloud, options, building_class=True, roofs=roofs, unmarked=others, surfaces=surfaces
@@ -189,7 +193,7 @@ def make_houses(task: Task) -> Facts:
     parts = {"house parts": len(houses.parts.polygons)}
     counts = {"buildings before merging": len(houses), **parts, **_count_forms(houses)}
     counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
-    return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts}
+    return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts, **feet}
 
 
 def find_near_houses(task: Task) -> Facts:

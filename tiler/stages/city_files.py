@@ -1,7 +1,7 @@
 """What stages make of city models and terrain rasters: points, footprints, roof surfaces, heights of nodes."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.city_model.city import find_places
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.roofs import take_roofs
@@ -26,14 +27,18 @@ from tiler.georeference.frame import origin_of
 from tiler.stages.readers import extent_of, read_units_of
 
 # Parameters of a run that decide what is read of a city model.
-MODEL_PARAMETERS = ("lod", "height_attribute", "points_of_models", "ground_of_models")
+MODEL_PARAMETERS = ("lod", "height_attribute", "points_of_models", "ground_of_models", "shift_z")
+OFF_GROUND = 5.0  # m; a house whose foot is farther from the ground is told
+SHIFTED = 2.0  # m; a median of all from which on they are told together
 BAND = 20_000  # rows of buildings in memory at a time
 
 
 def read_model_file(task: Task, path: Path) -> Facts:
     """Read a city model: its buildings as rows, and points on their roofs and around them (step 1.1)."""
     given = task.parameters
-    wanted = Wanted(given.lod, given.height_attribute, given.points_of_models, given.ground_of_models)
+    wanted = Wanted(
+        given.lod, given.height_attribute, given.points_of_models, given.ground_of_models, given.shift_z
+    )
     middle = (task.box[0] + task.box[2]) / 2, (task.box[1] + task.box[3]) / 2
     origin = origin_of(middle)
     counts: Counter[str] = Counter()
@@ -152,32 +157,37 @@ def _find_doubles(task: Task, files: list[str]) -> dict[str, str]:
     return {one: seen[one][2] for one in double}
 
 
-def read_surfaces(task: Task, polygons: NDArray[np.object_], ids: NDArray[np.str_]) -> RoofSurfaces:
-    """Read the roof surfaces of houses from the city models near them, by their ids.
+def read_surfaces(
+    task: Task, polygons: NDArray[np.object_], ids: NDArray[np.str_]
+) -> tuple[RoofSurfaces, NDArray[np.float64]]:
+    """Read the roof surfaces of houses from the city models near them, by their ids; and how low they reach (m).
 
     A house that is a part of a building, as ``A-2`` of ``A``, takes those of the building.
     """
     extent = extent_of(polygons)
     if extent is None:
-        return no_surfaces(0)
+        return no_surfaces(0), np.empty(0)
     rows = join_rows([_rows_near(task, name, facts, extent) for name, facts in list_kind(task, MODEL)])
     by_id: dict[str, list[int]] = {}
     for k, one in enumerate(rows.ids.tolist()):
         by_id.setdefault(one, []).append(k)
     count, surface = [0], [np.empty(0, np.int64)]
-    for one, polygon in zip(ids.tolist(), polygons, strict=True):
+    base = np.full(len(ids), np.nan)
+    for k, (one, polygon) in enumerate(zip(ids.tolist(), polygons, strict=True)):
         candidates = by_id.get(one) or by_id.get(one.rpartition("-")[0]) or []
-        own = _choose(rows, candidates, polygon)
+        best = _choose(rows, candidates, polygon)
+        own = np.empty(0, np.int64) if best is None else np.arange(rows.start[best], rows.start[best + 1])
+        base[k] = np.nan if best is None else rows.base[best]
         count.append(len(own))
         surface.append(own)
     chosen = np.concatenate(surface)
-    return RoofSurfaces(np.cumsum(count), rows.surfaces[chosen], take_roofs(rows.roofs, chosen))
+    return RoofSurfaces(np.cumsum(count), rows.surfaces[chosen], take_roofs(rows.roofs, chosen)), base
 
 
-def _choose(rows: ModelRows, candidates: list[int], polygon: shapely.Polygon) -> NDArray[np.int64]:
-    """Surfaces of the building that is a house: of several of one id the one over it, then by level and area."""
+def _choose(rows: ModelRows, candidates: list[int], polygon: shapely.Polygon) -> int | None:
+    """Row of the building that is a house: of several of one id the one over it, then by level; None for none."""
     if not candidates:
-        return np.empty(0, np.int64)
+        return None
     merit = [
         (
             round(shapely.area(shapely.intersection(rows.outlines[k], polygon)), 3),
@@ -186,8 +196,43 @@ def _choose(rows: ModelRows, candidates: list[int], polygon: shapely.Polygon) ->
         )
         for i, k in enumerate(candidates)
     ]
-    best = candidates[max(range(len(candidates)), key=merit.__getitem__)]
-    return np.arange(rows.start[best], rows.start[best + 1])
+    return candidates[max(range(len(candidates)), key=merit.__getitem__)]
+
+
+def note_feet(footprints: Footprints, base: NDArray[np.float64], ground: NDArray[np.float64]) -> list[Note]:
+    """Tell of the houses of a city model whose foot is far from the ground: kind ``model-off-ground``."""
+    off = base - ground
+    return [
+        Note(
+            "model-off-ground",
+            *place,
+            f"its foot is {abs(off[k]):.1f} m {'above' if off[k] > 0 else 'below'} the ground",
+        )
+        for k, place in find_places(footprints, np.abs(off) > OFF_GROUND)
+    ]
+
+
+def count_feet(base: NDArray[np.float64], ground: NDArray[np.float64]) -> dict[str, int]:
+    """Count houses by how far their foot is above the ground, in decimetres, as facts have it."""
+    known = np.isfinite(base) & np.isfinite(ground)
+    off = np.round(10 * (base - ground)[known]).astype(np.int64)
+    return {str(value): n for value, n in sorted(Counter(off.tolist()).items())}
+
+
+def describe_feet(counts: Iterable[dict[str, int]]) -> list[Note]:
+    """Tell where buildings of city models stand above or below the ground in the median: kind ``model-shift``."""
+    total: Counter[int] = Counter()
+    for one in counts:
+        total.update({int(value): n for value, n in one.items()})
+    values = np.repeat(list(total), list(total.values())).astype(np.float64)
+    if not len(values) or abs(shift := float(np.median(values)) / 10) <= SHIFTED:
+        return []
+    side = "above" if shift > 0 else "below"
+    detail = (
+        f"the feet of {len(values)} buildings are {abs(shift):.1f} m {side} the ground in the median: heights of "
+        f"model and terrain may be of two systems; --shift-z {-shift:.1f} moves the model"
+    )
+    return [Note("model-shift", detail=detail)]
 
 
 def _rows_near(task: Task, name: str, facts: Facts, box: Box) -> ModelRows:

@@ -137,6 +137,10 @@ WORDS: dict[str, Words] = {
     "model-no-roof": Words(
         DEFAULTED, "{n} building[s] of the city model [has|have] no roof: a height over the outline was taken"
     ),
+    "model-off-ground": Words(
+        OTHER, "{n} building[s] of the city model [stands|stand] more than 5 m above or below the ground"
+    ),
+    "model-shift": Words(OTHER, "the city model lies above or below the ground as a whole: see --shift-z"),
     "model-roof-gap": Words(
         DEFAULTED, "{n} roof[s] of the city model [has|have] a gap that took the nearest surface"
     ),

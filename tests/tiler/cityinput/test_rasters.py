@@ -108,9 +108,9 @@ def test_a_vrt_names_its_files(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_taken_is_refused(tmp_path: Path, more: dict[str, Any], words: str) -> None:
     path = write(tmp_path / "a.tif", np.zeros((2, 2)), **more)
+    read = find_lattice if "size" in more else lambda path, *_: read_raster_header(path)
     with pytest.raises(InputError, match=words):
-        read_raster_header(path)
-        find_lattice(path, AS_IT_IS, BOUNDS)
+        read(path, AS_IT_IS, BOUNDS)
 
 
 def test_a_file_that_is_no_raster_is_refused(tmp_path: Path) -> None:

@@ -28,13 +28,13 @@ from tiler.cityinput.row_arrays import RowPacker, find_ranges, unpack_rows
 from tiler.cityinput.rows import ModelRows, make_rows
 from tiler.cityinput.samples import grid_faces, grid_polygons
 from tiler.cityinput.sources import scan_model
-from tiler.georeference.frame import Frame
+from tiler.georeference.frame import AS_IT_IS, Frame
 
 EVERYWHERE = (0.0, 0.0, 1e7, 1e7)
 ALL = Wanted("auto", "", roof_points=True, ground_points=True)
 
 
-def rows_of(path: Path, lod: str = "auto", frame: Frame = Frame()) -> tuple[ModelRows, list[str], Counter[str]]:
+def rows_of(path: Path, lod: str = "auto", frame: Frame = AS_IT_IS) -> tuple[ModelRows, list[str], Counter[str]]:
     counts: Counter[str] = Counter()
     buildings = [each for each in scan_model(path) if isinstance(each, ModelBuilding)]
     rows, notes = make_rows(buildings, frame, lod, counts)
@@ -49,7 +49,8 @@ def height_at(rows: ModelRows, x: float, y: float) -> float:
 
 def several_levels() -> dict[str, Any]:
     """The house at levels 0, 1.2 (8 m), 1.3 (8.5 m) and 2.2."""
-    geometries, vertices = [solid(2.2)], list(CORNERS)
+    geometries = [solid(2.2)]
+    vertices: list[list[float]] = [[*corner] for corner in CORNERS]
     for lod, height in ((1.2, 8.0), (1.3, 8.5)):
         box, corners = box_solid(height, lod, len(vertices))
         geometries.append(box)
@@ -164,7 +165,7 @@ def test_flipped_and_repeated_surfaces_change_nothing(tmp_path: Path) -> None:
 
 
 def test_a_roof_surface_that_is_not_planar_is_told(tmp_path: Path) -> None:
-    corners = [list(corner) for corner in CORNERS]
+    corners: list[list[float]] = [[*corner] for corner in CORNERS]
     corners[4][2] = 7.0
     document = city_json({"house": {"type": "Building", "geometry": [solid()]}}, corners)
     rows, notes, _ = rows_of(write_json(tmp_path / "a.json", document))
