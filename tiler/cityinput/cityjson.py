@@ -62,8 +62,9 @@ def read_objects(path: Path) -> tuple[CityJsonHead, Iterator[tuple[Object, Verti
     if document is not None and _is_head(document, rest):
         head = _read_head(path, document, sequence=True)
         return head, _read_lines(path, head)
-    with path.open("rb") as file:
-        document = _parse(file.read())
+    if document is None or rest.strip():
+        with path.open("rb") as file:
+            document = _parse(file.read())
     if not isinstance(document, dict):
         raise InputError(f"{path}: is no JSON object; give a CityJSON file, or CityJSONSeq with one object a line")
     head = _read_head(path, document, sequence=False)

@@ -41,7 +41,8 @@ def area_vectors(xyz: Array, ring_start: NDArray[np.int64]) -> Array:
     after = np.arange(len(xyz)) + 1
     after[ring_start[1:] - 1] = ring_start[:-1]
     near = xyz - np.repeat(xyz[ring_start[:-1]], count, axis=0)
-    vectors = np.cross(near, near[after]) / 2
+    (x, y, z), (u, v, w) = near.T, near[after].T
+    vectors = np.column_stack((y * w - z * v, z * u - x * w, x * v - y * u)) / 2
     found: Array = np.add.reduceat(vectors, ring_start[:-1], axis=0)
     return found
 

@@ -17,7 +17,7 @@ from tiler.cityinput.citygml import Relief
 from tiler.cityinput.face_planes import find_planes
 from tiler.cityinput.faces import Faces, ModelBuilding
 from tiler.cityinput.rows import ModelRows, make_rows, no_rows, take_rows
-from tiler.cityinput.samples import along_outlines, are_among, grid_faces, grid_polygons, highest_nodes
+from tiler.cityinput.samples import along_outlines, grid_faces, grid_polygons, highest_nodes
 from tiler.cityinput.sources import scan_model
 from tiler.georeference.frame import Frame, to_region
 from tiler.pointclouds.cells import Box, order_by_cell
@@ -163,9 +163,7 @@ def _sample_roofs(rows: ModelRows) -> Array:
     owner = np.repeat(np.arange(len(rows)), np.diff(rows.start))[surface]
     xy = np.asarray((node + 0.5) * STEP, np.float64)
     z = roof_heights(_without_room(rows.roofs), surface, xy)
-    top = highest_nodes(owner, node, z)
-    row, inside = grid_polygons(rows.outlines, STEP)
-    top = top[are_among(owner[top], node[top], row, inside)]
+    top = highest_nodes(owner, node, z, grid_polygons(rows.outlines, STEP))
     return np.column_stack((xy, z))[top]
 
 

@@ -101,21 +101,55 @@ def grid_polygons(polygons: NDArray[np.object_], step: float) -> tuple[Index, In
     return grid_faces(xy, ring_start, face_start, step)
 
 
-def highest_nodes(owner: Index, node: Index, z: Array) -> Index:
-    """Rows of the highest of all nodes at one place of one owner, int64 (k,), by owner, row and column."""
-    order = np.lexsort((z, node[:, 0], node[:, 1], owner))
-    key = np.column_stack((owner, node))[order]
+def number_nodes(owner: Index, node: Index, low: Index, size: Index) -> Index:
+    """One number for each node of each owner, by owner, row and column, int64 (n,).
+
+    Parameters
+    ----------
+    owner : int64, (n,)
+        Owners.
+    node : int64, (n, 2)
+        Columns and rows.
+    low, size : int64, (2,)
+        Least column and row, and how many there are of each.
+    """
+    numbers: Index = (owner * size[1] + node[:, 1] - low[1]) * size[0] + node[:, 0] - low[0]
+    return numbers
+
+
+def highest_nodes(owner: Index, node: Index, z: Array, mask: tuple[Index, Index]) -> Index:
+    """Find the highest of all nodes at one place of one owner, where a mask has the place, too.
+
+    Parameters
+    ----------
+    owner : int64, (n,)
+        Owners of nodes.
+    node : int64, (n, 2)
+        Their columns and rows.
+    z : float64, (n,)
+        Their heights (m).
+    mask : (int64 (m,), int64 (m, 2))
+        Owners and nodes of places that count.
+
+    Returns
+    -------
+    int64, (k,)
+        Rows of the nodes, by owner, row and column.
+    """
+    if not len(owner) or not len(mask[0]):
+        return np.empty(0, np.int64)
+    both = np.concatenate((node, mask[1]))
+    low = both.min(axis=0)
+    size = both.max(axis=0) - low + 1
+    key, allowed = number_nodes(owner, node, low, size), number_nodes(*mask, low, size)
+    order = np.lexsort((z, key))
+    key = key[order]
     last = np.ones(len(order), np.bool_)
-    last[:-1] = (key[1:] != key[:-1]).any(axis=1)
-    return order[last]
-
-
-def are_among(owner: Index, node: Index, owner2: Index, node2: Index) -> NDArray[np.bool_]:
-    """Which nodes of owners are among others of theirs, bool (n,)."""
-    both = np.concatenate((np.column_stack((owner, node)), np.column_stack((owner2, node2))))
-    _, index = np.unique(both, axis=0, return_inverse=True)
-    index = index.reshape(-1)
-    found: NDArray[np.bool_] = np.isin(index[: len(owner)], index[len(owner) :])
+    last[:-1] = key[1:] != key[:-1]
+    order, key = order[last], key[last]
+    allowed = np.sort(allowed)
+    at = np.minimum(np.searchsorted(allowed, key), len(allowed) - 1)
+    found: Index = order[allowed[at] == key]
     return found
 
 

@@ -19,6 +19,7 @@ from tiler.pointclouds.clouds import CloudHeader
 
 CLOUD, MODEL, TERRAIN = "cloud", "model", "terrain"
 _RASTERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+ENOUGH = 2000  # solids and roofs that tell the order of axes
 CLEAR = 0.9  # share of solids and roofs that agree on an order of axes
 
 
@@ -90,6 +91,8 @@ class _Survey:
                 zip(shape.faces.xyz.min(axis=0).tolist(), shape.faces.xyz.max(axis=0).tolist(), strict=True)
             ):
                 self.low[k], self.high[k] = min(self.low[k], low), max(self.high[k], high)
+            if self.right + self.wrong >= ENOUGH:
+                continue
             sign = signed_volume(shape.faces) if shape.closed else upward_area(shape.faces)
             self.right += sign > 0
             self.wrong += sign < 0
