@@ -27,6 +27,7 @@ BATCH = 1000  # buildings in memory at a time
 ROW_CELL = 256.0  # m, side of the cells that buildings are sorted by
 STEP = 0.5  # m between points on roofs
 GROUND_STEP = 1.0  # m between points of terrain, and along outlines
+FOOT_ROOM = 0.25  # m from an outline to the points of the ground around it
 UNIT = 0.001  # m of a coordinate
 
 Array = NDArray[np.float64]
@@ -174,9 +175,10 @@ def _without_room(roofs: Roofs) -> Roofs:
 
 
 def _sample_feet(rows: ModelRows) -> Array:
-    """Points along outlines at the lowest height of each building."""
+    """Points close around outlines at the lowest height of each building."""
     known = np.flatnonzero(np.isfinite(rows.base))
-    xy, row = along_outlines(rows.outlines[known], GROUND_STEP)
+    around = shapely.buffer(rows.outlines[known], FOOT_ROOM, join_style="mitre")
+    xy, row = along_outlines(around, GROUND_STEP)
     return np.column_stack((xy, rows.base[known][row]))
 
 

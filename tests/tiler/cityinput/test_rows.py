@@ -194,7 +194,8 @@ def test_points_lie_on_the_roof_and_along_its_foot(tmp_path: Path) -> None:
     assert len(roof) == 20 * 16  # a grid of 0.5 m in 10 x 8 m
     y = roof[:, 1] - PLACE[1]
     assert roof[:, 2] == pytest.approx(9 - 0.75 * np.abs(y - 4))
-    assert len(foot) == 37  # each metre along 36 m, the first place again
+    assert len(foot) == 2 * (11 + 9) + 1  # at most a metre apart around 10.5 x 8.5 m, the first place again
+    assert foot[:, :2].min(axis=0).tolist() == [PLACE[0] - 0.25, PLACE[1] - 0.25]
     assert set(foot[:, 2].tolist()) == {2.0}
 
 
