@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import pytest
 import rasterio
@@ -199,6 +200,26 @@ def test_a_model_above_its_terrain_is_told_and_moved(
     assert moved.keys() == parts.keys()
     for name in ("roof_height", "roof_slope", "ground_height"):
         assert [moved[part][name] for part in parts] == pytest.approx([one[name] for one in parts.values()])
+
+
+def test_with_points_beside_it_the_model_has_the_roofs_and_points_tell_how_far_they_are(tmp_path: Path) -> None:
+    path = write_sequence(tmp_path / "b.jsonl", [house(0, 0), house(1, 0)])
+    x, y = (side.ravel() for side in np.meshgrid(np.arange(-19.5, 66), np.arange(-19.5, 28)))
+    on = (y > 0) & (y < 8) & (((x > 0) & (x < 10)) | ((x > PITCH) & (x < PITCH + 10)))
+    ground = np.array([ground_at(v) for v in (PLACE[0] + x).tolist()])
+    foot = np.where(x > 20, ground_at(PLACE[0] + PITCH + 5), ground_at(PLACE[0] + 5))
+    z = np.where(on, foot + 7.3 - 0.75 * np.abs(y - 4), ground)
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.header.scales, las.header.offsets = np.full(3, 0.001), np.array(PLACE)
+    las.x, las.y, las.z = PLACE[0] + x, PLACE[1] + y, z
+    las.classification = np.where(on, 6, 2)
+    las.write(tmp_path / "a.las")
+    values = {"pointcloud": [str(tmp_path / "a.las")], "buildings": [str(path)], "crs": "EPSG:28992"}
+    record = run(make_config(values | {"roofs": "planes", "out": str(tmp_path / "out")}))
+    assert record["counts"]["roofs of a city model"] == 2
+    assert {part["roof_method"] for part in parts_of(tmp_path / "out").values()} == {"model"}
+    assert record["fidelity"]["roof"]["bias"] == pytest.approx(-0.3, abs=0.1)
+    assert check_run(tmp_path / "out", StoredTerrain).ok
 
 
 def test_terrain_alone_is_meshed(block: tuple[dict[str, Any], Path, dict[str, Any]], tmp_path: Path) -> None:

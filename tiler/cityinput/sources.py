@@ -14,6 +14,7 @@ from tiler.cityinput.cityjson import read_buildings, read_objects, read_relief
 from tiler.cityinput.crs_names import NamedCrs, read_crs_name
 from tiler.cityinput.face_planes import signed_volume, upward_area
 from tiler.cityinput.faces import ModelBuilding
+from tiler.cityinput.geopackage import SIGNATURE, scan_geopackage
 from tiler.georeference.crs import horizontal_crs, is_on_its_place
 from tiler.pointclouds.clouds import CloudHeader
 
@@ -39,7 +40,7 @@ def kind_of(path: Path) -> str:
     text = start.removeprefix(b"\xef\xbb\xbf").lstrip()
     if start.startswith(_RASTERS) or text.startswith(b"<VRTDataset"):
         return TERRAIN
-    return MODEL if text[:1] in (b"{", b"<") else CLOUD
+    return MODEL if text[:1] in (b"{", b"<") or start.startswith(SIGNATURE) else CLOUD
 
 
 def scan_model(path: Path, height: str = "") -> Iterator[str | ModelBuilding | Relief]:
@@ -48,7 +49,7 @@ def scan_model(path: Path, height: str = "") -> Iterator[str | ModelBuilding | R
     Parameters
     ----------
     path : Path
-        CityJSON, CityJSONSeq or CityGML file.
+        CityJSON, CityJSONSeq or CityGML file, or a GeoPackage as of 3DBAG.
     height : str
         Attribute with the height above ground (m); ``""`` for the format's own.
 
@@ -62,8 +63,13 @@ def scan_model(path: Path, height: str = "") -> Iterator[str | ModelBuilding | R
     if start[:1] == b"<":
         yield from scan_citygml(path, height)
         return
+    if start.startswith(SIGNATURE):
+        yield from scan_geopackage(path)
+        return
     if start[:1] != b"{":
-        raise InputError(f"{path}: is neither CityJSON nor CityGML: it begins with {start[:20]!r}")
+        raise InputError(
+            f"{path}: is neither CityJSON nor CityGML nor a GeoPackage: it begins with {start[:20]!r}"
+        )
     head, documents = read_objects(path)
     if head.crs:
         yield head.crs

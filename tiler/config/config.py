@@ -71,8 +71,8 @@ class Config:
         "SHP, GPKG, GeoJSON or GeoParquet file of building footprints; without it, terrain only",
     )
     buildings: tuple[str, ...] = _parameter(
-        (), "input", "CityJSON, CityJSONSeq or CityGML files of buildings, instead of footprints: their roof "
-        "surfaces are meshed as they are",
+        (), "input", "CityJSON, CityJSONSeq or CityGML files of buildings, or GeoPackages of 3DBAG, instead of "
+        "footprints: their roof surfaces are meshed as they are",
     )  # fmt: skip
     terrain: tuple[str, ...] = _parameter(
         (), "input", "rasters with the height of the ground (GeoTIFF, COG, VRT), instead of ground points, which "

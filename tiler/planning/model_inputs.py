@@ -15,7 +15,7 @@ from tiler.pointclouds.clouds import CloudHeader
 
 MARGIN = 20.0  # m around the buildings of a city model that are meshed, where there is no point cloud
 SUFFIXES = {
-    MODEL: (".json", ".jsonl", ".gml", ".xml", ".city.json", ".citygml"),
+    MODEL: (".json", ".jsonl", ".gml", ".xml", ".citygml", ".gpkg"),
     TERRAIN: (".tif", ".tiff", ".vrt"),
 }
 WORDS = {MODEL: "city model", TERRAIN: "raster of terrain"}
