@@ -113,6 +113,7 @@ def test_houses_keep_their_roofs_and_the_ground_is_that_of_the_rasters(
     assert slopes == pytest.approx(np.degrees(np.arctan(0.75)), abs=0.2)
     assert record["fidelity"]["roof"]["rmse"] < 0.05
     assert record["region"]["bounds"][0] == PLACE[0] - 20
+    assert not [message for message in record["messages"] if "reaches beyond" in message]
 
 
 def test_the_ground_is_that_of_the_rasters_everywhere(block: tuple[dict[str, Any], Path, dict[str, Any]]) -> None:

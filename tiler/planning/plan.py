@@ -160,7 +160,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
             f"smoother = fem knows nothing of seams, and the region has {n_tiles} tiles; take smoother = columns, "
             f"or --tile-size {2 * side}"
         )
-    messages += [*describe_overhang(region.bounds, extent), *idle_parameters(config)]
+    messages += [*describe_overhang(region.bounds, headers_of_tiles(headers)), *idle_parameters(config)]
     messages += describe_pad(region.bounds, with_points) if config.padded else []
     if n_absent:
         messages.append(f"{n_absent} of {n_absent + n_tiles} tiles have no point cloud and are left out")
