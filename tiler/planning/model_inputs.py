@@ -157,7 +157,7 @@ def describe_others(headers: Sequence[CloudHeader], config: Config) -> tuple[lis
     if models:
         n = sum(one.n_buildings for one in models)
         files = "1 city model" if len(models) == 1 else f"{len(models)} city models"
-        words.append(f"{n} buildings in {files}")
+        words.append(f"{n} {'building' if n == 1 else 'buildings'} in {files}")
     for one in models:
         if one.axes:
             order = "the northing" if one.swapped else "the easting"
