@@ -15,6 +15,7 @@ from pipeline.city_model.building_points import (
 )
 from pipeline.city_model.city import City, CityOptions
 from pipeline.city_model.heights import ROOF_SOURCES
+from pipeline.city_model.model_roofs import lay_surfaces
 from pipeline.city_model.shaped_roofs import form_roofs, shape_roofs
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
@@ -26,10 +27,12 @@ from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions, fit_roofs
 from pipeline.roofs.roof_points import (
     RoofPoints,
     add_roof_points,
+    keep_roof_points,
     locate_roof_points,
     make_roof_points,
     no_roof_points,
 )
+from pipeline.roofs.roof_surfaces import RoofSurfaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +87,7 @@ def divide_houses(
     building_class: bool | None = None,
     roofs: RoofPoints | None = None,
     unmarked: NDArray[np.bool_] | None = None,
+    surfaces: RoofSurfaces | None = None,
 ) -> Houses:
     """Divide houses by the planes of their roofs, or where these step (step 2.0, ours).
 
@@ -103,6 +107,8 @@ def divide_houses(
         Roof points of the houses, where they are known.
     unmarked : bool, (h,), optional
         Houses whose roof points are those of `roofs` alone, whatever class they have in the cloud.
+    surfaces : RoofSurfaces, optional
+        Roof surfaces of the houses by a city model; not used where roofs are flat.
     """
     model = city.model
     marks = has_building_class(cloud) if building_class is None else building_class
@@ -114,7 +120,7 @@ def divide_houses(
         if roofs is None:
             roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
         if sloped:
-            fitted, form, notes = _fit_sloped(city, roofs, options)
+            fitted, form, notes = _fit_sloped(city, roofs, options, surfaces)
             parts, part_roofs, method, too_few = fitted.parts, fitted.roofs, fitted.method, fitted.too_few
         else:
             parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
@@ -147,21 +153,37 @@ def divide_houses(
 
 
 def _fit_sloped(
-    city: City, points: RoofPoints, options: CityOptions
+    city: City, points: RoofPoints, options: CityOptions, surfaces: RoofSurfaces | None
 ) -> tuple[HouseRoofs, NDArray[np.int8], list[Note]]:
-    """Roofs of planes, of given forms, and hipped ones, in this order where all are looked for.
+    """Roofs of a city model, of planes, of given forms, and hipped ones, in this order where all are looked for.
 
     Where planes are, points tell the roof if they are enough; else a given form does, and at last the outline.
     """
     model = city.model
-    fitted = fit_roofs(model.polygons, points, RoofOptions(clearance=options.clearance))
-    left = fitted.too_few if options.roofs == "planes" else np.ones(len(model), np.bool_)
+    wanted = RoofOptions(clearance=options.clearance)
+    known = np.zeros(len(model), np.bool_) if surfaces is None else np.diff(surfaces.start) > 0
+    few = fit_roofs(model.polygons, _leave_out(points, known), wanted)
+    laid, told_of = np.zeros(len(model), np.bool_), list[Note]()
+    if surfaces is not None:
+        few, laid, told_of = lay_surfaces(few, city, surfaces)
+        if (known & ~laid).any():  # their points tell the roof after all
+            others = fit_roofs(model.polygons, _leave_out(points, laid), wanted)
+            few, laid, told_of = lay_surfaces(others, city, surfaces)
+    left = ~laid & (few.too_few if options.roofs == "planes" else True)
     given = np.isfinite(city.forms[:, SHAPE])
-    fitted, form, notes = form_roofs(fitted, city, points, given & left)
-    form[given & ~left] = POINTS_TELL
+    fitted, form, notes = form_roofs(few, city, points, given & left)
+    form[given & ~left & ~laid] = POINTS_TELL
     told = city.roof_source != ROOF_SOURCES.index("default")
     hipped = left & (form < 0) & (told if options.roofs == "planes" else True)
-    return shape_roofs(fitted, model.polygons, hipped, model.ground, model.roof), form, notes
+    return shape_roofs(fitted, model.polygons, hipped, model.ground, model.roof), form, [*told_of, *notes]
+
+
+def _leave_out(points: RoofPoints, without: NDArray[np.bool_]) -> RoofPoints:
+    """Take the points of some houses away."""
+    if not without.any():
+        return points
+    kept = keep_roof_points(points, ~without)
+    return add_roof_points(no_roof_points(len(without)), np.flatnonzero(~without), kept)
 
 
 def _deal_out_roofs(

@@ -32,11 +32,9 @@ from pipeline.data.roofs import (
     join_roofs,
     plane_heights,
     roof_heights,
-    take_roofs,
 )
 from pipeline.geometry.inside import find_inside
-from pipeline.roofs.house_levels import HouseParts
-from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions
+from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions, replace_roofs
 from pipeline.roofs.roof_points import RoofPoints
 from pipeline.skeletons.skeleton_roofs import DEFAULT_SLOPE, RoofForm, skeleton_roofs
 
@@ -303,23 +301,8 @@ def _hip(polygon: shapely.Polygon, ground: float, roof: float) -> _Shaped | None
 
 def _replace_roofs(fitted: HouseRoofs, shaped: dict[int, _Shaped]) -> HouseRoofs:
     """Put the roofs of some houses in the place of those that they had."""
-    if not shaped:
-        return fitted
-    rows = list(shaped)
-    new = np.zeros(len(fitted.method), np.bool_)
-    new[rows] = True
-    kept = np.flatnonzero(~new[fitted.parts.house])
-    house = np.concatenate(
-        [fitted.parts.house[kept], *(np.full(len(each.parts), row) for row, each in shaped.items())]
-    )
-    order = np.argsort(house, kind="stable")
-    pieces = np.concatenate([fitted.parts.polygons[kept], *(each.parts for each in shaped.values())])
-    roofs = join_roofs([take_roofs(fitted.roofs, kept), *(each.roofs for each in shaped.values())])
-    method, n_planes = fitted.method.copy(), fitted.n_planes.copy()
-    method[rows] = [SKELETON if each.rise else FLAT for each in shaped.values()]
-    n_planes[rows] = [len(np.unique(each.roofs.plane, axis=0)) for each in shaped.values()]
-    parts = HouseParts(pieces[order], house[order])
-    return HouseRoofs(parts, take_roofs(roofs, order), method, n_planes, fitted.too_few)
+    new = {row: (each.parts, each.roofs, SKELETON if each.rise else FLAT) for row, each in shaped.items()}
+    return replace_roofs(fitted, new)
 
 
 def _note_forms(city: City, code: NDArray[np.int8], lowered: Array, off: Array) -> list[Note]:

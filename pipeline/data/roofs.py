@@ -8,8 +8,8 @@ import shapely
 from numpy.typing import NDArray
 
 # Where the roof of a building comes from: planes found in its points, a family of roofs fitted to them (gable,
-# hip, ...), the straight skeleton of its outline, or one height.
-ROOF_METHODS = ("planes", "family", "skeleton", "flat")
+# hip, ...), the straight skeleton of its outline, one height, or the surfaces of a city model.
+ROOF_METHODS = ("planes", "family", "skeleton", "flat", "model")
 NOT_FITTED = -1  # instead of a method, where every building has one height
 # Why a building has one height, where that is not what its points tell.
 ROOF_FALLBACKS = ("", "no roof points", "few roof points")

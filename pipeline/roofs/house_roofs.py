@@ -1,6 +1,7 @@
 """Roofs of houses as planes from their points: houses divided into parts with a plane each (step 2.0)."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
-from pipeline.data.roofs import ROOF_METHODS, Roofs
+from pipeline.data.roofs import ROOF_METHODS, Roofs, join_roofs, take_roofs
 from pipeline.geometry.group_order import percentile_by_group, sort_points
 from pipeline.geometry.inside import read_rings
 from pipeline.geometry.rings import make_canonical
@@ -30,7 +31,7 @@ from pipeline.roofs.subdivision import (
 )
 
 WALL_ROOM = 1.5  # clearances between a new wall and others: with one, cells are a third more for the same fit
-PLANES, FAMILY, _, FLAT = range(len(ROOF_METHODS))
+PLANES, FAMILY, FLAT = (ROOF_METHODS.index(name) for name in ("planes", "family", "flat"))
 MIN_FITTED = 8  # points to which a plane is fitted again
 MIN_NEAREST = 4  # points of a house to which a plane is the nearest
 DENSITY = 6.0  # points a m², of which denser ones are thinned to up to twice as many
@@ -149,6 +150,35 @@ def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOp
     local = fit_locally(start, xyz, area)
     fitted = _fit_houses(polygons, origin, start, (xyz, local), np.flatnonzero(~too_few), options)
     return _assemble(polygons, origin, heights, too_few, fitted)
+
+
+def replace_roofs(fitted: HouseRoofs, new: Mapping[int, tuple[NDArray[np.object_], Roofs, int]]) -> HouseRoofs:
+    """Put other roofs in the place of those of some houses.
+
+    Parameters
+    ----------
+    fitted : HouseRoofs
+        Roofs of all houses.
+    new : mapping of int to (object (p,), Roofs, int)
+        By the row of the house, its parts, their roofs, and where they come from: an index into `ROOF_METHODS`.
+    """
+    if not new:
+        return fitted
+    rows = list(new)
+    gone = np.zeros(len(fitted.method), np.bool_)
+    gone[rows] = True
+    kept = np.flatnonzero(~gone[fitted.parts.house])
+    house = np.concatenate(
+        [fitted.parts.house[kept], *(np.full(len(parts), row) for row, (parts, _, _) in new.items())]
+    )
+    order = np.argsort(house, kind="stable")
+    pieces = np.concatenate([fitted.parts.polygons[kept], *(parts for parts, _, _ in new.values())])
+    roofs = join_roofs([take_roofs(fitted.roofs, kept), *(roofs for _, roofs, _ in new.values())])
+    method, n_planes = fitted.method.copy(), fitted.n_planes.copy()
+    method[rows] = [code for _, _, code in new.values()]
+    n_planes[rows] = [len(np.unique(roofs.plane, axis=0)) for _, roofs, _ in new.values()]
+    parts = HouseParts(pieces[order], house[order])
+    return HouseRoofs(parts, take_roofs(roofs, order), method, n_planes, fitted.too_few)
 
 
 def _thin_out(start: NDArray[np.int64], share: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -21,6 +21,7 @@ from pipeline.city_model.city import (
 from pipeline.city_model.groups import adjacent_houses, group_roofs
 from pipeline.city_model.heights import Heights, highest_wall_ground, raise_low_roofs
 from pipeline.city_model.houses import Houses, divide_houses
+from pipeline.city_model.model_roofs import MODEL
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
@@ -196,7 +197,7 @@ def _raise_planar(
     else:
         made = _fit_sloped(
             take_roofs(houses.roofs, shapes.member),
-            houses.form[row] >= 0,
+            (houses.form[row] >= 0) | (houses.method[row] == MODEL),
             shapes,
             heights,
             wall_ground,
@@ -260,7 +261,7 @@ def _fit_sloped(
 ) -> _Raised:
     """Every part keeps its plane, fitted to the points of its face; where it has none, one height.
 
-    Roofs of a given form (`formed`) stay as they are, as a whole.
+    Roofs of a given form and those of a city model (`formed`) stay as they are, as a whole.
     """
     if roof_points is not None:
         fitted = refit_roofs(roofs, shapes.polygons, roof_points, max_slope=RoofOptions.max_slope)

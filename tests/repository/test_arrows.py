@@ -20,6 +20,8 @@ HOMES = {
     "zarr": ("tiler/store/",),
     "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py", "tiler/formats/vtkhdf.py"),
     "laspy": ("tiler/",),
+    "lxml": ("tiler/cityinput/citygml.py",),
+    "rasterio": ("tiler/cityinput/rasters.py", "tiler/wind/geotiff.py"),
     "pyogrio": ("tiler/",),
     "meshio": ("tiler/",),
     "rich": ("tiler/",),
@@ -69,7 +71,7 @@ def test_imports_follow_the_arrows() -> None:
 ORDER = {
     "tiler": [
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
-        "pointclouds", "footprints", "citymodels", "mesh_files", "stages", "planning", "dashboard",
+        "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "planning", "dashboard",
         "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats",
         "interface", "cli",
     ],

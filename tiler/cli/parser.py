@@ -35,7 +35,19 @@ WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
 # What a first run needs stands first in the help of a run, what is for studies of the method last.
 ESSENTIAL = (
-    *("footprints", "out", "crs", "bounds", "mesh_size", "domain_height", "border", "tile_size", "workers"),
+    *(
+        "footprints",
+        "buildings",
+        "terrain",
+        "out",
+        "crs",
+        "bounds",
+        "mesh_size",
+        "domain_height",
+        "border",
+        "tile_size",
+        "workers",
+    ),
     "overwrite",
 )
 RESEARCH = (
@@ -205,6 +217,8 @@ def _add_parameters(parser: argparse.ArgumentParser) -> Group:
             words |= {"type": str, "nargs": "+", "metavar": "M|nH"}
         elif get_origin(wanted) is tuple and get_args(wanted)[0] is int:
             words |= {"type": str, "metavar": "N,N"}
+        elif get_origin(wanted) is tuple and get_args(wanted)[0] is str:
+            words |= {"type": str, "nargs": "+", "metavar": "FILE"}
         elif get_origin(wanted) is tuple:
             words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
         elif wanted == Height:

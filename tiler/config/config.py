@@ -20,7 +20,7 @@ from tiler.config.domain_height import (
     height_in_metres,
     read_height,
 )
-from tiler.objects.places import check_url, is_url
+from tiler.objects.places import absolute, check_url, is_url
 from tiler.words.plain_text import shorten
 
 MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
@@ -70,6 +70,26 @@ class Config:
         "input",
         "SHP, GPKG, GeoJSON or GeoParquet file of building footprints; without it, terrain only",
     )
+    buildings: tuple[str, ...] = _parameter(
+        (), "input", "CityJSON, CityJSONSeq or CityGML files of buildings, or GeoPackages of 3DBAG, instead of "
+        "footprints: their roof surfaces are meshed as they are",
+    )  # fmt: skip
+    terrain: tuple[str, ...] = _parameter(
+        (), "input", "rasters with the height of the ground (GeoTIFF, COG, VRT), instead of ground points, which "
+        "count where these have none",
+    )  # fmt: skip
+    lod: str = _parameter(
+        "auto", "input", "level of detail that is taken of each building of a city model: the best roofs that it "
+        "has, or the best level up to a number", choices=("auto", "1.2", "1.3", "2.2"),
+    )  # fmt: skip
+    axis_order: str = _parameter(
+        UNSET, "input", "which coordinate comes first in city models: xy for the easting, yx for the northing; "
+        "empty: what they show", choices=(UNSET, "xy", "yx"),
+    )  # fmt: skip
+    shift_z: float = _parameter(
+        0.0, "input", "added to all heights of city models, where they are not those of the terrain", unit="m",
+        least=-10_000, most=10_000,
+    )  # fmt: skip
     layer: str = _parameter(UNSET, "input", "layer of the footprint file; empty: its only or first one")
     id_attribute: str = _parameter(
         UNSET, "input", "attribute that holds building ids; empty: a well-known name, else ids from geometry"
@@ -303,6 +323,21 @@ class Config:
         return bool(self.scheduler or self.cluster)
 
     @property
+    def has_buildings(self) -> bool:
+        """Whether any file of buildings is given: footprints or a city model."""
+        return bool(self.footprints or self.buildings)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """All that is given of points, buildings in space, and terrain."""
+        return (*self.pointcloud, *self.buildings, *self.terrain)
+
+    @property
+    def building_files(self) -> tuple[str, ...]:
+        """Files of buildings: of a city model, or footprints."""
+        return self.buildings or ((self.footprints,) if self.footprints else ())
+
+    @property
     def padded(self) -> bool:
         """Whether there is a pad around the region."""
         return any(width != 0 for width in self.pad)
@@ -420,6 +455,17 @@ def make_config(values: Mapping[str, Any]) -> Config:
     return config
 
 
+def with_absolute_inputs(config: Config) -> Config:
+    """Name inputs such that they are found from any folder."""
+    return dataclasses.replace(
+        config,
+        pointcloud=tuple(map(absolute, config.pointcloud)),
+        buildings=tuple(map(absolute, config.buildings)),
+        terrain=tuple(map(absolute, config.terrain)),
+        footprints=absolute(config.footprints) if config.footprints else "",
+    )
+
+
 def _convert(name: str, value: Any, wanted: Any) -> Any:
     if wanted == Height:
         wanted = str if isinstance(value, str) else float
@@ -439,7 +485,7 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         raise ConfigError(f"{name} = {_shown(value)}: {wanted.__name__} expected, not {type(value).__name__}")
     if isinstance(value, str):
         _check_text(name, value)
-        if name in ("pointcloud", "footprints", "out"):
+        if name in ("pointcloud", "footprints", "buildings", "terrain", "out"):
             check_url(value)
     return value
 
@@ -498,6 +544,7 @@ def _check_together(config: Config) -> None:
                 f"of {config.mesh_size:g} m; give xmin ymin xmax ymax"
             )
     _check_classes(config.building_classes)
+    _check_sources(config)
     if config.clearance_floor > config.clearance:
         raise ConfigError(
             f"clearance_floor = {config.clearance_floor:g} m: must be at most clearance = {config.clearance:g} m"
@@ -566,6 +613,18 @@ def _check_way(config: Config) -> None:
             f"scheduler = {_shown(config.scheduler)} and cluster = {_shown(config.cluster)}: workers are of one "
             "or the other; leave one out"
         )
+
+
+def _check_sources(config: Config) -> None:
+    if config.footprints and config.buildings:
+        raise ConfigError(
+            f"footprints = {_shown(config.footprints)} and buildings = {_shown(config.buildings[0])}: outlines "
+            "are of one or the other; leave one out"
+        )
+    if config.ground_filter and not config.pointcloud and (config.buildings or config.terrain):
+        raise ConfigError("ground_filter = true without a point cloud, in which it finds the ground; leave it out")
+    if config.ground_filter and config.terrain:
+        raise ConfigError("ground_filter = true with terrain: ground is that of the rasters; leave one out")
 
 
 def _check_pad(config: Config) -> None:

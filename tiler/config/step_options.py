@@ -48,14 +48,15 @@ LAYER_PARAMETERS = (
 SOIL_PARAMETERS = ("underground", "mesh_size", "least_spacing", "most_spacing", "stagger")
 
 
-def derived_parameters(config: Config) -> dict[str, float | str]:
+def derived_parameters(config: Config) -> dict[str, float | str | bool]:
     """Parameters that follow from others, by name: a stage that declares one does not depend on the others.
 
     ``graded_size`` is the largest target edge length of region and pad, ``tile_size_or_default`` the side of a
     tile (m).
     ``roof_clearance_or_spacing`` and ``roof_group_or_spacing`` (m) are at least the least vertical spacing of the
     adaptive mesher: heights closer than that cannot both be exact in a column. ``roofs_or_flat`` is "flat" where
-    the mesher or the way to simplify knows no sloped roofs.
+    the mesher or the way to simplify knows no sloped roofs. ``points_of_models`` says whether points are made on
+    the roofs of city models, ``ground_of_models`` whether they give the ground, too: where nothing else does.
     """
     spacing = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
     return {
@@ -65,6 +66,10 @@ def derived_parameters(config: Config) -> dict[str, float | str]:
         "tile_size_or_default": config.tile_size_or_default,
         "roof_clearance_or_spacing": max(config.roof_clearance, spacing),
         "roof_group_or_spacing": max(config.roof_group, spacing),
+        "buildings_given": bool(config.buildings),
+        "terrain_given": bool(config.terrain),
+        "points_of_models": not config.pointcloud,
+        "ground_of_models": not config.pointcloud and not config.terrain,
     }
 
 

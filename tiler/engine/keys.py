@@ -31,6 +31,8 @@ CODE = (
     "pyogrio",
     "pyproj",
     "deflate",
+    "lxml",
+    "rasterio",
 )
 DIGEST = "BLAKE3"  # how contents are hashed: a result with a digest of another kind is computed anew
 

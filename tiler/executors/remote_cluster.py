@@ -38,7 +38,8 @@ def connect_run(config: Config) -> Iterator[Executor]:
     CityError
         As `connect` and `tiler.executors.worker_requirements.require_files`; nothing is left in the folder.
     """
-    given = [str(path) for path in (*find_clouds(config.pointcloud), config.footprints) if str(path)]
+    clouds = find_clouds(config.pointcloud) if config.pointcloud else []
+    given = [str(path) for path in (*clouds, *config.building_files, *config.terrain)]
     files = [Path(path) for path in given if not is_url(path)]
     # Who reaches a bucket reaches the same one, and its first task fails if it does not.
     with (

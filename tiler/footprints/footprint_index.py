@@ -145,13 +145,13 @@ def scan_footprints(
         notes += [*_warnings(source, features, warned), *found]
         n_found += len(footprints.ids)
         if len(footprints.ids) or notes:
-            yield _block(footprints, notes)
+            yield block_footprints(footprints, notes)
         notes = []
     notes += count_notes_of(source, counts)
     if n_found == 0:
         notes += _outside(source)
     if n_found == 0 or notes:
-        yield _block(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), notes)
+        yield block_footprints(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), notes)
 
 
 def select_footprints(cell_box: NDArray[np.float64], start: NDArray[np.int64], box: Box) -> list[tuple[int, int]]:
@@ -218,7 +218,8 @@ def _meets(boxes: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
     return meets
 
 
-def _block(footprints: Footprints, notes: Sequence[Note]) -> FootprintBlock:
+def block_footprints(footprints: Footprints, notes: Sequence[Note]) -> FootprintBlock:
+    """Put footprints into blocks of rows sorted by place, with some notes."""
     box = shapely.bounds(footprints.polygons).reshape(-1, 4)
     by_id = np.argsort(footprints.ids, kind="stable")
     cells = order_by_cell((box[by_id, :2] + box[by_id, 2:]) / 2, FOOTPRINT_CELL)

@@ -191,6 +191,13 @@ def _configure(pointcloud: Source | Sequence[Source], footprints: Source, parame
             hint = f"did you mean {near[0]}?" if near else "citystitch config lists all"
             raise TypeError(f"unknown parameter {name!r}; {hint}")
     sources = [pointcloud] if isinstance(pointcloud, (str, Path)) else pointcloud
-    values = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
+    values = {name: _as_text(value) for name, value in parameters.items()}
     values |= {"footprints": str(footprints)} if footprints else {}
     return make_config(with_file({POSITIONAL: list(map(str, sources)), **values}))
+
+
+def _as_text(value: Any) -> Any:
+    """Paths as texts, alone or in a list."""
+    if isinstance(value, (list, tuple)):
+        return [_as_text(one) for one in value]
+    return str(value) if isinstance(value, Path) else value

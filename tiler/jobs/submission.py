@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import ConfigError, InputError
-from tiler.config.config import Config, make_config
+from tiler.config.config import Config, make_config, with_absolute_inputs
 from tiler.config.config_file import write_config
 from tiler.jobs.cluster import LOGS, SYSTEMS, WORKER_JOBS, WORKER_NAME, Cluster, QueueError, read_cluster
-from tiler.objects.places import absolute, in_bucket, place
+from tiler.objects.places import in_bucket, place
 from tiler.store.atomic import replacing
 from tiler.words.plain_text import printable
 
@@ -200,8 +200,7 @@ def read_worker_jobs(out: Path) -> set[str]:
 def _write_files(config: Config, out: Path, script: str) -> None:
     """Keep what the jobs run: nothing that is changed afterwards changes them."""
     folder = out / JOB
-    clouds, footprints = tuple(map(absolute, config.pointcloud)), config.footprints and absolute(config.footprints)
-    kept = dataclasses.replace(config, pointcloud=clouds, footprints=footprints, cluster="", out="out")
+    kept = dataclasses.replace(with_absolute_inputs(config), cluster="", out="out")
     text = write_config(kept, "the parameters of a submitted run")
     try:
         (folder / LOGS).mkdir(parents=True, exist_ok=True)

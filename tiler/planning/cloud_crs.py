@@ -50,7 +50,8 @@ class CloudGroup:
     @property
     def label(self) -> str:
         n = len(self.clouds)
-        return self.first.path.name if n == 1 else f"{n} point clouds ({self.first.path.name} and others)"
+        kind = "point clouds" if self.first.kind == "cloud" else "files"
+        return self.first.path.name if n == 1 else f"{n} {kind} ({self.first.path.name} and others)"
 
 
 @dataclass(frozen=True)

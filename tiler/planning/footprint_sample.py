@@ -1,6 +1,7 @@
 """A look at the footprints before a run: how many there are, where, and how finely they are drawn."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,11 +9,14 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
+from tiler.cityinput.model_blocks import Wanted, read_model_blocks
+from tiler.cityinput.sources import MODEL
 from tiler.config.config import Config
 from tiler.footprints.footprint_source import FootprintSource, make_footprints, open_source
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.objects.places import place
 from tiler.planning.region import Region
+from tiler.pointclouds.clouds import CloudHeader
 from tiler.vectors.layers import BATCH, scan_layer
 
 SAMPLE_FEATURES = 500_000  # features that are read; of a larger file the first ones, and they stand for all
@@ -55,7 +59,12 @@ class FootprintSample:
 
 
 def sample_footprints(
-    config: Config, region: Region, *, frame: Frame | None = None, limit: int = SAMPLE_FEATURES
+    config: Config,
+    region: Region,
+    *,
+    frame: Frame | None = None,
+    models: Sequence[CloudHeader] = (),
+    limit: int = SAMPLE_FEATURES,
 ) -> FootprintSample | None:
     """Read the footprints of a region, or enough of them to know the rest.
 
@@ -67,13 +76,15 @@ def sample_footprints(
         The region.
     frame : Frame, optional
         How coordinates of the footprints become those of the region; by default as the CRSs have it.
+    models : sequence of CloudHeader
+        City models of the region, where buildings are theirs.
     limit : int
         Reading stops after this many footprints.
 
     Returns
     -------
     FootprintSample or None
-        None if no footprints are configured.
+        None if no buildings are configured.
 
     Raises
     ------
@@ -85,6 +96,8 @@ def sample_footprints(
     Ids are not looked at. The number in the region of a file that is larger is that of all its features, less the
     share of the layer's extent that lies outside; it counts where the layer tells its number and extent.
     """
+    if config.buildings:
+        return _sample_models(config, region, models, limit)
     if not config.footprints:
         return None
     crs = pyproj.CRS.from_user_input(region.crs)
@@ -107,6 +120,31 @@ def sample_footprints(
         n_read += len(parts[-1])
     polygons = np.concatenate(parts)
     total = len(polygons) if complete else max(len(polygons), _number_within(source, region, crs))
+    return _make_sample(config, polygons, total, complete=complete)
+
+
+def _sample_models(config: Config, region: Region, models: Sequence[CloudHeader], limit: int) -> FootprintSample:
+    """Read the outlines of the buildings of city models; of very many those of the first ones."""
+    wanted = Wanted(config.lod, config.height_attribute, roof_points=False, ground_points=False)
+    blocks = (
+        block.rows.outlines
+        for header in models
+        if header.kind == MODEL
+        for block in read_model_blocks(header.path, header.frame, region.bounds, wanted)
+    )
+    parts, n_read, complete = [np.empty(0, np.object_)], 0, True
+    for outlines in blocks:
+        if n_read >= limit:
+            complete = False
+            break
+        parts.append(outlines)
+        n_read += len(outlines)
+    polygons = np.concatenate(parts)
+    total = len(polygons) if complete else max(len(polygons), sum(header.n_buildings for header in models))
+    return _make_sample(config, polygons, total, complete=complete)
+
+
+def _make_sample(config: Config, polygons: NDArray[np.object_], total: int, *, complete: bool) -> FootprintSample:
     detail, octaves = measure_detail(polygons, clearance=config.clearance, mesh_size=config.mesh_size)
     return FootprintSample(
         total, complete, polygons, shapely.bounds(polygons).reshape(-1, 4), shapely.area(polygons), detail, octaves

@@ -29,6 +29,7 @@ BYTES_A_LIDAR_POINT = 7.2  # of disk
 BYTES_A_CELL = 9.5
 BYTES_A_NODE = 8.0  # of the terrain grid, three stages together
 BYTES_A_HOUSE = 8000.0
+BYTES_OF_RECORDS = 40_000.0  # parameters, record and events of a small run
 BASE_MEMORY = 300e6  # bytes; of a worker with its libraries
 MEMORY_A_CELL = 16.0
 MEMORY_A_LIDAR_POINT = 18.0
@@ -148,6 +149,7 @@ def forecast_run(
     )
     cells = loads.cells.sum()
     disk = BYTES_A_LIDAR_POINT * points + BYTES_A_CELL * cells + BYTES_A_NODE * nodes + BYTES_A_HOUSE * houses
+    disk += BYTES_OF_RECORDS
     work = SECONDS_A_CELL * cells + SECONDS_A_LIDAR_POINT * points + SECONDS_A_HOUSE * houses
     work += SECONDS_A_TASK * n_tasks
     warnings = [] if memory is None else _memory_warnings(tile_memory, loads.area, config, memory)
@@ -238,7 +240,7 @@ def _thinning(survey: Survey, sample: FootprintSample | None, config: Config) ->
     """
     x, y = survey.meshed.lines
     shape = len(x) - 1, len(y) - 1
-    known = sample.complete if sample is not None else not config.footprints
+    known = sample.complete if sample is not None else not config.has_buildings
     if not config.graded_size or (config.open_size and not known):
         return np.ones(shape)
     side = int(np.clip(np.sqrt(MOST_LOOKS / (shape[0] * shape[1])), 2, LOOKS_A_SIDE))

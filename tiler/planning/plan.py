@@ -10,14 +10,24 @@ from pathlib import Path
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
 from stitch.tiling.grid import TileGrid, make_grid, tiles_present
+from tiler.cityinput.sources import CLOUD
 from tiler.config.config import Config, idle_parameters
 from tiler.engine.run_context import choose_tiles, make_layout, tile_key
 from tiler.engine.stage import FileItem, Layout
 from tiler.georeference.crs import boxes_meet, crs_text
 from tiler.georeference.operation import Operation
-from tiler.objects.places import identify, place
+from tiler.objects.places import place
 from tiler.objects.requests import trust_addresses
 from tiler.planning.establish_georeference import FOOTPRINTS, Georeference, establish_georeference, find_inexact
+from tiler.planning.model_inputs import (
+    describe_others,
+    headers_of_region,
+    headers_of_tiles,
+    identify_file,
+    order_headers,
+    read_other_headers,
+    turn_frames,
+)
 from tiler.planning.region import (
     Region,
     check_points,
@@ -75,9 +85,12 @@ class Plan(Survey):
 
 
 def check_sources(config: Config) -> None:
-    """Raise ConfigError if no point cloud is named."""
-    if not config.pointcloud:
-        raise ConfigError("no point cloud: give files, globs or folders, as in `citystitch run tiles/*.laz`")
+    """Raise ConfigError if neither a point cloud nor a city model nor terrain is named."""
+    if not config.sources:
+        raise ConfigError(
+            "no point cloud: give files, globs or folders, as in `citystitch run tiles/*.laz`, or a city model "
+            "with --buildings, or rasters with --terrain"
+        )
 
 
 def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
@@ -119,12 +132,17 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     -----
     Tiles stay arrays: a country of half a million tiles takes no longer than its headers.
     """
-    paths = find_clouds(config.pointcloud)
+    check_sources(config)
+    paths = find_clouds(config.pointcloud) if config.pointcloud else []
     headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
-    found = find_georeference(config, headers)
+    others, unread = read_other_headers(config)
+    unreadable |= unread
+    found = find_georeference(config, order_headers([*headers, *others]))
     headers, messages = found.clouds, list(found.messages)
-    region = Region(choose_bounds(config.bounds, headers), crs_text(found.crs), config.tile_size_or_default)
-    check_region(region, config.largest_size, headers, kind="open" if config.open_size else "mesh")
+    extent = headers_of_region(headers)
+    region = Region(choose_bounds(config.bounds, extent), crs_text(found.crs), config.tile_size_or_default)
+    with_points = [header for header in headers if header.kind == CLOUD]
+    check_region(region, config.largest_size, with_points, kind="open" if config.open_size else "mesh")
     check_sizes(region, config)
     clouds = [header for header in headers if header.n_points and boxes_meet(header.bounds, region.bounds)]
     whole = make_grid(
@@ -133,7 +151,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
         mesh_size=config.mesh_size,
         open_size=config.open_size,
     )
-    grid = choose_tiles(whole, [header.bounds[:4] for header in clouds])
+    grid = choose_tiles(whole, [header.bounds[:4] for header in headers_of_tiles(clouds)])
     present = tiles_present(grid)
     n_tiles, n_absent = int(present.sum()), int((~present).sum())
     if config.smoother == "fem" and config.mesher == "layered" and n_tiles > 1:
@@ -142,11 +160,11 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
             f"smoother = fem knows nothing of seams, and the region has {n_tiles} tiles; take smoother = columns, "
             f"or --tile-size {2 * side}"
         )
-    messages += [*describe_overhang(region.bounds, headers), *idle_parameters(config)]
-    messages += describe_pad(region.bounds, headers) if config.padded else []
+    messages += [*describe_overhang(region.bounds, headers_of_tiles(headers)), *idle_parameters(config)]
+    messages += describe_pad(region.bounds, with_points) if config.padded else []
     if n_absent:
         messages.append(f"{n_absent} of {n_absent + n_tiles} tiles have no point cloud and are left out")
-    if not config.footprints:
+    if not config.has_buildings:
         messages.append("no footprints given: the mesh has terrain only")
     for message in messages:
         say(message)
@@ -173,8 +191,10 @@ def find_georeference(config: Config, headers: Sequence[CloudHeader]) -> Georefe
             else f"{len(void)} point clouds have no sound box in their"
         )
         words.append(f"{have} header; the points were read for it")
-    notes = [*found.notes, *void, *inexact]
-    return replace(found, messages=[*found.messages, *words], notes=notes)
+    others, told = describe_others(found.clouds, config)
+    notes = [*found.notes, *void, *inexact, *told]
+    messages = [*found.messages, *words, *others]
+    return replace(found, clouds=turn_frames(found.clouds), messages=messages, notes=notes)
 
 
 def _describe_inexact(operation: Operation, subject: str, config: Config) -> str:
@@ -189,7 +209,7 @@ def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:
     for header in clouds:
         stem = re.sub(r"[^\w-]", "_", header.path.stem)
         name = next(name for k in count(1) if (name := f"{stem}-{k}" if k > 1 else stem) not in items)
-        items[name] = FileItem(str(header.path), header.bounds[:4], identify(header.path), header.frame)
+        items[name] = FileItem(str(header.path), header.bounds[:4], identify_file(header), header.frame)
     return items
 
 

@@ -21,6 +21,7 @@ ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray
 MOST_IN_ALL = 10_000_000  # tiles of the region's box; half a million make a country
 MOST_NODES = 400_000_000  # of the terrain of one tile, 8 bytes each
 MOST_CELLS = 2**31  # of one tile, whose local indices have 32 bits
+INPUTS = {"cloud": "point clouds", "terrain": "rasters of terrain", "model": "buildings"}
 PAST = 1.0  # m that a file reaches beyond a region before anything is said of it
 SPARSEST = 100.0  # m2; ... where it has fewer points than one in this area
 
@@ -137,9 +138,11 @@ def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Boun
     xmax, ymax = max(e[2] for e in extents), max(e[3] for e in extents)
     if not asked:
         return float(math.ceil(xmin)), float(math.ceil(ymin)), float(math.floor(xmax)), float(math.floor(ymax))
+    kind = clouds[0].kind
+    one = {"cloud": "point cloud", "terrain": "raster", "model": "building"}[kind]
     if asked[0] >= xmax or asked[2] <= xmin or asked[1] >= ymax or asked[3] <= ymin:
         raise InputError(
-            f"bounds {_words(asked)}: no point cloud there, the clouds cover "
+            f"bounds {_words(asked)}: no {one} there, the {INPUTS[kind]} cover "
             f"{_words((xmin, ymin, xmax, ymax))}; correct --bounds"
         )
     return asked[0], asked[1], asked[2], asked[3]
@@ -169,7 +172,8 @@ def describe_overhang(bounds: Bounds, clouds: Sequence[CloudHeader]) -> list[str
         "north": bounds[3] - max(extent[3] for extent in extents),
     }
     sides = ", ".join(f"{by:.1f} m {side}" for side, by in beyond.items() if by > 0)
-    return [f"the region reaches beyond the point clouds ({sides}); terrain is carried on there"] if sides else []
+    what = INPUTS[min((cloud.kind for cloud in clouds), key=list(INPUTS).index)] if sides else ""
+    return [f"the region reaches beyond the {what} ({sides}); terrain is carried on there"] if sides else []
 
 
 def check_sizes(region: Region, config: Config) -> None:

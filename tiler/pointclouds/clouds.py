@@ -45,6 +45,15 @@ class CloudHeader:
         Whether the box in the header is void, and the points were read for `bounds`.
     frame : Frame
         How coordinates of the file become those of the region.
+    kind : str
+        ``"cloud"``; other files that give points or ground are ``"model"``, a city model, and ``"terrain"``, a
+        raster.
+    swapped : bool
+        Whether the northing comes first in the file; `bounds` have the easting first all the same.
+    axes : str
+        What decided on that order, where it is not the usual one.
+    n_buildings : int
+        Number of buildings of a city model.
     """
 
     path: Path
@@ -56,6 +65,10 @@ class CloudHeader:
     unread: str = ""
     box_of_points: bool = False
     frame: Frame = AS_IT_IS
+    kind: str = "cloud"
+    swapped: bool = False
+    axes: str = ""
+    n_buildings: int = 0
 
 
 def find_clouds(sources: Sequence[str | Path]) -> list[Path]:

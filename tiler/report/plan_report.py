@@ -64,7 +64,7 @@ def plan_run(
     if picture is not None and picture.suffix.lower() != ".svg":
         raise ConfigError(f"{picture}: the picture of a plan is SVG; name it {picture.with_suffix('.svg').name}")
     survey = survey_inputs(config, say_nothing)
-    sample = sample_footprints(config, survey.region, frame=survey.georeference.footprints)
+    sample = sample_footprints(config, survey.region, frame=survey.georeference.footprints, models=survey.clouds)
     memory = None if config.on_cluster else machine_memory()
     forecast = forecast_run(survey, sample, config, memory=memory)
     plan = describe_plan(survey, sample, forecast, config, memory)
@@ -111,6 +111,11 @@ def describe_plan(
             "unreadable": survey.unreadable,
             "points": sum(header.n_points for header in survey.clouds),
             "points_in_region": round(loads.lidar_points.sum()),
+            "kinds": {
+                kind: n
+                for kind in ("cloud", "model", "terrain")
+                if (n := sum(header.kind == kind for header in survey.headers))
+            },
         },
         "footprints": None
         if sample is None
@@ -176,9 +181,7 @@ def _print_plan(plan: dict[str, Any], console: Console) -> None:
     )
     empty = f" ({files['empty']} empty)" if files["empty"] else ""
     density = f"{files['points_in_region'] / area:.1f} a m2" if area else ""
-    rows.append(
-        ("files", f"{files['number']:,}{empty}, {files['points_in_region']:,} points in the region, {density}")
-    )
+    rows.append(("files", f"{files['number']:,}{empty}, {_describe_points(files, density)}"))
     rows.append(("footprints", _footprints(plan["footprints"])))
     rows.append(
         (
@@ -236,6 +239,19 @@ def _task_rows(tasks: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
         ("tasks", f"{total:,}: stages {', '.join(parts)}"),
         ("", "more where houses must be joined in several rounds"),
     ]
+
+
+def _describe_points(files: dict[str, Any], density: str) -> str:
+    """What the files hold: points, unless none of them is a point cloud."""
+    kinds = files["kinds"]
+    if kinds.get("cloud", 0) == files["number"]:
+        return f"{files['points_in_region']:,} points in the region, {density}"
+    words = {
+        "cloud": ("point cloud", "point clouds"),
+        "model": ("city model", "city models"),
+        "terrain": ("raster of terrain", "rasters of terrain"),
+    }
+    return ", ".join(f"{n} {words[kind][n != 1]}" for kind, n in kinds.items())
 
 
 def _footprints(found: dict[str, Any] | None) -> str:

@@ -63,6 +63,7 @@ METHODS = {
     "family": "gable, hip or the like",
     "skeleton": "hipped, by its outline",
     "flat": "one height",
+    "model": "surfaces of the city model",
 }
 POINT_COLUMNS = ("rmse", "p50", "p95", "bias")
 SURFACES = {

@@ -11,6 +11,7 @@ from pipeline.city_model.building_points import reach_of_points
 from pipeline.city_model.city_steps import measure_city, prepare_footprints
 from pipeline.city_model.groups import adjacent_houses
 from pipeline.city_model.houses import Houses, divide_houses, join_houses, take_houses
+from pipeline.city_model.model_roofs import MODEL
 from pipeline.city_model.unmarked_roofs import MAY_BE_ROOF
 from pipeline.columns.adaptive import AdaptiveOptions
 from pipeline.columns.layered import LayeredOptions, choose_layers, terrain_reach
@@ -50,6 +51,7 @@ from tiler.config.step_options import CITY_PARAMETERS, city_options, layer_param
 from tiler.engine.run_context import find_owned, region_around, tile_key
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Result, Task
+from tiler.stages.city_files import count_feet, note_feet, read_surfaces
 from tiler.stages.house_points import add_unmarked, find_surfaces, points_near
 from tiler.stages.inputs import halo_of_points
 from tiler.stages.readers import extent_of, grow, hull, read_known_terrain, read_own_outlines
@@ -65,7 +67,8 @@ def house_stage(config: Config) -> Stage:
         Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
-    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN), version=6)
+    models = ("buildings_given", "ground_of_models") if config.buildings else ()
+    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN, *models), version=6)
 
 
 def first_round(config: Config) -> list[Stage]:
@@ -169,8 +172,18 @@ def make_houses(task: Task) -> Facts:
     task.notes(city.notes)
     roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
     others = np.isin(city.model.ids, own.ids[unmarked])
+    surfaces, feet = None, {}
+    if task.parameters.get("buildings_given", False):
+        with task.step("1.2 roof surfaces"):
+            surfaces, base = read_surfaces(task, city.model.polygons, city.model.ids)
+        if not task.parameters.ground_of_models:
+            houses_of = Footprints(city.model.polygons, city.model.ids, city.given_height)
+            task.notes(note_feet(houses_of, base, city.model.ground))
+            feet = {"feet": count_feet(base, city.model.ground)}
     with task.step("2.0 split levels"):
-        houses = divide_houses(city, cloud, options, building_class=True, roofs=roofs, unmarked=others)
+        houses = divide_houses(
+            city, cloud, options, building_class=True, roofs=roofs, unmarked=others, surfaces=surfaces
+        )
     del cloud  # large, and no longer needed
     with task.step("1.7 fit of roofs"):
         fidelity = measure_houses(roofs, city.model.polygons, city.model.roofs)
@@ -180,7 +193,7 @@ def make_houses(task: Task) -> Facts:
     parts = {"house parts": len(houses.parts.polygons)}
     counts = {"buildings before merging": len(houses), **parts, **_count_forms(houses)}
     counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
-    return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts}
+    return {"n": len(houses), "extent": extent_of(houses.polygons), "counts": counts, **feet}
 
 
 def find_near_houses(task: Task) -> Facts:
@@ -452,5 +465,6 @@ def _count_forms(houses: Houses) -> dict[str, int]:
     counts = {
         "roofs of a given form": int((houses.form >= 0).sum()),
         "given forms of roofs with points": int((houses.form == POINTS_TELL).sum()),
+        "roofs of a city model": int((houses.method == MODEL).sum()),
     }
     return {name: n for name, n in counts.items() if n}

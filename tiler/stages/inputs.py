@@ -1,6 +1,8 @@
 """Stages 1.1 to 1.3: points of each file, footprints, and the terrain of each tile."""
 
 from collections import Counter
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,31 +30,46 @@ from pipeline.points_terrain.terrain_fill import (
     merge_coarse,
 )
 from stitch.tiling.grid import Key, has_tile
+from tiler.cityinput.rasters import REACH as RASTER_REACH
+from tiler.cityinput.sources import CLOUD, MODEL, kind_of
 from tiler.citymodels.tables import pack_polygons
 from tiler.config.config import Config
 from tiler.engine.run_context import tile_key
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
-from tiler.footprints.footprint_index import scan_footprints
+from tiler.footprints.footprint_index import FootprintBlock, block_footprints, scan_footprints
 from tiler.georeference.frame import Frame
-from tiler.objects.places import place
+from tiler.objects.places import is_url, place
 from tiler.pointclouds.ingest import CELL, KEY_POINTS, read_cells
+from tiler.stages.city_files import (
+    MODEL_PARAMETERS,
+    read_model_bands,
+    read_model_file,
+    read_terrain_file,
+    sample_rasters,
+)
 from tiler.stages.readers import clip, extent_of, grow, join_rasters, read_bands, read_outlines, read_units
 
 
 def input_stages(config: Config) -> list[Stage]:
     """Stages from the files to the coarse level of the terrain."""
     spacing = config.dtm_spacing
-    ground = ("dtm_spacing", "ground_filter")
+    ground: tuple[str, ...] = ("dtm_spacing", "ground_filter")
+    of_models = MODEL_PARAMETERS if config.buildings else ()
+    around = halo_of_points(config, spacing)
+    if config.terrain:
+        ground, around = (*ground, "terrain_given"), max(around, RASTER_REACH)
     return [
         Stage(
             "points",
             Scope.FILE,
             read_point_file,
-            parameters=("skip_unreadable", "building_classes", "ground_filter"),
+            parameters=("skip_unreadable", "building_classes", "ground_filter", *of_models),
             version=4,
         ),
-        Stage(
+        Stage("footprints", Scope.REGION, read_model_footprints, (Read("points"),))
+        if config.buildings
+        else Stage(
             "footprints",
             Scope.REGION,
             read_footprint_file,
@@ -69,9 +86,7 @@ def input_stages(config: Config) -> list[Stage]:
             after="ground",
         ),
         Stage("reserved", Scope.REGION, list_reserved, (Read("footprints"),)),
-        Stage(
-            "ground", Scope.TILE, bin_tile, (Read("points", halo_of_points(config, spacing)),), ground, version=2
-        ),
+        Stage(*("ground", Scope.TILE, bin_tile, (Read("points", around),), ground), version=2),
         Stage(
             "flooded",
             Scope.TILE,
@@ -107,7 +122,16 @@ def halo_of_points(config: Config, reach: float) -> float:
 
 
 def read_point_file(task: Task) -> Facts:
-    """Read a point cloud file and deal its points out to cells (step 1.1)."""
+    """Read a point cloud file and deal its points out to cells (step 1.1); a city model or a raster likewise."""
+    path = place(task.file)
+    kind = kind_of(path) if not is_url(task.file) else CLOUD
+    if kind != CLOUD:
+        try:
+            return read_model_file(task, path) if kind == MODEL else read_terrain_file(task, path)
+        except InputError as error:
+            if not task.parameters.skip_unreadable:
+                raise
+            return _leave_out(task, error)
     counts: Counter[str] = Counter()
     classes: set[int] = set()
     become = rename_classes(task.parameters.building_classes)
@@ -134,8 +158,7 @@ def read_point_file(task: Task) -> Facts:
     except InputError as error:
         if not task.parameters.skip_unreadable:
             raise
-        task.discard()
-        return {"counts": {}, "classes": [], "marks_buildings": True, "unreadable": str(error)}
+        return _leave_out(task, error)
     task.put(block=np.array(blocks), end=np.array([row]))
     return {
         "counts": dict(counts),
@@ -144,6 +167,12 @@ def read_point_file(task: Task) -> Facts:
         "unreadable": None,
         **scaling,
     }
+
+
+def _leave_out(task: Task, error: InputError) -> Facts:
+    """Forget a file that cannot be read; gives its facts."""
+    task.discard()
+    return {"counts": {}, "classes": [], "marks_buildings": True, "unreadable": str(error)}
 
 
 def _check_classes(task: Task, steps: NDArray[np.float64], n_key_points: int) -> None:
@@ -170,18 +199,38 @@ def read_footprint_file(task: Task) -> Facts:
     given = task.parameters
     if not given.footprints:
         return {"n": 0, "part_like": []}
+    return _put_footprints(
+        task,
+        scan_footprints(
+            place(given.footprints),
+            crs=pyproj.CRS.from_user_input(task.context.crs),
+            bounds=grow(task.context.bounds, REACH) if given.align else task.context.bounds,
+            frame=Frame(*given.footprints_frame),
+            layer=given.layer,
+            id_attribute=given.id_attribute,
+            height_attribute=given.height_attribute,
+            roof_attribute=given.roof_attribute,
+        ),
+        given.footprints,
+    )
+
+
+def read_model_footprints(task: Task) -> Facts:
+    """Take the outlines of the buildings of all city models as footprints (step 1.2)."""
+    counts: Counter[str] = Counter()
+    for name in task.refs["points"]:
+        counts.update(task.store.attributes("points", name)["facts"].get("model", {}))
+    blocks = (block_footprints(*band) for band in read_model_bands(task))
+    return _put_footprints(task, blocks, "the city model") | {
+        "counts": {k: v for k, v in sorted(counts.items()) if v}
+    }
+
+
+def _put_footprints(task: Task, found: Iterable[FootprintBlock], source: str) -> Facts:
+    """Write footprints one behind the other."""
     n = first = n_bytes = n_letters = 0
     blocks, part_like = [0], set[str]()
-    for block in scan_footprints(
-        place(given.footprints),
-        crs=pyproj.CRS.from_user_input(task.context.crs),
-        bounds=grow(task.context.bounds, REACH) if given.align else task.context.bounds,
-        frame=Frame(*given.footprints_frame),
-        layer=given.layer,
-        id_attribute=given.id_attribute,
-        height_attribute=given.height_attribute,
-        roof_attribute=given.roof_attribute,
-    ):
+    for block in found:
         task.notes(block.notes)
         rows = block.rows
         names = [name.encode() for name in rows.ids.tolist()]
@@ -203,7 +252,7 @@ def read_footprint_file(task: Task) -> Facts:
         blocks.append(first)
         part_like |= {name for name in rows.ids.tolist() if "-part" in name}
     if n == 0:
-        task.note(Note("no-footprints-in-region", given.footprints, detail="terrain only"))
+        task.note(Note("no-footprints-in-region", source, detail="terrain only"))
     task.put(block=np.array(blocks), end=np.array([n]))
     return {"n": n, "part_like": sorted(part_like)}
 
@@ -257,6 +306,9 @@ def bin_tile(task: Task) -> Facts:
         raster, _ = bin_nodes(bands, window, spacing=spacing)
     else:
         raster = bin_units(read_units(task, box), box, window, spacing=spacing)
+    if task.parameters.get("terrain_given", False):
+        rasters = sample_rasters(task, window, spacing)
+        raster = replace(raster, z=np.where(np.isnan(rasters.z), raster.z, rasters.z))
     task.put_rasters(z=raster.z)
     return _raster_facts(raster)
 

@@ -160,6 +160,14 @@ def read_units(task: Task, box: Box) -> Iterator[UnitPoints]:
             yield _read_units(task, file)
 
 
+def read_units_of(task: Task, name: str, box: Box) -> Iterator[UnitPoints]:
+    """Read the points of a box's cells of one file of the stage ``points``, as `read_units`."""
+    found = _find_rows(task, name, box)
+    for files in _cut_bands([] if found is None else [found]):
+        for file in files:
+            yield _read_units(task, file)
+
+
 def _read_all(task: Task, box: Box) -> Iterator[tuple[PointCloud, NDArray[np.bool_]]]:
     """Read the points of all classes within a box, as files have them; and whether their file marks buildings."""
     for files in _cut_bands(_find_files(task, box)):

@@ -105,6 +105,17 @@ WORDS: dict[str, Words] = {
     "footprint-repaired": Words(REPAIRED, "{n} footprint[s] with an invalid ring [was|were] repaired"),
     "footprint-spike": Words(REPAIRED, "{n} footprint[s] lost a spike or slit"),
     "footprint-split": Words(REPAIRED, "{n} footprint[s] fell into parts"),
+    "model-fault": Words(DROPPED, "{n} geometr[y|ies] of the city model cannot be read"),
+    "model-in-two-files": Words(
+        DROPPED, "{n} building[s] [is|are] in another city model, too, and count[s|] there"
+    ),
+    "model-without-place": Words(
+        DROPPED, "{n} building[s] of the city model [has|have] neither faces nor an outline", "it has no geometry"
+    ),
+    "model-roof-overhang": Words(REPAIRED, "{n} roof[s] of the city model [was|were] cut off at the walls"),
+    "model-not-planar": Words(
+        REPAIRED, "{n} building[s] of the city model [has|have] roof surfaces that are not planar"
+    ),
     "plane-refinement-stopped": Words(
         REPAIRED, "{n} plane mesh[|es] reached the limit on added vertices; angles may be small"
     ),
@@ -120,6 +131,24 @@ WORDS: dict[str, Words] = {
     "solid-touching": Words(
         REPAIRED,
         "{n} outline[s] that [touches itself|touch themselves] [was|were] parted for [its solid|their solids]",
+    ),
+    "model-axes": Words(DEFAULTED, "the order of axes of city models was chosen by what they show"),
+    "model-ground": Words(DEFAULTED, "the ground is that of the city model, as none is given"),
+    "model-lower-level": Words(
+        DEFAULTED, "{n} building[s] of the city model [has|have] no roof at the best level: a lower one was taken"
+    ),
+    "model-no-roof": Words(
+        DEFAULTED, "{n} building[s] of the city model [has|have] no roof: a height over the outline was taken"
+    ),
+    "model-off-ground": Words(
+        OTHER, "{n} building[s] of the city model [stands|stand] more than 5 m above or below the ground"
+    ),
+    "model-shift": Words(OTHER, "the city model lies above or below the ground as a whole: see --shift-z"),
+    "model-roof-gap": Words(
+        DEFAULTED, "{n} roof[s] of the city model [has|have] a gap that took the nearest surface"
+    ),
+    "model-roof-unused": Words(
+        DEFAULTED, "{n} roof[s] of the city model [does|do] not cover the house, and [was|were] not used"
     ),
     "building-ground-from-dtm": Words(
         DEFAULTED, "{n} building part[s] without ground points took the ground height of the terrain"

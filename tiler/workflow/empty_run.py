@@ -28,7 +28,7 @@ class EmptyMeshError(InputError):
 
 def is_empty(config: Config, counts: dict[str, int]) -> bool:
     """Whether footprints were given, and no building was meshed."""
-    return bool(config.footprints) and not counts.get("buildings", 0)
+    return config.has_buildings and not counts.get("buildings", 0)
 
 
 def explain_empty(config: Config, region: Region, counts: dict[str, int], notes: Sequence[Note]) -> str:

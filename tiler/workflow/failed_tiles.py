@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.data.errors import CityError, ConfigError
 from stitch.tiling.grid import Bounds, Key
-from tiler.config.config import Config
+from tiler.config.config import Config, with_absolute_inputs
 from tiler.config.config_file import write_config
 from tiler.engine.engine import Engine
 from tiler.engine.failures import SetAside
@@ -116,9 +116,7 @@ def describe_missing(missing: Missing, out: Path) -> dict[str, Any]:
 def save_config(config: Config, out: Path) -> None:
     """Write the parameters of a run into its folder, paths absolute: any place will do to run it from."""
     saved = dataclasses.replace(
-        config,
-        pointcloud=tuple(map(absolute, config.pointcloud)),
-        footprints=absolute(config.footprints) if config.footprints else "",
+        with_absolute_inputs(config),
         out=absolute(str(out)),
         scheduler="",  # which no file may name
         tls_ca="",

@@ -67,7 +67,9 @@ def _read_run(path: Path) -> tuple[Box, str, list[str]] | None:
             return None
         region, given = found["region"], found["parameters"]
         west, south, east, north = (float(value) for value in region.get("core", region["bounds"]))
-        inputs = [str(name) for name in (*given["pointcloud"], given["footprints"]) if name]
+        inputs = [
+            str(name) for name in (*given["pointcloud"], given["footprints"], *given.get("buildings", ())) if name
+        ]
         return (west, south, east, north), str(region["crs"]), inputs
     except (CityError, *WRONG_FIELD):
         return None  # a damaged record is mended by the run

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import CityError, OutputError
-from tiler.config.config import ANYWHERE, Config, roofs_stay_flat
+from tiler.config.config import ANYWHERE, Config, roofs_stay_flat, with_absolute_inputs
 from tiler.dashboard.server import read_address, watched
 from tiler.engine.executor import Executor, Serial
 from tiler.engine.keys import code_versions
@@ -229,13 +229,13 @@ def _run(
 def _plan(config: Config, out: Path, say: Callable[[str], None], *, fresh: bool) -> Plan:
     """Plan a run; refuse inputs among its results and, unless it begins anew, the folder of another region."""
     plan = make_plan(config, say)
-    footprints = [config.footprints] if config.footprints else []
+    files = list(config.building_files)
     for warning in _foresee(plan, config):
         plan.messages.append(warning)
         say(warning)
-    refuse_inputs_within(out, [*(header.path for header in plan.headers), *map(place, footprints)])
+    refuse_inputs_within(out, [*(header.path for header in plan.headers), *map(place, files)])
     if not fresh:
-        refuse_other_region(out, plan.region, [*config.pointcloud, *footprints])
+        refuse_other_region(out, plan.region, [*config.pointcloud, *files, *config.terrain])
     return plan
 
 
@@ -316,9 +316,7 @@ def use_absolute_paths(config: Config) -> Config:
     if not config.on_cluster:
         return config
     return dataclasses.replace(
-        config,
-        pointcloud=tuple(map(absolute, config.pointcloud)),
-        footprints=absolute(config.footprints) if config.footprints else "",
+        with_absolute_inputs(config),
         out=absolute(config.out),
     )
 

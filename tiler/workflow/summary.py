@@ -22,6 +22,7 @@ from tiler.planning.plan import Plan
 from tiler.report.left_out import describe_left_out, report_left_out
 from tiler.stages.alignment import describe_alignment
 from tiler.stages.approach import RIM
+from tiler.stages.city_files import describe_feet
 from tiler.stages.domain import LOW_DOMAIN
 from tiler.stages.own_stages import CORE_STAGE
 from tiler.workflow.empty_run import explain_empty, is_empty
@@ -77,6 +78,7 @@ def summarise_run(
         notes = [note for note in notes if (note.kind, note.subject) != ("crs-accuracy", FOOTPRINTS)]
     report = records["report", REGION_ITEM].facts
     notes += note_parts(report["parts"])
+    notes += describe_feet(record.facts.get("feet", {}) for record in records.of("houses"))
     found = records["domain", REGION_ITEM].facts
     domain = settle(config.domain_height, config.top, found)
     outline = _join_outlines([record.facts["outline"] for record in records.of("model")])

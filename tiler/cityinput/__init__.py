@@ -1,0 +1,1 @@
+"""City models and rasters of terrain as input: as files have them, and as rows for a store."""

@@ -1,0 +1,256 @@
+"""CityJSON 1.0 to 2.0 and CityJSONSeq: buildings with their parts, one at a time."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.data.errors import InputError
+from tiler.cityinput.faces import KINDS, NO_LOD, OUTLINE, UNKNOWN, Faces, ModelBuilding, Shape
+
+WHOLE = 64 * 2**20  # bytes of a line; a longer one is no feature of a sequence
+# How many lists of faces lie around a polygon of each type of geometry.
+DEPTH = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
+RELIEF = "TINRelief"
+
+Object = Mapping[str, Any]
+Vertices = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CityJsonHead:
+    """What the first object of a CityJSON file or sequence says.
+
+    Attributes
+    ----------
+    version : str
+        Version of CityJSON.
+    crs : str
+        Name of the CRS, ``""`` for none.
+    sequence : bool
+        Whether features follow in lines of their own.
+    scale, translate : tuple of 3 floats
+        How integers become coordinates.
+    """
+
+    version: str
+    crs: str
+    sequence: bool
+    scale: tuple[float, float, float]
+    translate: tuple[float, float, float]
+
+
+def read_objects(path: Path) -> tuple[CityJsonHead, Iterator[tuple[Object, Vertices]]]:
+    """Read the head of a file, and give the city objects of each of its documents with their vertices.
+
+    A sequence has one document a feature, any other file a single one: of a sequence one feature is in memory.
+
+    Raises
+    ------
+    InputError
+        If the file is no CityJSON, or one of its lines is none.
+    """
+    with path.open("rb") as file:
+        first = file.readline(WHOLE)
+        document = _parse(first) if first.rstrip().endswith(b"}") else None
+        rest = file.read(1) if document is not None else b""
+    if document is not None and _is_head(document, rest):
+        head = _read_head(path, document, sequence=True)
+        return head, _read_lines(path, head)
+    if document is None or rest.strip():
+        with path.open("rb") as file:
+            document = _parse(file.read())
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: is no JSON object; give a CityJSON file, or CityJSONSeq with one object a line")
+    head = _read_head(path, document, sequence=False)
+    return head, iter([(_objects_of(path, document), _vertices_of(path, document, head))])
+
+
+def _is_head(document: Any, rest: bytes) -> bool:
+    """Whether a first line is the head of a sequence: it is CityJSON, and others follow or it has no objects."""
+    return (
+        isinstance(document, dict)
+        and document.get("type") == "CityJSON"
+        and (bool(rest.strip()) or document.get("CityObjects") == {})
+    )
+
+
+def _parse(data: bytes) -> Any:
+    try:
+        return json.loads(data)
+    except ValueError:
+        return None
+
+
+def _read_head(path: Path, document: dict[str, Any], *, sequence: bool) -> CityJsonHead:
+    if document.get("type") != "CityJSON":
+        raise InputError(
+            f"{path}: its type is {document.get('type')!r}, not 'CityJSON'; a sequence begins with a CityJSON "
+            "object that has the transform"
+        )
+    version = str(document.get("version", ""))
+    transform = document.get("transform")
+    if transform is None and (sequence or not version.startswith("1.0")):
+        raise InputError(
+            f"{path}: CityJSON {version} without a transform, so vertices have no place; write it anew"
+        )
+    try:
+        scale = tuple(float(v) for v in (transform or {}).get("scale", (1, 1, 1)))
+        translate = tuple(float(v) for v in (transform or {}).get("translate", (0, 0, 0)))
+    except (TypeError, ValueError):
+        scale, translate = (), ()
+    if len(scale) != 3 or len(translate) != 3 or not all(math.isfinite(v) for v in (*scale, *translate)):
+        raise InputError(f"{path}: its transform has not three finite scales and translations; write it anew")
+    metadata = document.get("metadata") or {}
+    crs = metadata.get("referenceSystem") or (metadata.get("crs") or {}).get("epsg") or ""
+    return CityJsonHead(version, str(crs), sequence, scale, translate)
+
+
+def _read_lines(path: Path, head: CityJsonHead) -> Iterator[tuple[Object, Vertices]]:
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            if not line.strip():
+                continue
+            document = _parse(line)
+            if not isinstance(document, dict):
+                raise InputError(
+                    f"{path}, line {number}: is no JSON object; the file may be cut off: copy it again"
+                )
+            if number == 1 and not document.get("CityObjects"):
+                continue
+            yield _objects_of(path, document), _vertices_of(path, document, head)
+
+
+def _objects_of(path: Path, document: dict[str, Any]) -> Object:
+    objects = document.get("CityObjects")
+    if not isinstance(objects, dict):
+        raise InputError(f"{path}: has no CityObjects; give a CityJSON file with buildings")
+    return objects
+
+
+def _vertices_of(path: Path, document: dict[str, Any], head: CityJsonHead) -> Vertices:
+    try:
+        xyz = np.array(document.get("vertices", []), np.float64).reshape(-1, 3)
+    except ValueError as error:
+        raise InputError(f"{path}: a vertex has not three numbers ({error}); write the file anew") from error
+    placed: Vertices = xyz * np.array(head.scale) + np.array(head.translate)
+    return placed
+
+
+def read_buildings(objects: Object, vertices: Vertices, height: str = "") -> Iterator[ModelBuilding]:
+    """Give the buildings among the objects of a document, each with its parts.
+
+    Parameters
+    ----------
+    objects : mapping
+        City objects by id.
+    vertices : float64, (n, 3)
+        Vertices of the document.
+    height : str
+        Attribute with the height above ground (m); ``""`` for ``measuredHeight``.
+
+    Notes
+    -----
+    A part belongs to its first parent; one whose parent is absent is a building by itself. A `Building` without
+    geometry is that of its parts.
+    """
+    parts: dict[str, list[str]] = {}
+    for name, thing in objects.items():
+        if str(thing.get("type")) == "BuildingPart":
+            known = [parent for parent in thing.get("parents", ()) if parent in objects]
+            parts.setdefault(known[0] if known else name, []).append(name)
+    for name, thing in objects.items():
+        if thing.get("type") == "Building" or (
+            thing.get("type") == "BuildingPart" and name in parts.get(name, ())
+        ):
+            yield _read_building(name, objects, vertices, parts.get(name, []), height)
+
+
+def _read_building(name: str, objects: Object, vertices: Vertices, parts: list[str], height: str) -> ModelBuilding:
+    shapes: list[Shape] = []
+    faults: list[str] = []
+    for owner in dict.fromkeys([name, *parts]):
+        for geometry in objects[owner].get("geometry") or ():
+            try:
+                shapes.append(_read_shape(owner, geometry, vertices))
+            except (KeyError, IndexError, TypeError, ValueError) as error:
+                faults.append(
+                    f"{owner}: a {geometry.get('type')} cannot be read ({type(error).__name__}: {error})"
+                )
+    attributes = objects[name].get("attributes") or {}
+    return ModelBuilding(name, tuple(shapes), _number(attributes.get(height or "measuredHeight")), tuple(faults))
+
+
+def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> Shape:
+    kind = str(geometry["type"])
+    if kind not in DEPTH:
+        raise ValueError(f"a {kind} has no surfaces")
+    semantics = geometry.get("semantics") or {}
+    lod = _number(geometry.get("lod"))
+    lod = NO_LOD if math.isnan(lod) else lod
+    default = OUTLINE if 0 <= lod < 1 else UNKNOWN
+    kinds = [KINDS.get(str(one.get("type")), UNKNOWN) for one in semantics.get("surfaces") or ()]
+    faces: list[Any] = geometry["boundaries"]
+    values: Any = semantics.get("values")
+    for _ in range(DEPTH[kind]):
+        # Shells behind the first are cavities.
+        solid = kind == "Solid"
+        shells = faces[:1] if solid else [shell for one in faces for shell in one[:1]]
+        if values is not None:
+            values = values[:1] if solid else [value for one in values for value in (one or [None])[:1]]
+        lists = values if values is not None else [None] * len(shells)
+        if not solid:
+            faces = [face for shell in shells for face in shell]
+            values = [v for shell, own in zip(shells, lists, strict=True) for v in (own or [None] * len(shell))]
+            break
+        faces = list(shells[0]) if shells else []
+        values = lists[0] if lists else None
+    return Shape(owner, lod, DEPTH[kind] > 0, _make_faces(faces, values, kinds, (vertices, default)))
+
+
+def _make_faces(faces: list[Any], values: Any, kinds: list[int], rest: tuple[Vertices, int]) -> Faces:
+    vertices, default = rest
+    numbers = values if values is not None else [None] * len(faces)
+    rings: list[list[int]] = []
+    sizes: list[int] = []
+    sorts: list[int] = []
+    for face, number in zip(faces, numbers, strict=True):
+        kept = [ring[:-1] if len(ring) > 1 and ring[0] == ring[-1] else ring for ring in face]
+        kept = [ring for ring in kept if len(ring) >= 3]
+        if not kept or len(face[0]) < 3:
+            continue
+        rings += kept
+        sizes.append(len(kept))
+        sorts.append(default if number is None else kinds[number])
+    lengths = np.fromiter(map(len, rings), np.int64, len(rings))
+    index = np.fromiter((v for ring in rings for v in ring), np.int64, int(lengths.sum()))
+    if len(index) and index.min() < 0:
+        raise IndexError(f"vertex {index.min()}")
+    return Faces(
+        vertices[index],
+        np.concatenate(([0], np.cumsum(lengths))),
+        np.concatenate(([0], np.cumsum(np.array(sizes, np.int64)))),
+        np.array(sorts, np.int8),
+    )
+
+
+def read_relief(objects: Object, vertices: Vertices) -> list[Faces]:
+    """Give the triangles of the terrain among the objects of a document."""
+    return [
+        _read_shape(name, geometry, vertices).faces
+        for name, thing in objects.items()
+        if thing.get("type") == RELIEF
+        for geometry in thing.get("geometry") or ()
+    ]
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan

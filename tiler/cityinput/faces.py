@@ -1,0 +1,156 @@
+"""Buildings of a city model as files have them: polygons in space by level of detail, whatever the format."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# What a face is; outlines are polygons that say where a building stands, without being a part of its surface.
+UNKNOWN, ROOF, GROUND, WALL, OUTLINE = range(5)
+KINDS = {
+    "RoofSurface": ROOF,
+    "OuterCeilingSurface": WALL,
+    "OuterFloorSurface": WALL,
+    "GroundSurface": GROUND,
+    "WallSurface": WALL,
+    "ClosureSurface": WALL,
+    "InteriorWallSurface": WALL,
+    "CeilingSurface": WALL,
+    "FloorSurface": WALL,
+}
+NO_LOD = -1.0
+
+Ring = Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Faces:
+    """Polygons in space, in the coordinates of their file.
+
+    Attributes
+    ----------
+    xyz : float64, (n, 3)
+        Vertices of all rings, none of them repeated at the end of its ring.
+    ring_start : int64, (r + 1,)
+        The vertices of ring k are the rows ``ring_start[k]`` to ``ring_start[k + 1]``.
+    face_start : int64, (f + 1,)
+        The rings of each face: the first is its border, others are holes.
+    kind : int8, (f,)
+        `UNKNOWN`, `ROOF`, `GROUND`, `WALL` or `OUTLINE`.
+    """
+
+    xyz: NDArray[np.float64]
+    ring_start: NDArray[np.int64]
+    face_start: NDArray[np.int64]
+    kind: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A building, or a part of it, at one level of detail.
+
+    Attributes
+    ----------
+    owner : str
+        Id of the building or part that it belongs to.
+    lod : float
+        Level of detail; `NO_LOD` where the file states none.
+    closed : bool
+        Whether it is a solid: its faces are then oriented outwards.
+    faces : Faces
+        Its polygons.
+    """
+
+    owner: str
+    lod: float
+    closed: bool
+    faces: Faces
+
+
+@dataclass(frozen=True, eq=False)
+class ModelBuilding:
+    """A building of a city model with its parts.
+
+    Attributes
+    ----------
+    id : str
+        Its id, ``""`` where the file has none.
+    shapes : tuple of Shape
+        All that is stated of it and its parts.
+    height : float
+        Height above ground by an attribute (m), NaN where there is none.
+    faults : tuple of str
+        What could not be read.
+    """
+
+    id: str
+    shapes: tuple[Shape, ...]
+    height: float = float("nan")
+    faults: tuple[str, ...] = ()
+
+
+@dataclass
+class FaceList:
+    """Faces as they are read, one after the other.
+
+    Attributes
+    ----------
+    rings : list
+        Vertices of each ring.
+    sizes : list of int
+        Number of rings of each face.
+    kinds : list of int
+        Kind of each face.
+    """
+
+    rings: list[Any] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+    kinds: list[int] = field(default_factory=list)
+
+    def add(self, rings: Sequence[Any], kind: int) -> bool:
+        """Add a face by its rings, float64 (k, 3) without a repeated end; whether its border has 3 vertices."""
+        kept = [ring for ring in rings if len(ring) >= 3]
+        if not kept or len(rings[0]) < 3:
+            return False
+        self.rings += kept
+        self.sizes.append(len(kept))
+        self.kinds.append(kind)
+        return True
+
+    def done(self) -> Faces:
+        """Give all of them as arrays."""
+        xyz = np.concatenate([np.empty((0, 3)), *self.rings])
+        lengths = np.fromiter(map(len, self.rings), np.int64, len(self.rings))
+        return Faces(
+            xyz,
+            np.concatenate(([0], np.cumsum(lengths))),
+            np.concatenate(([0], np.cumsum(np.array(self.sizes, np.int64)))),
+            np.array(self.kinds, np.int8),
+        )
+
+
+def join_faces(several: Iterable[Faces]) -> Faces:
+    """Put faces one after the other; none gives none."""
+    parts = list(several)
+    n_xyz = np.cumsum([0, *(len(faces.xyz) for faces in parts)])
+    n_rings = np.cumsum([0, *(len(faces.ring_start) - 1 for faces in parts)])
+    return Faces(
+        np.concatenate([np.empty((0, 3)), *(faces.xyz for faces in parts)]),
+        np.concatenate(
+            [np.zeros(1, np.int64), *(f.ring_start[1:] + n for f, n in zip(parts, n_xyz, strict=False))]
+        ),
+        np.concatenate(
+            [np.zeros(1, np.int64), *(f.face_start[1:] + n for f, n in zip(parts, n_rings, strict=False))]
+        ),
+        np.concatenate([np.empty(0, np.int8), *(faces.kind for faces in parts)]),
+    )
+
+
+def drop_end(ring: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Leave out the last vertex where it repeats the first."""
+    return ring[:-1] if len(ring) > 1 and (ring[0] == ring[-1]).all() else ring

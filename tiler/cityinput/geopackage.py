@@ -1,0 +1,164 @@
+"""Buildings of GeoPackages as 3DBAG delivers them: a layer of polygons in space for each level of detail."""
+
+import re
+import sqlite3
+import struct
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.data.errors import InputError
+from tiler.cityinput.faces import NO_LOD, OUTLINE, UNKNOWN, Faces, ModelBuilding, Shape
+from tiler.vectors.wkb import parse_wkb
+
+SIGNATURE = b"SQLite format 3\0"
+IDS = (
+    "identificatie",
+    "gml_id",
+    "building_id",
+    "id",
+)  # columns with the id of a building, the first that is there
+OUTLINES = "pand"  # layer with outlines in plan
+BATCH = 500  # buildings whose geometries are parsed at a time
+_LEVEL = re.compile(r"lod(\d)(\d)?_3d")
+_ENVELOPES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}  # bytes by the code in the header of a geometry
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """A table with geometries: the columns of these and of ids, its level, and the name of its CRS."""
+
+    table: str
+    geometry: str
+    id: str
+    lod: float
+    crs: str
+
+
+def scan_geopackage(path: Path) -> Iterator[str | ModelBuilding]:
+    """Give the name of the CRS, and the buildings by ascending id.
+
+    Layers ``lod12_3d``, ``lod13_3d`` and ``lod22_3d`` have the level of their name, ``pand`` that of outlines;
+    other layers in space have none. Rows of one id are one building.
+
+    Raises
+    ------
+    InputError
+        If the file has no such layer, or cannot be read.
+    """
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
+            layers = _list_layers(path, base)
+            yield layers[0].crs
+            rows = _list_rows(base, layers)
+            batch: list[tuple[str, list[tuple[int, int]]]] = []
+            for name, group in groupby(rows, key=lambda row: row[0]):
+                batch.append((name, [(layer, number) for _, layer, number in group]))
+                if len(batch) == BATCH:
+                    yield from _read_batch(base, layers, batch)
+                    batch = []
+            yield from _read_batch(base, layers, batch)
+    except sqlite3.Error as error:
+        raise InputError(f"{path}: cannot be read as a GeoPackage ({error}); copy it again") from error
+
+
+def _list_layers(path: Path, base: sqlite3.Connection) -> list[_Layer]:
+    found = []
+    query = (
+        "SELECT g.table_name, g.column_name, g.z, s.organization, s.organization_coordsys_id "
+        "FROM gpkg_geometry_columns g LEFT JOIN gpkg_spatial_ref_sys s ON s.srs_id = g.srs_id ORDER BY 1"
+    )
+    for table, column, z, organization, code in base.execute(query).fetchall():
+        columns = {row[1].lower(): row[1] for row in base.execute(f"PRAGMA table_info({_quote(table)})")}
+        level = _LEVEL.fullmatch(table.lower())
+        name = next((columns[one] for one in IDS if one in columns), "")
+        outline = table.lower() == OUTLINES
+        if not name or not (z or outline):
+            continue
+        lod = float(f"{level[1]}.{level[2] or 0}") if level else 0.0 if outline else NO_LOD
+        crs = f"{organization.upper()}:{code}" if organization and int(code) > 0 else ""
+        found.append(_Layer(table, column, name, lod, crs))
+    if not any(layer.lod for layer in found):
+        raise InputError(
+            f"{path}: has no layer of polygons in space with ids ({', '.join(IDS)}); footprints are taken by "
+            "--footprints"
+        )
+    return found
+
+
+def _list_rows(base: sqlite3.Connection, layers: list[_Layer]) -> Iterator[tuple[str, int, int]]:
+    """Id, layer and row of all geometries, by id; it is these that the database sorts."""
+    parts = [
+        f"SELECT CAST({_quote(layer.id)} AS TEXT), {k}, rowid FROM {_quote(layer.table)} "
+        f"WHERE {_quote(layer.id)} IS NOT NULL AND {_quote(layer.geometry)} IS NOT NULL"
+        for k, layer in enumerate(layers)
+    ]
+    yield from base.execute(" UNION ALL ".join(parts) + " ORDER BY 1, 2, 3")
+
+
+def _read_batch(
+    base: sqlite3.Connection, layers: list[_Layer], batch: list[tuple[str, list[tuple[int, int]]]]
+) -> Iterator[ModelBuilding]:
+    blobs, faults = [], list[str]()
+    for _, rows in batch:
+        for layer, number in rows:
+            one = layers[layer]
+            query = f"SELECT {_quote(one.geometry)} FROM {_quote(one.table)} WHERE rowid = ?"
+            (blob,) = base.execute(query, (number,)).fetchone()
+            stripped, fault = _strip(blob)
+            blobs.append(stripped)
+            faults.append(fault)
+    stored = np.empty(len(blobs), object)
+    stored[:] = blobs
+    geometry, _, broken = parse_wkb(stored)
+    k = 0
+    for name, rows in batch:
+        shapes, told = [], []
+        for layer, _ in rows:
+            lod = layers[layer].lod
+            if geometry[k] is None:
+                told.append(f"a geometry of {layers[layer].table}: {faults[k] or broken.get(k, 'is empty')}")
+            else:
+                faces = _make_faces(geometry[k], OUTLINE if lod == 0 else UNKNOWN)
+                shapes.append(Shape(name, lod, lod > 0, faces))
+            k += 1
+        yield ModelBuilding(name, tuple(shapes), faults=tuple(told))
+
+
+def _strip(blob: bytes) -> tuple[bytes | None, str]:
+    """Take the header of a GeoPackage's geometry away; None and the reason where there is no sound one."""
+    if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
+        return None, "has no header of a GeoPackage"
+    try:
+        (flags,) = struct.unpack_from("B", blob, 3)
+        return blob[8 + _ENVELOPES[flags >> 1 & 7] :], ""
+    except KeyError:
+        return None, "has a header of an unknown kind"
+
+
+def _make_faces(geometry: shapely.Geometry, kind: int) -> Faces:
+    parts = np.array([geometry], object)
+    while (shapely.get_type_id(parts) > shapely.GeometryType.POLYGON).any():
+        parts = shapely.get_parts(parts)
+    parts = parts[(shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & ~shapely.is_empty(parts)]
+    rings, part = shapely.get_rings(parts, return_index=True)
+    xyz, ring = shapely.get_coordinates(rings, include_z=True, return_index=True)
+    last = np.append(ring[1:] != ring[:-1], True) if len(ring) else np.zeros(0, np.bool_)
+    xyz, ring = np.nan_to_num(xyz[~last]), ring[~last]
+    ring_start: NDArray[np.int64] = np.searchsorted(ring, np.arange(len(rings) + 1))
+    return Faces(
+        xyz,
+        ring_start,
+        np.searchsorted(part, np.arange(len(parts) + 1)),
+        np.full(len(parts), kind, np.int8),
+    )
+
+
+def _quote(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'

@@ -1,0 +1,337 @@
+"""Buildings of city models as rows: outlines, heights, and the roof surfaces over them with their planes."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.data.citymodel import make_ids
+from pipeline.data.notes import Note
+from pipeline.data.roofs import Roofs, join_roofs, take_roofs
+from tiler.cityinput.face_planes import FacePlanes, find_planes
+from tiler.cityinput.faces import GROUND, ROOF, WALL, Faces, ModelBuilding, join_faces
+from tiler.cityinput.levels import find_outline, list_attempts
+from tiler.georeference.frame import Frame, to_region
+
+ROUNDING = 0.001  # m; coordinates in plan are whole multiples of it
+STEEPEST = 10.0  # slope from which a face is a wall
+LEAST_FACE = 0.01  # m2 in plan; smaller faces are no roofs
+ROOM = 0.5  # m, that a roof may reach beyond the heights of its surface
+NOT_PLANAR = 0.1  # m; vertices farther than this from the plane of their roof are told
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Placing = tuple[Frame, float]  # how coordinates of a file become those of the region, and what is added to heights
+
+
+@dataclass(frozen=True, eq=False)
+class ModelRows:
+    """Buildings of city models, one row each, and their roof surfaces.
+
+    Attributes
+    ----------
+    outlines : object, (n,)
+        Polygons and multipolygons in the region's CRS (m): where each building stands.
+    ids : str, (n,)
+        Ids of the buildings.
+    given_height : float64, (n,)
+        Height above ground by an attribute (m), NaN where there is none.
+    lod : float64, (n,)
+        Level of detail that the surfaces are of; NaN without any.
+    base : float64, (n,)
+        Lowest height of the building's faces (m), NaN without any.
+    start : int64, (n + 1,)
+        The surfaces of row k are ``start[k]`` to ``start[k + 1]``.
+    surfaces : object, (s,)
+        Roof surfaces in plan, shapely polygons.
+    roofs : Roofs
+        Their planes.
+    """
+
+    outlines: NDArray[np.object_]
+    ids: NDArray[np.str_]
+    given_height: Array
+    lod: Array
+    base: Array
+    start: Index
+    surfaces: NDArray[np.object_]
+    roofs: Roofs
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def no_rows() -> ModelRows:
+    """Give no building at all."""
+    nothing = np.empty(0)
+    return ModelRows(
+        nothing.astype(object), nothing.astype(np.str_), nothing, nothing, nothing, np.zeros(1, np.int64),
+        nothing.astype(object), join_roofs([]),
+    )  # fmt: skip
+
+
+def take_rows(rows: ModelRows, chosen: Index) -> ModelRows:
+    """Take some buildings, in the order of `chosen`, int64 (k,)."""
+    count = np.diff(rows.start)[chosen]
+    start = np.concatenate(([0], np.cumsum(count)))
+    surface = np.repeat(rows.start[chosen] - start[:-1], count) + np.arange(start[-1])
+    return ModelRows(
+        rows.outlines[chosen],
+        rows.ids[chosen],
+        rows.given_height[chosen],
+        rows.lod[chosen],
+        rows.base[chosen],
+        start,
+        rows.surfaces[surface],
+        take_roofs(rows.roofs, surface),
+    )
+
+
+def join_rows(several: Sequence[ModelRows]) -> ModelRows:
+    """Put rows one after the other; none gives none."""
+    parts = [no_rows(), *several]
+    n = np.cumsum([0, *(len(rows.surfaces) for rows in parts)])
+    return ModelRows(
+        np.concatenate([rows.outlines for rows in parts]),
+        np.concatenate([rows.ids for rows in parts]),
+        np.concatenate([rows.given_height for rows in parts]),
+        np.concatenate([rows.lod for rows in parts]),
+        np.concatenate([rows.base for rows in parts]),
+        np.concatenate([[0], *(rows.start[1:] + k for rows, k in zip(parts, n, strict=False))]).astype(np.int64),
+        np.concatenate([rows.surfaces for rows in parts]),
+        join_roofs([rows.roofs for rows in parts]),
+    )
+
+
+def make_rows(
+    buildings: Sequence[ModelBuilding], frame: Frame, asked: str, counts: Counter[str], shift: float = 0.0
+) -> tuple[ModelRows, list[Note]]:
+    """Make rows of buildings.
+
+    Parameters
+    ----------
+    buildings : sequence of ModelBuilding
+        As a file has them.
+    frame : Frame
+        How its coordinates become those of the region.
+    asked : str
+        Which level of detail is wanted, one of `levels.CHOICES`.
+    counts : Counter of str
+        Numbers for the record are added, by name.
+    shift : float
+        Added to all heights (m).
+
+    Returns
+    -------
+    ModelRows
+        Those that stand somewhere, in the order of the buildings.
+    list of Note
+        ``model-fault`` for what could not be read, ``model-lower-level`` where a level without roofs was left for
+        a lower one, ``model-no-roof`` where none has any, ``model-not-planar``, and ``model-without-place``.
+
+    Notes
+    -----
+    Roof surfaces are those that the file calls so, else all faces but walls and the ground: where several lie over
+    each other, the highest counts. A plane passes through the middle of its border, at right angles to the area
+    vector.
+    """
+    attempts = [list_attempts(building, asked) for building in buildings]
+    place = np.zeros(len(buildings), np.int64)  # which attempt each building is at
+    left = [k for k, tries in enumerate(attempts) if tries]
+    done: dict[int, _Found] = {}
+    while left:
+        tried = _find_roofs([(k, *attempts[k][place[k]]) for k in left], (frame, shift))
+        done |= {k: found for k, found in tried.items() if len(found.surfaces)}
+        place[left] += 1
+        left = [k for k in left if k not in done and place[k] < len(attempts[k])]
+    outlines = [(k, 0.0, find_outline(one)) for k, one in enumerate(buildings) if k not in done]
+    places = _find_outlines([each for each in outlines if len(each[2])], (frame, shift))
+    notes: list[Note] = []
+    kept = [k for k in range(len(buildings)) if k in done or k in places]
+    _count(buildings, attempts, place, (done, places), counts)
+    rows = _assemble(buildings, kept, done, places)
+    xy = shapely.get_coordinates(shapely.point_on_surface(rows.outlines)).reshape(-1, 2)
+    where = dict(zip(kept, xy.tolist(), strict=True))
+    for k, building in enumerate(buildings):
+        notes += _note(building, attempts[k], done.get(k), where.get(k))
+    return rows, notes
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Outline, level and roof surfaces of one building; `residual` (m) is that of each surface."""
+
+    outline: shapely.Geometry
+    lod: float
+    base: float
+    surfaces: NDArray[np.object_]
+    roofs: Roofs
+    residual: Array
+
+
+def _to_region(faces: Faces, placing: Placing) -> Faces:
+    frame, shift = placing
+    xy = np.round(to_region(frame, faces.xyz[:, :2]) / ROUNDING) * ROUNDING
+    # A whole number of millimetres as the nearest float, whatever the multiplication gave.
+    xyz = np.column_stack((np.round(xy, 3), faces.xyz[:, 2] * frame.height + shift))
+    return Faces(xyz, faces.ring_start, faces.face_start, faces.kind)
+
+
+def _find_roofs(tries: Sequence[tuple[int, float, Faces]], placing: Placing) -> dict[int, _Found]:
+    """Find outlines and roofs of buildings, all faces at a time; none for those without roof surfaces."""
+    faces = _to_region(join_faces(one for _, _, one in tries), placing)
+    owner = np.repeat(np.arange(len(tries)), [len(one) for _, _, one in tries])
+    planes = find_planes(faces)
+    up = np.abs(planes.normal[:, 2])
+    lying = (up * STEEPEST > np.linalg.norm(planes.normal, axis=1)) & (up > LEAST_FACE)
+    named = np.bincount(owner[lying & (faces.kind == ROOF)], minlength=len(tries)) > 0
+    roof = lying & np.where(named[owner], faces.kind == ROOF, (faces.kind != GROUND) & (faces.kind != WALL))
+    ground = lying & (faces.kind == GROUND)
+    polygons = np.full(len(faces), None, object)
+    polygons[lying] = _make_polygons(faces, np.flatnonzero(lying))
+    by_ground = np.bincount(owner[ground], minlength=len(tries)) > 0
+    outer = np.where(by_ground[owner], ground, lying)
+    base = np.full(len(tries), np.inf)
+    np.minimum.at(base, owner, planes.low)
+    limits, of_roof = np.flatnonzero(np.diff(owner, prepend=-1, append=len(tries))), np.flatnonzero(roof)
+    roofs = _make_roofs(planes, of_roof)
+    first = np.searchsorted(of_roof, limits)
+    found = {}
+    for begin, end, low, high in zip(limits[:-1], limits[1:], first[:-1], first[1:], strict=True):
+        which = int(owner[begin])
+        if low == high:
+            continue
+        outline = shapely.union_all(polygons[begin:end][outer[begin:end]])
+        own = np.arange(low, high)
+        found[tries[which][0]] = _Found(
+            _areas_of(outline), tries[which][1], float(base[which]), polygons[of_roof[own]],
+            take_roofs(roofs, own), planes.residual[of_roof[own]],
+        )  # fmt: skip
+    return {k: each for k, each in found.items() if not each.outline.is_empty}
+
+
+def _find_outlines(tries: Sequence[tuple[int, float, Faces]], placing: Placing) -> dict[int, shapely.Geometry]:
+    found = {}
+    for k, _, faces in tries:
+        placed = _to_region(faces, placing)
+        outline = _areas_of(shapely.union_all(_make_polygons(placed, np.arange(len(placed)))))
+        if not outline.is_empty:
+            found[k] = outline
+    return found
+
+
+def _make_polygons(faces: Faces, chosen: Index) -> NDArray[np.object_]:
+    """Polygons of faces in plan, made valid: a part without area is gone."""
+    rings = np.diff(faces.face_start)
+    ring_face = np.repeat(np.arange(len(faces)), rings)
+    ring = np.flatnonzero(np.isin(ring_face, chosen))
+    count = np.diff(faces.ring_start)
+    vertex = np.repeat(np.isin(np.arange(len(count)), ring), count)
+    number = np.cumsum(np.isin(np.arange(len(count)), ring)) - 1
+    index = np.repeat(number, count)[vertex]
+    lines = shapely.linearrings(faces.xyz[vertex, :2], indices=index) if len(index) else np.empty(0, object)
+    face = np.searchsorted(chosen, ring_face[ring])
+    polygons = shapely.polygons(lines, indices=face) if len(face) else np.empty(0, object)
+    bad = ~shapely.is_valid(polygons)
+    polygons[bad] = [_areas_of(one) for one in shapely.make_valid(polygons[bad])]
+    made: NDArray[np.object_] = polygons
+    return made
+
+
+def _areas_of(geometry: shapely.Geometry) -> shapely.Geometry:
+    """Give what of a geometry has an area."""
+    if geometry.geom_type in ("Polygon", "MultiPolygon"):
+        return geometry
+    parts = shapely.get_parts(geometry)
+    return shapely.union_all([part for part in parts if part.geom_type in ("Polygon", "MultiPolygon")])
+
+
+def _make_roofs(planes: FacePlanes, rows: Index) -> Roofs:
+    normal, centre = planes.normal[rows], planes.centre[rows]
+    slope = -normal[:, :2] / normal[:, 2:]
+    origin = np.floor(centre[:, :2])
+    height = centre[:, 2] + ((origin - centre[:, :2]) * slope).sum(axis=1)
+    level = np.abs(slope).max(axis=1, initial=0.0) < 1e-6  # a millionth: rounding of coordinates
+    slope[level], height[level] = 0.0, centre[level, 2]
+    limits = np.column_stack((planes.low[rows] - ROOM, planes.high[rows] + ROOM))
+    limits[level] = height[level, np.newaxis]
+    return Roofs(np.column_stack((slope, height)), origin, limits)
+
+
+def _assemble(
+    buildings: Sequence[ModelBuilding],
+    kept: Sequence[int],
+    done: dict[int, _Found],
+    places: dict[int, shapely.Geometry],
+) -> ModelRows:
+    outlines = np.empty(len(kept), object)
+    outlines[:] = [done[k].outline if k in done else places[k] for k in kept]
+    ids = np.array([buildings[k].id for k in kept], np.str_)
+    missing = np.flatnonzero(ids == "")
+    if len(missing):
+        made = make_ids(outlines[missing])
+        ids = ids.astype(f"<U{max(ids.itemsize // 4, 14)}")
+        ids[missing] = made
+    n_surfaces = [len(done[k].surfaces) if k in done else 0 for k in kept]
+    nothing = np.empty(0, object)
+    return ModelRows(
+        outlines,
+        ids,
+        np.array([buildings[k].height for k in kept], np.float64),
+        np.array([done[k].lod if k in done else np.nan for k in kept], np.float64),
+        np.array([done[k].base if k in done else np.nan for k in kept], np.float64),
+        np.concatenate(([0], np.cumsum(n_surfaces))).astype(np.int64),
+        np.concatenate([nothing, *(done[k].surfaces for k in kept if k in done)]),
+        join_roofs([done[k].roofs for k in kept if k in done]),
+    )
+
+
+def _count(
+    buildings: Sequence[ModelBuilding],
+    attempts: Sequence[Sequence[tuple[float, Faces]]],
+    place: Index,
+    found: tuple[dict[int, _Found], dict[int, shapely.Geometry]],
+    counts: Counter[str],
+) -> None:
+    done, places = found
+    counts["model buildings"] += len(buildings)
+    for k in range(len(buildings)):
+        if k in done:
+            level = done[k].lod
+            counts[f"model buildings at level {level:g}" if level >= 0 else "model buildings without level"] += 1
+            counts["model buildings at a lower level"] += int(place[k] > 1)
+            counts["model roof surfaces"] += len(done[k].surfaces)
+        elif k in places:
+            counts["model buildings with an outline alone"] += 1
+        else:
+            counts["model buildings without a place"] += 1
+
+
+def _note(
+    building: ModelBuilding,
+    attempts: Sequence[tuple[float, Faces]],
+    found: _Found | None,
+    place: Sequence[float] | None,
+) -> list[Note]:
+    """Tell of a building what could not be read of it, or not as it is."""
+    x, y = place if place is not None else (float("nan"), float("nan"))
+    tell = partial(Note, subject=building.id, x=x, y=y)
+    notes = [tell("model-fault", detail=fault) for fault in building.faults]
+    if found is not None:
+        if attempts[0][0] != found.lod:
+            notes.append(tell("model-lower-level", detail=f"level {attempts[0][0]:g} has no roof; {found.lod:g}"))
+        worst = float(found.residual.max())
+        if worst > NOT_PLANAR:
+            n = int((found.residual > NOT_PLANAR).sum())
+            detail = f"{n} of {len(found.surfaces)} roof surfaces are not planar, by {worst:.2f} m at most"
+            notes.append(tell("model-not-planar", detail=detail))
+    elif place is not None:
+        known = f"its height of {building.height:g} m" if building.height > 0 else "the default height"
+        notes.append(tell("model-no-roof", detail=f"no level has a roof; {known} is taken over its outline"))
+    else:
+        notes.append(tell("model-without-place", detail="it has neither faces that lie nor an outline; left out"))
+    return notes

@@ -1,0 +1,198 @@
+"""Files of city models: what kind they are, what they say of themselves, and their buildings one at a time."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pyproj
+
+from pipeline.data.errors import InputError
+from tiler.cityinput.citygml import Relief, scan_citygml
+from tiler.cityinput.cityjson import read_buildings, read_objects, read_relief
+from tiler.cityinput.crs_names import NamedCrs, read_crs_name
+from tiler.cityinput.face_planes import signed_volume, upward_area
+from tiler.cityinput.faces import ModelBuilding
+from tiler.cityinput.geopackage import SIGNATURE, scan_geopackage
+from tiler.georeference.crs import horizontal_crs, is_on_its_place
+from tiler.pointclouds.clouds import CloudHeader
+
+CLOUD, MODEL, TERRAIN = "cloud", "model", "terrain"
+_RASTERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+ENOUGH = 2000  # solids and roofs that tell the order of axes
+CLEAR = 0.9  # share of solids and roofs that agree on an order of axes
+
+
+def kind_of(path: Path) -> str:
+    """Whether a file is a point cloud, a city model or a raster of terrain, by its first bytes.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(4096)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    text = start.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if start.startswith(_RASTERS) or text.startswith(b"<VRTDataset"):
+        return TERRAIN
+    return MODEL if text[:1] in (b"{", b"<") or start.startswith(SIGNATURE) else CLOUD
+
+
+def scan_model(path: Path, height: str = "") -> Iterator[str | ModelBuilding | Relief]:
+    """Give the names of CRSs, the buildings and the terrain of a city model, in the order of the file.
+
+    Parameters
+    ----------
+    path : Path
+        CityJSON, CityJSONSeq or CityGML file, or a GeoPackage as of 3DBAG.
+    height : str
+        Attribute with the height above ground (m); ``""`` for the format's own.
+
+    Raises
+    ------
+    InputError
+        If the file is none of these, or damaged.
+    """
+    with path.open("rb") as file:
+        start = file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
+    if start[:1] == b"<":
+        yield from scan_citygml(path, height)
+        return
+    if start.startswith(SIGNATURE):
+        yield from scan_geopackage(path)
+        return
+    if start[:1] != b"{":
+        raise InputError(
+            f"{path}: is neither CityJSON nor CityGML nor a GeoPackage: it begins with {start[:20]!r}"
+        )
+    head, documents = read_objects(path)
+    if head.crs:
+        yield head.crs
+    for objects, vertices in documents:
+        yield from read_buildings(objects, vertices, height)
+        yield from map(Relief, read_relief(objects, vertices))
+
+
+@dataclass(eq=False)
+class _Survey:
+    low: list[float] = field(default_factory=lambda: [math.inf] * 3)
+    high: list[float] = field(default_factory=lambda: [-math.inf] * 3)
+    n_buildings: int = 0
+    n_vertices: int = 0
+    right: int = 0
+    wrong: int = 0
+
+    def add(self, building: ModelBuilding) -> None:
+        self.n_buildings += 1
+        for shape in building.shapes:
+            if not len(shape.faces):
+                continue
+            self.n_vertices += len(shape.faces.xyz)
+            for k, (low, high) in enumerate(
+                zip(shape.faces.xyz.min(axis=0).tolist(), shape.faces.xyz.max(axis=0).tolist(), strict=True)
+            ):
+                self.low[k], self.high[k] = min(self.low[k], low), max(self.high[k], high)
+            if self.right + self.wrong >= ENOUGH:
+                continue
+            sign = signed_volume(shape.faces) if shape.closed else upward_area(shape.faces)
+            self.right += sign > 0
+            self.wrong += sign < 0
+
+
+def read_model_header(path: Path, axis_order: str = "") -> CloudHeader:
+    """Read a city model once for its extent, its CRS and the order of its axes.
+
+    Parameters
+    ----------
+    path : Path
+        CityJSON, CityJSONSeq or CityGML file.
+    axis_order : str
+        ``"xy"`` for the easting first, ``"yx"`` for the northing first; ``""`` for what the file shows.
+
+    Returns
+    -------
+    CloudHeader
+        Of kind ``"model"``; its bounds have the easting first, and ``swapped`` says whether the file has not.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+
+    Notes
+    -----
+    A place in the area of use of the CRS decides the order of the axes; where both orders have one, or there is no
+    CRS, the solids and roofs do: with the wrong order volumes are negative and roofs look down. Where neither says
+    anything it is that of the name: a URN or a URL of OGC means the order of the register.
+    """
+    found, name = _Survey(), NamedCrs(None, False, "")
+    for each in scan_model(path):
+        if isinstance(each, str):
+            name = name if name.text else read_crs_name(each)
+        elif isinstance(each, ModelBuilding):
+            found.add(each)
+    low, high = found.low, found.high
+    n = found.n_vertices
+    box = (low[0], low[1], high[0], high[1]) if n else (math.nan,) * 4
+    if n and not np.isfinite(box).all():
+        raise InputError(f"{path}: a coordinate is not finite; mend the file")
+    swapped, why = choose_axes(name, box, (found.right, found.wrong), axis_order) if n else (False, "")
+    if swapped:
+        box = (box[1], box[0], box[3], box[2])
+    heights = (low[2], high[2]) if n else (math.nan, math.nan)
+    unread = f"the name {name.text!r} of its CRS is not understood" if name.text and name.crs is None else ""
+    return CloudHeader(
+        path, n, (*box, *heights), name.crs, unread=unread, kind=MODEL, swapped=swapped, axes=why,
+        n_buildings=found.n_buildings,
+    )  # fmt: skip
+
+
+def choose_axes(
+    name: NamedCrs, box: tuple[float, float, float, float], sense: tuple[int, int], asked: str
+) -> tuple[bool, str]:
+    """Decide whether the northing comes first in a file.
+
+    Parameters
+    ----------
+    name : NamedCrs
+        What the file says of its CRS.
+    box : tuple of 4 floats
+        Least and greatest first and second coordinates: first, second, first, second.
+    sense : (int, int)
+        Solids and roofs that look outwards and inwards with the first coordinate as the easting.
+    asked : str
+        ``"xy"``, ``"yx"`` or ``""``.
+
+    Returns
+    -------
+    bool
+        Whether the northing comes first.
+    str
+        What decided, ``""`` where the easting comes first and nothing contradicts.
+    """
+    if asked:
+        return asked == "yx", "by --axis-order"
+    other = (box[1], box[0], box[3], box[2])
+    flat = horizontal_crs(name.crs)
+    north_first = name.registered_axes and flat is not None and _is_north_first(flat)
+    as_is, turned = (flat is None or is_on_its_place(one, flat) for one in (box, other))
+    right, wrong = sense
+    if as_is != turned:
+        words = "it lies in the area of use of its CRS this way alone"
+        return turned, words if turned or north_first else ""
+    if wrong > CLEAR * (right + wrong):
+        return True, f"{wrong} of {right + wrong} solids and roofs would be inside out otherwise"
+    if right > CLEAR * (right + wrong):
+        return False, f"{right} of {right + wrong} solids and roofs are right this way" if north_first else ""
+    return north_first, "by the name of its CRS" if north_first else ""
+
+
+def _is_north_first(crs: pyproj.CRS) -> bool:
+    """Whether the first axis of a CRS is its northing or its latitude."""
+    first, second = (axis.direction.lower() for axis in crs.axis_info[:2])
+    return first == "north" and second == "east"
