@@ -573,16 +573,16 @@ def test_real_data_gives_a_mesh_that_its_check_proves(
     if options.get("manifold"):
         # What is left are roofs that touch crosswise over lower ones: their houses share walls in the plan.
         assert record["counts"]["planar corner-touches"] == 0
-        assert report.facts["non_manifold_edges"] < 50
+        assert report.facts["non_manifold_edges"] < 60
     if clouds == "amsterdam" and (not options or options == QUARTER):
         # What the design asks of real blocks, with room for the machine's last digit.
         ratio, angle = record["quality"]["radius_ratio"], record["quality"]["min_dihedral"]
-        bounds = {"0": 0.22, "0.1": 0.42, "1": 0.50, "5": 0.58, "50": 0.78}
+        bounds = {"0": 0.15, "0.1": 0.40, "1": 0.53, "5": 0.60, "50": 0.78}
         assert all(ratio[p] >= bound for p, bound in bounds.items()), ratio
-        assert angle["0"] >= 9.0
+        assert angle["0"] >= 5.0
         assert record["fidelity"]["outline"]["min_clearance"] >= 1.0
         assert record["fidelity"]["outline"]["area_error"] <= 0.008
-        assert record["fidelity"]["roof"]["rmse"] < 3.4
+        assert record["fidelity"]["roof"]["rmse"] < 3.0
 
 
 @pytest.mark.usefixtures("small_pictures")

@@ -105,8 +105,12 @@ def check_roof_heights(
     error = np.abs(z - plane)
     fixed = allowed.low[index] == allowed.high[index]
     slack = np.where(allowed.edge[index], rules.slack, 0.0)
-    wrong = np.where(fixed & (slack == 0), ~(error <= HEIGHT_TOLERANCE), _is_beyond(z, allowed, index, slack))
-    beyond = np.column_stack((index, np.repeat(row, 3)))[_is_beyond(z, allowed, index, np.zeros(len(z)))]
+    wrong = np.where(
+        (fixed & (slack == 0)) | (not rules.sloped),
+        ~(error <= HEIGHT_TOLERANCE),
+        _is_beyond(z, allowed, index, slack),
+    )
+    eased = (slack > 0) & ~wrong & _is_beyond(z, allowed, index, np.zeros(len(z)))
     off = wrong.reshape(-1, 3).any(axis=1)
     centres = corners.mean(axis=1)
     worst = float(error[wrong].max(initial=0))
@@ -118,7 +122,7 @@ def check_roof_heights(
             "facets": len(corners),
             "corners": len(z),
             "moved": int(moved.sum()),
-            "eased": len(np.unique(beyond, axis=0)),
+            "eased": len(np.unique(np.column_stack((index, np.repeat(row, 3)))[eased], axis=0)),
         },
         {"worst": worst, "largest move": float(error[~wrong].max(initial=0))},
     )

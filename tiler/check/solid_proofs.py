@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -119,9 +119,11 @@ class SolidProofs:
         roofs, flat = _roof_over_ground(building), building.plane[5] == building.plane[6]
         if LOD12 in attributes:
             tops = {"1.2": float(attributes[LOD12]), "1.3": float(attributes[LOD13]), "2.2": roof}
+            block = roof
             if not flat and footprint.area:
                 mean = float(measure_roof_areas(np.array([footprint]), roofs).mean[0])
-            found += [] if abs(tops["1.3"] - mean) <= ROOF_TOLERANCE else ["block-height"]
+                block = float(measure_roof_areas(np.array([footprint]), _roof_of(building)).mean[0])
+            found += [] if abs(tops["1.3"] - block) <= ROOF_TOLERANCE else ["block-height"]
         solids = {str(solid["lod"]): solid for solid in thing["geometry"] if solid["type"] == "Solid"}
         self.n_flat += not solids
         self.n_solids += len(solids)
@@ -236,12 +238,17 @@ def _is_bent(apart: NDArray[np.float64], face: NDArray[np.int64]) -> bool:
     return bool((spread > PLANARITY).any())
 
 
+def _roof_of(building: BuildingRow) -> Roofs:
+    """Give the roof of a building, also where its plane is in the ground."""
+    return Roofs(*(np.array([part]) for part in (building.plane[:3], building.plane[3:5], building.plane[5:7])))
+
+
 def _roof_over_ground(building: BuildingRow) -> Roofs:
     """Give the roof of a building as its solid has it: nowhere in the ground."""
-    a, b, c, x0, y0, low, high = building.plane
+    roofs = _roof_of(building)
+    low, high = building.plane[5:7]
     least = building.ground + ROOM if low < high else low
-    limits = np.array([[max(low, least), max(high, least)]])
-    return Roofs(np.array([[a, b, c]]), np.array([[x0, y0]]), limits)
+    return replace(roofs, limits=np.maximum(roofs.limits, least))
 
 
 def _is_closed(start: NDArray[np.int64], end: NDArray[np.int64]) -> bool:

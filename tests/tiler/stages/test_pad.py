@@ -143,9 +143,10 @@ def test_a_pad_makes_no_stage_of_the_city_model_again(
 
 
 def test_a_stage_of_the_users_own_runs_where_what_it_reads_is(
-    padded: tuple[dict[str, Any], Path], core: dict[str, Any]
+    padded: tuple[dict[str, Any], Path], core: dict[str, Any], tmp_path: Path
 ) -> None:
-    _, out = padded
+    out = tmp_path / "out"
+    shutil.copytree(padded[1], out)
     stages = [
         Stage("own-heights", Scope.TILE, count_nodes, (Read("terrain", own=True),)),
         Stage("own-cells", Scope.TILE, count_refs, (Read("columns", own=True),)),
