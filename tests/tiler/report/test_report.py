@@ -351,7 +351,6 @@ def test_run_facts_hold_little_of_long_lists(copy: Path) -> None:
 
 def test_roofs_of_planes_are_told_by_method_and_the_worst_are_listed(copy: Path) -> None:
     record = json.loads((copy / "run.json").read_text())
-    assert "roof_fit" not in record["fidelity"]
     fit = {
         "planes": {"buildings": 1234, "points": 56789, "rmse": 1.25, "median": 0.125, "within": 0.75},
         "family": {"buildings": 5, "points": 3 * 56789, "rmse": 0.25, "median": 0.5, "within": 0.5},
