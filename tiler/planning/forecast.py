@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.plane_mesh.sizes import SizeField, local_sizes, size_field_around
 from stitch.tiling.grid import Bounds, TileGrid, seams_present, tiles_present
 from stitch.tiling.smallest_tile import LEAST_TILE
-from tiler.config.config import Config
+from tiler.config.config import Config, roofs_stay_flat
 from tiler.config.step_options import expected_levels, size_rule
 from tiler.engine.stage import Scope
 from tiler.planning.footprint_sample import FootprintSample
@@ -23,6 +23,7 @@ TRIANGLES = 3.07  # on open ground, in one squared mesh size
 TRIANGLES_AN_OCTAVE = 2.4  # layered: at a wall, for each halving of the mesh size down to the wall's length
 FULL_SPACING = 0.785  # mesh sizes; levels above open ground are this far apart where 0.8 is allowed
 CELLS_AT_WALLS = 22.0  # adaptive: in each metre of height, for each 1/m that walls are finer than the mesh
+CELLS_OF_SLOPES = 1.16  # of those with flat roofs: in Amsterdam
 BUILT_HEIGHT = 10.0  # m; height of houses, which no cells fill
 CELLS_A_POINT = 5.5
 BYTES_A_LIDAR_POINT = 7.2  # of disk
@@ -220,6 +221,8 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
         spacing = h * FULL_SPACING / 0.8 * min(config.most_spacing, 1.0)
         closer = expected_levels(config, spacing) * spacing / height
         cells = 3 * TRIANGLES * volume * thin / (h**2 * spacing) * closer + CELLS_AT_WALLS * height * detail
+        if config.roofs != "flat" and not roofs_stay_flat(config.mesher, config.simplify):
+            cells = CELLS_OF_SLOPES * cells
     else:
         layers = max(round(expected_levels(config, config.layer_height_or_default)), 1)
         triangles = TRIANGLES * area * thin / h**2 + TRIANGLES_AN_OCTAVE * octaves

@@ -136,7 +136,13 @@ def amsterdam(shared_data: Path, **given: Any) -> Config:
 def test_cells_of_a_dense_city(
     shared_data: Path, mesher: str, mesh_size: float, height: float, cells: int
 ) -> None:
-    given = {"tile_size": 300.0, "mesh_size": mesh_size, "mesher": mesher, "domain_height": height}
+    given = {
+        "tile_size": 300.0,
+        "mesh_size": mesh_size,
+        "mesher": mesher,
+        "domain_height": height,
+        "roofs": "flat",
+    }
     config = amsterdam(shared_data, **given)
     assert cells / 1.25 < forecast_of(config).loads.cells.sum() < 1.25 * cells
 
