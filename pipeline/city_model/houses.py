@@ -23,7 +23,7 @@ from pipeline.data.roof_forms import NO_FORM, POINTS_TELL, SHAPE
 from pipeline.data.roofs import Roofs, flat_roofs, join_roofs, take_roofs
 from pipeline.geometry.inside import find_inside
 from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
-from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions, fit_roofs
+from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions, fit_roofs, replace_roofs
 from pipeline.roofs.roof_points import (
     RoofPoints,
     add_roof_points,
@@ -160,18 +160,14 @@ def _fit_sloped(
     Where planes are, points tell the roof if they are enough; else a given form does, and at last the outline.
     """
     model = city.model
-    wanted = RoofOptions(clearance=options.clearance)
-    known = np.zeros(len(model), np.bool_) if surfaces is None else np.diff(surfaces.start) > 0
-    few = fit_roofs(model.polygons, _leave_out(points, known), wanted)
-    laid, told_of = np.zeros(len(model), np.bool_), list[Note]()
-    if surfaces is not None:
-        few, laid, told_of = lay_surfaces(few, city, surfaces)
-        if (known & ~laid).any():  # their points tell the roof after all
-            others = fit_roofs(model.polygons, _leave_out(points, laid), wanted)
-            few, laid, told_of = lay_surfaces(others, city, surfaces)
-    left = ~laid & (few.too_few if options.roofs == "planes" else True)
+    new, told_of = ({}, []) if surfaces is None else lay_surfaces(city, surfaces)
+    laid = np.zeros(len(model), np.bool_)
+    laid[list(new)] = True
+    fitted = fit_roofs(model.polygons, _leave_out(points, laid), RoofOptions(clearance=options.clearance))
+    fitted = replace_roofs(fitted, new)
+    left = ~laid & (fitted.too_few if options.roofs == "planes" else True)
     given = np.isfinite(city.forms[:, SHAPE])
-    fitted, form, notes = form_roofs(few, city, points, given & left)
+    fitted, form, notes = form_roofs(fitted, city, points, given & left)
     form[given & ~left & ~laid] = POINTS_TELL
     told = city.roof_source != ROOF_SOURCES.index("default")
     hipped = left & (form < 0) & (told if options.roofs == "planes" else True)

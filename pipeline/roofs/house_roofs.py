@@ -38,6 +38,9 @@ DENSITY = 6.0  # points a m², of which denser ones are thinned to up to twice a
 
 Array = NDArray[np.float64]
 
+# Parts of a house, their roofs, and where they come from: an index into `ROOF_METHODS`.
+NewRoof = tuple[NDArray[np.object_], Roofs, int]
+
 
 @dataclass(frozen=True)
 class RoofOptions:
@@ -152,15 +155,15 @@ def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOp
     return _assemble(polygons, origin, heights, too_few, fitted)
 
 
-def replace_roofs(fitted: HouseRoofs, new: Mapping[int, tuple[NDArray[np.object_], Roofs, int]]) -> HouseRoofs:
+def replace_roofs(fitted: HouseRoofs, new: Mapping[int, NewRoof]) -> HouseRoofs:
     """Put other roofs in the place of those of some houses.
 
     Parameters
     ----------
     fitted : HouseRoofs
         Roofs of all houses.
-    new : mapping of int to (object (p,), Roofs, int)
-        By the row of the house, its parts, their roofs, and where they come from: an index into `ROOF_METHODS`.
+    new : mapping of int to NewRoof
+        By the row of the house.
     """
     if not new:
         return fitted

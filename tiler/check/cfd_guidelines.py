@@ -17,8 +17,8 @@ import numpy as np
 
 from pipeline.data.errors import ConfigError
 from pipeline.quality.histograms import percentile
-from tiler.check.cfd_survey import PEDESTRIAN, CfdSurvey, survey_domain
-from tiler.export.wind_profile import SIDES, WEST, split_sides
+from tiler.check.cfd_survey import CfdSurvey, survey_domain
+from tiler.export.wind_profile import PEDESTRIAN_HEIGHT, SIDES, WEST, split_sides
 
 COST, AIJ = "COST 732", "AIJ"
 INLET, LATERAL, TOP = 5.0, 5.0, 5.0  # heights of the tallest building
@@ -178,7 +178,7 @@ def _cell_rows(survey: CfdSurvey) -> list[CfdRow]:
     cells = float(np.median(sides)) if len(sides) else 0.0
     enough = cells >= CELLS_A_SIDE
     second = percentile(survey.second, MOST)
-    low = second <= PEDESTRIAN
+    low = second <= PEDESTRIAN_HEIGHT
     first = percentile(survey.first, 50.0)
     return [
         CfdRow(
@@ -196,10 +196,10 @@ def _cell_rows(survey: CfdSurvey) -> list[CfdRow]:
             f"a --mesh-size of {cells / CELLS_A_SIDE:.2f} times the present one",
         ),
         CfdRow(
-            f"cells below {PEDESTRIAN} m",
+            f"cells below {PEDESTRIAN_HEIGHT} m",
             f"first {first:.2f} m high, third begins at {second:.2f} m for {MOST:g} %",
-            (f"third <= {PEDESTRIAN} m", f"third <= {PEDESTRIAN} m"),
+            (f"third <= {PEDESTRIAN_HEIGHT} m", f"third <= {PEDESTRIAN_HEIGHT} m"),
             (low, low),
-            f"--first-layer {PEDESTRIAN / 2.2:.1f}",
+            f"--first-layer {PEDESTRIAN_HEIGHT / 2.2:.1f}",
         ),
     ]

@@ -19,7 +19,6 @@ from tiler.store.run_folder import read_run_record
 
 Floats = NDArray[np.float64]
 Bounds = tuple[float, float, float, float]
-PEDESTRIAN = 1.75  # m above ground
 BATCH = 10_000  # buildings that are loaded together
 STRIP = 1.0  # m; width of the strips in which the outline of the city is seen from the front
 RATIOS, HEIGHTS = ((1.0, 6.0), 5000), ((0.0, 50.0), 10_000)

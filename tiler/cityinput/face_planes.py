@@ -53,14 +53,11 @@ def find_planes(faces: Faces) -> FacePlanes:
         return FacePlanes(np.empty((0, 3)), np.empty((0, 3)), *(np.empty(0) for _ in range(3)))
     border = faces.face_start[:-1]
     rings = area_vectors(faces.xyz, faces.ring_start)
-    normal = 2 * rings[border]  # holes run the other way round, or should
     lengths = np.linalg.norm(rings, axis=1)
-    normal = (
-        rings[border]
-        * np.maximum(
-            1 - (np.add.reduceat(lengths, border) - lengths[border]) / np.maximum(lengths[border], 1e-12), 0.0
-        )[:, np.newaxis]
-    )
+    whole = np.maximum(lengths[border], 1e-12)
+    # Holes are taken away by their size: they should run the other way round, but do not always.
+    left = np.maximum(1 - (np.add.reduceat(lengths, border) - lengths[border]) / whole, 0.0)
+    normal = rings[border] * left[:, np.newaxis]
     first, last = faces.ring_start[border], faces.ring_start[border + 1]
     # Sums of the border's vertices alone: those of holes lie behind them.
     ends = np.column_stack((first, last)).ravel()

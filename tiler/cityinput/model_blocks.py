@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.classes import BUILDING, GROUND
 from pipeline.data.notes import Note
-from pipeline.data.roofs import Roofs, roof_heights
+from pipeline.data.roofs import plane_heights
 from tiler.cityinput.citygml import Relief
 from tiler.cityinput.face_planes import find_planes
 from tiler.cityinput.faces import Faces, ModelBuilding
@@ -163,15 +163,9 @@ def _sample_roofs(rows: ModelRows) -> Array:
     surface, node = grid_polygons(rows.surfaces, STEP)
     owner = np.repeat(np.arange(len(rows)), np.diff(rows.start))[surface]
     xy = np.asarray((node + 0.5) * STEP, np.float64)
-    z = roof_heights(_without_room(rows.roofs), surface, xy)
+    z = plane_heights(rows.roofs, surface, xy)
     top = highest_nodes(owner, node, z, grid_polygons(rows.outlines, STEP))
     return np.column_stack((xy, z))[top]
-
-
-def _without_room(roofs: Roofs) -> Roofs:
-    """Roofs whose planes are not cut: nodes lie within their surfaces."""
-    free = np.column_stack((np.full(len(roofs), -np.inf), np.full(len(roofs), np.inf)))
-    return Roofs(roofs.plane, roofs.origin, free)
 
 
 def _sample_feet(rows: ModelRows) -> Array:

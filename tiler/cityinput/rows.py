@@ -152,7 +152,7 @@ def make_rows(
     places = _find_outlines([each for each in outlines if len(each[2])], (frame, shift))
     notes: list[Note] = []
     kept = [k for k in range(len(buildings)) if k in done or k in places]
-    _count(buildings, attempts, place, (done, places), counts)
+    _count(len(buildings), place, (done, places), counts)
     rows = _assemble(buildings, kept, done, places)
     xy = shapely.get_coordinates(shapely.point_on_surface(rows.outlines)).reshape(-1, 2)
     where = dict(zip(kept, xy.tolist(), strict=True))
@@ -291,15 +291,14 @@ def _assemble(
 
 
 def _count(
-    buildings: Sequence[ModelBuilding],
-    attempts: Sequence[Sequence[tuple[float, Faces]]],
+    n: int,
     place: Index,
     found: tuple[dict[int, _Found], dict[int, shapely.Geometry]],
     counts: Counter[str],
 ) -> None:
     done, places = found
-    counts["model buildings"] += len(buildings)
-    for k in range(len(buildings)):
+    counts["model buildings"] += n
+    for k in range(n):
         if k in done:
             level = done[k].lod
             counts[f"model buildings at level {level:g}" if level >= 0 else "model buildings without level"] += 1

@@ -338,6 +338,11 @@ class Config:
         return self.buildings or ((self.footprints,) if self.footprints else ())
 
     @property
+    def has_sloped_roofs(self) -> bool:
+        """Whether roofs may slope: they are asked for, and the mesher and the simplification know them."""
+        return self.roofs != "flat" and not roofs_stay_flat(self.mesher, self.simplify)
+
+    @property
     def padded(self) -> bool:
         """Whether there is a pad around the region."""
         return any(width != 0 for width in self.pad)
@@ -420,7 +425,7 @@ def idle_parameters(config: Config) -> list[str]:
         and getattr(config, other) != value
         and not (config.underground and name in SOIL)
     ]
-    if config.roofs != "flat" and not roofs_stay_flat(config.mesher, config.simplify):
+    if config.has_sloped_roofs:
         idle += [
             f"{name} = {getattr(config, name)} has no effect: it counts with roofs = flat"
             for name in OF_FLAT_ROOFS

@@ -10,7 +10,7 @@ from pipeline.columns.spacing import SpacingLimits
 from pipeline.columns.underground import SoilOptions
 from pipeline.data.roofs import Weld
 from pipeline.plane_mesh.sizes import SizeRule
-from tiler.config.config import Config, roofs_stay_flat
+from tiler.config.config import Config
 from tiler.config.declared import Declared
 from tiler.config.domain_height import Domain
 
@@ -60,7 +60,7 @@ def derived_parameters(config: Config) -> dict[str, float | str | bool]:
     """
     spacing = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
     return {
-        "roofs_or_flat": "flat" if roofs_stay_flat(config.mesher, config.simplify) else config.roofs,
+        "roofs_or_flat": config.roofs if config.has_sloped_roofs else "flat",
         "layer_height_or_default": config.layer_height_or_default,
         "graded_size": config.graded_size,
         "tile_size_or_default": config.tile_size_or_default,
@@ -81,8 +81,7 @@ def needs_region(config: Config) -> bool:
 def layer_parameters(config: Config) -> tuple[str, ...]:
     """Parameters of the columns: those of features only where these are used, so that keys stay without them."""
     growth = ("first_layer", "layer_growth") if config.first_layer else ()
-    sloped = derived_parameters(config)["roofs_or_flat"] != "flat"
-    roofs = ("roofs_or_flat", "roof_clearance_or_spacing") if sloped else ()
+    roofs = ("roofs_or_flat", "roof_clearance_or_spacing") if config.has_sloped_roofs else ()
     return (*LAYER_PARAMETERS, *growth, *roofs, *(("top_elevation",) if config.top == "flat" else ()))
 
 

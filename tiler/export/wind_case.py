@@ -21,6 +21,7 @@ from tiler.export.wind_profile import (
     C_1,
     C_2,
     C_MU,
+    PEDESTRIAN_HEIGHT,
     SIDES,
     SIGMA_EPSILON,
     Wind,
@@ -36,7 +37,6 @@ SOLID = ("walls", "roofs")
 BUILDINGS = '"building_.*"'
 PARTS = '"procBoundary.*"'
 PEDESTRIAN = "pedestrian"  # function object, surface and results of it
-PEDESTRIAN_HEIGHT = 1.75  # m above ground
 
 CONDITIONS = """// Wind from {direction:g} degrees at {sides}: change it here, for all parts.
 Uref    {speed};  // m/s, at the height Zref above the inlet's lowest point

@@ -15,6 +15,7 @@ KAPPA, C_MU, C_1, C_2 = 0.41, 0.09, 1.44, 1.92
 # The profile solves the equation of epsilon with this alone (Richards and Hoxey 1993); 1.3 is the usual one.
 SIGMA_EPSILON = KAPPA**2 / ((C_2 - C_1) * math.sqrt(C_MU))
 PARALLEL = 1e-6  # a side is along the wind if the cosine of its normal with it is smaller
+PEDESTRIAN_HEIGHT = 1.75  # m above ground, at which the comfort of people is told
 SIDES = {"west": (-1.0, 0.0), "east": (1.0, 0.0), "south": (0.0, -1.0), "north": (0.0, 1.0)}
 WEST = 270.0
 

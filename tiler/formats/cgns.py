@@ -21,9 +21,8 @@ from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
 from tiler.export.pieces import Pieces, blocks_of
 from tiler.mesh_files.mesh_pieces import open_pieces
-from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
+from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import disk_errors, replacing
-from tiler.store.run_folder import read_crs
 
 VERSION = 3.3  # of CGNS, the first in which all that is written has today's meaning
 TRIANGLE, TETRAHEDRON = 5, 10  # TRI_3 and TETRA_4 among CGNS's types of elements
@@ -72,7 +71,7 @@ def export_cgns(output: Path, source: RunSource, *, buildings: str | None = None
         If the file cannot be written.
     """
     pieces = open_pieces(source)
-    crs = read_crs((source.directory if isinstance(source, RunFiles) else source) / RUN_RECORD)
+    crs = crs_of(source)
     with replacing(output) as part, disk_errors(output):
         write_cgns(part, pieces, crs=crs, buildings=buildings)
 

@@ -24,9 +24,8 @@ from tiler.export.surface import (
     place_vertices,
     survey_surface,
 )
-from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
+from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import replacing
-from tiler.store.run_folder import read_crs
 
 FLOAT, UNSIGNED_INT = 5126, 5125
 VERTICES, INDICES = 34962, 34963  # targets of buffer views
@@ -65,7 +64,7 @@ def export_glb(output: Path, source: RunSource, *, buildings: str | None = None)
         If the file cannot be written.
     """
     surface = open_surface(source)
-    crs = read_crs((source.directory if isinstance(source, RunFiles) else source) / RUN_RECORD)
+    crs = crs_of(source)
     with replacing(output) as part:
         write_glb(part, surface, crs=crs, buildings=buildings)
 

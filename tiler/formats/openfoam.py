@@ -25,12 +25,11 @@ from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, interface_nam
 from tiler.export.pedestrian_surface import write_pedestrian_surface
 from tiler.export.pieces import Pieces
 from tiler.export.region_faces import Ints, find_outer, survey_faces
-from tiler.export.wind_case import PEDESTRIAN, PEDESTRIAN_HEIGHT, Domain, write_wind_cases
-from tiler.export.wind_profile import Wind, WindWords, make_wind
+from tiler.export.wind_case import PEDESTRIAN, Domain, write_wind_cases
+from tiler.export.wind_profile import PEDESTRIAN_HEIGHT, Wind, WindWords, make_wind
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
-from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
+from tiler.mesh_files.run_files import RunFiles, RunSource, crs_of
 from tiler.store.atomic import replacing_folder
-from tiler.store.run_folder import read_crs
 
 # Roughness lengths between rough ground and the centres of its cells. Over bare ground the profile stays within
 # 2 % at 3 of them, and is 19 % off at 0.6: docs/wind.md.
@@ -103,7 +102,7 @@ def export_openfoam(
         (folder / "case.foam").touch()
         record = _record(counts, parts)
         if case is not None:
-            crs = read_crs(pieces.files.directory / RUN_RECORD)
+            crs = crs_of(pieces.files)
             record |= {"crs": crs, "wind": asdict(blowing), "notes": notes}
         (folder / EXPORT_RECORD).write_text(json.dumps(record, indent=1) + "\n")
     return notes

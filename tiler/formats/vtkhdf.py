@@ -14,9 +14,8 @@ from tiler.export.export import LARGEST_PART, Format
 from tiler.export.pieces import ROWS, Pieces, blocks_of, slices
 from tiler.export.surface import place_vertices, survey_surface
 from tiler.mesh_files.mesh_pieces import open_pieces
-from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource
+from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import disk_errors, replacing
-from tiler.store.run_folder import read_crs
 
 VERSION = (2, 2)  # of the format that VTK 9.4 reads
 ROOT = "VTKHDF"
@@ -43,8 +42,7 @@ def export_vtkhdf(output: Path, source: RunSource) -> None:
         If the file cannot be written.
     """
     pieces = open_pieces(source)
-    directory = source.directory if isinstance(source, RunFiles) else source
-    crs = read_crs(directory / RUN_RECORD)
+    crs = crs_of(source)
     with replacing(output) as part, disk_errors(output):
         write_vtkhdf(part, pieces, crs=crs)
 

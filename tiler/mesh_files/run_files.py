@@ -75,6 +75,13 @@ def refuse_strangers(directory: Path) -> None:
         )
 
 
+def crs_of(source: RunSource) -> str:
+    """Read the CRS of a run's coordinates; errors as `tiler.store.run_folder.read_crs`."""
+    from tiler.store.run_folder import read_crs
+
+    return read_crs((source.directory if isinstance(source, RunFiles) else source) / RUN_RECORD)
+
+
 def take_largest_part(files: RunFiles) -> RunFiles:
     """Take the pieces of the part of a mesh that has the most cells, where parts share no face.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.plane_mesh.sizes import SizeField, local_sizes, size_field_around
 from stitch.tiling.grid import Bounds, TileGrid, seams_present, tiles_present
 from stitch.tiling.smallest_tile import LEAST_TILE
-from tiler.config.config import Config, roofs_stay_flat
+from tiler.config.config import Config
 from tiler.config.step_options import expected_levels, size_rule
 from tiler.engine.stage import Scope
 from tiler.planning.footprint_sample import FootprintSample
@@ -221,7 +221,7 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
         spacing = h * FULL_SPACING / 0.8 * min(config.most_spacing, 1.0)
         closer = expected_levels(config, spacing) * spacing / height
         cells = 3 * TRIANGLES * volume * thin / (h**2 * spacing) * closer + CELLS_AT_WALLS * height * detail
-        if config.roofs != "flat" and not roofs_stay_flat(config.mesher, config.simplify):
+        if config.has_sloped_roofs:
             cells = CELLS_OF_SLOPES * cells
     else:
         layers = max(round(expected_levels(config, config.layer_height_or_default)), 1)

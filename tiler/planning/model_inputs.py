@@ -11,7 +11,7 @@ from tiler.cityinput.sources import CLOUD, MODEL, TERRAIN, kind_of, read_model_h
 from tiler.config.config import Config
 from tiler.georeference.frame import Frame
 from tiler.objects.places import identify, is_url
-from tiler.pointclouds.clouds import CloudHeader
+from tiler.pointclouds.clouds import CloudHeader, each_once, list_files
 
 MARGIN = 20.0  # m around the buildings of a city model that are meshed, where there is no point cloud
 SUFFIXES = {
@@ -20,7 +20,6 @@ SUFFIXES = {
 }
 WORDS = {MODEL: "city model", TERRAIN: "raster of terrain"}
 OPTIONS = {MODEL: "--buildings", TERRAIN: "--terrain"}
-_GLOB_SIGNS = set("*?[")
 
 
 def read_other_headers(config: Config) -> tuple[list[CloudHeader], dict[str, str]]:
@@ -70,22 +69,15 @@ def find_files(sources: Sequence[str], kind: str) -> list[Path]:
     InputError
         If one is missing, stands for no file, or is a URL.
     """
-    found: dict[Path, Path] = {}
+    found: list[Path] = []
     for source in sources:
         if is_url(source):
             raise InputError(f"{source}: a {WORDS[kind]} is read from a disk; copy it there")
-        path = Path(source)
-        if path.is_dir():
-            files = [one for one in path.iterdir() if one.name.lower().endswith(SUFFIXES[kind])]
-        elif path.is_file() or not _GLOB_SIGNS & set(source):
-            files = [path] if path.is_file() else []
-        else:
-            anchor = Path(path.anchor) if path.is_absolute() else Path()
-            files = sorted(one for one in anchor.glob(str(path.relative_to(path.anchor))) if one.is_file())
+        files = list_files(Path(source), SUFFIXES[kind])
         if not files:
             raise InputError(f"{source}: no {WORDS[kind]} is there; check the path")
-        found |= {one.resolve(): one for one in sorted(files, reverse=True)}
-    return sorted(found.values())
+        found += files
+    return each_once(found)
 
 
 def order_headers(headers: Sequence[CloudHeader]) -> list[CloudHeader]:

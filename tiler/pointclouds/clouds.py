@@ -1,7 +1,7 @@
 """Point cloud files: find them, and say what their headers say (step 1.1)."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,10 +92,47 @@ def find_clouds(sources: Sequence[str | Path]) -> list[Path]:
     """
     if not sources:
         raise InputError("no point cloud was given; name a file, a folder or a glob such as 'tiles/*.laz'")
-    local = [source for source in sources if not is_url(str(source))]
-    files = [path for source in local for path in _expand(Path(source))]
+    files = [path for source in sources if not is_url(str(source)) for path in _find(Path(source))]
     remote = {path for source in sources if is_url(str(source)) for path in _expand_url(str(source))}
-    return sorted({path.resolve(): path for path in sorted(files, reverse=True)}.values()) + sorted(remote)
+    return each_once(files) + sorted(remote)
+
+
+def list_files(source: Path, suffixes: Collection[str]) -> list[Path]:
+    """List the files that a file, a pattern or a folder stands for; none where nothing is there.
+
+    Parameters
+    ----------
+    source : Path
+        Of a folder the files with one of the suffixes, in any case; hidden ones are not meant, such as the
+        ``._x.laz`` of macOS archives.
+    suffixes : collection of str
+        As ``.laz``, in lower case.
+
+    Raises
+    ------
+    InputError
+        If a folder cannot be read, or a pattern cannot be followed.
+    """
+    try:
+        if source.is_dir():
+            return [path for path in source.iterdir() if _is_meant(path, suffixes) and path.is_file()]
+        if source.is_file():
+            return [source]
+        return _glob(source) if is_pattern(source) else []
+    except OSError as error:
+        raise InputError(
+            f"{source}: cannot be read ({error.strerror}); check the path and its permissions"
+        ) from error
+
+
+def is_pattern(source: Path) -> bool:
+    """Whether a path has signs of a pattern."""
+    return bool(_GLOB_SIGNS & set(str(source)))
+
+
+def each_once(files: Iterable[Path]) -> list[Path]:
+    """Sort files; of those that are one by symbolic links the first name counts."""
+    return sorted({path.resolve(): path for path in sorted(files, reverse=True)}.values())
 
 
 def read_header(path: str | Path) -> CloudHeader:
@@ -120,22 +157,13 @@ def read_header(path: str | Path) -> CloudHeader:
     return CloudHeader(path, header.point_count, bounds, stated.crs, *units, stated.unread, differs)
 
 
-def _expand(source: Path) -> list[Path]:
-    try:
-        return _find(source)
-    except OSError as error:
-        raise InputError(
-            f"{source}: cannot be read ({error.strerror}); check the path and its permissions"
-        ) from error
-
-
 def _expand_url(source: str) -> list[Path]:
     path = place(source)
     try:
         if path.suffix.lower() in _SUFFIXES:
             path.stat()
             return [path]
-        found = [one for one in path.iterdir() if _is_cloud(one) and one.is_file()]
+        found = [one for one in path.iterdir() if _is_meant(one, _SUFFIXES) and one.is_file()]
     except OSError as error:
         raise InputError(f"{source}: cannot be read ({error.strerror}); check the URL") from error
     if not found:
@@ -143,24 +171,17 @@ def _expand_url(source: str) -> list[Path]:
     return found
 
 
-def _is_cloud(path: Path) -> bool:
-    """Whether a file of a folder is meant: hidden ones are not, such as the ``._x.laz`` of macOS archives."""
-    return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
+def _is_meant(path: Path, suffixes: Collection[str]) -> bool:
+    return path.suffix.lower() in suffixes and not path.name.startswith(".")
 
 
 def _find(source: Path) -> list[Path]:
+    if found := list_files(source, _SUFFIXES):
+        return found
     if source.is_dir():
-        found = [path for path in source.iterdir() if _is_cloud(path) and path.is_file()]
-        if not found:
-            raise InputError(f"{source}: the folder holds no .las or .laz file; name the folder of the tiles")
-        return found
-    if source.is_file():
-        return [source]
-    if _GLOB_SIGNS & set(str(source)):
-        found = _glob(source)
-        if not found:
-            raise InputError(f"{source}: the pattern matches no file; check the folder's name")
-        return found
+        raise InputError(f"{source}: the folder holds no .las or .laz file; name the folder of the tiles")
+    if is_pattern(source):
+        raise InputError(f"{source}: the pattern matches no file; check the folder's name")
     raise InputError(f"{source}: no such file or folder; check the path")
 
 

@@ -112,7 +112,7 @@ def read_model_bands(task: Task) -> Iterator[tuple[Footprints, list[Note]]]:
     a city share the buildings on their borders. A file that has an id twice keeps both: cleaning numbers them.
     """
     files = list_kind(task, MODEL)
-    best = _find_doubles(task, [name for name, _ in files]) if len(files) > 1 else {}
+    best = _find_doubles(task, files) if len(files) > 1 else {}
     for name, facts in files:
         for first in range(0, facts["n"], BAND):
             rows = unpack_rows(partial(_read, task, name), [(first, min(first + BAND, facts["n"]))])
@@ -135,12 +135,11 @@ def _read(
     return task.read_ranges("points", name, names, ranges)
 
 
-def _find_doubles(task: Task, files: list[str]) -> dict[str, str]:
+def _find_doubles(task: Task, files: list[tuple[str, Facts]]) -> dict[str, str]:
     """Find the ids that several files have, and the file whose building counts."""
     seen: dict[str, tuple[float, float, str]] = {}
-    double: dict[str, str] = {}
-    for name in files:
-        facts = task.store.attributes("points", name)["facts"]
+    double: set[str] = set()
+    for name, facts in files:
         for first in range(0, facts["n"], BAND):
             rows = unpack_rows(partial(_read, task, name), [(first, min(first + BAND, facts["n"]))])
             merits = zip(
@@ -149,11 +148,11 @@ def _find_doubles(task: Task, files: list[str]) -> dict[str, str]:
                 strict=True,
             )
             for one, (level, area) in zip(rows.ids.tolist(), merits, strict=True):
-                if one in seen and seen[one][2] != name:
-                    seen[one] = max(seen[one], (level, area, name))
-                    double[one] = seen[one][2]
-                else:
-                    seen[one] = max(seen.get(one, (level, area, name)), (level, area, name))
+                merit = level, area, name
+                before = seen.get(one, merit)
+                if before[2] != name:
+                    double.add(one)
+                seen[one] = max(before, merit)
     return {one: seen[one][2] for one in double}
 
 

@@ -43,6 +43,7 @@ from tiler.objects.places import is_url, place
 from tiler.pointclouds.ingest import CELL, KEY_POINTS, read_cells
 from tiler.stages.city_files import (
     MODEL_PARAMETERS,
+    list_kind,
     read_model_bands,
     read_model_file,
     read_terrain_file,
@@ -218,8 +219,8 @@ def read_footprint_file(task: Task) -> Facts:
 def read_model_footprints(task: Task) -> Facts:
     """Take the outlines of the buildings of all city models as footprints (step 1.2)."""
     counts: Counter[str] = Counter()
-    for name in task.refs["points"]:
-        counts.update(task.store.attributes("points", name)["facts"].get("model", {}))
+    for _, facts in list_kind(task, MODEL):
+        counts.update(facts["model"])
     blocks = (block_footprints(*band) for band in read_model_bands(task))
     return _put_footprints(task, blocks, "the city model") | {
         "counts": {k: v for k, v in sorted(counts.items()) if v}

@@ -42,11 +42,12 @@ class Criterion:
         >>> CRITERIA["nen8100"].classify(lambda speed: np.array([0.0, 0.05, 0.3, np.nan])).tolist()
         [1, 3, 5, 0]
         """
-        found = exceeded(self.speeds[0])
-        classes = np.full(found.shape, len(self.names), np.uint8)
+        found = {speed: exceeded(speed) for speed in set(self.speeds)}
+        first = found[self.speeds[0]]
+        classes = np.full(first.shape, len(self.names), np.uint8)
         for number in range(len(self.speeds), 0, -1):
-            classes[exceeded(self.speeds[number - 1]) < self.shares[number - 1]] = number
-        classes[np.isnan(found)] = NO_CLASS
+            classes[found[self.speeds[number - 1]] < self.shares[number - 1]] = number
+        classes[np.isnan(first)] = NO_CLASS
         return classes
 
 

@@ -4,11 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import rasterio
 from numpy.typing import NDArray
+from pyproj.exceptions import CRSError
 from rasterio.transform import Affine
 
 from pipeline.data.errors import ConfigError
+from tiler.georeference.crs import horizontal_crs
 from tiler.wind.raster import Grid
 
 
@@ -54,16 +57,11 @@ def epsg_of(crs: str) -> int | None:
     >>> epsg_of("EPSG:28992"), epsg_of("EPSG:7415"), epsg_of("LOCAL_CS[1]")
     (28992, 28992, None)
     """
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
     try:
-        found = CRS.from_user_input(crs)
+        found = horizontal_crs(pyproj.CRS.from_user_input(crs))
     except CRSError:
         return None
-    if found.is_compound:
-        found = found.sub_crs_list[0]
-    number = found.to_epsg()
+    number = None if found is None else found.to_epsg()
     return None if number is None else int(number)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import CityError, OutputError
-from tiler.config.config import ANYWHERE, Config, roofs_stay_flat, with_absolute_inputs
+from tiler.config.config import ANYWHERE, Config, with_absolute_inputs
 from tiler.dashboard.server import read_address, watched
 from tiler.engine.executor import Executor, Serial
 from tiler.engine.keys import code_versions
@@ -304,9 +304,8 @@ def _describe(config: Config) -> dict[str, Any]:
 
 
 def _prepare(config: Config, say: Callable[[str], None]) -> None:
-    sloped = config.roofs != "flat" and not roofs_stay_flat(config.mesher, config.simplify)
     try:
-        prepare("planes" if sloped else config.mesher, config.workers, say)
+        prepare("planes" if config.has_sloped_roofs else config.mesher, config.workers, say)
     except KeyboardInterrupt:
         raise StoppedError("stopped before the first task; the same command begins again") from None
 
@@ -372,7 +371,7 @@ def _find_damage(out: Path) -> dict[str, str]:
 
 def _foresee(plan: Plan, config: Config) -> list[str]:
     """Name the roofs that stay flat against what was asked, and the tiles that may not fit into memory."""
-    stay_flat = config.roofs != "flat" and roofs_stay_flat(config.mesher, config.simplify)
+    stay_flat = config.roofs != "flat" and not config.has_sloped_roofs
     flat = [warn_of_flat_roofs(config)] if stay_flat else []
     return flat + ([] if config.on_cluster else warn_of_memory(plan, config, memory=machine_memory()))
 

@@ -523,7 +523,7 @@ def gather(case: Path, name: str, width: int, n_cells: int, *, parts: int = 2) -
 def assert_solvers_agree(one: Path, two: Path) -> None:
     solve(one, None)
     solve(two, 2)
-    for name, width, bound in (("T", 1, 1e-8), ("2/U", 3, 1e-3), ("2/p", 1, 1e-3), ("2/k", 1, 2e-3)):
+    for name, width, bound in (("T", 1, 1e-8), ("2/U", 3, 1e-4), ("2/p", 1, 1e-4), ("2/k", 1, 2e-4)):
         serial = read_field(one / name, width)
         parallel = gather(two, name, width, len(serial))
         assert np.ptp(serial) > 0
@@ -593,7 +593,7 @@ def test_openfoam_reads_and_solves_a_small_city(small_run: Path, tmp_path: Path)
 def assert_decompose_par_does_the_same(start: Path, ours: Path, case: Path, parts: int) -> None:
     """Hold parts against those that OpenFOAM makes of the whole mesh with the same cells: lists, and results.
 
-    Serial results differ by more: OpenFOAM takes distances of walls from the faces of a process alone.
+    Serial results differ by more, also from those of OpenFOAM's own parts.
     """
     shutil.copytree(start, case)
     cells = [read_labels(ours / f"processor{n}" / MESH / "cellProcAddressing") for n in range(parts)]
