@@ -189,6 +189,10 @@ def mesh_adaptive(
     )
     mesh, passed = _key_columns(mesh, seam, given, gates)  # levels beside walls moved
     eased = mesh.z[surface] - home[surface]
+    if sloped:
+        moved = np.zeros(len(mesh.z))
+        moved[surface] = eased
+        mesh = replace(mesh, moved=moved)
     report = AdaptiveReport(
         n_columns=len(plane.xy),
         n_levels=len(mesh.z),

@@ -225,7 +225,15 @@ def add_soil(
     whole = join_soil(levels, replace(bare_levels(mesh.z_start, mesh.z), key=mesh.merge_keys), grounded)
     raised = (np.diff(levels.start) - grounded).astype(np.int32)
     key = None if mesh.key is None else whole.key
-    columns = ColumnMesh(plane, whole.start, whole.z, mesh.bottom + raised[plane.triangles], mesh.order, key)
+    moved = None
+    if mesh.moved is not None:
+        moved = np.zeros(len(whole.z))
+        beyond = np.repeat(
+            whole.start[1:] - mesh.z_start[1:], np.diff(mesh.z_start)
+        )  # columns end at the same level
+        moved[np.arange(len(mesh.z)) + beyond] = mesh.moved
+    bottom = mesh.bottom + raised[plane.triangles]
+    columns = ColumnMesh(plane, whole.start, whole.z, bottom, mesh.order, key, moved)
     return SoilMesh(columns, (np.diff(levels.start) - 1).astype(np.int32)), raised, np.flatnonzero(lowered)
 
 

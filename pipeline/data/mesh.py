@@ -76,6 +76,8 @@ class ColumnMesh:
     key : float64, (z_start[-1],), optional
         What takes the place of heights in the order "heights", ascending in every column: beside steep tops of
         walls it differs from them. By default it is `z`.
+    moved : float64, (z_start[-1],), optional
+        Where roofs slope, by how much each level was moved that stands for one, for the sake of cells (m).
     """
 
     plane: PlaneMesh
@@ -84,6 +86,7 @@ class ColumnMesh:
     bottom: NDArray[np.int32]
     order: MergeOrder = "levels"
     key: NDArray[np.float64] | None = None
+    moved: NDArray[np.float64] | None = None
 
     @property
     def merge_keys(self) -> NDArray[np.float64]:

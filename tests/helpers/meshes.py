@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.data.citymodel import CityModel, number_ids
 from pipeline.data.mesh import Boundary, Marker, TetMesh
 from pipeline.data.roofs import flat_roofs
-from tests.helpers.vtk_writers import write_vtp, write_vtu
+from tests.helpers.vtk_writers import NO_ARRAYS, write_vtp, write_vtu
 from tiler.citymodels.cityjson import write_city_model
 from tiler.mesh_files.vtk_files import write_pvtp, write_pvtu
 
@@ -128,15 +128,19 @@ def split_city(city: TinyCity, east_of: float) -> dict[str, tuple[TetMesh, Bound
 
 
 def write_run(
-    directory: Path, city: TinyCity, *, pieces: Mapping[str, tuple[TetMesh, Boundary]] | None = None
+    directory: Path,
+    city: TinyCity,
+    *,
+    pieces: Mapping[str, tuple[TetMesh, Boundary]] | None = None,
+    boundary_data: Mapping[str, NDArray[Any]] = NO_ARRAYS,
 ) -> None:
-    """Write the run folder of a tiny city: record, city model, volume and boundary."""
+    """Write the run folder of a tiny city: record, city model, volume and boundary with arrays of its points."""
     pieces = pieces or {"0_0": (city.mesh, city.boundary)}
     for folder in ("mesh", "boundary"):
         (directory / folder).mkdir(parents=True)
     for name, (mesh, boundary) in pieces.items():
         write_vtu(directory / "mesh" / f"{name}.vtu", mesh)
-        write_vtp(directory / "boundary" / f"{name}.vtp", mesh.points, boundary)
+        write_vtp(directory / "boundary" / f"{name}.vtp", mesh.points, boundary, point_data=boundary_data)
     write_pvtu(directory / "mesh.pvtu", [directory / "mesh" / f"{name}.vtu" for name in pieces])
     write_pvtp(directory / "boundary.pvtp", [directory / "boundary" / f"{name}.vtp" for name in pieces])
     counts = {

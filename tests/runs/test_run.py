@@ -536,13 +536,16 @@ def test_random_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
 PAPER = {"simplify": "paper", "mesher": "layered", "roof_height": "percentile"}
 QUARTER = {"bounds": [120_700.0, 486_000.0, 121_000.0, 486_300.0]}
 LONG = pytest.mark.long
+FLAT = {"roofs": "flat"}
 REAL = [
     ("amsterdam", "amsterdam/footprints.shp", QUARTER, 300),
+    ("amsterdam", "amsterdam/footprints.shp", QUARTER | FLAT, 300),
     ("amsterdam_west_small", "amsterdam_west_small/footprints.gpkg", {}, 300),
     ("amsterdam_west_small", "amsterdam_west_small/footprints.gpkg", PAPER, 25),
     pytest.param("amsterdam", "amsterdam/footprints.shp", {}, 1400, marks=LONG),
+    pytest.param("amsterdam", "amsterdam/footprints.shp", FLAT, 1400, marks=LONG),
     pytest.param("amsterdam_no_building_class", "amsterdam/footprints.shp", QUARTER, 300, marks=LONG),
-    pytest.param("amsterdam", "amsterdam/footprints.shp", {"manifold": True}, 1400, marks=LONG),
+    pytest.param("amsterdam", "amsterdam/footprints.shp", {"manifold": True} | FLAT, 1400, marks=LONG),
     pytest.param(
         "amsterdam",
         "amsterdam/footprints.shp",
@@ -573,16 +576,23 @@ def test_real_data_gives_a_mesh_that_its_check_proves(
     if options.get("manifold"):
         # What is left are roofs that touch crosswise over lower ones: their houses share walls in the plan.
         assert record["counts"]["planar corner-touches"] == 0
-        assert report.facts["non_manifold_edges"] < 60
-    if clouds == "amsterdam" and (not options or options == QUARTER):
+        assert report.facts["non_manifold_edges"] < 50
+    ratio, angle = record["quality"]["radius_ratio"], record["quality"]["min_dihedral"]
+    if clouds == "amsterdam" and options in (FLAT, QUARTER | FLAT):
         # What the design asks of real blocks, with room for the machine's last digit.
-        ratio, angle = record["quality"]["radius_ratio"], record["quality"]["min_dihedral"]
-        bounds = {"0": 0.15, "0.1": 0.40, "1": 0.53, "5": 0.60, "50": 0.78}
+        bounds = {"0": 0.22, "0.1": 0.42, "1": 0.50, "5": 0.58, "50": 0.78}
         assert all(ratio[p] >= bound for p, bound in bounds.items()), ratio
-        assert angle["0"] >= 5.0
+        assert angle["0"] >= 9.0
         assert record["fidelity"]["outline"]["min_clearance"] >= 1.0
         assert record["fidelity"]["outline"]["area_error"] <= 0.008
-        assert record["fidelity"]["roof"]["rmse"] < 3.0
+        assert record["fidelity"]["roof"]["rmse"] < 3.4
+    if clouds == "amsterdam" and options in ({}, QUARTER):
+        bounds = {"0": 0.15, "1": 0.53, "50": 0.78}
+        assert all(ratio[p] >= bound for p, bound in bounds.items()), ratio
+        assert record["fidelity"]["outline"]["min_clearance"] >= 1.0
+        assert record["fidelity"]["outline"]["area_error"] <= 0.009
+        assert record["fidelity"]["roof"]["p50"] < 0.13
+        assert record["fidelity"]["roof"]["rmse"] < 3.1
 
 
 @pytest.mark.usefixtures("small_pictures")

@@ -238,7 +238,7 @@ def _conclude(
         proofs.prove_box(found["box"], bounds),
         proofs.prove_top(found["top"], record.top),
         proofs.prove_ground(found["ground"]),
-        city_proofs.prove_roofs(found["roofs"], record.eased),
+        city_proofs.prove_roofs(found["roofs"]),
         city_proofs.prove_walls(found["walls"]),
         wall_proofs.prove_overlap(found["overlap"]),
         city_proofs.prove_buildings(sums.built, index, bounds, rules=record.roofs, partial=partial),

@@ -13,7 +13,7 @@ from tiler.check import proofs
 from tiler.check.proofs import Bounds, Fault, Finding, Mask, Surface, Vertices
 from tiler.check.soil_proofs import check_between
 from tiler.mesh_files.vtk_files import BoundaryPiece, read_vtp
-from tiler.store.run_folder import read_volume
+from tiler.store.run_folder import ROOF_MOVED, read_volume
 
 # Kinds of points over the rim, each counted once: any, of the ground, of the top.
 ANY, GROUND, TOP = range(3)
@@ -165,7 +165,8 @@ def _join(exterior: Vertices, file: BoundaryPiece) -> tuple[Surface, NDArray[np.
     points[group] = rows
     index = group.astype(np.int32).reshape(-1, 3)
     boundary = Boundary(index[len(exterior) :], file.boundary.marker, file.boundary.building)
-    return proofs.make_surface(points, boundary), index[: len(exterior)]
+    moved = file.point_data.get(ROOF_MOVED, np.zeros(len(file.points)))[file.boundary.facets]
+    return proofs.make_surface(points, boundary, moved), index[: len(exterior)]
 
 
 def _facing_up(points: Vertices, faces: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -70,16 +70,16 @@ def prove_marks(found: Finding) -> Proof:
 
 def check_roofs(surface: Surface, buildings: Buildings, dtm: Dtm, rules: RoofRules) -> Finding:
     """Roofs lie on the plane of their building, at outlines near it, and inside its footprint."""
-    _, row, corners = _facets_of(surface, buildings, Marker.ROOF)
-    found = check_roof_heights(corners, row, buildings, dtm, rules)
+    chosen, row, corners = _facets_of(surface, buildings, Marker.ROOF)
+    found = check_roof_heights(corners, surface.moved[chosen], row, buildings, dtm, rules)
     outside = ~_all_near(buildings.footprints, row, corners)
     centres = corners.mean(axis=1)
     faults = find_faults("roof-off-footprint", centres[outside], f"not inside; {at_most(OUTLINE_TOLERANCE)}")
     return replace(found, faults=(*found.faults, *faults))
 
 
-def prove_roofs(found: Finding, eased: int = 0) -> Proof:
-    """Tell how far roofs are off at most; no more than `eased` vertices may be off for the sake of cells."""
+def prove_roofs(found: Finding) -> Proof:
+    """Tell how far roofs are off at most."""
     count, worst = found.sums["facets"], found.largest["worst"]
     claim = f"{count} roof facets lie at their building's height and in its footprint, worst {worst:.2g} m"
     bounds = f"{at_most(HEIGHT_TOLERANCE)} up, {OUTLINE_TOLERANCE:g} m across"
@@ -89,11 +89,7 @@ def prove_roofs(found: Finding, eased: int = 0) -> Proof:
             f"; {share:.1f} % of their corners, at outlines, are joined with other roofs, parted from them,"
             f" raised over terrain or moved for cells, by {found.largest['largest move']:.2f} m at most"
         )
-    faults, beyond = found.faults, int(found.sums["eased"])
-    if beyond > eased:
-        detail = f"{beyond} roof nodes are off, run.json: {eased} were moved for cells"
-        faults = (*faults, Fault("roof-nodes-moved", beyond - eased, (), detail))
-    return Proof(f"{claim}; {bounds}", faults)
+    return Proof(f"{claim}; {bounds}", found.faults)
 
 
 def check_walls(surface: Surface, buildings: Buildings, dtm: Dtm, rules: RoofRules) -> Finding:
@@ -103,7 +99,7 @@ def check_walls(surface: Surface, buildings: Buildings, dtm: Dtm, rules: RoofRul
     leaning = ~(width <= SIDE_TOLERANCE)
     used, index = np.unique(row, return_inverse=True)
     astray = ~_all_near(shapely.boundary(buildings.footprints[used]), index, corners)
-    above = are_above_roofs(corners, row, buildings, dtm, rules)
+    above = are_above_roofs(corners, surface.moved[chosen], row, buildings, dtm, rules)
     centres = corners.mean(axis=1)
     lean = f"{width.max(initial=0):.3g} m wide in plan; {at_most(SIDE_TOLERANCE)}"
     faults = [

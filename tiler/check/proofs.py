@@ -95,6 +95,8 @@ class Surface:
         All facets.
     corners : float64, (k, 3, 3)
         The vertices of each facet.
+    moved : float64, (k, 3)
+        By how much the file says that the roof at each of these was moved for the sake of cells (m).
     area, volume : float64, (k,)
         Signed plan area (m²) and volume above height zero (m³), see `compute_facet_areas`.
     """
@@ -102,6 +104,7 @@ class Surface:
     points: Vertices
     boundary: Boundary
     corners: Vertices
+    moved: NDArray[np.float64]
     area: NDArray[np.float64]
     volume: NDArray[np.float64]
 
@@ -110,10 +113,10 @@ class Surface:
         return np.isin(self.boundary.marker, markers)
 
 
-def make_surface(points: Vertices, boundary: Boundary) -> Surface:
+def make_surface(points: Vertices, boundary: Boundary, moved: NDArray[np.float64]) -> Surface:
     """Work out the geometry of the facets once, for all proofs."""
     area, volume = conformity.compute_facet_areas(points, boundary.facets)
-    return Surface(points, boundary, points[boundary.facets], area, volume)
+    return Surface(points, boundary, points[boundary.facets], moved, area, volume)
 
 
 def find_faults(kind: str, places: Vertices, detail: str) -> list[Fault]:

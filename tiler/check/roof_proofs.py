@@ -1,8 +1,8 @@
 """How high roofs and walls may stand, for `citystitch check`: on the planes of the city model, or near them.
 
 Inside its outline a roof lies on its plane, to the bit. At the outline the mesher moves it where it must: roofs
-that meet there are joined or parted by a step at most, a roof stands some way above the terrain at its walls, and
-at some vertices it is moved a little for the sake of cells; these are counted, and ``run.json`` has their number.
+that meet there are joined or parted by a step at most, and a roof stands some way above the terrain at its walls.
+At few vertices of outlines it is moved a little for the sake of cells, too: by how much, the boundary file tells.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class RoofRange:
     low, high : float64, (k,)
         Heights (m); equal where a roof must lie on its plane. NaN where no building is.
     edge : bool, (k,)
-        Whether a roof may be moved there by `RoofRules.slack` besides: it is at an outline.
+        Whether a roof may be moved there by `RoofRules.slack` besides: it is at an outline of sloped ones.
     """
 
     low: NDArray[np.float64]
@@ -85,7 +85,12 @@ def _find_moves(
 
 
 def check_roof_heights(
-    corners: Vertices, row: NDArray[np.int64], buildings: Buildings, dtm: Dtm, rules: RoofRules
+    corners: Vertices,
+    moved: NDArray[np.float64],
+    row: NDArray[np.int64],
+    buildings: Buildings,
+    dtm: Dtm,
+    rules: RoofRules,
 ) -> Finding:
     """Roof facets lie on the planes of their buildings, or at outlines in the range that is left to the mesher.
 
@@ -93,6 +98,8 @@ def check_roof_heights(
     ----------
     corners : float64, (k, 3, 3)
         Roof facets (m).
+    moved : float64, (k, 3)
+        By how much their corners are said to be moved for the sake of cells (m).
     row : int64, (k,)
         Row of the building of each.
     buildings, dtm, rules
@@ -101,50 +108,46 @@ def check_roof_heights(
     places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
     index = index.reshape(-1)
     allowed = find_roof_range(places, buildings, dtm, rules)
-    z, plane = corners[:, :, 2].ravel(), roof_heights(buildings.roofs, np.repeat(row, 3), places[index])
-    error = np.abs(z - plane)
+    way = moved.ravel()
+    z, plane = corners[:, :, 2].ravel() - way, roof_heights(buildings.roofs, np.repeat(row, 3), places[index])
     fixed = allowed.low[index] == allowed.high[index]
-    slack = np.where(allowed.edge[index], rules.slack, 0.0)
-    wrong = np.where(
-        (fixed & (slack == 0)) | (not rules.sloped),
-        ~(error <= HEIGHT_TOLERANCE),
-        _is_beyond(z, allowed, index, slack),
-    )
-    eased = (slack > 0) & ~wrong & _is_beyond(z, allowed, index, np.zeros(len(z)))
+    off_plane = ~(np.abs(z - plane) <= HEIGHT_TOLERANCE)
+    too_far = ~(np.abs(way) <= np.where(allowed.edge[index], rules.slack, 0.0))
+    wrong = too_far | np.where(fixed | (not rules.sloped), off_plane, _is_beyond(z, allowed, index))
+    error = np.abs(z + way - plane)
     off = wrong.reshape(-1, 3).any(axis=1)
     centres = corners.mean(axis=1)
     worst = float(error[wrong].max(initial=0))
     faults = find_faults("roof-height", centres[off], f"{worst:.3g} m off; {at_most(HEIGHT_TOLERANCE)}")
-    moved = error > HEIGHT_TOLERANCE
+    displaced = error > HEIGHT_TOLERANCE
     return Finding(
         tuple(faults),
-        {
-            "facets": len(corners),
-            "corners": len(z),
-            "moved": int(moved.sum()),
-            "eased": len(np.unique(np.column_stack((index, np.repeat(row, 3)))[eased], axis=0)),
-        },
+        {"facets": len(corners), "corners": len(z), "moved": int(displaced.sum())},
         {"worst": worst, "largest move": float(error[~wrong].max(initial=0))},
     )
 
 
 def are_above_roofs(
-    corners: Vertices, row: NDArray[np.int64], buildings: Buildings, dtm: Dtm, rules: RoofRules
+    corners: Vertices,
+    moved: NDArray[np.float64],
+    row: NDArray[np.int64],
+    buildings: Buildings,
+    dtm: Dtm,
+    rules: RoofRules,
 ) -> Mask:
-    """Tell which wall facets (k, 3, 3) rise above the roof of their building, bool (k,)."""
+    """Tell which wall facets (k, 3, 3) rise above the roof of their building, bool (k,).
+
+    Where a roof was `moved` (k, 3) for the sake of cells (m), it counts as if it were not.
+    """
     highest = buildings.roof[row][:, None]
     if rules.sloped:
         places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
-        allowed = find_roof_range(places, buildings, dtm, rules)
-        highest = (allowed.high + rules.slack * allowed.edge)[index.reshape(-1)].reshape(-1, 3)
-    low = corners[:, :, 2] <= highest + HEIGHT_TOLERANCE
+        highest = find_roof_range(places, buildings, dtm, rules).high[index.reshape(-1)].reshape(-1, 3)
+    low = corners[:, :, 2] - np.clip(moved, -rules.slack, rules.slack) <= highest + HEIGHT_TOLERANCE
     above: Mask = ~np.all(low, axis=1)
     return above
 
 
-def _is_beyond(
-    z: NDArray[np.float64], allowed: RoofRange, index: NDArray[np.int64], slack: NDArray[np.float64]
-) -> Mask:
-    more = slack + HEIGHT_TOLERANCE
-    within: Mask = (z >= allowed.low[index] - more) & (z <= allowed.high[index] + more)
+def _is_beyond(z: NDArray[np.float64], allowed: RoofRange, index: NDArray[np.int64]) -> Mask:
+    within: Mask = (z >= allowed.low[index] - HEIGHT_TOLERANCE) & (z <= allowed.high[index] + HEIGHT_TOLERANCE)
     return ~within

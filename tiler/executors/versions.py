@@ -16,8 +16,8 @@ MISSING = "missing"
 OURS = ("pipeline", "stitch", "tiler")  # the packages of citystitch, whose sources count
 TRANSPORT = ("dask", "distributed")  # what carries tasks
 LIBRARIES = (
-    *("blake3", "deflate", "laspy", "lazrs", "numba", "numcodecs", "numpy", "pyamg", "pyarrow", "pyogrio"),
-    *("pyproj", "scipy", "shapely", "triangle", "zarr"),
+    *("blake3", "deflate", "laspy", "lazrs", "lxml", "numba", "numcodecs", "numpy", "pyamg", "pyarrow", "pyogrio"),
+    *("pyproj", "rasterio", "scipy", "shapely", "triangle", "zarr"),
 )
 NATIVE = {  # libraries within those, by the module and the attribute that tell
     "GDAL": ("pyogrio", "__gdal_version_string__"),

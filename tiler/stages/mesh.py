@@ -75,7 +75,7 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     parameters += SIZE_PARAMETERS if config.graded_size else ()
     parameters += PAD_PARAMETERS if config.padded else ()
     parameters += SOIL_PARAMETERS if config.underground else ()
-    version = 7 if config.mesher == "layered" else 5
+    version = 8 if config.mesher == "layered" else 6
     return [
         Stage("seams", Scope.SEAM, make_seam, tuple(reads), parameters, version=version),
         Stage(

@@ -52,7 +52,7 @@ from tiler.stages.left_out import read_polygons
 from tiler.stages.readers import read_bands, read_buildings, read_terrain
 from tiler.store.checksums import FILES, state_files
 from tiler.store.results import COLUMN_ARRAYS, unpack_columns
-from tiler.store.run_folder import REGION
+from tiler.store.run_folder import REGION, ROOF_MOVED
 
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
 ID_ARRAYS = ("shared", "shared_id")
@@ -76,7 +76,7 @@ def piece_stages() -> list[Stage]:
     beside = (Read("columns", beside=True, others_by_name=True, optional=True),)
     return [
         # Of the tiles around it a piece asks only which of them there are.
-        Stage("pieces", Scope.TILE, write_piece, beside, version=6),
+        Stage("pieces", Scope.TILE, write_piece, beside, version=7),
         Stage(
             "report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True)), version=4
         ),
@@ -131,6 +131,8 @@ def write_piece(task: Task) -> Facts:
             cell_data={name: Rows.of(array) for name, array in region.items()},
         )
         data = {"vertex": vertex, VERTEX_ID: ids}
+        if (moved := mesh.moved) is not None:
+            data[ROOF_MOVED] = Values(1, np.dtype(np.float64), lambda levels: moved[levels])
         write_vtp_blocks(files[1], len(mesh.z), boundary, places, point_data=data)
         written = state_files(out, files)
     for name, histogram in meter.histograms.items():

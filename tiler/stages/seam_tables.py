@@ -85,6 +85,7 @@ def pack_columns(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> dict[str, NDAr
     plane = mesh.plane
     return {
         "key": np.empty(0) if mesh.key is None else mesh.key,
+        "moved": np.empty(0) if mesh.moved is None else mesh.moved,
         "xy": plane.xy,
         "triangles": plane.triangles,
         "building": np.append(numbers, -1)[plane.building],

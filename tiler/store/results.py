@@ -13,7 +13,7 @@ from pipeline.points_terrain.raster import Dtm, NodeWindow, grow_window, node_wi
 from pipeline.points_terrain.terrain import cut_terrain, join_terrain
 from tiler.store.store import Store
 
-COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom", "key")
+COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom", "key", "moved")
 APPROACH = "approach"
 KEPT_CHUNKS = 9  # tiles of terrain that stay in memory
 
@@ -32,8 +32,9 @@ def unpack_columns(arrays: Mapping[str, NDArray[Any]], order: Any) -> tuple[Colu
     outside = int(len(numbers) > 0 and numbers[0] < 0)
     rows: NDArray[np.int32] = (row.reshape(-1) - outside).astype(np.int32)
     plane = PlaneMesh(arrays["xy"], arrays["triangles"], rows)
-    key = arrays["key"] if len(arrays["key"]) else None
-    return ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], order, key), numbers[outside:]
+    key, moved = (arrays[name] if len(arrays[name]) else None for name in ("key", "moved"))
+    mesh = ColumnMesh(plane, arrays["z_start"], arrays["z"], arrays["bottom"], order, key, moved)
+    return mesh, numbers[outside:]
 
 
 class StoredTerrain:

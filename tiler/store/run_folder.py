@@ -23,6 +23,7 @@ TILES = "tiles"
 EASED = "roof nodes moved for cells"  # a count: roofs at vertices of outlines
 PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
 REGION = "region"  # cell array of a piece with soil
+ROOF_MOVED = "moved_for_cells"  # point array of the boundary where roofs slope: by how much one was moved for cells (m)
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
 
@@ -53,7 +54,7 @@ class RoofRules:
     lifts : bool
         Whether the least distance of two nodes may be more than the step, so that the upper one is raised.
     slack : float
-        How far it moves a roof besides, where cells would be bad (m).
+        How far it moves a roof besides at a vertex that the boundary's `ROOF_MOVED` tells (m).
     """
 
     sloped: bool = False
@@ -94,8 +95,6 @@ class RunRecord:
         where the record does not tell.
     roofs : RoofRules
         How far the mesher may move roofs.
-    eased : int
-        Vertices at which it moved one for the sake of cells, counted for each roof.
     """
 
     status: str
@@ -108,7 +107,6 @@ class RunRecord:
     rim: float = math.nan
     parts: tuple[MeshPart, ...] = ()
     roofs: RoofRules = FLAT_ROOFS
-    eased: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +161,6 @@ def read_run_record(path: Path) -> RunRecord:
         counts = {name: int(record["counts"][name]) for name in ("cells", "points", "facets")}
         # A record of an earlier version counts parts as buildings.
         counts[PARTS] = int(record["counts"][PARTS if PARTS in record["counts"] else "buildings"])
-        eased = int(record["counts"].get(EASED, 0))
         status = str(record["status"])
         depth = float(record.get("parameters", {}).get("underground", 0.0))
         core, rim = _read_pad(record["region"])
@@ -176,7 +173,7 @@ def read_run_record(path: Path) -> RunRecord:
     if not 0 <= depth < math.inf:
         raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
     return RunRecord(
-        status, (west, south, east, north), top, counts, record[TILES], depth, core, rim, parts, roofs, eased
+        status, (west, south, east, north), top, counts, record[TILES], depth, core, rim, parts, roofs
     )
 
 

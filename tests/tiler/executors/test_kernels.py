@@ -159,10 +159,11 @@ def test_a_run_prepares_the_workers_of_this_machine_alone(
 
     monkeypatch.setattr("tiler.workflow.run.prepare", note)
     run(city.config(tmp_path / "0", workers=0, mesher="layered"))
-    run(city.config(tmp_path / "1", workers=1))
+    run(city.config(tmp_path / "1", workers=1, roofs="flat"))
     run(city.config(tmp_path / "2", workers=0, roofs="skeleton"))
     run(city.config(tmp_path / "3", workers=0, roofs="planes", mesher="layered"))
-    assert asked == [("layered", 0), ("adaptive", 1), ("planes", 0), ("layered", 0)]
+    run(city.config(tmp_path / "4", workers=0))
+    assert asked == [("layered", 0), ("adaptive", 1), ("planes", 0), ("layered", 0), ("planes", 0)]
 
 
 def test_ctrl_c_while_kernels_are_compiled_stops_a_run(
