@@ -23,7 +23,7 @@ TILES = "tiles"
 EASED = "roof nodes moved for cells"  # a count: roofs at vertices of outlines
 PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
 REGION = "region"  # cell array of a piece with soil
-ROOF_MOVED = "moved_for_cells"  # point array of the boundary where roofs slope: by how much one was moved for cells (m)
+ROOF_MOVED = "moved_for_cells"  # point array of the boundary: by how much a roof was moved (m)
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
 
