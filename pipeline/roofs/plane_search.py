@@ -13,6 +13,7 @@ MAX_PLANES = 12  # of a house
 HYPOTHESES, SAMPLES = 200, 700  # local planes that are tried, and points that each is held against, at most
 SAME_SLOPE = 0.25  # squared difference of slopes, over 1 + slope², up to which a local plane agrees
 ROUGH = 0.3  # weight of a point without a local plane of its own
+ENOUGH = 0.8  # score, as a share of the points without a plane, at which no better one is looked for
 FLAT = 0.09  # slope below which a plane is flat
 SNAP = 0.978  # cosine of 12 degrees: a plane this close to uphill across a wall is turned there
 REFITS = 4
@@ -50,7 +51,7 @@ def search_planes(xyz: Array, local: Array, least: float, max_slope: float, plan
     Notes
     -----
     Each local plane is scored by the points that no plane has yet, by their distance. Points leave, so scores
-    fall: only those that might be the best are computed anew.
+    fall: only those that might be the best are computed anew, and none beyond one that nearly all points support.
     """
     n = len(xyz)
     free, smooth = np.ones(n, np.bool_), np.empty(n, np.bool_)
@@ -96,9 +97,10 @@ def _find_best(
     fresh: NDArray[np.int64],
     turn: int,
 ) -> int:
-    """Find the local plane with the best score, the first of equal ones; scores are brought up to date."""
+    """Find the local plane with the best score, or the first with `ENOUGH`; scores are brought up to date."""
     n = len(xyz)
     step, stride = max(1, n // HYPOTHESES), max(1, n // SAMPLES)
+    enough = ENOUGH * free.sum()
     while True:
         best = 0
         for k in range(1, len(score)):
@@ -124,6 +126,8 @@ def _find_best(
                     elif (local[q, 0] - a) ** 2 + (local[q, 1] - b) ** 2 <= unlike:
                         total += 1 - r * r
         score[best] = total * stride
+        if score[best] >= enough:
+            return best
 
 
 @kernel
