@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.mesh import Marker, Region
-from tiler.export.export import PER_BUILDING, Format
+from tiler.export.export import CELLS, PER_BUILDING, Format
 from tiler.export.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
 from tiler.export.pieces import Pieces, blocks_of, slices, write_lines
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
+from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
 
@@ -27,10 +28,11 @@ NAMES = {number: region.name.lower() for region, number in VOLUMES.items()}
 # Markers of facets that bound one of the two regions alone.
 OF_AIR = (Marker.WALL, Marker.ROOF, Marker.TOP)
 OF_SOIL = (Marker.BOTTOM, Marker.FOUNDATION)
-TRIANGLE, TETRAHEDRON = 2, 4  # Gmsh's types of elements
+TRIANGLE, QUADRILATERAL, TETRAHEDRON, PRISM = 2, 3, 4, 6  # Gmsh's types of elements
 TEXT_FLOAT = "%24.16e"  # 17 digits, enough for any float64; each has the same width
 
 _Box = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +65,7 @@ class _Survey:
         }
 
 
-def export_msh(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
+def export_msh(output: Path, source: RunSource, *, buildings: str | None = None, cells: str | None = None) -> None:
     """Write the mesh of a finished run as MSH 4.1, binary.
 
     Parameters
@@ -89,6 +91,9 @@ def export_msh(output: Path, source: RunSource, *, buildings: str | None = None)
     """
     pieces = open_pieces(source)
     by_building = buildings is not None
+    if cells == "prism":
+        _export_prisms(output, read_prisms(pieces), by_building=by_building)
+        return
     survey = _survey(pieces, by_building=by_building)
     with replacing(output) as part, part.open("wb") as file:
         file.write(b"$MeshFormat\n4.1 1 8\n" + np.array([1], "<i4").tobytes() + b"\n$EndMeshFormat\n")
@@ -114,6 +119,39 @@ def export_msh(output: Path, source: RunSource, *, buildings: str | None = None)
                     tags = first + seen[group] + np.arange(len(corners))
                     file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
                     seen[group] += len(corners)
+
+
+def _export_prisms(output: Path, mesh: PrismMesh, *, by_building: bool) -> None:
+    """Write prisms; a surface may have two blocks of elements, triangles and quadrilaterals."""
+    blocks: list[tuple[int, int, Ints]] = []
+    counts: dict[int, int] = {}
+    boxes: dict[int, _Box] = {AIR: _grown(_no_box(), mesh.points)}
+    for width, kind in ((3, TRIANGLE), (4, QUADRILATERAL)):
+        corners, marker, building = mesh.facets(width)
+        keys = patch_keys(marker, building, by_building=by_building)
+        for key, rows in facets_by_key(np.unique(keys).tolist(), keys):
+            blocks.append((key, kind, corners[rows]))
+            counts[key] = counts.get(key, 0) + len(rows)
+            boxes[key] = _grown(boxes.get(key, _no_box()), mesh.points[corners[rows].ravel()])
+    survey = _Survey(len(mesh.points), {AIR: len(mesh.cells)}, dict(sorted(counts.items())), boxes)
+    numbers = survey.numbers | {AIR: AIR}
+    with replacing(output) as part, part.open("wb") as file:
+        file.write(b"$MeshFormat\n4.1 1 8\n" + np.array([1], "<i4").tobytes() + b"\n$EndMeshFormat\n")
+        _write_names(file, survey)
+        _write_entities(file, survey)
+        file.seek(_begin_nodes(file, survey.n_points))
+        file.write(np.ascontiguousarray(mesh.points, "<f8").data)
+        file.seek(0, 2)
+        n = survey.n_elements
+        file.write(b"$Elements\n" + _packed("u8", [len(blocks) + 1, n, 1, n]))
+        tag = 1
+        for key, kind, corners in [*blocks, (AIR, PRISM, mesh.cells)]:
+            file.write(_packed("i4", [3 if kind == PRISM else 2, numbers[key], kind]))
+            file.write(_packed("u8", [len(corners)]))
+            tags = tag + np.arange(len(corners))
+            file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
+            tag += len(corners)
+        file.write(b"\n$EndElements\n")
 
 
 def export_msh2(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
@@ -246,4 +284,4 @@ def _numbered(tag: int, nodes: NDArray[np.int64], kind: int, group: NDArray[np.i
     return np.column_stack((tag + np.arange(n), np.full(n, kind), np.full(n, 2), group, group, nodes))
 
 
-FORMAT = Format("Gmsh's MSH 4.1, binary", export_msh, options=PER_BUILDING, suffix=".msh")
+FORMAT = Format("Gmsh's MSH 4.1, binary", export_msh, options=(*PER_BUILDING, CELLS), suffix=".msh")
