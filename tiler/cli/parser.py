@@ -391,6 +391,10 @@ def _add_export(export: argparse.ArgumentParser) -> None:
             "action": "store_true",
             "help": "of a mesh in parts that share no face, the one of the most cells alone",
         },
+        "origin": {
+            "metavar": "X,Y,Z|auto",
+            "help": "whole metres that coordinates count from; auto: the region's south-western corner",
+        },
         "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
     }
     for option, words in given.items():

@@ -82,6 +82,8 @@ def export_cgns(
     """
     pieces = open_pieces(source)
     crs = crs_of(source)
+    if origin := pieces.files.origin_words:
+        crs += f"; coordinates count from {origin} m"
     with replacing(output) as part, disk_errors(output):
         if cells == "prism":
             _write_prisms(part, read_prisms(pieces), crs, by_building=buildings is not None)

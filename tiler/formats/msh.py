@@ -92,11 +92,11 @@ def export_msh(output: Path, source: RunSource, *, buildings: str | None = None,
     pieces = open_pieces(source)
     by_building = buildings is not None
     if cells == "prism":
-        _export_prisms(output, read_prisms(pieces), by_building=by_building)
+        _export_prisms(output, read_prisms(pieces), pieces.files.origin_words, by_building=by_building)
         return
     survey = _survey(pieces, by_building=by_building)
     with replacing(output) as part, part.open("wb") as file:
-        file.write(b"$MeshFormat\n4.1 1 8\n" + np.array([1], "<i4").tobytes() + b"\n$EndMeshFormat\n")
+        _write_head(file, pieces.files.origin_words)
         _write_names(file, survey)
         _write_entities(file, survey)
         nodes = _begin_nodes(file, survey.n_points)
@@ -121,7 +121,7 @@ def export_msh(output: Path, source: RunSource, *, buildings: str | None = None,
                     seen[group] += len(corners)
 
 
-def _export_prisms(output: Path, mesh: PrismMesh, *, by_building: bool) -> None:
+def _export_prisms(output: Path, mesh: PrismMesh, origin: str, *, by_building: bool) -> None:
     """Write prisms; a surface may have two blocks of elements, triangles and quadrilaterals."""
     blocks: list[tuple[int, int, Ints]] = []
     counts: dict[int, int] = {}
@@ -136,7 +136,7 @@ def _export_prisms(output: Path, mesh: PrismMesh, *, by_building: bool) -> None:
     survey = _Survey(len(mesh.points), {AIR: len(mesh.cells)}, dict(sorted(counts.items())), boxes)
     numbers = survey.numbers | {AIR: AIR}
     with replacing(output) as part, part.open("wb") as file:
-        file.write(b"$MeshFormat\n4.1 1 8\n" + np.array([1], "<i4").tobytes() + b"\n$EndMeshFormat\n")
+        _write_head(file, origin)
         _write_names(file, survey)
         _write_entities(file, survey)
         file.seek(_begin_nodes(file, survey.n_points))
@@ -161,7 +161,7 @@ def export_msh2(output: Path, source: RunSource, *, buildings: str | None = None
     survey = _survey(pieces, by_building=by_building)
     keys, numbers = (np.array(list(some), np.int64) for some in (survey.numbers, survey.numbers.values()))
     with replacing(output) as part, part.open("wb") as file:
-        file.write(b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n")
+        file.write(b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n" + _comment(pieces.files.origin_words))
         _write_names(file, survey)
         digits = len(str(survey.n_points))
         file.write(f"$Nodes\n{survey.n_points}\n".encode())
@@ -186,6 +186,16 @@ def export_msh2(output: Path, source: RunSource, *, buildings: str | None = None
                 write_lines(file, line, np.column_stack((piece.ids[chosen] + 1, piece.points[chosen])))
             file.seek(end)
         file.write(b"$EndElements\n")
+
+
+def _write_head(file: BinaryIO, origin: str) -> None:
+    one = np.array([1], "<i4").tobytes()
+    file.write(b"$MeshFormat\n4.1 1 8\n" + one + b"\n$EndMeshFormat\n" + _comment(origin))
+
+
+def _comment(origin: str) -> bytes:
+    """Make the section that tells the origin; nothing for that of the CRS."""
+    return f"$Comments\norigin {origin}\n$EndComments\n".encode() if origin else b""
 
 
 def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.data.errors import CityError, ConfigError, InputError
 from tiler.export.cell_parts import ColumnsFile, divide_cells, take_whole
-from tiler.export.export import CELLS, EXPORT_RECORD, LARGEST_PART, Format
+from tiler.export.export import CELLS, EXPORT_RECORD, LARGEST_PART, ORIGIN, Format
 from tiler.export.foam_case import write_system
 from tiler.export.foam_files import LABEL_LIMIT
 from tiler.export.foam_part import DISTANCES, FoamPlan, PartCounts, PointPlaces, write_part
@@ -113,6 +113,8 @@ def export_openfoam(
         # ParaView opens a case by an empty file.
         (folder / "case.foam").touch()
         record = _record(counts, parts)
+        if any(pieces.files.origin):
+            record["origin"] = pieces.files.origin
         if case is not None:
             crs = crs_of(pieces.files)
             record |= {"crs": crs, "wind": asdict(blowing), "notes": notes}
@@ -269,7 +271,7 @@ def _by_region(piece: MeshPiece) -> Ints:
 FORMAT = Format(
     "a case folder of OpenFOAM",
     export_openfoam,
-    options=("parts", "case", *WIND_OPTIONS, "buildings", CELLS, LARGEST_PART),
+    options=("parts", "case", *WIND_OPTIONS, "buildings", CELLS, LARGEST_PART, ORIGIN),
     buildings=("patches", "zones"),
     folder=True,
 )

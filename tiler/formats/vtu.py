@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.export.export import CELLS, LARGEST_PART, Format
+from tiler.export.export import CELLS, LARGEST_PART, ORIGIN, Format
 from tiler.mesh_files.merged import TILE, write_merged_volume
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.prisms import PrismMesh, read_prisms
@@ -22,7 +22,7 @@ def export_vtu(path: Path, files: RunFiles, *, cells: str | None = None, scalars
     if cells == "prism":
         write_prisms(path, read_prisms(open_pieces(files)), scalars=scalars)
     else:
-        write_merged_volume(path, files.volumes, scalars=scalars)
+        write_merged_volume(path, files.volumes, scalars=scalars, origin=files.origin)
 
 
 def write_prisms(path: Path, mesh: PrismMesh, *, scalars: bool = False) -> None:
@@ -49,4 +49,4 @@ def _stream(name: str, values: NDArray[Any], dtype: np.dtype[Any], *, components
     return stream_items(name, dtype, components, len(flat), lambda i, j: flat[i:j])
 
 
-FORMAT = Format("the volume mesh as one VTK file", export_vtu, options=("scalars", CELLS, LARGEST_PART))
+FORMAT = Format("the volume mesh as one VTK file", export_vtu, options=("scalars", CELLS, LARGEST_PART, ORIGIN))

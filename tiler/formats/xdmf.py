@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.export.export import CELLS, LARGEST_PART, Format
+from tiler.export.export import CELLS, LARGEST_PART, ORIGIN, Format
 from tiler.export.pieces import Pieces, blocks_of
 from tiler.mesh_files.mesh_pieces import MeshPieces, open_pieces
 from tiler.mesh_files.prisms import PrismMesh, read_prisms
@@ -67,7 +67,7 @@ def export_xdmf(output: Path, source: RunSource, *, cells: str | None = None) ->
                 rows = _write_prisms(data_part, read_prisms(pieces))
             else:
                 rows = _write_data(data_part, pieces, *count_rows(pieces))
-        text_part.write_text(_render(data.name, rows))
+        text_part.write_text(_render(data.name, rows, pieces.files.origin_words))
         # Numbers that do not belong to an old text must not be read with it.
         output.unlink(missing_ok=True)
 
@@ -131,7 +131,7 @@ def _write_prisms(path: Path, mesh: PrismMesh) -> Rows:
     return {name: (len(values), values[:1].size or 1) for name, values in sets.items()}
 
 
-def _render(data: str, rows: Rows) -> str:
+def _render(data: str, rows: Rows, origin: str) -> str:
     def item(name: str) -> str:
         n, width = rows[name]
         dtype = ARRAYS[name.removeprefix("side_")][0] if name != SIDES else np.int64
@@ -167,13 +167,14 @@ def _render(data: str, rows: Rows) -> str:
     if SIDES in rows:
         names = {"marker": "side_marker", "building": "side_building"}
         grids.append(grid(SIDES, "Quadrilateral", SIDES, names))
-    return HEAD + "".join(grids) + TAIL
+    place = [f'    <Information Name="origin" Value="{origin}"/>\n'] if origin else []
+    return HEAD + "".join([*place, *grids]) + TAIL
 
 
 FORMAT = Format(
     "mesh and marked facets for FEniCS and ParaView, with a file .h5 beside it",
     export_xdmf,
-    options=(CELLS, LARGEST_PART),
+    options=(CELLS, LARGEST_PART, ORIGIN),
     suffix=".xdmf",
     companion=".h5",
 )
