@@ -25,7 +25,7 @@ def write_foam_prisms(
     by_building : bool
         Whether each building has a patch of its own.
     heights : Path, optional
-        An existing folder for the heights of the centres of cells (m), as `FoamPlan` has it.
+        An existing folder for the heights of the centres of cells (m), as `tiler.export.foam_part.FoamPlan`.
 
     Notes
     -----
