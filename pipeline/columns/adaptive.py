@@ -26,13 +26,13 @@ from pipeline.columns.nodes import (
     place_nodes,
 )
 from pipeline.columns.order_keys import set_order_keys, wall_gates
-from pipeline.columns.spacing import SpacingLimits, domain_top, mean_edges, vertical_spacing
+from pipeline.columns.spacing import SpacingLimits, column_spacing, domain_top, is_stretched
 from pipeline.columns.trim_layers import check_headroom
 from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import ColumnMesh, PlaneMesh
 from pipeline.data.roofs import Roofs, Weld, roof_heights
 from pipeline.plane_mesh.edges import plane_edges
-from pipeline.plane_mesh.sizes import SizeField, local_sizes
+from pipeline.plane_mesh.sizes import SizeField
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 
 HEADROOM = 0.5  # of the largest spacing: least air between a roof and the domain's top
@@ -162,11 +162,11 @@ def mesh_adaptive(
     mesh = ColumnMesh(plane, levels.start, levels.z, bottom, "heights")
     given = np.zeros(len(plane.xy), np.bool_)
     given[seam.vertex] = True
-    size = local_sizes(sizes, plane.xy, mesh_size=options.mesh_size)
-    spacing = vertical_spacing(mean_edges(plane), size, options.limits)
+    spacing = column_spacing(plane, sizes, options.limits, mesh_size=options.mesh_size)
     surfaces = collect_surfaces(plane, bottom)
     outline = np.diff(surfaces.start) > 1
-    slack = _level_slack(levels, outline, given, sample_dtm(dtm, plane.xy), spacing, options)
+    kept = given | is_stretched(plane.xy, sizes, mesh_size=options.mesh_size)
+    slack = _level_slack(levels, outline, given, kept, sample_dtm(dtm, plane.xy), spacing, options)
     surface = levels.start[:-1].repeat(np.diff(surfaces.start)) + surfaces.level
     n_shared, home = _count_shared(levels), levels.z
     del levels  # its kinds are of no use any more
@@ -251,8 +251,7 @@ def _fill_columns(
         top = np.full(len(plane.xy), options.top)
     air = HEADROOM * limits.most * size
     check_headroom(top, plane, highest_roofs(plane, roofs), ids, domain_height=options.domain_height, air=air)
-    local = local_sizes(sizes, plane.xy, mesh_size=size)
-    spacing = vertical_spacing(mean_edges(plane), local, limits)
+    spacing = column_spacing(plane, sizes, options.limits, mesh_size=options.mesh_size)
     shift = np.zeros(len(plane.xy))
     if options.stagger:
         shift = options.stagger * stagger_columns(len(plane.xy), plane_edges(plane.triangles)[0])
@@ -285,19 +284,21 @@ def _level_slack(
     levels: Levels,
     outline: NDArray[np.bool_],
     given: NDArray[np.bool_],
+    kept: NDArray[np.bool_],
     ground: NDArray[np.float64],
     spacing: NDArray[np.float64],
     options: AdaptiveOptions,
 ) -> NDArray[np.float64]:
     """How far each level may be moved for its cells (m): free ones anywhere, roofs a little at their outlines.
 
-    Columns that are given stay, and so do roofs that stand as low over the terrain as they may, and thin layers.
+    Columns that are given stay, and so do roofs in those that are kept, or as low over the terrain as they may be,
+    and thin layers.
     """
     column = np.repeat(np.arange(len(given)), np.diff(levels.start))
     slack = np.where(levels.kind == FREE, np.inf, 0.0)
     if options.weld is not None:
         high = levels.z >= ground[column] + options.weld.clearance + options.weld.slack
-        slack[(levels.kind == ROOF_LEVEL) & outline[column] & high] = options.weld.slack
+        slack[(levels.kind == ROOF_LEVEL) & (outline & ~kept)[column] & high] = options.weld.slack
     slack[given[column]] = 0.0
     if options.growth is not None:
         slack[levels.z <= (ground + movable_height(spacing, options.growth))[column]] = 0.0

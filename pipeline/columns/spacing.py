@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from pipeline.data.kernel import kernel
 from pipeline.data.mesh import PlaneMesh
 from pipeline.plane_mesh.edges import plane_edges
+from pipeline.plane_mesh.sizes import SizeField, local_sizes
 from pipeline.points_terrain.terrain import HEIGHT_UNIT, Dtm, sample_dtm
 
+TALLEST = 3.0  # times as high as wide; cells at walls that are finer in the plane alone, against others
 TOP_PASSES = 2  # moving averages of the terrain that shape the domain's top
 TOP_REACH = 0.5  # of the domain's height: how far those averages look together
 
@@ -76,6 +78,39 @@ def vertical_spacing(
         Limits in target sizes.
     """
     return np.clip(edge, limits.least * np.asarray(size), limits.most * np.asarray(size))
+
+
+def column_spacing(
+    plane: PlaneMesh, sizes: SizeField | None, limits: SpacingLimits, *, mesh_size: float
+) -> NDArray[np.float64]:
+    """Choose the distance of levels in each column of a plane mesh (m), float64 (n,).
+
+    Parameters
+    ----------
+    plane : PlaneMesh
+        Plane mesh.
+    sizes : SizeField or None
+        Its target edge lengths, where they are not the same everywhere.
+    limits : SpacingLimits
+        Limits in target sizes.
+    mesh_size : float
+        Target edge length (m).
+
+    Notes
+    -----
+    Where walls are finer in the plane alone, edges count as long as they would be without that, up to `TALLEST`
+    times their length.
+    """
+    upright = local_sizes(sizes, plane.xy, mesh_size=mesh_size, upright=True)
+    share = upright / local_sizes(sizes, plane.xy, mesh_size=mesh_size)
+    return vertical_spacing(mean_edges(plane) * np.minimum(share, TALLEST), upright, limits)
+
+
+def is_stretched(xy: NDArray[np.float64], sizes: SizeField | None, *, mesh_size: float) -> NDArray[np.bool_]:
+    """Tell where cells are higher than wide, as walls are finer in the plane alone: bool (n,)."""
+    upright, plan = (local_sizes(sizes, xy, mesh_size=mesh_size, upright=which) for which in (True, False))
+    stretched: NDArray[np.bool_] = plan < upright
+    return stretched
 
 
 def top_reach(domain_height: float) -> float:

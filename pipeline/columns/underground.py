@@ -22,10 +22,10 @@ from pipeline.columns.nodes import (
     join_levels,
     take_columns,
 )
-from pipeline.columns.spacing import SpacingLimits, mean_edges, vertical_spacing
+from pipeline.columns.spacing import SpacingLimits, column_spacing
 from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges
 from pipeline.plane_mesh.edges import plane_edges
-from pipeline.plane_mesh.sizes import SizeField, local_sizes
+from pipeline.plane_mesh.sizes import SizeField
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,7 @@ def fill_soil(
     Steps that grow downwards save cells where triangles are small, but make slivers of these: up to twice as wide
     saves 40 % of the soil under the centre of Amsterdam, and the worst radius ratio falls from 0.17 to 0.08.
     """
-    local = local_sizes(sizes, plane.xy, mesh_size=options.mesh_size)
-    spacing = vertical_spacing(mean_edges(plane), local, options.limits)[vertex]
+    spacing = column_spacing(plane, sizes, options.limits, mesh_size=options.mesh_size)[vertex]
     shift = np.zeros(len(plane.xy))
     if options.stagger:
         shift = options.stagger * stagger_columns(len(plane.xy), plane_edges(plane.triangles)[0])

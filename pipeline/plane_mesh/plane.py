@@ -145,7 +145,7 @@ def triangulate_plane(
     local = graph.xy - origin
     largest, smallest = max_area, max_area
     if sizes is not None:
-        largest, smallest = sizes.rule.open_size**2 / 2, sizes.rule.mesh_size**2 / 2
+        largest, smallest = sizes.rule.open_size**2 / 2, sizes.smallest**2 / 2
         local = np.concatenate((local, _open_vertices(local, graph.segments, origin, sizes)))
     width, height = local.max(axis=0)
     limit = STEINER_FACTOR * int(len(local) + width * height / smallest + 100)
@@ -200,7 +200,7 @@ def _open_vertices(
     box = ring_edges(shapely.get_rings(np.array([shapely.box(*low, *high)])))[:, 0]
     sides = {"vertices": box, "segments": np.array([[0, 1], [1, 2], [2, 3], [3, 0]])}
     out = triangle.triangulate(sides, f"pq{MIN_ANGLE:g}a{sizes.rule.open_size**2 / 2:.12g}")
-    for _ in range(math.ceil(math.log2(sizes.rule.open_size / sizes.rule.mesh_size)) + 1):
+    for _ in range(math.ceil(math.log2(sizes.rule.open_size / sizes.smallest)) + 1):
         a, b, c = (out["vertices"][out["triangles"][:, k]] for k in range(3))
         u, v = b - a, c - a
         quarter = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])[:, None] / 8

@@ -108,9 +108,12 @@ def tile_halo(tile_size: float, mesh_size: float, rule: SizeRule | None = None) 
     return max(widest, corner_sight(tile_size)) + mesh_size
 
 
-def sizes_halo(tile_size: float, rule: SizeRule) -> float:
-    """How far beyond a tile's lines walls count for the sizes in it and in the strips of its seams (m)."""
-    return _strip_reach(tile_size, rule) + rule.reach
+def sizes_halo(tile_size: float, rule: SizeRule, *, around_walls: bool = True) -> float:
+    """How far beyond a tile's lines walls count for the sizes in it and in the strips of its seams (m).
+
+    Where sizes grow around the region, not around walls, finer ones may still do so around these.
+    """
+    return _strip_reach(tile_size, rule) + max(rule.reach if around_walls else 0.0, rule.wall_reach)
 
 
 def areas_within(polygons: NDArray[np.object_], tile: shapely.Polygon) -> NDArray[np.float64]:

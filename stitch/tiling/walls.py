@@ -1,15 +1,20 @@
 """Walls in pieces that every tile and every strip cuts alike (before step 3.1)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.plane_mesh.plane import ring_edges
+from pipeline.plane_mesh.sizes import Finer, finer_sizes
 
 LONGEST_PIECE = 1.5  # mesh sizes
 
 
-def cut_walls(polygons: NDArray[np.object_], *, mesh_size: float) -> NDArray[np.float64]:
+def cut_walls(
+    polygons: NDArray[np.object_], *, mesh_size: float, finer: Sequence[Finer] = ()
+) -> NDArray[np.float64]:
     """Cut the walls of buildings into pieces.
 
     Parameters
@@ -17,7 +22,9 @@ def cut_walls(polygons: NDArray[np.object_], *, mesh_size: float) -> NDArray[np.
     polygons : object, (b,)
         Footprints that share walls vertex by vertex.
     mesh_size : float
-        Target edge length (m).
+        Target edge length at walls (m).
+    finer : sequence of Finer
+        Areas in which it is less.
 
     Returns
     -------
@@ -26,9 +33,10 @@ def cut_walls(polygons: NDArray[np.object_], *, mesh_size: float) -> NDArray[np.
 
     Notes
     -----
-    A wall is cut into as few equal pieces as `LONGEST_PIECE` allows. The cuts depend on the wall's two ends
-    alone: whoever sees the wall, in whatever direction, has the same vertices on it, bit for bit. So a
-    strip can take whole pieces where it ends, and none has to be clipped.
+    A wall is cut into as few equal pieces as `LONGEST_PIECE` allows, and these in half where the size in their
+    middle is less. The cuts depend on the wall's two ends and the areas alone: whoever sees the wall, in whatever
+    direction, has the same vertices on it, bit for bit. So a strip can take whole pieces where it ends, and none
+    has to be clipped.
 
     Examples
     --------
@@ -49,7 +57,22 @@ def cut_walls(polygons: NDArray[np.object_], *, mesh_size: float) -> NDArray[np.
     start, end = (edges[edge, 0] + across[edge] * (step / n[edge])[:, None] for step in (k, k + 1))
     start[k == 0] = edges[edge[k == 0], 0]
     end[k == n[edge] - 1] = edges[edge[k == n[edge] - 1], 1]
-    return np.stack((start, end), axis=1)
+    return _halve(np.stack((start, end), axis=1), finer, mesh_size)
+
+
+def _halve(pieces: NDArray[np.float64], finer: Sequence[Finer], mesh_size: float) -> NDArray[np.float64]:
+    """Halve pieces (w, 2, 2), in their order, until none is too long for the size in its middle."""
+    while finer:
+        middle = (pieces[:, 0] + pieces[:, 1]) / 2
+        across = pieces[:, 1] - pieces[:, 0]
+        length = np.sqrt(across[:, 0] ** 2 + across[:, 1] ** 2)
+        long = length > LONGEST_PIECE * finer_sizes(finer, middle, mesh_size)
+        if not long.any():
+            break
+        first = np.arange(len(pieces)) + np.cumsum(long) - long
+        pieces = np.repeat(pieces, 1 + long, axis=0)
+        pieces[first[long], 1] = pieces[first[long] + 1, 0] = middle[long]
+    return pieces
 
 
 def walls_within(walls: NDArray[np.float64], box: shapely.Polygon) -> NDArray[np.float64]:

@@ -23,7 +23,7 @@ from pipeline.data.mesh import ColumnMesh, TetMesh
 from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.plane import signed_areas
-from pipeline.plane_mesh.sizes import SizeField, SizeRule, size_field
+from pipeline.plane_mesh.sizes import Finer, SizeField, SizeRule, size_field
 from pipeline.points_terrain.terrain import Dtm, compute_dtm, sample_dtm
 from pipeline.simplification.simplify import simplify_city
 from stitch.pieces.conformity import compute_cell_volumes, pair_cell_faces, pair_edges
@@ -149,6 +149,7 @@ def mesh_alone(
     clip: bool = True,
     removed: NDArray[np.int32] | None = None,
     rule: SizeRule | None = None,
+    finer: Sequence[Finer] = (),
 ) -> Tile:
     """Mesh one tile: its corners and seams first, from what its halo holds, or from the whole scene.
 
@@ -161,8 +162,8 @@ def mesh_alone(
     rows = order[np.searchsorted(scene.model.numbers, model.numbers, sorter=order)]
     if isinstance(options, LayeredOptions):
         removed = (layers_of(scene, grid.bounds, options) if removed is None else removed)[rows]
-    walls = cut_walls(model.polygons, mesh_size=size)
-    sizes = size_field(walls, rule) if rule else None
+    walls = cut_walls(model.polygons, mesh_size=rule.at_walls if rule else size, finer=finer)
+    sizes = size_field(walls, rule, finer) if rule else None
     corners: dict[Key, Corner] = {}
     seams: dict[SeamKey, Seam] = {}
     columns: dict[SeamKey, Levels] = {}
@@ -207,11 +208,19 @@ def mesh_alone(
 
 
 def mesh_all(
-    scene: Scene, grid: TileGrid, options: Options = OPTIONS, *, rule: SizeRule | None = None
+    scene: Scene,
+    grid: TileGrid,
+    options: Options = OPTIONS,
+    *,
+    rule: SizeRule | None = None,
+    finer: Sequence[Finer] = (),
 ) -> dict[Key, Tile]:
     """Mesh every tile alone."""
     removed = layers_of(scene, grid.bounds, options) if isinstance(options, LayeredOptions) else None
-    return {tile: mesh_alone(scene, grid, tile, options, removed=removed, rule=rule) for tile in tile_keys(grid)}
+    return {
+        tile: mesh_alone(scene, grid, tile, options, removed=removed, rule=rule, finer=finer)
+        for tile in tile_keys(grid)
+    }
 
 
 def _seam_levels(

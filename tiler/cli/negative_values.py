@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from decimal import Decimal
 
-_TILE = re.compile(r"-?\d+_-?\d+")
+_WORD = re.compile(r"-?\d+_-?\d+|-[\d.eE+-]+(,[\d.eE+-]+)+")  # a tile, or numbers with commas
 _PLAIN = re.compile(r"-\d+|-\d*\.\d+")  # what argparse takes as a number, Python 3.11 to 3.14
 
 
@@ -20,7 +20,8 @@ def mark_values(arguments: Sequence[str]) -> list[str]:
     Returns
     -------
     list of str
-        A tile's name joined to the option before it, and negative numbers as plain decimals; all else as it was.
+        A tile's name or a box joined to the option before it, and negative numbers as plain decimals; all else as
+        it was.
 
     Examples
     --------
@@ -30,7 +31,7 @@ def mark_values(arguments: Sequence[str]) -> list[str]:
     marked: list[str] = []
     for text in arguments:
         before = marked[-1] if marked else ""
-        if text.startswith("-") and _TILE.fullmatch(text) and before.startswith("--") and "=" not in before:
+        if text.startswith("-") and _WORD.fullmatch(text) and before.startswith("--") and "=" not in before:
             marked[-1] = f"{before}={text}"
         else:
             marked.append(_plain_number(text))

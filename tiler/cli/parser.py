@@ -27,9 +27,9 @@ EXIT_CODES = (
 METAVARS = {str: "NAME", float: "NUMBER", int: "NUMBER"}
 # What a value is, where its type does not tell.
 KINDS = {
-    **dict.fromkeys(("footprints", "cluster", "tls_ca", "tls_cert", "tls_key"), "FILE"),
+    **dict.fromkeys(("footprints", "refine_areas", "cluster", "tls_ca", "tls_cert", "tls_key"), "FILE"),
     **{"out": "DIR", "crs": "EPSG", "layer": "LAYER", "scheduler": "ADDRESS"},
-    **dict.fromkeys(("id_attribute", "height_attribute", "roof_attribute"), "ATTRIBUTE"),
+    **dict.fromkeys(("id_attribute", "height_attribute", "roof_attribute", "refine_attribute"), "ATTRIBUTE"),
 }
 WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
@@ -217,6 +217,8 @@ def _add_parameters(parser: argparse.ArgumentParser) -> Group:
             words |= {"type": str, "nargs": "+", "metavar": "M|nH"}
         elif get_origin(wanted) is tuple and get_args(wanted)[0] is int:
             words |= {"type": str, "metavar": "N,N"}
+        elif entry.name == "refine":
+            words |= {"type": str, "action": "append", "metavar": "X0,Y0,X1,Y1,SIZE"}
         elif get_origin(wanted) is tuple and get_args(wanted)[0] is str:
             words |= {"type": str, "nargs": "+", "metavar": "FILE"}
         elif get_origin(wanted) is tuple:
@@ -354,6 +356,10 @@ def _add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument("--overwrite", action="store_true", help="replace it if it exists")
     given: dict[str, dict[str, Any]] = {
         "parts": {"type": int, "metavar": "N", "help": "decomposed for N processes instead of whole"},
+        "cells": {
+            "choices": ("prism",),
+            "help": "prisms of a layered mesh, a third as many, instead of tetrahedra",
+        },
         "case": {"choices": ("wind",), "help": "add the files of a simulation"},
         "direction": {
             "type": float,
@@ -384,6 +390,10 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         "largest_part": {
             "action": "store_true",
             "help": "of a mesh in parts that share no face, the one of the most cells alone",
+        },
+        "origin": {
+            "metavar": "X,Y,Z|auto",
+            "help": "whole metres that coordinates count from; auto: the region's south-western corner",
         },
         "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
     }

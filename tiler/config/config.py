@@ -29,6 +29,7 @@ UNSET = ""
 ANYWHERE = "127.0.0.1:0"  # a free port of this machine, for this machine
 PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is given for the open
 NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
+LEAST_SIZE = 0.1  # m; of edges
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
 
@@ -205,6 +206,26 @@ class Config:
         0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size or pad",
         least=Above(0), most=1,
     )  # fmt: skip
+    wall_size: float = _parameter(
+        0.0, "mesh", "target edge length at walls, in the plane alone, below mesh_size; 0 takes mesh_size",
+        unit="m", least=0,
+    )  # fmt: skip
+    wall_growth: float = _parameter(
+        1.2, "mesh", "with wall_size: ratio by which each edge is longer than the one before it on the way from a "
+        "wall", least=Above(1), most=2,
+    )  # fmt: skip
+    refine: tuple[str, ...] = _parameter(
+        (), "mesh", "box with a target edge length of its own, x0,y0,x1,y1,SIZE in coordinates of the region; may "
+        "be repeated", unit="m",
+    )  # fmt: skip
+    refine_areas: str = _parameter(
+        UNSET, "mesh", "vector file of areas or lines, each with a target edge length of its own"
+    )
+    refine_attribute: str = _parameter("size", "mesh", "attribute of refine_areas with that length in metres")
+    refine_growth: float = _parameter(
+        1.2, "mesh", "with refine or refine_areas: ratio by which each edge is longer than the one before it on "
+        "the way from a box or an area", least=Above(1), most=2,
+    )  # fmt: skip
     pad: tuple[float | str, ...] = _parameter(
         (), "mesh", "width of a margin of bare ground around the region, which flattens outwards and has coarser "
         "cells: one for all sides, or west east south north; metres, or 5H for five times the height of the "
@@ -348,6 +369,11 @@ class Config:
         return any(width != 0 for width in self.pad)
 
     @property
+    def refined(self) -> bool:
+        """Whether walls or areas are finer than the rest."""
+        return bool(self.wall_size or self.refine or self.refine_areas)
+
+    @property
     def largest_size(self) -> float:
         """Largest target edge length within the region (m)."""
         return self.open_size or self.mesh_size
@@ -433,6 +459,12 @@ def idle_parameters(config: Config) -> list[str]:
         ]
     if config.grading != default.grading and not config.graded_size:
         idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
+    if config.wall_growth != default.wall_growth and not config.wall_size:
+        idle.append(f"wall_growth = {config.wall_growth:g} has no effect: it counts with wall_size above 0")
+    if config.refine_growth != default.refine_growth and not (config.refine or config.refine_areas):
+        idle.append(f"refine_growth = {config.refine_growth:g} has no effect: it counts with refine, refine_areas")
+    if config.refine_attribute != default.refine_attribute and not config.refine_areas:
+        idle.append(f"refine_attribute = {config.refine_attribute} has no effect: it counts with refine_areas")
     if config.layer_growth != default.layer_growth and not config.first_layer:
         idle.append(f"layer_growth = {config.layer_growth:g} has no effect: it counts with first_layer above 0")
     if not config.scheduler:
@@ -468,6 +500,7 @@ def with_absolute_inputs(config: Config) -> Config:
         buildings=tuple(map(absolute, config.buildings)),
         terrain=tuple(map(absolute, config.terrain)),
         footprints=absolute(config.footprints) if config.footprints else "",
+        refine_areas=absolute(config.refine_areas) if config.refine_areas else "",
     )
 
 
@@ -490,7 +523,7 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         raise ConfigError(f"{name} = {_shown(value)}: {wanted.__name__} expected, not {type(value).__name__}")
     if isinstance(value, str):
         _check_text(name, value)
-        if name in ("pointcloud", "footprints", "buildings", "terrain", "out"):
+        if name in ("pointcloud", "footprints", "buildings", "terrain", "refine_areas", "out"):
             check_url(value)
     return value
 
@@ -559,6 +592,13 @@ def _check_together(config: Config) -> None:
             f"open_size = {config.open_size:g} m: must be above mesh_size = {config.mesh_size:g} m; 0 takes "
             "mesh_size everywhere"
         )
+    if config.wall_size and not LEAST_SIZE <= config.wall_size < config.mesh_size:
+        raise ConfigError(
+            f"wall_size = {config.wall_size:g} m: must be at least {LEAST_SIZE:g} m and below mesh_size = "
+            f"{config.mesh_size:g} m; 0 takes mesh_size"
+        )
+    for text in config.refine:
+        read_refinement(text, config.largest_size)
     if config.least_spacing > config.most_spacing:
         raise ConfigError(
             f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
@@ -586,6 +626,52 @@ def _check_together(config: Config) -> None:
     _check_way(config)
     if not isinstance(config.domain_height, str):
         check_height(config, config.domain_height)
+
+
+def read_refinement(text: str, largest: float) -> tuple[float, tuple[float, float, float, float]]:
+    """Read a box with a size of its own: x0,y0,x1,y1,SIZE (m).
+
+    Parameters
+    ----------
+    text : str
+        As the command line gives it.
+    largest : float
+        Target edge length of the rest (m), which the size is below.
+
+    Returns
+    -------
+    float
+        The size (m).
+    tuple of 4 floats
+        xmin, ymin, xmax, ymax (m).
+
+    Raises
+    ------
+    ConfigError
+        If it is no such box.
+
+    Examples
+    --------
+    >>> read_refinement("30,0,10,20,2.5", 10.0)
+    (2.5, (10.0, 0.0, 30.0, 20.0))
+    """
+    try:
+        x0, y0, x1, y1, size = (float(word) for word in text.split(","))
+    except ValueError:
+        raise ConfigError(f"refine = {_shown(text)}: five numbers x0,y0,x1,y1,SIZE expected") from None
+    if not all(map(math.isfinite, (x0, y0, x1, y1))) or x0 == x1 or y0 == y1:
+        raise ConfigError(f"refine = {_shown(text)}: the box has no area; give x0,y0,x1,y1,SIZE")
+    check_refinement(size, largest, f"refine = {_shown(text)}")
+    return size, (min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))
+
+
+def check_refinement(size: float, largest: float, place: str) -> None:
+    """Raise ConfigError if the size of an area is out of bounds (m); `place` begins the message."""
+    if not LEAST_SIZE <= size < largest:
+        raise ConfigError(
+            f"{place}: a size of {size:g} m; must be at least {LEAST_SIZE:g} m and below that of the rest, "
+            f"{largest:g} m"
+        )
 
 
 def _check_classes(classes: tuple[int, ...]) -> None:

@@ -159,7 +159,7 @@ def _relative_to(folder: Path, name: str, value: Any) -> Any:
     if name in ("pointcloud", "buildings", "terrain") and isinstance(value, (str, list)):
         value = [value] if isinstance(value, str) else value
         return [_below(folder, item) if isinstance(item, str) else item for item in value]
-    if name in ("footprints", "out", *TLS) and isinstance(value, str) and value:
+    if name in ("footprints", "refine_areas", "out", *TLS) and isinstance(value, str) and value:
         return _below(folder, value)
     return value
 

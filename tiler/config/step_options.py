@@ -2,6 +2,8 @@
 
 from typing import Any, Literal
 
+import shapely
+
 from pipeline.city_model.city import CityOptions
 from pipeline.columns.adaptive import AdaptiveOptions
 from pipeline.columns.growth import Growth, count_steps
@@ -9,7 +11,7 @@ from pipeline.columns.layered import LayeredOptions
 from pipeline.columns.spacing import SpacingLimits
 from pipeline.columns.underground import SoilOptions
 from pipeline.data.roofs import Weld
-from pipeline.plane_mesh.sizes import SizeRule
+from pipeline.plane_mesh.sizes import Finer, SizeRule
 from tiler.config.config import Config
 from tiler.config.declared import Declared
 from tiler.config.domain_height import Domain
@@ -37,6 +39,8 @@ CITY_PARAMETERS = (
 PLANE_PARAMETERS = ("mesh_size", "min_angle", "mesher")
 # Further ones of both where sizes are graded.
 SIZE_PARAMETERS = ("open_size", "grading")
+# Further ones of both where walls or areas are finer than the rest.
+REFINE_PARAMETERS = ("wall_size", "wall_growth", "refinements", "refine_growth")
 # Further ones of both where there is a pad; the first also of what reads its terrain.
 PAD_PARAMETERS = ("core_bounds", "graded_size")
 # Parameters of the columns.
@@ -149,8 +153,23 @@ def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | A
 
 
 def size_rule(given: Any, largest: float) -> SizeRule:
-    """Rule of the sizes in the plane, with the largest one (m), where they are graded."""
-    return SizeRule(given.mesh_size, largest, given.grading)
+    """Rule of the sizes in the plane, with the largest one (m), 0 where only walls or areas are finer."""
+    wall = _optional(given, "wall_size", 0.0)
+    growth = given.wall_growth - 1 if wall else 0.0
+    return SizeRule(given.mesh_size, largest or given.mesh_size, given.grading, wall, growth)
+
+
+def is_refined(given: Any) -> bool:
+    """Whether walls or areas are finer than the rest."""
+    return bool(_optional(given, "wall_size", 0.0) or _optional(given, "refinements", ()))
+
+
+def refined_areas(given: Any) -> list[Finer]:
+    """Areas that are finer than the rest, those of one size together."""
+    areas = _optional(given, "refinements", ())
+    sizes = sorted({size for size, _ in areas})
+    shapes = {size: shapely.from_wkb([text for other, text in areas if other == size]) for size in sizes}
+    return [Finer(size, given.refine_growth - 1, shapely.STRtree(shapes[size])) for size in sizes]
 
 
 def soil_options(given: Any) -> SoilOptions | None:

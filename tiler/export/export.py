@@ -19,13 +19,17 @@ from tiler.mesh_files.run_files import (
     RUN_RECORD,
     VOLUME_INDEX,
     RunFiles,
+    crs_of,
     find_files,
     take_largest_part,
+    take_origin,
 )
 
 EXPORT_RECORD = "export.json"  # in every folder that was exported: only such a one is ever replaced
 LARGEST_PART = "largest_part"  # taken by every format of the mesh, not by those of the city model
-PER_BUILDING = ("buildings", LARGEST_PART)
+CELLS = "cells"  # what cells are: tetrahedra, or prisms
+ORIGIN = "origin"  # taken by all of these but glb, which has its own
+PER_BUILDING = ("buildings", LARGEST_PART, ORIGIN)
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,11 @@ def export_run(
         raise ConfigError(f"{output}: holds no {EXPORT_RECORD}, so it was not exported; give another --output")
     if given.pop(LARGEST_PART, False):
         files = take_largest_part(files)
-    return kind.write(output, files, **given) or []
+    said = []
+    if (origin := given.pop(ORIGIN, None)) is not None:
+        files = take_origin(files, origin)
+        said.append(f"coordinates count from {files.origin_words or '0 0 0'} m, in {crs_of(files)}")
+    return said + (kind.write(output, files, **given) or [])
 
 
 def _check_target(output: Path, files: RunFiles, *, overwrite: bool) -> None:

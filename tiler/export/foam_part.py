@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -402,8 +403,8 @@ class _PartWriter:
                 height[other[order] == beyond].tofile(place)
 
 
-def count_distances(points: NDArray[np.float64], cells: NDArray[np.int32], facets: NDArray[np.int32]) -> Ints:
-    """Count how far centres of cells (k, 4) are from the planes of their facets (k, 3): bins of `DISTANCES`.
+def count_distances(points: NDArray[np.float64], cells: NDArray[Any], facets: NDArray[Any]) -> Ints:
+    """Count how far centres of cells (k, 4 or 6) are from planes of their facets (k, 3 or 4): bins of `DISTANCES`.
 
     Examples
     --------

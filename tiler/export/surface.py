@@ -83,7 +83,8 @@ class RunSurface:
                 f"{path}: markers {marks.min()}..{marks.max()}, known are 1..{max(PATCHES)}; run the tile again"
             )
         ids = number_piece(path, piece.point_data.get(VERTEX_ID), self.pieces.numbering)
-        return BoundaryPart(piece.points, piece.boundary.facets, marks, piece.boundary.building, ids)
+        points = piece.points - self.pieces.files.origin
+        return BoundaryPart(points, piece.boundary.facets, marks, piece.boundary.building, ids)
 
 
 def open_surface(source: RunSource) -> RunSurface:

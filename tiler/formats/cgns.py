@@ -17,16 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
+from tiler.export.export import CELLS as CELL_KIND
 from tiler.export.export import PER_BUILDING, Format
 from tiler.export.foam_patches import Patch, facets_by_key, patch_keys, patch_of_key
 from tiler.export.pieces import Pieces, blocks_of
 from tiler.mesh_files.mesh_pieces import open_pieces
+from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import disk_errors, replacing
 
 VERSION = 3.3  # of CGNS, the first in which all that is written has today's meaning
-TRIANGLE, TETRAHEDRON = 5, 10  # TRI_3 and TETRA_4 among CGNS's types of elements
+ELEMENTS = {3: 5, 4: 10, 6: 14}  # TRI_3, TETRA_4 and PENTA_6 among CGNS's types of elements, by corners
+QUADRILATERAL = 7  # QUAD_4
+QUADRILATERALS = "_quadrilaterals"  # behind the name of a patch, in that of their section
 BASE, ZONE, CELLS = "city", "air", "cells"
+Ints = NDArray[np.int64]
 INT32_LIMIT = 2**31 - 1
 NAME_BYTES, TYPE_BYTES = 33, 3  # of attributes and the strings at the root, their last byte zero
 UNITS = ("Null", "Meter", "Null", "Null", "Null")  # mass, length, time, temperature, angle: 32 characters each
@@ -36,20 +41,23 @@ TYPES = {"i4": "I4", "i8": "I8", "f4": "R4", "f8": "R8", "i1": "C1"}
 
 @dataclass(frozen=True, eq=False)
 class _Survey:
-    """What is known after reading all pieces once: cells, and facets by key of patch, ascending."""
+    """After reading all pieces once: cells, and facets by key of patch, ascending, then by corners."""
 
     n_points: int
     n_cells: int
-    facets: dict[int, int]
+    facets: dict[int, dict[int, int]]
+    width: int = 4  # corners of a cell
 
     @property
     def integer(self) -> str:
         """Type of all numbers of points and elements: 64 bits only where a length does not fit in 32."""
-        n_elements = self.n_cells + sum(self.facets.values())
-        return "i4" if max(self.n_points, n_elements, 4 * self.n_cells) <= INT32_LIMIT else "i8"
+        n_elements = self.n_cells + sum(sum(counts.values()) for counts in self.facets.values())
+        return "i4" if max(self.n_points, n_elements, self.width * self.n_cells) <= INT32_LIMIT else "i8"
 
 
-def export_cgns(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
+def export_cgns(
+    output: Path, source: RunSource, *, buildings: str | None = None, cells: str | None = None
+) -> None:
     """Write the mesh of a finished run as CGNS.
 
     Parameters
@@ -60,6 +68,8 @@ def export_cgns(output: Path, source: RunSource, *, buildings: str | None = None
         Folder of the run.
     buildings : {"patches"}, optional
         See `write_cgns`.
+    cells : {"prism"}, optional
+        Write prisms instead of tetrahedra; see `tiler.mesh_files.prisms`, also for memory.
 
     Raises
     ------
@@ -72,8 +82,33 @@ def export_cgns(output: Path, source: RunSource, *, buildings: str | None = None
     """
     pieces = open_pieces(source)
     crs = crs_of(source)
+    if origin := pieces.files.origin_words:
+        crs += f"; coordinates count from {origin} m"
     with replacing(output) as part, disk_errors(output):
-        write_cgns(part, pieces, crs=crs, buildings=buildings)
+        if cells == "prism":
+            _write_prisms(part, read_prisms(pieces), crs, by_building=buildings is not None)
+        else:
+            write_cgns(part, pieces, crs=crs, buildings=buildings)
+
+
+def _write_prisms(path: Path, mesh: PrismMesh, crs: str, *, by_building: bool) -> None:
+    """Write prisms; a patch may have two sections, triangles and quadrilaterals, one behind the other."""
+    facets: dict[int, dict[int, Ints]] = {}
+    for width in (3, 4):
+        corners, marker, building = mesh.facets(width)
+        keys = patch_keys(marker, building, by_building=by_building)
+        for key, rows in facets_by_key(np.unique(keys).tolist(), keys):
+            facets.setdefault(key, {})[width] = corners[rows]
+    counts = {key: {width: len(rows) for width, rows in facets[key].items()} for key in sorted(facets)}
+    survey = _Survey(len(mesh.points), len(mesh.cells), counts, width=6)
+    with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
+        zone = _write_tree(file, survey, crs)
+        for axis, name in enumerate("XYZ"):
+            zone[f"GridCoordinates/Coordinate{name}/ data"][:] = mesh.points[:, axis]
+        zone[f"{CELLS}/ElementConnectivity/ data"][:] = mesh.cells.ravel() + 1
+        for key, parts in facets.items():
+            for width, rows in parts.items():
+                zone[f"{_section(key, width)}/ElementConnectivity/ data"][:] = rows.ravel() + 1
 
 
 def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = None) -> None:
@@ -99,7 +134,7 @@ def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = 
     with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
         zone = _write_tree(file, survey, crs)
         coordinates = [zone[f"GridCoordinates/Coordinate{axis}/ data"] for axis in "XYZ"]
-        sections = {0: CELLS} | {key: patch_of_key(key).name for key in survey.facets}
+        sections = {0: CELLS} | {key: _section(key, 3) for key in survey.facets}
         seen = dict.fromkeys(sections, 0)
         for k in range(len(pieces.names)):
             piece = pieces.read(k)
@@ -129,7 +164,12 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
         )
         for key, n in zip(keys.tolist(), counts.tolist(), strict=True):
             facets[key] = facets.get(key, 0) + n
-    return _Survey(pieces.n_points, n_cells, dict(sorted(facets.items())))
+    return _Survey(pieces.n_points, n_cells, {key: {3: n} for key, n in sorted(facets.items())})
+
+
+def _section(key: int, width: int) -> str:
+    """Name the section of a patch's facets with so many corners."""
+    return patch_of_key(key).name + (QUADRILATERALS if width == 4 else "")
 
 
 def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
@@ -154,17 +194,18 @@ def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
     for axis in "XYZ":
         coordinate = _array(grid, f"Coordinate{axis}", survey.n_points, "f8")
         _node(coordinate, "DimensionalExponents", "DimensionalExponents_t", np.array(LENGTH, "<f4"))
-    _write_section(zone, CELLS, TETRAHEDRON, 4, 1, survey.n_cells, kind)
+    _write_section(zone, CELLS, survey.width, 1, survey.n_cells, kind)
     conditions = _node(zone, "ZoneBC", "ZoneBC_t") if patches else None
     first = survey.n_cells + 1
     for key, patch in patches.items():
-        n = survey.facets[key]
-        _write_section(zone, patch.name, TRIANGLE, 3, first, n, kind)
+        begin = first
+        for width, n in survey.facets[key].items():
+            _write_section(zone, _section(key, width), width, first, n, kind)
+            first += n
         condition = _node(conditions, patch.name, "BC_t", "FamilySpecified")
-        _node(condition, "PointRange", "IndexRange_t", np.array([[first], [first + n - 1]], f"<{kind}"))
+        _node(condition, "PointRange", "IndexRange_t", np.array([[begin], [first - 1]], f"<{kind}"))
         _node(condition, "GridLocation", "GridLocation_t", "FaceCenter")
         _node(condition, "FamilyName", "FamilyName_t", patch.name)
-        first += n
     return zone
 
 
@@ -173,7 +214,9 @@ def _write_family(base: h5py.Group, patch: Patch) -> None:
     _node(family, "FamilyBC", "FamilyBC_t", "BCWall" if patch.kind == "wall" else "UserDefined")
 
 
-def _write_section(zone: h5py.Group, name: str, element: int, width: int, first: int, n: int, kind: str) -> None:
+def _write_section(zone: h5py.Group, name: str, width: int, first: int, n: int, kind: str) -> None:
+    """Write a section of `n` elements with `width` corners: facets with 4 are told from cells by their name."""
+    element = QUADRILATERAL if width == 4 and name != CELLS else ELEMENTS[width]
     section = _node(zone, name, "Elements_t", np.array([element, 0], "<i4"))
     _node(section, "ElementRange", "IndexRange_t", np.array([first, first + n - 1], f"<{kind}"))
     _array(section, "ElementConnectivity", n * width, kind)
@@ -215,4 +258,6 @@ def _characters(text: str) -> NDArray[np.int8]:
     return np.frombuffer(text.encode(), np.int8)
 
 
-FORMAT = Format("mesh and named patches as CGNS in HDF5", export_cgns, options=PER_BUILDING, suffix=".cgns")
+FORMAT = Format(
+    "mesh and named patches as CGNS in HDF5", export_cgns, options=(*PER_BUILDING, CELL_KIND), suffix=".cgns"
+)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker
-from tiler.export.export import PER_BUILDING, Format
+from tiler.export.export import LARGEST_PART, Format
 from tiler.export.foam_patches import FIRST_BUILDING, PATCHES, building_name, facets_by_key, is_house
 from tiler.export.surface import (
     Surface,
@@ -213,5 +213,8 @@ def _material(marker: Marker) -> dict[str, Any]:
 
 
 FORMAT = Format(
-    "the boundary as glTF 2.0, binary, one material a patch", export_glb, options=PER_BUILDING, suffix=".glb"
+    "the boundary as glTF 2.0, binary, one material a patch",
+    export_glb,
+    options=("buildings", LARGEST_PART),
+    suffix=".glb",
 )

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.mesh import Marker, Region
-from tiler.export.export import PER_BUILDING, Format
+from tiler.export.export import CELLS, PER_BUILDING, Format
 from tiler.export.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
 from tiler.export.pieces import Pieces, blocks_of, slices, write_lines
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
+from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
 
@@ -27,10 +28,11 @@ NAMES = {number: region.name.lower() for region, number in VOLUMES.items()}
 # Markers of facets that bound one of the two regions alone.
 OF_AIR = (Marker.WALL, Marker.ROOF, Marker.TOP)
 OF_SOIL = (Marker.BOTTOM, Marker.FOUNDATION)
-TRIANGLE, TETRAHEDRON = 2, 4  # Gmsh's types of elements
+TRIANGLE, QUADRILATERAL, TETRAHEDRON, PRISM = 2, 3, 4, 6  # Gmsh's types of elements
 TEXT_FLOAT = "%24.16e"  # 17 digits, enough for any float64; each has the same width
 
 _Box = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +65,7 @@ class _Survey:
         }
 
 
-def export_msh(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
+def export_msh(output: Path, source: RunSource, *, buildings: str | None = None, cells: str | None = None) -> None:
     """Write the mesh of a finished run as MSH 4.1, binary.
 
     Parameters
@@ -89,9 +91,12 @@ def export_msh(output: Path, source: RunSource, *, buildings: str | None = None)
     """
     pieces = open_pieces(source)
     by_building = buildings is not None
+    if cells == "prism":
+        _export_prisms(output, read_prisms(pieces), pieces.files.origin_words, by_building=by_building)
+        return
     survey = _survey(pieces, by_building=by_building)
     with replacing(output) as part, part.open("wb") as file:
-        file.write(b"$MeshFormat\n4.1 1 8\n" + np.array([1], "<i4").tobytes() + b"\n$EndMeshFormat\n")
+        _write_head(file, pieces.files.origin_words)
         _write_names(file, survey)
         _write_entities(file, survey)
         nodes = _begin_nodes(file, survey.n_points)
@@ -116,6 +121,39 @@ def export_msh(output: Path, source: RunSource, *, buildings: str | None = None)
                     seen[group] += len(corners)
 
 
+def _export_prisms(output: Path, mesh: PrismMesh, origin: str, *, by_building: bool) -> None:
+    """Write prisms; a surface may have two blocks of elements, triangles and quadrilaterals."""
+    blocks: list[tuple[int, int, Ints]] = []
+    counts: dict[int, int] = {}
+    boxes: dict[int, _Box] = {AIR: _grown(_no_box(), mesh.points)}
+    for width, kind in ((3, TRIANGLE), (4, QUADRILATERAL)):
+        corners, marker, building = mesh.facets(width)
+        keys = patch_keys(marker, building, by_building=by_building)
+        for key, rows in facets_by_key(np.unique(keys).tolist(), keys):
+            blocks.append((key, kind, corners[rows]))
+            counts[key] = counts.get(key, 0) + len(rows)
+            boxes[key] = _grown(boxes.get(key, _no_box()), mesh.points[corners[rows].ravel()])
+    survey = _Survey(len(mesh.points), {AIR: len(mesh.cells)}, dict(sorted(counts.items())), boxes)
+    numbers = survey.numbers | {AIR: AIR}
+    with replacing(output) as part, part.open("wb") as file:
+        _write_head(file, origin)
+        _write_names(file, survey)
+        _write_entities(file, survey)
+        file.seek(_begin_nodes(file, survey.n_points))
+        file.write(np.ascontiguousarray(mesh.points, "<f8").data)
+        file.seek(0, 2)
+        n = survey.n_elements
+        file.write(b"$Elements\n" + _packed("u8", [len(blocks) + 1, n, 1, n]))
+        tag = 1
+        for key, kind, corners in [*blocks, (AIR, PRISM, mesh.cells)]:
+            file.write(_packed("i4", [3 if kind == PRISM else 2, numbers[key], kind]))
+            file.write(_packed("u8", [len(corners)]))
+            tags = tag + np.arange(len(corners))
+            file.write(np.ascontiguousarray(np.column_stack((tags, corners + 1)), "<u8").data)
+            tag += len(corners)
+        file.write(b"\n$EndElements\n")
+
+
 def export_msh2(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
     """Write the mesh of a finished run as MSH 2.2, text; see `export_msh`."""
     pieces = open_pieces(source)
@@ -123,7 +161,7 @@ def export_msh2(output: Path, source: RunSource, *, buildings: str | None = None
     survey = _survey(pieces, by_building=by_building)
     keys, numbers = (np.array(list(some), np.int64) for some in (survey.numbers, survey.numbers.values()))
     with replacing(output) as part, part.open("wb") as file:
-        file.write(b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n")
+        file.write(b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n" + _comment(pieces.files.origin_words))
         _write_names(file, survey)
         digits = len(str(survey.n_points))
         file.write(f"$Nodes\n{survey.n_points}\n".encode())
@@ -148,6 +186,16 @@ def export_msh2(output: Path, source: RunSource, *, buildings: str | None = None
                 write_lines(file, line, np.column_stack((piece.ids[chosen] + 1, piece.points[chosen])))
             file.seek(end)
         file.write(b"$EndElements\n")
+
+
+def _write_head(file: BinaryIO, origin: str) -> None:
+    one = np.array([1], "<i4").tobytes()
+    file.write(b"$MeshFormat\n4.1 1 8\n" + one + b"\n$EndMeshFormat\n" + _comment(origin))
+
+
+def _comment(origin: str) -> bytes:
+    """Make the section that tells the origin; nothing for that of the CRS."""
+    return f"$Comments\norigin {origin}\n$EndComments\n".encode() if origin else b""
 
 
 def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
@@ -246,4 +294,4 @@ def _numbered(tag: int, nodes: NDArray[np.int64], kind: int, group: NDArray[np.i
     return np.column_stack((tag + np.arange(n), np.full(n, kind), np.full(n, 2), group, group, nodes))
 
 
-FORMAT = Format("Gmsh's MSH 4.1, binary", export_msh, options=PER_BUILDING, suffix=".msh")
+FORMAT = Format("Gmsh's MSH 4.1, binary", export_msh, options=(*PER_BUILDING, CELLS), suffix=".msh")

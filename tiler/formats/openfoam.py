@@ -17,17 +17,19 @@ import numpy as np
 
 from pipeline.data.errors import CityError, ConfigError, InputError
 from tiler.export.cell_parts import ColumnsFile, divide_cells, take_whole
-from tiler.export.export import EXPORT_RECORD, LARGEST_PART, Format
+from tiler.export.export import CELLS, EXPORT_RECORD, LARGEST_PART, ORIGIN, Format
 from tiler.export.foam_case import write_system
 from tiler.export.foam_files import LABEL_LIMIT
 from tiler.export.foam_part import DISTANCES, FoamPlan, PartCounts, PointPlaces, write_part
 from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, interface_name, is_house
+from tiler.export.foam_prisms import write_foam_prisms
 from tiler.export.pedestrian_surface import write_pedestrian_surface
 from tiler.export.pieces import Pieces
 from tiler.export.region_faces import Ints, find_outer, survey_faces
 from tiler.export.wind_case import PEDESTRIAN, Domain, write_wind_cases
 from tiler.export.wind_profile import PEDESTRIAN_HEIGHT, Wind, WindWords, make_wind
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
+from tiler.mesh_files.prisms import read_prisms
 from tiler.mesh_files.run_files import RunFiles, RunSource, crs_of
 from tiler.store.atomic import replacing_folder
 
@@ -44,6 +46,7 @@ def export_openfoam(
     parts: int | None = None,
     case: str | None = None,
     buildings: str | None = None,
+    cells: str | None = None,
     **wind: Unpack[WindWords],
 ) -> list[str]:
     """Write a case folder of OpenFOAM from a finished run.
@@ -58,6 +61,8 @@ def export_openfoam(
         See `write_openfoam`.
     case : {"wind"}, optional
         Add the files of a simulation.
+    cells : {"prism"}, optional
+        Write prisms instead of tetrahedra; see `tiler.mesh_files.prisms`.
     **wind
         See `tiler.export.wind_profile.Wind`.
 
@@ -69,8 +74,8 @@ def export_openfoam(
     Raises
     ------
     ConfigError
-        If there are too few columns for so many parts, no side for the wind to come from, soil where it should
-        blow, or a mesh of several parts that share no face.
+        If there are too few columns for so many parts, or prisms are to be in parts or zones, no side for the wind
+        to come from, soil where it should blow, or a mesh of several parts that share no face.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
@@ -79,6 +84,9 @@ def export_openfoam(
     if case is None and wind:
         raise ConfigError(f"--{min(wind).replace('_', '-')}: is for --case wind; give that too")
     blowing = make_wind(wind)
+    if cells == "prism" and (parts is not None or buildings == "zones"):
+        option = "--buildings zones" if parts is None else "--parts"
+        raise ConfigError(f"{option}: not with --cells prism; leave one out, and divide the case by decomposePar")
     pieces = open_pieces(source)
     if case is not None and pieces.files.depth:
         raise ConfigError(
@@ -89,7 +97,11 @@ def export_openfoam(
         raise _refuse_parts(case, pieces.files)
     with replacing_folder(output) as folder, TemporaryDirectory(dir=folder, prefix=".heights.") as name:
         heights = None if case is None else Path(name)
-        counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings, heights=heights)
+        if cells == "prism":
+            prisms = read_prisms(pieces)
+            counts = [write_foam_prisms(folder, prisms, by_building=buildings == "patches", heights=heights)]
+        else:
+            counts = write_openfoam(folder, pieces, parts=parts, buildings=buildings, heights=heights)
         notes = []
         if heights is None:
             write_system(folder, parts=parts)
@@ -101,6 +113,8 @@ def export_openfoam(
         # ParaView opens a case by an empty file.
         (folder / "case.foam").touch()
         record = _record(counts, parts)
+        if any(pieces.files.origin):
+            record["origin"] = pieces.files.origin
         if case is not None:
             crs = crs_of(pieces.files)
             record |= {"crs": crs, "wind": asdict(blowing), "notes": notes}
@@ -257,7 +271,7 @@ def _by_region(piece: MeshPiece) -> Ints:
 FORMAT = Format(
     "a case folder of OpenFOAM",
     export_openfoam,
-    options=("parts", "case", *WIND_OPTIONS, "buildings", LARGEST_PART),
+    options=("parts", "case", *WIND_OPTIONS, "buildings", CELLS, LARGEST_PART, ORIGIN),
     buildings=("patches", "zones"),
     folder=True,
 )

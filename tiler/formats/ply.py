@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.data.errors import InputError
-from tiler.export.export import LARGEST_PART, Format
+from tiler.export.export import LARGEST_PART, ORIGIN, Format
 from tiler.export.foam_patches import patch_of_key
 from tiler.export.surface import Surface, SurfaceSurvey, place_vertices, survey_surface, write_surface
 
@@ -77,6 +77,6 @@ def _header(survey: SurfaceSurvey) -> bytes:
 FORMAT = Format(
     "the boundary as PLY, binary, with marker and building",
     write_surface(write_ply),
-    options=(LARGEST_PART,),
+    options=(LARGEST_PART, ORIGIN),
     suffix=".ply",
 )

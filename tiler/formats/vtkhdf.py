@@ -10,9 +10,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.export.export import LARGEST_PART, Format
+from tiler.export.export import LARGEST_PART, ORIGIN, Format
 from tiler.export.pieces import ROWS, Pieces, blocks_of, slices
 from tiler.export.surface import place_vertices, survey_surface
+from tiler.mesh_files.merged import NO_PLACE, Place
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import disk_errors, replacing
@@ -44,10 +45,10 @@ def export_vtkhdf(output: Path, source: RunSource) -> None:
     pieces = open_pieces(source)
     crs = crs_of(source)
     with replacing(output) as part, disk_errors(output):
-        write_vtkhdf(part, pieces, crs=crs)
+        write_vtkhdf(part, pieces, crs=crs, origin=pieces.files.origin)
 
 
-def write_vtkhdf(path: Path, pieces: Pieces, *, crs: str) -> None:
+def write_vtkhdf(path: Path, pieces: Pieces, *, crs: str, origin: Place = NO_PLACE) -> None:
     """Write a mesh as two data sets, ``mesh`` and ``boundary``.
 
     Parameters
@@ -58,6 +59,8 @@ def write_vtkhdf(path: Path, pieces: Pieces, *, crs: str) -> None:
         The mesh.
     crs : str
         CRS of the coordinates, an attribute of the root.
+    origin : tuple of float
+        Place in it (m) that coordinates count from, likewise if it is not that of the CRS.
 
     Notes
     -----
@@ -68,6 +71,8 @@ def write_vtkhdf(path: Path, pieces: Pieces, *, crs: str) -> None:
     with h5py.File(path, "w", libver=("earliest", "v108")) as file:
         root = _open_group(file, ROOT, "MultiBlockDataSet")
         root.attrs["crs"] = crs
+        if any(origin):
+            root.attrs["origin"] = np.array(origin)
         mesh = _Grid(root, "mesh", n_points=pieces.n_points, kind=TETRAHEDRON)
         boundary = _Grid(root, "boundary", n_points=survey.n_vertices, kind=TRIANGLE)
         for k in range(len(pieces.names)):
@@ -134,6 +139,6 @@ class _Grid:
 FORMAT = Format(
     "mesh and marked boundary in one file for VTK 9.4 and later",
     export_vtkhdf,
-    options=(LARGEST_PART,),
+    options=(LARGEST_PART, ORIGIN),
     suffix=".vtkhdf",
 )

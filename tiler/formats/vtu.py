@@ -3,14 +3,50 @@
 from pathlib import Path
 from typing import Any
 
-from tiler.export.export import LARGEST_PART, Format
-from tiler.mesh_files.merged import write_merged_volume
+import numpy as np
+from numpy.typing import NDArray
+
+from tiler.export.export import CELLS, LARGEST_PART, ORIGIN, Format
+from tiler.mesh_files.merged import TILE, write_merged_volume
+from tiler.mesh_files.mesh_pieces import open_pieces
+from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunFiles
+from tiler.mesh_files.vtk_files import stream_offsets
+from tiler.mesh_files.vtk_xml import Stream, stream_items, write_data_file
+
+WEDGE = 13  # number of VTK, whose measures of volume and shape are positive for corners in our order
 
 
-def export_vtu(path: Path, files: RunFiles, **options: Any) -> None:
-    """Write the volume of a finished run, as `tiler.mesh_files.merged.write_merged_volume` does."""
-    write_merged_volume(path, files.volumes, **options)
+def export_vtu(path: Path, files: RunFiles, *, cells: str | None = None, scalars: bool = False) -> None:
+    """Write the volume of a finished run, as `tiler.mesh_files.merged.write_merged_volume` does, or as prisms."""
+    if cells == "prism":
+        write_prisms(path, read_prisms(open_pieces(files)), scalars=scalars)
+    else:
+        write_merged_volume(path, files.volumes, scalars=scalars, origin=files.origin)
 
 
-FORMAT = Format("the volume mesh as one VTK file", export_vtu, options=("scalars", LARGEST_PART))
+def write_prisms(path: Path, mesh: PrismMesh, *, scalars: bool = False) -> None:
+    """Write prisms as VTK's wedges; `scalars` adds the cell array of tiles."""
+    n = len(mesh.cells)
+    number = np.dtype(np.int32 if len(mesh.points) < 2**31 else np.int64)
+    tiles = [_stream(TILE, mesh.tile, mesh.tile.dtype)] if scalars else []
+    sections = {
+        "Points": [_stream("Points", mesh.points, mesh.points.dtype, components=3)],
+        "Cells": [
+            _stream("connectivity", mesh.cells, number),
+            stream_offsets(n, 6),
+            _stream("types", np.full(n, WEDGE, np.uint8), np.dtype(np.uint8)),
+        ],
+        "PointData": [],
+        "CellData": tiles,
+    }
+    counts = {"NumberOfPoints": len(mesh.points), "NumberOfCells": n}
+    write_data_file(path, "UnstructuredGrid", counts, sections)
+
+
+def _stream(name: str, values: NDArray[Any], dtype: np.dtype[Any], *, components: int = 1) -> Stream:
+    flat = values.reshape(-1)
+    return stream_items(name, dtype, components, len(flat), lambda i, j: flat[i:j])
+
+
+FORMAT = Format("the volume mesh as one VTK file", export_vtu, options=("scalars", CELLS, LARGEST_PART, ORIGIN))

@@ -2,6 +2,7 @@
 
 The first grid, ``mesh``, has the tetrahedra, the second, ``facets``, the boundary's triangles with ``marker`` and
 ``building``: what `XDMFFile.read_mesh` and `read_meshtags` of DOLFINx take. With soil, ``mesh`` has ``region``.
+With prisms a third one, ``sides``, has the boundary's quadrilaterals.
 """
 
 from pathlib import Path
@@ -11,9 +12,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.export.export import LARGEST_PART, Format
+from tiler.export.export import CELLS, LARGEST_PART, ORIGIN, Format
 from tiler.export.pieces import Pieces, blocks_of
 from tiler.mesh_files.mesh_pieces import MeshPieces, open_pieces
+from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import disk_errors, replacing
 
@@ -27,10 +29,13 @@ ARRAYS = {
     "region": (np.int32, 1),
 }
 HEAD = '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
+TOPOLOGIES = {4: "Tetrahedron", 6: "Wedge"}  # of cells, by their corners
+SIDES = "sides"  # quadrilaterals of the boundary
+Rows = dict[str, tuple[int, int]]  # rows and columns of each data set
 TAIL = "  </Domain>\n</Xdmf>\n"
 
 
-def export_xdmf(output: Path, source: RunSource) -> None:
+def export_xdmf(output: Path, source: RunSource, *, cells: str | None = None) -> None:
     """Write the mesh of a finished run as XDMF.
 
     Parameters
@@ -39,6 +44,8 @@ def export_xdmf(output: Path, source: RunSource) -> None:
         The XML file; the numbers go to the file of the same name with the suffix ``.h5``.
     source : Path or RunFiles
         Folder of the run.
+    cells : {"prism"}, optional
+        Write prisms instead of tetrahedra; see `tiler.mesh_files.prisms`, also for memory.
 
     Raises
     ------
@@ -53,13 +60,14 @@ def export_xdmf(output: Path, source: RunSource) -> None:
     read twice. The XML is written last: without it there is no mesh.
     """
     pieces = open_pieces(source)
-    n_cells, n_facets = count_rows(pieces)
     data = output.with_suffix(DATA)
     with replacing(output) as text_part, replacing(data) as data_part:
         with disk_errors(data):
-            _write_data(data_part, pieces, n_cells, n_facets)
-        tags = ("region",) if pieces.files.depth else ()
-        text_part.write_text(_render(data.name, pieces.n_points, n_cells, n_facets, tags))
+            if cells == "prism":
+                rows = _write_prisms(data_part, read_prisms(pieces))
+            else:
+                rows = _write_data(data_part, pieces, *count_rows(pieces))
+        text_part.write_text(_render(data.name, rows, pieces.files.origin_words))
         # Numbers that do not belong to an old text must not be read with it.
         output.unlink(missing_ok=True)
 
@@ -74,7 +82,8 @@ def count_rows(pieces: Pieces) -> tuple[int, int]:
     return n_cells, n_facets
 
 
-def _write_data(path: Path, pieces: MeshPieces, n_cells: int, n_facets: int) -> None:
+def _write_data(path: Path, pieces: MeshPieces, n_cells: int, n_facets: int) -> Rows:
+    """Write the numbers of tetrahedra; returns how many rows and columns each data set has."""
     rows = {
         "points": pieces.n_points,
         "cells": n_cells,
@@ -103,6 +112,7 @@ def _write_data(path: Path, pieces: MeshPieces, n_cells: int, n_facets: int) -> 
             _put(sets["marker"], facet, piece.marker)
             _put(sets["building"], facet, piece.building)
             facet += len(piece.facets)
+    return {name: (n, ARRAYS[name][1]) for name, n in rows.items()}
 
 
 def _put(data: h5py.Dataset, start: int, rows: NDArray[np.generic]) -> None:
@@ -110,9 +120,21 @@ def _put(data: h5py.Dataset, start: int, rows: NDArray[np.generic]) -> None:
         data[start : start + len(rows)] = rows
 
 
-def _render(data: str, n_points: int, n_cells: int, n_facets: int, tags: tuple[str, ...]) -> str:
-    def item(name: str, n: int) -> str:
-        dtype, width = ARRAYS[name]
+def _write_prisms(path: Path, mesh: PrismMesh) -> Rows:
+    """Write the numbers of prisms; returns how many rows and columns each data set has."""
+    sets: dict[str, NDArray[np.generic]] = {"points": mesh.points, "cells": mesh.cells}
+    for name, width in (("", 3), ("side_", 4)):
+        sets[SIDES if name else "facets"], sets[f"{name}marker"], sets[f"{name}building"] = mesh.facets(width)
+    with h5py.File(path, "w", libver=("earliest", "v108")) as file:
+        for name, values in sets.items():
+            file.create_dataset(name, data=values)
+    return {name: (len(values), values[:1].size or 1) for name, values in sets.items()}
+
+
+def _render(data: str, rows: Rows, origin: str) -> str:
+    def item(name: str) -> str:
+        n, width = rows[name]
+        dtype = ARRAYS[name.removeprefix("side_")][0] if name != SIDES else np.int64
         kind = "Float" if dtype is np.float64 else "Int"
         shape = f"{n} {width}" if width > 1 else f"{n}"
         return (
@@ -120,33 +142,39 @@ def _render(data: str, n_points: int, n_cells: int, n_facets: int, tags: tuple[s
             f'Format="HDF">{escape(data)}:/{name}</DataItem>'
         )
 
-    def grid(name: str, topology: str, n: int, rows: str, attributes: tuple[str, ...] = ()) -> str:
-        nodes = ARRAYS[rows][1]
+    def grid(name: str, topology: str, cells: str, attributes: dict[str, str]) -> str:
+        n, nodes = rows[cells]
         lines = [
             f'    <Grid Name="{name}" GridType="Uniform">',
             f'      <Topology TopologyType="{topology}" NumberOfElements="{n}" NodesPerElement="{nodes}">',
-            f"        {item(rows, n)}",
+            f"        {item(cells)}",
             "      </Topology>",
             '      <Geometry GeometryType="XYZ">',
-            f"        {item('points', n_points)}",
+            f"        {item('points')}",
             "      </Geometry>",
         ]
-        for attribute in attributes:
+        for attribute, values in attributes.items():
             lines += [
                 f'      <Attribute Name="{attribute}" AttributeType="Scalar" Center="Cell">',
-                f"        {item(attribute, n)}",
+                f"        {item(values)}",
                 "      </Attribute>",
             ]
         return "\n".join([*lines, "    </Grid>", ""])
 
-    cells = grid("mesh", "Tetrahedron", n_cells, "cells", tags)
-    return HEAD + cells + grid("facets", "Triangle", n_facets, "facets", ("marker", "building")) + TAIL
+    tags = {"region": "region"} if "region" in rows else {}
+    grids = [grid("mesh", TOPOLOGIES[rows["cells"][1]], "cells", tags)]
+    grids.append(grid("facets", "Triangle", "facets", {"marker": "marker", "building": "building"}))
+    if SIDES in rows:
+        names = {"marker": "side_marker", "building": "side_building"}
+        grids.append(grid(SIDES, "Quadrilateral", SIDES, names))
+    place = [f'    <Information Name="origin" Value="{origin}"/>\n'] if origin else []
+    return HEAD + "".join([*place, *grids]) + TAIL
 
 
 FORMAT = Format(
     "mesh and marked facets for FEniCS and ParaView, with a file .h5 beside it",
     export_xdmf,
-    options=(LARGEST_PART,),
+    options=(CELLS, LARGEST_PART, ORIGIN),
     suffix=".xdmf",
     companion=".h5",
 )

@@ -33,6 +33,8 @@ VERTEX_ID = "vertex_id"  # point array of a piece: its points' region-wide ids, 
 TILE = "tile"  # cell array on request: which tile a cell is of, counted from 0 by name
 RADIUS_RATIO = "radius_ratio"  # cell array on request
 CHUNK = 1 << 20  # vertices that are moved at once
+Place = tuple[float, float, float]
+NO_PLACE = (0.0, 0.0, 0.0)
 Reader = Callable[[int], dict[str, dict[str, NDArray[Any]]]]
 
 
@@ -48,7 +50,9 @@ class _Source:
     n_points: int
 
 
-def write_merged_volume(path: Path, pieces: Sequence[Path], *, scalars: bool = False) -> None:
+def write_merged_volume(
+    path: Path, pieces: Sequence[Path], *, scalars: bool = False, origin: Place = NO_PLACE
+) -> None:
     """Write one VTU file of many.
 
     Parameters
@@ -76,11 +80,16 @@ def write_merged_volume(path: Path, pieces: Sequence[Path], *, scalars: bool = F
     9 bytes a vertex; coordinates are in a file that the system maps. Each piece is read twice, and again for each
     of its arrays.
     """
-    _write(path, pieces, pieces, "UnstructuredGrid", scalars=scalars)
+    _write(path, pieces, pieces, "UnstructuredGrid", scalars=scalars, origin=origin)
 
 
 def write_merged_boundary(
-    path: Path, pieces: Sequence[Path], volumes: Sequence[Path], *, scalars: bool = False
+    path: Path,
+    pieces: Sequence[Path],
+    volumes: Sequence[Path],
+    *,
+    scalars: bool = False,
+    origin: Place = NO_PLACE,
 ) -> None:
     """Write one VTP file of many; see `write_merged_volume`.
 
@@ -94,13 +103,15 @@ def write_merged_boundary(
         The VTU pieces of all tiles.
     scalars : bool
         Add the cell array `TILE`.
+    origin : tuple of float
+        Place (m) that coordinates are to count from.
 
     Notes
     -----
     Only the vertices of facets are written, in the order of their ids. The array ``vertex`` names which vertex of
     the merged volume each is.
     """
-    _write(path, pieces, volumes, "PolyData", scalars=scalars)
+    _write(path, pieces, volumes, "PolyData", scalars=scalars, origin=origin)
 
 
 def read_numbering(volumes: Iterable[Path]) -> Numbering:
@@ -144,11 +155,13 @@ def number_piece(path: Path, ids: NDArray[Any] | None, numbering: Numbering) -> 
         raise InputError(f"{path}: a {VERTEX_ID} of it is in no piece of the volume; run the tile again") from None
 
 
-def _write(path: Path, pieces: Sequence[Path], volumes: Sequence[Path], kind: str, *, scalars: bool) -> None:
+def _write(
+    path: Path, pieces: Sequence[Path], volumes: Sequence[Path], kind: str, *, scalars: bool, origin: Place
+) -> None:
     if not pieces:
         raise ValueError("a merged file needs at least one piece")
     with disk_errors(path), TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-        gathered = _gather(pieces, read_numbering(volumes), kind, Path(folder))
+        gathered = _gather(pieces, read_numbering(volumes), kind, Path(folder), origin)
         _write_file(path, kind, *gathered, scalars=scalars)
 
 
@@ -184,7 +197,7 @@ def _write_file(
 
 
 def _gather(
-    pieces: Sequence[Path], numbering: Numbering, kind: str, folder: Path
+    pieces: Sequence[Path], numbering: Numbering, kind: str, folder: Path, origin: Place
 ) -> tuple[_Source, NDArray[np.int64], NDArray[np.float64]]:
     """Read all pieces once: how many rows each has, which vertices it has, and where these are."""
     read = _reader(pieces, kind)
@@ -195,7 +208,7 @@ def _gather(
     for k, piece in enumerate(pieces):
         sections = read(k)
         n_rows[k] = len(sections[section]["connectivity"]) // width
-        number, points = _numbers(piece, sections, numbering), sections["Points"]["Points"]
+        number, points = _numbers(piece, sections, numbering), sections["Points"]["Points"] - origin
         known = seen[number]
         if (xyz[number[known]] != points[known]).any():
             raise InputError(f"{piece}: a {VERTEX_ID} stands for two places; run the tile again")

@@ -29,7 +29,7 @@ class MeshPiece:
     name : str
         The tile, ``"60_-3"``: its column and row in the CRS.
     points : float64, (n, 3)
-        Points that its cells use (m).
+        Points that its cells use (m), from the origin of `RunFiles` on.
     cells : int32, (m, 4)
         Tetrahedra of positive volume, as rows of `points`.
     facets : int32, (f, 3)
@@ -91,7 +91,7 @@ class MeshPieces:
         volume, boundary = read_vtu(path), read_vtp(self.files.boundaries[k])
         return MeshPiece(
             self.names[k],
-            volume.mesh.points,
+            volume.mesh.points - self.files.origin,
             volume.mesh.cells,
             _facets_in_volume(self.files.boundaries[k], volume, boundary),
             mark_sides(self.files, boundary),

@@ -1,11 +1,13 @@
 """The files of a finished run that writers read, found by its index files."""
 
 from dataclasses import dataclass, replace
+from math import floor
 from pathlib import Path
 
 from pipeline.data.errors import ConfigError, InputError
 
 RUN_RECORD, VOLUME_INDEX, BOUNDARY_INDEX = "run.json", "mesh.pvtu", "boundary.pvtp"
+MOST_ORIGIN = 1e9  # m
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,8 @@ class RunFiles:
     sides : tuple of float or None
         West, south, east and north side (m) of the part of the mesh that these are the files of; None where they
         are those of the whole mesh.
+    origin : tuple of float
+        Place in the CRS (m) that coordinates are to count from.
     """
 
     directory: Path
@@ -33,6 +37,12 @@ class RunFiles:
     depth: float = 0.0
     parts: int = 0
     sides: tuple[float, float, float, float] | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def origin_words(self) -> str:
+        """The origin as text, empty where it is that of the CRS."""
+        return " ".join(f"{value:.0f}" for value in self.origin) if any(self.origin) else ""
 
     @property
     def whole(self) -> bool:
@@ -80,6 +90,35 @@ def crs_of(source: RunSource) -> str:
     from tiler.store.run_folder import read_crs
 
     return read_crs((source.directory if isinstance(source, RunFiles) else source) / RUN_RECORD)
+
+
+def take_origin(files: RunFiles, text: str) -> RunFiles:
+    """Let coordinates count from a place of their own.
+
+    Parameters
+    ----------
+    files : RunFiles
+        Files of a run.
+    text : str
+        ``x,y,z`` (m), or ``auto``: the region's south-western corner in whole metres, at height 0.
+
+    Raises
+    ------
+    ConfigError
+        If it is neither, or not in whole metres: only then no digit of a coordinate is lost.
+    """
+    from tiler.store.run_folder import read_run_record
+
+    if text == "auto":
+        west, south, _, _ = read_run_record(files.directory / RUN_RECORD).bounds
+        return replace(files, origin=(float(floor(west)), float(floor(south)), 0.0))
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--origin {text}: three numbers x,y,z, or auto, expected") from None
+    if not all(value.is_integer() and abs(value) <= MOST_ORIGIN for value in (x, y, z)):
+        raise ConfigError(f"--origin {text}: whole metres of at most {MOST_ORIGIN:.0e} expected")
+    return replace(files, origin=(x, y, z))
 
 
 def take_largest_part(files: RunFiles) -> RunFiles:

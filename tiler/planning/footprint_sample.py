@@ -145,7 +145,8 @@ def _sample_models(config: Config, region: Region, models: Sequence[CloudHeader]
 
 
 def _make_sample(config: Config, polygons: NDArray[np.object_], total: int, *, complete: bool) -> FootprintSample:
-    detail, octaves = measure_detail(polygons, clearance=config.clearance, mesh_size=config.mesh_size)
+    at_walls = config.wall_size or config.mesh_size
+    detail, octaves = measure_detail(polygons, clearance=config.clearance, mesh_size=at_walls)
     return FootprintSample(
         total, complete, polygons, shapely.bounds(polygons).reshape(-1, 4), shapely.area(polygons), detail, octaves
     )

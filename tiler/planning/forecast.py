@@ -1,20 +1,23 @@
 """What a run will take, estimated before it: cells, tasks, memory, disk and hours."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.plane_mesh.sizes import SizeField, local_sizes, size_field_around
+from pipeline.columns.spacing import TALLEST
+from pipeline.plane_mesh.sizes import SizeField, finer_walls, local_sizes, size_field_around
 from stitch.tiling.grid import Bounds, TileGrid, seams_present, tiles_present
 from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.config.config import Config
-from tiler.config.step_options import expected_levels, size_rule
+from tiler.config.step_options import expected_levels, refined_areas, size_rule
 from tiler.engine.stage import Scope
 from tiler.planning.footprint_sample import FootprintSample
 from tiler.planning.plan import Survey
+from tiler.planning.refinements import read_refinements
 from tiler.pointclouds.clouds import CloudHeader
 from tiler.stages.own_stages import list_stages, stages_of_pad
 
@@ -44,6 +47,7 @@ MEASURED_ON = "a shared core of a cloud server (x86-64, 2026)"
 MEMORY_SHARE = 0.8  # of a worker's share of the machine, beyond which a tile is said not to fit
 LARGEST_TILE = 1.5  # tile sizes; side of a tile on the border
 LOOKS_A_SIDE = 16  # places along each side of a tile in which graded sizes are looked up
+LOOKS_OF_FINER = 500  # the same where walls or areas are finer
 MOST_LOOKS = 250_000  # in all tiles; fewer a tile where there are many, but four
 TILE_STEP = 50.0  # m; tile sizes that are proposed are multiples of it
 
@@ -237,26 +241,34 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
 
 
 def _thinning(survey: Survey, sample: FootprintSample | None, config: Config) -> NDArray[np.float64]:
-    """How many cells open ground has with graded sizes, of those without, in each tile: float64 (nx, ny).
+    """How many cells open ground has with graded or finer sizes, of those without, in each tile: float64 (nx, ny).
 
     Sizes are looked up in some places of each tile. Footprints that are not known are taken to be everywhere.
     """
     x, y = survey.meshed.lines
     shape = len(x) - 1, len(y) - 1
     known = sample.complete if sample is not None else not config.has_buildings
-    if not config.graded_size or (config.open_size and not known):
+    largest = 0.0 if config.open_size and not known else config.graded_size
+    if not largest and not config.refined:
         return np.ones(shape)
-    side = int(np.clip(np.sqrt(MOST_LOOKS / (shape[0] * shape[1])), 2, LOOKS_A_SIDE))
+    most = LOOKS_OF_FINER if config.refined else LOOKS_A_SIDE
+    side = int(np.clip(np.sqrt(MOST_LOOKS / (shape[0] * shape[1])), 2, most))
     places = (np.arange(side) + 0.5) / side
     columns, rows = ((axis[:-1, None] + np.diff(axis)[:, None] * places).ravel() for axis in (x, y))
     xy = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1).reshape(-1, 2)
-    rule = size_rule(config, config.graded_size)
-    if config.open_size:
-        field = SizeField(rule, shapely.STRtree(sample.polygons if sample is not None else []))
+    rule = size_rule(config, largest)
+    houses = sample.polygons if sample is not None else np.empty(0, np.object_)
+    if config.open_size or not largest:
+        field = SizeField(rule, shapely.STRtree(houses))
     else:
         field = size_field_around(survey.region.bounds, rule)
+    areas = refined_areas(SimpleNamespace(**vars(config), refinements=read_refinements(config, survey.region)))
+    field = replace(field, finer=(*areas, *finer_walls(shapely.STRtree(shapely.boundary(houses)), rule)))
     size = local_sizes(field, xy, mesh_size=config.mesh_size)
-    share = (config.mesh_size / size) ** (3 if config.mesher == "adaptive" else 2)
+    share = (config.mesh_size / size) ** 2
+    if config.mesher == "adaptive":
+        upright = local_sizes(field, xy, mesh_size=config.mesh_size, upright=True)
+        share *= config.mesh_size / np.minimum(upright, TALLEST * size)
     mean: NDArray[np.float64] = share.reshape(shape[0], side, shape[1], side).mean(axis=(1, 3))
     return mean
 

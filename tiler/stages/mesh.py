@@ -29,13 +29,13 @@ from stitch.seams.tiles import Sides, mesh_tile
 from stitch.tiling.corners import Corner, place_corner
 from stitch.tiling.grid import Bounds, Key, SeamKey, ends_of_seam, is_pinched, seams_of_tile
 from stitch.tiling.patches import mesh_patch
-from stitch.tiling.walls import cut_walls
 from tiler.citymodels.tables import NearBuildings
 from tiler.config.config import Config
 from tiler.config.domain_height import Domain
 from tiler.config.step_options import (
     PAD_PARAMETERS,
     PLANE_PARAMETERS,
+    REFINE_PARAMETERS,
     SIZE_PARAMETERS,
     SOIL_PARAMETERS,
     layer_parameters,
@@ -58,7 +58,7 @@ from tiler.stages.seam_tables import (
     unpack_seam,
     unpack_soil,
 )
-from tiler.stages.surroundings import find_sizes, halos, read_surroundings, terrain_around, terrain_halo
+from tiler.stages.surroundings import find_walls, halos, read_surroundings, terrain_around, terrain_halo
 from tiler.store.run_folder import EASED
 
 
@@ -72,7 +72,8 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     ]
     reads += [Read("layers", see, by_extent=True)] if chooses_layers_later(config) else []
     parameters = (*PLANE_PARAMETERS, *layer_parameters(config), "dtm_spacing", "tile_size_or_default")
-    parameters += SIZE_PARAMETERS if config.graded_size else ()
+    parameters += SIZE_PARAMETERS if config.graded_size or config.refined else ()
+    parameters += REFINE_PARAMETERS if config.refined else ()
     parameters += PAD_PARAMETERS if config.padded else ()
     parameters += SOIL_PARAMETERS if config.underground else ()
     version = 8 if config.mesher == "layered" else 6
@@ -90,8 +91,7 @@ def make_seam(task: Task) -> Facts:
     key = seam_key(task.name)
     buildings, dtm = read_surroundings(task)
     polygons = buildings.model.polygons
-    walls = cut_walls(polygons, mesh_size=given.mesh_size)
-    sizes = find_sizes(walls, task)
+    walls, sizes = find_walls(polygons, task)
     with task.step("3.1 seams"):
         start, end = (
             place_corner(grid, corner, polygons, walls, mesh_size=given.mesh_size, sizes=sizes)
@@ -140,8 +140,7 @@ def make_columns(task: Task) -> Facts:
     options = mesh_options(given)
     buildings, dtm = read_surroundings(task)
     model = buildings.model
-    walls = cut_walls(model.polygons, mesh_size=given.mesh_size)
-    sizes = find_sizes(walls, task)
+    walls, sizes = find_walls(model.polygons, task)
     names = [seam_name(key) for key in seams_of_tile(tile_key(task.name))]
     found = {result.name: result for result in task.read("seams") if result.name in names}
     sides = tuple(unpack_seam(found[name].arrays, model.numbers) for name in names)

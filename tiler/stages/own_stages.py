@@ -70,7 +70,7 @@ def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, 
     if taken:
         raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")
     given = {*dataclasses.asdict(config), *derived_parameters(config), "footprints_identity", "top_elevation"}
-    given |= {"footprints_frame", "footprints_shift"}
+    given |= {"footprints_frame", "footprints_shift", "refinements"}
     given |= {"core_bounds", "rim_store", "rim_digest"}
     clash = sorted(own.parameters.keys() & given)
     if clash:

@@ -1,21 +1,24 @@
 """What counts for a seam or a tile that is meshed: how far around, and the buildings and terrain there."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from pipeline.columns.adaptive import AdaptiveOptions
 from pipeline.columns.layered import terrain_reach
 from pipeline.columns.spacing import top_reach
-from pipeline.plane_mesh.sizes import SizeField, size_field, size_field_around
+from pipeline.plane_mesh.sizes import SizeField, finer_walls, size_field, size_field_around
 from pipeline.points_terrain.raster import Dtm
 from pipeline.points_terrain.terrain import cut_terrain
 from stitch.seams.tiles import sizes_halo, tile_halo
 from stitch.tiling.grid import Key, nominal_corner
+from stitch.tiling.walls import cut_walls
 from tiler.citymodels.tables import NearBuildings
 from tiler.config.domain_height import Domain
-from tiler.config.step_options import mesh_options, size_rule
+from tiler.config.step_options import is_refined, mesh_options, refined_areas, size_rule
 from tiler.engine.task import Task
 from tiler.stages.readers import grow, read_buildings, read_known_terrain, region_window
 
@@ -30,12 +33,12 @@ def terrain_halo(given: Any, domain: Domain | None = None) -> float:
 
 def halos(given: Any, largest: float, *, around_walls: bool) -> tuple[float, float]:
     """How far beyond a box terrain is sampled, and buildings count (m); the largest size is 0 without grading."""
-    if not largest:
+    if not largest and not is_refined(given):
         halo = tile_halo(given.tile_size_or_default, given.mesh_size)
         return halo, halo
     rule = size_rule(given, largest)
     halo = tile_halo(given.tile_size_or_default, given.mesh_size, rule)
-    return halo, sizes_halo(given.tile_size_or_default, rule) if around_walls else halo
+    return halo, sizes_halo(given.tile_size_or_default, rule, around_walls=around_walls)
 
 
 def _halos_of(task: Task) -> tuple[float, float]:
@@ -44,13 +47,21 @@ def _halos_of(task: Task) -> tuple[float, float]:
     return halos(task.parameters, largest, around_walls=largest > 0 and task.parameters.open_size > 0)
 
 
-def find_sizes(walls: NDArray[np.float64], task: Task) -> SizeField | None:
-    """Sizes around walls, or with a pad alone around the region; None where they are the same everywhere."""
+def find_walls(polygons: NDArray[np.object_], task: Task) -> tuple[NDArray[np.float64], SizeField | None]:
+    """Walls in pieces, and the sizes around them, or with a pad alone around the region.
+
+    The sizes are None where they are the same everywhere.
+    """
     given, largest = task.parameters, task.context.open_size
-    if not largest:
-        return None
-    rule = size_rule(given, largest)
-    return size_field(walls, rule) if given.open_size else size_field_around(given.core_bounds, rule)
+    if not largest and not is_refined(given):
+        return cut_walls(polygons, mesh_size=given.mesh_size), None
+    rule, finer = size_rule(given, largest), refined_areas(given)
+    walls = cut_walls(polygons, mesh_size=rule.at_walls, finer=finer)
+    if given.open_size or not largest:
+        return walls, size_field(walls, rule, finer)
+    around = shapely.STRtree(shapely.linestrings(walls))
+    field = size_field_around(given.core_bounds, rule)
+    return walls, replace(field, finer=(*finer, *finer_walls(around, rule)))
 
 
 def read_surroundings(task: Task) -> tuple[NearBuildings, Dtm]:

@@ -32,11 +32,14 @@ class WindCase:
         The undisturbed wind.
     crs : str
         CRS of the coordinates.
+    origin : tuple of float
+        Place in it (m) that those of the case count from.
     """
 
     folder: Path
     wind: Wind
     crs: str
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def case_of(self, direction: float) -> Path:
         """Return the folder of a direction."""
@@ -90,7 +93,8 @@ def open_case(folder: Path) -> WindCase:
         )
         if not wind.directions or not math.isfinite(wind.speed_at(wind.height)) or not wind.speed > 0:
             raise ValueError(f"wind {wind}")
-        return WindCase(folder, wind, str(record["crs"]))
+        x, y, z = (float(value) for value in record.get("origin", (0.0, 0.0, 0.0)))
+        return WindCase(folder, wind, str(record["crs"]), (x, y, z))
     except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError) as error:
         raise InputError(
             f"{folder}: is no exported wind case ({path.name}: {error}); make one by citystitch export --format "
@@ -117,7 +121,7 @@ def read_triangles(case: WindCase) -> Triangles:
             raise ValueError("a vertex that is not there")
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: is missing or damaged ({error}); export the case again") from None
-    return Triangles(points, corners)
+    return Triangles(points + case.origin, corners)
 
 
 def read_samples(case: WindCase, direction: float, triangles: Triangles) -> Sampled:
@@ -141,7 +145,7 @@ def read_samples(case: WindCase, direction: float, triangles: Triangles) -> Samp
             raise ValueError(f"rows of {table.shape[1]} numbers, expected 6 finite ones")
     except (OSError, ValueError, IndexError) as error:
         raise InputError(f"{path}: is missing or damaged ({error}); run the case again") from None
-    speed = _match(table[:, :3], np.linalg.norm(table[:, 3:], axis=1), triangles.centres)
+    speed = _match(table[:, :3] + case.origin, np.linalg.norm(table[:, 3:], axis=1), triangles.centres)
     if np.isnan(speed).all():
         raise InputError(f"{path}: none of its {len(table)} samples is over a triangle of the case; run it again")
     return Sampled(speed, max(times))

@@ -229,7 +229,7 @@ def _run(
 def _plan(config: Config, out: Path, say: Callable[[str], None], *, fresh: bool) -> Plan:
     """Plan a run; refuse inputs among its results and, unless it begins anew, the folder of another region."""
     plan = make_plan(config, say)
-    files = list(config.building_files)
+    files = [*config.building_files, *filter(None, [config.refine_areas])]
     for warning in _foresee(plan, config):
         plan.messages.append(warning)
         say(warning)

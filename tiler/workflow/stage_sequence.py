@@ -14,6 +14,7 @@ from tiler.engine.stage import REGION_ITEM
 from tiler.engine.watcher import Watcher
 from tiler.objects.places import identify, place
 from tiler.planning.plan import Plan
+from tiler.planning.refinements import read_refinements
 from tiler.stages.alignment import alignment_stages, shift_of
 from tiler.stages.city import first_round, house_stage, later_round, member_stage, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
@@ -138,6 +139,7 @@ def make_engine(
         footprints_identity=identify(footprints) if footprints else "",
         footprints_frame=dataclasses.astuple(plan.georeference.footprints),
         footprints_shift=(0.0, 0.0),
+        refinements=read_refinements(config, plan.region),
     )
     return Engine(
         out / STORE,

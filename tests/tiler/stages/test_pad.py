@@ -24,6 +24,7 @@ from tiler.check.check import check_run
 from tiler.cli.main import main
 from tiler.config.config import Config, check_height, make_config
 from tiler.config.config_file import load_config
+from tiler.config.declared import Declared
 from tiler.config.domain_height import widths_in_metres
 from tiler.engine.run_context import absent_tiles, choose_tiles
 from tiler.engine.stage import Facts, Read, Scope, Stage
@@ -33,7 +34,7 @@ from tiler.mesh_files.vtk_files import read_vtu
 from tiler.planning.region import find_pad, pad_bounds, pad_grid
 from tiler.report.plan_report import plan_run
 from tiler.stages.own_stages import list_stages
-from tiler.stages.surroundings import find_sizes
+from tiler.stages.surroundings import find_walls
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
 from tiler.workflow.run import run
@@ -331,14 +332,16 @@ def test_the_check_tells_a_rim_that_is_uneven_and_a_house_in_the_pad(
 
 
 def test_with_a_pad_alone_sizes_count_from_the_region_and_with_an_open_size_from_walls() -> None:
-    walls = np.array([[[CORE[0], CORE[1]], [CORE[0], CORE[3]]]])
+    house = np.array([shapely.box(CORE[0] - 5, CORE[1], CORE[0], CORE[3])])
     xy = np.array([[CORE[0] + 200.0, CORE[1] + 100.0], [CORE[0] - 50.0, CORE[1] + 100.0]])
     found = []
     for open_size in (0.0, 30.0):
-        given = SimpleNamespace(mesh_size=10.0, open_size=open_size, grading=0.2, core_bounds=CORE)
+        given = Declared(
+            "columns", {"mesh_size": 10.0, "open_size": open_size, "grading": 0.2, "core_bounds": CORE}
+        )
         task: Any = SimpleNamespace(parameters=given, context=SimpleNamespace(open_size=30.0))
-        found.append(local_sizes(find_sizes(walls, task), xy, mesh_size=10.0).tolist())
-    assert found == [[10.0, 20.0], [30.0, 20.0]]
+        found.append(local_sizes(find_walls(house, task)[1], xy, mesh_size=10.0).tolist())
+    assert found == [[10.0, 20.0], [30.0, 19.0]]
 
 
 @pytest.mark.long

@@ -1,0 +1,192 @@
+"""Columns as prisms: a third of the cells, the same air and boundary, in every format that can hold them."""
+
+import json
+import re
+from itertools import permutations
+from pathlib import Path
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+import pyvista
+
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.mesh import Marker
+from stitch.pieces.conformity import compute_cell_volumes
+from tests.helpers.programs import mesh_is_ok, read_check, run_foam, run_program
+from tiler.cli.main import main
+from tiler.export.export import export_run
+from tiler.mesh_files.mesh_pieces import open_pieces
+from tiler.mesh_files.prisms import NO_CORNER, PrismMesh, combine_cells, read_prisms
+
+UPRIGHT = {Marker.WALL, Marker.WEST, Marker.EAST, Marker.SOUTH, Marker.NORTH}
+
+
+@pytest.fixture(scope="module")
+def layered_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished run of a synthetic city on four tiles in layers that grow."""
+    from tiler.config.config import make_config
+    from tiler.interface.synth import write_city
+    from tiler.workflow.run import run
+
+    folder = tmp_path_factory.mktemp("layered")
+    files = write_city(folder / "city", size=300, buildings=15, density=1.0)
+    given = {"pointcloud": [str(path) for path in files.clouds], "footprints": str(files.footprints)}
+    mesh = {"mesher": "layered", "first_layer": 2.0, "tile_size": 150.0, "domain_height": 60.0}
+    run(make_config(given | mesh | {"out": str(folder / "out")}))
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def prisms(layered_run: Path) -> PrismMesh:
+    return read_prisms(open_pieces(layered_run))
+
+
+def counts_of(run: Path) -> dict[str, int]:
+    counts: dict[str, int] = json.loads((run / "run.json").read_text())["counts"]
+    return counts
+
+
+def test_three_cells_are_a_prism_in_any_order_of_columns() -> None:
+    low, high = np.array([0, 2, 4]), np.array([1, 3, 5])
+    for first, second, third in permutations(range(3)):
+        around = [first, (first + 1) % 3, (first + 2) % 3]
+        three = np.array(
+            [
+                [*low[around], high[first]],
+                [low[second], high[first], low[third], high[second]],
+                [low[third], high[first], high[second], high[third]],
+            ],
+            np.int32,
+        )
+        found, whole = combine_cells(three)
+        assert whole.tolist() == [True]
+        assert found[0].tolist() == [*low[around], *high[around]]
+        wrong = three.copy()
+        wrong[2, 3] = 7
+        wrong[1, 1] = 7
+        assert not combine_cells(wrong)[1].any()
+        assert not combine_cells(three[[1, 0, 2]])[1].any()
+
+
+def test_prisms_fill_the_same_air_with_a_third_of_the_cells(layered_run: Path, prisms: PrismMesh) -> None:
+    pieces = open_pieces(layered_run)
+    volume = 0.0
+    for k in range(len(pieces.names)):
+        piece = pieces.read(k)
+        volume += compute_cell_volumes(piece.points, piece.cells)[0].sum()
+    assert 3 * len(prisms.cells) == counts_of(layered_run)["cells"]
+    corner = prisms.points[prisms.cells]
+    for k in range(3):  # positive at all corners
+        around = [k, (k + 1) % 3, (k + 2) % 3]
+        for plane, up in ((around, k + 3), ([n + 3 for n in around], k)):
+            edges = corner[:, [plane[1], plane[2], up]] - corner[:, [plane[0]]]
+            assert ((np.linalg.det(edges) > 0) == (up > 2)).all()
+    u, v = corner[:, 1, :2] - corner[:, 0, :2], corner[:, 2, :2] - corner[:, 0, :2]
+    area = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
+    heights = (corner[:, 3:, 2] - corner[:, :3, 2]).mean(axis=1)
+    assert (area * heights).sum() == pytest.approx(volume, rel=1e-9)
+
+
+def test_faces_are_in_order_and_those_of_the_boundary_have_their_markers(
+    layered_run: Path, prisms: PrismMesh
+) -> None:
+    assert (prisms.owner < prisms.neighbour).all()
+    order = np.lexsort((prisms.neighbour, prisms.owner))
+    assert (order == np.arange(len(order))).all()
+    assert 5 * len(prisms.cells) == 2 * len(prisms.inner) + len(prisms.outer)
+    triangles, marker, building = prisms.facets(3)
+    assert set(marker.tolist()) == {Marker.GROUND, Marker.ROOF, Marker.TOP}
+    assert ((building >= 0) == (marker == Marker.ROOF)).all()
+    sides, upright, of = prisms.facets(4)
+    assert set(upright.tolist()) == UPRIGHT
+    assert ((of >= 0) == (upright == Marker.WALL)).all()
+    assert len(triangles) + 2 * len(sides) == counts_of(layered_run)["facets"]
+    normal = np.zeros(3)
+    for face, corners in ((triangles, [0, 1, 2]), (sides, [0, 1, 2]), (sides, [0, 2, 3])):
+        a, b, c = (prisms.points[face[:, k]] - prisms.points[0] for k in corners)
+        normal += np.cross(b - a, c - a).sum(axis=0)
+    np.testing.assert_allclose(normal, 0, atol=1e-5)  # closed, and all of it one way round
+    west = prisms.points[sides[upright == Marker.WEST]]
+    assert (np.cross(west[:, 1] - west[:, 0], west[:, 2] - west[:, 0])[:, 0] < 0).all()
+
+
+def test_readers_find_prisms_and_quadrilaterals(layered_run: Path, prisms: PrismMesh, tmp_path: Path) -> None:
+    for name in ("vtu", "msh", "xdmf", "cgns"):
+        words = ["--format", name, "--cells", "prism", "-o", f"{tmp_path}/a.{name}"]
+        assert main(["export", str(layered_run), *words]) == 0
+    grid = pyvista.read(tmp_path / "a.vtu")
+    assert set(grid.celltypes.tolist()) == {pyvista.CellType.WEDGE}
+    volume = grid.compute_cell_sizes(length=False, area=False)["Volume"]
+    assert volume.min() > 0
+    mesh = meshio.read(tmp_path / "a.msh")
+    assert (mesh.cells_dict["wedge"] == prisms.cells).all()
+    for kind, width in (("triangle", 3), ("quad", 4)):
+        corners, marker, _ = prisms.facets(width)
+        order = np.argsort(marker, kind="stable")
+        assert (mesh.cells_dict[kind] == corners[order]).all()
+        assert (mesh.cell_data_dict["gmsh:physical"][kind] == marker[order]).all()
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert (file["cells"][:] == prisms.cells).all()
+        assert (file["sides"][:] == prisms.facets(4)[0]).all()
+        assert (file["side_marker"][:] == prisms.facets(4)[1]).all()
+    with h5py.File(tmp_path / "a.cgns") as file:
+        zone = file["city/air"]
+        assert zone["cells/ data"][0] == 14
+        assert (zone["cells/ElementConnectivity/ data"][:].reshape(-1, 6) == prisms.cells + 1).all()
+        assert zone["walls_quadrilaterals/ data"][0] == 7
+
+
+def test_xdmf_has_three_grids_that_vtk_reads(layered_run: Path, prisms: PrismMesh, tmp_path: Path) -> None:
+    from vtkmodules.vtkIOXdmf2 import vtkXdmfReader
+
+    export_run(layered_run, tmp_path / "a.xdmf", name="xdmf", options={"cells": "prism"})
+    reader = vtkXdmfReader()
+    reader.SetFileName(str(tmp_path / "a.xdmf"))
+    reader.Update()
+    blocks = reader.GetOutputDataObject(0)
+    grids = [blocks.GetBlock(k) for k in range(blocks.GetNumberOfBlocks())]
+    found = [(grid.GetCellType(0), grid.GetNumberOfCells()) for grid in grids]
+    expected = [(13, len(prisms.cells)), (5, len(prisms.facets(3)[0])), (9, len(prisms.facets(4)[0]))]
+    assert found == expected
+    assert [grids[2].GetCellData().GetArrayName(k) for k in (0, 1)] == ["marker", "building"]
+
+
+def test_openfoam_has_faces_of_three_and_of_four_corners(
+    layered_run: Path, prisms: PrismMesh, tmp_path: Path
+) -> None:
+    export_run(layered_run, tmp_path / "case", name="openfoam", options={"cells": "prism"})
+    reader = pyvista.POpenFOAMReader(str(tmp_path / "case" / "case.foam"))
+    grid = reader.read()["internalMesh"]
+    assert set(grid.celltypes.tolist()) == {pyvista.CellType.WEDGE}
+    assert grid.n_cells == len(prisms.cells)
+    record = json.loads((tmp_path / "case" / "export.json").read_text())["meshes"][0]
+    assert record["faces"] == len(prisms.inner) + len(prisms.outer)
+    assert record["patches"]["ground"] == (prisms.marker == Marker.GROUND).sum()
+    quads = (prisms.outer[:, 3] != NO_CORNER) & (prisms.marker == Marker.WALL)
+    assert record["patches"]["walls"] == quads.sum()
+
+
+def test_columns_whose_levels_merge_are_refused(small_run: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"tile .*: its cells are not all thirds of prisms.*--mesher layered"):
+        export_run(small_run, tmp_path / "a.vtu", name="vtu", options={"cells": "prism"})
+    with pytest.raises(ConfigError, match=r"--parts: not with --cells prism.*decomposePar"):
+        export_run(small_run, tmp_path / "case", name="openfoam", options={"cells": "prism", "parts": 2})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.long
+def test_programs_are_content(layered_run: Path, prisms: PrismMesh, tmp_path: Path) -> None:
+    options = {"cells": "prism", "case": "wind", "direction": [240.0], "buildings": "patches"}
+    export_run(layered_run, tmp_path / "case", name="openfoam", options=options)
+    text = run_foam("checkMesh", tmp_path / "case")
+    assert mesh_is_ok(text)
+    assert read_check(text)["cells"] == len(prisms.cells)
+    control = tmp_path / "case" / "system" / "controlDict"
+    control.write_text(re.sub(r"endTime +\d+;", "endTime 20;", control.read_text()))
+    run_foam("simpleFoam", tmp_path / "case")
+    for name, command in (("msh", ["gmsh", "-check"]), ("cgns", ["cgnscheck"])):
+        export_run(layered_run, tmp_path / f"a.{name}", name=name, options={"cells": "prism"})
+        said = run_program([*command, f"a.{name}"], tmp_path)
+        assert "rror" not in said, said[-2000:]
