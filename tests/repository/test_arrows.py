@@ -72,11 +72,11 @@ ORDER = {
     "tiler": [
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
         "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "planning", "dashboard",
-        "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats",
+        "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats", "towns",
         "interface", "cli",
     ],
     "pipeline": [
-        "data", "geometry", "points_terrain", "skeletons", "roofs", "city_model", "simplification",
+        "data", "geometry", "points_terrain", "architecture", "skeletons", "roofs", "city_model", "simplification",
         "plane_mesh", "quality", "smoothing", "columns",
     ],
     "stitch": ["tiling", "seams", "pieces"],
