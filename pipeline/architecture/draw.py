@@ -133,7 +133,7 @@ def _settle(house: House, lot: Lot, ground: Ground) -> House:
     house = replace(house, x=corner[0], y=corner[1])
     foot = [place(house, wall, 0.0, 0.0, 0.0) for wall in range(4)]
     corners = to_town(house, [Surface(GROUND, foot, [])])[0].border
-    return replace(house, z=round(min(ground(x, y) for x, y, _ in corners), 3))
+    return replace(house, z=round(min(float(ground(x, y)) for x, y, _ in corners), 3))
 
 
 def _draw_parts(dice: _Dice, house: House, lot: Lot) -> tuple[BuildingPart, ...]:

@@ -203,11 +203,10 @@ def _read_distribution(rule: Any) -> Distribution:
         return Distribution("constant", (rule if isinstance(rule, str) else _number(rule),))
     keys = set(rule)
     if keys == {"uniform"}:
-        low, high = map(_number, rule["uniform"])
-        return Distribution("uniform", (low, high))
+        return Distribution("uniform", _limits(rule["uniform"]))
     if keys == {"normal", "within"}:
         mean, sigma = map(_number, rule["normal"])
-        low, high = map(_number, rule["within"])
+        low, high = _limits(rule["within"])
         if sigma <= 0:
             raise ValueError(f"deviation {sigma:g}, expected more than 0")
         return Distribution("normal", (mean, sigma, low, high))
@@ -215,6 +214,13 @@ def _read_distribution(rule: Any) -> Distribution:
         values = [value if isinstance(value, str) else _number(value) for value in rule["choice"]]
         return Distribution("choice", tuple(values), _cumulate(rule.get("weights"), len(values)))
     raise ValueError("expected uniform, normal and within, or choice and weights")
+
+
+def _limits(values: Sequence[Any]) -> tuple[float, float]:
+    low, high = map(_number, values)
+    if low > high:
+        raise ValueError(f"{low:g} to {high:g}, the least comes first")
+    return low, high
 
 
 def _cumulate(weights: Sequence[Any] | None, n: int) -> tuple[float, ...]:

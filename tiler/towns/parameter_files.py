@@ -74,10 +74,11 @@ def read_xml(path: Path) -> Iterator[House]:
     """
     last = "the start"
     try:
-        for _, element in etree.iterparse(str(path), tag="building", resolve_entities=False, no_network=True):
-            last = element.get("ID", "")
-            yield _make(House, _house_values(element))
-            element.clear()
+        with path.open("rb") as file:
+            for _, element in etree.iterparse(file, tag="building", resolve_entities=False, no_network=True):
+                last = element.get("ID", "")
+                yield _make(House, _house_values(element))
+                element.clear()
     except (etree.XMLSyntaxError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}, at {last}: is no house ({error})") from error
 
