@@ -20,7 +20,7 @@ HOMES = {
     "zarr": ("tiler/store/",),
     "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py", "tiler/formats/vtkhdf.py"),
     "laspy": ("tiler/",),
-    "lxml": ("tiler/cityinput/citygml.py",),
+    "lxml": ("tiler/cityinput/citygml.py", "tiler/towns/parameter_files.py"),
     "rasterio": ("tiler/cityinput/rasters.py", "tiler/wind/geotiff.py"),
     "pyogrio": ("tiler/",),
     "meshio": ("tiler/",),

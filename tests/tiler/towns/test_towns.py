@@ -35,6 +35,7 @@ def houses_of(style: str, size: float) -> list[House]:
 
 def read_document(path: Path) -> dict[str, Any]:
     """CityJSONSeq as one document."""
+    head: dict[str, Any]
     head, *features = (json.loads(line) for line in path.read_text().splitlines())
     for feature in features:
         first = len(head["vertices"])
