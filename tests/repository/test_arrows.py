@@ -20,7 +20,7 @@ HOMES = {
     "zarr": ("tiler/store/",),
     "h5py": ("tiler/formats/xdmf.py", "tiler/formats/cgns.py", "tiler/formats/vtkhdf.py"),
     "laspy": ("tiler/",),
-    "lxml": ("tiler/cityinput/citygml.py",),
+    "lxml": ("tiler/cityinput/citygml.py", "tiler/towns/parameter_files.py"),
     "rasterio": ("tiler/cityinput/rasters.py", "tiler/wind/geotiff.py"),
     "pyogrio": ("tiler/",),
     "meshio": ("tiler/",),
@@ -72,11 +72,11 @@ ORDER = {
     "tiler": [
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
         "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "planning", "dashboard",
-        "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats",
+        "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats", "towns",
         "interface", "cli",
     ],
     "pipeline": [
-        "data", "geometry", "points_terrain", "skeletons", "roofs", "city_model", "simplification",
+        "data", "geometry", "points_terrain", "architecture", "skeletons", "roofs", "city_model", "simplification",
         "plane_mesh", "quality", "smoothing", "columns",
     ],
     "stitch": ["tiling", "seams", "pieces"],

@@ -251,8 +251,23 @@ def _fetch(options: argparse.Namespace) -> int:
 
 
 def _synth(options: argparse.Namespace) -> int:
-    _write_city(options.directory, options)
+    if options.style == "boxes":
+        _write_city(options.directory, options)
+    else:
+        _write_town(options.directory, options)
     return 0
+
+
+def _write_town(directory: Path, options: argparse.Namespace) -> None:
+    from tiler.towns.town import ModelOptions, open_town, write_town
+
+    town = open_town(options.size, options.style, rules=options.rules, seed=options.seed, relief=options.relief)
+    models = ModelOptions(
+        tuple(options.levels.split(",")), options.walls, options.block_height, solid=not options.surfaces
+    )
+    files = write_town(directory, town, density=options.density, models=models)
+    points = f"{len(files.clouds)} LAZ files in {files.clouds[0].parent}, " if files.clouds else ""
+    say(f"{files.houses} houses: {points}{files.models.name}, {files.footprints.name} and {files.parameters.name}")
 
 
 def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":

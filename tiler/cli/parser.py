@@ -159,9 +159,12 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     report = command("report", "write report.html: what a run made, how good it is, what was left out")
     report.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
     _add_fetch(command("fetch", "fetch the folder of a run from a bucket, and verify its checksums"))
-    synth = command("synth", "write a synthetic city: point cloud and footprints")
+    synth = command(
+        "synth", "write a synthetic city: point cloud and footprints, or a town of houses with architecture"
+    )
     synth.add_argument("directory", type=Path, metavar="DIR", help="folder to write to")
     _add_city(synth, size=1000.0, buildings=500)
+    _add_town(synth)
     _add_demo(command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one"))
     render = command("render", "draw a picture of a run")
     render.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
@@ -280,6 +283,35 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int, r
         choices=("flat", "mixed"),
         default=roofs,
         help=f"roofs of the city; mixed: flat, shed, gable, hip, pyramid and mansard ones (default: {roofs})",
+    )
+
+
+def _add_town(synth: argparse.ArgumentParser) -> None:
+    """Add what towns of houses with architecture have besides."""
+    town = synth.add_argument_group("towns of houses that are drawn by rules, with their city model")
+    town.add_argument(
+        "--style",
+        choices=("boxes", "detached", "grid", "terraces", "apartments", "towers"),
+        default="boxes",
+        help="boxes: blocks, or roofs as of --roofs; others: houses with architecture (default: boxes)",
+    )
+    town.add_argument(
+        "--rules", type=Path, metavar="FILE", help="TOML or JSON with other rules than those of the style"
+    )
+    town.add_argument(
+        "--levels", default="1.2,2.2", metavar="LOD,...", help="of the city model: 0.0 to 3.3 (default: 1.2,2.2)"
+    )
+    town.add_argument(
+        "--walls", choices=("walls", "eaves"), default="walls", help="where walls stand (default: walls)"
+    )
+    town.add_argument(
+        "--block-height",
+        choices=("eaves", "third", "half", "two-thirds", "ridge"),
+        default="half",
+        help="height of the blocks of level 1, as a share of the roof (default: half)",
+    )
+    town.add_argument(
+        "--surfaces", action="store_true", help="surfaces with chimneys and overhangs, instead of solids without"
     )
 
 

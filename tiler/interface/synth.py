@@ -4,21 +4,18 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 from typing import Any
 
-import laspy
 import numpy as np
 import pyogrio
-import pyproj
 import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
-from pipeline.data.pointcloud import PointCloud
 from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, make_city
 from pipeline.points_terrain.synthetic_roofs import ROOF_TYPES, wing_rings
+from tiler.towns.synthetic_files import DAY, GPKG_TIME, write_laz
 
 CRS = "EPSG:3006"
 DENSITY = 1.5  # points/m2
@@ -27,9 +24,6 @@ SEED = 1
 
 _TILE_SIZE = 500.0  # m, about: a city is cut into equal squares
 _TAGS = {"shed": "skillion", "gable": "gabled", "hip": "hipped", "pyramid": "pyramidal"}  # of `ROOF_TYPES`
-_SCALE = 0.01  # m
-_DAY = date(2022, 1, 1)  # in all files, so that the same seed gives the same bytes
-_GPKG_TIME = {"OGR_CURRENT_DATE": f"{_DAY.isoformat()}T00:00:00.000Z"}
 
 
 @dataclass(frozen=True)
@@ -104,7 +98,7 @@ def write_city(
         if strangers:
             raise ConfigError(f"{min(strangers)}: is not of this city; give an empty folder or remove it")
         for path, (part, bounds) in tiles.items():
-            _write_laz(path, city_points(city, bounds, part), bounds)
+            write_laz(path, city_points(city, bounds, part), bounds, CRS)
         _write_footprints(city, files)
         files.truth.write_text(json.dumps(_truth(city, buildings, relief), indent=1) + "\n")
     return files
@@ -126,29 +120,15 @@ def _tiles(
     }
 
 
-def _write_laz(path: Path, cloud: PointCloud, bounds: tuple[float, float, float, float]) -> None:
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales = np.full(3, _SCALE)
-    header.offsets = np.array([np.floor(bounds[0]), np.floor(bounds[1]), 0.0])
-    header.creation_date = _DAY
-    header.generating_software = "citystitch synth"
-    header.add_crs(pyproj.CRS(CRS))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = cloud.xyz.T
-    las.classification = cloud.classification
-    las.return_number = las.number_of_returns = np.ones(len(cloud.xyz), np.uint8)
-    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
-
-
 def _write_footprints(city: SyntheticCity, files: SynthFiles) -> None:
     wkb = shapely.to_wkb(city.polygons)
     ids = {"id": city.ids.astype(np.object_)}
     words = {} if city.roofs == "flat" else _roof_tags(city)
-    pyogrio.set_gdal_config_options(_GPKG_TIME)
+    pyogrio.set_gdal_config_options(GPKG_TIME)
     try:
         for path, fields, options in (
             (files.footprints, ids | words, {}),
-            (files.shapefile, ids, {"DBF_DATE_LAST_UPDATE": _DAY.isoformat()}),
+            (files.shapefile, ids, {"DBF_DATE_LAST_UPDATE": DAY.isoformat()}),
         ):
             path.unlink(missing_ok=True)
             values = list(fields.values())
@@ -156,7 +136,7 @@ def _write_footprints(city: SyntheticCity, files: SynthFiles) -> None:
                 path, wkb, values, list(fields), geometry_type="Polygon", crs=CRS, layer="footprints", **options
             )
     finally:
-        pyogrio.set_gdal_config_options(dict.fromkeys(_GPKG_TIME))
+        pyogrio.set_gdal_config_options(dict.fromkeys(GPKG_TIME))
 
 
 def _roof_tags(city: SyntheticCity) -> dict[str, NDArray[Any]]:

@@ -1,0 +1,94 @@
+"""Lots that houses stand on: where each is, by its numbers alone."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+PLACEMENTS = ("grid", "random", "rows")
+ROW = 6  # lots of a row, the last of which stays free
+_STREET = 12.0  # m between two rows
+
+
+@dataclass(frozen=True)
+class Lot:
+    """A lot.
+
+    Attributes
+    ----------
+    i, j : int
+        Its numbers: eastwards and northwards.
+    x, y : float
+        Its centre (m).
+    size : float
+        Diameter of the circle that a house on it has to keep to (m); of a row, its width.
+    rotation : float
+        Of the house (degrees).
+    party : tuple of int
+        Walls that its house shares with neighbours: it fills the lot between them.
+    """
+
+    i: int
+    j: int
+    x: float
+    y: float
+    size: float
+    rotation: float
+    party: tuple[int, ...] = ()
+
+
+def list_lots(
+    bounds: tuple[float, float, float, float], placement: str, size: float, *, seed: int, depth: float = 0.0
+) -> Iterator[Lot]:
+    """List the lots whose centre lies in a box, row by row.
+
+    Parameters
+    ----------
+    bounds : tuple of 4 floats
+        West, south, east, north (m); a centre on the western or southern side is inside.
+    placement : str
+        ``"grid"``: one beside the other, houses along the axes; ``"random"``: turned, and moved within the lot
+        such that none can meet its neighbour; ``"rows"``: terraces of five houses that share walls, along streets.
+    size : float
+        Of a lot (m); of a row, the width of a house.
+    seed : int
+        What turns and moves are drawn from.
+    depth : float
+        How deep the houses of rows are (m).
+
+    Notes
+    -----
+    A lot depends on seed and numbers alone: the lots of two boxes side by side are those of both.
+    """
+    if placement not in PLACEMENTS or not size > 0:
+        raise ValueError(f"placement {placement!r}, lots of {size} m; placements are {', '.join(PLACEMENTS)}")
+    west, south, east, north = bounds
+    step_y = depth + _STREET if placement == "rows" else size
+    for j in range(math.floor(south / step_y) - 1, math.ceil(north / step_y) + 1):
+        for i in range(math.floor(west / size) - 1, math.ceil(east / size) + 1):
+            lot = _make_lot(i, j, placement, size, step_y, seed)
+            if lot is not None and west <= lot.x < east and south <= lot.y < north:
+                yield lot
+
+
+def _make_lot(i: int, j: int, placement: str, size: float, step_y: float, seed: int) -> Lot | None:
+    x, y = (i + 0.5) * size, (j + 0.5) * step_y
+    if placement == "grid":
+        return Lot(i, j, x, y, size, 0.0)
+    if placement == "rows":
+        k = (i + 3 * j) % ROW
+        if k == ROW - 1:
+            return None
+        party = ((3,) if k > 0 else ()) + ((1,) if k < ROW - 2 else ())
+        return Lot(i, j, x, y, size, 0.0, party)
+    rng = lot_random(seed, i, j, 0)
+    rotation, angle, far = rng.random(3)
+    room = 0.08 * size
+    moved = x + room * far * math.cos(math.tau * angle), y + room * far * math.sin(math.tau * angle)
+    return Lot(i, j, *moved, size - 2 * room, 360.0 * float(rotation))
+
+
+def lot_random(seed: int, i: int, j: int, purpose: int) -> np.random.Generator:
+    """Random numbers of a lot: of its seed, its numbers and what they are for, alone."""
+    return np.random.default_rng([seed, i % 2**32, j % 2**32, purpose])

@@ -1,0 +1,41 @@
+"""Files of synthetic points: LAZ that has the same bytes whenever it is written."""
+
+from datetime import date
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyproj
+
+from pipeline.data.pointcloud import PointCloud
+
+SCALE = 0.01  # m
+DAY = date(2022, 1, 1)  # in all files, so that the same seed gives the same bytes
+GPKG_TIME = {"OGR_CURRENT_DATE": f"{DAY.isoformat()}T00:00:00.000Z"}
+
+
+def write_laz(path: Path, cloud: PointCloud, bounds: tuple[float, float, float, float], crs: str) -> None:
+    """Write a point cloud.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    cloud : PointCloud
+        The points, each the only return of its pulse.
+    bounds : tuple of 4 floats
+        Its box: offsets are whole metres of the lower left corner.
+    crs : str
+        Its CRS, as ``EPSG:3006``.
+    """
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, SCALE)
+    header.offsets = np.array([np.floor(bounds[0]), np.floor(bounds[1]), 0.0])
+    header.creation_date = DAY
+    header.generating_software = "citystitch synth"
+    header.add_crs(pyproj.CRS(crs))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = cloud.xyz.T
+    las.classification = cloud.classification
+    las.return_number = las.number_of_returns = np.ones(len(cloud.xyz), np.uint8)
+    las.write(path, laz_backend=laspy.LazBackend.Lazrs)
