@@ -73,7 +73,7 @@ ORDER = {
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
         "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "planning", "dashboard",
         "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats",
-        "interface", "cli",
+        "convert", "interface", "cli",
     ],
     "pipeline": [
         "data", "geometry", "points_terrain", "skeletons", "roofs", "city_model", "simplification",

@@ -182,8 +182,9 @@ def _read_building(name: str, objects: Object, vertices: Vertices, parts: list[s
                 faults.append(
                     f"{owner}: a {geometry.get('type')} cannot be read ({type(error).__name__}: {error})"
                 )
-    attributes = objects[name].get("attributes") or {}
-    return ModelBuilding(name, tuple(shapes), _number(attributes.get(height or "measuredHeight")), tuple(faults))
+    attributes = {owner: objects[owner].get("attributes") or {} for owner in dict.fromkeys([name, *parts])}
+    above = _number(attributes[name].get(height or "measuredHeight"))
+    return ModelBuilding(name, tuple(shapes), above, tuple(faults), attributes)
 
 
 def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> Shape:
@@ -196,6 +197,7 @@ def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> 
     default = OUTLINE if 0 <= lod < 1 else UNKNOWN
     kinds = [KINDS.get(str(one.get("type")), UNKNOWN) for one in semantics.get("surfaces") or ()]
     faces: list[Any] = geometry["boundaries"]
+    several = DEPTH[kind] == 2 and len(faces) > 1
     values: Any = semantics.get("values")
     for _ in range(DEPTH[kind]):
         # Shells behind the first are cavities.
@@ -210,7 +212,7 @@ def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> 
             break
         faces = list(shells[0]) if shells else []
         values = lists[0] if lists else None
-    return Shape(owner, lod, DEPTH[kind] > 0, _make_faces(faces, values, kinds, (vertices, default)))
+    return Shape(owner, lod, DEPTH[kind] > 0, _make_faces(faces, values, kinds, (vertices, default)), several)
 
 
 def _make_faces(faces: list[Any], values: Any, kinds: list[int], rest: tuple[Vertices, int]) -> Faces:
