@@ -162,6 +162,27 @@ def test_other_formats_give_the_same_bytes(
     assert {name: value for name, value in hashes(tmp_path / "out").items() if "mesh" in name} == mesh
 
 
+def test_parts_of_a_roof_from_one_square_metre_on_are_kept(tmp_path: Path) -> None:
+    document = house(0, 0)
+    first = len(document["vertices"])
+    for x, y, side in ((3.0, 1.5, 1.3), (7.0, 1.5, 0.9)):
+        square = ((x, y), (x + side, y), (x + side, y + side), (x, y + side))
+        document["vertices"] += [[round(1000 * a), round(1000 * b), 12_000] for a, b in square]
+    document["CityObjects"]["h00"]["geometry"].append(
+        {
+            "type": "MultiSurface",
+            "lod": "2.2",
+            "boundaries": [[list(range(k, k + 4))] for k in (first, first + 4)],
+            "semantics": {"surfaces": [{"type": "RoofSurface"}], "values": [0, 0]},
+        }
+    )
+    path = write_json(tmp_path / "a.json", document)
+    run(make_config({"buildings": [str(path)], "roofs": "planes", "out": str(tmp_path / "out")}))
+    heights = sorted(part["roof_height"] for part in parts_of(tmp_path / "out").values())
+    assert len(heights) == 3  # the larger stack is a part, the smaller one joined with the slope
+    assert heights[-1] == 12.0
+
+
 def test_without_terrain_the_ground_lies_at_the_feet_of_the_houses(tmp_path: Path) -> None:
     path = write_json(tmp_path / "a.json", house(0, 0))
     record = run(make_config({"buildings": [str(path)], "roofs": "planes", "out": str(tmp_path / "out")}))
