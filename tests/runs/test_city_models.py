@@ -218,6 +218,15 @@ def test_a_model_above_its_terrain_is_told_and_moved(
     assert "--shift-z -6.1" in told["detail"]  # ground is a low percentile of a slope
     record = run(make_config(lifted | {"shift_z": -6.0, "out": str(tmp_path / "moved")}))
     assert "model-shift" not in record["notes"]
+    measured = run(make_config(lifted | {"shift_z": "auto", "out": str(tmp_path / "measured")}))
+    (told,) = measured["notes"]["model-shifted"]["items"]
+    assert told["detail"] == "city models were moved by -6.1 m onto the terrain, as measured at 16 buildings"
+    assert measured["parameters"]["shift_z"] == "auto"
+    fixed = run(make_config(lifted | {"shift_z": -6.1, "out": str(tmp_path / "fixed")}))
+    assert hashes(tmp_path / "measured")["mesh.pvtu"] == hashes(tmp_path / "fixed")["mesh.pvtu"]
+    assert measured["counts"] == fixed["counts"]
+    again = run(make_config(lifted | {"shift_z": "auto", "out": str(tmp_path / "measured")}))
+    assert again["tasks"]["ran"] == 0
     moved, parts = parts_of(tmp_path / "moved"), parts_of(out)
     assert moved.keys() == parts.keys()
     for name in ("roof_height", "roof_slope", "ground_height"):
@@ -255,6 +264,10 @@ def test_what_does_not_go_together_is_refused(
     block: tuple[dict[str, Any], Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     values, _, _ = block
+    with pytest.raises(ConfigError, match="takes city models and rasters of terrain"):
+        make_config(values | {"terrain": (), "shift_z": "auto"})
+    with pytest.raises(ConfigError, match="metres or 'auto' expected"):
+        make_config(values | {"shift_z": "low"})
     with pytest.raises(ConfigError, match="leave one out"):
         make_config(values | {"footprints": "a.gpkg"})
     far = house(0, 0)

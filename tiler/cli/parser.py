@@ -225,7 +225,7 @@ def _add_parameters(parser: argparse.ArgumentParser) -> Group:
         elif get_origin(wanted) is tuple:
             words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
         elif wanted == Height:
-            words |= {"type": str, "metavar": "M|nH"}
+            words |= {"type": str, "metavar": "M|auto" if entry.name == "shift_z" else "M|nH"}
         else:
             unit = KINDS.get(entry.name, "" if wanted is str else data["unit"].upper())
             words |= {"type": wanted, "metavar": unit or METAVARS[wanted]}

@@ -26,6 +26,7 @@ from tiler.words.plain_text import shorten
 MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
 MAX_INT = 2**53
 UNSET = ""
+AUTO = "auto"  # instead of metres: as measured
 ANYWHERE = "127.0.0.1:0"  # a free port of this machine, for this machine
 PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is given for the open
 NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
@@ -86,9 +87,9 @@ class Config:
         UNSET, "input", "which coordinate comes first in city models: xy for the easting, yx for the northing; "
         "empty: what they show", choices=(UNSET, "xy", "yx"),
     )  # fmt: skip
-    shift_z: float = _parameter(
-        0.0, "input", "added to all heights of city models, where they are not those of the terrain", unit="m",
-        least=-10_000, most=10_000,
+    shift_z: float | str = _parameter(
+        0.0, "input", "added to all heights of city models, where they are not those of the terrain; auto: what "
+        "the rasters of terrain are above the feet of buildings in the median", unit="m", least=-1e4, most=1e4,
     )  # fmt: skip
     layer: str = _parameter(UNSET, "input", "layer of the footprint file; empty: its only or first one")
     id_attribute: str = _parameter(
@@ -475,7 +476,7 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
     if wanted == Height:
         wanted = str if isinstance(value, str) else float
         converted = _convert(name, value, wanted)
-        return read_height(converted, name)
+        return _read_shift(converted) if name == "shift_z" else read_height(converted, name)
     if get_origin(wanted) is tuple:
         if get_args(wanted)[0] is int and isinstance(value, str):
             value = _split_numbers(name, value)
@@ -493,6 +494,16 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         if name in ("pointcloud", "footprints", "buildings", "terrain", "out"):
             check_url(value)
     return value
+
+
+def _read_shift(value: Height) -> Height:
+    """Read metres, or the word for what is measured."""
+    if isinstance(value, float) or value.strip().lower() == AUTO:
+        return value if isinstance(value, float) else AUTO
+    try:
+        return float(value)
+    except ValueError:
+        raise ConfigError(f"shift_z = {_shown(value)}: metres or {AUTO!r} expected") from None
 
 
 def _split_numbers(name: str, text: str) -> list[int]:
@@ -550,6 +561,10 @@ def _check_together(config: Config) -> None:
             )
     _check_classes(config.building_classes)
     _check_sources(config)
+    if config.shift_z == AUTO and not (config.buildings and config.terrain):
+        raise ConfigError(
+            f"shift_z = {AUTO}: takes city models and rasters of terrain; give it in metres: a run tells how many"
+        )
     if config.clearance_floor > config.clearance:
         raise ConfigError(
             f"clearance_floor = {config.clearance_floor:g} m: must be at most clearance = {config.clearance:g} m"
