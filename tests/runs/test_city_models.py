@@ -250,7 +250,19 @@ def test_with_points_beside_it_the_model_has_the_roofs_and_points_tell_how_far_t
     assert record["counts"]["roofs of a city model"] == 2
     assert {part["roof_method"] for part in parts_of(tmp_path / "out").values()} == {"model"}
     assert record["fidelity"]["roof"]["bias"] == pytest.approx(-0.3, abs=0.1)
+    assert record["fidelity"]["roof_fit"]["model"]["rmse"] == pytest.approx(0.3, abs=0.1)
+    rmse = [part["roof_rmse"] for part in parts_of(tmp_path / "out").values()]
+    assert rmse == pytest.approx([0.3] * 4, abs=0.1)  # the distance of model and points, by building
     assert check_run(tmp_path / "out", StoredTerrain).ok
+    record = run(make_config(values | {"prefer": "points", "out": str(tmp_path / "points")}))
+    assert {part["roof_method"] for part in parts_of(tmp_path / "points").values()} == {"planes"}
+    assert abs(record["fidelity"]["roof"]["bias"]) < 0.05
+    las = laspy.read(tmp_path / "a.las")
+    las.points = las.points[(las.classification != 6) | (las.x > PLACE[0] + 20)]
+    las.write(tmp_path / "a.las")  # of the first house no points are left
+    run(make_config(values | {"prefer": "points", "out": str(tmp_path / "some")}))
+    methods = {name.partition("-")[0]: part["roof_method"] for name, part in parts_of(tmp_path / "some").items()}
+    assert methods == {"h00": "model", "h10": "planes"}
 
 
 def test_terrain_alone_is_meshed(block: tuple[dict[str, Any], Path, dict[str, Any]], tmp_path: Path) -> None:
@@ -266,6 +278,8 @@ def test_what_does_not_go_together_is_refused(
     values, _, _ = block
     with pytest.raises(ConfigError, match="takes city models and rasters of terrain"):
         make_config(values | {"terrain": (), "shift_z": "auto"})
+    with pytest.raises(ConfigError, match="beside a point cloud"):
+        make_config(values | {"prefer": "points"})
     with pytest.raises(ConfigError, match="metres or 'auto' expected"):
         make_config(values | {"shift_z": "low"})
     with pytest.raises(ConfigError, match="leave one out"):

@@ -83,6 +83,10 @@ class Config:
         "auto", "input", "level of detail that is taken of each building of a city model: the best roofs that it "
         "has, or the best level up to a number", choices=("auto", "1.2", "1.3", "2.2"),
     )  # fmt: skip
+    prefer: str = _parameter(
+        "model", "input", "whose roof a house has that both a point cloud and a city model have one of",
+        choices=("model", "points"),
+    )  # fmt: skip
     axis_order: str = _parameter(
         UNSET, "input", "which coordinate comes first in city models: xy for the easting, yx for the northing; "
         "empty: what they show", choices=(UNSET, "xy", "yx"),
@@ -561,6 +565,8 @@ def _check_together(config: Config) -> None:
             )
     _check_classes(config.building_classes)
     _check_sources(config)
+    if config.prefer == "points" and not (config.buildings and config.pointcloud):
+        raise ConfigError("prefer = points: takes city models beside a point cloud; leave it out, or give both")
     if config.shift_z == AUTO and not (config.buildings and config.terrain):
         raise ConfigError(
             f"shift_z = {AUTO}: takes city models and rasters of terrain; give it in metres: a run tells how many"
