@@ -218,24 +218,29 @@ def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> 
 def _make_faces(faces: list[Any], values: Any, kinds: list[int], rest: tuple[Vertices, int]) -> Faces:
     vertices, default = rest
     numbers = values if values is not None else [None] * len(faces)
-    rings: list[list[int]] = []
+    corners: list[int] = []  # of all rings: millions of them in a file, so a ring is added at a time
+    lengths: list[int] = []
     sizes: list[int] = []
     sorts: list[int] = []
     for face, number in zip(faces, numbers, strict=True):
-        kept = [ring[:-1] if len(ring) > 1 and ring[0] == ring[-1] else ring for ring in face]
-        kept = [ring for ring in kept if len(ring) >= 3]
-        if not kept or len(face[0]) < 3:
-            continue
-        rings += kept
-        sizes.append(len(kept))
-        sorts.append(default if number is None else kinds[number])
-    lengths = np.fromiter(map(len, rings), np.int64, len(rings))
-    index = np.fromiter((v for ring in rings for v in ring), np.int64, int(lengths.sum()))
+        n = 0
+        for ring in face:
+            whole = ring[:-1] if len(ring) > 1 and ring[0] == ring[-1] else ring
+            if len(whole) >= 3:
+                corners += whole
+                lengths.append(len(whole))
+                n += 1
+            elif not n:
+                break  # without a border there is no face
+        if n:
+            sizes.append(n)
+            sorts.append(default if number is None else kinds[number])
+    index = np.array(corners, np.int64)
     if len(index) and index.min() < 0:
         raise IndexError(f"vertex {index.min()}")
     return Faces(
         vertices[index],
-        np.concatenate(([0], np.cumsum(lengths))),
+        np.concatenate(([0], np.cumsum(np.array(lengths, np.int64)))),
         np.concatenate(([0], np.cumsum(np.array(sizes, np.int64)))),
         np.array(sorts, np.int8),
     )
