@@ -96,7 +96,7 @@ def draw_house(rules: Rules, lot: Lot, ground: Ground, *, seed: int) -> House:
     if roof.shape == "hipped" and length - width < 1.0:
         roof = replace(roof, shape="pyramidal")
     house = House(
-        id=str(uuid.uuid5(_IDS, f"{seed}/{lot.i}/{lot.j}")),
+        id=f"UUID_{uuid.uuid5(_IDS, f'{seed}/{lot.i}/{lot.j}')}",
         x=0.0,
         y=0.0,
         z=0.0,

@@ -152,7 +152,7 @@ class House:
     Attributes
     ----------
     id : str
-        UUID.
+        ``UUID_`` and a UUID: XML takes no id that begins with a digit.
     x, y, z : float
         Lower left corner of its front, in the CRS of the town (m).
     rotation : float

@@ -88,6 +88,7 @@ def divide_houses(
     roofs: RoofPoints | None = None,
     unmarked: NDArray[np.bool_] | None = None,
     surfaces: RoofSurfaces | None = None,
+    prefer_points: bool = False,
 ) -> Houses:
     """Divide houses by the planes of their roofs, or where these step (step 2.0, ours).
 
@@ -109,6 +110,8 @@ def divide_houses(
         Houses whose roof points are those of `roofs` alone, whatever class they have in the cloud.
     surfaces : RoofSurfaces, optional
         Roof surfaces of the houses by a city model; not used where roofs are flat.
+    prefer_points : bool
+        Whether such a roof counts only where points are too few for planes.
     """
     model = city.model
     marks = has_building_class(cloud) if building_class is None else building_class
@@ -120,7 +123,7 @@ def divide_houses(
         if roofs is None:
             roofs = locate_roof_points(cloud, model.polygons, building_class=marks)
         if sloped:
-            fitted, form, notes = _fit_sloped(city, roofs, options, surfaces)
+            fitted, form, notes = _fit_sloped(city, roofs, options, surfaces, prefer_points)
             parts, part_roofs, method, too_few = fitted.parts, fitted.roofs, fitted.method, fitted.too_few
         else:
             parts = split_levels(model.polygons, roofs, LevelOptions(clearance=options.clearance))
@@ -153,7 +156,7 @@ def divide_houses(
 
 
 def _fit_sloped(
-    city: City, points: RoofPoints, options: CityOptions, surfaces: RoofSurfaces | None
+    city: City, points: RoofPoints, options: CityOptions, surfaces: RoofSurfaces | None, prefer_points: bool
 ) -> tuple[HouseRoofs, NDArray[np.int8], list[Note]]:
     """Roofs of a city model, of planes, of given forms, and hipped ones, in this order where all are looked for.
 
@@ -163,7 +166,11 @@ def _fit_sloped(
     new, told_of = ({}, []) if surfaces is None else lay_surfaces(city, surfaces)
     laid = np.zeros(len(model), np.bool_)
     laid[list(new)] = True
-    fitted = fit_roofs(model.polygons, _leave_out(points, laid), RoofOptions(clearance=options.clearance))
+    used = points if prefer_points else _leave_out(points, laid)
+    fitted = fit_roofs(model.polygons, used, RoofOptions(clearance=options.clearance))
+    if prefer_points:
+        laid &= fitted.too_few
+        new = {row: roof for row, roof in new.items() if laid[row]}
     fitted = replace_roofs(fitted, new)
     left = ~laid & (fitted.too_few if options.roofs == "planes" else True)
     given = np.isfinite(city.forms[:, SHAPE])

@@ -6,10 +6,11 @@ from pipeline.city_model.city import City, find_places
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.roofs import ROOF_METHODS, take_roofs
-from pipeline.roofs.house_roofs import NewRoof, RoofOptions
+from pipeline.roofs.house_roofs import NewRoof
 from pipeline.roofs.roof_surfaces import RoofSurfaces, make_surfaced_roof
 
 MODEL = ROOF_METHODS.index("model")
+LEAST_PART = 1.0  # m2; smaller parts are joined with others: roofs of a model are known, not found in points
 TOLD_SHARE = 0.05  # of a house: larger overhangs and gaps are told ...
 TOLD_AREA = 1.0  # m2, ... if they are larger than this, too
 
@@ -42,7 +43,7 @@ def lay_surfaces(city: City, surfaces: RoofSurfaces) -> tuple[dict[int, NewRoof]
             model.polygons[row],
             surfaces.polygons[own],
             take_roofs(surfaces.roofs, own),
-            min_area=RoofOptions.min_area,
+            min_area=LEAST_PART,
         )
         if found is None:
             continue

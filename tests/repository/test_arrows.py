@@ -72,8 +72,8 @@ ORDER = {
     "tiler": [
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
         "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "planning", "dashboard",
-        "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats", "towns",
-        "interface", "cli",
+        "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats", "convert",
+        "towns", "interface", "cli",
     ],
     "pipeline": [
         "data", "geometry", "points_terrain", "architecture", "skeletons", "roofs", "city_model", "simplification",

@@ -162,6 +162,27 @@ def test_other_formats_give_the_same_bytes(
     assert {name: value for name, value in hashes(tmp_path / "out").items() if "mesh" in name} == mesh
 
 
+def test_parts_of_a_roof_from_one_square_metre_on_are_kept(tmp_path: Path) -> None:
+    document = house(0, 0)
+    first = len(document["vertices"])
+    for x, y, side in ((3.0, 1.5, 1.3), (7.0, 1.5, 0.9)):
+        square = ((x, y), (x + side, y), (x + side, y + side), (x, y + side))
+        document["vertices"] += [[round(1000 * a), round(1000 * b), 12_000] for a, b in square]
+    document["CityObjects"]["h00"]["geometry"].append(
+        {
+            "type": "MultiSurface",
+            "lod": "2.2",
+            "boundaries": [[list(range(k, k + 4))] for k in (first, first + 4)],
+            "semantics": {"surfaces": [{"type": "RoofSurface"}], "values": [0, 0]},
+        }
+    )
+    path = write_json(tmp_path / "a.json", document)
+    run(make_config({"buildings": [str(path)], "roofs": "planes", "out": str(tmp_path / "out")}))
+    heights = sorted(part["roof_height"] for part in parts_of(tmp_path / "out").values())
+    assert len(heights) == 3  # the larger stack is a part, the smaller one joined with the slope
+    assert heights[-1] == 12.0
+
+
 def test_without_terrain_the_ground_lies_at_the_feet_of_the_houses(tmp_path: Path) -> None:
     path = write_json(tmp_path / "a.json", house(0, 0))
     record = run(make_config({"buildings": [str(path)], "roofs": "planes", "out": str(tmp_path / "out")}))
@@ -197,6 +218,15 @@ def test_a_model_above_its_terrain_is_told_and_moved(
     assert "--shift-z -6.1" in told["detail"]  # ground is a low percentile of a slope
     record = run(make_config(lifted | {"shift_z": -6.0, "out": str(tmp_path / "moved")}))
     assert "model-shift" not in record["notes"]
+    measured = run(make_config(lifted | {"shift_z": "auto", "out": str(tmp_path / "measured")}))
+    (told,) = measured["notes"]["model-shifted"]["items"]
+    assert told["detail"] == "city models were moved by -6.1 m onto the terrain, as measured at 16 buildings"
+    assert measured["parameters"]["shift_z"] == "auto"
+    fixed = run(make_config(lifted | {"shift_z": -6.1, "out": str(tmp_path / "fixed")}))
+    assert hashes(tmp_path / "measured")["mesh.pvtu"] == hashes(tmp_path / "fixed")["mesh.pvtu"]
+    assert measured["counts"] == fixed["counts"]
+    again = run(make_config(lifted | {"shift_z": "auto", "out": str(tmp_path / "measured")}))
+    assert again["tasks"]["ran"] == 0
     moved, parts = parts_of(tmp_path / "moved"), parts_of(out)
     assert moved.keys() == parts.keys()
     for name in ("roof_height", "roof_slope", "ground_height"):
@@ -220,7 +250,19 @@ def test_with_points_beside_it_the_model_has_the_roofs_and_points_tell_how_far_t
     assert record["counts"]["roofs of a city model"] == 2
     assert {part["roof_method"] for part in parts_of(tmp_path / "out").values()} == {"model"}
     assert record["fidelity"]["roof"]["bias"] == pytest.approx(-0.3, abs=0.1)
+    assert record["fidelity"]["roof_fit"]["model"]["rmse"] == pytest.approx(0.3, abs=0.1)
+    rmse = [part["roof_rmse"] for part in parts_of(tmp_path / "out").values()]
+    assert rmse == pytest.approx([0.3] * 4, abs=0.1)  # the distance of model and points, by building
     assert check_run(tmp_path / "out", StoredTerrain).ok
+    record = run(make_config(values | {"prefer": "points", "out": str(tmp_path / "points")}))
+    assert {part["roof_method"] for part in parts_of(tmp_path / "points").values()} == {"planes"}
+    assert abs(record["fidelity"]["roof"]["bias"]) < 0.05
+    las = laspy.read(tmp_path / "a.las")
+    las.points = las.points[(las.classification != 6) | (las.x > PLACE[0] + 20)]
+    las.write(tmp_path / "a.las")  # of the first house no points are left
+    run(make_config(values | {"prefer": "points", "out": str(tmp_path / "some")}))
+    methods = {name.partition("-")[0]: part["roof_method"] for name, part in parts_of(tmp_path / "some").items()}
+    assert methods == {"h00": "model", "h10": "planes"}
 
 
 def test_terrain_alone_is_meshed(block: tuple[dict[str, Any], Path, dict[str, Any]], tmp_path: Path) -> None:
@@ -234,6 +276,12 @@ def test_what_does_not_go_together_is_refused(
     block: tuple[dict[str, Any], Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     values, _, _ = block
+    with pytest.raises(ConfigError, match="takes city models and rasters of terrain"):
+        make_config(values | {"terrain": (), "shift_z": "auto"})
+    with pytest.raises(ConfigError, match="beside a point cloud"):
+        make_config(values | {"prefer": "points"})
+    with pytest.raises(ConfigError, match="metres or 'auto' expected"):
+        make_config(values | {"shift_z": "low"})
     with pytest.raises(ConfigError, match="leave one out"):
         make_config(values | {"footprints": "a.gpkg"})
     far = house(0, 0)

@@ -6,7 +6,8 @@ namespaces.
 
 import math
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,9 @@ SKIPPED = {
     "interiorRoom",
     "interiorBuildingInstallation",
 }
+GENERIC = {"intAttribute": int, "doubleAttribute": float, "measureAttribute": float}
+# Children of a building that hold no attribute of it.
+NO_ATTRIBUTES = {"boundedBy", "boundary", "consistsOfBuildingPart", "buildingPart"}
 FEET = {"ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "[ft_i]": 0.3048}
 _LOD = re.compile(r"lod([0-4])(\w*)")
 
@@ -114,12 +118,15 @@ class _Reading:
     """What is found of a building and its parts, by owner, level of detail, and whether it is a solid."""
 
     faces: dict[tuple[str, float, bool], FaceList] = field(default_factory=dict)
-    links: list[tuple[tuple[str, float, bool], int, str]] = field(default_factory=list)
+    links: list[tuple[tuple[str, float, bool], int, str, bool]] = field(default_factory=list)
     polygons: dict[str, Any] = field(default_factory=dict)
     seen: dict[tuple[str, float], set[str]] = field(default_factory=dict)
+    linked: dict[tuple[str, float], set[str]] = field(default_factory=dict)
+    solids: Counter[tuple[str, float, bool]] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)
+    attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
 
-    def add(self, key: tuple[str, float, bool], kind: int, element: Any) -> None:
+    def add(self, key: tuple[str, float, bool], kind: int, element: Any, *, turned: bool = False) -> None:
         name = _name_of(element)
         owner, lod, _ = key
         if name:
@@ -129,7 +136,16 @@ class _Reading:
         except (TypeError, ValueError) as error:
             self.faults.append(f"polygon {name or 'without id'} cannot be read ({error})")
             return
-        self.faces.setdefault(key, FaceList()).add(rings, kind)
+        self.faces.setdefault(key, FaceList()).add([ring[::-1] for ring in rings] if turned else rings, kind)
+
+    def make_shape(self, key: tuple[str, float, bool], found: FaceList) -> Shape:
+        """Give the faces of an owner at a level; boundary surfaces are a solid where one links to all of them."""
+        owner, lod, closed = key
+        solid = (owner, lod, True)
+        whole = (
+            not closed and solid not in self.faces and len(self.linked.get((owner, lod), ())) == len(found.kinds)
+        )
+        return Shape(owner, lod, closed or whole, found.done(), self.solids[solid] > 1)
 
 
 def _read_building(element: Any, height: str) -> ModelBuilding:
@@ -138,9 +154,11 @@ def _read_building(element: Any, height: str) -> ModelBuilding:
     _read_object(element, name, reading)
     # Links to polygons elsewhere in the building; those to its own boundary surfaces are there already.
     targets: dict[str, Any] | None = None
-    for key, kind, link in reading.links:
-        owner, lod, _ = key
+    for key, kind, link, turned in reading.links:
+        owner, lod, closed = key
         if link in reading.seen.get((owner, lod), ()):
+            if closed and not turned:
+                reading.linked.setdefault((owner, lod), set()).add(link)
             continue
         if targets is None:
             targets = {_name_of(one): one for one in element.iter() if isinstance(one.tag, str) and _name_of(one)}
@@ -150,15 +168,14 @@ def _read_building(element: Any, height: str) -> ModelBuilding:
             continue
         for one in target.iter():
             if _local(one) in POLYGONS:
-                reading.add(key, kind, one)
-    shapes = tuple(
-        Shape(owner, lod, closed, found.done()) for (owner, lod, closed), found in reading.faces.items()
-    )
-    return ModelBuilding(name, shapes, _height_of(element, height), tuple(reading.faults))
+                reading.add(key, kind, one, turned=turned)
+    shapes = tuple(reading.make_shape(key, found) for key, found in reading.faces.items())
+    return ModelBuilding(name, shapes, _height_of(element, height), tuple(reading.faults), reading.attributes)
 
 
 def _read_object(element: Any, owner: str, reading: _Reading) -> None:
     """Read a building or a part of it, and the parts in it by themselves."""
+    reading.attributes.setdefault(owner, {}).update(_read_attributes(element))
     for child in element:
         tag = _local(child)
         if not tag or tag in SKIPPED:
@@ -194,21 +211,55 @@ def _read_geometry(element: Any, owner: str, reading: _Reading, lod: tuple[float
     if form in ("TerrainIntersection", "MultiCurve", "ImplicitRepresentation", "Point"):
         return
     key = (owner, level, form == "Solid")
-    for one in _iter_outer(element):
+    for one, turned in _iter_outer(element, turned=element.get("orientation") == "-"):
+        reading.solids[key] += _local(one) == "Solid"
         if _local(one) in POLYGONS:
-            reading.add(key, kind, one)
+            reading.add(key, kind, one, turned=turned)
         elif link := one.get(HREF):
-            reading.links.append((key, kind, link.rpartition("#")[2]))
+            reading.links.append((key, kind, link.rpartition("#")[2], turned))
 
 
-def _iter_outer(element: Any) -> Iterator[Any]:
-    """Give the elements below one, but not those within cavities of solids."""
+def _iter_outer(element: Any, *, turned: bool) -> Iterator[tuple[Any, bool]]:
+    """Give the elements below one, but not those within cavities of solids, and whether each is turned over."""
     for child in element:
         if _local(child) == "interior" and _local(element) == "Solid":
             continue
-        yield child
+        over = turned != (child.get("orientation") == "-")
+        yield child, over
         if _local(child) not in POLYGONS:
-            yield from _iter_outer(child)
+            yield from _iter_outer(child, turned=over)
+
+
+def _read_attributes(element: Any) -> dict[str, Any]:
+    """Read what a building or part is said to be: generic attributes, and children with a text alone."""
+    found: dict[str, Any] = {}
+    for child in element:
+        tag = _local(child)
+        if not tag or tag in SKIPPED | NO_ATTRIBUTES or _LOD.fullmatch(tag):
+            continue
+        generic = child[0] if tag == "genericAttribute" and len(child) else child
+        kind = _local(generic)
+        parts = {_local(one): (one.text or "").strip() for one in generic}
+        if "value" in parts and kind.endswith("Attribute"):
+            name = child.get("name") or parts.get("name", "")
+            value = _typed(parts["value"], GENERIC.get(kind[:1].lower() + kind[1:], str))
+        elif tag == "height":
+            name, value = "measuredHeight", _height_of([child], "")
+        elif not len(child):
+            name, value = tag, (child.text or "").strip()
+            value = _metres(child, value) if tag == "measuredHeight" else value
+        else:
+            continue
+        if name and value != "" and not (isinstance(value, float) and math.isnan(value)):
+            found[name] = f"{found[name]}; {value}" if name in found else value
+    return found
+
+
+def _typed(text: str, kind: Callable[[str], Any]) -> Any:
+    try:
+        return kind(text)
+    except ValueError:
+        return text
 
 
 def _collect_polygons(element: Any, found: FaceList, kind: int) -> None:

@@ -182,8 +182,9 @@ def _read_building(name: str, objects: Object, vertices: Vertices, parts: list[s
                 faults.append(
                     f"{owner}: a {geometry.get('type')} cannot be read ({type(error).__name__}: {error})"
                 )
-    attributes = objects[name].get("attributes") or {}
-    return ModelBuilding(name, tuple(shapes), _number(attributes.get(height or "measuredHeight")), tuple(faults))
+    attributes = {owner: objects[owner].get("attributes") or {} for owner in dict.fromkeys([name, *parts])}
+    above = _number(attributes[name].get(height or "measuredHeight"))
+    return ModelBuilding(name, tuple(shapes), above, tuple(faults), attributes)
 
 
 def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> Shape:
@@ -196,6 +197,7 @@ def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> 
     default = OUTLINE if 0 <= lod < 1 else UNKNOWN
     kinds = [KINDS.get(str(one.get("type")), UNKNOWN) for one in semantics.get("surfaces") or ()]
     faces: list[Any] = geometry["boundaries"]
+    several = DEPTH[kind] == 2 and len(faces) > 1
     values: Any = semantics.get("values")
     for _ in range(DEPTH[kind]):
         # Shells behind the first are cavities.
@@ -210,30 +212,35 @@ def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> 
             break
         faces = list(shells[0]) if shells else []
         values = lists[0] if lists else None
-    return Shape(owner, lod, DEPTH[kind] > 0, _make_faces(faces, values, kinds, (vertices, default)))
+    return Shape(owner, lod, DEPTH[kind] > 0, _make_faces(faces, values, kinds, (vertices, default)), several)
 
 
 def _make_faces(faces: list[Any], values: Any, kinds: list[int], rest: tuple[Vertices, int]) -> Faces:
     vertices, default = rest
     numbers = values if values is not None else [None] * len(faces)
-    rings: list[list[int]] = []
+    corners: list[int] = []  # of all rings: millions of them in a file, so a ring is added at a time
+    lengths: list[int] = []
     sizes: list[int] = []
     sorts: list[int] = []
     for face, number in zip(faces, numbers, strict=True):
-        kept = [ring[:-1] if len(ring) > 1 and ring[0] == ring[-1] else ring for ring in face]
-        kept = [ring for ring in kept if len(ring) >= 3]
-        if not kept or len(face[0]) < 3:
-            continue
-        rings += kept
-        sizes.append(len(kept))
-        sorts.append(default if number is None else kinds[number])
-    lengths = np.fromiter(map(len, rings), np.int64, len(rings))
-    index = np.fromiter((v for ring in rings for v in ring), np.int64, int(lengths.sum()))
+        n = 0
+        for ring in face:
+            whole = ring[:-1] if len(ring) > 1 and ring[0] == ring[-1] else ring
+            if len(whole) >= 3:
+                corners += whole
+                lengths.append(len(whole))
+                n += 1
+            elif not n:
+                break  # without a border there is no face
+        if n:
+            sizes.append(n)
+            sorts.append(default if number is None else kinds[number])
+    index = np.array(corners, np.int64)
     if len(index) and index.min() < 0:
         raise IndexError(f"vertex {index.min()}")
     return Faces(
         vertices[index],
-        np.concatenate(([0], np.cumsum(lengths))),
+        np.concatenate(([0], np.cumsum(np.array(lengths, np.int64)))),
         np.concatenate(([0], np.cumsum(np.array(sizes, np.int64)))),
         np.array(sorts, np.int8),
     )

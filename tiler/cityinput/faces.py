@@ -1,6 +1,6 @@
 """Buildings of a city model as files have them: polygons in space by level of detail, whatever the format."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +19,7 @@ KINDS = {
     "InteriorWallSurface": WALL,
     "CeilingSurface": WALL,
     "FloorSurface": WALL,
+    "GenericThematicSurface": UNKNOWN,
 }
 NO_LOD = -1.0
 
@@ -64,12 +65,15 @@ class Shape:
         Whether it is a solid: its faces are then oriented outwards.
     faces : Faces
         Its polygons.
+    several : bool
+        Whether it is several solids, one after the other.
     """
 
     owner: str
     lod: float
     closed: bool
     faces: Faces
+    several: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +90,15 @@ class ModelBuilding:
         Height above ground by an attribute (m), NaN where there is none.
     faults : tuple of str
         What could not be read.
+    attributes : mapping of str to mapping
+        Attributes of the building and of each of its parts, by id; those of a GeoPackage only where asked for.
     """
 
     id: str
     shapes: tuple[Shape, ...]
     height: float = float("nan")
     faults: tuple[str, ...] = ()
+    attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 @dataclass

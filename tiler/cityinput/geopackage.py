@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -25,6 +26,7 @@ IDS = (
     "id",
 )  # columns with the id of a building, the first that is there
 OUTLINES = "pand"  # layer with outlines in plan
+PART = "part"  # column with the id of the part that a row is, where it is one
 BATCH = 500  # buildings whose geometries are parsed at a time
 _LEVEL = re.compile(r"lod(\d)(\d)?_3d")
 _ENVELOPES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}  # bytes by the code in the header of a geometry
@@ -41,11 +43,12 @@ class _Layer:
     crs: str
 
 
-def scan_geopackage(path: Path) -> Iterator[str | ModelBuilding]:
+def scan_geopackage(path: Path, *, attributes: bool = False) -> Iterator[str | ModelBuilding]:
     """Give the name of the CRS, and the buildings by ascending id.
 
     Layers ``lod12_3d``, ``lod13_3d`` and ``lod22_3d`` have the level of their name, ``pand`` that of outlines;
-    other layers in space have none. Rows of one id are one building.
+    other layers in space have none. Rows of one id are one building. With `attributes` columns are read: of each
+    the first value of its rows.
 
     Raises
     ------
@@ -61,9 +64,9 @@ def scan_geopackage(path: Path) -> Iterator[str | ModelBuilding]:
             for name, group in groupby(rows, key=lambda row: row[0]):
                 batch.append((name, [(layer, number) for _, layer, number in group]))
                 if len(batch) == BATCH:
-                    yield from _read_batch(base, layers, batch)
+                    yield from _read_batch(base, layers, batch, attributes)
                     batch = []
-            yield from _read_batch(base, layers, batch)
+            yield from _read_batch(base, layers, batch, attributes)
     except sqlite3.Error as error:
         raise InputError(f"{path}: cannot be read as a GeoPackage ({error}); copy it again") from error
 
@@ -103,15 +106,26 @@ def _list_rows(base: sqlite3.Connection, layers: list[_Layer]) -> Iterator[tuple
 
 
 def _read_batch(
-    base: sqlite3.Connection, layers: list[_Layer], batch: list[tuple[str, list[tuple[int, int]]]]
+    base: sqlite3.Connection,
+    layers: list[_Layer],
+    batch: list[tuple[str, list[tuple[int, int]]]],
+    all_columns: bool,
 ) -> Iterator[ModelBuilding]:
     blobs, faults = [], list[str]()
-    for _, rows in batch:
+    values: dict[str, dict[str, dict[str, Any]]] = {}
+    owners = list[str]()
+    for name, rows in batch:
         for layer, number in rows:
             one = layers[layer]
-            query = f"SELECT {_quote(one.geometry)} FROM {_quote(one.table)} WHERE rowid = ?"
-            (blob,) = base.execute(query, (number,)).fetchone()
-            stripped, fault = _strip(blob)
+            columns = "*" if all_columns else _quote(one.geometry)
+            found = base.execute(f"SELECT {columns} FROM {_quote(one.table)} WHERE rowid = ?", (number,))
+            row = dict(zip((column[0] for column in found.description), found.fetchone(), strict=True))
+            stripped, fault = _strip(row.pop(one.geometry))
+            owners.append(str(row.pop(PART, None) or name))
+            known = values.setdefault(name, {}).setdefault(owners[-1], {})
+            for key, value in row.items():
+                if key not in (one.id, "fid", "ogc_fid") and value is not None and not isinstance(value, bytes):
+                    known.setdefault(key, value)
             blobs.append(stripped)
             faults.append(fault)
     stored = np.empty(len(blobs), object)
@@ -126,9 +140,9 @@ def _read_batch(
                 told.append(f"a geometry of {layers[layer].table}: {faults[k] or broken.get(k, 'is empty')}")
             else:
                 faces = _make_faces(geometry[k], OUTLINE if lod == 0 else UNKNOWN)
-                shapes.append(Shape(name, lod, lod > 0, faces))
+                shapes.append(Shape(owners[k], lod, lod > 0, faces))
             k += 1
-        yield ModelBuilding(name, tuple(shapes), faults=tuple(told))
+        yield ModelBuilding(name, tuple(shapes), faults=tuple(told), attributes=values[name])
 
 
 def _strip(blob: bytes) -> tuple[bytes | None, str]:

@@ -194,6 +194,25 @@ def read_raster(path: Path, frame: Frame, lattice: Lattice, bounds: Box) -> Iter
             yield _make_block(z * frame.height, lattice, (i0, first))
 
 
+def sample_heights(path: Path, frame: Frame, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heights of the cells of a raster at places of the region, float64 (n,) (m); NaN where there is none."""
+    z = np.full(len(xy), np.nan)
+    with _open(path) as source:
+        place, step = _to_file(frame, xy), source.transform
+        column, row = np.floor((place[:, 0] - step.c) / step.a), np.floor((place[:, 1] - step.f) / step.e)
+        inside = (column >= 0) & (column < source.width) & (row >= 0) & (row < source.height)
+        block = source.block_shapes[0]
+        # A block of the file at a time.
+        number = np.where(inside, row // block[0] * source.width + column // block[1], -1)
+        for one in np.unique(number[inside]).tolist():
+            own = np.flatnonzero(number == one)
+            c, r = column[own].astype(np.int64), row[own].astype(np.int64)
+            cells = _read(source, (int(c.min()), int(r.min()), int(np.ptp(c)) + 1, int(np.ptp(r)) + 1))
+            z[own] = cells[r - r.min(), c - c.min()] * frame.height
+    z[np.abs(z) > HIGHEST] = np.nan
+    return z
+
+
 def _make_block(z: NDArray[np.float64], lattice: Lattice, corner: tuple[int, int]) -> RasterBlock:
     with np.errstate(invalid="ignore"):
         row, column = np.nonzero(np.abs(z) <= HIGHEST)

@@ -43,7 +43,9 @@ def kind_of(path: Path) -> str:
     return MODEL if text[:1] in (b"{", b"<") or start.startswith(SIGNATURE) else CLOUD
 
 
-def scan_model(path: Path, height: str = "") -> Iterator[str | ModelBuilding | Relief]:
+def scan_model(
+    path: Path, height: str = "", *, attributes: bool = False
+) -> Iterator[str | ModelBuilding | Relief]:
     """Give the names of CRSs, the buildings and the terrain of a city model, in the order of the file.
 
     Parameters
@@ -52,6 +54,8 @@ def scan_model(path: Path, height: str = "") -> Iterator[str | ModelBuilding | R
         CityJSON, CityJSONSeq or CityGML file, or a GeoPackage as of 3DBAG.
     height : str
         Attribute with the height above ground (m); ``""`` for the format's own.
+    attributes : bool
+        Whether attributes of a GeoPackage are read too: those of other formats always are.
 
     Raises
     ------
@@ -64,7 +68,7 @@ def scan_model(path: Path, height: str = "") -> Iterator[str | ModelBuilding | R
         yield from scan_citygml(path, height)
         return
     if start.startswith(SIGNATURE):
-        yield from scan_geopackage(path)
+        yield from scan_geopackage(path, attributes=attributes)
         return
     if start[:1] != b"{":
         raise InputError(
@@ -179,7 +183,7 @@ def choose_axes(
         return asked == "yx", "by --axis-order"
     other = (box[1], box[0], box[3], box[2])
     flat = horizontal_crs(name.crs)
-    north_first = name.registered_axes and flat is not None and _is_north_first(flat)
+    north_first = name.registered_axes and flat is not None and is_north_first(flat)
     as_is, turned = (flat is None or is_on_its_place(one, flat) for one in (box, other))
     right, wrong = sense
     if as_is != turned:
@@ -192,7 +196,7 @@ def choose_axes(
     return north_first, "by the name of its CRS" if north_first else ""
 
 
-def _is_north_first(crs: pyproj.CRS) -> bool:
+def is_north_first(crs: pyproj.CRS) -> bool:
     """Whether the first axis of a CRS is its northing or its latitude."""
     first, second = (axis.direction.lower() for axis in crs.axis_info[:2])
     return first == "north" and second == "east"

@@ -356,6 +356,16 @@ def _export(options: argparse.Namespace) -> int:
     return 0
 
 
+def _convert(options: argparse.Namespace) -> int:
+    from tiler.convert.convert import Asked, convert_models
+
+    asked = Asked(options.format, options.lod, options.crs, options.axis_order, options.overwrite)
+    for line in convert_models(options.inputs, options.output, asked):
+        say(line)
+    say(str(options.output))
+    return 0
+
+
 def _wind(options: argparse.Namespace) -> int:
     from tiler.wind.study import WindMaps, assess_wind
 
@@ -393,6 +403,7 @@ HANDLERS: Mapping[str, Handler] = {
     "demo": _demo,
     "render": _render,
     "export": _export,
+    "convert": _convert,
     "wind": _wind,
     "kernels": _kernels,
     "config": _config,

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any, NoReturn, get_args, get_origin, get_type_hints
 
 from pipeline.data.errors import ConfigError
+from tiler.cityinput.levels import CHOICES
 from tiler.config.config import ANYWHERE, Config
 from tiler.config.config_file import POSITIONAL
 from tiler.config.domain_height import Height
+from tiler.convert import NAMES
 from tiler.export.export import list_formats, load_format
 from tiler.jobs.submission import add_job_commands
 from tiler.objects.places import place, refuse_bucket
@@ -178,6 +180,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     )
     add_job_commands(add, _add_inputs)
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
+    _add_convert(command("convert", "write city models, or that of a run, as another format of city models"))
     _add_wind(command("wind", "map mean wind and comfort from results of a wind case and a wind rose"))
     command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
     command("config", "print all parameters of a run, annotated, as a configuration file")
@@ -227,7 +230,7 @@ def _add_parameters(parser: argparse.ArgumentParser) -> Group:
         elif get_origin(wanted) is tuple:
             words |= {"type": get_args(wanted)[0], "nargs": 4, "metavar": ("XMIN", "YMIN", "XMAX", "YMAX")}
         elif wanted == Height:
-            words |= {"type": str, "metavar": "M|nH"}
+            words |= {"type": str, "metavar": "M|auto" if entry.name == "shift_z" else "M|nH"}
         else:
             unit = KINDS.get(entry.name, "" if wanted is str else data["unit"].upper())
             words |= {"type": wanted, "metavar": unit or METAVARS[wanted]}
@@ -433,6 +436,30 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         export.add_argument(
             f"--{option.replace('_', '-')}", dest=EXPORT_OPTION + option, default=argparse.SUPPRESS, **words
         )
+
+
+def _add_convert(convert: argparse.ArgumentParser) -> None:
+    """Add inputs, output and options of a conversion."""
+    convert.add_argument(
+        "inputs", nargs="+", type=_on_disk, metavar="MODEL|DIR",
+        help="CityJSON, CityJSONSeq, CityGML or GeoPackage files; or the folder of a run",
+    )  # fmt: skip
+    convert.add_argument("--format", choices=NAMES, required=True, help="what to write")
+    convert.add_argument("-o", "--output", type=_on_disk, required=True, metavar="FILE", help="file to write")
+    convert.add_argument(
+        "--lod",
+        choices=CHOICES,
+        default="auto",
+        help="level of detail in an OBJ or GLB; others have all (default: auto)",
+    )
+    convert.add_argument("--crs", default="", metavar="EPSG", help="reproject to this CRS, in plan")
+    convert.add_argument(
+        "--axis-order",
+        choices=("xy", "yx"),
+        default="",
+        help="which coordinate comes first, against what files show",
+    )
+    convert.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
 
 
 def _on_disk(text: str) -> Path:

@@ -26,6 +26,7 @@ from tiler.words.plain_text import shorten
 MAX_TEXT = 10_000  # characters of one value; a CRS as WKT has some 2,000
 MAX_INT = 2**53
 UNSET = ""
+AUTO = "auto"  # instead of metres: as measured
 ANYWHERE = "127.0.0.1:0"  # a free port of this machine, for this machine
 PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is given for the open
 NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
@@ -83,13 +84,17 @@ class Config:
         "auto", "input", "level of detail that is taken of each building of a city model: the best roofs that it "
         "has, or the best level up to a number", choices=("auto", "1.2", "1.3", "2.2"),
     )  # fmt: skip
+    prefer: str = _parameter(
+        "model", "input", "whose roof a house has that both a point cloud and a city model have one of",
+        choices=("model", "points"),
+    )  # fmt: skip
     axis_order: str = _parameter(
         UNSET, "input", "which coordinate comes first in city models: xy for the easting, yx for the northing; "
         "empty: what they show", choices=(UNSET, "xy", "yx"),
     )  # fmt: skip
-    shift_z: float = _parameter(
-        0.0, "input", "added to all heights of city models, where they are not those of the terrain", unit="m",
-        least=-10_000, most=10_000,
+    shift_z: float | str = _parameter(
+        0.0, "input", "added to all heights of city models, where they are not those of the terrain; auto: what "
+        "the rasters of terrain are above the feet of buildings in the median", unit="m", least=-1e4, most=1e4,
     )  # fmt: skip
     layer: str = _parameter(UNSET, "input", "layer of the footprint file; empty: its only or first one")
     id_attribute: str = _parameter(
@@ -508,7 +513,7 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
     if wanted == Height:
         wanted = str if isinstance(value, str) else float
         converted = _convert(name, value, wanted)
-        return read_height(converted, name)
+        return _read_shift(converted) if name == "shift_z" else read_height(converted, name)
     if get_origin(wanted) is tuple:
         if get_args(wanted)[0] is int and isinstance(value, str):
             value = _split_numbers(name, value)
@@ -526,6 +531,16 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         if name in ("pointcloud", "footprints", "buildings", "terrain", "refine_areas", "out"):
             check_url(value)
     return value
+
+
+def _read_shift(value: Height) -> Height:
+    """Read metres, or the word for what is measured."""
+    if isinstance(value, float) or value.strip().lower() == AUTO:
+        return value if isinstance(value, float) else AUTO
+    try:
+        return float(value)
+    except ValueError:
+        raise ConfigError(f"shift_z = {_shown(value)}: metres or {AUTO!r} expected") from None
 
 
 def _split_numbers(name: str, text: str) -> list[int]:
@@ -587,18 +602,7 @@ def _check_together(config: Config) -> None:
         raise ConfigError(
             f"clearance_floor = {config.clearance_floor:g} m: must be at most clearance = {config.clearance:g} m"
         )
-    if config.open_size and config.open_size <= config.mesh_size:
-        raise ConfigError(
-            f"open_size = {config.open_size:g} m: must be above mesh_size = {config.mesh_size:g} m; 0 takes "
-            "mesh_size everywhere"
-        )
-    if config.wall_size and not LEAST_SIZE <= config.wall_size < config.mesh_size:
-        raise ConfigError(
-            f"wall_size = {config.wall_size:g} m: must be at least {LEAST_SIZE:g} m and below mesh_size = "
-            f"{config.mesh_size:g} m; 0 takes mesh_size"
-        )
-    for text in config.refine:
-        read_refinement(text, config.largest_size)
+    _check_sizes(config)
     if config.least_spacing > config.most_spacing:
         raise ConfigError(
             f"least_spacing = {config.least_spacing:g}: must be at most most_spacing = {config.most_spacing:g}"
@@ -626,6 +630,21 @@ def _check_together(config: Config) -> None:
     _check_way(config)
     if not isinstance(config.domain_height, str):
         check_height(config, config.domain_height)
+
+
+def _check_sizes(config: Config) -> None:
+    if config.open_size and config.open_size <= config.mesh_size:
+        raise ConfigError(
+            f"open_size = {config.open_size:g} m: must be above mesh_size = {config.mesh_size:g} m; 0 takes "
+            "mesh_size everywhere"
+        )
+    if config.wall_size and not LEAST_SIZE <= config.wall_size < config.mesh_size:
+        raise ConfigError(
+            f"wall_size = {config.wall_size:g} m: must be at least {LEAST_SIZE:g} m and below mesh_size = "
+            f"{config.mesh_size:g} m; 0 takes mesh_size"
+        )
+    for text in config.refine:
+        read_refinement(text, config.largest_size)
 
 
 def read_refinement(text: str, largest: float) -> tuple[float, tuple[float, float, float, float]]:
@@ -716,6 +735,12 @@ def _check_sources(config: Config) -> None:
         raise ConfigError("ground_filter = true without a point cloud, in which it finds the ground; leave it out")
     if config.ground_filter and config.terrain:
         raise ConfigError("ground_filter = true with terrain: ground is that of the rasters; leave one out")
+    if config.prefer == "points" and not (config.buildings and config.pointcloud):
+        raise ConfigError("prefer = points: takes city models beside a point cloud; leave it out, or give both")
+    if config.shift_z == AUTO and not (config.buildings and config.terrain):
+        raise ConfigError(
+            f"shift_z = {AUTO}: takes city models and rasters of terrain; give it in metres: a run tells how many"
+        )
 
 
 def _check_pad(config: Config) -> None:

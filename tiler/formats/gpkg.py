@@ -1,6 +1,7 @@
 """GeoPackage of the simplified footprints: a row a building, or part of one, with heights and all attributes."""
 
 import json
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
@@ -76,7 +77,7 @@ def write_gpkg(path: Path, model: Path, *, crs: str) -> None:
     as JSON text. The city model is read three times, an object at a time; memory holds `BATCH` rows.
     """
     kinds = _survey(model)
-    with TemporaryFile() as spool, _fixed_time():
+    with TemporaryFile() as spool, fixed_time():
         vertices = spool_vertices(model, spool)
         rows = (
             (name, thing, read_building(model, name, thing, vertices).footprint) for name, thing in _objects(model)
@@ -110,20 +111,37 @@ def _append(
         "house": (np.array(houses, np.object_), None),
     }
     for name, found in kinds.items():
-        columns[name] = _column([thing["attributes"].get(name) for _, thing, _ in rows], found)
+        columns[name] = make_column([thing["attributes"].get(name) for _, thing, _ in rows], found)
+    footprints = shapely.to_wkb(np.array([footprint for _, _, footprint in rows], np.object_))
+    write_rows(path, footprints, columns, layer=LAYER, crs=crs, append=append)
+
+
+def write_rows(
+    path: Path,
+    wkb: NDArray[np.object_],
+    columns: Mapping[str, Column],
+    *,
+    layer: str,
+    crs: str | None,
+    kind: str = "Polygon",
+    append: bool = False,
+) -> None:
+    """Write rows of a layer, or append them: geometries of one kind as WKB, and columns by name."""
     try:
-        pyogrio.raw.write(
-            path,
-            shapely.to_wkb(np.array([footprint for _, _, footprint in rows], np.object_)),
-            [values for values, _ in columns.values()],
-            list(columns),
-            field_mask=[mask for _, mask in columns.values()],
-            geometry_type="Polygon",
-            crs=crs,
-            layer=LAYER,
-            driver="GPKG",
-            append=append,
-        )
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="'crs' was not provided")
+            pyogrio.raw.write(
+                path,
+                wkb,
+                [values for values, _ in columns.values()],
+                list(columns),
+                field_mask=[mask for _, mask in columns.values()],
+                geometry_type=kind,
+                crs=crs,
+                layer=layer,
+                driver="GPKG",
+                append=append,
+            )
     except (RuntimeError, ValueError) as error:  # pyogrio's own errors are RuntimeErrors
         # What GDAL says names the file.
         raise OutputError(
@@ -131,7 +149,7 @@ def _append(
         ) from error
 
 
-def _column(values: list[Any], kinds: set[type]) -> Column:
+def make_column(values: list[Any], kinds: set[type]) -> Column:
     """Make a column, and say where it has no value."""
     none = np.array([value is None for value in values], np.bool_)
     known = kinds - {type(None)}
@@ -143,7 +161,8 @@ def _column(values: list[Any], kinds: set[type]) -> Column:
 
 
 @contextmanager
-def _fixed_time() -> Iterator[None]:
+def fixed_time() -> Iterator[None]:
+    """Let GDAL write one time of writing, whenever that is."""
     pyogrio.set_gdal_config_options(TIME)
     try:
         yield

@@ -67,7 +67,7 @@ def house_stage(config: Config) -> Stage:
         Read("points", halo_of_points(config, config.ground_margin), around="outlines"),
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
-    models = ("buildings_given", "ground_of_models") if config.buildings else ()
+    models = ("buildings_given", "ground_of_models", "prefer") if config.buildings else ()
     return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN, *models), version=6)
 
 
@@ -182,7 +182,14 @@ def make_houses(task: Task) -> Facts:
             feet = {"feet": count_feet(base, city.model.ground)}
     with task.step("2.0 split levels"):
         houses = divide_houses(
-            city, cloud, options, building_class=True, roofs=roofs, unmarked=others, surfaces=surfaces
+            city,
+            cloud,
+            options,
+            building_class=True,
+            roofs=roofs,
+            unmarked=others,
+            surfaces=surfaces,
+            prefer_points=task.parameters.get("prefer", "model") == "points",
         )
     del cloud  # large, and no longer needed
     with task.step("1.7 fit of roofs"):

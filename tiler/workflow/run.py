@@ -31,6 +31,7 @@ from tiler.monitoring.run_log import RunLog
 from tiler.monitoring.watchers import Watchers
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.planning.forecast import warn_of_memory
+from tiler.planning.model_shift import settle_shift
 from tiler.planning.plan import Plan, check_sources, make_plan
 from tiler.planning.region import Pad
 from tiler.stages.own_stages import OwnStages, check_own, run_own_stages
@@ -192,6 +193,7 @@ def _run(
         # Nothing of an earlier run is touched before the inputs are known to be there; then, before anything else
         # changes, its record no longer says that it is done, whatever happens to the power.
         plan = _plan(config, out, say, fresh=config.overwrite or not earlier)
+        given, (config, plan) = config, settle_shift(config, plan, say)
         untouched = False
         _write_record(out, record, durable=bool(earlier))
         clear_folder(out, earlier, overwrite=config.overwrite)
@@ -199,7 +201,7 @@ def _run(
             if not earlier:  # after a loss of power there is nothing yet that the record could lie about
                 sync_meanwhile(out / RUN_RECORD)
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
-        save_config(config, out)
+        save_config(given, out)
         progress = begin_watching(config, out, plan, own, watchers, shown=means.shown)
         record |= _mesh_region(config, out, plan, own, watchers, damage, means)
         record["finished"] = progress.finished

@@ -8,6 +8,7 @@ from tiler.config.config import Config
 from tiler.engine.executor import Serial
 from tiler.engine.run_context import seam_name, tile_key
 from tiler.objects.places import refuse_bucket
+from tiler.planning.model_shift import settle_shift
 from tiler.planning.plan import check_sources, make_plan
 from tiler.stages.alignment import shift_of_run
 from tiler.stages.mesh import mesh_stages
@@ -45,7 +46,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
     """
     check_sources(config)
     refuse_bucket(config.out, "--only")
-    whole = make_plan(config, say_nothing)
+    config, whole = settle_shift(config, make_plan(config, say_nothing), say_nothing)
     domain, tallest = domain_of_run(config)
     shift = shift_of_run(config) if config.align and config.footprints else None
     pad, store = None, None

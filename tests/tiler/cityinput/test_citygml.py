@@ -78,6 +78,18 @@ def test_links_to_other_polygons_of_the_building_are_followed_and_lost_ones_told
     assert house.faults == ("a: xlink to #none, which is not in the building",)
 
 
+def test_one_id_at_several_surfaces_loses_none(tmp_path: Path) -> None:
+    surfaces = "".join(
+        "<bldg:boundedBy><bldg:RoofSurface gml:id='same'><bldg:lod2MultiSurface><gml:MultiSurface>"
+        f"{member(polygon_gml(ring, 'twice'))}</gml:MultiSurface></bldg:lod2MultiSurface></bldg:RoofSurface>"
+        "</bldg:boundedBy>"
+        for ring in FACES["RoofSurface"]
+    )
+    solid = solid_of("<gml:surfaceMember xlink:href='#twice'/>")
+    (house,) = buildings_of(write_gml(tmp_path / "a.gml", building(solid + surfaces)))
+    assert [(len(shape.faces), shape.closed) for shape in house.shapes] == [(2, False)]
+
+
 def test_twelve_parts_are_twelve_parts(tmp_path: Path) -> None:
     parts = "".join(
         f"<bldg:consistsOfBuildingPart><bldg:BuildingPart gml:id='p{k}'>"

@@ -10,6 +10,7 @@ import pytest
 from pipeline.data.errors import InputError
 from tests.tiler.cityinput.models import CORNERS, city_json, house_json, solid, write_json, write_sequence
 from tiler.cityinput.citygml import Relief
+from tiler.cityinput.cityjson import read_buildings
 from tiler.cityinput.faces import GROUND, OUTLINE, ROOF, UNKNOWN, WALL, ModelBuilding
 from tiler.cityinput.sources import read_model_header, scan_model
 
@@ -147,3 +148,19 @@ def test_a_header_has_the_extent_of_buildings_alone(tmp_path: Path) -> None:
     nothing = read_model_header(write_json(tmp_path / "b.json", city_json({}, [])))
     assert np.isnan(nothing.bounds).all()
     assert nothing.n_points == 0
+
+
+def test_a_face_whose_border_is_a_line_is_none_whatever_holes_it_has() -> None:
+    document = house_json()
+    faces = document["CityObjects"]["house"]["geometry"][0]["boundaries"][0]
+    faces.append([[0, 1, 0], [4, 5, 6]])
+    document["CityObjects"]["house"]["geometry"][0]["semantics"]["values"][0].append(1)
+    objects, vertices = document["CityObjects"], np.array(document["vertices"], np.float64)
+    (house,) = read_buildings(objects, vertices)
+    assert len(house.shapes[0].faces) == 7
+    objects["house"]["geometry"][0]["boundaries"][0] = [[[0, 1, 0]]]
+    objects["house"]["geometry"][0]["semantics"]["values"][0] = [0]
+    (house,) = read_buildings(objects, vertices)
+    (shape,) = house.shapes
+    assert (len(shape.faces), shape.faces.face_start.tolist()) == (0, [0])
+    assert shape.faces.ring_start.dtype == np.int64

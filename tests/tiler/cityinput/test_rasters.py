@@ -62,6 +62,19 @@ def test_cells_lie_in_their_middles_and_the_first_row_is_north(tmp_path: Path) -
     assert by_place[500_002.5, 5_000_008.5] == 6.0
 
 
+def test_a_raster_of_points_lies_where_its_transform_says(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tif", np.arange(16).reshape(4, 4))
+    before = cells_of(path)[1]
+    with rasterio.open(path, "r+") as file:
+        file.update_tags(AREA_OR_POINT="Point")
+    raw = path.read_bytes()
+    lattice, after = cells_of(path)
+    # The tie point in the file is now a middle: GDAL gives the corner half a cell before it.
+    assert after.tolist() == before.tolist()
+    assert (lattice.x % 1.0, lattice.y % 1.0) == (0.5, 0.5)
+    assert np.float64(500_000.5).tobytes() in raw
+
+
 def test_no_height_where_a_cell_says_so_or_is_nan_or_absurd(tmp_path: Path) -> None:
     _, xyz = cells_of(write(tmp_path / "a.tif", [[1, -9999, np.nan], [1e30, 5, -1e5]], nodata=-9999))
     assert sorted(xyz[:, 2].tolist()) == [1.0, 5.0]

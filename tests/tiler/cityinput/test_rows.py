@@ -164,6 +164,36 @@ def test_flipped_and_repeated_surfaces_change_nothing(tmp_path: Path) -> None:
     assert [height_at(rows, 5, y) for y in (1, 3, 5, 7)] == [6.75, 8.25, 8.25, 6.75]
 
 
+def test_a_shell_that_misses_walls_has_the_same_roof(tmp_path: Path) -> None:
+    document = house_json()
+    (geometry,) = document["CityObjects"]["house"]["geometry"]
+    del geometry["boundaries"][0][4:], geometry["semantics"]["values"][0][4:]
+    rows, notes, _ = rows_of(write_json(tmp_path / "a.json", document))
+    assert [height_at(rows, 5, y) for y in (1, 3, 5, 7)] == [6.75, 8.25, 8.25, 6.75]
+    assert (rows.outlines[0].area, notes) == (pytest.approx(80.0), [])
+
+
+def test_attributes_of_slope_and_height_are_not_believed(tmp_path: Path) -> None:
+    document = house_json()
+    house = document["CityObjects"]["house"]
+    house["attributes"]["measuredHeight"] = 100.0
+    for surface in house["geometry"][0]["semantics"]["surfaces"]:
+        surface |= {"Slope": 90, "Direction": 0}  # 90 means flat there
+    rows, _, _ = rows_of(write_json(tmp_path / "a.json", document))
+    assert np.abs(rows.roofs.plane[:, 1]) == pytest.approx([0.75, 0.75])
+    assert [height_at(rows, 5, y) for y in (1, 3)] == [6.75, 8.25]
+
+
+def test_the_same_house_as_solid_and_as_surfaces_is_one_house(tmp_path: Path) -> None:
+    document = house_json()
+    box, corners = box_solid(12.0, "2.2", len(CORNERS))  # without kinds
+    document["CityObjects"]["house"]["geometry"].append(box)
+    document["vertices"] += [[round(1000 * v) for v in corner] for corner in corners]
+    rows, _, _ = rows_of(write_json(tmp_path / "a.json", document))
+    assert (len(rows), len(rows.surfaces)) == (1, 2)
+    assert [height_at(rows, 5, y) for y in (1, 3)] == [6.75, 8.25]
+
+
 def test_a_roof_surface_that_is_not_planar_is_told(tmp_path: Path) -> None:
     corners: list[list[float]] = [[*corner] for corner in CORNERS]
     corners[4][2] = 7.0

@@ -1,0 +1,93 @@
+"""CityJSON 2.0 and CityJSONSeq of features."""
+
+import json
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+from tiler.convert.features import SURFACES, Feature, Geometry, iter_features, level_text, origin_of
+from tiler.convert.inputs import ModelSource
+from tiler.georeference.crs import horizontal_crs
+
+COPY_BYTES = 1 << 20
+HIGHEST = 4  # CityJSON has no level from this on
+
+
+def write_sequence(path: Path, source: ModelSource) -> None:
+    """Write CityJSONSeq: the head, then a feature a line."""
+    with path.open("wb") as file:
+        file.write(_line(_head(source) | {"CityObjects": {}, "vertices": []}))
+        for feature in iter_features(source):
+            told = {
+                "type": "CityJSONFeature",
+                "id": feature.objects[0].id,
+                "CityObjects": _objects(feature, source),
+            }
+            file.write(_line(told | {"vertices": feature.vertices.tolist()}))
+
+
+def write_document(path: Path, source: ModelSource) -> None:
+    """Write CityJSON, an object a line; vertices wait in a temporary file."""
+    n_vertices, before = 0, "\n"
+    with path.open("wb") as file, TemporaryFile() as spool:
+        file.write(_line(_head(source))[:-2] + b',"CityObjects":{')
+        for feature in iter_features(source):
+            for name, thing in _objects(feature, source, n_vertices).items():
+                file.write(f"{before}{json.dumps(name)}:".encode("ascii") + _line(thing)[:-1])
+                before = ",\n"
+            if len(feature.vertices):
+                text = ",\n".join(["[%d,%d,%d]"] * len(feature.vertices)) % tuple(
+                    feature.vertices.ravel().tolist()
+                )
+                spool.write(f"{',' if n_vertices else ''}\n{text}".encode("ascii"))
+            n_vertices += len(feature.vertices)
+        file.write(b'\n},\n"vertices":[')
+        spool.seek(0)
+        while piece := spool.read(COPY_BYTES):
+            file.write(piece)
+        file.write(b"\n]}\n")
+
+
+def _head(source: ModelSource) -> dict[str, Any]:
+    extent = [round(float(value), 9) for value in (*source.low, *source.high)]
+    metadata: dict[str, Any] = {"geographicalExtent": extent}
+    codes = [None if crs is None else crs.to_epsg() for crs in (source.crs, horizontal_crs(source.crs))]
+    if code := codes[0] or codes[1]:
+        metadata["referenceSystem"] = f"https://www.opengis.net/def/crs/EPSG/0/{code}"
+    transform = {"scale": source.step.tolist(), "translate": origin_of(source).tolist()}
+    return {"type": "CityJSON", "version": "2.0", "transform": transform, "metadata": metadata}
+
+
+def _objects(feature: Feature, source: ModelSource, first: int = 0) -> dict[str, Any]:
+    """Give the objects of a feature by id; vertices are counted from `first`."""
+    house, *parts = feature.objects
+    found: dict[str, Any] = {}
+    for one in feature.objects:
+        kept = [item for item in one.geometries if item.lod < HIGHEST]
+        source.told["geometries of level 4, which CityJSON has not"] += len(one.geometries) - len(kept)
+        thing: dict[str, Any] = (
+            {"type": "BuildingPart", "parents": [house.id]}
+            if one is not house
+            else {"type": "Building"} | ({"children": [part.id for part in parts]} if parts else {})
+        )
+        found[one.id] = thing | {
+            "attributes": one.attributes,
+            "geometry": [_geometry(item, first) for item in kept],
+        }
+    return found
+
+
+def _geometry(item: Geometry, first: int) -> dict[str, Any]:
+    faces: Any = [[[vertex + first for vertex in ring] for ring in rings] for _, rings in item.faces]
+    kinds = [kind for kind in SURFACES if any(kind == other for other, _ in item.faces)]
+    values: Any = [kinds.index(kind) if kind in kinds else None for kind, _ in item.faces]
+    told: dict[str, Any] = {"type": "Solid" if item.closed else "MultiSurface", "lod": level_text(item.lod)}
+    told["boundaries"] = [faces] if item.closed else faces
+    if kinds:
+        surfaces = [{"type": SURFACES[kind]} for kind in kinds]
+        told["semantics"] = {"surfaces": surfaces, "values": [values] if item.closed else values}
+    return told
+
+
+def _line(document: Any) -> bytes:
+    return (json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n").encode("ascii")

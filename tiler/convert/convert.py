@@ -1,0 +1,107 @@
+"""`citystitch convert`: city models, or the model of a run, as another format."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.data.errors import ConfigError
+from tiler.convert.citygml_files import write_citygml
+from tiler.convert.cityjson_files import write_document, write_sequence
+from tiler.convert.glb_files import write_glb
+from tiler.convert.gpkg_files import write_gpkg
+from tiler.convert.inputs import ModelSource, open_source
+from tiler.convert.obj_files import write_obj
+from tiler.georeference.crs import crs_name
+from tiler.store.atomic import replacing
+
+
+@dataclass(frozen=True)
+class Target:
+    """A format that city models are converted to.
+
+    Attributes
+    ----------
+    suffixes : tuple of str
+        What the name of a file may end with.
+    write : callable
+        Writes a source to a path, at a level of detail where `one_level`.
+    one_level : bool
+        Whether it holds each building at one level: it is a surface in metres.
+    """
+
+    suffixes: tuple[str, ...]
+    write: Callable[[Path, ModelSource, str], None]
+    one_level: bool = False
+
+
+TARGETS: Mapping[str, Target] = {
+    "cityjson": Target((".json",), lambda path, source, _: write_document(path, source)),
+    "cityjsonseq": Target((".jsonl",), lambda path, source, _: write_sequence(path, source)),
+    "citygml2": Target((".gml", ".xml"), lambda path, source, _: write_citygml(path, source, "2.0")),
+    "citygml3": Target((".gml", ".xml"), lambda path, source, _: write_citygml(path, source, "3.0")),
+    "gpkg": Target((".gpkg",), lambda path, source, _: write_gpkg(path, source)),
+    "obj": Target((".obj",), write_obj, one_level=True),
+    "glb": Target((".glb",), write_glb, one_level=True),
+}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of a conversion, as the command line has it."""
+
+    name: str
+    lod: str = "auto"
+    crs: str = ""
+    axis_order: str = ""
+    overwrite: bool = False
+
+
+def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[str]:
+    """Write city models as another format.
+
+    Parameters
+    ----------
+    inputs : sequence of Path
+        CityJSON, CityJSONSeq, CityGML or GeoPackage files, or the folder of a run.
+    output : Path
+        The file; it appears whole or not at all.
+    asked : Asked
+        What is asked.
+
+    Returns
+    -------
+    list of str
+        What must be known of the file, a line each.
+
+    Raises
+    ------
+    ConfigError
+        If the file exists, is an input or has another suffix; if an option does not go with the format.
+    InputError
+        If an input cannot be read.
+    OutputError
+        If the file cannot be written.
+
+    Notes
+    -----
+    Buildings are read and written one at a time, as often as a format needs; but for CityJSON documents, which are
+    read as a whole. Heights are never changed.
+    """
+    target = TARGETS[asked.name]
+    if output.suffix not in target.suffixes:
+        raise ConfigError(
+            f"{output}: a file of format {asked.name} ends with {' or '.join(target.suffixes)}; rename --output"
+        )
+    if asked.lod != "auto" and not target.one_level:
+        raise ConfigError(f"--lod {asked.lod}: format {asked.name} has all levels side by side; leave --lod out")
+    if output.resolve() in {path.resolve() for path in inputs}:
+        raise ConfigError(f"{output}: is one of the inputs; give another --output")
+    if output.exists() and not asked.overwrite:
+        raise ConfigError(f"{output}: exists; give another --output, or --overwrite")
+    with open_source(inputs, crs=asked.crs, axis_order=asked.axis_order) as source:
+        if target.one_level and source.in_degrees:
+            name = crs_name(source.crs) if source.crs is not None else ""
+            raise ConfigError(f"{name} is in degrees, and format {asked.name} in metres; give --crs EPSG:NNNN")
+        with replacing(output) as part:
+            target.write(part, source, asked.lod)
+        return [*source.notes, *(f"{number} {what}" for what, number in source.told.items() if number)]

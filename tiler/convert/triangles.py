@@ -1,0 +1,119 @@
+"""Buildings at one level of detail as triangles, for formats of surfaces."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from tiler.cityinput.face_planes import area_vectors
+from tiler.cityinput.faces import Faces
+from tiler.cityinput.levels import list_attempts
+from tiler.convert.features import plain_value, rings_of
+from tiler.convert.inputs import ModelSource
+
+
+@dataclass(frozen=True, eq=False)
+class SolidBuilding:
+    """A building as triangles.
+
+    Attributes
+    ----------
+    id : str
+        Its id.
+    attributes : dict
+        Its own, then those of its parts that it has not itself.
+    xyz : float64, (n, 3)
+        Vertices.
+    triangles : int64, (t, 3)
+        Their corners, counter-clockwise seen from the side that the faces look to.
+    kind : int8, (t,)
+        Kind of the face that each is of.
+    """
+
+    id: str
+    attributes: dict[str, Any]
+    xyz: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    kind: NDArray[np.int8]
+
+
+def iter_triangles(source: ModelSource, lod: str) -> Iterator[SolidBuilding]:
+    """Give each building that has surfaces, at the level that `levels.list_attempts` puts first."""
+    for building in source.buildings():
+        attempts = list_attempts(building, lod)
+        if not attempts:
+            source.told["buildings without surfaces above level 0"] += bool(building.shapes)
+            continue
+        faces = attempts[0][1]
+        xyz, number = np.unique(np.round(faces.xyz / source.step), axis=0, return_inverse=True)
+        xyz = xyz * source.step
+        triangles, kind, n_fans = triangulate(faces, xyz, number.ravel().tolist())
+        source.told["faces that cross themselves, cut into triangles around a corner"] += n_fans
+        attributes = {key: value for own in building.attributes.values() for key, value in own.items()}
+        attributes |= building.attributes.get(building.id, {})
+        kept = {key: plain_value(value) for key, value in attributes.items()}
+        if len(triangles):
+            yield SolidBuilding(building.id, kept, xyz, triangles, kind)
+
+
+def triangulate(
+    faces: Faces, xyz: NDArray[np.float64], number: list[int]
+) -> tuple[NDArray[np.int64], NDArray[np.int8], int]:
+    """Cut faces into triangles.
+
+    Parameters
+    ----------
+    faces : Faces
+        Polygons with holes.
+    xyz : float64, (n, 3)
+        Places, each there once.
+    number : list of int
+        Which of them each vertex of the faces is at.
+
+    Returns
+    -------
+    int64, (t, 3)
+        Corners of triangles, as rows of `xyz`.
+    int8, (t,)
+        Kinds of their faces.
+    int
+        How many faces are no polygons in their plane: triangles meet in their first corner.
+    """
+    found: list[list[int]] = []
+    kinds: list[int] = []
+    n_fans = 0
+    for kind, rings in rings_of(faces, number):
+        if not rings:
+            continue
+        parts = [rings[0]] if len(rings) == 1 and len(rings[0]) == 3 else _cut(rings, xyz)
+        if parts is None:
+            n_fans += 1
+            parts = [[rings[0][0], a, b] for a, b in pairwise(rings[0][1:])]
+        found += parts
+        kinds += [kind] * len(parts)
+    return np.array(found, np.int64).reshape(-1, 3), np.array(kinds, np.int8), n_fans
+
+
+def _cut(rings: list[list[int]], xyz: NDArray[np.float64]) -> list[list[int]] | None:
+    """Cut a face into triangles, seen along the axis that it is largest from; None where it is no polygon."""
+    corners = xyz[rings[0]]
+    normal = area_vectors(corners, np.array([0, len(corners)]))[0]
+    axis = int(np.argmax(np.abs(normal)))
+    kept = [(axis + 1) % 3, (axis + 2) % 3]
+    plan = [xyz[ring][:, kept] for ring in rings]
+    outline = shapely.Polygon(plan[0], plan[1:])
+    if not outline.is_valid or not outline.area:
+        return None
+    place = {
+        tuple(xy): v
+        for ring, own in zip(rings, plan, strict=True)
+        for v, xy in zip(ring, own.tolist(), strict=True)
+    }
+    pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
+    ends = shapely.get_coordinates(shapely.orient_polygons(pieces)).reshape(-1, 4, 2)[:, :3].tolist()
+    triangles = [[place[tuple(xy)] for xy in one] for one in ends]
+    return triangles if normal[axis] > 0 else [one[::-1] for one in triangles]
