@@ -110,6 +110,7 @@ def test_solids_of_any_roofs_are_valid(tmp_path: Path, seed: int) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("roofs", ["planes", "skeleton"])
 def test_solids_of_amsterdam_are_valid(shared_data: Path, tmp_path: Path, roofs: str) -> None:
     data = shared_data / "amsterdam"
