@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.data.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
-from tiler.cli.parser import EXPORT_OPTION, Handler, build_parser
+from tiler.cli.parser import EXPORT_OPTION, SYNTH_BUILDINGS, Handler, build_parser
 from tiler.config.config import Config, make_config
 from tiler.config.config_file import annotated_defaults, with_file
 from tiler.jobs.submission import describe_job, find_run, job_line
@@ -261,6 +261,11 @@ def _synth(options: argparse.Namespace) -> int:
 def _write_town(directory: Path, options: argparse.Namespace) -> None:
     from tiler.towns.town import ModelOptions, open_town, write_town
 
+    if options.buildings != SYNTH_BUILDINGS or options.roofs != "flat":
+        raise ConfigError(
+            f"--style {options.style}: has lots and rules of its own; --buildings and --roofs go with boxes, "
+            "leave them out"
+        )
     town = open_town(options.size, options.style, rules=options.rules, seed=options.seed, relief=options.relief)
     models = ModelOptions(
         tuple(options.levels.split(",")), options.walls, options.block_height, solid=not options.surfaces

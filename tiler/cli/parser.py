@@ -34,6 +34,7 @@ KINDS = {
     **dict.fromkeys(("id_attribute", "height_attribute", "roof_attribute", "refine_attribute"), "ATTRIBUTE"),
 }
 WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
+SYNTH_BUILDINGS = 500  # of a city of boxes
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
 # What a first run needs stands first in the help of a run, what is for studies of the method last.
 ESSENTIAL = (
@@ -165,7 +166,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
         "synth", "write a synthetic city: point cloud and footprints, or a town of houses with architecture"
     )
     synth.add_argument("directory", type=Path, metavar="DIR", help="folder to write to")
-    _add_city(synth, size=1000.0, buildings=500)
+    _add_city(synth, size=1000.0, buildings=SYNTH_BUILDINGS)
     _add_town(synth)
     _add_demo(command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one"))
     render = command("render", "draw a picture of a run")

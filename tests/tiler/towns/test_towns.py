@@ -203,6 +203,7 @@ def test_rules_are_files_with_a_schema(tmp_path: Path) -> None:
         (["--size", "0"], "--size 0"),
         (["--density", "-1"], "--density -1"),
         (["--seed", "-1"], "seed -1"),
+        (["--buildings", "9"], "--style detached: has lots"),
         (["--rules", "none.toml"], "none.toml: cannot be read"),
     ],
 )
