@@ -1,11 +1,12 @@
 """A house in 16 levels of detail, from an outline to openings (paper, 3.2; the refined levels of CityGML)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import shapely
 
-from pipeline.architecture.parameters import WALLS, BuildingPart, House
+from pipeline.architecture.parameters import WALLS, BuildingPart, Chimney, Dormer, House, RoofWindow
 from pipeline.architecture.roof_sides import Flat, list_sides, place
 from pipeline.architecture.shell import Detail, make_shell
 from pipeline.architecture.surfaces import GROUND, ROOF, Surface, prism, to_town
@@ -15,6 +16,7 @@ FOOTPRINTS = ("walls", "eaves")
 TOPS = {"eaves": 0.0, "third": 1 / 3, "half": 0.5, "two-thirds": 2 / 3, "ridge": 1.0}  # share of the roof's rise
 
 Footprint = Literal["walls", "eaves"]
+OnRoof = TypeVar("OnRoof", Dormer, Chimney, RoofWindow)
 
 _DETAILS = {
     "2.0": Detail(),
@@ -135,24 +137,9 @@ def at_eaves(house: House) -> House:
         parts=tuple(
             replace(part, along=part.along + (ends if part.wall % 2 == 0 else far)) for part in house.parts
         ),
-        dormers=tuple(
-            replace(
-                one, along=one.along + (ends if one.side % 2 == 0 else far), up=one.up + _out(one.side, far, ends)
-            )
-            for one in house.dormers
-        ),
-        chimneys=tuple(
-            replace(
-                one, along=one.along + (ends if one.side % 2 == 0 else far), up=one.up + _out(one.side, far, ends)
-            )
-            for one in house.chimneys
-        ),
-        roof_windows=tuple(
-            replace(
-                one, along=one.along + (ends if one.side % 2 == 0 else far), up=one.up + _out(one.side, far, ends)
-            )
-            for one in house.roof_windows
-        ),
+        dormers=_move_in(house.dormers, far, ends),
+        chimneys=_move_in(house.chimneys, far, ends),
+        roof_windows=_move_in(house.roof_windows, far, ends),
         openings=tuple(
             replace(one, along=one.along + (ends if one.wall % 2 == 0 else far))
             for one in house.openings
@@ -163,8 +150,13 @@ def at_eaves(house: House) -> House:
     return replace(moved, x=corner[0], y=corner[1])
 
 
-def _out(wall: int, far: float, ends: float) -> float:
-    return far if wall % 2 == 0 else ends
+def _move_in(things: Sequence[OnRoof], far: float, ends: float) -> tuple[OnRoof, ...]:
+    """Keep what stands on a roof where it is; front and back walls move out by `far`, the others by `ends`."""
+    shifts = ((ends, far), (far, ends))  # along a wall and away from it, by the wall's parity
+    return tuple(
+        replace(one, along=one.along + shifts[one.side % 2][0], up=one.up + shifts[one.side % 2][1])
+        for one in things
+    )
 
 
 def part_ring(house: House, part: BuildingPart) -> list[Flat]:

@@ -185,3 +185,20 @@ def test_presets_are_rules() -> None:
     for preset in PRESETS:
         house = draw_house(make_rules({}, preset=preset), Lot(0, 0, 0.0, 0.0, 60.0, 0.0), lambda x, y: 0.0, seed=1)
         assert make_level(house, "2.2")[0].closed
+
+
+@pytest.mark.parametrize("shape", ["gabled", "hipped", "pyramidal"])
+def test_what_stands_on_a_roof_stays_where_it_is_below_the_eaves(shape: RoofShape) -> None:
+    dormers = (Dormer(0, 4.0, 0.8, 1.5, 0.6), Dormer(2, 5.0, 0.9, 1.2, 0.5))
+    house = plain(shape, dormers=dormers, chimneys=(Chimney(0, 7.0, 2.0, 0.6, 0.8),))
+    if shape == "hipped":
+        house = replace(house, dormers=(*dormers, Dormer(1, 3.0, 0.7, 1.2, 0.4)))
+    both: list[Any] = list(FOOTPRINTS)
+    tops = [
+        {place for one in make_level(house, "2.3", footprint=footprint, solid=False)[0].surfaces
+         if one.kind == "ClosureSurface" or (one.kind == ROOF and len({z for *_, z in one.border}) == 1)
+         for place in one.border}
+        for footprint in both
+    ]  # fmt: skip
+    assert len(tops[0]) >= 12
+    np.testing.assert_allclose(sorted(tops[0]), sorted(tops[1]), atol=0.002)
