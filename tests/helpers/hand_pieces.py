@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import permutations
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,11 @@ class HandPieces:
     names: tuple[str, ...]
     n_points: int
     pieces: list[MeshPiece]
+
+    @property
+    def files(self) -> SimpleNamespace:
+        """What writers ask of the files: coordinates are those of the CRS."""
+        return SimpleNamespace(origin=np.zeros(3), origin_words="", depth=0.0)
 
     def read(self, k: int) -> MeshPiece:
         """Return piece `k`."""

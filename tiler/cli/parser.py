@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NoReturn, get_args, get_origin, get_type_hints
 
 from pipeline.data.errors import ConfigError
-from tiler.cityinput.levels import CHOICES
 from tiler.config.config import ANYWHERE, Config
 from tiler.config.config_file import POSITIONAL
 from tiler.config.domain_height import Height
@@ -34,6 +33,7 @@ KINDS = {
     **dict.fromkeys(("id_attribute", "height_attribute", "roof_attribute", "refine_attribute"), "ATTRIBUTE"),
 }
 WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
+LODS = next(entry.metadata["choices"] for entry in dataclasses.fields(Config) if entry.name == "lod")
 SYNTH_BUILDINGS = 500  # of a city of boxes
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
 # What a first run needs stands first in the help of a run, what is for studies of the method last.
@@ -449,7 +449,7 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
     convert.add_argument("-o", "--output", type=_on_disk, required=True, metavar="FILE", help="file to write")
     convert.add_argument(
         "--lod",
-        choices=CHOICES,
+        choices=LODS,
         default="auto",
         help="level of detail in an OBJ or GLB; others have all (default: auto)",
     )
