@@ -27,7 +27,7 @@ class RoofRange:
     low, high : float64, (k,)
         Heights (m); equal where a roof must lie on its plane. NaN where no building is.
     edge : bool, (k,)
-        Whether a roof may be moved there by `RoofRules.slack` besides: it is at an outline of sloped ones.
+        Whether a roof may be moved there by `RoofRules.slack` besides: at outlines, where roofs slope.
     """
 
     low: NDArray[np.float64]

@@ -54,7 +54,7 @@ class RoofRules:
     lifts : bool
         Whether the least distance of two nodes may be more than the step, so that the upper one is raised.
     slack : float
-        How far it moves a roof besides at a vertex that the boundary's `ROOF_MOVED` tells (m).
+        How far a roof may be moved besides, where the boundary's `ROOF_MOVED` says so (m).
     """
 
     sloped: bool = False

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -77,12 +78,16 @@ class Town:
         for lot in lots:
             yield draw_house(self.rules, lot, self.ground, seed=self.seed)
 
+    @cached_property
+    def _phases(self) -> list[float]:
+        phases: list[float] = (np.random.default_rng([self.seed, 7]).random(len(_WAVES)) * 2 * np.pi).tolist()
+        return phases
+
     def ground(self, x: Any, y: Any) -> Any:
         """Give the height of the ground (m) at places x, y: a number, or as many as there are of these."""
-        phase = np.random.default_rng([self.seed, 7]).random(len(_WAVES)) * 2 * np.pi
         waves = (
             share * np.sin(2 * np.pi * (x / east + y / north) + turn)
-            for (east, north, share), turn in zip(_WAVES, phase.tolist(), strict=True)
+            for (east, north, share), turn in zip(_WAVES, self._phases, strict=True)
         )
         return 10.0 + self.relief / 2 * (1 + sum(waves))
 
