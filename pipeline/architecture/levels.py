@@ -84,12 +84,14 @@ def make_level(
 
     Notes
     -----
-    | level | what it shows |
-    |---|---|
-    | 0.0 | one rectangle around all; 0.1: the main body; 0.2: with its parts; 0.3: and the edges of the roof |
-    | 1.0 | a block over 0.0; 1.1: over 0.1; 1.2: over 0.2; 1.3: each part as high as it is |
-    | 2.0 | the roof; 2.1: and parts; 2.2: and dormers; 2.3: and chimneys and overhangs |
-    | 3.0 | 2.3 and windows in the roof; 3.1: 2.3 and windows and doors; 3.2: all of these; 3.3: deep in the wall |
+    =====  ================================================================================================
+    level  what it shows
+    =====  ================================================================================================
+    0.0    one rectangle around all; 0.1: the main body; 0.2: with its parts; 0.3: and the edges of the roof
+    1.0    a block over 0.0; 1.1: over 0.1; 1.2: over 0.2; 1.3: each part as high as it is
+    2.0    the roof; 2.1: and parts; 2.2: and dormers; 2.3: and chimneys and overhangs
+    3.0    2.3 and windows in the roof; 3.1: 2.3 and windows and doors; 3.2: all of these; 3.3: deep in the wall
+    =====  ================================================================================================
 
     Examples
     --------
