@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pipeline.data.kernel import kernel
 from pipeline.geometry.group_order import order_values
 
+SHIFTS = 4  # to either side, within a clearance, by which a line is moved that has no room where it is best
 MAX_TRIES = 5  # lines that are tried for a cut, the best first
 RIDGE_BONUS = 0.25  # share of the price of a cut by which intersections of planes go before other lines
 SAME_PLANE = 0.15  # difference of slopes below which planes have no ridge
@@ -110,6 +111,48 @@ def rank_cuts(
                 ranked[n_ranked, q] = found[d, q]
             n_ranked += 1
     return ranked[:n_ranked].copy()
+
+
+@kernel
+def shift_cuts(
+    points: tuple[Array, Array, Index], piece: int, ranked: Array, min_points: int, rules: tuple[float, float]
+) -> Array:
+    """Move lines that have no room by up to a clearance, for they may save enough beside the best place too.
+
+    Parameters
+    ----------
+    points
+        Points of the house (m), their misfits, and their faces, as for `rank_cuts`.
+    piece, min_points
+        As for `rank_cuts`.
+    ranked : float64, (k, 4)
+        As from there.
+    rules : tuple of 2 floats
+        What a line must save, and the clearance (m).
+
+    Returns
+    -------
+    float64, (m, 4)
+        As `ranked`.
+    """
+    xyz, cost, face = points
+    price, clearance = rules
+    n, total = 0, np.zeros(cost.shape[1])
+    for p in range(len(face)):
+        if face[p] == piece:
+            n += 1
+            for k in range(len(total)):
+                total[k] += cost[p, k]
+    lines, m = np.empty((len(ranked) * 2 * SHIFTS, 4)), 0
+    for k in range(len(ranked)):
+        for step in range(-SHIFTS, SHIFTS + 1):
+            lines[m, :2] = ranked[k, :2]
+            lines[m, 2] = ranked[k, 2] + step * clearance / SHIFTS
+            lines[m, 3] = _saved_by(xyz, cost, face, piece, lines[m, :3], (total, n, min_points)) if step else 0.0
+            if lines[m, 3] >= price:
+                m += 1
+    kept: Array = lines[:m][order_values(-lines[:m, 3])]
+    return kept
 
 
 @kernel

@@ -18,7 +18,16 @@ from pipeline.roofs.house_levels import HouseParts
 from pipeline.roofs.lines import wall_directions
 from pipeline.roofs.local_planes import fit_locally
 from pipeline.roofs.partition import PartRules, cut_house, join_faces, limit_parts
-from pipeline.roofs.plane_search import BAND, MAX_PLANES, misfit, refit_plane, regularise, search_planes
+from pipeline.roofs.plane_search import (
+    BAND,
+    MAX_LEVELS,
+    MAX_PLANES,
+    misfit,
+    refit_plane,
+    regularise,
+    search_levels,
+    search_planes,
+)
 from pipeline.roofs.refit import LIMIT_ROOM, LIMIT_SHARE
 from pipeline.roofs.roof_points import RoofPoints
 from pipeline.roofs.subdivision import (
@@ -129,10 +138,12 @@ def fit_roofs(polygons: NDArray[np.object_], points: RoofPoints, options: RoofOp
     -----
     1. A plane is fitted to the neighbours of each point (`fit_locally`), and of these the planes that most points
        support are taken one after the other (`search_planes`); flat, or uphill across a wall, where they nearly
-       are. The planes of the best family of roofs (`fit_family`) and a flat one at the median are added.
+       are. Flat planes at heights where many other points lie (`search_levels`), the planes of the best family
+       of roofs (`fit_family`) and a flat one at the median are added.
     2. Each point has a misfit under each plane: the square of its distance over half a metre, linear beyond.
        The outline is cut in two where both sides fall best under a plane each (`cut_house`), along walls or
-       where planes meet, or along a rectangle under another plane, as long as a cut saves `cut_price`.
+       where planes meet, or along a rectangle under another plane, as long as a cut saves `cut_price`. Where
+       no line has room, the best are moved by up to the distance that walls keep (`shift_cuts`).
     3. Neighbouring faces are joined (`join_faces`): under the same plane, too small, or not worth their wall.
 
     Points are put in an order of their own first, so theirs does not matter. Of dense points every second, third
@@ -353,8 +364,9 @@ def _find_candidates(
     """
     along = wall_directions(a, b)
     family = fit_family(xyz, a, b, along, density, max_slope)
-    found = np.empty((MAX_PLANES, 3))
-    n_found = search_planes(xyz, local, least, max_slope, found)
+    found = np.empty((MAX_PLANES + MAX_LEVELS, 3))
+    n_found = search_planes(xyz, local, least, max_slope, found[:MAX_PLANES])
+    n_found = search_levels(xyz, least, found, n_found)
     planes = np.empty((len(family) + n_found + 1, 3))
     n_family = n = 0
     for k in range(len(family)):

@@ -10,6 +10,7 @@ from pipeline.roofs.local_planes import add_point, solve_plane
 
 BAND = 0.25  # m, points within this distance (in height) support a plane
 MAX_PLANES = 12  # of a house
+MAX_LEVELS = 2  # flat planes of a house through points that are too rough for planes of their own
 HYPOTHESES, SAMPLES = 200, 700  # local planes that are tried, and points that each is held against, at most
 SAME_SLOPE = 0.25  # squared difference of slopes, over 1 + slope², up to which a local plane agrees
 ROUGH = 0.3  # weight of a point without a local plane of its own
@@ -85,6 +86,48 @@ def search_planes(xyz: Array, local: Array, least: float, max_slope: float, plan
             planes[n_planes, 0], planes[n_planes, 1], planes[n_planes, 2] = a, b, c
             n_planes += 1
     return n_planes
+
+
+@kernel
+def search_levels(xyz: Array, least: float, planes: Array, n: int) -> int:
+    """Find the heights at which most points lie that no plane is near; write flat planes, and give their number.
+
+    Parameters
+    ----------
+    xyz : float64, (p, 3)
+        Points of a house, ascending by height (m).
+    least : float
+        Points that must lie within a band.
+    planes : float64, (m, 3)
+        The planes that there are, and room for `MAX_LEVELS` more.
+    n : int
+        Number of planes.
+
+    Notes
+    -----
+    Small flat roofs, and those with plants or fences, have no smooth points: walls are within the neighbours of
+    each. They lie at one height nevertheless. O(p n).
+    """
+    for _ in range(MAX_LEVELS):
+        z, m = np.empty(len(xyz)), 0
+        for p in range(len(xyz)):
+            free = True
+            for k in range(n):
+                free &= abs(xyz[p, 2] - planes[k, 0] * xyz[p, 0] - planes[k, 1] * xyz[p, 1] - planes[k, 2]) >= BAND
+            if free:
+                z[m] = xyz[p, 2]
+                m += 1
+        first = best = begin = 0
+        for end in range(m):
+            while z[end] - z[first] > 2 * BAND:
+                first += 1
+            if end + 1 - first > best:
+                best, begin = end + 1 - first, first
+        if best < least:
+            break
+        planes[n, 0], planes[n, 1], planes[n, 2] = 0.0, 0.0, z[begin : begin + best].mean()
+        n += 1
+    return n
 
 
 @kernel

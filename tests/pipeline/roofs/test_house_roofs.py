@@ -11,6 +11,7 @@ from pipeline.data.roofs import ROOF_METHODS, roof_heights
 from pipeline.geometry.inside import find_inside
 from pipeline.geometry.rings import make_canonical
 from pipeline.roofs.house_roofs import HouseRoofs, RoofOptions, fit_roofs
+from pipeline.roofs.plane_search import search_levels
 from pipeline.roofs.roof_points import make_roof_points, no_roof_points
 from tests.helpers.sloped_roofs import SHAPES, SlopedHouse, scan_roof, town_of_slopes
 
@@ -95,6 +96,28 @@ def test_a_flat_roof_with_a_chimney_has_two_heights() -> None:
     chimney = found.parts.polygons[height.argmax()]
     assert chimney.area == pytest.approx(9.0, abs=2.5)
     np.testing.assert_allclose(chimney.centroid.coords[0], (6, 9), atol=0.4)
+
+
+def test_an_annex_narrower_than_the_room_of_walls_keeps_its_height() -> None:
+    """1.4 m deep: its wall is moved to where it has room, 1.5 clearances from the outline."""
+    house = SlopedHouse(shapely.box(0, 0, 12, 8), lambda x, y: np.where(x < 1.4, 3.0, 9.0 + 0.5 * y), 2)
+    found = fit(house.outline, scan_roof(house))
+    check_cover(found, one(house.outline))
+    low = found.parts.polygons[found.roofs.plane[:, 2].argmin()]
+    np.testing.assert_allclose(low.bounds, (0, 0, 1.7, 8), atol=0.2)
+    assert heights_at(found, np.array([[0.7, 4.0]])) == pytest.approx(3.0, abs=0.05)
+
+
+def test_heights_at_which_many_points_lie_are_planes() -> None:
+    """Two rough roofs beside a plane: the one with most points first, and none with too few."""
+    rng = np.random.default_rng(1)
+    z = np.concatenate([rng.uniform(2.8, 3.2, 30), rng.uniform(5.9, 6.1, 20), np.full(50, 9.0)])
+    xyz = np.column_stack([rng.uniform(0, 8, (100, 2)), np.sort(z)])
+    planes = np.zeros((3, 3))
+    planes[0, 2] = 9.0
+    assert search_levels(xyz, 15.0, planes, 1) == 3
+    np.testing.assert_allclose(planes, [[0, 0, 9], [0, 0, 3], [0, 0, 6]], atol=0.1)
+    assert search_levels(xyz, 25.0, planes, 1) == 2
 
 
 def test_a_house_around_a_courtyard_keeps_it() -> None:
