@@ -104,7 +104,7 @@ def test_a_seam_that_fails_takes_its_two_tiles(town: Town, tmp_path: Path) -> No
     prove_hole(town, out, record, one, other)
 
 
-@pytest.mark.parametrize("stage", ["ground", "shapes-0"])
+@pytest.mark.parametrize("stage", [pytest.param("ground", marks=pytest.mark.long), "shapes-0"])
 def test_a_tile_that_fails_before_there_is_a_city_model_is_as_absent(
     stage: str, town: Town, tmp_path: Path
 ) -> None:
@@ -143,6 +143,7 @@ def test_what_a_hole_does_not_touch_has_its_result(tmp_path: Path) -> None:
     assert not {(stage, far) for stage in watched} & redone
 
 
+@pytest.mark.long
 def test_a_file_that_cannot_be_read_takes_the_tiles_below_it(tmp_path: Path) -> None:
     write_city(tmp_path / "city", size=1000.0, buildings=20, density=0.3, relief=5, seed=3)
     town = Town(tmp_path / "city", tmp_path / "whole", {})

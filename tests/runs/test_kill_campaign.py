@@ -203,6 +203,7 @@ def finish_with_one_worker(victim: Victim, target: int, folder: Path) -> None:
         victim.finish()
 
 
+@pytest.mark.long
 def test_killed_processes_lose_nothing(small: SparseCity, tmp_path: Path) -> None:
     victim = Victim(small, tmp_path, np.random.default_rng(1))
     try:

@@ -100,6 +100,7 @@ def test_a_lost_piece_and_a_lost_city_model_are_written_again(town: Town, tmp_pa
     assert hashes(out) == hashes(town.out)
 
 
+@pytest.mark.long
 def test_other_parameters_leave_nothing_of_the_unfinished_run(town: Town, tmp_path: Path) -> None:
     """Other tiles: points and footprints are used again, and no result or piece of a tile that is gone stays."""
     out = town.unfinished(tmp_path / "out")

@@ -54,7 +54,7 @@ def test_open_ground_is_cut_straight_and_glued() -> None:
     prove_volume(tiles, scene, SQUARE)
 
 
-@pytest.mark.parametrize("seed", rounds([0, 5, 7], [1, 2, 3, 4, 6]))
+@pytest.mark.parametrize("seed", rounds([0, 7], [1, 2, 3, 4, 5, 6]))
 def test_random_cities_are_one_mesh(seed: int) -> None:
     scene = random_scene(SQUARE, 40 + 20 * seed, seed=seed, relief=20.0 * (seed % 3))
     tiles = mesh_all(scene, NINE)
@@ -158,6 +158,7 @@ def test_seams_cost_little_quality() -> None:
     assert len(tiled) < 1.03 * len(untiled)
 
 
+@pytest.mark.long
 @pytest.mark.shared
 @pytest.mark.parametrize("simplify", ["clearance", "paper"])
 def test_amsterdam_in_four_tiles_is_one_mesh(simplify: Literal["clearance", "paper"], shared_data: Path) -> None:

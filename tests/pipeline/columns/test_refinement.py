@@ -127,7 +127,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
     return lambda **more: values | {"refine": [box]} | more
 
 
-@pytest.mark.parametrize("mesher", ["adaptive", "layered"])
+@pytest.mark.parametrize("mesher", ["adaptive", pytest.param("layered", marks=pytest.mark.long)])
 def test_a_refined_run_is_proved_and_foreseen(town: Town, mesher: str, tmp_path: Path) -> None:
     values = town(mesher=mesher, wall_size=4.0)
     record = run_of(values, tmp_path / "out")
@@ -139,6 +139,7 @@ def test_a_refined_run_is_proved_and_foreseen(town: Town, mesher: str, tmp_path:
     assert 0.6 < cells / record["counts"]["cells"] < 1.6
 
 
+@pytest.mark.long
 def test_workers_leave_the_same_files_as_one_process(town: Town, tmp_path: Path) -> None:
     for workers in (0, 2):
         run_of(town(wall_size=4.0), tmp_path / str(workers), workers=workers)

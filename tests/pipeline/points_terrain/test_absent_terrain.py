@@ -96,8 +96,7 @@ def test_a_window_without_any_tile_is_an_error() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mesher", ["adaptive", "layered"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("seed", "mesher"), [(0, "adaptive"), (1, "layered"), (2, "adaptive"), (3, "layered")])
 def test_any_tiles_may_be_absent(seed: int, mesher: str, tmp_path: Path) -> None:
     """Tile sizes and sets of absent files: four in a square and three others, off most tiles' lines."""
     rng = np.random.default_rng([seed, 5])

@@ -211,13 +211,14 @@ def roof_error(
     return found.roof
 
 
+@pytest.mark.long
 @pytest.mark.shared
 @pytest.mark.parametrize(
     ("folder", "most"),
     [
         # Most RMSE of one height a house, then of one cut, then of eight; percentile 50, then 90.
         ("amsterdam", {(0, 50): 4.6, (0, 90): 6.1, (1, 50): 4.05, (8, 50): 3.05, (8, 90): 4.0}),
-        pytest.param("amsterdam_no_building_class", {(8, 50): 3.05, (8, 90): 4.05}, marks=pytest.mark.long),
+        ("amsterdam_no_building_class", {(8, 50): 3.05, (8, 90): 4.05}),
     ],
 )
 def test_split_houses_come_closer_to_the_points(

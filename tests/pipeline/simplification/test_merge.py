@@ -362,6 +362,7 @@ def test_sparse_houses_cost_about_as_much_as_they_are() -> None:
     assert set(merged.method) == {"single"}
 
 
+@pytest.mark.long
 @pytest.mark.shared
 def test_amsterdam_keeps_the_promises(shared_data: Path) -> None:
     _, _, raw, _ = pyogrio.raw.read(shared_data / "amsterdam" / "footprints.shp")

@@ -184,6 +184,7 @@ def test_sloped_roofs_are_read_as_they_were_given(tmp_path: Path) -> None:
     assert height.tolist() == [9.123456789, 9.0]
 
 
+@pytest.mark.long
 def test_memory_is_a_hundred_bytes_a_building(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(building_index, "BLOCK", 256)
     monkeypatch.setitem(json_stream.OPTIONS, "buf_size", 10_000)

@@ -49,6 +49,7 @@ def test_workers_are_forked_with_their_settings(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.long
 def test_workers_end_with_a_driver_that_is_killed(tmp_path: Path) -> None:
     city = make_city(tmp_path, 2, buildings=12)
     process = start(city.command(tmp_path / "again", "--workers", "2"), tmp_path / "log.txt")

@@ -32,6 +32,7 @@ def _parts(folder: Path, pieces: HandPieces) -> None:
 
 
 # The faces of all cells alone are 40 bytes a cell.
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("export", "most"),
     [

@@ -106,6 +106,7 @@ def test_the_middle_of_a_large_region_is_its_inner_rings(tmp_path: Path) -> None
     assert find_middle(tmp_path, most=10) == frozenset({"0_0"})
 
 
+@pytest.mark.long
 def test_blocks_stand_on_the_terrain(small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     record = json.loads((small_run / "run.json").read_text())
     west, south, east, north = record["region"]["bounds"]

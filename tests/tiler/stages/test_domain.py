@@ -75,7 +75,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return write_town(folder, small, files=(2, 1)) | {"tile_size": SIZE}
 
 
-@pytest.mark.parametrize("mesher", ["adaptive", "layered"])
+@pytest.mark.parametrize("mesher", ["adaptive", pytest.param("layered", marks=pytest.mark.long)])
 def test_a_flat_top_above_grown_layers_is_proved_in_tiles_of_any_size(
     town: dict[str, Any], mesher: str, tmp_path: Path
 ) -> None:
@@ -125,7 +125,7 @@ def test_real_blocks_have_a_flat_top_above_grown_layers(shared_data: Path, meshe
     ("mesher", "options"),
     [
         ("adaptive", CFD | {"domain_height": "1.5H"}),
-        ("layered", {"first_layer": 1.0, "domain_height": 38.0}),
+        pytest.param("layered", {"first_layer": 1.0, "domain_height": 38.0}, marks=pytest.mark.long),
         pytest.param("layered", CFD | {"domain_height": "1.3H"}, marks=pytest.mark.long),
     ],
 )
@@ -137,7 +137,7 @@ def test_a_tile_is_the_same_in_a_larger_region(mesher: str, options: dict[str, A
     prove_local(values, TILE, tmp_path, around(TILE, least + 0.2), around(TILE, least))
 
 
-@pytest.mark.parametrize("mesher", ["adaptive", "layered"])
+@pytest.mark.parametrize("mesher", [pytest.param("adaptive", marks=pytest.mark.long), "layered"])
 def test_a_tile_alone_has_the_domain_of_the_whole(town: dict[str, Any], mesher: str, tmp_path: Path) -> None:
     """Four tiles alone know the highest ground and the tallest building of nine."""
     values = write_town(tmp_path / "city", hill_town(1.0)) | CFD | {"tile_size": SIZE, "mesher": mesher}

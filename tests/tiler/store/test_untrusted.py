@@ -170,6 +170,7 @@ def test_bounds_that_are_none_are_those_of_the_points(city: Path, capsys: Captur
     assert "points were read for it" in found.out
 
 
+@pytest.mark.long
 def test_no_claim_of_a_file_takes_memory(city: Path) -> None:
     """A whole run of the tiny city takes some 300 MB; the points that are claimed would take 30 GB."""
     patch(city / "cloud.laz", 247, "Q", 10**9)
@@ -180,6 +181,7 @@ def test_no_claim_of_a_file_takes_memory(city: Path) -> None:
     assert call_apart(*arguments(city), megabytes=450).code == 1
 
 
+@pytest.mark.long
 def test_two_million_copies_of_a_point_are_read_in_bounded_memory(city: Path) -> None:
     write_cloud(city / "cloud.laz", np.tile([318030.0, 6399030.0, 2.0], (1_900_000, 1)), 2)
     found = call_apart(
@@ -223,6 +225,7 @@ def test_patterns_do_not_follow_links_in_circles(city: Path, capsys: Capture) ->
 # Footprints
 
 
+@pytest.mark.long
 def test_nested_geometries_do_not_end_the_process(city: Path) -> None:
     """GEOS recurses and ends the process by a signal where the stack ends."""
     put_wkb(city / "house.gpkg", nested_wkb(2_000_000, 6))
@@ -255,6 +258,7 @@ def test_a_footprint_of_a_million_vertices_is_left_out_and_told(city: Path, caps
     assert record["counts"]["buildings"] == 1
 
 
+@pytest.mark.long
 def test_a_ragged_footprint_of_many_vertices_takes_seconds(city: Path) -> None:
     write_houses(city / "house.gpkg", [circle(99_000)])
     found = call_apart(*arguments(city, "--allow-empty"), megabytes=700, timeout=90)
