@@ -225,7 +225,7 @@ def _add_parameters(parser: argparse.ArgumentParser) -> Group:
         elif get_origin(wanted) is tuple and get_args(wanted)[0] is int:
             words |= {"type": str, "metavar": "N,N"}
         elif entry.name == "refine":
-            words |= {"type": str, "action": "append", "metavar": "X0,Y0,X1,Y1,SIZE"}
+            words |= {"type": str, "action": "append", "metavar": "PLACE,SIZE"}
         elif get_origin(wanted) is tuple and get_args(wanted)[0] is str:
             words |= {"type": str, "nargs": "+", "metavar": "FILE"}
         elif get_origin(wanted) is tuple:

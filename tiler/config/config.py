@@ -220,8 +220,8 @@ class Config:
         "wall", least=Above(1), most=2,
     )  # fmt: skip
     refine: tuple[str, ...] = _parameter(
-        (), "mesh", "box with a target edge length of its own, x0,y0,x1,y1,SIZE in coordinates of the region; may "
-        "be repeated", unit="m",
+        (), "mesh", "box or circle with a target edge length of its own, x0,y0,x1,y1,SIZE or x,y,RADIUS,SIZE in "
+        "coordinates of the region; may be repeated", unit="m",
     )  # fmt: skip
     refine_areas: str = _parameter(
         UNSET, "mesh", "vector file of areas or lines, each with a target edge length of its own"
@@ -647,8 +647,8 @@ def _check_sizes(config: Config) -> None:
         read_refinement(text, config.largest_size)
 
 
-def read_refinement(text: str, largest: float) -> tuple[float, tuple[float, float, float, float]]:
-    """Read a box with a size of its own: x0,y0,x1,y1,SIZE (m).
+def read_refinement(text: str, largest: float) -> tuple[float, tuple[float, ...]]:
+    """Read a box or a circle with a size of its own: x0,y0,x1,y1,SIZE or x,y,RADIUS,SIZE (m).
 
     Parameters
     ----------
@@ -661,26 +661,40 @@ def read_refinement(text: str, largest: float) -> tuple[float, tuple[float, floa
     -------
     float
         The size (m).
-    tuple of 4 floats
-        xmin, ymin, xmax, ymax (m).
+    tuple of 4 or 3 floats
+        xmin, ymin, xmax, ymax of the box; x, y and radius of the circle (m).
 
     Raises
     ------
     ConfigError
-        If it is no such box.
+        If it is no such box or circle.
 
     Examples
     --------
     >>> read_refinement("30,0,10,20,2.5", 10.0)
     (2.5, (10.0, 0.0, 30.0, 20.0))
+    >>> read_refinement("30,0,100,2.5", 10.0)
+    (2.5, (30.0, 0.0, 100.0))
     """
+    subject = f"refine = {_shown(text)}"
     try:
-        x0, y0, x1, y1, size = (float(word) for word in text.split(","))
+        *place, size = (float(word) for word in text.split(","))
     except ValueError:
-        raise ConfigError(f"refine = {_shown(text)}: five numbers x0,y0,x1,y1,SIZE expected") from None
-    if not all(map(math.isfinite, (x0, y0, x1, y1))) or x0 == x1 or y0 == y1:
-        raise ConfigError(f"refine = {_shown(text)}: the box has no area; give x0,y0,x1,y1,SIZE")
-    check_refinement(size, largest, f"refine = {_shown(text)}")
+        place, size = [], 0.0
+    if len(place) not in (3, 4):
+        raise ConfigError(
+            f"{subject}: five numbers x0,y0,x1,y1,SIZE expected, or four of a circle: x,y,RADIUS,SIZE"
+        )
+    if not all(map(math.isfinite, place)):
+        raise ConfigError(f"{subject}: a number is not finite; give metres in coordinates of the region")
+    check_refinement(size, largest, subject)
+    if len(place) == 3:
+        if place[2] <= 0:
+            raise ConfigError(f"{subject}: a radius of {place[2]:g} m; must be above 0")
+        return size, tuple(place)
+    x0, y0, x1, y1 = place
+    if x0 == x1 or y0 == y1:
+        raise ConfigError(f"{subject}: the box has no area; give x0,y0,x1,y1,SIZE")
     return size, (min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))
 
 

@@ -146,6 +146,7 @@ def _render(data: str, rows: Rows, origin: str) -> str:
         n, nodes = rows[cells]
         lines = [
             f'    <Grid Name="{name}" GridType="Uniform">',
+            '      <Time Value="0"/>',  # PyVista reads no file without
             f'      <Topology TopologyType="{topology}" NumberOfElements="{n}" NodesPerElement="{nodes}">',
             f"        {item(cells)}",
             "      </Topology>",

@@ -1,4 +1,4 @@
-"""Boxes, and areas of a file, in which cells are finer than in the rest of a region."""
+"""Boxes, circles, and areas of a file, in which cells are finer than in the rest of a region."""
 
 from functools import partial
 from pathlib import Path
@@ -47,7 +47,7 @@ def read_refinements(config: Config, region: Region) -> Refinements:
         If the file cannot be read, has a feature without size or geometry, or too many vertices or sizes.
     """
     found = [read_refinement(text, config.largest_size) for text in config.refine]
-    areas = {(size, shapely.to_wkb(shapely.box(*box), hex=True, byte_order=1)) for size, box in found}
+    areas = {(size, shapely.to_wkb(_make_shape(*place), hex=True, byte_order=1)) for size, place in found}
     if config.refine_areas:
         areas |= _read_file(place(config.refine_areas), config, region)
     n_places = int(shapely.get_num_coordinates(shapely.from_wkb([text for _, text in areas])).sum())
@@ -58,6 +58,14 @@ def read_refinements(config: Config, region: Region) -> Refinements:
             f"{MOST_SIZES} are taken: simplify or dissolve the areas"
         )
     return tuple(sorted(areas))
+
+
+def _make_shape(*place: float) -> shapely.Polygon:
+    """Polygon of a box, or of a circle: 64 sides, vertices on whole millimetres, the same on any processor."""
+    if len(place) == 4:
+        return shapely.box(*place)
+    x, y, radius = place
+    return shapely.set_precision(shapely.Point(x, y).buffer(radius), 0.001, mode="pointwise")
 
 
 def _read_file(path: Path, config: Config, region: Region) -> set[tuple[float, str]]:

@@ -203,7 +203,8 @@ def test_areas_that_cannot_be_meant_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"refine": ["1,2,3,4"]}, "five numbers x0,y0,x1,y1,SIZE"),
+        ({"refine": ["1,2,3"]}, "five numbers x0,y0,x1,y1,SIZE"),
+        ({"refine": ["0,0,-9,3"]}, "radius of -9 m; must be above 0"),
         ({"refine": ["0,0,0,9,2"]}, "no area"),
         ({"refine": ["0,0,9,9,10"]}, "size of 10 m"),
         ({"wall_size": 10.0}, "below mesh_size = 10 m"),
@@ -221,6 +222,16 @@ def test_boxes_come_from_the_command_line_repeated_and_west_of_the_origin() -> N
     given = build_parser(defaultdict(lambda: len)).parse_args(words)
     assert given.refine == ["-5,-2e1,7,8,2", "1,2,3,4,3"]
     assert read_refinement(given.refine[0], 10.0) == (2.0, (-5.0, -20.0, 7.0, 8.0))
+
+
+def test_a_circle_is_a_place_and_a_radius() -> None:
+    ((size, shape),) = read_refinements(make_config({"refine": ["318010,6399020.5,50,3"]}), REGION)
+    circle = shapely.from_wkb(shape)
+    assert size == 3.0
+    away = shapely.distance(shapely.points(shapely.get_coordinates(circle)), shapely.Point(318_010, 6_399_020.5))
+    np.testing.assert_allclose(away, 50.0, atol=0.001)
+    assert len(away) == 65
+    assert circle.area > 0.995 * np.pi * 50**2
 
 
 def test_edges_of_areas_are_seen_in_the_plane_mesh() -> None:

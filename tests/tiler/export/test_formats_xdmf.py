@@ -67,6 +67,15 @@ def test_vtk_reads_cells_and_marked_facets(small_run: Path, exported: Path) -> N
         assert np.array_equal(found, np.concatenate([getattr(part, name) for part in parts]))
 
 
+def test_pyvista_reads_both_grids(small_run: Path, exported: Path) -> None:
+    import pyvista
+
+    counts = json.loads((small_run / "run.json").read_text())["counts"]
+    grids = pyvista.read(exported)
+    assert [grid.n_cells for grid in grids] == [counts["cells"], counts["facets"]]
+    assert grids[1].array_names == ["marker", "building"]
+
+
 def test_scikit_fem_solves_a_linear_problem_exactly(exported: Path) -> None:
     import skfem
     from skfem.helpers import dot, grad
