@@ -24,6 +24,16 @@ class Marker(IntEnum):
     FOUNDATION = 12  # the soil's top under a building
 
 
+# Markers from here on are ground, too: that of the patches of land cover, by number from 1.
+GROUND_PATCHES = 30
+
+
+def is_ground(marker: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Tell which facets (f,) are ground, of any patch."""
+    found: NDArray[np.bool_] = (marker == Marker.GROUND) | (marker > GROUND_PATCHES)
+    return found
+
+
 class Region(IntEnum):
     """What a cell is filled with."""
 

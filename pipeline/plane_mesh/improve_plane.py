@@ -32,6 +32,7 @@ def improve_plane(
     *,
     mesh_size: float | NDArray[np.float64],
     passes: int,
+    kept: NDArray[np.int32] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Move free vertices and flip free edges for better angles.
 
@@ -47,6 +48,8 @@ def improve_plane(
         Target edge length (m), one for all or one a vertex, which scales the search.
     passes : int
         Rounds of moving and flipping; 0 returns the input.
+    kept : int32, (k, 2), optional
+        Pairs of vertices whose edges stay, too, those that no edge has do not matter.
 
     Returns
     -------
@@ -64,6 +67,8 @@ def improve_plane(
     if passes == 0:
         return xy, triangles
     neighbour = triangle_neighbours(triangles)
+    if kept is not None and len(kept):
+        _part_at(kept, triangles, neighbour, len(xy))
     frozen = _frozen_vertices(len(xy), triangles, neighbour, label)
     first_step = FIRST_STEP * np.broadcast_to(np.asarray(mesh_size, np.float64), len(xy))
     for _ in range(passes):
@@ -80,6 +85,15 @@ def _frozen_vertices(
     for k in range(3):
         frozen[triangles[kept[:, k]][:, [(k + 1) % 3, (k + 2) % 3]]] = True
     return frozen
+
+
+def _part_at(kept: NDArray[np.int32], triangles: NDArray[np.int32], neighbour: NDArray[np.int32], n: int) -> None:
+    """Part the triangles on both sides of edges, in place: an edge without a neighbour stays."""
+    ends = np.sort(kept.astype(np.int64), axis=1)
+    wanted = ends[:, 0] * n + ends[:, 1]
+    for k in range(3):
+        p, q = (triangles[:, (k + i) % 3].astype(np.int64) for i in (1, 2))
+        neighbour[np.isin(np.minimum(p, q) * n + np.maximum(p, q), wanted), k] = -1
 
 
 @kernel(error_model="numpy")

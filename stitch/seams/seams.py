@@ -12,7 +12,7 @@ from pipeline.plane_mesh.sizes import SizeField, largest_size, local_sizes
 from stitch.tiling.corners import Corner
 from stitch.tiling.grid import Bounds, SeamKey, TileGrid, is_border
 from stitch.tiling.paths import find_path
-from stitch.tiling.strips import Strip, centres, improve_around, mesh_strip, strip_core
+from stitch.tiling.strips import NO_EDGES, Strip, centres, improve_around, mesh_strip, strip_core
 from stitch.tiling.walls import find_on_walls
 
 SURROUNDINGS = 2.0  # mesh sizes; how far around a seam triangles count for the layers of its columns
@@ -59,12 +59,13 @@ def trace_seam(
     passes: int,
     sizes: SizeField | None = None,
     surroundings: float = SURROUNDINGS,
+    edges: NDArray[np.float64] = NO_EDGES,
 ) -> Seam:
     """Find a seam in the triangles of its strip.
 
     Parameters
     ----------
-    grid, key, ends, polygons, walls, mesh_size, min_angle, sizes
+    grid, key, ends, polygons, walls, mesh_size, min_angle, sizes, edges
         As in `mesh_strip`, with its errors and those of `find_path`.
     passes : int
         Rounds of `improve_plane` around the seam.
@@ -88,6 +89,7 @@ def trace_seam(
         mesh_size=mesh_size,
         min_angle=min_angle,
         sizes=sizes,
+        edges=edges,
     )
     if border:
         nothing = PlaneMesh(np.empty((0, 2)), np.empty((0, 3), np.int32), np.empty(0, np.int32))

@@ -13,8 +13,9 @@ from pipeline.plane_mesh.sizes import SizeField, SizeRule, local_sizes
 from stitch.seams.seams import ON_WALL, Seam
 from stitch.tiling.corners import corner_sight
 from stitch.tiling.grid import band_width, corner_reach
+from stitch.tiling.land_cover import find_kept
 from stitch.tiling.patches import PATCH
-from stitch.tiling.strips import MARGIN, RING, label_triangles
+from stitch.tiling.strips import MARGIN, NO_EDGES, RING, label_triangles
 from stitch.tiling.walls import LONGEST_PIECE, split_walls, walls_within
 
 CLEAR_OF_SEAMS = 1.2  # mesh sizes; vertices of a strip that the tile begins with are that far from its other seams
@@ -35,6 +36,7 @@ def mesh_tile(
     passes: int,
     sizes: SizeField | None = None,
     divide_chords: bool = False,
+    edges: NDArray[np.float64] = NO_EDGES,
 ) -> tuple[PlaneMesh, bool]:
     """Mesh a tile between its four seams.
 
@@ -51,6 +53,8 @@ def mesh_tile(
     divide_chords : bool
         Set a vertex in the middle of each piece of a wall that crosses the tile from seam to seam: with sloped
         roofs the tile must be free to move a column of every wall.
+    edges : float64, (e, 2, 2)
+        Further edges of the mesh, on open ground (m): those that the seams were found with, too.
 
     Returns
     -------
@@ -72,7 +76,9 @@ def mesh_tile(
     ring = tile_ring(sides)
     tile = shapely.Polygon(ring)
     nodes = np.concatenate([side.wall_nodes for side in sides])
-    pieces = split_walls(walls_within(walls, shapely.box(*tile.bounds)), nodes, reach=ON_WALL)
+    edges = walls_within(edges, shapely.box(*tile.bounds))
+    walls = np.concatenate((walls_within(walls, shapely.box(*tile.bounds)), edges))
+    pieces = split_walls(walls, nodes, reach=ON_WALL)
     middle = pieces.mean(axis=1)
     inner = pieces[shapely.contains_xy(tile, middle[:, 0], middle[:, 1])]
     if divide_chords:
@@ -90,7 +96,8 @@ def mesh_tile(
     )
     label = label_triangles(xy, triangles, polygons)
     size = local_sizes(sizes, xy, mesh_size=mesh_size)
-    xy, triangles = improve_plane(xy, triangles, label, mesh_size=size, passes=passes)
+    kept = find_kept(xy, edges, triangles)
+    xy, triangles = improve_plane(xy, triangles, label, mesh_size=size, passes=passes, kept=kept)
     plane = order_plane(xy, triangles, label)
     check_areas(plane, tile.area, areas_within(polygons, tile), polygons)
     return plane, complete

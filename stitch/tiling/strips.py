@@ -12,11 +12,13 @@ from pipeline.plane_mesh.plane import collect_graph, triangulate_plane
 from pipeline.plane_mesh.sizes import SizeField, largest_size, local_sizes
 from stitch.tiling.corners import Corner
 from stitch.tiling.grid import Bounds, SeamKey, TileGrid, band_width, corner_reach, is_border, seam_bounds
+from stitch.tiling.land_cover import find_kept
 from stitch.tiling.walls import LONGEST_PIECE, walls_within
 
 RING = 1.5  # mesh sizes; the triangles around a vertex have their centres within that
 SECTORS = 5  # four quadrants around a corner, and elsewhere
 CORRIDOR = 4  # triangles on either side of a path that are improved
+NO_EDGES = np.empty((0, 2, 2))
 MARGIN = 0.5  # mesh sizes between the last piece of wall and the strip's sides
 
 
@@ -33,13 +35,16 @@ class Strip:
     building : int32, (m,)
         Row of the building that holds the triangle, -1 on open ground; true within the strip's core.
     walls : float64, (w, 2, 2)
-        Pieces of wall that are edges of the strip (m).
+        Pieces of wall, and further edges, that are edges of the strip (m).
+    edges : float64, (e, 2, 2)
+        The further ones (m).
     """
 
     xy: NDArray[np.float64]
     triangles: NDArray[np.int32]
     building: NDArray[np.int32]
     walls: NDArray[np.float64]
+    edges: NDArray[np.float64]
 
 
 def mesh_strip(
@@ -52,6 +57,7 @@ def mesh_strip(
     mesh_size: float,
     min_angle: float,
     sizes: SizeField | None = None,
+    edges: NDArray[np.float64] = NO_EDGES,
 ) -> Strip:
     """Triangulate a strip.
 
@@ -73,6 +79,8 @@ def mesh_strip(
         Bound on the angles (degrees).
     sizes : SizeField, optional
         Target edge lengths that are not the same everywhere.
+    edges : float64, (e, 2, 2)
+        Further edges of the mesh, on open ground (m).
 
     Raises
     ------
@@ -85,18 +93,18 @@ def mesh_strip(
     are in the strip, whole; beyond it nothing counts, so what lies there makes no difference.
     """
     core = strip_core(grid, seam, mesh_size=largest_size(sizes, mesh_size=mesh_size))
-    inside = walls_within(walls, shapely.box(*core))
+    inside, further = (walls_within(some, shapely.box(*core)) for some in (walls, edges))
     bounds = seam_bounds(grid, seam)
     outer = _grow(core, (LONGEST_PIECE + MARGIN) * mesh_size, bounds)
     spokes = _spokes(ends, bounds)
-    edges = np.concatenate((_outline(outer, ends), inside, spokes))
+    fixed = np.concatenate((_outline(outer, ends), inside, further, spokes))
     xy, triangles, _, _ = triangulate_plane(
-        collect_graph(edges, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle, sizes=sizes
+        collect_graph(fixed, np.empty((0, 2))), max_area=mesh_size**2 / 2, min_angle=min_angle, sizes=sizes
     )
     building = label_triangles(xy, triangles, polygons)
     # Beyond the core, what holds a triangle is a matter of which houses were given.
     building[~_within(xy, triangles, core)] = -1
-    return Strip(xy, triangles, building, inside)
+    return Strip(xy, triangles, building, np.concatenate((inside, further)), further)
 
 
 def improve_around(
@@ -133,10 +141,11 @@ def improve_around(
     # Different labels on the two sides of a first edge keep it where it is.
     label = strip.building[rows] * SECTORS + _sectors(xy, triangles, ends)
     size = local_sizes(sizes, xy, mesh_size=mesh_size)
-    xy, triangles = improve_plane(xy, triangles, label.astype(np.int32), mesh_size=size, passes=passes)
+    kept = find_kept(xy, strip.edges, triangles)
+    xy, triangles = improve_plane(xy, triangles, label.astype(np.int32), mesh_size=size, passes=passes, kept=kept)
     all_xy, all_triangles = strip.xy.copy(), strip.triangles.copy()
     all_xy[vertex], all_triangles[rows] = xy, vertex[triangles]
-    return Strip(all_xy, all_triangles, strip.building, strip.walls)
+    return Strip(all_xy, all_triangles, strip.building, strip.walls, strip.edges)
 
 
 def _rows_around(strip: Strip, path: NDArray[np.int64]) -> NDArray[np.int64]:

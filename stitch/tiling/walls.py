@@ -43,7 +43,12 @@ def cut_walls(
     >>> len(cut_walls(np.array([shapely.box(0, 0, 4, 20)]), mesh_size=10.0))
     6
     """
-    edges = ring_edges(shapely.get_rings(polygons))
+    return _halve(cut_edges(ring_edges(shapely.get_rings(polygons)), mesh_size=mesh_size), finer, mesh_size)
+
+
+def cut_edges(edges: NDArray[np.float64], *, mesh_size: float) -> NDArray[np.float64]:
+    """Cut edges (s, 2, 2) in any direction into pieces as `cut_walls` does, where no size is finer."""
+    edges = edges.copy()
     backwards = (edges[:, 0, 0] > edges[:, 1, 0]) | (
         (edges[:, 0, 0] == edges[:, 1, 0]) & (edges[:, 0, 1] > edges[:, 1, 1])
     )
@@ -57,7 +62,7 @@ def cut_walls(
     start, end = (edges[edge, 0] + across[edge] * (step / n[edge])[:, None] for step in (k, k + 1))
     start[k == 0] = edges[edge[k == 0], 0]
     end[k == n[edge] - 1] = edges[edge[k == n[edge] - 1], 1]
-    return _halve(np.stack((start, end), axis=1), finer, mesh_size)
+    return np.stack((start, end), axis=1)
 
 
 def _halve(pieces: NDArray[np.float64], finer: Sequence[Finer], mesh_size: float) -> NDArray[np.float64]:
@@ -118,11 +123,13 @@ def split_walls(walls: NDArray[np.float64], nodes: NDArray[np.float64], *, reach
 
 
 def find_on_walls(
-    walls: NDArray[np.float64], nodes: NDArray[np.float64], *, reach: float
+    walls: NDArray[np.float64], nodes: NDArray[np.float64], *, reach: float, ends: bool = False
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find the vertices that are on a piece of wall, but for its ends: their rows, and those of the pieces."""
+    """Find the vertices that are on a piece of wall, but for its `ends`: their rows, and those of the pieces."""
     nodes_on, wall = shapely.STRtree(shapely.linestrings(walls)).query(
         shapely.points(nodes), predicate="dwithin", distance=reach
     )
+    if ends:
+        return nodes_on, wall
     at_end = (nodes[nodes_on][:, None] == walls[wall]).all(axis=2).any(axis=1)
     return nodes_on[~at_end], wall[~at_end]

@@ -17,8 +17,8 @@ from tiler.engine.executor import Serial
 from tiler.engine.run_context import tile_key, tile_name
 from tiler.engine.stage import Box, Facts, Scope
 from tiler.engine.task import Record
+from tiler.planning.own_stages import OwnStages
 from tiler.planning.plan import make_plan
-from tiler.stages.own_stages import OwnStages
 from tiler.store.store import Store
 from tiler.workflow.stage_sequence import make_engine, run_stages
 

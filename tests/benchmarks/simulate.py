@@ -28,8 +28,8 @@ from tiler.engine.schedule import StoppedError
 from tiler.engine.task import Record
 from tiler.executors.local_cluster import local
 from tiler.monitoring.progress import RunProgress
+from tiler.planning.own_stages import OwnStages, list_stages
 from tiler.planning.plan import Plan, make_plan
-from tiler.stages.own_stages import OwnStages, list_stages
 from tiler.store.out_folder import MANIFEST_PATH, STORE
 from tiler.workflow.audit import find_remade, write_manifest
 from tiler.workflow.failed_tiles import HolesError, Missing, find_missing, leave_holes

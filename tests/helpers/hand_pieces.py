@@ -20,6 +20,7 @@ class HandPieces:
     names: tuple[str, ...]
     n_points: int
     pieces: list[MeshPiece]
+    ground: tuple[str, ...] = ()
 
     @property
     def files(self) -> SimpleNamespace:

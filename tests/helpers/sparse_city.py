@@ -16,7 +16,7 @@ from tests.runs.test_run import hashes
 from tiler.config.config import Config, make_config
 from tiler.executors.dask_settings import METHOD
 from tiler.interface.synth import write_city
-from tiler.stages.own_stages import list_stages
+from tiler.planning.own_stages import list_stages
 from tiler.workflow.run import run
 
 ROOT = Path(__file__).resolve().parents[2]

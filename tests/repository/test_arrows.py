@@ -71,9 +71,9 @@ def test_imports_follow_the_arrows() -> None:
 ORDER = {
     "tiler": [
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
-        "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "planning", "dashboard",
-        "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats", "convert",
-        "towns", "interface", "cli",
+        "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "landcover", "planning",
+        "dashboard", "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats",
+        "convert", "towns", "interface", "cli",
     ],
     "pipeline": [
         "data", "geometry", "points_terrain", "architecture", "skeletons", "roofs", "city_model", "simplification",

@@ -12,18 +12,21 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker
 from stitch.pieces.frontier import Settled, add_rim, close_frontier, start_frontier
-from tiler.check import city_proofs, pad_proofs, proofs, soil_proofs, wall_proofs
+from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proofs, wall_proofs
 from tiler.check.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
-from tiler.check.proofs import Dtm, Fault, Finding, Proof, Vertices
+from tiler.check.proofs import Bounds, Dtm, Fault, Finding, Proof, Vertices
 from tiler.check.solid_proofs import SolidProofs
 from tiler.citymodels.building_index import BuildingIndex, index_buildings
+from tiler.landcover.stored_cover import StoredCanopy, StoredCover
 from tiler.mesh_files.mesh_parts import report_parts
-from tiler.mesh_files.vtk_files import read_piece_paths
+from tiler.mesh_files.mesh_pieces import read_leaves
+from tiler.mesh_files.vtk_files import read_piece_paths, read_vtu
 from tiler.store.out_folder import CITY_MODEL, RUN_RECORD, STORE
 from tiler.store.run_folder import PARTS, RunRecord, read_run_record
 
 VOLUME_INDEX = "mesh.pvtu"
 BOUNDARY_INDEX = "boundary.pvtp"
+ALONE = 3.0  # spacings of the terrain; closer to other water a node may have its level
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,8 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
     with index_buildings(directory / CITY_MODEL, solids.add) as index:
         files = _in_order(_pair_pieces(directory), record)
         dtm = load_dtm(directory / STORE)
+        cover = _open_cover(directory / STORE, record) if record.ground else None
+        canopy = StoredCanopy(directory / STORE, _boxes(record), record.leaf_column) if record.leaves else None
         sums = _Sums.start(len(index))
         frontier = start_frontier()
         for number, (volume, boundary) in enumerate(files):
@@ -110,6 +115,10 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
             rim = replace(piece.rim, part=piece.rim.part + len(sums.part_cells))
             frontier, settled, fresh = add_rim(frontier, rim, number)
             sums.add_piece(piece, fresh, record, index, dtm)
+            if cover is not None:
+                sums.add_cover(piece, fresh, record, cover)
+            if canopy is not None:
+                sums.add_leaves(directory / volume, canopy)
             sums.add_settled(settled)
         sums.add_settled(close_frontier(frontier))
         sums.add_rim_walls()
@@ -187,6 +196,19 @@ class _Sums:
         self.part_cells = np.concatenate((self.part_cells, piece.part_cells))
         self.part_soil = np.concatenate((self.part_soil, piece.part_soil))
 
+    def add_cover(self, piece: Piece, fresh: NDArray[np.bool_], record: RunRecord, cover: StoredCover) -> None:
+        """Add what a piece says of the patches of the ground, and of its water."""
+        self._join("cover", cover_proofs.check_cover(piece.surface, piece.patch, record.ground, cover))
+        ground = take_vertices(piece, Marker.GROUND, GROUND, fresh)
+        level = cover.levels_at(ground[:, :2], alone=ALONE * record.dtm_spacing)
+        self._join("levels", cover_proofs.check_levels(ground, level))
+
+    def add_leaves(self, path: Path, canopy: StoredCanopy) -> None:
+        """Add what a piece says of the leaves in its cells."""
+        volume = read_vtu(path)
+        leaves = read_leaves(path, volume)
+        self._join("leaves", cover_proofs.check_leaves(volume.mesh.points, volume.mesh.cells, leaves, canopy))
+
     def add_settled(self, settled: Settled) -> None:
         """Add what is settled between pieces."""
         self._join("seams", proofs.check_seams(settled))
@@ -248,6 +270,13 @@ def _conclude(
     )
     if record.core is not None:
         claims += (pad_proofs.prove_pad(found["pad"], record.core, record.rim),)
+    if record.ground:
+        claims += (
+            cover_proofs.prove_cover(found["cover"], record.ground),
+            cover_proofs.prove_levels(found["levels"]),
+        )
+    if record.leaves:
+        claims += (cover_proofs.prove_leaves(found["leaves"]),)
     if record.depth:
         claims += (
             soil_proofs.prove_between(found["between"]),
@@ -257,6 +286,14 @@ def _conclude(
         )
         facts |= {"soil_volume": found["soil"].sums["cells"]}
     return claims, facts
+
+
+def _boxes(record: RunRecord) -> dict[str, Bounds]:
+    return {name: (box[0], box[1], box[2], box[3]) for name, box in record.tiles.items() if box is not None}
+
+
+def _open_cover(path: Path, record: RunRecord) -> StoredCover:
+    return StoredCover(path, _boxes(record), record.core, len(record.ground) - 1)
 
 
 def _tell(fault: Fault) -> str:

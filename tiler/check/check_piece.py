@@ -13,7 +13,7 @@ from tiler.check import proofs
 from tiler.check.proofs import Bounds, Fault, Finding, Mask, Surface, Vertices
 from tiler.check.soil_proofs import check_between
 from tiler.mesh_files.vtk_files import BoundaryPiece, read_vtp
-from tiler.store.run_folder import ROOF_MOVED, read_volume
+from tiler.store.run_folder import PATCH_OF_GROUND, ROOF_MOVED, read_volume
 
 # Kinds of points over the rim, each counted once: any, of the ground, of the top.
 ANY, GROUND, TOP = range(3)
@@ -45,6 +45,8 @@ class Piece:
         Boundary edges of more than two facets, paired, not over the rim.
     faults : tuple of Fault
         Of its cells.
+    patch : int8, (k,), or None
+        Patch of the ground of each facet of the surface; None where the file tells of none.
     """
 
     n_cells: int
@@ -63,6 +65,7 @@ class Piece:
     closed: Finding
     crowded: Vertices
     faults: tuple[Fault, ...]
+    patch: NDArray[np.int8] | None
 
 
 def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: bool = False) -> Piece:
@@ -121,6 +124,7 @@ def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: 
                 *proofs.find_face_faults(surface.points, joined),
             ]
         ),
+        patch=file.cell_data.get(PATCH_OF_GROUND),
     )
 
 

@@ -28,9 +28,11 @@ EXIT_CODES = (
 METAVARS = {str: "NAME", float: "NUMBER", int: "NUMBER"}
 # What a value is, where its type does not tell.
 KINDS = {
-    **dict.fromkeys(("footprints", "refine_areas", "cluster", "tls_ca", "tls_cert", "tls_key"), "FILE"),
+    **dict.fromkeys(("footprints", "refine_areas", "land_cover_table", "trees", "cluster"), "FILE"),
+    **dict.fromkeys(("tls_ca", "tls_cert", "tls_key"), "FILE"),
     **{"out": "DIR", "crs": "EPSG", "layer": "LAYER", "scheduler": "ADDRESS"},
-    **dict.fromkeys(("id_attribute", "height_attribute", "roof_attribute", "refine_attribute"), "ATTRIBUTE"),
+    **dict.fromkeys(("id_attribute", "height_attribute", "roof_attribute"), "ATTRIBUTE"),
+    **dict.fromkeys(("refine_attribute", "land_cover_field"), "ATTRIBUTE"),
 }
 WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 LODS = next(entry.metadata["choices"] for entry in dataclasses.fields(Config) if entry.name == "lod")

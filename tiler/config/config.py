@@ -34,6 +34,10 @@ LEAST_SIZE = 0.1  # m; of edges
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
 
+# What may be given as a URL.
+URLS = ("pointcloud", "footprints", "buildings", "terrain", "refine_areas", "land_cover", "trees", "out")
+
+
 class Above(float):
     """A lower bound that is itself too low."""
 
@@ -107,6 +111,36 @@ class Config:
         UNSET, "input", "attribute with the shapes of roofs, as roof:shape of OSM has them or codes of CityGML; "
         "empty: a well-known name; only for --roofs planes and skeleton",
     )  # fmt: skip
+    land_cover: tuple[str, ...] = _parameter(
+        (), "input", "vector files of polygons that make patches of the ground: water, street, grass and others"
+    )
+    land_cover_field: str = _parameter(
+        "class", "input", "attribute of land_cover with the class; of several with commas between them the first "
+        "that the table knows counts",
+    )  # fmt: skip
+    land_cover_table: str = _parameter(
+        UNSET, "input", "TOML file with the patches of the ground, their roughness length and classes; empty: ours"
+    )
+    water_points: bool = _parameter(
+        False, "input", "make water where points of class 9 lie: a patch of the ground at one height, beside "
+        "land_cover or alone",
+    )  # fmt: skip
+    vegetation_classes: tuple[int, ...] = _parameter(
+        (), "input", "classes of points that are leaves, 5 or 3,4,5: cells between them are porous; empty: none",
+        least=0, most=255,
+    )  # fmt: skip
+    trees: str = _parameter(
+        UNSET,
+        "input",
+        "vector file of trees: crowns, or positions, with heights or without, whose cells are porous",
+    )
+    leaf_area_density: float = _parameter(
+        0.0, "input", "leaf area density of all trees; 0 takes what points let through, and 1 for trees whose "
+        "height the file states", unit="m2/m3", least=0, most=10,
+    )  # fmt: skip
+    leaf_column: float = _parameter(
+        2.0, "input", "side of the columns in which leaves are counted", unit="m", least=0.5, most=50
+    )
     crs: str = _parameter(
         UNSET, "input", "CRS of the region, as EPSG:NNNN; empty: that of the data, where it states one"
     )
@@ -379,6 +413,16 @@ class Config:
         return bool(self.wall_size or self.refine or self.refine_areas)
 
     @property
+    def covered(self) -> bool:
+        """Whether the ground has patches."""
+        return bool(self.land_cover or self.water_points)
+
+    @property
+    def has_trees(self) -> bool:
+        """Whether cells between leaves are marked."""
+        return bool(self.vegetation_classes or self.trees)
+
+    @property
     def largest_size(self) -> float:
         """Largest target edge length within the region (m)."""
         return self.open_size or self.mesh_size
@@ -470,6 +514,16 @@ def idle_parameters(config: Config) -> list[str]:
         idle.append(f"refine_growth = {config.refine_growth:g} has no effect: it counts with refine, refine_areas")
     if config.refine_attribute != default.refine_attribute and not config.refine_areas:
         idle.append(f"refine_attribute = {config.refine_attribute} has no effect: it counts with refine_areas")
+    idle += [
+        f"{name} = {getattr(config, name)} has no effect: it counts with land_cover"
+        for name in ("land_cover_field", "land_cover_table")
+        if getattr(config, name) != getattr(default, name) and not config.covered
+    ]
+    idle += [
+        f"{name} = {getattr(config, name):g} has no effect: it counts with vegetation_classes, trees"
+        for name in ("leaf_area_density", "leaf_column")
+        if getattr(config, name) != getattr(default, name) and not config.has_trees
+    ]
     if config.layer_growth != default.layer_growth and not config.first_layer:
         idle.append(f"layer_growth = {config.layer_growth:g} has no effect: it counts with first_layer above 0")
     if not config.scheduler:
@@ -506,6 +560,9 @@ def with_absolute_inputs(config: Config) -> Config:
         terrain=tuple(map(absolute, config.terrain)),
         footprints=absolute(config.footprints) if config.footprints else "",
         refine_areas=absolute(config.refine_areas) if config.refine_areas else "",
+        land_cover=tuple(map(absolute, config.land_cover)),
+        land_cover_table=absolute(config.land_cover_table) if config.land_cover_table else "",
+        trees=absolute(config.trees) if config.trees else "",
     )
 
 
@@ -528,7 +585,7 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         raise ConfigError(f"{name} = {_shown(value)}: {wanted.__name__} expected, not {type(value).__name__}")
     if isinstance(value, str):
         _check_text(name, value)
-        if name in ("pointcloud", "footprints", "buildings", "terrain", "refine_areas", "out"):
+        if name in URLS:
             check_url(value)
     return value
 
@@ -597,6 +654,11 @@ def _check_together(config: Config) -> None:
                 f"of {config.mesh_size:g} m; give xmin ymin xmax ymax"
             )
     _check_classes(config.building_classes)
+    if taken := sorted(set(config.vegetation_classes) & {*config.building_classes, *NO_BUILDINGS}):
+        raise ConfigError(
+            f"vegetation_classes = {_shown(config.vegetation_classes)}: {taken[0]} is of ground (2), water (9), "
+            "noise (7, 18) or buildings (building_classes); leave it out"
+        )
     _check_sources(config)
     if config.clearance_floor > config.clearance:
         raise ConfigError(

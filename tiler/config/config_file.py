@@ -156,10 +156,14 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _relative_to(folder: Path, name: str, value: Any) -> Any:
-    if name in ("pointcloud", "buildings", "terrain") and isinstance(value, (str, list)):
+    if name in ("pointcloud", "buildings", "terrain", "land_cover") and isinstance(value, (str, list)):
         value = [value] if isinstance(value, str) else value
         return [_below(folder, item) if isinstance(item, str) else item for item in value]
-    if name in ("footprints", "refine_areas", "out", *TLS) and isinstance(value, str) and value:
+    if (
+        name in ("footprints", "refine_areas", "land_cover_table", "trees", "out", *TLS)
+        and isinstance(value, str)
+        and value
+    ):
         return _below(folder, value)
     return value
 

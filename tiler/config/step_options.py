@@ -43,6 +43,8 @@ SIZE_PARAMETERS = ("open_size", "grading")
 REFINE_PARAMETERS = ("wall_size", "wall_growth", "refinements", "refine_growth")
 # Further ones of both where there is a pad; the first also of what reads its terrain.
 PAD_PARAMETERS = ("core_bounds", "graded_size")
+# Further ones of both where there is land cover: of a run, and what follows from it for its stages.
+COVER_PARAMETERS = ("covered", "clearance", "cover_table", "cover_reach")
 # Parameters of the columns.
 LAYER_PARAMETERS = (
     *("mesh_size", "mesher", "domain_height", "least_spacing", "most_spacing", "stagger", "improve_passes"),
@@ -70,6 +72,8 @@ def derived_parameters(config: Config) -> dict[str, float | str | bool]:
         "tile_size_or_default": config.tile_size_or_default,
         "roof_clearance_or_spacing": max(config.roof_clearance, spacing),
         "roof_group_or_spacing": max(config.roof_group, spacing),
+        "covered": config.covered,
+        "trees_given": bool(config.trees),
         "buildings_given": bool(config.buildings),
         "terrain_given": bool(config.terrain),
         "points_of_models": not config.pointcloud,
@@ -170,6 +174,11 @@ def refined_areas(given: Any) -> list[Finer]:
     sizes = sorted({size for size, _ in areas})
     shapes = {size: shapely.from_wkb([text for other, text in areas if other == size]) for size in sizes}
     return [Finer(size, given.refine_growth - 1, shapely.STRtree(shapes[size])) for size in sizes]
+
+
+def is_covered(given: Any) -> bool:
+    """Whether there is land cover."""
+    return bool(_optional(given, "covered", False))
 
 
 def soil_options(given: Any) -> SoilOptions | None:

@@ -60,7 +60,7 @@ LOCAL: Mapping[str, Any] = {
     "distributed.scheduler.worker-ttl": None,
     "distributed.deploy.lost-worker-timeout": "3650 days",
 }
-PRELOADED = ("distributed.nanny", "tiler.executors.local_cluster", "tiler.stages.own_stages")
+PRELOADED = ("distributed.nanny", "tiler.executors.local_cluster", "tiler.planning.own_stages")
 
 
 def as_variables(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -158,8 +158,8 @@ def divide_cells(
         of_facets = _part_of_facets(cuts, piece, faces, own)
         for found, (keys_of, sets) in zip(counts, kinds, strict=False):
             _count_sets(found, k, of_facets, keys_of(piece), sets.keys)
-        if piece.region is not None:
-            _count_sets(counts[-1], k, own, volumes[0](piece), volumes[1].keys)
+        if len(keys := volumes[0](piece)):
+            _count_sets(counts[-1], k, own, keys, volumes[1].keys)
     if n_cells.min() == 0:
         raise ConfigError(
             f"--parts {n_parts}: the {n:,} cells stand in columns, which are not divided, and these are too few; "

@@ -1,8 +1,9 @@
 """One polyMesh of OpenFOAM: the whole mesh, or the part of one process."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,17 @@ from stitch.pieces.cell_faces import CellFaces
 from tiler.export.cell_parts import CellParts
 from tiler.export.foam_files import FoamFaces, FoamList, foam_header
 from tiler.export.foam_patches import (
+    FIRST_LEAVES,
     GROUND_ZONE,
     POLY_MESH,
     ZonesFile,
+    add_all_leaves,
     cell_zone_name,
     face_zone_name,
     patch_of_key,
     runs_of,
     write_boundary,
+    write_volumes,
 )
 from tiler.export.pieces import Pieces
 from tiler.export.region_faces import (
@@ -40,6 +44,16 @@ from tiler.mesh_files.mesh_pieces import MeshPiece
 DISTANCES = np.logspace(-4, 3, 281)  # m; bins of 6 %
 
 
+def no_keys(_: MeshPiece) -> Ints:
+    """Give no key of cells."""
+    return np.empty(0, np.int64)
+
+
+def leaves_beside(heights: Path) -> Path:
+    """Name the file of the leaf area density of cells (m2/m3), float64, beside that of their heights."""
+    return heights.with_name(f"leaves.{heights.name}")
+
+
 @dataclass(frozen=True)
 class PartCounts:
     """What was written of a mesh, or of one part of it.
@@ -55,6 +69,8 @@ class PartCounts:
     near : mapping of str to int64 (len(DISTANCES) + 1,)
         Of each patch that is a wall, for how many faces the centre of their cell is within `DISTANCES` of their
         plane.
+    leaves : mapping of str to int
+        Cells of each zone of cells between leaves.
     """
 
     cells: int
@@ -65,6 +81,7 @@ class PartCounts:
     lowest: Mapping[str, float]
     highest: Mapping[str, float]
     near: Mapping[str, Ints]
+    leaves: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +105,8 @@ class FoamPlan:
         Part of each cell.
     label : int
         Bits of an integer.
+    volume_keys : callable
+        Gives the key of each cell of a piece, or none at all.
     heights : Path, optional
         A folder for the heights of the centres of cells (m), float64: a file for each part by its number, and for
         two parts ``a`` and ``b`` that meet a file ``a-b`` of the cells of ``a`` at their faces, in their order.
@@ -103,6 +122,7 @@ class FoamPlan:
     parts: CellParts
     label: int
     heights: Path | None = None
+    volume_keys: Callable[[MeshPiece], Ints] = no_keys
 
 
 class PointPlaces:
@@ -198,6 +218,7 @@ class _PartWriter:
         self._lowest: dict[str, float] = {}
         self._highest: dict[str, float] = {}
         self._near: dict[str, Ints] = {}
+        self._leaves: Counter[int] = Counter()
         n = numbers.n_faces
         self._faces = stack.enter_context(FoamFaces(folder / "faces", location=POLY_MESH, label=plan.label, n=n))
         n_points = plan.pieces.n_points if places is None else None
@@ -215,7 +236,7 @@ class _PartWriter:
             self._zones = stack.enter_context(faces)
         self._volumes = None
         if len(plan.volumes.keys):
-            cells = ZonesFile(folder / "cellZones", volumes, numbers.pieces, cell_zone_name)
+            cells = ZonesFile(folder / "cellZones", add_all_leaves(volumes), numbers.pieces, cell_zone_name)
             self._volumes = stack.enter_context(cells)
         self._heights = None
         if plan.heights is not None:
@@ -232,15 +253,19 @@ class _PartWriter:
         local = self._add_points(k, piece, cells)
         self._add_inner(k, piece, faces, local)
         self._add_facets(k, piece, faces, local)
-        if self._volumes is not None and piece.region is not None:
+        if self._volumes is not None:
             number = np.arange(cells.start, cells.stop) if isinstance(cells, slice) else cells
-            region = piece.region[number - start].astype(np.int64)
-            self._volumes.write(k, region, self._plan.parts.place_of(number))
+            keys = self._plan.volume_keys(piece)[number - start]
+            write_volumes(self._volumes, k, keys, self._plan.parts.place_of(number))
+            self._leaves.update(keys[keys >= FIRST_LEAVES].tolist())
         if self._heights is not None:
             rows = slice(0, len(piece.cells)) if isinstance(cells, slice) else cells - start
             z = piece.points[:, 2]
             low, high = (z[piece.cells[rows, k]] + z[piece.cells[rows, k + 1]] for k in (0, 2))
             ((low + high) / 4).tofile(self._heights)
+            if piece.leaves is not None and self._plan.heights is not None:
+                with leaves_beside(self._plan.heights / str(self.numbers.number)).open("ab") as file:
+                    piece.leaves[rows].astype("<f8").tofile(file)
 
     def finish(self) -> PartCounts:
         """Write what stands behind the pieces."""
@@ -250,7 +275,7 @@ class _PartWriter:
             rows = [*range(len(plan.patches.keys)), *(-1 for _ in numbers.others)]
             self._open("boundaryProcAddressing").append(np.array(rows, np.int64))
         patches = {
-            patch_of_key(key): n
+            patch_of_key(key, plan.pieces.ground): n
             for key, n in zip(plan.patches.keys.tolist(), numbers.patch_n.tolist(), strict=True)
         }
         counts = write_boundary(
@@ -266,6 +291,7 @@ class _PartWriter:
             self._lowest,
             self._highest,
             self._near,
+            {cell_zone_name(key): n for key, n in sorted(self._leaves.items())},
         )
 
     def _open(
@@ -374,7 +400,7 @@ class _PartWriter:
             if self._places is not None:
                 first, _, start = self._whole
                 self._face_to.write(at, int(start[row]) + first[k][row] + 1 + in_piece)
-            patch, height = patch_of_key(int(keys[row])), piece.points[facets[chosen], 2]
+            patch, height = patch_of_key(int(keys[row]), self._plan.pieces.ground), piece.points[facets[chosen], 2]
             name = patch.name
             self._lowest[name] = min(self._lowest.get(name, np.inf), float(height.min()))
             self._highest[name] = max(self._highest.get(name, -np.inf), float(height.max()))

@@ -4,12 +4,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import Marker, Region
+from pipeline.data.mesh import GROUND_PATCHES, Marker, Region
 from tiler.export.foam_files import foam_header
 from tiler.export.region_faces import FacetSets, Ints
 
@@ -31,6 +31,9 @@ HOUSE = (Marker.WALL, Marker.ROOF)
 SOLID = (Marker.GROUND, *HOUSE, Marker.FOUNDATION)
 FIRST_BUILDING = 100  # keys of patches from here on are buildings, those below are markers
 GROUND_ZONE = 1 << 62  # key of the face zone of the ground, where it is inside; those below are buildings
+VEGETATION = "vegetation"  # begins the names of the zones of cells between leaves
+FIRST_LEAVES, LEAF_KEYS = 100, 1000  # keys of these: from the first on, so many to 1 m2/m3
+ALL_LEAVES = 1 << 40  # key of the zone of all of them
 WIDTH = 20  # characters of a face's number in a zone, its line break among them
 
 
@@ -51,16 +54,22 @@ class Patch:
     groups: tuple[str, ...]
 
 
-def patch_of_key(key: int) -> Patch:
+def patch_of_key(key: int, ground: Sequence[str] = ()) -> Patch:
     """Return the patch of a key: a marker, or `FIRST_BUILDING` and the number of a building.
+
+    `ground` has the names of the patches of the ground, whose keys are `GROUND_PATCHES` and their number.
 
     Examples
     --------
     >>> patch_of_key(4).name, patch_of_key(107)
     ('top', Patch(name='building_7', kind='wall', groups=('wall', 'buildings')))
+    >>> patch_of_key(32, ["ground", "ground_water", "ground_street"])
+    Patch(name='ground_street', kind='wall', groups=('wall', 'grounds'))
     """
     if key >= FIRST_BUILDING:
         return Patch(building_name(key - FIRST_BUILDING), "wall", ("wall", "buildings"))
+    if key > GROUND_PATCHES:
+        return Patch(ground[key - GROUND_PATCHES], "wall", ("wall", "grounds"))
     marker = Marker(key)
     if marker not in SOLID:
         return Patch(PATCHES[marker], "patch", ())
@@ -124,14 +133,50 @@ def face_zone_name(key: int) -> str:
 
 
 def cell_zone_name(key: int) -> str:
-    """Name a cell zone: that of a region.
+    """Name a cell zone: that of a region, or of cells between leaves of one density.
 
     Examples
     --------
-    >>> cell_zone_name(1)
-    'soil'
+    >>> cell_zone_name(1), cell_zone_name(leaf_key(np.array([0.538]))[0])
+    ('soil', 'vegetation_0.538')
     """
+    if key == ALL_LEAVES:
+        return VEGETATION
+    if key >= FIRST_LEAVES:
+        return f"{VEGETATION}_{(key - FIRST_LEAVES) / LEAF_KEYS:g}"
     return Region(key).name.lower()
+
+
+def leaf_key(density: NDArray[np.floating[Any]]) -> Ints:
+    """Give the key of the cell zone of leaf area densities above 0 (m2/m3)."""
+    return FIRST_LEAVES + np.rint(density.astype(np.float64) * LEAF_KEYS).astype(np.int64)
+
+
+def add_all_leaves(sets: FacetSets) -> FacetSets:
+    """Add the zone of all cells between leaves, if there are any, to the zones of one density.
+
+    Examples
+    --------
+    >>> found = add_all_leaves(FacetSets(np.array([1, 638, 853]), {0: {0: 9, 1: 2, 2: 3}}))
+    >>> found.keys.tolist(), found.counts
+    ([1, 638, 853, 1099511627776], {0: {0: 9, 1: 2, 2: 3, 3: 5}})
+    """
+    leaves = sets.keys >= FIRST_LEAVES
+    if not leaves.any():
+        return sets
+    row = len(sets.keys)
+    counts = {
+        k: {**found, row: n} if (n := sum(count for key, count in found.items() if leaves[key])) else found
+        for k, found in sets.counts.items()
+    }
+    return FacetSets(np.append(sets.keys, ALL_LEAVES), counts)
+
+
+def write_volumes(file: "ZonesFile", k: int, keys: Ints, numbers: Ints) -> None:
+    """Write which cells of piece `k` are in the zones `keys`, and in that of all leaves."""
+    file.write(k, keys, numbers)
+    if (leafy := keys >= FIRST_LEAVES).any():
+        file.write(k, np.where(leafy, ALL_LEAVES, -1), numbers)
 
 
 def interface_name(number: int, other: int) -> str:

@@ -6,8 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiler.export.foam_files import LABEL_LIMIT, FoamList, foam_header
-from tiler.export.foam_part import PartCounts, count_distances
-from tiler.export.foam_patches import POLY_MESH, patch_keys, patch_of_key, write_boundary
+from tiler.export.foam_part import PartCounts, count_distances, leaves_beside
+from tiler.export.foam_patches import (
+    POLY_MESH,
+    ZonesFile,
+    add_all_leaves,
+    cell_zone_name,
+    leaf_key,
+    patch_keys,
+    patch_of_key,
+    write_boundary,
+    write_volumes,
+)
+from tiler.export.region_faces import FacetSets
 from tiler.mesh_files.prisms import NO_CORNER, PrismMesh
 
 
@@ -51,7 +62,7 @@ def write_foam_prisms(
         with FoamList(place / name, header, dtype, width=rows[:1].size, n=len(rows)) as file:
             file.write(0, rows)
     present, first, n = np.unique(keys, return_index=True, return_counts=True)
-    patches = {patch_of_key(int(key)): int(count) for key, count in zip(present, n, strict=True)}
+    patches = {patch_of_key(int(key), mesh.ground): int(count) for key, count in zip(present, n, strict=True)}
     counts = write_boundary(place / "boundary", patches, start=len(mesh.inner), number=0, others={})
     lowest, highest, near = {}, {}, {}
     for patch, start, count in zip(patches, first.tolist(), n.tolist(), strict=True):
@@ -63,9 +74,23 @@ def write_foam_prisms(
             near[patch.name] = count_distances(mesh.points, mesh.cells[outer_cell[mine]], outer[mine])
     if heights is not None:
         mesh.points[mesh.cells, 2].mean(axis=1).tofile(heights / "0")
+    leaves = _write_leaves(place / "cellZones", mesh, heights) if mesh.leaves is not None else {}
     return PartCounts(
-        len(mesh.cells), len(mesh.points), len(faces), len(mesh.inner), counts, lowest, highest, near
+        len(mesh.cells), len(mesh.points), len(faces), len(mesh.inner), counts, lowest, highest, near, leaves
     )
+
+
+def _write_leaves(path: Path, mesh: PrismMesh, heights: Path | None) -> dict[str, int]:
+    """Write the zones of cells between leaves, and their density beside the heights; gives the cells of each."""
+    density = np.zeros(0, np.float32) if mesh.leaves is None else mesh.leaves
+    keys = np.where(density > 0, leaf_key(density), -1)
+    present, count = np.unique(keys[keys >= 0], return_counts=True)
+    sets = FacetSets(present, {0: dict(enumerate(count.tolist()))})
+    with ZonesFile(path, add_all_leaves(sets), [0], cell_zone_name) as file:
+        write_volumes(file, 0, keys, np.arange(len(keys)))
+    if heights is not None:
+        density.astype("<f8").tofile(leaves_beside(heights / "0"))
+    return dict(zip(map(cell_zone_name, present.tolist()), count.tolist(), strict=True))
 
 
 def _write_faces(path: Path, faces: NDArray[np.int64], size: NDArray[np.int64], label: int) -> None:

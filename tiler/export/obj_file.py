@@ -38,7 +38,7 @@ def write_obj(path: Path, surface: Surface, *, buildings: str | None = None) -> 
         file.seek(start + survey.n_vertices * VERTEX_BYTES)
         places = {}
         for key, n in survey.facets.items():
-            file.write(f"g {patch_of_key(key).name}\n".encode())
+            file.write(f"g {patch_of_key(key, surface.ground).name}\n".encode())
             places[key] = file.tell()
             file.seek(n * width, 1)
         file.truncate()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.data.mesh import Marker
+from pipeline.data.mesh import Marker, is_ground
 from tiler.export.obj_file import write_obj
 from tiler.export.surface import BoundaryPart, RunSurface, Surface, open_surface
 from tiler.mesh_files.run_files import RunSource
@@ -36,12 +36,18 @@ class LiftedGround:
         """Number of different points of the whole mesh."""
         return self.surface.n_points
 
+    @property
+    def ground(self) -> tuple[str, ...]:
+        """Names of the patches of the ground, by number."""
+        return self.surface.ground
+
     def read(self, k: int) -> BoundaryPart:
         """Read the ground of piece `k`."""
         piece = self.surface.read(k)
-        ground = piece.marker == Marker.GROUND
+        ground = is_ground(piece.marker)
+        marker = np.full(int(ground.sum()), Marker.GROUND, np.int32)  # one group, of whatever patches
         points = piece.points + np.array([0.0, 0.0, self.height])
-        return BoundaryPart(points, piece.facets[ground], piece.marker[ground], piece.building[ground], piece.ids)
+        return BoundaryPart(points, piece.facets[ground], marker, piece.building[ground], piece.ids)
 
 
 def write_pedestrian_surface(path: Path, source: RunSource, *, height: float) -> None:

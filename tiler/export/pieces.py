@@ -22,6 +22,10 @@ class Pieces(Protocol):
     def n_points(self) -> int:
         """Number of different points of the whole mesh."""
 
+    @property
+    def ground(self) -> tuple[str, ...]:
+        """Names of the patches of the ground, by number; none without land cover."""
+
     def read(self, k: int) -> MeshPiece:
         """Read piece `k`."""
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import Marker, Region
+from pipeline.data.mesh import Region, is_ground
 from stitch.pieces.cell_faces import CellFaces, find_cell_faces
 from stitch.pieces.conformity import group_rows
 from tiler.export.pieces import Pieces
@@ -214,7 +214,7 @@ def find_outer(piece: MeshPiece) -> NDArray[np.bool_]:
     """Return which facets of a piece bound its cells, bool (f,): all, but for the ground with soil below it."""
     if piece.region is None:
         return np.ones(len(piece.facets), np.bool_)
-    outer: NDArray[np.bool_] = piece.marker != Marker.GROUND
+    outer: NDArray[np.bool_] = ~is_ground(piece.marker)
     return outer
 
 

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
+from pipeline.data.mesh import GROUND_PATCHES
 from tiler.export.foam_patches import PATCHES, patch_keys
 from tiler.export.pieces import blocks_of
 from tiler.mesh_files.merged import VERTEX_ID, number_piece
-from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces, mark_sides, open_pieces
+from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces, mark_facets, open_pieces
 from tiler.mesh_files.run_files import RunSource
 from tiler.mesh_files.vtk_files import read_vtp
 from tiler.store.atomic import replacing
@@ -47,6 +48,10 @@ class Surface(Protocol):
     def n_points(self) -> int:
         """Number of different points of the whole mesh."""
 
+    @property
+    def ground(self) -> tuple[str, ...]:
+        """Names of the patches of the ground, by number; none without land cover."""
+
     def read(self, k: int) -> SurfacePiece:
         """Read piece `k`."""
 
@@ -67,6 +72,11 @@ class RunSurface:
         """Number of different points of the whole mesh."""
         return self.pieces.n_points
 
+    @property
+    def ground(self) -> tuple[str, ...]:
+        """Names of the patches of the ground, by number; none without land cover."""
+        return self.pieces.ground
+
     def read(self, k: int) -> BoundaryPart:
         """Read piece `k`.
 
@@ -77,8 +87,8 @@ class RunSurface:
         """
         path = self.pieces.files.boundaries[k]
         piece = read_vtp(path)
-        marks = mark_sides(self.pieces.files, piece)
-        if not np.isin(marks, [int(marker) for marker in PATCHES]).all():
+        marks = mark_facets(self.pieces.files, path, piece)
+        if not np.isin(marks[marks <= GROUND_PATCHES], [int(marker) for marker in PATCHES]).all():
             raise InputError(
                 f"{path}: markers {marks.min()}..{marks.max()}, known are 1..{max(PATCHES)}; run the tile again"
             )

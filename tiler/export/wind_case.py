@@ -4,6 +4,7 @@ A logarithmic profile at the sides that the wind enters, pressure at those that 
 top that drives the flow by the shear of the profile.
 """
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from tiler.export.foam_case import write_system
 from tiler.export.foam_files import foam_header
+from tiler.export.foam_part import leaves_beside
 from tiler.export.foam_patches import interface_name
 from tiler.export.pieces import ROWS
 from tiler.export.wind_profile import (
@@ -29,6 +31,7 @@ from tiler.export.wind_profile import (
     flow_of,
     split_sides,
 )
+from tiler.store.run_folder import LEAVES
 
 Profile = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # values by height above ground (m)
 AIR = 1.5e-5  # kinematic viscosity, m2/s
@@ -56,6 +59,26 @@ RAS
     printCoeffs on;
     // With this sigmaEps the profile of the inlet is a solution (Richards and Hoxey 1993); 1.3 is the usual one.
     kEpsilonCoeffs {{ Cmu {c_mu}; C1 {c_1}; C2 {c_2}; sigmaEps {sigma:.6f}; }}
+}}
+"""
+
+DRAG = 0.2  # coefficient of leaves
+LEAF_WORDS = """// Drag of leaves: - Cd LAD |U| U, Cd = 0.2, with the leaf area density of each zone (field lad).
+// The porous source of OpenFOAM is - (nu d + |U| f / 2) U, so f = 2 Cd LAD. k and epsilon have no source.
+"""
+POROUS = """{zone}
+{{
+    type    explicitPorositySource;
+    active  yes;
+    explicitPorositySourceCoeffs
+    {{
+        selectionMode cellZone;
+        cellZone      {zone};
+        type          DarcyForchheimer;
+        d             (0 0 0);
+        f             ({f:.9g} {f:.9g} {f:.9g});
+        coordinateSystem {{ type cartesian; origin (0 0 0); rotation {{ type axes; e1 (1 0 0); e2 (0 1 0); }} }}
+    }}
 }}
 """
 
@@ -104,12 +127,15 @@ class Domain:
     heights : sequence of Path
         For each part a file of the heights of the centres of its cells (m), float64; beside them those of cells at
         faces between two parts, see `tiler.export.foam_part.FoamPlan`.
+    leaves : sequence of str
+        Zones of cells between leaves.
     """
 
     patches: Mapping[str, int]
     lowest: Mapping[str, float]
     highest: Mapping[str, float]
     heights: Sequence[Path]
+    leaves: Sequence[str] = ()
 
     @property
     def flat_top(self) -> bool:
@@ -220,12 +246,19 @@ def _write_case(case: Path, domain: Domain, wind: Wind, direction: float, *, par
     (case / "constant" / "wind").write_text(
         CONDITIONS.format(**words, direction=direction, sides=", ".join(inlets), east=east, north=north)
     )
+    if domain.leaves:
+        drag = [(zone, 2 * DRAG * float(zone.rpartition("_")[2])) for zone in domain.leaves]
+        sources = "".join(POROUS.format(zone=zone, f=f) for zone, f in drag)
+        header = foam_header("fvOptions", "dictionary", location="constant")
+        (case / "constant" / "fvOptions").write_text(header + LEAF_WORDS + sources)
     fields = _fields(domain, wind, (east, north), top, Roles(inlets, outlets, [*along, "missing"]))
     starts = [case] if parts is None else [case / f"processor{n}" for n in range(parts)]
     for start, heights in zip(starts, domain.heights, strict=True):
         (start / "0").mkdir(parents=True)
         for name, field in fields.items():
             _write_field(start / "0" / name, field, heights, ground)
+        if leaves_beside(heights).exists():
+            _write_leaves(start / "0" / LEAVES, leaves_beside(heights))
     run = "simpleFoam" if parts is None else f"mpirun -np {parts} $MPI_FLAGS simpleFoam -parallel"
     _write_script(case / "Allrun", ALLRUN.format(command=run))
     slip = f"; slip along {', '.join(along)}" if along else ""
@@ -331,7 +364,8 @@ def _fields(domain: Domain, wind: Wind, flow: tuple[float, float], top: float, r
             },
         ),
     }
-    rough = {"ground": wind.roughness, **wind.patches}
+    grounds = [name for name in domain.patches if name.startswith("ground_")]
+    rough = {**dict.fromkeys(("ground", *grounds), wind.roughness), **wind.patches}
     inner: dict[str, Profile] = {
         "U": lambda h: np.multiply.outer(wind.speed_at(h), np.array([east, north, 0.0])),
         "epsilon": wind.epsilon_at,
@@ -343,7 +377,7 @@ def _fields(domain: Domain, wind: Wind, flow: tuple[float, float], top: float, r
             **dict.fromkeys(roles.outlets, of_role["outlet"]),
             **dict.fromkeys(roles.along, slip),
             "top": of_role["top"],
-            **dict.fromkeys(("ground", *SOLID, BUILDINGS), of_role["solid"]),
+            **dict.fromkeys(("ground", *grounds, *SOLID, BUILDINGS), of_role["solid"]),
         }
         if name == "nut":
             conditions |= {patch: _rough(z0) for patch, z0 in rough.items()}
@@ -373,6 +407,20 @@ def _write_field(path: Path, field: Field, heights: Path, ground: float) -> None
             _write_values(file, field, beyond, ground)
             file.write(b"}\n")
         file.write(b"}\n")
+
+
+def _write_leaves(path: Path, leaves: Path) -> None:
+    """Write the leaf area density of cells as a field."""
+    header = foam_header(path.name, "volScalarField", location="0", binary=True)
+    with path.open("wb") as file:
+        file.write(f"{header}dimensions      [0 -1 0 0 0 0 0];\n".encode())
+        file.write(f"internalField   nonuniform List<scalar> {leaves.stat().st_size // 8}\n(".encode())
+        with leaves.open("rb") as rows:
+            shutil.copyfileobj(rows, file)
+        words = (
+            f'    ".*" {{ type calculated; value uniform 0; }}\n    {PARTS} {{ type processor; value uniform 0; }}'
+        )
+        file.write(f")\n;\nboundaryField\n{{\n{words}\n}}\n".encode())
 
 
 def _write_values(file: BinaryIO, field: Field, heights: Path, ground: float) -> None:

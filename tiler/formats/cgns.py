@@ -46,6 +46,7 @@ class _Survey:
     n_points: int
     n_cells: int
     facets: dict[int, dict[int, int]]
+    ground: tuple[str, ...]  # names of its patches
     width: int = 4  # corners of a cell
 
     @property
@@ -100,7 +101,7 @@ def _write_prisms(path: Path, mesh: PrismMesh, crs: str, *, by_building: bool) -
         for key, rows in facets_by_key(np.unique(keys).tolist(), keys):
             facets.setdefault(key, {})[width] = corners[rows]
     counts = {key: {width: len(rows) for width, rows in facets[key].items()} for key in sorted(facets)}
-    survey = _Survey(len(mesh.points), len(mesh.cells), counts, width=6)
+    survey = _Survey(len(mesh.points), len(mesh.cells), counts, mesh.ground, width=6)
     with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
         zone = _write_tree(file, survey, crs)
         for axis, name in enumerate("XYZ"):
@@ -108,7 +109,9 @@ def _write_prisms(path: Path, mesh: PrismMesh, crs: str, *, by_building: bool) -
         zone[f"{CELLS}/ElementConnectivity/ data"][:] = mesh.cells.ravel() + 1
         for key, parts in facets.items():
             for width, rows in parts.items():
-                zone[f"{_section(key, width)}/ElementConnectivity/ data"][:] = rows.ravel() + 1
+                zone[f"{_section(patch_of_key(key, mesh.ground), width)}/ElementConnectivity/ data"][:] = (
+                    rows.ravel() + 1
+                )
 
 
 def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = None) -> None:
@@ -134,7 +137,7 @@ def write_cgns(path: Path, pieces: Pieces, *, crs: str, buildings: str | None = 
     with h5py.File(path, "w", libver=("earliest", "v108"), track_order=True) as file:
         zone = _write_tree(file, survey, crs)
         coordinates = [zone[f"GridCoordinates/Coordinate{axis}/ data"] for axis in "XYZ"]
-        sections = {0: CELLS} | {key: _section(key, 3) for key in survey.facets}
+        sections = {0: CELLS} | {key: _section(patch_of_key(key, survey.ground), 3) for key in survey.facets}
         seen = dict.fromkeys(sections, 0)
         for k in range(len(pieces.names)):
             piece = pieces.read(k)
@@ -164,12 +167,12 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
         )
         for key, n in zip(keys.tolist(), counts.tolist(), strict=True):
             facets[key] = facets.get(key, 0) + n
-    return _Survey(pieces.n_points, n_cells, {key: {3: n} for key, n in sorted(facets.items())})
+    return _Survey(pieces.n_points, n_cells, {key: {3: n} for key, n in sorted(facets.items())}, pieces.ground)
 
 
-def _section(key: int, width: int) -> str:
+def _section(patch: Patch, width: int) -> str:
     """Name the section of a patch's facets with so many corners."""
-    return patch_of_key(key).name + (QUADRILATERALS if width == 4 else "")
+    return patch.name + (QUADRILATERALS if width == 4 else "")
 
 
 def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
@@ -184,7 +187,7 @@ def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
     units = np.stack([_characters(unit.ljust(32)) for unit in UNITS])
     _node(base, "DimensionalUnits", "DimensionalUnits_t", units)
     _node(base, "CRS", "Descriptor_t", crs)
-    patches = {key: patch_of_key(key) for key in survey.facets}
+    patches = {key: patch_of_key(key, survey.ground) for key in survey.facets}
     for patch in patches.values():
         _write_family(base, patch)
     size = np.array([[survey.n_points], [survey.n_cells], [0]], f"<{kind}")
@@ -200,7 +203,7 @@ def _write_tree(file: h5py.File, survey: _Survey, crs: str) -> h5py.Group:
     for key, patch in patches.items():
         begin = first
         for width, n in survey.facets[key].items():
-            _write_section(zone, _section(key, width), width, first, n, kind)
+            _write_section(zone, _section(patch, width), width, first, n, kind)
             first += n
         condition = _node(conditions, patch.name, "BC_t", "FamilySpecified")
         _node(condition, "PointRange", "IndexRange_t", np.array([[begin], [first - 1]], f"<{kind}"))

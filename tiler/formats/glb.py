@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import Marker
+from pipeline.data.mesh import GROUND_PATCHES, Marker
 from tiler.export.export import LARGEST_PART, Format
-from tiler.export.foam_patches import FIRST_BUILDING, PATCHES, building_name, facets_by_key, is_house
+from tiler.export.foam_patches import FIRST_BUILDING, building_name, facets_by_key, is_house, patch_of_key
 from tiler.export.surface import (
     Surface,
     SurfacePiece,
@@ -39,6 +39,16 @@ COLOURS = {
     Marker.ROOF: (0.66, 0.33, 0.25),
     Marker.BOTTOM: EARTH,
     Marker.FOUNDATION: EARTH,
+}
+GROUND_COLOURS = {
+    "ground_water": (0.3, 0.46, 0.62),
+    "ground_street": (0.42, 0.42, 0.43),
+    "ground_rail": (0.5, 0.44, 0.4),
+    "ground_sand": (0.8, 0.74, 0.58),
+    "ground_forest": (0.2, 0.36, 0.2),
+    "ground_scrub": (0.4, 0.48, 0.28),
+    "ground_grass": (0.47, 0.62, 0.35),
+    "ground_field": (0.68, 0.64, 0.4),
 }
 SIDE_COLOUR, SIDE_OPACITY = (0.6, 0.75, 0.9), 0.1  # of top and sides, through which the city is seen
 
@@ -98,7 +108,7 @@ def write_glb(path: Path, surface: Surface, *, crs: str, buildings: str | None =
     if not survey.n_facets:
         raise InputError("boundary: has no facets, and GLB no empty meshes; mesh the region again")
     origin = np.floor([*(survey.low + survey.high)[:2] / 2, survey.low[2]])
-    text = json.dumps(_document(survey, origin, crs), separators=(",", ":")).encode()
+    text = json.dumps(_document(survey, origin, crs, surface.ground), separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     data = _data_bytes(survey)
     total = 28 + len(text) + data
@@ -133,10 +143,10 @@ def _by_building_and_marker(piece: SurfacePiece) -> NDArray[np.int64]:
     return np.where(is_house(piece.marker, piece.building), keys, piece.marker)
 
 
-def _of_key(key: int) -> tuple[int, Marker]:
+def _of_key(key: int) -> tuple[int, int]:
     """Return number of building, -1 for none, and marker of a key."""
     if key < FIRST_BUILDING:
-        return -1, Marker(key)
+        return -1, key
     number, roof = divmod(key - FIRST_BUILDING, 2)
     return number, Marker.ROOF if roof else Marker.WALL
 
@@ -150,7 +160,9 @@ def _data_bytes(survey: SurfaceSurvey) -> int:
     return survey.n_vertices * VERTEX_BYTES + survey.n_facets * FACET_BYTES
 
 
-def _document(survey: SurfaceSurvey, origin: NDArray[np.float64], crs: str) -> dict[str, Any]:
+def _document(
+    survey: SurfaceSurvey, origin: NDArray[np.float64], crs: str, ground: tuple[str, ...]
+) -> dict[str, Any]:
     # Rounding keeps order, so the corners of the box are turned into the exact least and greatest coordinates.
     box = _local(np.stack((survey.low, survey.high)), origin)
     split = survey.n_vertices * VERTEX_BYTES
@@ -193,7 +205,7 @@ def _document(survey: SurfaceSurvey, origin: NDArray[np.float64], crs: str) -> d
         "scenes": [{"nodes": list(range(len(nodes)))}],
         "nodes": nodes,
         "meshes": [{"name": names[number], "primitives": parts} for number, parts in primitives.items()],
-        "materials": [_material(marker) for marker in materials],
+        "materials": [_material(marker, patch_of_key(marker, ground).name) for marker in materials],
         "accessors": [position, *indices],
         "bufferViews": [
             {"buffer": 0, "byteLength": split, "target": VERTICES},
@@ -203,12 +215,16 @@ def _document(survey: SurfaceSurvey, origin: NDArray[np.float64], crs: str) -> d
     }
 
 
-def _material(marker: Marker) -> dict[str, Any]:
+def _material(marker: int, name: str) -> dict[str, Any]:
     """Colour a patch; its back is what one sees from the air."""
-    solid = marker in COLOURS
-    colour = [*COLOURS.get(marker, SIDE_COLOUR), 1.0 if solid else SIDE_OPACITY]
+    colours = {int(key): colour for key, colour in COLOURS.items()}
+    if marker > GROUND_PATCHES:
+        colours[marker] = GROUND_COLOURS.get(name, COLOURS[Marker.GROUND])
+    known = colours.get(marker)
+    solid = known is not None
+    colour = [*(known or SIDE_COLOUR), 1.0 if solid else SIDE_OPACITY]
     surface = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
-    material = {"name": PATCHES[marker], "pbrMetallicRoughness": surface, "doubleSided": True}
+    material = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
     return material if solid else material | {"alphaMode": "BLEND"}
 
 

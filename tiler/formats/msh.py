@@ -43,6 +43,7 @@ class _Survey:
     cells: dict[int, int]
     facets: dict[int, int]
     boxes: dict[int, _Box]
+    ground: tuple[str, ...]
 
     @property
     def n_elements(self) -> int:
@@ -52,7 +53,7 @@ class _Survey:
     @property
     def groups(self) -> list[tuple[int, int, str]]:
         """Dimension, number and name of each physical group."""
-        names = [(2, number, patch_of_key(key).name) for key, number in self.numbers.items()]
+        names = [(2, number, patch_of_key(key, self.ground).name) for key, number in self.numbers.items()]
         return sorted([*names, *((3, group, NAMES[group]) for group in self.cells)])
 
     @property
@@ -133,7 +134,7 @@ def _export_prisms(output: Path, mesh: PrismMesh, origin: str, *, by_building: b
             blocks.append((key, kind, corners[rows]))
             counts[key] = counts.get(key, 0) + len(rows)
             boxes[key] = _grown(boxes.get(key, _no_box()), mesh.points[corners[rows].ravel()])
-    survey = _Survey(len(mesh.points), {AIR: len(mesh.cells)}, dict(sorted(counts.items())), boxes)
+    survey = _Survey(len(mesh.points), {AIR: len(mesh.cells)}, dict(sorted(counts.items())), boxes, mesh.ground)
     numbers = survey.numbers | {AIR: AIR}
     with replacing(output) as part, part.open("wb") as file:
         _write_head(file, origin)
@@ -214,7 +215,9 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
             used = np.zeros(len(piece.points), np.bool_)
             used[corners] = True
             boxes[group] = _grown(boxes.get(group, _no_box()), piece.points[used])
-    return _Survey(pieces.n_points, dict(sorted(cells.items())), dict(sorted(facets.items())), boxes)
+    return _Survey(
+        pieces.n_points, dict(sorted(cells.items())), dict(sorted(facets.items())), boxes, pieces.ground
+    )
 
 
 def _groups(piece: MeshPiece) -> NDArray[np.int64]:

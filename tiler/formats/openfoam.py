@@ -8,7 +8,7 @@ the same order on both sides, and the addressing to the whole mesh lies beside i
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Unpack
@@ -21,7 +21,7 @@ from tiler.export.export import CELLS, EXPORT_RECORD, LARGEST_PART, ORIGIN, Form
 from tiler.export.foam_case import write_system
 from tiler.export.foam_files import LABEL_LIMIT
 from tiler.export.foam_part import DISTANCES, FoamPlan, PartCounts, PointPlaces, write_part
-from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, interface_name, is_house
+from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, interface_name, is_house, leaf_key
 from tiler.export.foam_prisms import write_foam_prisms
 from tiler.export.pedestrian_surface import write_pedestrian_surface
 from tiler.export.pieces import Pieces
@@ -108,7 +108,10 @@ def export_openfoam(
         else:
             surface = folder / "constant" / "triSurface" / f"{PEDESTRIAN}.obj"
             write_pedestrian_surface(surface, pieces.files, height=PEDESTRIAN_HEIGHT)
-            notes = write_wind_cases(folder, _describe_domain(counts, heights), blowing, parts=parts)
+            domain = _describe_domain(counts, heights)
+            own = {name: z0 for name, z0 in pieces.files.ground if z0 is not None and domain.patches.get(name)}
+            blowing = replace(blowing, patches={**own, **blowing.patches})
+            notes = write_wind_cases(folder, domain, blowing, parts=parts)
             notes += _tell_near_walls(counts, blowing)
         # ParaView opens a case by an empty file.
         (folder / "case.foam").touch()
@@ -130,7 +133,8 @@ def _describe_domain(counts: Sequence[PartCounts], heights: Path) -> Domain:
         patches.update({name: n for name, n in part.patches.items() if name in part.lowest})
         lowest |= {name: min(z, lowest.get(name, z)) for name, z in part.lowest.items()}
         highest |= {name: max(z, highest.get(name, z)) for name, z in part.highest.items()}
-    return Domain(patches, lowest, highest, tuple(heights / str(n) for n in range(len(counts))))
+    leaves = sorted(set().union(*(part.leaves for part in counts)))
+    return Domain(patches, lowest, highest, tuple(heights / str(n) for n in range(len(counts))), tuple(leaves))
 
 
 def _tell_near_walls(counts: Sequence[PartCounts], wind: Wind) -> list[str]:
@@ -174,6 +178,8 @@ def _record(counts: Sequence[PartCounts], parts: int | None) -> dict[str, Any]:
     meshes = [asdict(part) for part in counts]
     for mesh in meshes:
         del mesh["near"]
+        if not mesh["leaves"]:
+            del mesh["leaves"]
     return {**record, "meshes": meshes}
 
 
@@ -228,19 +234,21 @@ def write_openfoam(
         columns = ColumnsFile(scratch / "columns")
         look = None if parts is None else columns.add
         region, (patches, zones, volumes) = survey_faces(
-            pieces, scratch, kinds=(sets_of, zones_of, _by_region), look=look
+            pieces, scratch, kinds=(sets_of, zones_of, _by_volume), look=look
         )
         if parts is None:
             divided = take_whole(region, (patches, zones, volumes))
         else:
             kinds = ((sets_of, patches), (zones_of, zones))
             divided = divide_cells(
-                pieces, region, columns, scratch, n_parts=parts, kinds=kinds, volumes=(_by_region, volumes)
+                pieces, region, columns, scratch, n_parts=parts, kinds=kinds, volumes=(_by_volume, volumes)
             )
         n_faces = region.n_inner + int(patches.first(range(len(pieces.names)))[1].sum())
         label = 32 if max(3 * n_faces, pieces.n_points, int(region.cell_start[-1])) <= LABEL_LIMIT else 64
         zoned = buildings == "zones" or len(zones.keys) > 0
-        plan = FoamPlan(pieces, region, patches, volumes, zoned, sets_of, zones_of, divided, label, heights)
+        plan = FoamPlan(
+            pieces, region, patches, volumes, zoned, sets_of, zones_of, divided, label, heights, _by_volume
+        )
         if parts is None:
             return [write_part(folder, plan, 0, None)]
         places = PointPlaces(scratch / "places", pieces.n_points)
@@ -264,8 +272,12 @@ def _by_ground(piece: MeshPiece) -> Ints:
     return np.where(find_outer(piece), -1, GROUND_ZONE)
 
 
-def _by_region(piece: MeshPiece) -> Ints:
-    return np.empty(0, np.int64) if piece.region is None else piece.region.astype(np.int64)
+def _by_volume(piece: MeshPiece) -> Ints:
+    """Give the key of each cell's zone, -1 for none; nothing at all where no cell can have one."""
+    if piece.leaves is None:
+        return np.empty(0, np.int64) if piece.region is None else piece.region.astype(np.int64)
+    of_region = -1 if piece.region is None else piece.region.astype(np.int64)
+    return np.where(piece.leaves > 0, leaf_key(piece.leaves), of_region)
 
 
 FORMAT = Format(

@@ -41,7 +41,7 @@ def write_ply(path: Path, surface: Surface) -> None:
             f"boundary: {survey.n_vertices} vertices; PLY's bound: {MOST_VERTICES}; export parts of the region"
         )
     with path.open("wb") as file:
-        file.write(_header(survey))
+        file.write(_header(survey, surface.ground))
         start = file.tell()
         face = start + survey.n_vertices * VERTEX_BYTES
         for k in range(len(surface.names)):
@@ -57,11 +57,11 @@ def write_ply(path: Path, surface: Surface) -> None:
             face += rows.nbytes
 
 
-def _header(survey: SurfaceSurvey) -> bytes:
+def _header(survey: SurfaceSurvey, ground: tuple[str, ...]) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        *(f"comment marker {key} {patch_of_key(key).name}" for key in survey.facets),
+        *(f"comment marker {key} {patch_of_key(key, ground).name}" for key in survey.facets),
         f"element vertex {survey.n_vertices}",
         *(f"property double {axis}" for axis in "xyz"),
         f"element face {survey.n_facets}",

@@ -43,7 +43,7 @@ def write_stl(path: Path, surface: Surface, *, buildings: str | None = None) -> 
     with path.open("wb") as file:
         places = {}
         for key, n in survey.facets.items():
-            name = patch_of_key(key).name
+            name = patch_of_key(key, surface.ground).name
             file.write(f"solid {name}\n".encode())
             places[key] = file.tell()
             file.seek(n * FACET_BYTES, 1)

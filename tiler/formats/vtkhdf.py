@@ -17,6 +17,7 @@ from tiler.mesh_files.merged import NO_PLACE, Place
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import disk_errors, replacing
+from tiler.store.run_folder import LEAVES
 
 VERSION = (2, 2)  # of the format that VTK 9.4 reads
 ROOT = "VTKHDF"
@@ -80,6 +81,8 @@ def write_vtkhdf(path: Path, pieces: Pieces, *, crs: str, origin: Place = NO_PLA
             of_cells: dict[str, NDArray[Any]] = {"tile": np.full(len(piece.cells), k, np.int32)}
             if piece.region is not None:
                 of_cells["region"] = piece.region
+            if piece.leaves is not None:
+                of_cells[LEAVES] = piece.leaves
             runs = [(start, piece.points[rows]) for start, rows in blocks_of(piece.ids)]
             mesh.add(runs, piece.ids[piece.cells], of_cells)
             runs, facets = place_vertices(piece, survey.vertices)

@@ -13,6 +13,7 @@ from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunFiles
 from tiler.mesh_files.vtk_files import stream_offsets
 from tiler.mesh_files.vtk_xml import Stream, stream_items, write_data_file
+from tiler.store.run_folder import LEAVES
 
 WEDGE = 13  # number of VTK, whose measures of volume and shape are positive for corners in our order
 
@@ -30,6 +31,7 @@ def write_prisms(path: Path, mesh: PrismMesh, *, scalars: bool = False) -> None:
     n = len(mesh.cells)
     number = np.dtype(np.int32 if len(mesh.points) < 2**31 else np.int64)
     tiles = [_stream(TILE, mesh.tile, mesh.tile.dtype)] if scalars else []
+    tiles += [_stream(LEAVES, mesh.leaves, mesh.leaves.dtype)] if mesh.leaves is not None else []
     sections = {
         "Points": [_stream("Points", mesh.points, mesh.points.dtype, components=3)],
         "Cells": [

@@ -18,6 +18,7 @@ from tiler.mesh_files.mesh_pieces import MeshPieces, open_pieces
 from tiler.mesh_files.prisms import PrismMesh, read_prisms
 from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import disk_errors, replacing
+from tiler.store.run_folder import LEAVES
 
 DATA = ".h5"  # suffix of the second file
 ARRAYS = {
@@ -27,6 +28,7 @@ ARRAYS = {
     "marker": (np.int32, 1),
     "building": (np.int64, 1),
     "region": (np.int32, 1),
+    LEAVES: (np.float32, 1),
 }
 HEAD = '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n  <Domain>\n'
 TOPOLOGIES = {4: "Tetrahedron", 6: "Wedge"}  # of cells, by their corners
@@ -93,6 +95,8 @@ def _write_data(path: Path, pieces: MeshPieces, n_cells: int, n_facets: int) -> 
     }
     if pieces.files.depth:
         rows["region"] = n_cells
+    if pieces.files.leaves:
+        rows[LEAVES] = n_cells
     with h5py.File(path, "w", libver=("earliest", "v108")) as file:
         sets = {
             name: file.create_dataset(name, (rows[name], width) if width > 1 else (rows[name],), dtype)
@@ -107,6 +111,8 @@ def _write_data(path: Path, pieces: MeshPieces, n_cells: int, n_facets: int) -> 
             _put(sets["cells"], cell, piece.ids[piece.cells])
             if piece.region is not None:
                 _put(sets["region"], cell, piece.region)
+            if piece.leaves is not None:
+                _put(sets[LEAVES], cell, piece.leaves)
             cell += len(piece.cells)
             _put(sets["facets"], facet, piece.ids[piece.facets])
             _put(sets["marker"], facet, piece.marker)
@@ -123,6 +129,8 @@ def _put(data: h5py.Dataset, start: int, rows: NDArray[np.generic]) -> None:
 def _write_prisms(path: Path, mesh: PrismMesh) -> Rows:
     """Write the numbers of prisms; returns how many rows and columns each data set has."""
     sets: dict[str, NDArray[np.generic]] = {"points": mesh.points, "cells": mesh.cells}
+    if mesh.leaves is not None:
+        sets[LEAVES] = mesh.leaves
     for name, width in (("", 3), ("side_", 4)):
         sets[SIDES if name else "facets"], sets[f"{name}marker"], sets[f"{name}building"] = mesh.facets(width)
     with h5py.File(path, "w", libver=("earliest", "v108")) as file:
@@ -135,7 +143,7 @@ def _render(data: str, rows: Rows, origin: str) -> str:
     def item(name: str) -> str:
         n, width = rows[name]
         dtype = ARRAYS[name.removeprefix("side_")][0] if name != SIDES else np.int64
-        kind = "Float" if dtype is np.float64 else "Int"
+        kind = "Float" if dtype in (np.float64, np.float32) else "Int"
         shape = f"{n} {width}" if width > 1 else f"{n}"
         return (
             f'<DataItem Dimensions="{shape}" NumberType="{kind}" Precision="{np.dtype(dtype).itemsize}" '
@@ -162,7 +170,7 @@ def _render(data: str, rows: Rows, origin: str) -> str:
             ]
         return "\n".join([*lines, "    </Grid>", ""])
 
-    tags = {"region": "region"} if "region" in rows else {}
+    tags = {name: name for name in ("region", LEAVES) if name in rows}
     grids = [grid("mesh", TOPOLOGIES[rows["cells"][1]], "cells", tags)]
     grids.append(grid("facets", "Triangle", "facets", {"marker": "marker", "building": "building"}))
     if SIDES in rows:

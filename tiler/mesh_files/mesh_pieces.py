@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import Marker, Region
+from pipeline.data.mesh import GROUND_PATCHES, Marker, Region
 from stitch.pieces.numbering import Numbering
 from tiler.mesh_files.merged import VERTEX_ID, number_piece, read_numbering
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource, find_files
 from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
-from tiler.store.run_folder import REGION, read_run_record
+from tiler.store.run_folder import LEAVES, PATCH_OF_GROUND, REGION, read_run_record
 
 SIDE = 1e-6  # m; how far from a side of the region a facet on it may be
 
@@ -36,7 +36,8 @@ class MeshPiece:
         Facets of the region's boundary, as rows of `points`, counter-clockwise seen from outside; faces that it
         shares with another tile are not among them. With soil, the ground is there although it is inside.
     marker : int32, (f,)
-        `pipeline.data.mesh.Marker` of each facet.
+        `pipeline.data.mesh.Marker` of each facet; with land cover, `GROUND_PATCHES` and the number of its patch on
+        ground that has one.
     building : int64, (f,)
         Number of each facet's building, -1 where there is none.
     ids : int64, (n,)
@@ -44,6 +45,8 @@ class MeshPiece:
         tiles have is bitwise the same in all of them, and has one number.
     region : int8, (m,), or None
         `pipeline.data.mesh.Region` of each cell; None where all is air.
+    leaves : float32, (m,), or None
+        Leaf area density of each cell (m2/m3), 0 in open air; None in a run without trees.
     """
 
     name: str
@@ -54,6 +57,7 @@ class MeshPiece:
     building: NDArray[np.int64]
     ids: NDArray[np.int64]
     region: NDArray[np.int8] | None = None
+    leaves: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +83,11 @@ class MeshPieces:
         """Number of different points of the whole mesh."""
         return self.numbering.n_points
 
+    @property
+    def ground(self) -> tuple[str, ...]:
+        """Names of the patches of the ground, by number; none without land cover."""
+        return self.files.ground_names
+
     def read(self, k: int) -> MeshPiece:
         """Read piece `k`.
 
@@ -94,14 +103,40 @@ class MeshPieces:
             volume.mesh.points - self.files.origin,
             volume.mesh.cells,
             _facets_in_volume(self.files.boundaries[k], volume, boundary),
-            mark_sides(self.files, boundary),
+            mark_facets(self.files, self.files.boundaries[k], boundary),
             boundary.boundary.building,
             number_piece(path, volume.point_data.get(VERTEX_ID), self.numbering),
             _regions(path, volume) if self.files.depth else None,
+            read_leaves(path, volume) if self.files.leaves else None,
         )
 
 
-def mark_sides(files: RunFiles, piece: BoundaryPiece) -> NDArray[np.int32]:
+def mark_facets(files: RunFiles, path: Path, piece: BoundaryPiece) -> NDArray[np.int32]:
+    """Give the markers of a boundary piece as `MeshPiece` has them.
+
+    Raises
+    ------
+    InputError
+        If the run has land cover, and the piece does not tell the patch of all ground.
+    """
+    marker = _mark_sides(files, piece)
+    if not files.ground:
+        return marker
+    patch = piece.cell_data.get(PATCH_OF_GROUND)
+    on_ground = marker == Marker.GROUND
+    if (
+        patch is None
+        or patch.shape != marker.shape
+        or not np.isin(patch[on_ground], range(len(files.ground))).all()
+    ):
+        raise InputError(
+            f"{path}: has no cell array {PATCH_OF_GROUND!r} of 0 to {len(files.ground) - 1}; run the tile again"
+        )
+    of_patch = on_ground & (patch > 0)
+    return np.where(of_patch, GROUND_PATCHES + patch.astype(np.int32), marker)
+
+
+def _mark_sides(files: RunFiles, piece: BoundaryPiece) -> NDArray[np.int32]:
     """Give the markers of a boundary piece; the outer sides of a part of a mesh are those of its region.
 
     A side of the whole mesh that lies towards a tile that is not there is ``missing``; where it is the westernmost
@@ -154,6 +189,19 @@ def open_pieces(source: RunSource) -> MeshPieces:
             f"{counted} points; run again"
         )
     return MeshPieces(names, files, numbering)
+
+
+def read_leaves(path: Path, volume: VolumePiece) -> NDArray[np.float32]:
+    """Take the leaf area density of the cells of a piece (m2/m3); InputError where it has none."""
+    leaves = volume.cell_data.get(LEAVES)
+    if (
+        leaves is None
+        or leaves.dtype != np.float32
+        or leaves.ndim != 1
+        or not ((leaves >= 0) & (leaves < 1e3)).all()
+    ):
+        raise InputError(f"{path}: has no cell array {LEAVES!r} of leaf area densities; run the tile again")
+    return leaves
 
 
 def _regions(path: Path, volume: VolumePiece) -> NDArray[np.int8]:

@@ -44,6 +44,10 @@ class PrismMesh:
         `pipeline.data.mesh.Marker` of each of them.
     building : int64, (f,)
         Number of its building, -1 where there is none.
+    ground : tuple of str
+        Names of the patches of the ground, by number; none without land cover.
+    leaves : float32, (m,), or None
+        Leaf area density of each cell (m2/m3), that of the middle one of its three tetrahedra; None without trees.
     """
 
     points: NDArray[np.float64]
@@ -56,6 +60,8 @@ class PrismMesh:
     outer_cell: Ints
     marker: NDArray[np.int32]
     building: Ints
+    ground: tuple[str, ...] = ()
+    leaves: NDArray[np.float32] | None = None
 
     def facets(self, width: int) -> tuple[Ints, NDArray[np.int32], Ints]:
         """Give the triangles (3) or quadrilaterals (4) of the boundary: corners, marker and building of each."""
@@ -82,6 +88,7 @@ def read_prisms(pieces: MeshPieces) -> PrismMesh:
     """
     points = np.empty((pieces.n_points, 3))
     cells, facets, marker, building = [], [], [], []
+    leaves: list[NDArray[np.float32]] = []
     for k in range(len(pieces.names)):
         piece = pieces.read(k)
         points[piece.ids] = piece.points
@@ -89,6 +96,7 @@ def read_prisms(pieces: MeshPieces) -> PrismMesh:
         facets.append(piece.ids[piece.facets])
         marker.append(piece.marker)
         building.append(piece.building)
+        leaves += [] if piece.leaves is None else [piece.leaves[1::3]]
     tile = np.repeat(np.arange(len(cells), dtype=np.int32), [len(part) for part in cells])
     prisms = np.concatenate(cells)
     inner, owner, neighbour, outer, outer_cell = _pair_faces(prisms)
@@ -97,7 +105,12 @@ def read_prisms(pieces: MeshPieces) -> PrismMesh:
     if (np.append(marks, 0)[row] != marks[row[:, :1]]).any():
         raise InputError(f"{pieces.files.directory}: halves of a face have different markers; run again")
     first = row[:, 0]
-    return PrismMesh(points, prisms, tile, inner, owner, neighbour, outer, outer_cell, marks[first], houses[first])
+    faces = inner, owner, neighbour, outer, outer_cell
+    return PrismMesh(points, prisms, tile, *faces, marks[first], houses[first], pieces.ground, _join(leaves))
+
+
+def _join(leaves: list[NDArray[np.float32]]) -> NDArray[np.float32] | None:
+    return np.concatenate(leaves) if leaves else None
 
 
 def combine_cells(cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:

@@ -29,6 +29,10 @@ class RunFiles:
         are those of the whole mesh.
     origin : tuple of float
         Place in the CRS (m) that coordinates are to count from.
+    ground : tuple of (str, float or None)
+        Patches of the ground by number: names and roughness lengths (m); none without land cover.
+    leaves : bool
+        Whether cells tell their leaf area density.
     """
 
     directory: Path
@@ -38,6 +42,13 @@ class RunFiles:
     parts: int = 0
     sides: tuple[float, float, float, float] | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ground: tuple[tuple[str, float | None], ...] = ()
+    leaves: bool = False
+
+    @property
+    def ground_names(self) -> tuple[str, ...]:
+        """Names of the patches of the ground, by number."""
+        return tuple(name for name, _ in self.ground)
 
     @property
     def origin_words(self) -> str:
@@ -70,7 +81,16 @@ def find_files(directory: Path) -> RunFiles:
     if found.status != "done":
         raise InputError(f"{record}: the run is {found.status!r}, not 'done'; finish it or run again")
     volumes, boundaries = (read_piece_paths(directory / name) for name in (VOLUME_INDEX, BOUNDARY_INDEX))
-    return RunFiles(directory, tuple(volumes), tuple(boundaries), found.depth, len(found.parts))
+    ground = tuple((patch.name, patch.roughness) for patch in found.ground)
+    return RunFiles(
+        directory,
+        tuple(volumes),
+        tuple(boundaries),
+        found.depth,
+        len(found.parts),
+        ground=ground,
+        leaves=found.leaves,
+    )
 
 
 def refuse_strangers(directory: Path) -> None:

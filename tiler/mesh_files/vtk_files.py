@@ -5,7 +5,7 @@ twice. ParaView and vtk read all four kinds, meshio the volume.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path, PurePath
 from typing import Any, Self
@@ -32,6 +32,7 @@ from tiler.mesh_files.vtk_xml import (
 TETRA = 10  # VTK_TETRA
 KEPT_ROWS = 1 << 24  # whose offsets are kept once they are compressed: 20 MB where a piece has so many cells
 Arrays = Mapping[str, NDArray[Any]]
+NO_ARRAYS: Arrays = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +120,15 @@ class BoundaryPiece:
         Index of each point among the points of the volume mesh.
     point_data : mapping of name to array, first axis (n,)
         Further arrays.
+    cell_data : mapping of name to array, first axis (k,)
+        Further arrays of facets.
     """
 
     points: NDArray[np.float64]
     boundary: Boundary
     vertex: NDArray[np.int64]
     point_data: Arrays
+    cell_data: Arrays = field(default_factory=dict)
 
 
 def write_vtu_blocks(
@@ -159,7 +163,13 @@ def write_vtu_blocks(
 
 
 def write_vtp_blocks(
-    path: Path, n_points: int, boundary: Boundary, points: Values, *, point_data: ValueArrays
+    path: Path,
+    n_points: int,
+    boundary: Boundary,
+    points: Values,
+    *,
+    point_data: ValueArrays,
+    cell_data: Arrays = NO_ARRAYS,
 ) -> None:
     """Write the boundary of a volume mesh as a VTP file, with points that are made a block at a time.
 
@@ -175,6 +185,8 @@ def write_vtp_blocks(
         Coordinates, float64, three of each point (m).
     point_data : mapping of name to Values
         All arrays of points; `read_vtp` wants ``vertex``, each point's index in the volume mesh.
+    cell_data : mapping of name to array
+        Further arrays of facets.
 
     Raises
     ------
@@ -190,6 +202,7 @@ def write_vtp_blocks(
     marks: Arrays = {
         "marker": boundary.marker.astype(np.int32, copy=False),
         "building": boundary.building.astype(np.int64, copy=False),
+        **cell_data,
     }
     named = {"Points": points, **point_data}
     streams = [_stream(name, values.rows(n_used, lambda i, j: used[i:j])) for name, values in named.items()]
@@ -268,7 +281,8 @@ def read_vtp(path: Path) -> BoundaryPiece:
         marks["building"].astype(np.int64, copy=False),
     )
     rest = {name: array for name, array in point_data.items() if name != "vertex"}
-    return BoundaryPiece(points, boundary, point_data["vertex"].astype(np.int64, copy=False), rest)
+    more = {name: array for name, array in marks.items() if name not in ("marker", "building")}
+    return BoundaryPiece(points, boundary, point_data["vertex"].astype(np.int64, copy=False), rest, more)
 
 
 def read_piece_paths(path: Path) -> list[Path]:

@@ -16,10 +16,10 @@ from tiler.config.config import Config
 from tiler.config.step_options import expected_levels, refined_areas, size_rule
 from tiler.engine.stage import Scope
 from tiler.planning.footprint_sample import FootprintSample
+from tiler.planning.own_stages import list_stages, stages_of_pad
 from tiler.planning.plan import Survey
 from tiler.planning.refinements import read_refinements
 from tiler.pointclouds.clouds import CloudHeader
-from tiler.stages.own_stages import list_stages, stages_of_pad
 
 # Measured on synthetic cities and Amsterdam with mesh sizes of 4 to 20 m: see docs/plan.md.
 TRIANGLES = 3.07  # on open ground, in one squared mesh size

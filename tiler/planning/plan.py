@@ -16,6 +16,7 @@ from tiler.engine.run_context import choose_tiles, make_layout, tile_key
 from tiler.engine.stage import FileItem, Layout
 from tiler.georeference.crs import boxes_meet, crs_text
 from tiler.georeference.operation import Operation
+from tiler.landcover.cover_table import read_table
 from tiler.objects.places import place
 from tiler.objects.requests import trust_addresses
 from tiler.planning.establish_georeference import FOOTPRINTS, Georeference, establish_georeference, find_inexact
@@ -109,7 +110,10 @@ def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
         If an input is missing or unreadable, or does not fit the others.
     """
     trust_addresses(False)  # whatever this process did before
+    table = read_table(config)  # refuses one that is wrong before anything is read
     found = survey_inputs(config, say)
+    if table:
+        say(f"land cover makes patches of the ground, in this order: {', '.join(row.patch for row in table)}")
     layout = make_layout(found.grid, file_items(found.clouds), identity=found.region.crs)
     return Plan(**vars(found), layout=layout)
 

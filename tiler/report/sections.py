@@ -105,6 +105,9 @@ def describe_summary(facts: RunFacts) -> Iterator[str]:
         shown += [("region", f"{area:,.3g} km²"), ("tiles", number(len(facts.tiles.names)))]
     if "quality" in members:
         shown.append(("worst radius ratio", number(members["quality"]["radius_ratio"]["0"])))
+    for patch in (members.get("land_cover") or {}).get("patches", []):
+        if patch["area (m2)"]:
+            shown.append((patch["patch"], f"{patch['area (m2)']:,.0f} m²"))
     shown.append(("time", f"{members.get('seconds_total', 0.0):,.1f} s"))
     if "peak_memory_bytes" in members:
         shown.append(("peak memory of a process", f"{members['peak_memory_bytes'] / 2**20:,.0f} MiB"))

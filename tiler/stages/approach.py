@@ -12,6 +12,7 @@ from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.stages.inputs import own_window
 from tiler.stages.readers import join_rasters
+from tiler.stages.surroundings import LEVELLED
 from tiler.store.store import Store
 
 APPROACH, RIM = "approach", "rim"
@@ -35,7 +36,12 @@ def known_rim() -> Stage:
 
 
 def terrain_stage(config: Config) -> str:
-    """Name of the stage that has the terrain of all that is meshed."""
+    """Name of the stage that has the terrain of all that is meshed, with level water where there is land cover."""
+    return LEVELLED if config.covered else ground_stage(config)
+
+
+def ground_stage(config: Config) -> str:
+    """Name of the stage that has the terrain of region and pad as points and pad make it."""
     return APPROACH if config.padded else "terrain"
 
 

@@ -14,7 +14,7 @@ from tiler.config.domain_height import GUIDELINE, Domain, height_in_metres, is_l
 from tiler.config.step_options import PAD_PARAMETERS, layer_parameters, mesh_options
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
-from tiler.stages.approach import terrain_stage
+from tiler.stages.approach import ground_stage
 from tiler.stages.city import chooses_layers_later
 from tiler.stages.left_out import LEFT_OUT, left_out_stage
 from tiler.stages.readers import grow, read_known_terrain
@@ -38,7 +38,7 @@ def layer_stages(config: Config, domain: Domain) -> list[Stage]:
     if not chooses_layers_later(config):
         return []
     reach = mesh_reach(config, domain) + 2 * config.dtm_spacing
-    reads = (Read("model", own=True), Read(terrain_stage(config), reach, around="model"))
+    reads = (Read("model", own=True), Read(ground_stage(config), reach, around="model"))
     parameters = (*layer_parameters(config), "dtm_spacing", *(PAD_PARAMETERS[:1] if config.padded else ()))
     return [Stage("layers", Scope.TILE, choose_tile_layers, reads, parameters, version=3)]
 

@@ -200,7 +200,7 @@ def read_footprint_file(task: Task) -> Facts:
     given = task.parameters
     if not given.footprints:
         return {"n": 0, "part_like": []}
-    return _put_footprints(
+    return put_rows(
         task,
         scan_footprints(
             place(given.footprints),
@@ -222,13 +222,11 @@ def read_model_footprints(task: Task) -> Facts:
     for _, facts in list_kind(task, MODEL):
         counts.update(facts["model"])
     blocks = (block_footprints(*band) for band in read_model_bands(task))
-    return _put_footprints(task, blocks, "the city model") | {
-        "counts": {k: v for k, v in sorted(counts.items()) if v}
-    }
+    return put_rows(task, blocks, "the city model") | {"counts": {k: v for k, v in sorted(counts.items()) if v}}
 
 
-def _put_footprints(task: Task, found: Iterable[FootprintBlock], source: str) -> Facts:
-    """Write footprints one behind the other."""
+def put_rows(task: Task, found: Iterable[FootprintBlock], source: str) -> Facts:
+    """Write footprints or other polygons one behind the other; a note tells of none, unless `source` is empty."""
     n = first = n_bytes = n_letters = 0
     blocks, part_like = [0], set[str]()
     for block in found:
@@ -252,7 +250,7 @@ def _put_footprints(task: Task, found: Iterable[FootprintBlock], source: str) ->
         first += len(block.cell)
         blocks.append(first)
         part_like |= {name for name in rows.ids.tolist() if "-part" in name}
-    if n == 0:
+    if n == 0 and source:
         task.note(Note("no-footprints-in-region", source, detail="terrain only"))
     task.put(block=np.array(blocks), end=np.array([n]))
     return {"n": n, "part_like": sorted(part_like)}
@@ -280,12 +278,12 @@ def list_reserved(task: Task) -> Facts:
     }
 
 
-def own_window(task: Task) -> NodeWindow:
-    """Nodes that a tile owns."""
+def own_window(task: Task, *, spacing: float = 0.0) -> NodeWindow:
+    """Nodes that a tile owns: those of the terrain, or of another raster."""
     grid, (i, j) = task.context.grid, tile_key(task.name)
     return node_window(
         task.box,
-        task.parameters.dtm_spacing,
+        spacing or task.parameters.dtm_spacing,
         low_border=(not has_tile(grid, Key(i - 1, j)), not has_tile(grid, Key(i, j - 1))),
         high_border=(not has_tile(grid, Key(i + 1, j)), not has_tile(grid, Key(i, j + 1))),
     )

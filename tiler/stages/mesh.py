@@ -16,6 +16,7 @@ from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.data.notes import Note
 from pipeline.data.roofs import is_flat
+from pipeline.plane_mesh.plane import signed_areas
 from pipeline.plane_mesh.sizes import SizeField
 from pipeline.points_terrain.raster import Dtm, sample_dtm, window_of
 from pipeline.points_terrain.terrain import cut_terrain
@@ -28,11 +29,14 @@ from stitch.seams.soil_columns import fill_corner_soil, fill_seam_soil, join_sea
 from stitch.seams.tiles import Sides, mesh_tile
 from stitch.tiling.corners import Corner, place_corner
 from stitch.tiling.grid import Bounds, Key, SeamKey, ends_of_seam, is_pinched, seams_of_tile
+from stitch.tiling.land_cover import LandCover, find_patches
 from stitch.tiling.patches import mesh_patch
+from stitch.tiling.strips import centres
 from tiler.citymodels.tables import NearBuildings
 from tiler.config.config import Config
 from tiler.config.domain_height import Domain
 from tiler.config.step_options import (
+    COVER_PARAMETERS,
     PAD_PARAMETERS,
     PLANE_PARAMETERS,
     REFINE_PARAMETERS,
@@ -58,8 +62,16 @@ from tiler.stages.seam_tables import (
     unpack_seam,
     unpack_soil,
 )
-from tiler.stages.surroundings import find_walls, halos, read_surroundings, terrain_around, terrain_halo
-from tiler.store.run_folder import EASED
+from tiler.stages.surroundings import (
+    COVERED,
+    find_walls,
+    halos,
+    read_cover,
+    read_surroundings,
+    terrain_around,
+    terrain_halo,
+)
+from tiler.store.run_folder import EASED, PATCH_OF_GROUND
 
 
 def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
@@ -76,6 +88,8 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     parameters += REFINE_PARAMETERS if config.refined else ()
     parameters += PAD_PARAMETERS if config.padded else ()
     parameters += SOIL_PARAMETERS if config.underground else ()
+    parameters += COVER_PARAMETERS if config.covered else ()
+    reads += [Read(COVERED)] if config.covered else []
     version = 8 if config.mesher == "layered" else 6
     return [
         Stage("seams", Scope.SEAM, make_seam, tuple(reads), parameters, version=version),
@@ -92,9 +106,11 @@ def make_seam(task: Task) -> Facts:
     buildings, dtm = read_surroundings(task)
     polygons = buildings.model.polygons
     walls, sizes = find_walls(polygons, task)
+    _, edges = read_cover(task, walls)
+    fixed = np.concatenate((walls, edges))
     with task.step("3.1 seams"):
         start, end = (
-            place_corner(grid, corner, polygons, walls, mesh_size=given.mesh_size, sizes=sizes)
+            place_corner(grid, corner, polygons, fixed, mesh_size=given.mesh_size, sizes=sizes)
             for corner in ends_of_seam(key)
         )
         plane = plane_options(given)
@@ -109,15 +125,16 @@ def make_seam(task: Task) -> Facts:
             passes=plane["passes"],
             sizes=sizes,
             surroundings=SURROUNDINGS if given.mesher == "layered" else 0.0,
+            edges=edges,
         )
     task.put(**pack_seam(seam, buildings.model.numbers))
     facts = {"border": seam.border, "vertices": len(seam.xy)}
     if seam.border:
-        pinched = _fill_pinched(key, (start, end), dtm, buildings, walls, sizes, soil, task)
+        pinched = _fill_pinched(key, (start, end), dtm, buildings, fixed, sizes, soil, task)
         return facts | {"pinched": pinched}
     with task.step("3.2-3.5 columns of seams"):
         first, last = (
-            _fill_corner(place, corner, dtm, buildings, walls, sizes, task)
+            _fill_corner(place, corner, dtm, buildings, fixed, sizes, task)
             for place, corner in zip((start, end), ends_of_seam(key), strict=True)
         )
         terrain = cut_terrain(dtm, window_of(dtm))
@@ -141,6 +158,7 @@ def make_columns(task: Task) -> Facts:
     buildings, dtm = read_surroundings(task)
     model = buildings.model
     walls, sizes = find_walls(model.polygons, task)
+    cover, further = read_cover(task, walls)
     names = [seam_name(key) for key in seams_of_tile(tile_key(task.name))]
     found = {result.name: result for result in task.read("seams") if result.name in names}
     sides = tuple(unpack_seam(found[name].arrays, model.numbers) for name in names)
@@ -152,6 +170,7 @@ def make_columns(task: Task) -> Facts:
             mesh_size=given.mesh_size,
             sizes=sizes,
             divide_chords=not is_flat(model.roofs).all(),
+            edges=further,
             **plane_options(given),
         )
     inner = [k for k, seam in enumerate(sides) if not seam.border]
@@ -207,16 +226,33 @@ def make_columns(task: Task) -> Facts:
     )
     underground = {} if soil is None else {"soil": {"depth (m)": soil.depth, "cells": n_cells}}
     eased = {EASED: report.eased_nodes} if isinstance(report, AdaptiveReport) and report.eased_nodes else {}
-    return underground | {
-        "order": columns.order,
-        "facts": {"smallest gap (m)": round(gap, 4)} | asdict(report),
-        "counts": {
-            "cells": cells + n_cells,
-            **eased,
-            "triangles": len(plane.triangles),
-            "columns": len(plane.xy),
-        },
-    }
+    return (
+        underground
+        | _put_patches(task, plane, cover)
+        | {
+            "order": columns.order,
+            "facts": {"smallest gap (m)": round(gap, 4)} | asdict(report),
+            "counts": {
+                "cells": cells + n_cells,
+                **eased,
+                "triangles": len(plane.triangles),
+                "columns": len(plane.xy),
+            },
+        }
+    )
+
+
+def _put_patches(task: Task, plane: PlaneMesh, cover: LandCover | None) -> Facts:
+    """Write the patch of the ground of each triangle, and give their areas (m2); nothing without land cover."""
+    if cover is None:
+        return {}
+    patch = find_patches(cover, centres(plane.xy, plane.triangles))
+    task.put(**{PATCH_OF_GROUND: patch})
+    open_ground = plane.building < 0
+    area = np.bincount(
+        patch[open_ground], np.abs(signed_areas(plane))[open_ground], len(task.parameters.cover_table) + 2
+    )
+    return {PATCH_OF_GROUND: np.round(area, 3).tolist()}
 
 
 def _fill_corner(

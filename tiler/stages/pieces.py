@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from pipeline.columns.underground import SoilMesh, expand_regions, find_used, sp
 from pipeline.data.classes import BUILDING, GROUND, WATER
 from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import ColumnMesh, SeamEdges
+from pipeline.points_terrain.canopy import Canopy, densities_at
 from pipeline.quality.building_facts import fidelity_table
 from pipeline.quality.histograms import (
     QUALITY_BINS,
@@ -38,6 +39,7 @@ from stitch.pieces.numbering import (
     number_columns,
     tile_part,
 )
+from stitch.seams.tiles import tile_halo
 from stitch.tiling.grid import Key, seams_of_tile
 from tiler.citymodels.tables import unpack_polygons
 from tiler.config.config import Config
@@ -52,8 +54,9 @@ from tiler.stages.left_out import read_polygons
 from tiler.stages.readers import read_bands, read_buildings, read_terrain
 from tiler.store.checksums import FILES, state_files
 from tiler.store.results import COLUMN_ARRAYS, unpack_columns
-from tiler.store.run_folder import REGION, ROOF_MOVED
+from tiler.store.run_folder import LEAVES, PATCH_OF_GROUND, REGION, ROOF_MOVED
 
+CANOPY = "leaves"  # stage that has the leaves around a tile in columns
 EDGE_ARRAYS = ("edge", "edge_bottom", "edge_building", "edge_missing", "edge_seam")
 ID_ARRAYS = ("shared", "shared_id")
 FIT_CLASSES = (BUILDING, GROUND, WATER)
@@ -71,12 +74,16 @@ def fit_stage(config: Config) -> Stage:
     return Stage("fit", Scope.TILE, measure_fit, reads, parameters, version=2, after="alignment")
 
 
-def piece_stages() -> list[Stage]:
+def piece_stages(config: Config) -> list[Stage]:
     """Stages from columns to files; the last reads the fit, too."""
+    # A tile reaches beyond its box as far as its seams may.
+    reach = tile_halo(config.tile_size_or_default, config.largest_size) if config.has_trees else 0.0
+    leaves = (Read(CANOPY, reach),) if config.has_trees else ()
+    of_leaves = ("leaf_column",) if config.has_trees else ()
     beside = (Read("columns", beside=True, others_by_name=True, optional=True),)
     return [
         # Of the tiles around it a piece asks only which of them there are.
-        Stage("pieces", Scope.TILE, write_piece, beside, version=7),
+        Stage("pieces", Scope.TILE, write_piece, (*beside, *leaves), of_leaves, version=7),
         Stage(
             "report", Scope.REGION, sum_up, (Read("pieces", optional=True), Read("fit", optional=True)), version=4
         ),
@@ -119,6 +126,7 @@ def write_piece(task: Task) -> Facts:
         column = points.column[levels]
         return lowest[column] + (levels - mesh.z_start[column])
 
+    leaves = _leaf_rows(task, cells, points) if CANOPY in task.refs else {}
     places, ids = Values(3, np.dtype(np.float64), points.place), Values(1, np.dtype(np.int64), make_ids)
     vertex = Values(1, np.dtype(np.int64), points.numbers)
     with task.step("3.6 write pieces"), task.output() as out:
@@ -128,12 +136,15 @@ def write_piece(task: Task) -> Facts:
             places.rows(points.n_points, points.levels),
             _measured_rows(task, cells, points, number_used(used), meter),
             point_data={VERTEX_ID: ids.rows(points.n_points, points.levels)},
-            cell_data={name: Rows.of(array) for name, array in region.items()},
+            cell_data={name: Rows.of(array) for name, array in region.items()} | leaves,
         )
+        of_facets: dict[str, NDArray[np.int8]] = {}
+        if PATCH_OF_GROUND in attributes["facts"]:
+            of_facets[PATCH_OF_GROUND] = _mark_ground(task, mesh, len(boundary.facets))
         data = {"vertex": vertex, VERTEX_ID: ids}
         if (moved := mesh.moved) is not None:
             data[ROOF_MOVED] = Values(1, np.dtype(np.float64), lambda levels: moved[levels])
-        write_vtp_blocks(files[1], len(mesh.z), boundary, places, point_data=data)
+        write_vtp_blocks(files[1], len(mesh.z), boundary, places, point_data=data, cell_data=of_facets)
         written = state_files(out, files)
     for name, histogram in meter.histograms.items():
         task.put(**{name: histogram.counts, f"{name}_range": _range(histogram)})
@@ -144,6 +155,14 @@ def write_piece(task: Task) -> Facts:
         "parts": parts,
         FILES: written,
     }
+
+
+def _mark_ground(task: Task, mesh: ColumnMesh, n_facets: int) -> NDArray[np.int8]:
+    """Give the patch of the ground of each facet, -1 elsewhere: the first ones are what stands under triangles."""
+    patch = task.store.read("columns", task.name, names=(PATCH_OF_GROUND,))[0][PATCH_OF_GROUND]
+    marks = np.full(n_facets, -1, np.int8)
+    marks[: len(patch)] = np.where(mesh.plane.building < 0, patch, -1)
+    return marks
 
 
 def _measured_rows(
@@ -158,6 +177,23 @@ def _measured_rows(
         return number[made]
 
     return Rows(cells.n_cells, 4, np.dtype(np.int32), make)
+
+
+def _leaf_rows(task: Task, cells: CellBlocks, points: UsedPoints) -> dict[str, Rows]:
+    """Make the leaf area density of cells as they are written: that at the middle of each."""
+    size = task.parameters.leaf_column
+    canopies = [make_canopy(result.arrays, result.facts, size) for result in task.read(CANOPY)]
+
+    def make(begin: int, end: int) -> NDArray[np.float32]:
+        corners = points.place(cells.make(begin, end).ravel()).reshape(-1, 4, 3)
+        return densities_at(canopies, (corners[:, 0] + corners[:, 1] + corners[:, 2] + corners[:, 3]) / 4)
+
+    return {LEAVES: Rows(cells.n_cells, 1, np.dtype(np.float32), make)}
+
+
+def make_canopy(arrays: Mapping[str, NDArray[Any]], facts: Facts, size: float) -> Canopy:
+    """Make a canopy of what its stage has; `size` is the side of its columns (m)."""
+    return Canopy(arrays["base"], arrays["top"], arrays["density"], facts["i0"], facts["j0"], size)
 
 
 def prove_seams(sides: Iterable[tuple[str, str, Facts]]) -> Facts:

@@ -187,9 +187,9 @@ def read_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm
 def read_known_terrain(task: Task, box: Box, *, spacing: float, bounds: Bounds) -> Dtm:
     """Read the terrain of a box within the region, NaN at nodes of tiles that are absent (see `cut_terrain`).
 
-    Where the task reads the stage ``approach``, it is that of region and pad.
+    Where the task reads the stage ``approach``, it is that of region and pad; ``levelled`` has level water.
     """
-    stage = "approach" if "approach" in task.refs else "terrain"
+    stage = next(name for name in ("levelled", "approach", "terrain") if name in task.refs)
     window = region_window(box, spacing, bounds)
     return join_terrain(_read_rasters(task, stage, window), window)
 
@@ -227,9 +227,9 @@ def read_outlines(task: Task, *, shift: tuple[float, float] = (0.0, 0.0)) -> Foo
     """
     if any(shift):
         xmin, ymin, xmax, ymax = task.box
-        found = _read_outlines(task, (xmin - shift[0], ymin - shift[1], xmax - shift[0], ymax - shift[1]))
+        found = read_rows(task, (xmin - shift[0], ymin - shift[1], xmax - shift[0], ymax - shift[1]))
         return replace(found, polygons=shapely.transform(found.polygons, lambda xy: xy + shift))
-    return _read_outlines(task, task.box)
+    return read_rows(task, task.box)
 
 
 def read_own_outlines(task: Task) -> Footprints:
@@ -238,15 +238,16 @@ def read_own_outlines(task: Task) -> Footprints:
     return Footprints(unpack_polygons(found, "outline"), found["ids"], found["given_height"], found["forms"])
 
 
-def _read_outlines(task: Task, box: Box) -> Footprints:
-    (found,) = task.read("footprints", ())
+def read_rows(task: Task, box: Box, *, stage: str = "footprints") -> Footprints:
+    """Read the polygons that meet a box, from a stage of the region that has them as `put_rows` does."""
+    (found,) = task.read(stage, ())
     if found.facts["n"] == 0:
         return join_footprints([], box)
-    arrays, _ = task.store.read("footprints", found.name, names=("cell_box", "cell_start", "end"))
+    arrays, _ = task.store.read(stage, found.name, names=("cell_box", "cell_start", "end"))
     ranges = select_footprints(arrays["cell_box"], np.append(arrays["cell_start"], arrays["end"]), box)
 
     def read(ranges: Ranges, *names: str) -> dict[str, NDArray[Any]]:
-        return task.read_ranges("footprints", found.name, names, ranges)
+        return task.read_ranges(stage, found.name, names, ranges)
 
     # A row begins where the one before it ends.
     ends = read([(max(first - 1, 0), last) for first, last in ranges], "wkb_end", "id_end")

@@ -14,7 +14,7 @@ from pipeline.points_terrain.terrain import cut_terrain, join_terrain
 from tiler.store.store import Store
 
 COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom", "key", "moved")
-APPROACH = "approach"
+APPROACH, LEVELLED = "approach", "levelled"
 KEPT_CHUNKS = 9  # tiles of terrain that stay in memory
 
 
@@ -53,9 +53,10 @@ class StoredTerrain:
 
     def __init__(self, path: Path) -> None:
         self._store = Store(path)
-        pad = self._store.names(APPROACH)  # with a pad, what has the terrain of both
-        self._stage = APPROACH if pad else "terrain"
-        self._names = np.array(pad or self._store.names("terrain"), np.str_)
+        # With land cover that with level water, with a pad that of both.
+        known = {stage: self._store.names(stage) for stage in (LEVELLED, APPROACH, "terrain")}
+        self._stage = next((stage for stage, names in known.items() if names), "terrain")
+        self._names = np.array(known[self._stage], np.str_)
         if not len(self._names):
             raise InputError(f"{path}: holds no terrain; run citystitch again")
         self._windows = np.empty((len(self._names), 4), np.int64)  # i0, j0, nx, ny

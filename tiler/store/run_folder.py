@@ -18,11 +18,13 @@ from tiler.config.config import roofs_stay_flat
 from tiler.store.json_stream import iterate_members, read_members
 
 SCHEMA = 1  # of run.json
-RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts")
+RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts", "land_cover")
 TILES = "tiles"
 EASED = "roof nodes moved for cells"  # a count: roofs at vertices of outlines
 PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
 REGION = "region"  # cell array of a piece with soil
+PATCH_OF_GROUND = "ground_patch"  # cell array of the boundary with land cover: patch of the ground, -1 elsewhere
+LEAVES = "lad"  # cell array of a piece with trees: leaf area density (m2/m3), 0 in open air
 ROOF_MOVED = "moved_for_cells"  # point array of the boundary: by how much a roof was moved (m)
 # How a field that is missing, or of another type, or too large, shows when it is used.
 WRONG_FIELD = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
@@ -35,6 +37,14 @@ class MeshPart:
     cells: int
     tiles: tuple[str, ...] = ()
     divided: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class GroundPatch:
+    """A patch of the ground: its name, and its roughness length (m), None where it has none of its own."""
+
+    name: str
+    roughness: float | None = None
 
 
 @dataclass(frozen=True)
@@ -95,6 +105,14 @@ class RunRecord:
         where the record does not tell.
     roofs : RoofRules
         How far the mesher may move roofs.
+    ground : tuple of GroundPatch
+        Patches of the ground by number, without land cover none.
+    dtm_spacing : float
+        Distance between nodes of the terrain (m).
+    leaves : bool
+        Whether cells tell their leaf area density.
+    leaf_column : float
+        Side of the columns in which that is known (m).
     """
 
     status: str
@@ -107,6 +125,10 @@ class RunRecord:
     rim: float = math.nan
     parts: tuple[MeshPart, ...] = ()
     roofs: RoofRules = FLAT_ROOFS
+    ground: tuple[GroundPatch, ...] = ()
+    dtm_spacing: float = 1.0
+    leaves: bool = False
+    leaf_column: float = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +188,12 @@ def read_run_record(path: Path) -> RunRecord:
         core, rim = _read_pad(record["region"])
         parts = _read_parts(record.get("parts") or {}, counts["cells"])
         roofs = _read_roof_rules(record.get("parameters", {}))
+        found = (record.get("land_cover") or {}).get("patches", [])
+        given = record.get("parameters", {})
+        leaves = bool(given.get("vegetation_classes") or given.get("trees"))
+        cell = float(given.get("leaf_column", 2.0))
+        spacing = float(record.get("parameters", {}).get("dtm_spacing", 1.0))
+        ground = tuple(GroundPatch(str(row["patch"]), _optional(row["z0 (m)"])) for row in found)
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
     if not (west < east and south < north and math.isfinite(west + south + east + north)):
@@ -173,8 +201,25 @@ def read_run_record(path: Path) -> RunRecord:
     if not 0 <= depth < math.inf:
         raise InputError(f"{path}: underground is {depth} m, expected 0 or more; run again")
     return RunRecord(
-        status, (west, south, east, north), top, counts, record[TILES], depth, core, rim, parts, roofs
+        status,
+        (west, south, east, north),
+        top,
+        counts,
+        record[TILES],
+        depth,
+        core,
+        rim,
+        parts,
+        roofs,
+        ground,
+        spacing,
+        leaves,
+        cell,
     )
+
+
+def _optional(value: Any) -> float | None:
+    return None if value is None else float(value)
 
 
 def _read_roof_rules(parameters: Mapping[str, Any]) -> RoofRules:

@@ -95,6 +95,15 @@ WORDS: dict[str, Words] = {
     ),
     "building-roof-raised": Words(REPAIRED, "{n} roof[s] [was|were] raised over the terrain at the walls"),
     "courtyard-filled": Words(REPAIRED, "{n} courtyard[s] smaller than --min-courtyard-area [was|were] filled"),
+    "land-cover-unknown-class": Words(
+        DROPPED, "{n} file[s] of land cover [has|have] classes that the table does not know: they are ground"
+    ),
+    "land-cover-no-polygon": Words(DROPPED, "{n} file[s] of land cover [has|have] features that are no polygons"),
+    "trees-left-out": Words(DROPPED, "{n} file[s] of trees [has|have] features that are no trees"),
+    "no-trees-in-region": Words(OTHER, "the file of trees has none in the region"),
+    "water-levels-differ": Words(
+        OTHER, "{n} bod[y|ies] of water [has|have] several declared levels: the lowest counts"
+    ),
     "damaged-artefact": Words(REPAIRED, "{n} damaged or missing result[s] of an earlier run [was|were] made anew"),
     "footprint-id-repeated": Words(REPAIRED, "{n} id[s] of several footprints [was|were] completed by geometry"),
     "footprint-on-border-clipped": Words(

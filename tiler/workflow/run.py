@@ -32,9 +32,9 @@ from tiler.monitoring.watchers import Watchers
 from tiler.objects.places import absolute, in_bucket, place
 from tiler.planning.forecast import warn_of_memory
 from tiler.planning.model_shift import settle_shift
+from tiler.planning.own_stages import OwnStages, check_own, run_own_stages
 from tiler.planning.plan import Plan, check_sources, make_plan
 from tiler.planning.region import Pad
-from tiler.stages.own_stages import OwnStages, check_own, run_own_stages
 from tiler.store.atomic import replacing, sync_meanwhile
 from tiler.store.checksums import seal, state_files
 from tiler.store.folder_lock import only_run
@@ -231,7 +231,8 @@ def _run(
 def _plan(config: Config, out: Path, say: Callable[[str], None], *, fresh: bool) -> Plan:
     """Plan a run; refuse inputs among its results and, unless it begins anew, the folder of another region."""
     plan = make_plan(config, say)
-    files = [*config.building_files, *filter(None, [config.refine_areas])]
+    more = [config.refine_areas, config.land_cover_table, config.trees]
+    files = [*config.building_files, *config.land_cover, *filter(None, more)]
     for warning in _foresee(plan, config):
         plan.messages.append(warning)
         say(warning)

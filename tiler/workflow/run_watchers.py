@@ -14,9 +14,9 @@ from tiler.engine.watcher import RunStart, Watcher
 from tiler.monitoring.events import EventLog, begin_file
 from tiler.monitoring.progress import RunProgress, command_line
 from tiler.monitoring.watchers import Watchers
+from tiler.planning.own_stages import OwnStages, list_stages, stages_of_pad
 from tiler.planning.plan import Plan
 from tiler.planning.region import foresee_pad
-from tiler.stages.own_stages import OwnStages, list_stages, stages_of_pad
 from tiler.store.atomic import replacing
 from tiler.store.out_folder import EVENTS
 

@@ -126,7 +126,7 @@ def lay_pad(engine: Engine, config: Config, domain: Domain, pad: Pad, rim_store:
     engine.lay_out(layout, wider)
     stages = approach_stages(config)
     if rim_store is not None:
-        engine.add_parameters(rim_store=str(rim_store), rim_digest=_digest_rim(rim_store))
+        engine.add_parameters(rim_store=str(rim_store), rim_digest=digest_of(rim_store, RIM))
         stages = [known_rim() if stage.name == RIM else stage for stage in stages]
     engine.run(*stages)
     if engine.set_aside:
@@ -202,11 +202,13 @@ def core_part(box: Bounds, core: Bounds, tile_size: float) -> Bounds:
     return low[0], low[1], high[0], high[1]
 
 
-def _digest_rim(store: Path) -> str:
+def digest_of(store: Path, stage: str) -> str:
+    """Digest of the result of a stage of the region in a run's store; InputError where there is none yet."""
     try:
-        return Store(store).describe(RIM, REGION_ITEM)[1]
+        return Store(store).describe(stage, REGION_ITEM)[1]
     except InputError as error:
+        what = "the ground of the pad" if stage == RIM else f"the stage {stage}"
         raise InputError(
-            f"{store}: the ground of the pad follows from the whole region, and its run has not come that far "
-            f"({error}); run it without --only first"
+            f"{store}: {what} follows from the whole region, and its run has not come that far ({error}); run it "
+            "without --only first"
         ) from None

@@ -3,22 +3,26 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from pipeline.data.errors import ConfigError
 from stitch.tiling.grid import seams_of_tile
 from tiler.config.config import Config
 from tiler.engine.executor import Serial
 from tiler.engine.run_context import seam_name, tile_key
+from tiler.landcover.canopy_stages import canopy_stages
+from tiler.landcover.cover_stages import cover_stages
+from tiler.landcover.water import LEVELS, known_levels
 from tiler.objects.places import refuse_bucket
 from tiler.planning.model_shift import settle_shift
+from tiler.planning.own_stages import OwnStages
 from tiler.planning.plan import check_sources, make_plan
 from tiler.stages.alignment import shift_of_run
 from tiler.stages.mesh import mesh_stages
-from tiler.stages.own_stages import OwnStages
 from tiler.stages.pieces import piece_stages
 from tiler.store.folder_lock import only_run
-from tiler.store.out_folder import PIECES
+from tiler.store.out_folder import PIECES, STORE
 from tiler.words.plain_text import say_nothing
 from tiler.workflow.failed_tiles import config_alone
-from tiler.workflow.settled_domain import domain_of_run, plan_alone, take_domain
+from tiler.workflow.settled_domain import digest_of, domain_of_run, plan_alone, take_domain
 from tiler.workflow.stage_sequence import make_engine, run_city_stages
 
 
@@ -45,6 +49,8 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
         What its stages raise; any other error likewise, its type kept.
     """
     check_sources(config)
+    if config.water_points:
+        raise ConfigError("--only with --water-points: water at the sides of its part of the region would differ")
     refuse_bucket(config.out, "--only")
     config, whole = settle_shift(config, make_plan(config, say_nothing), say_nothing)
     domain, tallest = domain_of_run(config)
@@ -64,7 +70,12 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
         run_city_stages(engine, alone, shift=shift)
         seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
         take_domain(engine, alone, domain, pad, store)
-        engine.run(*mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
-        (pieces,) = (stage for stage in piece_stages() if stage.name == "pieces")
-        engine.run(pieces, items={"pieces": [tile]})
+        stages = cover_stages(alone)
+        if config.covered:
+            whole_store = Path(config.out) / STORE
+            engine.add_parameters(levels_store=str(whole_store), levels_digest=digest_of(whole_store, LEVELS))
+            stages = [known_levels() if stage.name == LEVELS else stage for stage in stages]
+        engine.run(*stages, *mesh_stages(alone, domain), items={"seams": seams, "columns": [tile]})
+        (pieces,) = (stage for stage in piece_stages(alone) if stage.name == "pieces")
+        engine.run(*canopy_stages(alone), pieces, items={"pieces": [tile]})
     return out / "mesh" / f"{tile}.vtu"

@@ -12,7 +12,12 @@ from tiler.engine.failures import Policy
 from tiler.engine.run_context import RunContext, pack_tiles
 from tiler.engine.stage import REGION_ITEM
 from tiler.engine.watcher import Watcher
-from tiler.objects.places import identify, place
+from tiler.landcover.canopy_stages import canopy_stages, tree_file_stages
+from tiler.landcover.cover_stages import cover_file_stages, cover_stages
+from tiler.landcover.cover_table import read_table
+from tiler.landcover.water_points import water_point_stages
+from tiler.objects.places import identify, is_missing, place
+from tiler.planning.own_stages import CORE_STAGE, OwnStages
 from tiler.planning.plan import Plan
 from tiler.planning.refinements import read_refinements
 from tiler.stages.alignment import alignment_stages, shift_of
@@ -20,8 +25,8 @@ from tiler.stages.city import first_round, house_stage, later_round, member_stag
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.inputs import fill_stage, input_stages, lake_stage
 from tiler.stages.mesh import mesh_stages
-from tiler.stages.own_stages import CORE_STAGE, OwnStages
 from tiler.stages.pieces import fit_stage, piece_stages
+from tiler.stages.surroundings import cover_reach
 from tiler.store.out_folder import (
     STORE,
 )
@@ -44,10 +49,10 @@ def run_stages(engine: Engine, config: Config) -> int:
     rounds = run_city_stages(engine, config)
     domain = settle_domain(engine, config)
     # Nothing waits for these: first in a call, so last of what may run, they fill the time in which others wait.
-    of_model = [fit_stage(config), *city_model_stages()]
+    of_model = [fit_stage(config), *city_model_stages(), *canopy_stages(config)]
     if config.footprints and not config.align:
         of_model = [*alignment_stages(config), *of_model]
-    meshed = [*mesh_stages(config, domain), *piece_stages()]
+    meshed = [*cover_stages(config), *mesh_stages(config, domain), *piece_stages(config)]
     if config.padded:
         engine.describe_layout()
         both = engine.layout, engine.context
@@ -61,7 +66,7 @@ def run_stages(engine: Engine, config: Config) -> int:
     while lost := [name for stage, name in engine.set_aside if stage == "pieces"]:
         for tile in lost:
             engine.give_up(("pieces", tile), ("columns", tile))
-        engine.run(*piece_stages())
+        engine.run(*piece_stages(config))
     return rounds
 
 
@@ -79,8 +84,9 @@ def run_city_stages(engine: Engine, config: Config, *, shift: tuple[float, float
         engine.add_parameters(footprints_shift=shift)
     elif config.align and config.footprints:
         _align(engine, config)
+    files = [*water_point_stages(config), *cover_file_stages(config), *tree_file_stages(config)]
     # The terrain of tiles with deep lakes waits for the coarse level, that of all others does not.
-    engine.run(*input_stages(config), lake_stage(), fill_stage(), items={"lakes": ()})
+    engine.run(*input_stages(config), *files, lake_stage(), fill_stage(), items={"lakes": ()})
     stop_at_holes(engine)
     if deep := engine.records["coarse", REGION_ITEM].facts["deep"]:
         engine.run(lake_stage(), fill_stage(), items={"lakes": deep, "terrain": deep})
@@ -140,6 +146,14 @@ def make_engine(
         footprints_frame=dataclasses.astuple(plan.georeference.footprints),
         footprints_shift=(0.0, 0.0),
         refinements=read_refinements(config, plan.region),
+        cover_table=tuple(map(dataclasses.astuple, read_table(config))),
+        land_cover_identity=tuple(
+            identify(path) for path in map(place, config.land_cover) if not is_missing(path)
+        ),
+        trees_identity=identify(place(config.trees))
+        if config.trees and not is_missing(place(config.trees))
+        else "",
+        cover_reach=cover_reach(config) if config.covered else 0.0,
     )
     return Engine(
         out / STORE,

@@ -5,6 +5,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from pipeline.data.notes import Note, count_notes
 from pipeline.points_terrain.terrain_fill import RIM as FAR_NODES
 from pipeline.simplification.house_clusters import add_counts
@@ -15,16 +17,18 @@ from tiler.engine.records import Records
 from tiler.engine.run_context import absent_tiles, tile_name
 from tiler.engine.stage import REGION_ITEM, Facts
 from tiler.engine.task import read_notes
+from tiler.landcover.cover_table import describe_patches, read_table
 from tiler.mesh_files.mesh_parts import MESH_IN_PARTS, describe_parts, note_parts
 from tiler.objects.places import place
 from tiler.planning.establish_georeference import FOOTPRINTS
+from tiler.planning.own_stages import CORE_STAGE
 from tiler.planning.plan import Plan
 from tiler.report.left_out import describe_left_out, report_left_out
 from tiler.stages.alignment import describe_alignment
 from tiler.stages.approach import RIM
 from tiler.stages.city_files import describe_feet
 from tiler.stages.domain import LOW_DOMAIN
-from tiler.stages.own_stages import CORE_STAGE
+from tiler.store.run_folder import PATCH_OF_GROUND
 from tiler.workflow.empty_run import explain_empty, is_empty
 from tiler.workflow.failed_tiles import Missing, describe_missing
 
@@ -113,6 +117,7 @@ def summarise_run(
             }
             for name in sorted(plan.layout.tiles.keys() - missing.tiles.keys())
         },
+        **({"land_cover": _describe_cover(records, config)} if config.covered else {}),
         **describe_missing(missing, place(config.out)),
         "counts": counts,
         **empty,
@@ -135,6 +140,13 @@ def summarise_run(
         "unreadable": unreadable,
         "notes": group_notes(notes),
     }
+
+
+def _describe_cover(records: Records, config: Config) -> dict[str, Any]:
+    """Describe the patches of the ground by number, with the area of each."""
+    patches = describe_patches(read_table(config), padded=config.padded)
+    area = np.sum([record.facts[PATCH_OF_GROUND] for record in records.of("columns")], axis=0)
+    return {"patches": [row | {"area (m2)": round(float(area[k]), 1)} for k, row in enumerate(patches)]}
 
 
 def _roof_fit(records: Records) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from tiler.config.config import Config, make_config
 from tiler.engine.stage import Scope, Stage
 from tiler.interface.synth import write_city
 from tiler.monitoring.status import read_status
-from tiler.stages.own_stages import check_own
+from tiler.planning.own_stages import check_own
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
 from tiler.workflow.run import run

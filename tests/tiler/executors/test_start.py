@@ -15,7 +15,7 @@ DASK = ("dask", "distributed")
 SCIPY = tuple(f"scipy.{part}" for part in ("fft", "io", "linalg", "ndimage", "sparse", "spatial", "special"))
 UNNEEDED = ("meshio", "numpy.testing", "pyamg", "zarr", *SCIPY)
 BY_NUMBA = {"numpy.testing", "scipy.linalg"}  # imported at the first kernel, as numba asks scipy for BLAS
-RUN = ("tiler.workflow.run", "tiler.monitoring.terminal", "tiler.stages.own_stages")
+RUN = ("tiler.workflow.run", "tiler.monitoring.terminal", "tiler.planning.own_stages")
 
 
 def find_imported(names: tuple[str, ...], modules: tuple[str, ...]) -> list[str]:

@@ -31,9 +31,9 @@ from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.export.export import export_run
 from tiler.mesh_files.vtk_files import read_vtu
+from tiler.planning.own_stages import list_stages
 from tiler.planning.region import find_pad, pad_bounds, pad_grid
 from tiler.report.plan_report import plan_run
-from tiler.stages.own_stages import list_stages
 from tiler.stages.surroundings import find_walls
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store

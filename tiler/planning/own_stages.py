@@ -10,6 +10,9 @@ from tiler.config.domain_height import Domain
 from tiler.config.step_options import derived_parameters
 from tiler.engine.engine import Engine
 from tiler.engine.stage import Stage
+from tiler.landcover.canopy_stages import canopy_stages, tree_file_stages
+from tiler.landcover.cover_stages import cover_file_stages, cover_stages
+from tiler.landcover.water_points import water_point_stages
 from tiler.stages.alignment import alignment_stages
 from tiler.stages.approach import approach_stages
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
@@ -45,14 +48,21 @@ def list_stages(config: Config) -> list[Stage]:
     stages += [*approach_stages(config), *layer_stages(config, Domain(config.expected_height, None))]
     stages += [*city_model_stages(), fit_stage(config)]
     stages += alignment_stages(config) if config.footprints else []
-    return [*stages, *mesh_stages(config), *piece_stages()]
+    return [*stages, *of_cover(config), *mesh_stages(config), *piece_stages(config)]
+
+
+def of_cover(config: Config) -> list[Stage]:
+    """List the stages of land cover and trees."""
+    files = [*water_point_stages(config), *cover_file_stages(config), *tree_file_stages(config)]
+    return [*files, *canopy_stages(config), *cover_stages(config)]
 
 
 def stages_of_pad(config: Config) -> set[str]:
     """Names of the stages that are run over region and pad; none without a pad."""
     if not config.padded:
         return set()
-    return {stage.name for stage in [*approach_stages(config), *mesh_stages(config), *piece_stages()]}
+    stages = [*approach_stages(config), *cover_stages(config), *mesh_stages(config), *piece_stages(config)]
+    return {stage.name for stage in stages}
 
 
 def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, Any] | None) -> OwnStages:
@@ -71,7 +81,8 @@ def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, 
         raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")
     given = {*dataclasses.asdict(config), *derived_parameters(config), "footprints_identity", "top_elevation"}
     given |= {"footprints_frame", "footprints_shift", "refinements"}
-    given |= {"core_bounds", "rim_store", "rim_digest"}
+    given |= {"core_bounds", "rim_store", "rim_digest", "land_cover_identity", "cover_table", "cover_reach"}
+    given |= {"levels_store", "levels_digest", "trees_identity"}
     clash = sorted(own.parameters.keys() & given)
     if clash:
         raise ValueError(f"parameter {', '.join(clash)}: the run has one of this name; name yours otherwise")

@@ -1,0 +1,94 @@
+"""Trees of vector files: crowns, or positions with a width, as rows for the store."""
+
+import hashlib
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.data.citymodel import Footprints
+from pipeline.data.errors import InputError
+from pipeline.data.notes import Note
+from pipeline.data.roof_forms import no_forms
+from tiler.footprints.footprint_index import FootprintBlock, block_footprints
+from tiler.footprints.footprint_source import open_source
+from tiler.georeference.frame import to_region
+from tiler.objects.places import is_missing
+from tiler.vectors.features import Box, Features
+from tiler.vectors.layers import scan_layer
+from tiler.vectors.lengths import metres_of
+
+HEIGHT, BASE, WIDTH = "height", "base", "crown"  # attributes (m): of the top and of the crown's foot above ground
+CROWN = 6.0  # m; width of the crown of a position that states none
+BASE_COLUMN = 0  # of `Footprints.forms`, which has room for numbers of a row
+AREAS = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)
+
+
+def scan_trees(path: Path, *, crs: pyproj.CRS, bounds: Box) -> Iterator[FootprintBlock]:
+    """Read the trees of a file that meet a box, by batches.
+
+    Parameters
+    ----------
+    path : Path
+        Any vector file of polygons or points.
+    crs : pyproj.CRS
+        The region's.
+    bounds : tuple of 4 floats
+        The region (m).
+
+    Yields
+    ------
+    FootprintBlock
+        Crowns; heights are those of the tops above ground (m), NaN where the file states none, and the first
+        column of forms has the feet of the crowns.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    if is_missing(path):
+        raise InputError(f"{path}: no such file; check the path of trees")
+    source = open_source(path, crs=crs, bounds=bounds, layer="", id_attribute="", height_attribute="")
+    if source.layer.gdal is not None and source.layer.gdal.driver == "OSM":
+        raise InputError(
+            f"{path}: of an extract of OpenStreetMap tags of buildings alone are read; make a file of its trees: "
+            f'ogr2ogr -where "other_tags like \'%natural"=>"tree%\'" trees.gpkg {path.name} points'
+        )
+    names = [name for name in (HEIGHT, BASE, WIDTH) if name in source.layer.fields]
+    left = 0
+    for features in scan_layer(source.layer, names, source.box):
+        there = np.flatnonzero([blob is not None for blob in features.wkb])
+        shapes = shapely.force_2d(shapely.from_wkb(features.wkb[there], on_invalid="fix"))
+        if source.frame.changes_plan:
+            shapes = shapely.transform(shapes, partial(to_region, source.frame))
+        height, base, width = (_lengths(features, name)[there] for name in (HEIGHT, BASE, WIDTH))
+        kind = shapely.get_type_id(shapes)
+        points = kind == shapely.GeometryType.POINT
+        radius = np.where(np.isfinite(width) & (width > 0), width, CROWN)[points] / 2
+        shapes[points] = shapely.buffer(shapes[points], radius, quad_segs=4)
+        finite = np.array([bool(np.isfinite(shapely.get_coordinates(one)).all()) for one in shapes], np.bool_)
+        usable = finite & (points | np.isin(kind, AREAS)) & ~(height <= 0)
+        left += len(features.wkb) - int(usable.sum())
+        shapes[~usable] = None
+        kept = usable & shapely.intersects(shapes, shapely.box(*bounds))
+        parts, owner = shapely.get_parts(shapely.normalize(shapes[kept]), return_index=True)
+        forms = no_forms(len(parts))
+        forms[:, BASE_COLUMN] = base[kept][owner]
+        blobs = shapely.to_wkb(parts, output_dimension=2, byte_order=1)
+        ids = np.array([hashlib.blake2b(blob, digest_size=8).hexdigest() for blob in blobs], np.str_)
+        yield block_footprints(Footprints(parts, ids, height[kept][owner], forms), [])
+    if left:
+        note = Note("trees-left-out", path.name, detail=f"{left} features are no area or point, or have no height")
+        yield block_footprints(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), [note])
+
+
+def _lengths(features: Features, name: str) -> NDArray[np.float64]:
+    values = features.columns.get(name)
+    if values is None:
+        return np.full(len(features.wkb), np.nan)
+    return np.array([metres_of(value) for value in values], np.float64)
