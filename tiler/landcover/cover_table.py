@@ -44,7 +44,7 @@ class CoverRow:
 # Wieringa, "Updating the Davenport roughness classification", J. Wind Eng. Ind. Aerodyn. 41, 357-368, 1992); words
 # are values of OpenStreetMap, of the Dutch BGT, and plain ones.
 WORDS = {
-    "water": "water river canal lake pond basin reservoir riverbank dock waterway waterdeel",
+    "water": "water river canal lake pond basin reservoir riverbank dock waterway waterdeel waterloop watervlakte",
     "street": "street road highway motorway primary secondary tertiary service pedestrian footway path cycleway "
     "parking paved wegdeel rijbaan voetpad fietspad",
     "rail": "rail railway tram spoorbaan",
