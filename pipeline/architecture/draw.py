@@ -148,7 +148,7 @@ def _draw_parts(dice: _Dice, house: House, lot: Lot) -> tuple[BuildingPart, ...]
         parts.append(BuildingPart("garage", 1, round(0.5, 3), round(wide, 3), depth, height))
     wide = round(min(4.0, house.length / 2), 3)
     deep = 1.5 if lot.party else min(2.5, math.sqrt(max(room**2 - (wide / 2 + 2.0) ** 2, 0.0)) - house.width / 2)
-    if alcove and deep >= 1.0:
+    if alcove and deep >= 1.0 and 2 not in lot.party:
         along = dice.between(0.5, house.length - wide - 0.5) if lot.party else round((house.length - wide) / 2, 3)
         parts.append(BuildingPart("alcove", 2, along, wide, round(deep, 3), height))
     return tuple(parts)

@@ -18,7 +18,7 @@ TOPS = {"eaves": 0.0, "third": 1 / 3, "half": 0.5, "two-thirds": 2 / 3, "ridge":
 Footprint = Literal["walls", "eaves"]
 OnRoof = TypeVar("OnRoof", Dormer, Chimney, RoofWindow)
 
-_DETAILS = {
+DETAILS = {
     "2.0": Detail(),
     "2.1": Detail(),
     "2.2": Detail(dormers=True),
@@ -104,9 +104,9 @@ def make_level(
         raise ValueError(f"level {level}, footprint {footprint}, top {top}")
     shown = at_eaves(house) if footprint == "eaves" else house
     if level[0] in "01":
-        volumes = _make_blocks(shown, level, shown.height + TOPS[top] * shown.roof.rise)
+        volumes = make_blocks(shown, level, shown.height + TOPS[top] * shown.roof.rise)
     else:
-        detail = _DETAILS[level]
+        detail = DETAILS[level]
         if solid:
             detail = replace(detail, chimneys=False, overhangs=False)
         elif footprint == "eaves":
@@ -114,13 +114,18 @@ def make_level(
         closed = solid or not detail.overhangs or house.roof.overhang == 0
         volumes = [Volume(-1, closed, make_shell(shown, detail))]
         if level != "2.0":
-            volumes += _make_parts(shown)
+            volumes += make_parts(shown)
     return [replace(volume, surfaces=to_town(shown, volume.surfaces)) for volume in volumes]
 
 
 def at_eaves(house: House) -> House:
     """Move the walls of a house out below the edges of its roof; what lies in the walls stays where it was."""
-    roof, far = house.roof, house.roof.overhang
+    return move_walls(house, house.roof.overhang)
+
+
+def move_walls(house: House, far: float) -> House:
+    """Move the walls of a house out by a distance (m), in if it is negative; the planes of its roof stay."""
+    roof = house.roof
     if far == 0:
         return house
     sides = list_sides(house)
@@ -135,7 +140,7 @@ def at_eaves(house: House) -> House:
         length=house.length + 2 * ends,
         width=house.width + 2 * far,
         height=height,
-        roof=replace(roof, rise=highest - height, overhang=0.0),
+        roof=replace(roof, rise=highest - height, overhang=max(roof.overhang - far, 0.0)),
         parts=tuple(
             replace(part, along=part.along + (ends if part.wall % 2 == 0 else far)) for part in house.parts
         ),
@@ -189,11 +194,17 @@ def _bounding_ring(house: House) -> list[Flat]:
     return [(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)]
 
 
-def _make_blocks(house: House, level: str, top: float) -> list[Volume]:
-    ring = {"0": _bounding_ring, "1": _body_ring, "2": outline_ring, "3": outline_ring}[level[2]](house)
+def level_ring(house: House, level: str) -> list[Flat]:
+    """Outline of a house at level 0 or 1, in its frame, counter-clockwise from above."""
+    return {"0": _bounding_ring, "1": _body_ring, "2": outline_ring, "3": outline_ring}[level[2]](house)
+
+
+def make_blocks(house: House, level: str, top: float) -> list[Volume]:
+    """Make a house at level 0 or 1, in its frame; blocks of its main body are `top` high (m)."""
+    ring = level_ring(house, level)
     if level[0] == "1":
         if level == "1.3":
-            return [Volume(-1, True, prism(_body_ring(house), 0.0, top)), *_make_parts(house)]
+            return [Volume(-1, True, prism(_body_ring(house), 0.0, top)), *make_parts(house)]
         return [Volume(-1, True, prism(ring, 0.0, top))]
     surfaces = [Surface(GROUND, [(x, y, 0.0) for x, y in reversed(ring)], [])]
     if level == "0.3":
@@ -207,5 +218,6 @@ def _make_blocks(house: House, level: str, top: float) -> list[Volume]:
     return [Volume(-1, False, surfaces)]
 
 
-def _make_parts(house: House) -> list[Volume]:
+def make_parts(house: House) -> list[Volume]:
+    """Make the blocks of the parts of a house, in its frame."""
     return [Volume(k, True, prism(part_ring(house, part), 0.0, part.height)) for k, part in enumerate(house.parts)]

@@ -6,7 +6,7 @@ from tiler.cityinput.faces import NO_LOD, OUTLINE, ROOF, UNKNOWN, Faces, ModelBu
 
 ROOFS = 2.0  # from this level on, roofs have their shapes
 OPENINGS = 3.0  # from this level on, surfaces have openings and details
-CHOICES = ("auto", "1.2", "1.3", "2.2")
+CHOICES = ("auto", "1.2", "1.3", "2.1", "2.2")
 
 
 def rank_levels(levels: Sequence[float], asked: str) -> list[float]:

@@ -27,6 +27,7 @@ from tiler.words.std_streams import guard_streams
 if TYPE_CHECKING:
     from tiler.engine.watcher import Watcher
     from tiler.interface.synth import SynthFiles
+    from tiler.towns.town_tile import Output
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 DEMO_TILES = 3  # tiles along each side of the demo's city, fewer where they would be too small
@@ -108,6 +109,8 @@ def _run(options: argparse.Namespace) -> int:
     if options.only is None:
         dashboard = None if options.no_dashboard else options.dashboard_address
         words = {"quiet": options.quiet, "verbose": options.verbose, "log": options.log_json}
+        if options.lods is not None:
+            return _run_levels(options, dashboard=dashboard, report=options.report, **words)
         return _run_config(config, dashboard=dashboard, report=options.report, **words)
     if options.log_json is not None:
         raise ConfigError("--log-json tells of a whole run; leave out it or --only")
@@ -115,6 +118,20 @@ def _run(options: argparse.Namespace) -> int:
 
     print(run_alone(config, options.only, say=None if options.quiet else say))
     return 0
+
+
+def _run_levels(options: argparse.Namespace, **words: Any) -> int:
+    """Make a mesh of each level of a city model; the exit code is that of the worst."""
+    if not options.__dict__.get("buildings") or options.log_json is not None:
+        raise ConfigError("--lods: takes levels of --buildings, and no --log-json; give a city model")
+    values = with_file(vars(options))
+    levels = options.lods.split(",")
+    configs = [make_config(values | {"lod": lod, "out": f"{values['out']}/lod{lod}"}) for lod in levels]
+    codes = []
+    for config in configs:
+        say(f"level {config.lod}: {config.out}")
+        codes.append(_run_config(config, **words))
+    return max(codes)
 
 
 def _run_config(
@@ -252,6 +269,9 @@ def _fetch(options: argparse.Namespace) -> int:
 
 def _synth(options: argparse.Namespace) -> int:
     if options.style == "boxes":
+        names = ("lidar", "trees", "water", "workers", "variants", "degrade", "broken", "parameters", "footprints")
+        if given := [name for name in names if getattr(options, name)]:
+            raise ConfigError(f"--{given[0]}: goes with a town; give its --style, as --style detached")
         _write_city(options.directory, options)
     else:
         _write_town(options.directory, options)
@@ -259,20 +279,72 @@ def _synth(options: argparse.Namespace) -> int:
 
 
 def _write_town(directory: Path, options: argparse.Namespace) -> None:
-    from tiler.towns.town import ModelOptions, open_town, write_town
+    from tiler.towns.town import make_output, open_town, write_faults, write_town
+    from tiler.towns.town_tile import ModelOptions
 
     if options.buildings != SYNTH_BUILDINGS or options.roofs != "flat":
         raise ConfigError(
             f"--style {options.style}: has lots and rules of its own; --buildings and --roofs go with boxes, "
             "leave them out"
         )
-    town = open_town(options.size, options.style, rules=options.rules, seed=options.seed, relief=options.relief)
+    variants = options.variants.split(",") if options.variants else ()
     models = ModelOptions(
         tuple(options.levels.split(",")), options.walls, options.block_height, solid=not options.surfaces
     )
-    files = write_town(directory, town, density=options.density, models=models)
+    if options.broken:
+        directory.mkdir(parents=True, exist_ok=True)
+        write_faults(directory / "broken.city.jsonl")
+    if options.parameters or options.footprints:
+        _write_given(directory, options, make_output(models, variants, options.degrade, seed=options.seed))
+        return
+    town = open_town(
+        options.size,
+        options.style,
+        rules=options.rules,
+        seed=options.seed,
+        relief=options.relief,
+        trees=options.trees,
+        water=options.water,
+    )
+    files = write_town(
+        directory,
+        town,
+        density=options.density,
+        models=models,
+        lidar=options.lidar,
+        class_errors=options.class_errors,
+        workers=options.workers,
+        variants=variants,
+        degrade=options.degrade,
+    )
     points = f"{len(files.clouds)} LAZ files in {files.clouds[0].parent}, " if files.clouds else ""
     say(f"{files.houses} houses: {points}{files.models.name}, {files.footprints.name} and {files.parameters.name}")
+
+
+def _write_given(directory: Path, options: argparse.Namespace, output: "Output") -> None:
+    """Make the models of parameters, or of footprints by rules where their attributes say nothing."""
+    from tiler.towns.augment import augment, write_augmented
+    from tiler.towns.parameter_files import read_json, read_xml
+    from tiler.towns.rule_files import make_file_rules
+    from tiler.towns.styles import STYLES
+    from tiler.towns.town import write_houses
+
+    if options.lidar or (options.parameters and options.footprints):
+        raise ConfigError("--parameters, --footprints and --lidar do not go together; give one of them")
+    if options.parameters:
+        read = read_xml if options.parameters.suffix == ".xml" else read_json
+        files = write_houses(directory, read(options.parameters), output)
+        say(f"{files.houses} houses: {files.models.name}, {files.footprints.name}")
+        return
+    rules = make_file_rules(options.rules, STYLES[options.style].preset)
+    found = augment(options.footprints, rules, seed=options.seed)
+    files = write_houses(directory, found.houses, output, crs=found.crs)
+    write_augmented(directory / "augmented.gpkg", found)
+    for what, number in sorted(found.counts.items()):
+        say(f"{number} {what}")
+    say(
+        f"{len(found.outlines)} footprints in augmented.gpkg, {files.houses} of them houses in {files.models.name}"
+    )
 
 
 def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":

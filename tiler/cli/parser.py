@@ -37,6 +37,9 @@ KINDS = {
 WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 LODS = next(entry.metadata["choices"] for entry in dataclasses.fields(Config) if entry.name == "lod")
 SYNTH_BUILDINGS = 500  # of a city of boxes
+# What `pipeline.architecture` and `tiler.towns` have, without their numpy; a test holds these against theirs.
+TOWN_STYLES = ("boxes", "detached", "grid", "terraces", "blocks", "apartments", "towers")
+TOWN_WALLS, BLOCK_HEIGHTS = ("walls", "eaves"), ("eaves", "third", "half", "two-thirds", "ridge")
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
 # What a first run needs stands first in the help of a run, what is for studies of the method last.
 ESSENTIAL = (
@@ -132,9 +135,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
         help="where the page of the run is shown while it is at work (default: a free port of 127.0.0.1)",
     )
     shown.add_argument("--no-dashboard", action="store_true", help="show no page of the run")
-    shown.add_argument(
-        "--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure"
-    )
+    _add_choice(shown)
     words = shown.add_mutually_exclusive_group()
     words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
     words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
@@ -292,12 +293,24 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int, r
     )
 
 
+def _add_choice(shown: Group) -> None:
+    """Add which part of the region, or which levels, a run makes."""
+    shown.add_argument(
+        "--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure"
+    )
+    shown.add_argument(
+        "--lods",
+        metavar="LOD,...",
+        help="make a mesh of each of these levels of --buildings, as of --lod, in OUT/lod1.2 and so on",
+    )
+
+
 def _add_town(synth: argparse.ArgumentParser) -> None:
     """Add what towns of houses with architecture have besides."""
     town = synth.add_argument_group("towns of houses that are drawn by rules, with their city model")
     town.add_argument(
         "--style",
-        choices=("boxes", "detached", "grid", "terraces", "apartments", "towers"),
+        choices=TOWN_STYLES,
         default="boxes",
         help="boxes: blocks, or roofs as of --roofs; others: houses with architecture (default: boxes)",
     )
@@ -307,14 +320,69 @@ def _add_town(synth: argparse.ArgumentParser) -> None:
     town.add_argument(
         "--levels", default="1.2,2.2", metavar="LOD,...", help="of the city model: 0.0 to 3.3 (default: 1.2,2.2)"
     )
-    town.add_argument(
-        "--walls", choices=("walls", "eaves"), default="walls", help="where walls stand (default: walls)"
-    )
+    town.add_argument("--walls", choices=TOWN_WALLS, default="walls", help="where walls stand (default: walls)")
     town.add_argument(
         "--block-height",
-        choices=("eaves", "third", "half", "two-thirds", "ridge"),
+        choices=BLOCK_HEIGHTS,
         default="half",
         help="height of the blocks of level 1, as a share of the roof (default: half)",
+    )
+    town.add_argument(
+        "--lidar",
+        type=float,
+        default=0.0,
+        metavar="N",
+        help="scan it in strips, with N pulses per m2 of a strip, instead of --density; writes truth.jsonl too",
+    )
+    town.add_argument(
+        "--class-errors",
+        type=float,
+        default=0.01,
+        metavar="SHARE",
+        help="of the points of --lidar, that have a wrong class (default: 0.01)",
+    )
+    town.add_argument(
+        "--trees",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="of the corners of lots with trees (default: 0)",
+    )
+    town.add_argument(
+        "--water", type=float, default=0.0, metavar="SHARE", help="of the relief, that lakes fill (default: 0)"
+    )
+    town.add_argument(
+        "--workers", type=int, default=0, metavar="N", help="processes that make tiles (default: 0, this one)"
+    )
+    town.add_argument(
+        "--variants",
+        default="",
+        metavar="NAME,...",
+        help="write each of these representations to a file of its own in variants/; all: all 392",
+    )
+    town.add_argument(
+        "--degrade",
+        type=float,
+        default=0.0,
+        metavar="SIGMA",
+        help="write twins with normal noise of SIGMA m on their parameters besides, with the same ids",
+    )
+    town.add_argument(
+        "--broken",
+        action="store_true",
+        help="write broken.city.jsonl besides: each fault of a solid once, by name",
+    )
+    town.add_argument(
+        "--parameters",
+        type=Path,
+        metavar="FILE",
+        help="make models of these: parameters.jsonl or .xml, also edited",
+    )
+    town.add_argument(
+        "--footprints",
+        type=Path,
+        metavar="FILE",
+        help="make houses on these; rules of the style hold where attributes say nothing",
     )
     town.add_argument(
         "--surfaces", action="store_true", help="surfaces with chimneys and overhangs, instead of solids without"

@@ -86,7 +86,7 @@ class Config:
     )  # fmt: skip
     lod: str = _parameter(
         "auto", "input", "level of detail that is taken of each building of a city model: the best roofs that it "
-        "has, or the best level up to a number", choices=("auto", "1.2", "1.3", "2.2"),
+        "has, or the best level up to a number", choices=("auto", "1.2", "1.3", "2.1", "2.2"),
     )  # fmt: skip
     prefer: str = _parameter(
         "model", "input", "whose roof a house has that both a point cloud and a city model have one of",

@@ -60,8 +60,15 @@ def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHE
     RuntimeError
         In a script without ``if __name__ == "__main__":``, which each worker process would run again.
     """
-    start_fork_server()
     limits = limits or Limits(memory=share_memory(workers))
+    with open_cluster(workers, limits, dashboard=dashboard) as (client, cluster):
+        yield DaskExecutor(client, workers, limits, cluster.scheduler)
+
+
+@contextmanager
+def open_cluster(workers: int, limits: Limits, *, dashboard: str = ANYWHERE) -> Iterator[tuple[Any, Any]]:
+    """Start a scheduler and worker processes, and end them with the context: client and cluster."""
+    start_fork_server()
     with (
         config.set(dict(LOCAL)),
         LocalCluster(
@@ -77,7 +84,7 @@ def local(workers: int, limits: Limits | None = None, *, dashboard: str = ANYWHE
     ):
         client.register_plugin(WorkerSetup(int(REFUSE_AT * limits.memory)))
         try:
-            yield DaskExecutor(client, workers, limits, cluster.scheduler)
+            yield client, cluster
         except KeyboardInterrupt:  # at once: running tasks are not waited for
             _kill_workers(cluster)
             raise

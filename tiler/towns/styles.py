@@ -1,5 +1,6 @@
 """Styles of towns: rules, placement and lots that go together, and the houses of a town by tile."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,12 +9,15 @@ from typing import Any
 import numpy as np
 
 from pipeline.architecture.draw import draw_house
-from pipeline.architecture.lots import list_lots
+from pipeline.architecture.lots import Lot, list_lots, list_open_lots
 from pipeline.architecture.parameters import House
+from pipeline.architecture.plants import Tree, draw_trees
 from pipeline.architecture.rules import Distribution, make_rules
 
 Box = tuple[float, float, float, float]
 
+LOWEST = 10.0  # m, of the ground
+FREEBOARD = 0.5  # m, of houses above the water
 _WAVES = ((1100.0, 700.0, 0.5), (310.0, -450.0, 0.3), (-170.0, 230.0, 0.2))  # lengths in x and y (m), share
 
 
@@ -40,6 +44,7 @@ STYLES = {
     "detached": Style("detached", "random", 24.0),
     "grid": Style("detached", "grid", 22.0),
     "terraces": Style("terraces", "rows", 6.5),
+    "blocks": Style("terraces", "blocks", 10.0),
     "apartments": Style("apartments", "random", 60.0),
     "towers": Style("towers", "grid", 55.0),
 }
@@ -61,6 +66,10 @@ class Town:
         Not negative.
     relief : float
         Highest minus lowest ground, about (m).
+    trees : float
+        Share of the corners of lots that have a tree.
+    water : float
+        Share of the relief that lakes fill; no house stands in them.
     """
 
     bounds: Box
@@ -68,15 +77,66 @@ class Town:
     rules: Mapping[str, Distribution]
     seed: int
     relief: float
+    trees: float = 0.0
+    water: float = 0.0
+
+    def lots(self, box: Box) -> Iterator[Lot]:
+        """List the lots whose centre lies in a box (m), and in the town."""
+        placement, size = self.style.placement, self.style.lot
+        return list_lots(self._inner(box), placement, size, seed=self.seed, depth=self._depth)
+
+    def draw(self, lot: Lot) -> House | None:
+        """Draw the house of a lot: it depends on no others. None where it would stand in water."""
+        house = draw_house(self.rules, lot, self.ground, seed=self.seed)
+        return house if house.z >= self.water_level + FREEBOARD else None
 
     def houses(self, box: Box) -> Iterator[House]:
-        """Draw the houses whose lot has its centre in a box (m), and in the town: they depend on no others."""
+        """Draw the houses of the lots of a box."""
+        return (house for house in map(self.draw, self.lots(box)) if house is not None)
+
+    @property
+    def reach(self) -> float:
+        """How far from the centre of a lot its house may reach (m), at most."""
+        return self.style.lot + self._depth
+
+    def plants(self, box: Box) -> Iterator[Tree]:
+        """Draw the trees of a box (m), as `houses`; none stands in water."""
+        lot, seed = self.style.lot, self.seed
+        inner = self._inner(box)
+        for tree in draw_trees(
+            inner, self.style.placement, lot, self.ground, share=self.trees, seed=seed, depth=self._depth
+        ):
+            if tree.z > self.water_level:
+                yield tree
+
+    def open_lots(self, box: Box) -> Iterator[Lot]:
+        """List the lots of streets and courtyards of a box (m)."""
+        return list_open_lots(self._inner(box), self.style.placement, self.style.lot)
+
+    def _inner(self, box: Box) -> Box:
         west, south, east, north = self.bounds
-        inner = max(box[0], west), max(box[1], south), min(box[2], east), min(box[3], north)
-        depth = self.rules["width"].limits()[1]
-        lots = list_lots(inner, self.style.placement, self.style.lot, seed=self.seed, depth=depth)
-        for lot in lots:
-            yield draw_house(self.rules, lot, self.ground, seed=self.seed)
+        return max(box[0], west), max(box[1], south), min(box[2], east), min(box[3], north)
+
+    @property
+    def _depth(self) -> float:
+        return self.rules["width"].limits()[1]
+
+    @property
+    def water_level(self) -> float:
+        """Height of the water (m); minus infinity without any."""
+        return LOWEST + self.water * self.relief if self.water > 0 else -math.inf
+
+    @property
+    def top(self) -> float:
+        """Height (m) that nothing of the town is above."""
+        most = {name: self.rules[name].limits()[1] for name in ("storeys", "storey_height", "roof_pitch")}
+        rise = self._depth * math.tan(math.radians(most["roof_pitch"]))
+        return LOWEST + self.relief + most["storeys"] * most["storey_height"] + rise + 2.0
+
+    @property
+    def steepest(self) -> float:
+        """Slope that the ground has nowhere more of."""
+        return math.pi * self.relief * sum(share * math.hypot(1 / x, 1 / y) for x, y, share in _WAVES)
 
     @cached_property
     def _phases(self) -> list[float]:
@@ -89,10 +149,19 @@ class Town:
             share * np.sin(2 * np.pi * (x / east + y / north) + turn)
             for (east, north, share), turn in zip(_WAVES, self._phases, strict=True)
         )
-        return 10.0 + self.relief / 2 * (1 + sum(waves))
+        return LOWEST + self.relief / 2 * (1 + sum(waves))
 
 
-def make_town(bounds: Box, style: str, given: Mapping[str, Any], *, seed: int, relief: float) -> Town:
+def make_town(
+    bounds: Box,
+    style: str,
+    given: Mapping[str, Any],
+    *,
+    seed: int,
+    relief: float,
+    trees: float = 0.0,
+    water: float = 0.0,
+) -> Town:
     """Make a town of a style, with some rules other than those of its preset.
 
     Raises
@@ -105,4 +174,6 @@ def make_town(bounds: Box, style: str, given: Mapping[str, Any], *, seed: int, r
     west, south, east, north = bounds
     if not (west < east and south < north and seed >= 0 and 0 <= relief < 1000):
         raise ValueError(f"bounds {bounds}, seed {seed}, relief {relief}")
-    return Town(bounds, STYLES[style], make_rules(given, preset=STYLES[style].preset), seed, relief)
+    if not (0 <= trees <= 1 and 0 <= water < 1):
+        raise ValueError(f"trees {trees:g}, water {water:g}; expected shares from 0 to 1")
+    return Town(bounds, STYLES[style], make_rules(given, preset=STYLES[style].preset), seed, relief, trees, water)

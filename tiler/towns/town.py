@@ -1,56 +1,64 @@
 """Write a town: parameters of its houses, their city model, footprints, and the points of a flight."""
 
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
-from typing import NamedTuple
+from shutil import copyfileobj, rmtree
+from typing import IO
 
 import numpy as np
 import pyogrio
 import pyproj
 import shapely
 
-from pipeline.architecture.levels import LEVELS, Footprint, outline_ring
+from pipeline.architecture.faults import list_faults
+from pipeline.architecture.levels import LEVELS
 from pipeline.architecture.parameters import House
-from pipeline.architecture.surfaces import GROUND, Surface, to_town
+from pipeline.architecture.representations import list_representations
 from pipeline.data.errors import ConfigError, OutputError
 from pipeline.points_terrain.synthetic import ORIGIN
-from tiler.towns.parameter_files import write_json, write_xml
+from tiler.executors.in_order import map_in_order
+from tiler.towns.parameter_files import XML_END, XML_HEAD
 from tiler.towns.rule_files import read_rules
 from tiler.towns.styles import Box, Town, make_town
-from tiler.towns.synthetic_files import GPKG_TIME, write_laz
-from tiler.towns.town_cloud import scan_town
-from tiler.towns.town_models import write_models
+from tiler.towns.synthetic_files import GPKG_TIME
+from tiler.towns.town_models import fault_feature, model_head
+from tiler.towns.town_scan import check_flight
+from tiler.towns.town_tile import CRS, ModelOptions, Output, TownTile, house_outline, write_tile
 
-CRS = "EPSG:3006"
 TILE = 500.0  # m, of files of points, and of houses that are in memory at a time
 MOST_SIZE, MOST_DENSITY = 1e6, 1000.0  # m, points/m2
-REACH = 100.0  # m from the middle of a lot, beyond which nothing of its house is
+CLASS_ERRORS = 0.01
+BATCH = 500  # houses of other origins that are in memory at a time
+MOST_NOISE = 10.0  # m
 
 
 @dataclass(frozen=True)
 class TownFiles:
-    """What `write_town` wrote: LAZ files, footprints, city model, parameters as JSON and XML; number of houses."""
+    """What `write_town` wrote: LAZ files, footprints, city model, parameters as JSON and XML, truth; houses."""
 
     clouds: list[Path]
     footprints: Path
     models: Path
     parameters: Path
     parameters_xml: Path
+    truth: Path
     houses: int
 
 
-class ModelOptions(NamedTuple):
-    """Which geometry the city model has: see `pipeline.architecture.levels.make_level`."""
-
-    levels: Sequence[str] = ("1.2", "2.2")
-    footprint: Footprint = "walls"
-    top: str = "half"
-    solid: bool = True
-
-
-def open_town(size: float, style: str, *, rules: Path | None, seed: int, relief: float) -> Town:
+def open_town(
+    size: float,
+    style: str,
+    *,
+    rules: Path | None,
+    seed: int,
+    relief: float,
+    trees: float = 0.0,
+    water: float = 0.0,
+) -> Town:
     """Make a town on a square whose lower left corner is that of all synthetic cities.
 
     Parameters
@@ -65,6 +73,8 @@ def open_town(size: float, style: str, *, rules: Path | None, seed: int, relief:
         Not negative; the same seed gives the same town.
     relief : float
         Highest minus lowest ground, about (m).
+    trees, water : float
+        Share of the corners of lots with a tree, and of the relief that lakes fill.
 
     Raises
     ------
@@ -76,13 +86,24 @@ def open_town(size: float, style: str, *, rules: Path | None, seed: int, relief:
     bounds = (ORIGIN[0], ORIGIN[1], ORIGIN[0] + size, ORIGIN[1] + size)
     given = {} if rules is None else read_rules(rules)
     try:
-        return make_town(bounds, style, given, seed=seed, relief=relief)
+        return make_town(bounds, style, given, seed=seed, relief=relief, trees=trees, water=water)
     except ValueError as error:
         raise ConfigError(f"{'synth' if rules is None else rules}: {error}") from error
 
 
-def write_town(directory: Path, town: Town, *, density: float, models: ModelOptions) -> TownFiles:
-    """Write a town: the same parameters give the same bytes.
+def write_town(
+    directory: Path,
+    town: Town,
+    *,
+    density: float,
+    models: ModelOptions,
+    lidar: float = 0.0,
+    class_errors: float = CLASS_ERRORS,
+    workers: int = 0,
+    variants: Sequence[str] = (),
+    degrade: float = 0.0,
+) -> TownFiles:
+    """Write a town: the same parameters give the same bytes, whatever the workers.
 
     Parameters
     ----------
@@ -91,9 +112,17 @@ def write_town(directory: Path, town: Town, *, density: float, models: ModelOpti
     town : Town
         The town.
     density : float
-        Points per square metre; with 0 there are no files of points.
+        Points per square metre, seen from right above; with 0 there are no files of points.
     models : ModelOptions
         Levels and variants of the city model.
+    lidar : float
+        Pulses per square metre of each strip of a scanner, instead of `density`; see `scan_strips`.
+    class_errors : float
+        Share of the scanner's points that have a wrong class.
+    workers : int
+        Processes that make tiles; 0 for this one.
+    variants, degrade
+        As of `make_output`.
 
     Raises
     ------
@@ -104,36 +133,135 @@ def write_town(directory: Path, town: Town, *, density: float, models: ModelOpti
 
     Notes
     -----
-    Houses and points are made tile by tile: memory does not grow with the town.
+    Tiles are drawn once, each for all of its files: memory does not grow with the town.
+    """
+    output = make_output(models, variants, degrade, truth=lidar > 0, seed=town.seed)
+    for name, value in (("density", density), ("lidar", lidar)):
+        if not 0 <= value <= MOST_DENSITY:
+            raise ConfigError(f"--{name} {value:g}: expected 0 to {MOST_DENSITY:g} points per m2")
+    if not 0 <= class_errors <= 1:
+        raise ConfigError(f"--class-errors {class_errors:g}: expected 0 to 1")
+    if lidar > 0:
+        check_flight(town)
+    tile = TownTile(directory, town, town.bounds, (0, 0), density, lidar, class_errors, output)
+    tiles = [replace(tile, box=box, numbers=numbers) for box, numbers in list_tiles(town.bounds)]
+    clouds = [one.cloud for one in tiles] if density or lidar else []
+    with _open_town(directory, output, CRS, clouds=clouds) as files:
+        for tile, houses in zip(tiles, map_in_order(write_tile, tiles, workers), strict=True):
+            for kind, file in files.opened.items():
+                with tile.piece(kind).open("rb") as piece:
+                    copyfileobj(piece, file)
+            with tile.piece("outline").open() as lines:
+                files.append_footprints([json.loads(line) for line in lines])
+            rmtree(tile.folder)
+            files.houses += houses
+    return _list_files(directory, clouds, files.houses)
+
+
+def write_houses(directory: Path, houses: Iterable[House], output: Output, *, crs: str = CRS) -> TownFiles:
+    """Write houses of any origin as a town without points; a few of them are in memory."""
+    with _open_town(directory, output, crs, clouds=[]) as files:
+        rest = iter(houses)
+        while batch := list(islice(rest, BATCH)):
+            for house in batch:
+                for kind, line in output.house_lines(house).items():
+                    files.opened[kind].write(line.encode())
+            files.append_footprints([(house.id, *house_outline(house)) for house in batch])
+            files.houses += len(batch)
+    return _list_files(directory, [], files.houses)
+
+
+def make_output(
+    models: ModelOptions, variants: Sequence[str], degrade: float, *, truth: bool = False, seed: int = 1
+) -> Output:
+    """Choose the files of houses.
+
+    Parameters
+    ----------
+    models : ModelOptions
+        Of the city model.
+    variants : sequence of str
+        Names of representations, each of which is written to a file of its own: see `list_representations`;
+        ``"all"`` for all.
+    degrade : float
+        Standard deviation of the noise of degraded twins (m); 0 for none.
+    truth, seed
+        As of `Output`.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such level or representation, or the noise is out of range.
     """
     if unknown := [level for level in models.levels if level not in LEVELS]:
         raise ConfigError(f"--levels {unknown[0]}: expected some of {', '.join(LEVELS)}")
-    if not 0 <= density <= MOST_DENSITY:
-        raise ConfigError(f"--density {density:g}: expected 0 to {MOST_DENSITY:g} points per m2")
-    files = TownFiles(
-        [_tile_path(directory, box) for box, _ in list_tiles(town.bounds)] if density > 0 else [],
+    known = {one.name: one for one in list_representations()}
+    names = list(known) if "all" in variants else list(dict.fromkeys(variants))
+    if unknown := [name for name in names if name not in known]:
+        raise ConfigError(f"--variants {unknown[0]}: no such representation; docs/town-variants.md lists them")
+    if not 0 <= degrade <= MOST_NOISE:
+        raise ConfigError(f"--degrade {degrade:g}: expected 0 to {MOST_NOISE:g} m")
+    return Output(models, tuple(known[name] for name in names), degrade, truth, seed)
+
+
+@dataclass(eq=False)
+class _OpenTown:
+    """Files of a town that is being written, by their kinds, and what is in them."""
+
+    opened: Mapping[str, IO[bytes]]
+    footprints: Path
+    crs: str
+    houses: int = 0
+
+    def append_footprints(self, rows: Sequence[tuple[str, float, list[list[float]]]]) -> None:
+        """Append outlines with id and height."""
+        _append_footprints(rows, self.footprints, self.crs)
+
+
+@contextmanager
+def _open_town(directory: Path, output: Output, crs: str, *, clouds: Sequence[Path]) -> Iterator[_OpenTown]:
+    """Open the files of a town with their heads, and close them with their ends."""
+    try:
+        (directory / "tiles").mkdir(parents=True, exist_ok=True)
+        strangers = set((directory / "tiles").iterdir()) - set(clouds)
+        if strangers:
+            raise ConfigError(f"{min(strangers)}: is not of this town; give an empty folder or remove it")
+        footprints = directory / "footprints.gpkg"
+        footprints.unlink(missing_ok=True)
+        if output.variants:
+            (directory / "variants").mkdir(exist_ok=True)
+        head = model_head(pyproj.CRS(crs)).encode()
+        with ExitStack() as stack:
+            paths = output.paths(directory)
+            opened = {kind: stack.enter_context(path.open("wb")) for kind, path in paths.items()}
+            for kind, path in paths.items():
+                if path.name.endswith(".city.jsonl"):
+                    opened[kind].write(head)
+            opened["xml"].write(XML_HEAD.encode())
+            yield _OpenTown(opened, footprints, crs)
+            opened["xml"].write(XML_END.encode())
+    except (OSError, pyogrio.errors.DataSourceError) as error:
+        raise OutputError(f"{directory}: cannot be written ({error}); give a folder that can") from error
+
+
+def _list_files(directory: Path, clouds: list[Path], houses: int) -> TownFiles:
+    return TownFiles(
+        clouds,
         directory / "footprints.gpkg",
         directory / "town.city.jsonl",
         directory / "parameters.jsonl",
         directory / "parameters.xml",
-        0,
+        directory / "truth.jsonl",
+        houses,
     )
-    try:
-        (directory / "tiles").mkdir(parents=True, exist_ok=True)
-        strangers = set((directory / "tiles").iterdir()) - set(files.clouds)
-        if strangers:
-            raise ConfigError(f"{min(strangers)}: is not of this town; give an empty folder or remove it")
-        write_json(list_houses(town), files.parameters)
-        write_xml(list_houses(town), files.parameters_xml)
-        number = write_models(list_houses(town), files.models, crs=pyproj.CRS(CRS), **models._asdict())
-        _write_footprints(town, files.footprints)
-        for box, part in list_tiles(town.bounds) if density > 0 else ():
-            around = box[0] - REACH, box[1] - REACH, box[2] + REACH, box[3] + REACH
-            cloud = scan_town(town, box, list(town.houses(around)), part, density=density)
-            write_laz(_tile_path(directory, box), cloud, box, CRS)
-    except (OSError, pyogrio.errors.DataSourceError) as error:
-        raise OutputError(f"{directory}: cannot be written ({error}); give a folder that can") from error
-    return replace(files, houses=number)
+
+
+def write_faults(path: Path) -> None:
+    """Write broken solids, a building a fault, as CityJSONSeq."""
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.write(model_head(pyproj.CRS(CRS)))
+        for number, (name, faces) in enumerate(list_faults()):
+            file.write(fault_feature(name, faces, (ORIGIN[0] + 60.0 * number, ORIGIN[1], 10.0)))
 
 
 def list_tiles(bounds: Box) -> Iterator[tuple[Box, tuple[int, int]]]:
@@ -152,37 +280,26 @@ def list_houses(town: Town) -> Iterator[House]:
         yield from town.houses(box)
 
 
-def _tile_path(directory: Path, box: Box) -> Path:
-    return directory / "tiles" / f"{box[0]:.0f}_{box[1]:.0f}.laz"
-
-
-def _write_footprints(town: Town, path: Path) -> None:
-    """Write outlines of houses with their parts, with id, and height from the ground to the ridge (m)."""
-    path.unlink(missing_ok=True)
+def _append_footprints(rows: Sequence[tuple[str, float, list[list[float]]]], path: Path, crs: str) -> None:
+    """Append outlines with id and height; a file without any is written, too."""
+    if not rows and path.exists():
+        return
+    polygons = np.array([shapely.Polygon(ring) for *_, ring in rows], object)
+    fields = {
+        "id": np.array([name for name, *_ in rows], object),
+        "height": np.array([height for _, height, _ in rows], np.float64),
+    }
     pyogrio.set_gdal_config_options(GPKG_TIME)
     try:
-        for box, _ in list_tiles(town.bounds):
-            houses = list(town.houses(box))
-            if not houses and path.exists():
-                continue
-            outlines = [
-                to_town(house, [Surface(GROUND, [(x, y, 0.0) for x, y in outline_ring(house)], [])])[0].border
-                for house in houses
-            ]
-            polygons = np.array([shapely.Polygon([corner[:2] for corner in ring]) for ring in outlines], object)
-            fields = {
-                "id": np.array([house.id for house in houses], object),
-                "height": np.array([round(house.height + house.roof.rise, 3) for house in houses], np.float64),
-            }
-            pyogrio.raw.write(
-                path,
-                shapely.to_wkb(polygons),
-                list(fields.values()),
-                list(fields),
-                geometry_type="Polygon",
-                crs=CRS,
-                layer="footprints",
-                append=path.exists(),
-            )
+        pyogrio.raw.write(
+            path,
+            shapely.to_wkb(polygons),
+            list(fields.values()),
+            list(fields),
+            geometry_type="Polygon",
+            crs=crs,
+            layer="footprints",
+            append=path.exists(),
+        )
     finally:
         pyogrio.set_gdal_config_options(dict.fromkeys(GPKG_TIME))

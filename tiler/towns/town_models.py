@@ -1,15 +1,21 @@
 """City models of towns: CityJSONSeq, all levels of detail of a house in one object."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyproj
 
+from pipeline.architecture.interiors import make_interior
 from pipeline.architecture.levels import Footprint, Volume, make_level
+from pipeline.architecture.lots import Lot
 from pipeline.architecture.parameters import House
+from pipeline.architecture.plants import Tree, crown_rings
+from pipeline.architecture.representations import Representation, make_representation
+from pipeline.architecture.roof_sides import Point
 from pipeline.data.errors import ConfigError
 
 _ROOF_TYPES = {
@@ -44,25 +50,121 @@ def write_models(
     levels, footprint, top, solid
         As of `make_level`; all levels stand side by side.
     """
+    number = 0
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.write(model_head(crs))
+        for house in houses:
+            file.write(house_feature(house, levels=levels, footprint=footprint, top=top, solid=solid))
+            number += 1
+    return number
+
+
+def model_head(crs: pyproj.CRS) -> str:
+    """Give the first line of CityJSONSeq: coordinates are whole millimetres."""
     code = crs.to_epsg()
     if code is None:
         raise ConfigError(f"{crs.name}: has no EPSG code, which CityJSON names it by")
-    head = {
-        "type": "CityJSON",
-        "version": "2.0",
-        "transform": {"scale": [0.001] * 3, "translate": [0.0] * 3},
-        "metadata": {"referenceSystem": f"https://www.opengis.net/def/crs/EPSG/0/{code}"},
-        "CityObjects": {},
-        "vertices": [],
+    return _text(
+        {
+            "type": "CityJSON",
+            "version": "2.0",
+            "transform": {"scale": [0.001] * 3, "translate": [0.0] * 3},
+            "metadata": {"referenceSystem": f"https://www.opengis.net/def/crs/EPSG/0/{code}"},
+            "CityObjects": {},
+            "vertices": [],
+        }
+    )
+
+
+def house_feature(
+    house: House, *, levels: Sequence[str], footprint: Footprint = "walls", top: str = "half", solid: bool = True
+) -> str:
+    """Give the line of a house in CityJSONSeq; see `write_models`."""
+    made = {level: make_level(house, level, footprint=footprint, top=top, solid=solid) for level in levels}
+    return _text(_feature(house, made))
+
+
+def variant_feature(house: House, asked: Representation) -> str:
+    """Give the line of a house in one of its representations; what is inside are storeys of the building."""
+    semantics = asked.kind != "surfaces"
+    if not asked.interior:
+        made = {asked.level: make_representation(house, asked)}
+        return _text(_feature(house, made, semantics=semantics))
+    vertices = _Vertices()
+    objects: dict[str, Any] = {house.id: {"type": "Building", "attributes": describe_house(house), "geometry": []}}
+    rooms = make_interior(house, asked.level)
+    for room in rooms:
+        geometry = [_geometry(asked.level, room.volume, vertices, semantics=False)]
+        if room.storey < 0:
+            objects[house.id]["geometry"] = geometry
+            continue
+        name = f"{house.id}-storey-{room.storey}"
+        objects[house.id].setdefault("children", []).append(name)
+        objects[name] = {
+            "type": "BuildingStorey",
+            "parents": [house.id],
+            "attributes": {"storey": room.storey},
+            "geometry": geometry,
+        }
+    return _text({"type": "CityJSONFeature", "id": house.id, "CityObjects": objects, "vertices": vertices.rows()})
+
+
+def fault_feature(name: str, faces: Sequence[Sequence[Sequence[Point]]], corner: Point) -> str:
+    """Give the line of a solid whose shell is as it is, moved to a corner (m)."""
+    vertices = _Vertices()
+
+    def place(ring: Sequence[Point]) -> list[int]:
+        return vertices.ring(
+            [(round(x + corner[0], 3), round(y + corner[1], 3), z + corner[2]) for x, y, z in ring]
+        )
+
+    shell = [[place(ring) for ring in face] for face in faces]
+    thing = {
+        "type": "Building",
+        "attributes": {"fault": name},
+        "geometry": [{"type": "Solid", "lod": "1.2", "boundaries": [shell]}],
     }
-    number = 0
-    with path.open("w", encoding="ascii", newline="\n") as file:
-        file.write(_text(head))
-        for house in houses:
-            made = {level: make_level(house, level, footprint=footprint, top=top, solid=solid) for level in levels}
-            file.write(_text(_feature(house, made)))
-            number += 1
-    return number
+    rows = vertices.rows()
+    return _text({"type": "CityJSONFeature", "id": name, "CityObjects": {name: thing}, "vertices": rows})
+
+
+def lot_feature(lot: Lot, ground: Callable[[float, float], float]) -> str:
+    """Give the line of a piece of a street or of the green of a courtyard: two triangles on the ground."""
+    half = lot.size / 2
+    corners = [(lot.x - half, lot.y - half), (lot.x + half, lot.y - half), (lot.x + half, lot.y + half)]
+    corners.append((lot.x - half, lot.y + half))
+    places = [(round(x, 3), round(y, 3), round(float(ground(x, y)), 3)) for x, y in corners]
+    vertices = _Vertices()
+    faces = [[vertices.ring([places[0], places[k], places[k + 1]])] for k in (1, 2)]
+    street = lot.use == "street"
+    name = f"{'road' if street else 'green'}-{lot.i}-{lot.j}"
+    geometry: dict[str, Any] = {"type": "MultiSurface", "lod": "1.0", "boundaries": faces}
+    if street:
+        geometry["semantics"] = {"surfaces": [{"type": "TrafficArea"}], "values": [0, 0]}
+    thing = {"type": "Road" if street else "PlantCover", "geometry": [geometry]}
+    rows = vertices.rows()
+    return _text({"type": "CityJSONFeature", "id": name, "CityObjects": {name: thing}, "vertices": rows})
+
+
+def tree_feature(tree: Tree) -> str:
+    """Give the line of a tree: its crown as a surface of triangles and quadrilaterals."""
+    vertices = _Vertices()
+    rings = [[(round(x, 3), round(y, 3), round(z, 3)) for x, y, z in ring] for ring in crown_rings(tree)]
+    faces = []
+    for low, high in pairwise(rings):
+        n = max(len(low), len(high))
+        for k in range(n):
+            a, b = low[k % len(low)], low[(k + 1) % n % len(low)]
+            c, d = high[(k + 1) % n % len(high)], high[k % len(high)]
+            faces.append([vertices.ring(list(dict.fromkeys((a, b, c, d))))])
+    name = f"tree-{tree.i}-{tree.j}"
+    thing = {
+        "type": "SolitaryVegetationObject",
+        "attributes": {"height": tree.height, "crownDiameter": round(2 * tree.radius, 3)},
+        "geometry": [{"type": "MultiSurface", "lod": "2.0", "boundaries": faces}],
+    }
+    rows = vertices.rows()
+    return _text({"type": "CityJSONFeature", "id": name, "CityObjects": {name: thing}, "vertices": rows})
 
 
 def describe_house(house: House) -> dict[str, Any]:
@@ -94,14 +196,14 @@ class _Vertices:
         return rows
 
 
-def _feature(house: House, made: dict[str, list[Volume]]) -> dict[str, Any]:
+def _feature(house: House, made: dict[str, list[Volume]], *, semantics: bool = True) -> dict[str, Any]:
     names = [f"{house.id}-{part.kind}-{k + 1}" for k, part in enumerate(house.parts)]
     vertices = _Vertices()
     geometry: dict[str, list[dict[str, Any]]] = {name: [] for name in (house.id, *names)}
     for level, volumes in made.items():
         for volume in volumes:
             owner = house.id if volume.part < 0 else names[volume.part]
-            geometry[owner].append(_geometry(level, volume, vertices))
+            geometry[owner].append(_geometry(level, volume, vertices, semantics=semantics))
     objects: dict[str, Any] = {
         house.id: {"type": "Building", "attributes": describe_house(house), "geometry": geometry[house.id]}
     }
@@ -117,10 +219,12 @@ def _feature(house: House, made: dict[str, list[Volume]]) -> dict[str, Any]:
     return {"type": "CityJSONFeature", "id": house.id, "CityObjects": objects, "vertices": vertices.rows()}
 
 
-def _geometry(level: str, volume: Volume, vertices: _Vertices) -> dict[str, Any]:
+def _geometry(level: str, volume: Volume, vertices: _Vertices, *, semantics: bool) -> dict[str, Any]:
     faces = [[vertices.ring(ring) for ring in (surface.border, *surface.holes)] for surface in volume.surfaces]
     told: dict[str, Any] = {"type": "Solid" if volume.closed else "MultiSurface", "lod": level}
     told["boundaries"] = [faces] if volume.closed else faces
+    if not semantics:
+        return told
     values = [surface.kind for surface in volume.surfaces]
     kinds = list(dict.fromkeys(values))
     rows = [kinds.index(kind) for kind in values]

@@ -16,14 +16,18 @@ from pipeline.architecture.surfaces import GROUND, Surface, to_town
 LAYOUTS = {
     "detached": ("random", 24.0),
     "terraces": ("rows", 6.5),
+    "blocks": ("blocks", 10.0),
     "apartments": ("random", 60.0),
     "towers": ("grid", 55.0),
 }
 
 
+PRESET = {"blocks": "terraces"}
+
+
 def town(preset: str, bounds: tuple[float, float, float, float], **rules: object) -> list[House]:
     placement, size = LAYOUTS[preset]
-    read = make_rules(rules, preset=preset)
+    read = make_rules(rules, preset=PRESET.get(preset, preset))
     lots = list_lots(bounds, placement, size, seed=5, depth=read["width"].limits()[1])
     return [draw_house(read, lot, lambda x, y: 3.0, seed=5) for lot in lots]
 
@@ -49,12 +53,12 @@ def test_houses_do_not_overlap(preset: str) -> None:
     pairs = [(a, b) for a, b in tree.query(outlines, "intersects").T.tolist() if a < b]
     assert all(outlines[a].intersection(outlines[b]).area < 0.05 for a, b in pairs)
     touching = [(a, b) for a, b in pairs if outlines[a].intersection(outlines[b]).length > 5]
-    assert bool(touching) == (preset == "terraces")
+    assert bool(touching) == (preset in ("terraces", "blocks"))
 
 
 @pytest.mark.parametrize("preset", LAYOUTS)
 def test_rules_and_constraints_hold(preset: str) -> None:
-    rules = make_rules({}, preset=preset)
+    rules = make_rules({}, preset=PRESET.get(preset, preset))
     for house in town(preset, (0.0, 0.0, 300.0, 300.0)):
         low, high = rules["storeys"].limits()
         assert low <= house.storeys <= high

@@ -25,8 +25,9 @@ from tiler.cli.main import main
 from tiler.towns.parameter_files import read_json, read_xml, write_json, write_xml
 from tiler.towns.rule_files import read_rules, rule_schema
 from tiler.towns.styles import STYLES
-from tiler.towns.town import ModelOptions, list_houses, open_town, write_town
+from tiler.towns.town import list_houses, open_town, write_town
 from tiler.towns.town_models import write_models
+from tiler.towns.town_tile import ModelOptions
 
 
 def houses_of(style: str, size: float) -> list[House]:

@@ -1,0 +1,233 @@
+"""Augmentation: footprints with heights, storeys and roofs by rules where their attributes say nothing."""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.architecture.draw import LEAST_RISE, draw_house
+from pipeline.architecture.lots import Lot, lot_random
+from pipeline.architecture.parameters import House
+from pipeline.architecture.rules import Distribution
+from pipeline.data.errors import InputError
+from tiler.towns.synthetic_files import GPKG_TIME
+
+# Attributes that win over rules, by what they give: the first that a file has.
+NAMES = {
+    "id": ("id", "identificatie", "osm_id"),
+    "height": ("height", "measuredHeight"),
+    "storeys": ("building:levels", "storeysAboveGround", "storeys"),
+    "shape": ("roof:shape", "roofShape"),
+    "rise": ("roof:height",),
+    "year": ("yearOfConstruction", "year", "bouwjaar"),
+    "use": ("usage", "use"),
+    "ground": ("ground",),
+}
+_SHAPES = {"skillion": "shed", **{name: name for name in ("flat", "shed", "gabled", "hipped", "pyramidal")}}
+_WORDS = {"shed": "skillion"}  # of OpenStreetMap, where they are other ones
+RECTANGLE = (
+    0.97  # of the area of the least rectangle around: outlines that fill it are houses with walls and openings
+)
+_BESIDE = 0.15  # m from a wall: what lies there shares it
+
+
+@dataclass(frozen=True, eq=False)
+class Augmented:
+    """Footprints with what rules and attributes say of them.
+
+    Attributes
+    ----------
+    outlines : object, (n,)
+        Polygons and multipolygons of the file.
+    columns : mapping of str to array
+        ``id``, ``height`` (m, to the ridge), ``building:levels``, ``roof:shape`` and ``roof:height`` of each.
+    houses : sequence of House
+        Those of rectangular outlines.
+    crs : str
+        Of the file.
+    counts : Counter of str
+        How many attributes were taken, how many outlines are no houses, and what could not be read.
+    """
+
+    outlines: NDArray[np.object_]
+    columns: Mapping[str, NDArray[Any]]
+    houses: Sequence[House]
+    crs: str
+    counts: Counter[str]
+
+
+def augment(path: Path, rules: Mapping[str, Distribution], *, seed: int) -> Augmented:
+    """Draw what the attributes of footprints do not say.
+
+    Parameters
+    ----------
+    path : Path
+        A vector file of polygons in a metric CRS; all of them are in memory.
+    rules : mapping of str to Distribution
+        As from `make_rules`.
+    seed : int
+        Not negative; what is drawn depends on it, the rules, the attributes and the place of a footprint alone.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or its CRS is not metric.
+    """
+    try:
+        meta, _, wkb, values = pyogrio.raw.read(path)
+    except (OSError, pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a vector file of polygons") from error
+    crs = pyproj.CRS(meta["crs"]) if meta["crs"] else None
+    if crs is None or not crs.is_projected or crs.axis_info[0].unit_name != "metre":
+        raise InputError(
+            f"{path}: its CRS is {crs.name if crs else 'unknown'}; expected a projected one in metres"
+        )
+    outlines = shapely.force_2d(shapely.from_wkb(wkb))
+    if not len(outlines):
+        raise InputError(f"{path}: has no features; give a file with footprints")
+    table = dict(zip(meta["fields"].tolist(), values, strict=True))
+    given = {what: next((table[name] for name in names if name in table), None) for what, names in NAMES.items()}
+    tree = shapely.STRtree(outlines)
+    counts: Counter[str] = Counter()
+    rows, houses = [], []
+    for number, outline in enumerate(outlines.tolist()):
+        if outline is None or outline.is_empty or not outline.area > 0:
+            raise InputError(f"{path}, feature {number}: has no area; remove it")
+        told = dict(_read_attributes({k: v[number] for k, v in given.items() if v is not None}, counts))
+        name = str(told.pop("id", f"F{number:07d}"))
+        drawn = _draw(rules, outline, told, seed)
+        rows.append((name, *drawn.describe()))
+        box = shapely.minimum_rotated_rectangle(outline)
+        if outline.geom_type != "Polygon" or outline.area < RECTANGLE * box.area or drawn.shape is None:
+            counts["footprints that are no rectangles, or have another roof: without walls and openings"] += 1
+            continue
+        houses.append(replace(_make_house(rules, outline, drawn, tree, number, seed), id=name))
+    names = ("id", "height", "building:levels", "roof:shape", "roof:height")
+    kinds = (object, np.float64, np.int32, object, np.float64)
+    columns = {
+        name: np.array(column, kind)
+        for name, column, kind in zip(names, zip(*rows, strict=True), kinds, strict=True)
+    }
+    return Augmented(outlines, columns, houses, crs.to_string(), counts)
+
+
+def write_augmented(path: Path, found: Augmented) -> None:
+    """Write footprints with their attributes as a GeoPackage that `citystitch run` takes roofs from."""
+    path.unlink(missing_ok=True)
+    pyogrio.set_gdal_config_options(GPKG_TIME)
+    try:
+        single = bool((shapely.get_type_id(found.outlines) == shapely.GeometryType.POLYGON).all())
+        pyogrio.raw.write(
+            path,
+            shapely.to_wkb(found.outlines),
+            list(found.columns.values()),
+            list(found.columns),
+            geometry_type="Polygon" if single else "Unknown",
+            crs=found.crs,
+            layer="footprints",
+        )
+    finally:
+        pyogrio.set_gdal_config_options(dict.fromkeys(GPKG_TIME))
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What a footprint has: by its attributes, else by rules; ``shape`` is None for a roof that is not ours."""
+
+    shape: str | None
+    word: str
+    storeys: int
+    eaves: float
+    rise: float
+    run: float
+    ground: float
+    year: int
+    use: str
+
+    def describe(self) -> tuple[float, int, str, float]:
+        return round(self.eaves + self.rise, 3), self.storeys, self.word, round(self.rise, 3)
+
+
+def _read_attributes(row: Mapping[str, Any], counts: Counter[str]) -> Iterator[tuple[str, Any]]:
+    """Read what a row says; numbers that are none are counted, and rules hold."""
+    for what, value in row.items():
+        if value is None or value == "" or (isinstance(value, float) and math.isnan(value)):
+            continue
+        if what in ("id", "shape", "use"):
+            yield what, str(value)
+        else:
+            try:
+                number = float(value)
+            except (TypeError, ValueError):
+                number = math.nan
+            if not math.isfinite(number) or (number <= 0 and what in ("height", "storeys")) or (
+                number < 0 and what == "rise"
+            ):  # fmt: skip
+                counts[f"attributes of {what} that are no such number: drawn by rules"] += 1
+                continue
+            yield what, number
+        counts[f"attributes of {what} taken"] += 1
+
+
+def _draw(rules: Mapping[str, Distribution], outline: Any, told: Mapping[str, Any], seed: int) -> _Drawn:
+    centre = outline.centroid
+    rng = lot_random(seed, round(1000 * centre.x), round(1000 * centre.y), 3)
+    drawn = {name: rules[name].draw(rng) for name in ("roof_shape", "roof_pitch", "storeys", "storey_height")}
+    drawn |= {name: rules[name].draw(rng) for name in ("year", "use")}
+    word = str(told.get("shape", drawn["roof_shape"])).lower()
+    shape = _SHAPES.get(word)
+    run = shapely.maximum_inscribed_circle(outline).length * (2 if shape == "shed" else 1)
+    rise = float(told.get("rise", run * math.tan(math.radians(float(drawn["roof_pitch"])))))
+    height, storey = told.get("height"), float(drawn["storey_height"])
+    if height is not None and "rise" not in told:
+        rise = min(rise, height / 2)
+    if shape == "flat" or rise < LEAST_RISE or (height is not None and height <= rise):
+        shape, word, rise = ("flat" if shape else None), ("flat" if shape else word), 0.0
+    if height is None:
+        storeys = int(told.get("storeys", round(float(drawn["storeys"]))))
+        eaves = storeys * storey
+    else:
+        eaves = height - rise
+        storeys = int(told.get("storeys", max(round(eaves / storey), 1)))
+    year, use = int(told.get("year", drawn["year"])), str(told.get("use", drawn["use"]))
+    ground = float(told.get("ground", 0.0))
+    return _Drawn(shape, _WORDS.get(word, word), max(storeys, 1), eaves, rise, run, ground, year, use)
+
+
+def _make_house(
+    rules: Mapping[str, Distribution], outline: Any, drawn: _Drawn, tree: Any, number: int, seed: int
+) -> House:
+    """Draw parts of the roof and openings of a rectangular outline whose sizes are known."""
+    corners = shapely.get_coordinates(shapely.orient_polygons(shapely.minimum_rotated_rectangle(outline)))[:4]
+    sides = np.diff(corners, axis=0, append=corners[:1])
+    lengths = np.hypot(*sides.T)
+    first = int(np.argmax(lengths[:2]))
+    length, width = float(lengths[first]), float(lengths[1 - first])
+    shed = drawn.shape == "shed"
+    fixed: dict[str, float | str] = {
+        **{"length": length, "width": width, "storeys": drawn.storeys},
+        **{"storey_height": drawn.eaves / drawn.storeys, "roof_shape": str(drawn.shape)},
+        "roof_pitch": math.degrees(math.atan(drawn.rise / (width if shed else width / 2))),
+        **{"garage": 0.0, "alcove": 0.0, "overhang": 0.0, "year": drawn.year, "use": drawn.use},
+    }
+    own = {**rules, **{name: Distribution("constant", (value,)) for name, value in fixed.items()}}
+    order = [(first + k) % 4 for k in range(4)]
+    middles = (corners + np.roll(corners, -1, axis=0))[order] / 2
+    outward = np.column_stack((sides[:, 1], -sides[:, 0]))[order] / lengths[order][:, None]
+    near, wall = tree.query(shapely.points(middles + _BESIDE * outward), "intersects")[::-1]
+    shared = {k for other, k in zip(near.tolist(), wall.tolist(), strict=True) if other != number}
+    centre = corners.mean(axis=0)
+    place = (round(1000 * float(centre[0])), round(1000 * float(centre[1])))
+    size = math.hypot(length, width) + 3.0  # that nothing is made smaller
+    rotation = math.degrees(math.atan2(sides[first, 1], sides[first, 0]))
+    lot = Lot(*place, float(centre[0]), float(centre[1]), size, rotation)
+    house = draw_house(own, lot, lambda x, y: drawn.ground, seed=seed)
+    return replace(house, openings=tuple(one for one in house.openings if one.wall not in shared))
