@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pipeline.data.errors import CityError
-    from tiler.interface.api import mesh, plan, write_city
+    from tiler.interface.api import convert_models, mesh, plan, write_city
     from tiler.interface.api import open_folder as open
     from tiler.interface.city_mesh import Building, CityMesh, Picture
     from tiler.interface.plan_view import RunPlan
@@ -25,6 +25,7 @@ __all__ = [
     "MeshPiece",
     "Picture",
     "RunPlan",
+    "convert_models",
     "mesh",
     "open",
     "plan",
@@ -40,6 +41,7 @@ _PLACES = {
     "MeshPiece": ("tiler.mesh_files.mesh_pieces", "MeshPiece"),
     "Picture": ("tiler.interface.city_mesh", "Picture"),
     "RunPlan": ("tiler.interface.plan_view", "RunPlan"),
+    "convert_models": ("tiler.interface.api", "convert_models"),
     "mesh": ("tiler.interface.api", "mesh"),
     "open": ("tiler.interface.api", "open_folder"),
     "plan": ("tiler.interface.api", "plan"),

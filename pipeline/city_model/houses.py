@@ -163,7 +163,7 @@ def _fit_sloped(
     Where planes are, points tell the roof if they are enough; else a given form does, and at last the outline.
     """
     model = city.model
-    new, told_of = ({}, []) if surfaces is None else lay_surfaces(city, surfaces)
+    new, told_of = ({}, []) if surfaces is None else lay_surfaces(city, surfaces, clearance=options.clearance)
     laid = np.zeros(len(model), np.bool_)
     laid[list(new)] = True
     used = points if prefer_points else _leave_out(points, laid)

@@ -10,12 +10,11 @@ from pipeline.roofs.house_roofs import NewRoof
 from pipeline.roofs.roof_surfaces import RoofSurfaces, make_surfaced_roof
 
 MODEL = ROOF_METHODS.index("model")
-LEAST_PART = 1.0  # m2; smaller parts are joined with others: roofs of a model are known, not found in points
 TOLD_SHARE = 0.05  # of a house: larger overhangs and gaps are told ...
 TOLD_AREA = 1.0  # m2, ... if they are larger than this, too
 
 
-def lay_surfaces(city: City, surfaces: RoofSurfaces) -> tuple[dict[int, NewRoof], list[Note]]:
+def lay_surfaces(city: City, surfaces: RoofSurfaces, *, clearance: float) -> tuple[dict[int, NewRoof], list[Note]]:
     """Make the roofs that a city model has for houses.
 
     Parameters
@@ -24,6 +23,8 @@ def lay_surfaces(city: City, surfaces: RoofSurfaces) -> tuple[dict[int, NewRoof]
         The houses.
     surfaces : RoofSurfaces
         Roof surfaces of each, none where nothing is known.
+    clearance : float
+        Least distance of walls (m).
 
     Returns
     -------
@@ -43,7 +44,7 @@ def lay_surfaces(city: City, surfaces: RoofSurfaces) -> tuple[dict[int, NewRoof]
             model.polygons[row],
             surfaces.polygons[own],
             take_roofs(surfaces.roofs, own),
-            min_area=LEAST_PART,
+            clearance=clearance,
         )
         if found is None:
             continue

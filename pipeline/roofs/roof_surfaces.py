@@ -14,7 +14,8 @@ GRID = 0.001  # m, on which lines are noded
 SAME_PLANE = 0.05  # m; surfaces that are closer to one plane get one part
 CROSSING = 0.05  # m; roofs that change order by less within a cell do not cross there
 LEAST_SHARE = 0.125  # of a house; parts that are smaller, and than the least area, are joined with others
-LEAST_WIDTH = 0.5  # m, twice the area over the perimeter; narrower parts are joined with others
+LEAST_WIDTH = 0.5  # m, twice the area over the perimeter; narrower parts are joined with others ...
+SQUARES = 4.0  # ... and those smaller than this many squares of the least width
 ROUNDS = 2  # of adding lines where surfaces cross
 LEAST_COVER = 0.01  # m2 of a house; a surface over less is that of another one
 LOST = 1e-3  # share of a house's area that its parts may miss
@@ -68,7 +69,7 @@ class SurfacedRoof:
 
 
 def make_surfaced_roof(
-    polygon: shapely.Polygon, surfaces: NDArray[np.object_], roofs: Roofs, *, min_area: float
+    polygon: shapely.Polygon, surfaces: NDArray[np.object_], roofs: Roofs, *, clearance: float
 ) -> SurfacedRoof | None:
     """Make the roof of a house from the surfaces over it.
 
@@ -80,9 +81,10 @@ def make_surfaced_roof(
         Roof surfaces in plan, at least one.
     roofs : Roofs
         Their planes.
-    min_area : float
-        A part that is smaller than this and than an eighth of the house is joined with its neighbour of the
-        closest plane (m²).
+    clearance : float
+        Least distance of walls (m). A part that is narrower than it, or than `LEAST_WIDTH`, is joined with its
+        neighbour of the closest plane; as is one smaller than `SQUARES` squares of that width and than an eighth
+        of the house.
 
     Returns
     -------
@@ -122,8 +124,8 @@ def make_surfaced_roof(
     label = leader[chosen]
     parts, owner = _join_cells(cells.polygons[cells.inside], label)
     made = _widen(roofs, [leader == k for k in owner.tolist()], owner)
-    least = min(min_area, LEAST_SHARE * polygon.area)
-    parts, rows = _join_small(parts, made, least)
+    width = min(LEAST_WIDTH, clearance)
+    parts, rows = _join_small(parts, made, width, min(SQUARES * width**2, LEAST_SHARE * polygon.area))
     made = take_roofs(made, rows)
     if abs(float(shapely.area(parts).sum()) - polygon.area) > max(LOST * polygon.area, 0.05):
         return None
@@ -261,8 +263,10 @@ def _join_cells(cells: NDArray[np.object_], label: Index) -> tuple[NDArray[np.ob
     return np.concatenate(parts), np.concatenate(owner)
 
 
-def _join_small(parts: NDArray[np.object_], roofs: Roofs, least: float) -> tuple[NDArray[np.object_], Index]:
-    """Join parts that are too small or narrow, the smallest first, with the neighbour of the closest plane.
+def _join_small(
+    parts: NDArray[np.object_], roofs: Roofs, least_width: float, least: float
+) -> tuple[NDArray[np.object_], Index]:
+    """Join parts that are too narrow (m) or small (m²), the smallest first, with that of the closest plane beside.
 
     Gives the parts that are left, and the row of the roof of each.
     """
@@ -270,7 +274,7 @@ def _join_small(parts: NDArray[np.object_], roofs: Roofs, least: float) -> tuple
     there, kept = np.ones(len(parts), np.bool_), np.zeros(len(parts), np.bool_)
     area, width = shapely.area(parts), 2 * shapely.area(parts) / shapely.length(parts)
     while True:
-        small = np.flatnonzero(there & ~kept & ((area < least) | (width < LEAST_WIDTH)))
+        small = np.flatnonzero(there & ~kept & ((area < least) | (width < least_width)))
         if not len(small):
             return parts[there], row[there]
         k = int(small[np.argmin(area[small])])

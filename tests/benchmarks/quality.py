@@ -41,6 +41,9 @@ Written by `make quality`; do not edit. Real data is central Amsterdam in `../sh
 `citystitch synth` of 1 km with 500 buildings. Every line is one run of `citystitch run` with the options that it
 names. Machine: {machine}.
 
+The published samples of city models, meshed with their own roofs: [city-models.md](city-models.md#samples), by
+`python -m tests.benchmarks.city_models`.
+
 ![The same block in three modes](block-modes.png)
 
 ## How well the city model fits

@@ -261,8 +261,8 @@ def shuffle_inputs(values: dict[str, Any], folder: Path, *, seed: int) -> dict[s
     return {"pointcloud": [str(folder / "tiles")], "footprints": str(folder / "footprints.gpkg")}
 
 
-def write_footprints(path: Path, polygons: NDArray[np.object_], ids: NDArray[np.object_]) -> None:
-    """Write footprints in `CRS`."""
+def write_footprints(path: Path, polygons: NDArray[np.object_], ids: NDArray[np.object_], crs: str = CRS) -> None:
+    """Write footprints with their ids."""
     pyogrio.raw.write(
-        path, geometry=shapely.to_wkb(polygons), field_data=[ids], fields=["id"], geometry_type="Polygon", crs=CRS
+        path, geometry=shapely.to_wkb(polygons), field_data=[ids], fields=["id"], geometry_type="Polygon", crs=crs
     )

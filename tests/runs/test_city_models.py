@@ -8,9 +8,11 @@ import laspy
 import numpy as np
 import pytest
 import rasterio
+import shapely
 from rasterio.transform import Affine
 
 from pipeline.data.errors import ConfigError, InputError
+from tests.helpers.tiles import write_footprints
 from tests.runs.test_run import hashes
 from tests.tiler.cityinput.models import (
     CORNERS,
@@ -162,10 +164,10 @@ def test_other_formats_give_the_same_bytes(
     assert {name: value for name, value in hashes(tmp_path / "out").items() if "mesh" in name} == mesh
 
 
-def test_parts_of_a_roof_from_one_square_metre_on_are_kept(tmp_path: Path) -> None:
+def test_parts_of_a_roof_from_four_squares_of_the_clearance_on_are_kept(tmp_path: Path) -> None:
     document = house(0, 0)
     first = len(document["vertices"])
-    for x, y, side in ((3.0, 1.5, 1.3), (7.0, 1.5, 0.9)):
+    for x, y, side in ((3.0, 1.5, 1.1), (7.0, 1.5, 0.9)):
         square = ((x, y), (x + side, y), (x + side, y + side), (x, y + side))
         document["vertices"] += [[round(1000 * a), round(1000 * b), 12_000] for a, b in square]
     document["CityObjects"]["h00"]["geometry"].append(
@@ -233,18 +235,24 @@ def test_a_model_above_its_terrain_is_told_and_moved(
         assert [moved[part][name] for part in parts] == pytest.approx([one[name] for one in parts.values()])
 
 
-def test_with_points_beside_it_the_model_has_the_roofs_and_points_tell_how_far_they_are(tmp_path: Path) -> None:
-    path = write_sequence(tmp_path / "b.jsonl", [house(0, 0), house(1, 0)])
-    x, y = (side.ravel() for side in np.meshgrid(np.arange(-19.5, 66), np.arange(-19.5, 28)))
-    on = (y > 0) & (y < 8) & (((x > 0) & (x < 10)) | ((x > PITCH) & (x < PITCH + 10)))
+def write_points(path: Path, n: int) -> None:
+    """Points of houses in a row, their roofs 0.3 m below those of the model, and of the ground around them."""
+    x, y = (side.ravel() for side in np.meshgrid(np.arange(-19.5, PITCH * n - 6), np.arange(-19.5, 28)))
+    number = np.floor((x + 13) / PITCH).clip(0, n - 1)
+    on = (y > 0) & (y < 8) & (x > PITCH * number) & (x < PITCH * number + 10)
     ground = np.array([ground_at(v) for v in (PLACE[0] + x).tolist()])
-    foot = np.where(x > 20, ground_at(PLACE[0] + PITCH + 5), ground_at(PLACE[0] + 5))
+    foot = np.array([ground_at(PLACE[0] + PITCH * k + 5) for k in number.tolist()])
     z = np.where(on, foot + 7.3 - 0.75 * np.abs(y - 4), ground)
     las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
     las.header.scales, las.header.offsets = np.full(3, 0.001), np.array(PLACE)
     las.x, las.y, las.z = PLACE[0] + x, PLACE[1] + y, z
     las.classification = np.where(on, 6, 2)
-    las.write(tmp_path / "a.las")
+    las.write(path)
+
+
+def test_with_points_beside_it_the_model_has_the_roofs_and_points_tell_how_far_they_are(tmp_path: Path) -> None:
+    path = write_sequence(tmp_path / "b.jsonl", [house(0, 0), house(1, 0)])
+    write_points(tmp_path / "a.las", 2)
     values = {"pointcloud": [str(tmp_path / "a.las")], "buildings": [str(path)], "crs": "EPSG:28992"}
     record = run(make_config(values | {"roofs": "planes", "out": str(tmp_path / "out")}))
     assert record["counts"]["roofs of a city model"] == 2
@@ -265,6 +273,44 @@ def test_with_points_beside_it_the_model_has_the_roofs_and_points_tell_how_far_t
     assert methods == {"h00": "model", "h10": "planes"}
 
 
+def test_footprints_beside_a_model_give_way_to_its_buildings(tmp_path: Path) -> None:
+    path = write_sequence(tmp_path / "b.jsonl", [house(0, 0), house(1, 0)])
+    write_points(tmp_path / "a.las", 3)
+    boxes = {"h00": (2, 0, 14, 8), "h10": (9, 0, 19, 8), "new": (2 * PITCH, 0, 2 * PITCH + 10, 8)}
+    polygons = shapely.transform(np.array([shapely.box(*b) for b in boxes.values()]), lambda xy: xy + PLACE[:2])
+    values = {
+        "pointcloud": [str(tmp_path / "a.las")],
+        "buildings": [str(path)],
+        "crs": "EPSG:28992",
+        "mesh_size": 4.0,
+    }
+    cities = []
+    for side, rows in ((60.0, [0, 1, 2]), (400.0, [2, 1, 0])):
+        file, out = tmp_path / f"{side}.gpkg", tmp_path / f"{side}"
+        write_footprints(file, polygons[rows], np.array(list(boxes), object)[rows], "EPSG:28992")
+        given = {"footprints": str(file), "tile_size": side, "out": str(out), "domain_height": 40.0}
+        record = run(make_config(values | given))
+        assert record["counts"]["tiles"] == (1 if side == 400 else 2)
+        assert record["counts"]["footprints read"] == 5
+        told = {kind: one["items"] for kind, one in record["notes"].items() if kind.startswith("footprint-")}
+        assert {kind: len(items) for kind, items in told.items()} == {
+            "footprint-in-model": 1,
+            "footprint-cut-by-model": 1,
+            "footprint-id-repeated": 1,
+            "footprint-roof-from-default": 1,
+        }
+        assert told["footprint-in-model"][0]["subject"] == "h00"
+        cut = told["footprint-cut-by-model"][0]
+        assert cut["detail"].startswith("8.00 of its 80.00 m2 are under buildings of the city model")
+        parts = parts_of(out)
+        methods = {name.partition("-part")[0]: part["roof_method"] for name, part in parts.items()}
+        assert methods == {"h00": "model", "h10": "model", cut["subject"]: "flat", "new": "planes"}
+        assert cut["subject"].startswith("h10-g")
+        assert check_run(out, StoredTerrain).ok
+        cities.append(parts)
+    assert cities[0] == cities[1]
+
+
 def test_terrain_alone_is_meshed(block: tuple[dict[str, Any], Path, dict[str, Any]], tmp_path: Path) -> None:
     values, _, _ = block
     record = run(make_config({"terrain": values["terrain"], "mesh_size": 20.0, "out": str(tmp_path)}))
@@ -282,8 +328,6 @@ def test_what_does_not_go_together_is_refused(
         make_config(values | {"prefer": "points"})
     with pytest.raises(ConfigError, match="metres or 'auto' expected"):
         make_config(values | {"shift_z": "low"})
-    with pytest.raises(ConfigError, match="leave one out"):
-        make_config(values | {"footprints": "a.gpkg"})
     far = house(0, 0)
     far["transform"]["translate"] = [200_000.0, 450_000.0, 0.0]
     path = write_json(tmp_path / "far.json", far)

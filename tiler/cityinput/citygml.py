@@ -16,7 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from tiler.cityinput.faces import KINDS, OUTLINE, UNKNOWN, FaceList, Faces, ModelBuilding, Shape, drop_end
+from tiler.cityinput.faces import (
+    KINDS,
+    OUTLINE,
+    UNKNOWN,
+    FaceList,
+    Faces,
+    ModelBuilding,
+    Shape,
+    check_places,
+    drop_end,
+)  # fmt: skip
 
 HREF = "{http://www.w3.org/1999/xlink}href"
 BUILDING, PART, RELIEF = "Building", "BuildingPart", "TINRelief"
@@ -314,7 +324,7 @@ def _as_ring(numbers: list[float], width: int) -> NDArray[np.float64]:
     xyz = np.array(numbers, np.float64).reshape(-1, width)
     if width == 2:
         xyz = np.column_stack((xyz, np.zeros(len(xyz))))
-    return drop_end(xyz)
+    return drop_end(check_places(xyz))
 
 
 def _height_of(element: Any, name: str) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from tiler.cityinput.faces import KINDS, NO_LOD, OUTLINE, UNKNOWN, Faces, ModelBuilding, Shape
+from tiler.cityinput.faces import KINDS, NO_LOD, OUTLINE, UNKNOWN, Faces, ModelBuilding, Shape, check_places
 
 WHOLE = 64 * 2**20  # bytes of a line; a longer one is no feature of a sequence
 # How many lists of faces lie around a polygon of each type of geometry.
@@ -135,9 +135,15 @@ def _objects_of(path: Path, document: dict[str, Any]) -> Object:
 
 def _vertices_of(path: Path, document: dict[str, Any], head: CityJsonHead) -> Vertices:
     try:
-        xyz = np.array(document.get("vertices", []), np.float64).reshape(-1, 3)
-    except ValueError as error:
-        raise InputError(f"{path}: a vertex has not three numbers ({error}); write the file anew") from error
+        xyz = np.array(document.get("vertices") or np.empty((0, 3)), np.float64)
+    except (TypeError, ValueError):
+        xyz = np.empty(0)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        feature = f", feature {document['id']}" if "id" in document else ""
+        raise InputError(
+            f"{path}{feature}: not all vertices have three numbers; write it anew, or give outlines in plan as "
+            "--footprints"
+        )
     placed: Vertices = xyz * np.array(head.scale) + np.array(head.translate)
     return placed
 
@@ -178,7 +184,7 @@ def _read_building(name: str, objects: Object, vertices: Vertices, parts: list[s
         for geometry in objects[owner].get("geometry") or ():
             try:
                 shapes.append(_read_shape(owner, geometry, vertices))
-            except (KeyError, IndexError, TypeError, ValueError) as error:
+            except (AttributeError, KeyError, IndexError, TypeError, ValueError) as error:
                 faults.append(
                     f"{owner}: a {geometry.get('type')} cannot be read ({type(error).__name__}: {error})"
                 )
@@ -191,7 +197,8 @@ def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> 
     kind = str(geometry["type"])
     if kind not in DEPTH:
         raise ValueError(f"a {kind} has no surfaces")
-    semantics = geometry.get("semantics") or {}
+    given = geometry.get("semantics")
+    semantics = given if isinstance(given, Mapping) else {}  # before CityJSON 1.0 it was a list
     lod = _number(geometry.get("lod"))
     lod = NO_LOD if math.isnan(lod) else lod
     default = OUTLINE if 0 <= lod < 1 else UNKNOWN
@@ -239,7 +246,7 @@ def _make_faces(faces: list[Any], values: Any, kinds: list[int], rest: tuple[Ver
     if len(index) and index.min() < 0:
         raise IndexError(f"vertex {index.min()}")
     return Faces(
-        vertices[index],
+        check_places(vertices[index]),
         np.concatenate(([0], np.cumsum(np.array(lengths, np.int64)))),
         np.concatenate(([0], np.cumsum(np.array(sizes, np.int64)))),
         np.array(sorts, np.int8),

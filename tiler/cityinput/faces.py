@@ -22,6 +22,7 @@ KINDS = {
     "GenericThematicSurface": UNKNOWN,
 }
 NO_LOD = -1.0
+FARTHEST = 1e8  # coordinates beyond this are of no place, in metres or degrees
 
 Ring = Sequence[Sequence[float]]
 
@@ -144,6 +145,8 @@ class FaceList:
 def join_faces(several: Iterable[Faces]) -> Faces:
     """Put faces one after the other; none gives none."""
     parts = list(several)
+    if len(parts) == 1:
+        return parts[0]
     n_xyz = np.cumsum([0, *(len(faces.xyz) for faces in parts)])
     n_rings = np.cumsum([0, *(len(faces.ring_start) - 1 for faces in parts)])
     return Faces(
@@ -156,6 +159,13 @@ def join_faces(several: Iterable[Faces]) -> Faces:
         ),
         np.concatenate([np.empty(0, np.int8), *(faces.kind for faces in parts)]),
     )
+
+
+def check_places(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Give vertices back; ValueError where a coordinate is NaN, infinite or beyond `FARTHEST`."""
+    if not (np.abs(xyz) <= FARTHEST).all():
+        raise ValueError(f"a coordinate is no number, or beyond ±{FARTHEST:g}")
+    return xyz
 
 
 def drop_end(ring: NDArray[np.float64]) -> NDArray[np.float64]:

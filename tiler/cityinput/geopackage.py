@@ -15,7 +15,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from tiler.cityinput.faces import NO_LOD, OUTLINE, UNKNOWN, Faces, ModelBuilding, Shape
+from tiler.cityinput.faces import NO_LOD, OUTLINE, UNKNOWN, Faces, ModelBuilding, Shape, check_places
 from tiler.vectors.wkb import parse_wkb
 
 SIGNATURE = b"SQLite format 3\0"
@@ -139,8 +139,11 @@ def _read_batch(
             if geometry[k] is None:
                 told.append(f"a geometry of {layers[layer].table}: {faults[k] or broken.get(k, 'is empty')}")
             else:
-                faces = _make_faces(geometry[k], OUTLINE if lod == 0 else UNKNOWN)
-                shapes.append(Shape(owners[k], lod, lod > 0, faces))
+                try:
+                    faces = _make_faces(geometry[k], OUTLINE if lod == 0 else UNKNOWN)
+                    shapes.append(Shape(owners[k], lod, lod > 0, faces))
+                except ValueError as error:
+                    told.append(f"a geometry of {layers[layer].table}: {error}")
             k += 1
         yield ModelBuilding(name, tuple(shapes), faults=tuple(told), attributes=values[name])
 
@@ -164,10 +167,11 @@ def _make_faces(geometry: shapely.Geometry, kind: int) -> Faces:
     rings, part = shapely.get_rings(parts, return_index=True)
     xyz, ring = shapely.get_coordinates(rings, include_z=True, return_index=True)
     last = np.append(ring[1:] != ring[:-1], True) if len(ring) else np.zeros(0, np.bool_)
-    xyz, ring = np.nan_to_num(xyz[~last]), ring[~last]
+    xyz, ring = xyz[~last], ring[~last]
+    xyz[np.isnan(xyz[:, 2]), 2] = 0.0  # in plan alone
     ring_start: NDArray[np.int64] = np.searchsorted(ring, np.arange(len(rings) + 1))
     return Faces(
-        xyz,
+        check_places(xyz),
         ring_start,
         np.searchsorted(part, np.arange(len(parts) + 1)),
         np.full(len(parts), kind, np.int8),

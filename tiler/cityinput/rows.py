@@ -19,8 +19,10 @@ from tiler.georeference.frame import Frame, to_region
 
 ROUNDING = 0.001  # m; coordinates in plan are whole multiples of it
 STEEPEST = 10.0  # slope from which a face is a wall
+STEEP_ROOF = 3.0  # area of a roof over its area in plan, 70 degrees, from which it is one beside flatter roofs
 LEAST_FACE = 0.01  # m2 in plan; smaller faces are no roofs
 ROOM = 0.5  # m, that a roof may reach beyond the heights of its surface
+CROSSING_SHARE = 0.05  # of its area in plan, by which a face that crosses itself has less within its border
 NOT_PLANAR = 0.1  # m; vertices farther than this from the plane of their roof are told
 
 Array = NDArray[np.float64]
@@ -131,7 +133,9 @@ def make_rows(
         Those that stand somewhere, in the order of the buildings.
     list of Note
         ``model-fault`` for what could not be read, ``model-lower-level`` where a level without roofs was left for
-        a lower one, ``model-no-roof`` where none has any, ``model-not-planar``, and ``model-without-place``.
+        a lower one, ``model-no-roof`` where none has any, ``model-self-crossing``, ``model-steep-roof``,
+        ``model-not-planar``, and
+        ``model-without-place``.
 
     Notes
     -----
@@ -163,7 +167,11 @@ def make_rows(
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """Outline, level and roof surfaces of one building; `residual` (m) is that of each surface."""
+    """Outline, level and roof surfaces of one building.
+
+    `residual` (m) is that of each surface, `crossing` the number of faces that cross themselves,
+    `steep` that of roofs which are taken for walls.
+    """
 
     outline: shapely.Geometry
     lod: float
@@ -171,6 +179,8 @@ class _Found:
     surfaces: NDArray[np.object_]
     roofs: Roofs
     residual: Array
+    crossing: int
+    steep: int
 
 
 def _to_region(faces: Faces, placing: Placing) -> Faces:
@@ -187,13 +197,23 @@ def _find_roofs(tries: Sequence[tuple[int, float, Faces]], placing: Placing) -> 
     owner = np.repeat(np.arange(len(tries)), [len(one) for _, _, one in tries])
     planes = find_planes(faces)
     up = np.abs(planes.normal[:, 2])
-    lying = (up * STEEPEST > np.linalg.norm(planes.normal, axis=1)) & (up > LEAST_FACE)
+    whole = np.linalg.norm(planes.normal, axis=1)
+    lying = (up * STEEPEST > whole) & (up > LEAST_FACE)
     named = np.bincount(owner[lying & (faces.kind == ROOF)], minlength=len(tries)) > 0
     roof = lying & np.where(named[owner], faces.kind == ROOF, (faces.kind != GROUND) & (faces.kind != WALL))
+    # Columns cannot follow steeper ones exactly: of a building that has others, these are walls.
+    steep = roof & (up * STEEP_ROOF <= whole)
+    steep &= np.bincount(owner[roof & ~steep], minlength=len(tries))[owner] > 0
+    roof &= ~steep
     ground = lying & (faces.kind == GROUND)
     polygons = np.full(len(faces), None, object)
     polygons[lying] = _make_polygons(faces, np.flatnonzero(lying))
+    # The area vector of a face that crosses itself is too short: it says not where a building stands.
+    area = np.zeros(len(faces))
+    area[lying] = shapely.area(polygons[lying])
+    crossing = area - up > np.maximum(CROSSING_SHARE * area, LEAST_FACE)
     by_ground = np.bincount(owner[ground], minlength=len(tries)) > 0
+    by_ground &= np.bincount(owner[ground & crossing], minlength=len(tries)) == 0
     outer = np.where(by_ground[owner], ground, lying)
     base = np.full(len(tries), np.inf)
     np.minimum.at(base, owner, planes.low)
@@ -209,7 +229,8 @@ def _find_roofs(tries: Sequence[tuple[int, float, Faces]], placing: Placing) -> 
         own = np.arange(low, high)
         found[tries[which][0]] = _Found(
             _areas_of(outline), tries[which][1], float(base[which]), polygons[of_roof[own]],
-            take_roofs(roofs, own), planes.residual[of_roof[own]],
+            take_roofs(roofs, own), planes.residual[of_roof[own]], int(crossing[begin:end].sum()),
+            int(steep[begin:end].sum()),
         )  # fmt: skip
     return {k: each for k, each in found.items() if not each.outline.is_empty}
 
@@ -323,6 +344,12 @@ def _note(
     if found is not None:
         if attempts[0][0] != found.lod:
             notes.append(tell("model-lower-level", detail=f"level {attempts[0][0]:g} has no roof; {found.lod:g}"))
+        if found.crossing:
+            detail = f"{found.crossing} of its surfaces cross themselves; taken as they lie in plan"
+            notes.append(tell("model-self-crossing", detail=detail))
+        if found.steep:
+            detail = f"{found.steep} roof surfaces steeper than 70 degrees are taken for walls"
+            notes.append(tell("model-steep-roof", detail=detail))
         worst = float(found.residual.max())
         if worst > NOT_PLANAR:
             n = int((found.residual > NOT_PLANAR).sum())

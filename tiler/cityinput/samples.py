@@ -142,12 +142,13 @@ def highest_nodes(owner: Index, node: Index, z: Array, mask: tuple[Index, Index]
     low = both.min(axis=0)
     size = both.max(axis=0) - low + 1
     key, allowed = number_nodes(owner, node, low, size), number_nodes(*mask, low, size)
-    order = np.lexsort((z, key))
-    key = key[order]
-    last = np.ones(len(order), np.bool_)
-    last[:-1] = key[1:] != key[:-1]
+    order = np.argsort(key, kind="stable")  # of long runs, which a stable sort merges
+    key, height = key[order], z[order]
+    start = np.flatnonzero(np.diff(key, prepend=key[0] - 1))
+    top = np.repeat(np.maximum.reduceat(height, start), np.diff(start, append=len(key)))
+    last = np.maximum.reduceat(np.where(height == top, np.arange(len(key)), 0), start)
     order, key = order[last], key[last]
-    allowed = np.sort(allowed)
+    allowed = np.sort(allowed, kind="stable")
     at = np.minimum(np.searchsorted(allowed, key), len(allowed) - 1)
     found: Index = order[allowed[at] == key]
     return found

@@ -436,7 +436,8 @@ def _export(options: argparse.Namespace) -> int:
 def _convert(options: argparse.Namespace) -> int:
     from tiler.convert.convert import Asked, convert_models
 
-    asked = Asked(options.format, options.lod, options.crs, options.axis_order, options.overwrite)
+    words = {name: getattr(options, name) for name in ("lod", "crs", "axis_order", "tile_size", "overwrite")}
+    asked = Asked(options.format, **words)
     for line in convert_models(options.inputs, options.output, asked):
         say(line)
     say(str(options.output))

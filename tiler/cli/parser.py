@@ -516,7 +516,14 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
         help="CityJSON, CityJSONSeq, CityGML or GeoPackage files; or the folder of a run",
     )  # fmt: skip
     convert.add_argument("--format", choices=NAMES, required=True, help="what to write")
-    convert.add_argument("-o", "--output", type=_on_disk, required=True, metavar="FILE", help="file to write")
+    convert.add_argument(
+        "-o",
+        "--output",
+        type=_on_disk,
+        required=True,
+        metavar="FILE",
+        help="file to write, or folder of tiles",
+    )
     convert.add_argument(
         "--lod",
         choices=LODS,
@@ -530,7 +537,14 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
         default="",
         help="which coordinate comes first, against what files show",
     )
-    convert.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
+    convert.add_argument(
+        "--tile-size",
+        type=float,
+        default=0.0,
+        metavar="METRES",
+        help="write a folder with a file for each tile of this size; a building is in that of its middle",
+    )
+    convert.add_argument("--overwrite", action="store_true", help="replace the file or folder if it exists")
 
 
 def _on_disk(text: str) -> Path:

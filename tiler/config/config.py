@@ -31,6 +31,7 @@ ANYWHERE = "127.0.0.1:0"  # a free port of this machine, for this machine
 PAD_COARSENING = 3.0  # mesh sizes; target edge length in a pad, where none is given for the open
 NO_BUILDINGS = (GROUND, LOW_NOISE, WATER, HIGH_NOISE)  # classes that cannot mark buildings
 LEAST_SIZE = 0.1  # m; of edges
+CLEARANCE_OF_MODELS = 0.5  # m; their walls are exact: moved by more, a court comes under a roof beside it
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
 
@@ -74,11 +75,12 @@ class Config:
     footprints: str = _parameter(
         UNSET,
         "input",
-        "SHP, GPKG, GeoJSON or GeoParquet file of building footprints; without it, terrain only",
+        "SHP, GPKG, GeoJSON or GeoParquet file of building footprints; beside a city model, of the buildings that "
+        "it has not",
     )
     buildings: tuple[str, ...] = _parameter(
         (), "input", "CityJSON, CityJSONSeq or CityGML files of buildings, or GeoPackages of 3DBAG, instead of "
-        "footprints: their roof surfaces are meshed as they are",
+        "footprints, or beside them: their roof surfaces are meshed as they are",
     )  # fmt: skip
     terrain: tuple[str, ...] = _parameter(
         (), "input", "rasters with the height of the ground (GeoTIFF, COG, VRT), instead of ground points, which "
@@ -210,7 +212,8 @@ class Config:
         source="paper, step 2.1", choices=("clearance", "paper"),
     )  # fmt: skip
     clearance: float = _parameter(
-        1.0, "simplify", "least distance of walls; with simplify = paper, buildings closer than this are merged",
+        1.0, "simplify", "least distance of walls; with simplify = paper, buildings closer than this are merged. "
+        f"Where roofs of a city model are meshed as they are, {CLEARANCE_OF_MODELS:g} m by default",
         unit="m", source="paper, step 2.1", least=0.1,
     )  # fmt: skip
     clearance_floor: float = _parameter(
@@ -394,13 +397,18 @@ class Config:
 
     @property
     def building_files(self) -> tuple[str, ...]:
-        """Files of buildings: of a city model, or footprints."""
-        return self.buildings or ((self.footprints,) if self.footprints else ())
+        """Files of buildings: of a city model, and footprints."""
+        return (*self.buildings, *filter(None, [self.footprints]))
 
     @property
     def has_sloped_roofs(self) -> bool:
         """Whether roofs may slope: they are asked for, and the mesher and the simplification know them."""
         return self.roofs != "flat" and not roofs_stay_flat(self.mesher, self.simplify)
+
+    @property
+    def keeps_model_roofs(self) -> bool:
+        """Whether roofs of a city model are meshed as they are."""
+        return bool(self.buildings) and self.has_sloped_roofs and self.prefer == "model"
 
     @property
     def padded(self) -> bool:
@@ -547,6 +555,8 @@ def make_config(values: Mapping[str, Any]) -> Config:
             _check_bounds(entry.name, value, entry.metadata)
             checked[entry.name] = value
     config = Config(**checked)
+    if "clearance" not in checked and config.keeps_model_roofs:
+        config = dataclasses.replace(config, clearance=CLEARANCE_OF_MODELS)
     _check_together(config)
     return config
 
@@ -802,11 +812,6 @@ def _check_way(config: Config) -> None:
 
 
 def _check_sources(config: Config) -> None:
-    if config.footprints and config.buildings:
-        raise ConfigError(
-            f"footprints = {_shown(config.footprints)} and buildings = {_shown(config.buildings[0])}: outlines "
-            "are of one or the other; leave one out"
-        )
     if config.ground_filter and not config.pointcloud and (config.buildings or config.terrain):
         raise ConfigError("ground_filter = true without a point cloud, in which it finds the ground; leave it out")
     if config.ground_filter and config.terrain:

@@ -16,14 +16,19 @@ HIGHEST = 4  # CityJSON has no level from this on
 def write_sequence(path: Path, source: ModelSource) -> None:
     """Write CityJSONSeq: the head, then a feature a line."""
     with path.open("wb") as file:
-        file.write(_line(_head(source) | {"CityObjects": {}, "vertices": []}))
-        for feature in iter_features(source):
-            told = {
-                "type": "CityJSONFeature",
-                "id": feature.objects[0].id,
-                "CityObjects": _objects(feature, source),
-            }
-            file.write(_line(told | {"vertices": feature.vertices.tolist()}))
+        file.write(head_line(source))
+        file.writelines(feature_line(feature, source) for feature in iter_features(source))
+
+
+def head_line(source: ModelSource) -> bytes:
+    """Give the first line of a sequence."""
+    return _line(_head(source) | {"CityObjects": {}, "vertices": []})
+
+
+def feature_line(feature: Feature, source: ModelSource) -> bytes:
+    """Give the line of a building in a sequence."""
+    told = {"type": "CityJSONFeature", "id": feature.objects[0].id, "CityObjects": _objects(feature, source)}
+    return _line(told | {"vertices": feature.vertices.tolist()})
 
 
 def write_document(path: Path, source: ModelSource) -> None:

@@ -1,18 +1,27 @@
 """`citystitch convert`: city models, or the model of a run, as another format."""
 
+import math
+import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from pipeline.data.errors import ConfigError
+from tiler.cityinput.levels import CHOICES
 from tiler.convert.citygml_files import write_citygml
 from tiler.convert.cityjson_files import write_document, write_sequence
 from tiler.convert.glb_files import write_glb
 from tiler.convert.gpkg_files import write_gpkg
 from tiler.convert.inputs import ModelSource, open_source
 from tiler.convert.obj_files import write_obj
+from tiler.convert.tiles import split_source
 from tiler.georeference.crs import crs_name
-from tiler.store.atomic import replacing
+from tiler.store.atomic import replacing, replacing_folder
+
+LEAST_TILE = 10.0  # m
+TILE = re.compile(r"-?\d+_-?\d+")  # names of files of tiles
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,7 @@ class Asked:
     lod: str = "auto"
     crs: str = ""
     axis_order: str = ""
+    tile_size: float = 0.0
     overwrite: bool = False
 
 
@@ -64,7 +74,7 @@ def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[s
     inputs : sequence of Path
         CityJSON, CityJSONSeq, CityGML or GeoPackage files, or the folder of a run.
     output : Path
-        The file; it appears whole or not at all.
+        The file, or with a size of tiles the folder of their files ``i_j``; it appears whole or not at all.
     asked : Asked
         What is asked.
 
@@ -85,10 +95,19 @@ def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[s
     Notes
     -----
     Buildings are read and written one at a time, as often as a format needs; but for CityJSON documents, which are
-    read as a whole. Heights are never changed.
+    read as a whole. Tiles wait as sequences in a temporary folder. Heights are never changed.
     """
+    for name, value, known in (
+        ("format", asked.name, tuple(TARGETS)),
+        ("lod", asked.lod, CHOICES),
+        ("axis order", asked.axis_order, ("", "xy", "yx")),
+    ):
+        if value not in known:
+            raise ConfigError(f"{name} {value!r}: must be one of {', '.join(filter(None, known))}")
     target = TARGETS[asked.name]
-    if output.suffix not in target.suffixes:
+    if not (math.isfinite(asked.tile_size) and (asked.tile_size == 0 or asked.tile_size >= LEAST_TILE)):
+        raise ConfigError(f"tile size {asked.tile_size:g} m: at least {LEAST_TILE:g} m, or 0 for one file")
+    if not asked.tile_size and output.suffix not in target.suffixes:
         raise ConfigError(
             f"{output}: a file of format {asked.name} ends with {' or '.join(target.suffixes)}; rename --output"
         )
@@ -98,10 +117,39 @@ def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[s
         raise ConfigError(f"{output}: is one of the inputs; give another --output")
     if output.exists() and not asked.overwrite:
         raise ConfigError(f"{output}: exists; give another --output, or --overwrite")
+    if asked.tile_size and output.exists() and not _holds_tiles(output):
+        raise ConfigError(f"{output}: is no folder of tiles, which would be replaced; give another --output")
     with open_source(inputs, crs=asked.crs, axis_order=asked.axis_order) as source:
         if target.one_level and source.in_degrees:
             name = crs_name(source.crs) if source.crs is not None else ""
             raise ConfigError(f"{name} is in degrees, and format {asked.name} in metres; give --crs EPSG:NNNN")
-        with replacing(output) as part:
-            target.write(part, source, asked.lod)
-        return [*source.notes, *(f"{number} {what}" for what, number in source.told.items() if number)]
+        told: Counter[str] = Counter()
+        if asked.tile_size:
+            with replacing_folder(output) as folder:
+                told["files, a tile each"] = _write_tiles(folder, source, asked, told)
+        else:
+            with replacing(output) as part:
+                target.write(part, source, asked.lod)
+            told = source.told
+        return [*source.notes, *(f"{number} {what}" for what, number in told.items() if number)]
+
+
+def _holds_tiles(folder: Path) -> bool:
+    return folder.is_dir() and all(TILE.fullmatch(path.stem) for path in folder.iterdir())
+
+
+def _write_tiles(folder: Path, source: ModelSource, asked: Asked, told: Counter[str]) -> int:
+    """Write a file for each tile, and count what is told of all; gives the number of files."""
+    target = TARGETS[asked.name]
+    if source.in_degrees:
+        raise ConfigError(f"tiles of {asked.tile_size:g} m of a model in degrees; give --crs EPSG:NNNN")
+    with TemporaryDirectory() as waiting:
+        tiles = split_source(source, asked.tile_size, Path(waiting))
+        told.update(source.told)
+        for path in tiles:
+            with open_source([path], axis_order="xy") as own:
+                tile = replace(own, crs=source.crs)  # its name in the sequence may not tell it
+                target.write(folder / f"{path.stem}{target.suffixes[0]}", tile, asked.lod)
+                told.update(tile.told)
+            path.unlink()
+    return len(tiles)

@@ -141,6 +141,8 @@ def _read_header(path: Path, axis_order: str, sequence: Path) -> CloudHeader:
     if kind_of(path) != MODEL:
         raise InputError(f"{path}: is no city model; mesh a point cloud first, then convert the folder of the run")
     header = read_model_header(path, axis_order)
+    if known is not None:  # of a run: the easting comes first, without a word
+        header = replace(header, axes="")
     if not header.n_points:
         raise InputError(f"{path}: has no building with a surface; give another file")
     return replace(header, crs=known) if known is not None else header

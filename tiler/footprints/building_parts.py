@@ -111,7 +111,7 @@ def find_building_parts(
         finite = np.isfinite(shapely.bounds(geometry).reshape(-1, 4)).all(axis=1)
         if frame.changes_plan:
             geometry = shapely.transform(geometry, partial(to_region, frame))
-        shapes.append(_mend(geometry[finite]))
+        shapes.append(mend_polygons(geometry[finite]))
         heights.append(read_heights(layer, height_name, features)[0][hits[outlines.rows[finite]]])
     polygons = np.concatenate(shapes)
     if not len(polygons):
@@ -146,7 +146,7 @@ def share_places(
     row, part = parts.tree.query(geometry, predicate="intersects")
     order = np.argsort(row, kind="stable")
     touched, start = np.unique(row[order], return_index=True)
-    polygons = _mend(geometry[touched])
+    polygons = mend_polygons(geometry[touched])
     ranks = _rank(polygons, height[touched])
     for k, over in enumerate(np.split(part[order], start[1:]) if len(touched) else []):
         i = touched[k]
@@ -158,12 +158,12 @@ def share_places(
         taken = over[takes & (common > SEEN)].tolist()
         if taken:
             highest_first = sorted(taken, key=parts.ranks.__getitem__)  # whatever the order of the file
-            kept[i] = _subtract(polygons[k], parts.polygons[highest_first])
+            kept[i] = subtract_polygons(polygons[k], parts.polygons[highest_first])
             share[i] = shapely.area(kept[i]) / shapely.area(polygons[k])
     return Shares(kept, share)
 
 
-def _subtract(polygon: shapely.Geometry, others: NDArray[np.object_]) -> shapely.Geometry:
+def subtract_polygons(polygon: shapely.Geometry, others: NDArray[np.object_]) -> shapely.Geometry:
     """Subtract polygons from one; of the rest, pieces that are large and wide enough."""
     rest = shapely.get_parts(shapely.difference(polygon, shapely.union_all(others)))
     wide = ~shapely.is_empty(shapely.buffer(rest, -LEAST_WIDTH / 2))
@@ -171,7 +171,7 @@ def _subtract(polygon: shapely.Geometry, others: NDArray[np.object_]) -> shapely
     return rest[0] if len(rest) == 1 else shapely.multipolygons(rest)
 
 
-def _mend(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
+def mend_polygons(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
     """Make polygons valid, those that are stay as they are."""
     mended = geometry.copy()
     bad = ~shapely.is_valid(geometry)

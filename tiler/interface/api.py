@@ -161,6 +161,61 @@ def write_city(folder: Source, *, size: float = 1000.0, buildings: int = 500, **
     return write(Path(folder), size=size, buildings=buildings, **options)
 
 
+def convert_models(
+    models: Source | Sequence[Source],
+    output: Source,
+    format: str,
+    *,
+    lod: str = "auto",
+    crs: str = "",
+    axis_order: str = "",
+    tile_size: float = 0.0,
+    overwrite: bool = False,
+) -> list[str]:
+    """Write city models, or that of a run, as another format: `citystitch convert`.
+
+    Parameters
+    ----------
+    models : path, or sequence of paths
+        CityJSON, CityJSONSeq, CityGML or GeoPackage files of one CRS; or the folder of a run.
+    output : path
+        File to write, or with `tile_size` a folder; it appears whole or not at all.
+    format : str
+        ``"cityjson"``, ``"cityjsonseq"``, ``"citygml2"``, ``"citygml3"``, ``"gpkg"``, ``"obj"`` or ``"glb"``.
+    lod : str
+        Level of detail in an OBJ or GLB: ``"auto"``, ``"1.2"``, ``"1.3"`` or ``"2.2"``; others have all.
+    crs : str
+        CRS of the output; ``""`` for that of the files. Heights stay.
+    axis_order : str
+        ``"xy"`` or ``"yx"``, against what the files show.
+    tile_size : float
+        Side of tiles with a file each (m); 0 for one file.
+    overwrite : bool
+        Whether to replace what is there.
+
+    Returns
+    -------
+    list of str
+        What must be known of the result, a line each: what was left out, changed or assumed, and how often.
+
+    Raises
+    ------
+    CityError
+        If an option or the output does not fit, or a file cannot be read or written.
+
+    Examples
+    --------
+    >>> import tiler
+    >>> tiler.convert_models("city.gml", "city.city.json", "cityjson")  # doctest: +SKIP
+    """
+    from tiler.convert.convert import Asked
+    from tiler.convert.convert import convert_models as convert
+
+    paths = [Path(one) for one in ([models] if isinstance(models, (str, Path)) else models)]
+    asked = Asked(format, lod, crs, axis_order, tile_size, overwrite)
+    return convert(paths, Path(output), asked)
+
+
 def _check_script(workers: int) -> None:
     """Refuse a script that its own workers would run again: they are processes that import it."""
     path = Path(getattr(sys.modules["__main__"], "__file__", None) or "")

@@ -9,10 +9,12 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.data.citymodel import Footprints
 from tiler.cityinput.model_blocks import Wanted, read_model_blocks
 from tiler.cityinput.sources import MODEL
 from tiler.config.config import Config
 from tiler.footprints.footprint_source import FootprintSource, make_footprints, open_source
+from tiler.footprints.model_places import ModelPlaces, give_way
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.objects.places import place
 from tiler.planning.region import Region
@@ -93,13 +95,39 @@ def sample_footprints(
 
     Notes
     -----
-    Ids are not looked at. The number in the region of a file that is larger is that of all its features, less the
-    share of the layer's extent that lies outside; it counts where the layer tells its number and extent.
+    Ids are not looked at. Beside city models, footprints give way to those buildings of the models that were
+    read. The number in the region of a file that is larger is that of all its features, less the share of the
+    layer's extent that lies outside; it counts where the layer tells its number and extent.
     """
-    if config.buildings:
-        return _sample_models(config, region, models, limit)
-    if not config.footprints:
+    found = [_read_models(config, region, models, limit)] if config.buildings else []
+    found += [_read_file(config, region, frame, limit)] if config.footprints else []
+    if not found:
         return None
+    polygons = [one.polygons for one in found]
+    if len(found) == 2:
+        ids = np.arange(len(polygons[1])).astype(np.str_)
+        beside = Footprints(polygons[1], ids, np.full(len(ids), np.nan))
+        polygons[1] = give_way(beside, ModelPlaces(polygons[0], np.empty(0, np.int64)), region.bounds)[0].polygons
+    rest = sum(one.total - len(one.polygons) for one in found)
+    return _make_sample(
+        config,
+        np.concatenate(polygons),
+        sum(map(len, polygons)) + rest,
+        complete=all(one.complete for one in found),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Outlines:
+    """Outlines that were read, how many there are in the region, and whether that is all of them."""
+
+    polygons: NDArray[np.object_]
+    total: int
+    complete: bool
+
+
+def _read_file(config: Config, region: Region, frame: Frame | None, limit: int) -> _Outlines:
+    """Read the footprints of a file, or the first of very many."""
     crs = pyproj.CRS.from_user_input(region.crs)
     source = open_source(
         place(config.footprints),
@@ -120,10 +148,10 @@ def sample_footprints(
         n_read += len(parts[-1])
     polygons = np.concatenate(parts)
     total = len(polygons) if complete else max(len(polygons), _number_within(source, region, crs))
-    return _make_sample(config, polygons, total, complete=complete)
+    return _Outlines(polygons, total, complete)
 
 
-def _sample_models(config: Config, region: Region, models: Sequence[CloudHeader], limit: int) -> FootprintSample:
+def _read_models(config: Config, region: Region, models: Sequence[CloudHeader], limit: int) -> _Outlines:
     """Read the outlines of the buildings of city models; of very many those of the first ones."""
     wanted = Wanted(config.lod, config.height_attribute, roof_points=False, ground_points=False)
     blocks = (
@@ -141,7 +169,7 @@ def _sample_models(config: Config, region: Region, models: Sequence[CloudHeader]
         n_read += len(outlines)
     polygons = np.concatenate(parts)
     total = len(polygons) if complete else max(len(polygons), sum(header.n_buildings for header in models))
-    return _make_sample(config, polygons, total, complete=complete)
+    return _Outlines(polygons, total, complete)
 
 
 def _make_sample(config: Config, polygons: NDArray[np.object_], total: int, *, complete: bool) -> FootprintSample:

@@ -150,6 +150,11 @@ def describe_others(headers: Sequence[CloudHeader], config: Config) -> tuple[lis
         n = sum(one.n_buildings for one in models)
         files = "1 city model" if len(models) == 1 else f"{len(models)} city models"
         words.append(f"{n} {'building' if n == 1 else 'buildings'} in {files}")
+    if models and config.keeps_model_roofs:
+        words.append(
+            f"walls keep {config.clearance:g} m from each other (--clearance): more makes fewer cells, and moves "
+            "walls of the model by up to as much"
+        )
     for one in models:
         if one.axes:
             order = "the northing" if one.swapped else "the easting"

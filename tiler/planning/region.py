@@ -11,6 +11,7 @@ from pipeline.data.errors import ConfigError, InputError
 from stitch.pieces.numbering import MOST_TILES
 from stitch.tiling.grid import Bounds, TileGrid, make_grid, tiles_present
 from stitch.tiling.smallest_tile import LEAST_TILE
+from tiler.cityinput.sources import MODEL
 from tiler.config.config import Config
 from tiler.config.domain_height import EXPECTED_TALLEST, check_widths, widths_in_metres
 from tiler.config.step_options import expected_levels
@@ -118,10 +119,15 @@ class Region:
 
 def check_points(clouds: Sequence[CloudHeader]) -> None:
     """Raise InputError if no cloud has a point."""
-    if not any(cloud.n_points > 0 for cloud in clouds):
+    if any(cloud.n_points > 0 for cloud in clouds):
+        return
+    if clouds and all(cloud.kind == MODEL for cloud in clouds):
         raise InputError(
-            f"point cloud: {len(clouds)} files hold no point at all; nothing can be meshed without ground points"
+            f"{clouds[0].path}: no Building with a surface in {len(clouds)} city models; others are not meshed"
         )
+    raise InputError(
+        f"point cloud: {len(clouds)} files hold no point at all; nothing can be meshed without ground points"
+    )
 
 
 def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Bounds:

@@ -185,8 +185,6 @@ def read_surfaces(
 
 def _choose(rows: ModelRows, candidates: list[int], polygon: shapely.Polygon) -> int | None:
     """Row of the building that is a house: of several of one id the one over it, then by level; None for none."""
-    if not candidates:
-        return None
     merit = [
         (
             round(shapely.area(shapely.intersection(rows.outlines[k], polygon)), 3),
@@ -195,7 +193,8 @@ def _choose(rows: ModelRows, candidates: list[int], polygon: shapely.Polygon) ->
         )
         for i, k in enumerate(candidates)
     ]
-    return candidates[max(range(len(candidates)), key=merit.__getitem__)]
+    best = max(range(len(merit)), key=merit.__getitem__, default=-1)
+    return candidates[best] if best >= 0 and merit[best][0] > 0 else None  # a footprint beside it may have its id
 
 
 def note_feet(footprints: Footprints, base: NDArray[np.float64], ground: NDArray[np.float64]) -> list[Note]:

@@ -1,14 +1,16 @@
 """Stages 1.1 to 1.3: points of each file, footprints, and the terrain of each tile."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyproj
+import shapely
 from numpy.typing import NDArray
 
+from pipeline.data.citymodel import Footprints, number_ids, take_footprints
 from pipeline.data.classes import GROUND, KEY_POINT, WATER
 from pipeline.data.errors import InputError
 from pipeline.data.notes import Note
@@ -34,10 +36,11 @@ from tiler.cityinput.rasters import REACH as RASTER_REACH
 from tiler.cityinput.sources import CLOUD, MODEL, kind_of
 from tiler.citymodels.tables import pack_polygons
 from tiler.config.config import Config
-from tiler.engine.run_context import tile_key
+from tiler.engine.run_context import find_owned, tile_key
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.footprints.footprint_index import FootprintBlock, block_footprints, scan_footprints
+from tiler.footprints.model_places import ModelPlaces, give_way
 from tiler.georeference.frame import Frame
 from tiler.objects.places import is_url, place
 from tiler.pointclouds.ingest import CELL, KEY_POINTS, read_cells
@@ -49,7 +52,9 @@ from tiler.stages.city_files import (
     read_terrain_file,
     sample_rasters,
 )
-from tiler.stages.readers import clip, extent_of, grow, join_rasters, read_bands, read_outlines, read_units
+from tiler.stages.readers import clip, extent_of, grow, hull, join_rasters, read_bands, read_outlines, read_units
+
+MODEL_OUTLINES = "model-outlines"  # stage of the buildings of city models, where there are footprints, too
 
 
 def input_stages(config: Config) -> list[Stage]:
@@ -60,6 +65,8 @@ def input_stages(config: Config) -> list[Stage]:
     around = halo_of_points(config, spacing)
     if config.terrain:
         ground, around = (*ground, "terrain_given"), max(around, RASTER_REACH)
+    both = bool(config.buildings and config.footprints)
+    outlines = (Read("footprints"), *([Read(MODEL_OUTLINES)] if both else []))
     return [
         Stage(
             "points",
@@ -68,8 +75,9 @@ def input_stages(config: Config) -> list[Stage]:
             parameters=("skip_unreadable", "building_classes", "ground_filter", *of_models),
             version=4,
         ),
+        *([Stage(MODEL_OUTLINES, Scope.REGION, read_models_beside, (Read("points"),))] if both else []),
         Stage("footprints", Scope.REGION, read_model_footprints, (Read("points"),))
-        if config.buildings
+        if config.buildings and not both
         else Stage(
             "footprints",
             Scope.REGION,
@@ -77,16 +85,17 @@ def input_stages(config: Config) -> list[Stage]:
             parameters=(
                 *("footprints", "footprints_identity", "footprints_frame", "align"),
                 *("layer", "id_attribute", "height_attribute", "roof_attribute"),
+                *(("buildings_given",) if both else ()),
             ),
             version=4,
         ),
         # What a tile needs of the footprints: it does not run again when others change.
         Stage(
-            *("outlines", Scope.TILE, take_outlines, (Read("footprints"),), ("footprints_shift",)),
+            *("outlines", Scope.TILE, take_outlines, outlines, ("footprints_shift",)),
             version=4,
             after="ground",
         ),
-        Stage("reserved", Scope.REGION, list_reserved, (Read("footprints"),)),
+        Stage("reserved", Scope.REGION, list_reserved, outlines),
         Stage(*("ground", Scope.TILE, bin_tile, (Read("points", around),), ground), version=2),
         Stage(
             "flooded",
@@ -213,20 +222,48 @@ def read_footprint_file(task: Task) -> Facts:
             roof_attribute=given.roof_attribute,
         ),
         given.footprints,
+        *(["houses are those of the city model"] if given.get("buildings_given", False) else []),
     )
 
 
 def read_model_footprints(task: Task) -> Facts:
     """Take the outlines of the buildings of all city models as footprints (step 1.2)."""
+    return _put_models(task, lambda blocks: blocks)
+
+
+def _put_models(
+    task: Task,
+    see: Callable[[Iterable[FootprintBlock]], Iterable[FootprintBlock]],
+    empty: str = "terrain only",
+) -> Facts:
     counts: Counter[str] = Counter()
     for _, facts in list_kind(task, MODEL):
         counts.update(facts["model"])
     blocks = (block_footprints(*band) for band in read_model_bands(task))
-    return put_rows(task, blocks, "the city model") | {"counts": {k: v for k, v in sorted(counts.items()) if v}}
+    return put_rows(task, see(blocks), "the city model", empty) | {
+        "counts": {k: v for k, v in sorted(counts.items()) if v}
+    }
 
 
-def put_rows(task: Task, found: Iterable[FootprintBlock], source: str) -> Facts:
-    """Write footprints or other polygons one behind the other; a note tells of none, unless `source` is empty."""
+def read_models_beside(task: Task) -> Facts:
+    """Take the outlines of the buildings of city models beside footprints, and the numbers of their ids."""
+    numbers = [np.empty(0, np.int64)]
+
+    def noted(blocks: Iterable[FootprintBlock]) -> Iterator[FootprintBlock]:
+        for block in blocks:
+            numbers.append(number_ids(block.rows.ids))
+            yield block
+
+    facts = _put_models(task, noted, "houses are those of the footprints")
+    task.put(number=np.sort(np.concatenate(numbers)))
+    return facts
+
+
+def put_rows(task: Task, found: Iterable[FootprintBlock], source: str, empty: str = "terrain only") -> Facts:
+    """Write footprints or other polygons one behind the other.
+
+    A note says what it means that there is none, unless `source` is empty.
+    """
     n = first = n_bytes = n_letters = 0
     blocks, part_like = [0], set[str]()
     for block in found:
@@ -251,14 +288,16 @@ def put_rows(task: Task, found: Iterable[FootprintBlock], source: str) -> Facts:
         blocks.append(first)
         part_like |= {name for name in rows.ids.tolist() if "-part" in name}
     if n == 0 and source:
-        task.note(Note("no-footprints-in-region", source, detail="terrain only"))
+        task.note(Note("no-footprints-in-region", source, detail=empty))
     task.put(block=np.array(blocks), end=np.array([n]))
     return {"n": n, "part_like": sorted(part_like)}
 
 
 def take_outlines(task: Task) -> Facts:
-    """Take the footprints that meet a tile (step 1.2)."""
+    """Take the footprints that meet a tile (step 1.2); beside a city model, its buildings and what these leave."""
     footprints = read_outlines(task, shift=task.parameters.footprints_shift)
+    if MODEL_OUTLINES in task.refs:
+        footprints = _join_models(task, footprints)
     task.put(
         **pack_polygons(footprints.polygons, "outline"),
         ids=footprints.ids,
@@ -271,10 +310,29 @@ def take_outlines(task: Task) -> Facts:
     return {"n": len(footprints.ids), "extent": inside}
 
 
+def _join_models(task: Task, footprints: Footprints) -> Footprints:
+    """Join the buildings of city models that meet a tile, and what they leave of footprints."""
+    bounds = task.context.bounds
+    near = read_outlines(task, hull(task.box, extent_of(footprints.polygons)), stage=MODEL_OUTLINES)
+    (found,) = task.read(MODEL_OUTLINES, ("number",))
+    left, notes = give_way(footprints, ModelPlaces(near.polygons, found.arrays["number"]), bounds)
+    mine = find_owned(task.box, bounds, np.array([(note.x, note.y) for note in notes]).reshape(-1, 2))
+    task.notes(note for note, own in zip(notes, mine, strict=True) if own)
+    own = take_footprints(near, shapely.intersects(near.polygons, shapely.box(*task.box)))
+    return Footprints(
+        np.concatenate((own.polygons, left.polygons)),
+        np.concatenate((own.ids, left.ids)),
+        np.concatenate((own.given_height, left.given_height)),
+        np.concatenate((own.forms, left.forms)),
+    )
+
+
 def list_reserved(task: Task) -> Facts:
     """List the ids of footprints that look like one of a part of a house."""
     return {
-        "names": sorted({name for result in task.read("footprints", ()) for name in result.facts["part_like"]})
+        "names": sorted(
+            {name for stage in task.refs for one in task.read(stage, ()) for name in one.facts["part_like"]}
+        )
     }
 
 

@@ -220,16 +220,18 @@ def region_window(box: Box, spacing: float, bounds: Bounds) -> NodeWindow:
     return grow_window(node_window(box, spacing), 0, within=node_window(bounds, spacing))
 
 
-def read_outlines(task: Task, *, shift: tuple[float, float] = (0.0, 0.0)) -> Footprints:
-    """Read the footprints that meet the task's box, from the stage ``footprints``: the rows of its cells alone.
+def read_outlines(
+    task: Task, box: Box | None = None, *, stage: str = "footprints", shift: tuple[float, float] = (0.0, 0.0)
+) -> Footprints:
+    """Read the footprints that meet a box, by default the task's, from a stage: the rows of its cells alone.
 
     They are moved by a shift (m) before.
     """
+    xmin, ymin, xmax, ymax = box or task.box
     if any(shift):
-        xmin, ymin, xmax, ymax = task.box
-        found = read_rows(task, (xmin - shift[0], ymin - shift[1], xmax - shift[0], ymax - shift[1]))
+        found = read_rows(task, (xmin - shift[0], ymin - shift[1], xmax - shift[0], ymax - shift[1]), stage=stage)
         return replace(found, polygons=shapely.transform(found.polygons, lambda xy: xy + shift))
-    return read_rows(task, task.box)
+    return read_rows(task, (xmin, ymin, xmax, ymax), stage=stage)
 
 
 def read_own_outlines(task: Task) -> Footprints:

@@ -49,6 +49,12 @@ WORDS: dict[str, Words] = {
     "footprint-empty": Words(
         DROPPED, "{n} footprint[s] without an area [was|were] dropped", "it has no area at the tolerance"
     ),
+    "footprint-in-model": Words(
+        DROPPED, "{n} footprint[s] [was|were] left out: buildings of the city model stand there"
+    ),
+    "footprint-cut-by-model": Words(
+        REPAIRED, "{n} footprint[s] [was|were] cut where a building of the city model stands"
+    ),
     "footprint-lost": Words(
         DROPPED,
         "{n} footprint[s] [has|have] no area on the grid of the city model",
@@ -122,6 +128,12 @@ WORDS: dict[str, Words] = {
         DROPPED, "{n} building[s] of the city model [has|have] neither faces nor an outline", "it has no geometry"
     ),
     "model-roof-overhang": Words(REPAIRED, "{n} roof[s] of the city model [was|were] cut off at the walls"),
+    "model-self-crossing": Words(
+        REPAIRED, "{n} building[s] of the city model [has|have] surfaces that cross themselves"
+    ),
+    "model-steep-roof": Words(
+        REPAIRED, "{n} building[s] of the city model [has|have] roofs so steep that they are taken for walls"
+    ),
     "model-not-planar": Words(
         REPAIRED, "{n} building[s] of the city model [has|have] roof surfaces that are not planar"
     ),
@@ -260,7 +272,7 @@ WORDS: dict[str, Words] = {
     "footprints-reprojected": Words(OTHER, "the footprints were reprojected to the region's CRS"),
     "mesh-in-parts": Words(OTHER, "the mesh falls apart: parts of it share no face"),
     "terrain-far-from-points": Words(OTHER, "terrain was interpolated over large areas without ground points"),
-    "no-footprints-in-region": Words(OTHER, "no footprint lies in the region: terrain only"),
+    "no-footprints-in-region": Words(OTHER, "no footprint of a file lies in the region"),
 }
 
 

@@ -15,6 +15,7 @@ STAGES: dict[str, tuple[str, str]] = {
     "coarse": (TERRAIN, "coarse grid for large gaps"),
     "lakes": (TERRAIN, "large gaps"),
     "terrain": (TERRAIN, "grid"),
+    "model-outlines": (BUILDINGS, "city models"),
     "footprints": (BUILDINGS, "footprint file"),
     "outlines": (BUILDINGS, "footprints of tiles"),
     "reserved": (BUILDINGS, "ids"),

@@ -28,6 +28,7 @@ from tiler.stages.alignment import describe_alignment
 from tiler.stages.approach import RIM
 from tiler.stages.city_files import describe_feet
 from tiler.stages.domain import LOW_DOMAIN
+from tiler.stages.inputs import MODEL_OUTLINES
 from tiler.store.run_folder import PATCH_OF_GROUND
 from tiler.workflow.empty_run import explain_empty, is_empty
 from tiler.workflow.failed_tiles import Missing, describe_missing
@@ -229,7 +230,8 @@ def _join_counts(engine: Engine, plan: Plan, rounds: int) -> dict[str, int]:
     total["tiles"] = len(plan.layout.tiles)
     total["tiles absent"] = len(absent_tiles(plan.grid))
     total["rounds of simplification"] = rounds
-    total["footprints read"] = engine.records["footprints", REGION_ITEM].facts["n"]
+    sources = [stage for stage in ("footprints", MODEL_OUTLINES) if stage in engine.records.stages()]
+    total["footprints read"] = sum(engine.records[stage, REGION_ITEM].facts["n"] for stage in sources)
     for stage in engine.records.stages():
         for record in engine.records.of(stage):
             counts = record.facts.get("counts", {})

@@ -22,8 +22,8 @@ def roofs_of(planes: object, low: float = -np.inf, high: float = np.inf) -> Roof
     return Roofs(plane, np.zeros((len(plane), 2)), limits)
 
 
-def make(surfaces: object, planes: object, house: shapely.Polygon = HOUSE, min_area: float = 4.0) -> SurfacedRoof:
-    found = make_surfaced_roof(house, np.array(surfaces, object), roofs_of(planes), min_area=min_area)
+def make(surfaces: object, planes: object, house: shapely.Polygon = HOUSE, clearance: float = 1.0) -> SurfacedRoof:
+    found = make_surfaced_roof(house, np.array(surfaces, object), roofs_of(planes), clearance=clearance)
     assert found is not None
     return found
 
@@ -83,13 +83,13 @@ def test_surfaces_that_cross_get_a_wall_where_they_do() -> None:
 
 
 def test_small_and_narrow_parts_take_the_closest_plane_beside_them() -> None:
-    dormer, edge = shapely.box(4, 1, 5, 2), shapely.box(0, 7.8, 10, 8)
+    dormer, edge = shapely.box(4, 1, 5, 1.9), shapely.box(0, 7.8, 10, 8)
     surfaces = [shapely.difference(GABLE[0], dormer), shapely.difference(GABLE[1], edge), dormer, edge]
     roof = make(surfaces, [*SLOPES, [0, 0, 8.0], [0, 0, 5.9]])
     assert sorted(shapely.area(roof.parts).tolist()) == pytest.approx([40.0, 40.0])
     assert_covers(roof)
-    kept = make(surfaces, [*SLOPES, [0, 0, 8.0], [0, 0, 5.9]], min_area=0.5)
-    assert sorted(shapely.area(kept.parts).tolist()) == pytest.approx([1.0, 39.0, 40.0])
+    kept = make(surfaces, [*SLOPES, [0, 0, 8.0], [0, 0, 5.9]], clearance=0.4)
+    assert sorted(shapely.area(kept.parts).tolist()) == pytest.approx([0.9, 39.1, 40.0])
 
 
 def test_a_courtyard_stays_open() -> None:
@@ -101,7 +101,7 @@ def test_a_courtyard_stays_open() -> None:
 
 def test_surfaces_elsewhere_give_no_roof() -> None:
     far = np.array([shapely.box(20, 0, 30, 8)], object)
-    assert make_surfaced_roof(HOUSE, far, roofs_of([0, 0, 5]), min_area=4.0) is None
+    assert make_surfaced_roof(HOUSE, far, roofs_of([0, 0, 5]), clearance=1.0) is None
 
 
 @settings(max_examples=25, deadline=None)
@@ -114,7 +114,7 @@ def test_the_order_of_surfaces_does_not_matter(order: list[int], shift: int) -> 
     first = make(surfaces, planes)
     rows: NDArray[np.int64] = np.array(order)
     moved = take_roofs(roofs_of(planes), rows)
-    second = make_surfaced_roof(HOUSE, surfaces[rows], moved, min_area=4.0)
+    second = make_surfaced_roof(HOUSE, surfaces[rows], moved, clearance=1.0)
     assert second is not None
     assert shapely.to_wkb(second.parts).tolist() == shapely.to_wkb(first.parts).tolist()
     assert second.roofs.plane.tolist() == first.roofs.plane.tolist()

@@ -103,6 +103,18 @@ def test_terrain_is_read_beside_buildings(tmp_path: Path) -> None:
     assert len(terrain.faces) == 1
 
 
+def test_kinds_in_an_older_form_are_not_read_and_things_that_are_none_told(tmp_path: Path) -> None:
+    document = house_json()
+    (geometry,) = document["CityObjects"]["house"]["geometry"]
+    geometry["semantics"] = [[{"type": "RoofSurface"}]]
+    document["CityObjects"]["house"]["geometry"].append({"type": "Solid", "lod": "1", "boundaries": [[{}]]})
+    (house,) = buildings_of(write_json(tmp_path / "a.json", document))
+    assert set(house.shapes[0].faces.kind.tolist()) == {UNKNOWN}
+    geometry["semantics"] = {"surfaces": ["RoofSurface"], "values": [[0]]}
+    (house,) = buildings_of(write_json(tmp_path / "a.json", document))
+    assert "AttributeError" in house.faults[0]
+
+
 def test_a_geometry_that_cannot_be_read_is_told_and_others_stay(tmp_path: Path) -> None:
     document = house_json()
     bad = solid("1.2")
@@ -111,6 +123,17 @@ def test_a_geometry_that_cannot_be_read_is_told_and_others_stay(tmp_path: Path) 
     (house,) = buildings_of(write_json(tmp_path / "a.json", document))
     assert len(house.shapes) == 1
     assert "house: a Solid cannot be read (IndexError" in house.faults[0]
+
+
+@pytest.mark.parametrize("value", [None, 1e12])
+def test_a_vertex_without_a_place_costs_its_building_alone(tmp_path: Path, value: Any) -> None:
+    bad = house_json()
+    bad["vertices"][4][0] = value
+    path = write_sequence(tmp_path / "a.jsonl", [bad, house_json()])
+    first, second = buildings_of(path)
+    assert (first.shapes, len(second.shapes)) == ((), 1)
+    assert "a coordinate is no number, or beyond" in first.faults[0]
+    assert read_model_header(path).bounds == (100_000, 450_000, 100_010, 450_008, 2, 9)
 
 
 @pytest.mark.parametrize(
@@ -124,6 +147,7 @@ def test_a_geometry_that_cannot_be_read_is_told_and_others_stay(tmp_path: Path) 
             "no CityObjects",
         ),
         (json.dumps(house_json())[:-40], "is no JSON object"),
+        (json.dumps(house_json() | {"vertices": [[1, 2], [3, 4], [5, 6]]}), "not all vertices have three numbers"),
     ],
 )
 def test_a_damaged_file_is_refused_with_the_reason(tmp_path: Path, text: str, words: str) -> None:

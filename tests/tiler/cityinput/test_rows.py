@@ -213,6 +213,29 @@ def test_a_crossed_surface_is_mended(tmp_path: Path) -> None:
     assert shapely.is_valid(rows.outlines).all()
 
 
+def test_a_roof_steeper_than_70_degrees_is_a_wall_beside_others_and_told(tmp_path: Path) -> None:
+    document = house_json()
+    document["vertices"][8][2] = document["vertices"][9][2] = 20_000  # a ridge 14 m over eaves 4 m away
+    rows, notes, _ = rows_of(write_json(tmp_path / "a.json", document))
+    assert (len(rows.surfaces), notes) == (2, [])
+    (geometry,) = document["CityObjects"]["house"]["geometry"]
+    geometry["boundaries"][0].append([[4, 5, 6, 7]])
+    geometry["semantics"]["values"][0].append(1)
+    rows, notes, _ = rows_of(write_json(tmp_path / "a.json", document))
+    told = "model-steep-roof house: 2 roof surfaces steeper than 70 degrees are taken for walls"
+    assert (len(rows.surfaces), height_at(rows, 5, 3.9), notes) == (1, 6.0, [told])
+
+
+def test_a_ground_surface_that_crosses_itself_says_not_where_the_house_stands(tmp_path: Path) -> None:
+    document = house_json()
+    document["vertices"].append([2000, 0, 2000])
+    (geometry,) = document["CityObjects"]["house"]["geometry"]
+    geometry["boundaries"][0][0] = [[0, 2, 3, len(CORNERS)]]
+    rows, notes, _ = rows_of(write_json(tmp_path / "a.json", document))
+    assert shapely.area(rows.outlines).tolist() == [80.0]
+    assert notes == ["model-self-crossing house: 1 of its surfaces cross themselves; taken as they lie in plan"]
+
+
 def block_of(path: Path, wanted: Wanted = ALL, bounds: Any = EVERYWHERE) -> ModelBlock:
     (block,) = read_model_blocks(path, Frame(), bounds, wanted)
     return block

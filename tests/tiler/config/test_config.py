@@ -58,6 +58,19 @@ def test_every_parameter_is_an_option(capsys: pytest.CaptureFixture[str]) -> Non
             assert f"--{entry.name.replace('_', '-')}" in text
 
 
+def test_walls_of_a_city_model_have_a_clearance_of_their_own() -> None:
+    model: dict[str, object] = {"buildings": ["a.gml"]}
+    other = (
+        {"roofs": "flat"},
+        {"mesher": "layered"},
+        {"pointcloud": ["a.laz"], "prefer": "points"},
+        {"clearance": 1.0},
+    )
+    assert make_config(model).clearance == 0.5
+    assert [make_config(model | one).clearance for one in other] == [1.0] * 4
+    assert make_config({"footprints": "a.gpkg"}).clearance == 1.0
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [

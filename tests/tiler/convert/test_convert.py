@@ -13,6 +13,7 @@ import pytest
 import pyvista
 from lxml import etree
 
+import tiler
 from pipeline.data.errors import CityError, ConfigError, InputError
 from tests.conftest import SHARED
 from tests.helpers.iso19107 import check_solids
@@ -356,9 +357,34 @@ def test_one_building_is_held_at_a_time(source: Path) -> None:
         assert [one.id for one in next(features).objects] == ["h2", "p2"]
 
 
+def test_tiles_have_each_building_once_and_whole(tmp_path: Path) -> None:
+    far = model("far", "q")
+    far["vertices"] = [[x + 95_000, y - 40_000, z] for x, y, z in far["vertices"]]
+    bare = city_json({"bare": {"type": "Building"}}, [])
+    path = write_sequence(tmp_path / "in.jsonl", [model(), far, model("h2", "p2"), bare])
+    for name in LEVELS:
+        out = tmp_path / name
+        told = tiler.convert_models(path, out, name, tile_size=50)
+        assert {"2 files, a tile each", "1 buildings without surfaces, which are in no tile"} <= set(told)
+        names = ["2000_9000", "2002_8999"]  # a corner is at 100 000, 450 000
+        assert [one.stem for one in sorted(out.iterdir())] == names
+        tiles = [shapes_of(one) for one in sorted(out.iterdir())]
+        assert {owner for owner, _ in tiles[1]} == {"far", "q"}
+        assert tiles[0] | tiles[1] == shapes_of(convert(path, name, tmp_path))
+        first = read_model_header(sorted(out.iterdir())[0])
+        assert str(first.crs) == "EPSG:28992"
+        assert first.bounds[2] <= 100_010
+    tiler.convert_models(path, out, name, tile_size=50, overwrite=True)
+    (out / "mine.txt").touch()
+    with pytest.raises(CityError, match="is no folder of tiles"):
+        tiler.convert_models(path, out, name, tile_size=50, overwrite=True)
+
+
 @pytest.mark.parametrize(
     ("words", "match"),
     [
+        ({"name": "dxf", "output": "a.dxf"}, "format 'dxf': must be one of cityjson, "),
+        ({"name": "cityjson", "output": "tiles", "tile_size": 2.0}, "tile size 2 m: at least 10 m"),
         ({"name": "cityjson", "output": "a.gml"}, "ends with .json"),
         ({"name": "cityjson", "output": "a.json", "lod": "1.2"}, "all levels side by side"),
         ({"name": "cityjsonseq", "output": "in.jsonl"}, "is one of the inputs"),
