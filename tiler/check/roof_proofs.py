@@ -137,13 +137,20 @@ def are_above_roofs(
 ) -> Mask:
     """Tell which wall facets (k, 3, 3) rise above the roof of their building, bool (k,).
 
-    Where a roof was `moved` (k, 3) for the sake of cells (m), it counts as if it were not.
+    Where a roof was `moved` (k, 3) for the sake of cells (m), it counts as if it were not. Beside sloped roofs the
+    highest corner at a place is held to them: free levels of the wall below a roof that was moved up are no roof.
     """
-    highest = buildings.roof[row][:, None]
+    z, way = corners[:, :, 2], np.clip(moved, -rules.slack, rules.slack)
     if rules.sloped:
         places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
-        highest = find_roof_range(places, buildings, dtm, rules).high[index.reshape(-1)].reshape(-1, 3)
-    low = corners[:, :, 2] - np.clip(moved, -rules.slack, rules.slack) <= highest + HEIGHT_TOLERANCE
+        index = index.reshape(-1)
+        highest = find_roof_range(places, buildings, dtm, rules).high + HEIGHT_TOLERANCE
+        order = np.lexsort((z.ravel(), index))
+        top = order[np.searchsorted(index[order], np.arange(len(places)), side="right") - 1]
+        fits = z.ravel()[top] - way.ravel()[top] <= highest
+        low = (fits[index] | (z.ravel() <= highest[index])).reshape(-1, 3)
+    else:
+        low = z - way <= buildings.roof[row][:, None] + HEIGHT_TOLERANCE
     above: Mask = ~np.all(low, axis=1)
     return above
 

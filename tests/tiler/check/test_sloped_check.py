@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from numpy.typing import NDArray
 
 from pipeline.columns.adaptive import mesh_adaptive
 from pipeline.columns.columns import expand_cells, extract_boundary
 from pipeline.data.mesh import ColumnMesh, Marker
+from pipeline.data.roofs import Roofs
 from pipeline.points_terrain.terrain import Dtm, sample_dtm
 from tests.helpers.meshes import PlaneDtm, TinyCity, edit_json, write_run
 from tests.helpers.sloped_towns import BOUNDS, OPTIONS, SlopedTown, sloped_town
 from tiler.check.check import CheckReport, check_run
-from tiler.store.run_folder import ROOF_MOVED
+from tiler.check.roof_proofs import are_above_roofs
+from tiler.store.run_folder import ROOF_MOVED, Buildings, RoofRules
 
 
 class Terrain:
@@ -80,6 +83,20 @@ def test_a_mesh_without_order_keys_has_walls_twice(tmp_path: Path, town: SlopedT
 def test_roofs_that_should_be_flat_are_not(tmp_path: Path, town: SlopedTown, mesh: ColumnMesh) -> None:
     write(tmp_path, town, mesh, roofs="flat")
     assert "roof-height" in kinds(check(tmp_path, town))
+
+
+def test_a_wall_may_rise_to_a_roof_that_was_moved_up_and_no_further() -> None:
+    """Free levels of the wall below that roof are above its plane, too, and were not moved."""
+    roofs = Roofs(np.array([[0.5, 0.0, 10.0]]), np.zeros((1, 2)), np.array([[0.0, 99.0]]))
+    footprint = np.array([shapely.box(0, 0, 10, 10)], dtype=object)
+    buildings = Buildings(np.array([7]), footprint, np.zeros(1), np.array([15.0]), roofs)
+    rules = RoofRules(sloped=True, step=1.0, clearance=2.0, slack=1.0)
+    rise = np.array([[0.0, 15.3, 15.6], [0.0, 15.0, 15.3]])
+    corners = np.stack((np.full((2, 3), 10.0), np.array([[5.0, 5, 5], [2, 5, 5]]), rise), axis=2)
+    moved = np.array([[0.0, 0.0, 0.6], [0.0, 0.0, 0.0]])
+    for way, above in ((moved, [False, False]), (moved * 0, [True, True]), (moved / 2, [True, True])):
+        found = are_above_roofs(corners, way, np.zeros(2, np.int64), buildings, PlaneDtm(0, 0, 0), rules)
+        assert found.tolist() == above
 
 
 def inner_roof_level(town: SlopedTown, mesh: ColumnMesh) -> int:
