@@ -134,8 +134,14 @@ def divide_cells(
     Memory: a piece with its faces, and a few numbers for each part that a piece has cells of. Files: 12 bytes a
     cell.
     """
-    cuts = bisect_columns(columns.rows(), n_parts)
     n = int(region.cell_start[-1])
+    too_few = ConfigError(
+        f"--parts {n_parts}: the {n:,} cells stand in columns, which are not divided, and these are too few; "
+        "give fewer parts"
+    )
+    if len(columns.rows()) < n_parts:
+        raise too_few
+    cuts = bisect_columns(columns.rows(), n_parts)
     part = np.memmap(folder / "part", np.int32, "w+", shape=(max(n, 1),))
     place = np.memmap(folder / "place", np.int64, "w+", shape=(max(n, 1),))
     n_cells, n_inner = np.zeros(n_parts, np.int64), np.zeros(n_parts, np.int64)
@@ -161,10 +167,7 @@ def divide_cells(
         if len(keys := volumes[0](piece)):
             _count_sets(counts[-1], k, own, keys, volumes[1].keys)
     if n_cells.min() == 0:
-        raise ConfigError(
-            f"--parts {n_parts}: the {n:,} cells stand in columns, which are not divided, and these are too few; "
-            "give fewer parts"
-        )
+        raise too_few
     _count_shared(region, part, n_inner, between)
     divided = [
         [FacetSets(sets.keys, rows) for rows in found]

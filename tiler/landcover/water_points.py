@@ -3,9 +3,9 @@
 import hashlib
 
 import numpy as np
+import scipy  # what is asked of it is imported then
 import shapely
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from pipeline.data.classes import BUILDING, GROUND, WATER
 from tiler.citymodels.tables import pack_polygons
@@ -64,7 +64,8 @@ def find_wet(task: Task) -> Facts:
         more += np.bincount(j[inside] * shape[1] + i[inside], sign, len(more)).astype(np.int64)
     wet = (more > 0).reshape(shape)
     near = np.ones((3, 3), np.bool_)
-    wet = ndimage.binary_opening(ndimage.binary_closing(wet, near), near)[AROUND:-AROUND, AROUND:-AROUND]
+    wet = scipy.ndimage.binary_opening(scipy.ndimage.binary_closing(wet, near), near)
+    wet = wet[AROUND:-AROUND, AROUND:-AROUND]
     polygons = [
         polygon
         for bj in range(window.ny)

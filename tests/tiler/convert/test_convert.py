@@ -213,6 +213,7 @@ def test_real_models_obey_the_schemas_and_keep_buildings_and_faces(name: str, tm
         jsonschema.Draft7Validator(features).validate(json.loads(line))
 
 
+@pytest.mark.long
 def test_a_run_is_converted_and_its_solids_stay_valid_through_every_format(
     sloped_run: Path, tmp_path: Path
 ) -> None:
