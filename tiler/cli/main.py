@@ -241,7 +241,7 @@ def _report(options: argparse.Namespace) -> int:
     from tiler.report import write_report
 
     refuse_strangers(options.directory)
-    say(str(write_report(options.directory)))
+    say(str(write_report(options.directory, truth=options.truth)))
     return 0
 
 

@@ -162,8 +162,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     board.add_argument(
         "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
     )
-    report = command("report", "write report.html: what a run made, how good it is, what was left out")
-    report.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
+    _add_report(command("report", "write report.html: what a run made, how good it is, what was left out"))
     _add_fetch(command("fetch", "fetch the folder of a run from a bucket, and verify its checksums"))
     synth = command(
         "synth", "write a synthetic city: point cloud and footprints, or a town of houses with architecture"
@@ -387,6 +386,12 @@ def _add_town(synth: argparse.ArgumentParser) -> None:
     town.add_argument(
         "--surfaces", action="store_true", help="surfaces with chimneys and overhangs, instead of solids without"
     )
+
+
+def _add_report(report: argparse.ArgumentParser) -> None:
+    report.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
+    words = "truth.jsonl of the synthetic town that was meshed, to hold its roofs against"
+    report.add_argument("--truth", type=Path, metavar="FILE", help=words)
 
 
 def _add_fetch(fetch: argparse.ArgumentParser) -> None:

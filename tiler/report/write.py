@@ -8,6 +8,7 @@ from tiler.report.collect import collect_numbers
 from tiler.report.page import Page, paragraph
 from tiler.report.pictures import describe_pictures
 from tiler.report.record import RunFacts, read_run_facts
+from tiler.report.roof_truth import compare_with_truth, describe_truth
 from tiler.report.samples import measure_samples
 from tiler.report.timeline import read_timeline
 from tiler.store.atomic import replacing
@@ -16,13 +17,15 @@ from tiler.store.run_folder import WRONG_FIELD, broken_field
 from tiler.store.store import Store
 
 
-def write_report(directory: Path) -> Path:
+def write_report(directory: Path, *, truth: Path | None = None) -> Path:
     """Write ``report.html`` of a run: one file that needs no other and no network.
 
     Parameters
     ----------
     directory : Path
         Folder of a run that is done, or that failed.
+    truth : Path, optional
+        ``truth.jsonl`` of the synthetic town that was meshed, against which its roofs are held.
 
     Returns
     -------
@@ -32,7 +35,7 @@ def write_report(directory: Path) -> Path:
     Raises
     ------
     ConfigError
-        If there is no such folder.
+        If there is no such folder, or the truth is that of another town.
     InputError
         If its record or a result is missing or damaged, or the run is at work.
     OutputError
@@ -46,7 +49,7 @@ def write_report(directory: Path) -> Path:
         raise ConfigError(f"{directory}: no such folder; give the folder of a run")
     facts = read_run_facts(directory)
     try:
-        page = _fill(directory, facts)
+        page = _fill(directory, facts, truth)
     except WRONG_FIELD as error:
         raise broken_field(directory / RUN_RECORD, error) from error
     target = directory / REPORT
@@ -55,7 +58,7 @@ def write_report(directory: Path) -> Path:
     return target
 
 
-def _fill(directory: Path, facts: RunFacts) -> Page:
+def _fill(directory: Path, facts: RunFacts, truth: Path | None) -> Page:
     timeline = read_timeline(directory / EVENTS, frozenset(facts.tiles.names))
     page = Page(f"citystitch: {directory.resolve().name}")
     page.section("summary", "Summary", sections.describe_summary(facts))
@@ -71,6 +74,8 @@ def _fill(directory: Path, facts: RunFacts) -> Page:
         page.section("quality", "Quality of cells", sections.describe_quality(facts, numbers, samples))
         page.section("heights", "Heights", sections.format_heights(facts, numbers))
         page.section("fidelity", "Fidelity to the input", sections.describe_fidelity(facts, samples))
+        if truth is not None:
+            page.section("truth", "Fidelity to the truth", describe_truth(compare_with_truth(directory, truth)))
     page.section("time", "Time", sections.format_time(facts, timeline))
     page.section("notes", "Dropped, repaired, defaulted", sections.describe_notes(facts))
     page.section("parameters", "Parameters and versions", sections.report_parameters(facts))

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.data.errors import ConfigError
 from tiler.cli.main import main
+from tiler.report.roof_truth import compare_with_truth
 
 
 @pytest.mark.long
@@ -24,6 +26,17 @@ def test_each_level_is_a_mesh_of_its_own(tmp_path: Path) -> None:
         parts[lod] = record["counts"]["building parts"], record["counts"].get("sloped parts", 0)
     assert parts["1.2"][0] < parts["1.3"][0] < parts["2.1"][0] < parts["2.2"][0]  # parts, planes, dormers
     assert parts["1.2"][1] == parts["1.3"][1] == 0 < parts["2.1"][1]
+    assert main(["report", str(tmp_path / "m/lod2.2"), "--truth", str(tmp_path / "t/truth.jsonl")]) == 0
+    page = (tmp_path / "m/lod2.2/report.html").read_text()
+    assert "Fidelity to the truth" in page
+    rows = {row["type"]: row for row in compare_with_truth(tmp_path / "m/lod2.2", tmp_path / "t/truth.jsonl")}
+    assert rows["all"]["houses"] > 5  # without those beside the border
+    assert rows["all"]["right_type"] == 1.0
+    assert rows["all"]["height_50"] < 0.01
+    other = json.loads((tmp_path / "t/truth.jsonl").read_text().splitlines()[0]) | {"id": "another"}
+    (tmp_path / "t/other.jsonl").write_text(json.dumps(other) + "\n")
+    with pytest.raises(ConfigError, match="none of its"):
+        compare_with_truth(tmp_path / "m/lod1.2", tmp_path / "t/other.jsonl")
 
 
 def test_levels_need_a_city_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
