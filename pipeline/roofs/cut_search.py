@@ -115,7 +115,12 @@ def rank_cuts(
 
 @kernel
 def shift_cuts(
-    points: tuple[Array, Array, Index], piece: int, ranked: Array, min_points: int, rules: tuple[float, float]
+    points: tuple[Array, Array, Index],
+    piece: int,
+    rows: Index,
+    ranked: Array,
+    min_points: int,
+    rules: tuple[float, float],
 ) -> Array:
     """Move lines that have no room by up to a clearance, for they may save enough beside the best place too.
 
@@ -125,6 +130,8 @@ def shift_cuts(
         Points of the house (m), their misfits, and their faces, as for `rank_cuts`.
     piece, min_points
         As for `rank_cuts`.
+    rows : int64, (n,)
+        The points of the piece.
     ranked : float64, (k, 4)
         As from there.
     rules : tuple of 2 floats
@@ -137,18 +144,13 @@ def shift_cuts(
     """
     xyz, cost, face = points
     price, clearance = rules
-    n, total = 0, np.zeros(cost.shape[1])
-    for p in range(len(face)):
-        if face[p] == piece:
-            n += 1
-            for k in range(len(total)):
-                total[k] += cost[p, k]
+    sums = (sum_costs(cost, rows), len(rows), min_points)
     lines, m = np.empty((len(ranked) * 2 * SHIFTS, 4)), 0
     for k in range(len(ranked)):
         for step in range(-SHIFTS, SHIFTS + 1):
             lines[m, :2] = ranked[k, :2]
             lines[m, 2] = ranked[k, 2] + step * clearance / SHIFTS
-            lines[m, 3] = _saved_by(xyz, cost, face, piece, lines[m, :3], (total, n, min_points)) if step else 0.0
+            lines[m, 3] = _saved_by(xyz, cost, face, piece, lines[m, :3], sums) if step else 0.0
             if lines[m, 3] >= price:
                 m += 1
     kept: Array = lines[:m][order_values(-lines[:m, 3])]

@@ -162,7 +162,7 @@ def _cut_piece(
             break
         cut = cut_face(half, place, count, piece, (ranked[k, 0], ranked[k, 1], ranked[k, 2]), rules.clearance)
     if not cut and len(ranked):
-        shifted = shift_cuts(points, piece, ranked, least, (MOVED_PRICE * rules.price, rules.clearance))
+        shifted = shift_cuts(points, piece, rows, ranked, least, (MOVED_PRICE * rules.price, rules.clearance))
         for k in range(len(shifted)):
             if cut:
                 break

@@ -18,9 +18,8 @@ from tiler.check.proofs import (
 )
 from tiler.store.run_folder import PATCH_OF_GROUND, GroundPatch
 
-# Given places (n, 2), the patch of the ground at each, (n,).
+PatchesAt = Callable[[NDArray[np.float64]], NDArray[np.int8]]  # patch of the ground at places (n, 2)
 DensityAt = Callable[[NDArray[np.float64]], NDArray[np.float32]]  # leaf area density (m2/m3) at places (n, 3)
-PatchesAt = Callable[[NDArray[np.float64]], NDArray[np.int8]]
 
 
 def check_cover(

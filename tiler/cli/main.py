@@ -122,9 +122,9 @@ def _run(options: argparse.Namespace) -> int:
 
 def _run_levels(options: argparse.Namespace, **words: Any) -> int:
     """Make a mesh of each level of a city model; the exit code is that of the worst."""
-    if not options.__dict__.get("buildings") or options.log_json is not None:
-        raise ConfigError("--lods: takes levels of --buildings, and no --log-json; give a city model")
     values = with_file(vars(options))
+    if not values.get("buildings") or options.log_json is not None:
+        raise ConfigError("--lods: takes levels of --buildings, and no --log-json; give a city model")
     levels = options.lods.split(",")
     configs = [make_config(values | {"lod": lod, "out": f"{values['out']}/lod{lod}"}) for lod in levels]
     codes = []
@@ -272,6 +272,9 @@ def _synth(options: argparse.Namespace) -> int:
         names = ("lidar", "trees", "water", "workers", "variants", "degrade", "broken", "parameters", "footprints")
         if given := [name for name in names if getattr(options, name)]:
             raise ConfigError(f"--{given[0]}: goes with a town; give its --style, as --style detached")
+    if options.class_errors is not None and not options.lidar:
+        raise ConfigError("--class-errors: are those of the points of --lidar; give both or neither")
+    if options.style == "boxes":
         _write_city(options.directory, options)
     else:
         _write_town(options.directory, options)
@@ -279,7 +282,7 @@ def _synth(options: argparse.Namespace) -> int:
 
 
 def _write_town(directory: Path, options: argparse.Namespace) -> None:
-    from tiler.towns.town import make_output, open_town, write_faults, write_town
+    from tiler.towns.town import CLASS_ERRORS, make_output, open_town, write_faults, write_town
     from tiler.towns.town_tile import ModelOptions
 
     if options.buildings != SYNTH_BUILDINGS or options.roofs != "flat":
@@ -312,7 +315,7 @@ def _write_town(directory: Path, options: argparse.Namespace) -> None:
         density=options.density,
         models=models,
         lidar=options.lidar,
-        class_errors=options.class_errors,
+        class_errors=CLASS_ERRORS if options.class_errors is None else options.class_errors,
         workers=options.workers,
         variants=variants,
         degrade=options.degrade,
@@ -329,8 +332,10 @@ def _write_given(directory: Path, options: argparse.Namespace, output: "Output")
     from tiler.towns.styles import STYLES
     from tiler.towns.town import write_houses
 
-    if options.lidar or (options.parameters and options.footprints):
-        raise ConfigError("--parameters, --footprints and --lidar do not go together; give one of them")
+    if options.parameters and options.footprints:
+        raise ConfigError("--parameters and --footprints do not go together; give one of them")
+    if given := [name for name in ("lidar", "trees", "water", "workers") if getattr(options, name)]:
+        raise ConfigError(f"--{given[0]}: goes with towns that are drawn; leave out --parameters and --footprints")
     if options.parameters:
         read = read_xml if options.parameters.suffix == ".xml" else read_json
         files = write_houses(directory, read(options.parameters), output)

@@ -336,7 +336,6 @@ def _add_town(synth: argparse.ArgumentParser) -> None:
     town.add_argument(
         "--class-errors",
         type=float,
-        default=0.01,
         metavar="SHARE",
         help="of the points of --lidar, that have a wrong class (default: 0.01)",
     )

@@ -1,5 +1,6 @@
 """The folder ``system`` of an OpenFOAM case: enough for `checkMesh`, or a solver's schemes and solvers."""
 
+import math
 from pathlib import Path
 
 from tiler.export.foam_files import foam_header
@@ -81,8 +82,21 @@ def write_system(folder: Path, *, parts: int | None, application: str | None = N
         "controlDict": CONTROL.format(**ends, libs=words),
         "fvSchemes": SCHEMES,
         "fvSolution": SOLUTION,
-        "decomposeParDict": f"numberOfSubdomains {parts or PROCESSES};\nmethod scotch;\n",
+        "decomposeParDict": _decomposition(parts or PROCESSES),
     }
     (folder / "system").mkdir(parents=True)
     for name, text in texts.items():
         (folder / "system" / name).write_text(foam_header(name, "dictionary", location="system") + text)
+
+
+def _decomposition(parts: int) -> str:
+    """Write how `decomposePar` divides: in boxes, which every build of OpenFOAM can; Debian's has no scotch.
+
+    Examples
+    --------
+    >>> _decomposition(6).splitlines()[-1]
+    'hierarchicalCoeffs { n (3 2 1); delta 0.001; order xyz; }'
+    """
+    across = next(n for n in range(math.isqrt(parts), 0, -1) if parts % n == 0)
+    coefficients = f"hierarchicalCoeffs {{ n ({parts // across} {across} 1); delta 0.001; order xyz; }}"
+    return f"numberOfSubdomains {parts};\nmethod hierarchical;\n{coefficients}\n"

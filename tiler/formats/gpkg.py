@@ -4,6 +4,7 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import date
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -25,7 +26,7 @@ from tiler.store.run_folder import read_crs
 LAYER = "buildings"
 BATCH = 5000  # rows that are written at once
 # GeoPackage says when it was written; equal input gives equal bytes.
-TIME = {"OGR_CURRENT_DATE": "2000-01-01T00:00:00.000Z"}
+DAY = date(2000, 1, 1)
 Kinds = dict[str, set[type]]
 Column = tuple[NDArray[Any], NDArray[np.bool_] | None]  # values, and where there is none
 
@@ -161,13 +162,14 @@ def make_column(values: list[Any], kinds: set[type]) -> Column:
 
 
 @contextmanager
-def fixed_time() -> Iterator[None]:
-    """Let GDAL write one time of writing, whenever that is."""
-    pyogrio.set_gdal_config_options(TIME)
+def fixed_time(day: date = DAY) -> Iterator[None]:
+    """Let GDAL write one time of writing, midnight of a day, whenever that is."""
+    time = {"OGR_CURRENT_DATE": f"{day.isoformat()}T00:00:00.000Z"}
+    pyogrio.set_gdal_config_options(time)
     try:
         yield
     finally:
-        pyogrio.set_gdal_config_options(dict.fromkeys(TIME))
+        pyogrio.set_gdal_config_options(dict.fromkeys(time))
 
 
 FORMAT = Format(

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, make_city
 from pipeline.points_terrain.synthetic_roofs import ROOF_TYPES, wing_rings
-from tiler.towns.synthetic_files import DAY, GPKG_TIME, write_laz
+from tiler.formats.gpkg import fixed_time
+from tiler.towns.synthetic_files import DAY, write_laz
 
 CRS = "EPSG:3006"
 DENSITY = 1.5  # points/m2
@@ -124,8 +125,7 @@ def _write_footprints(city: SyntheticCity, files: SynthFiles) -> None:
     wkb = shapely.to_wkb(city.polygons)
     ids = {"id": city.ids.astype(np.object_)}
     words = {} if city.roofs == "flat" else _roof_tags(city)
-    pyogrio.set_gdal_config_options(GPKG_TIME)
-    try:
+    with fixed_time(DAY):
         for path, fields, options in (
             (files.footprints, ids | words, {}),
             (files.shapefile, ids, {"DBF_DATE_LAST_UPDATE": DAY.isoformat()}),
@@ -135,8 +135,6 @@ def _write_footprints(city: SyntheticCity, files: SynthFiles) -> None:
             pyogrio.raw.write(
                 path, wkb, values, list(fields), geometry_type="Polygon", crs=CRS, layer="footprints", **options
             )
-    finally:
-        pyogrio.set_gdal_config_options(dict.fromkeys(GPKG_TIME))
 
 
 def _roof_tags(city: SyntheticCity) -> dict[str, NDArray[Any]]:

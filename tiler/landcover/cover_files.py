@@ -1,6 +1,5 @@
 """Polygons of land cover in vector files, as rows for the store."""
 
-import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -11,12 +10,12 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.citymodel import Footprints
+from pipeline.data.citymodel import Footprints, make_ids
 from pipeline.data.errors import InputError
 from pipeline.data.notes import Note
 from tiler.footprints.footprint_attributes import known_attribute
 from tiler.footprints.footprint_index import FootprintBlock, block_footprints
-from tiler.footprints.footprint_source import open_source
+from tiler.footprints.footprint_source import FootprintSource, open_source
 from tiler.footprints.plan_outlines import outline_all
 from tiler.georeference.frame import to_region
 from tiler.landcover.cover_table import class_word
@@ -63,14 +62,10 @@ def scan_cover(
     ConfigError
         If it has none of the attributes.
     """
-    if is_missing(path):
-        raise InputError(f"{path}: no such file; check the path of land_cover")
-    source = open_source(path, crs=crs, bounds=bounds, layer="", id_attribute="", height_attribute="")
-    if source.layer.gdal is not None and source.layer.gdal.driver == "OSM":
-        raise InputError(
-            f"{path}: of an extract of OpenStreetMap tags of buildings alone are read; make a file of its areas: "
-            f"ogr2ogr cover.gpkg {path.name} multipolygons, and give --land-cover-field natural,landuse,leisure"
-        )
+    hint = (
+        f"areas: ogr2ogr cover.gpkg {path.name} multipolygons, and give --land-cover-field natural,landuse,leisure"
+    )
+    source = open_file(path, "land_cover", hint, crs=crs, bounds=bounds)
     known = {*source.layer.fields, source.layer.fid_name}
     asked = [name.strip() for name in field.split(",")]
     names = [name for name in asked if name in known] or [known_attribute(source.layer, asked[0], known)]
@@ -104,6 +99,21 @@ def scan_cover(
     yield block_footprints(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), notes)
 
 
+def open_file(path: Path, parameter: str, hint: str, *, crs: pyproj.CRS, bounds: Box) -> FootprintSource:
+    """Open a vector file that a parameter names; InputError where it is missing, or an extract of OpenStreetMap.
+
+    `hint` says how areas or trees of an extract are made into a file.
+    """
+    if is_missing(path):
+        raise InputError(f"{path}: no such file; check the path of {parameter}")
+    source = open_source(path, crs=crs, bounds=bounds, layer="", id_attribute="", height_attribute="")
+    if source.layer.gdal is not None and source.layer.gdal.driver == "OSM":
+        raise InputError(
+            f"{path}: of an extract of OpenStreetMap tags of buildings alone are read; make a file of its {hint}"
+        )
+    return source
+
+
 def _find_rows(
     features: Features, names: Sequence[str], rows: Mapping[str, int], unknown: Counter[str]
 ) -> NDArray[np.int64]:
@@ -131,7 +141,5 @@ def _block(
     kept = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
     kept &= ~shapely.is_empty(parts) & shapely.intersects(parts, shapely.box(*bounds))
     parts, owner = shapely.normalize(parts[kept]), owner[kept]
-    blobs = shapely.to_wkb(parts, output_dimension=2, byte_order=1)
-    names = [hashlib.blake2b(blob, digest_size=8).hexdigest() for blob in blobs]
-    ids = np.array([f"{r:03d}-{name}" for r, name in zip(row[owner].tolist(), names, strict=True)], np.str_)
+    ids = np.array([f"{r:03d}-{name}" for r, name in zip(row[owner], make_ids(parts), strict=True)], np.str_)
     return block_footprints(Footprints(parts, ids, level[owner]), [])

@@ -1,6 +1,5 @@
 """Trees of vector files: crowns, or positions with a width, as rows for the store."""
 
-import hashlib
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -10,14 +9,12 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.citymodel import Footprints
-from pipeline.data.errors import InputError
+from pipeline.data.citymodel import Footprints, make_ids
 from pipeline.data.notes import Note
 from pipeline.data.roof_forms import no_forms
 from tiler.footprints.footprint_index import FootprintBlock, block_footprints
-from tiler.footprints.footprint_source import open_source
 from tiler.georeference.frame import to_region
-from tiler.objects.places import is_missing
+from tiler.landcover.cover_files import open_file
 from tiler.vectors.features import Box, Features
 from tiler.vectors.layers import scan_layer
 from tiler.vectors.lengths import metres_of
@@ -51,14 +48,8 @@ def scan_trees(path: Path, *, crs: pyproj.CRS, bounds: Box) -> Iterator[Footprin
     InputError
         If the file cannot be read.
     """
-    if is_missing(path):
-        raise InputError(f"{path}: no such file; check the path of trees")
-    source = open_source(path, crs=crs, bounds=bounds, layer="", id_attribute="", height_attribute="")
-    if source.layer.gdal is not None and source.layer.gdal.driver == "OSM":
-        raise InputError(
-            f"{path}: of an extract of OpenStreetMap tags of buildings alone are read; make a file of its trees: "
-            f'ogr2ogr -where "other_tags like \'%natural"=>"tree%\'" trees.gpkg {path.name} points'
-        )
+    hint = f'trees: ogr2ogr -where "other_tags like \'%natural"=>"tree%\'" trees.gpkg {path.name} points'
+    source = open_file(path, "trees", hint, crs=crs, bounds=bounds)
     names = [name for name in (HEIGHT, BASE, WIDTH) if name in source.layer.fields]
     left = 0
     for features in scan_layer(source.layer, names, source.box):
@@ -79,9 +70,7 @@ def scan_trees(path: Path, *, crs: pyproj.CRS, bounds: Box) -> Iterator[Footprin
         parts, owner = shapely.get_parts(shapely.normalize(shapes[kept]), return_index=True)
         forms = no_forms(len(parts))
         forms[:, BASE_COLUMN] = base[kept][owner]
-        blobs = shapely.to_wkb(parts, output_dimension=2, byte_order=1)
-        ids = np.array([hashlib.blake2b(blob, digest_size=8).hexdigest() for blob in blobs], np.str_)
-        yield block_footprints(Footprints(parts, ids, height[kept][owner], forms), [])
+        yield block_footprints(Footprints(parts, make_ids(parts), height[kept][owner], forms), [])
     if left:
         note = Note("trees-left-out", path.name, detail=f"{left} features are no area or point, or have no height")
         yield block_footprints(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), [note])

@@ -1,12 +1,11 @@
 """Water by points of class 9: polygons of squares of the CRS, the same whatever the tiles (beyond the paper)."""
 
-import hashlib
-
 import numpy as np
 import scipy  # what is asked of it is imported then
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.data.citymodel import make_ids
 from pipeline.data.classes import BUILDING, GROUND, WATER
 from tiler.citymodels.tables import pack_polygons
 from tiler.config.config import Config
@@ -78,8 +77,7 @@ def find_wet(task: Task) -> Facts:
     ]
     array = np.empty(len(polygons), np.object_)
     array[:] = polygons
-    names = [hashlib.blake2b(blob, digest_size=8).hexdigest() for blob in shapely.to_wkb(array, byte_order=1)]
-    task.put(**pack_polygons(array, "outline"), names=np.array(names, np.str_))
+    task.put(**pack_polygons(array, "outline"), names=make_ids(array))
     return {"n": len(polygons)}
 
 

@@ -76,6 +76,9 @@ def _fill(directory: Path, facts: RunFacts, truth: Path | None) -> Page:
         page.section("fidelity", "Fidelity to the input", sections.describe_fidelity(facts, samples))
         if truth is not None:
             page.section("truth", "Fidelity to the truth", describe_truth(compare_with_truth(directory, truth)))
+    elif truth is not None:
+        status = facts.members["status"]
+        raise ConfigError(f"{directory}: its run {status}; it has no roofs yet to hold against {truth}, run again")
     page.section("time", "Time", sections.format_time(facts, timeline))
     page.section("notes", "Dropped, repaired, defaulted", sections.describe_notes(facts))
     page.section("parameters", "Parameters and versions", sections.report_parameters(facts))

@@ -192,7 +192,7 @@ def read_run_record(path: Path) -> RunRecord:
         given = record.get("parameters", {})
         leaves = bool(given.get("vegetation_classes") or given.get("trees"))
         cell = float(given.get("leaf_column", 2.0))
-        spacing = float(record.get("parameters", {}).get("dtm_spacing", 1.0))
+        spacing = float(given.get("dtm_spacing", 1.0))
         ground = tuple(GroundPatch(str(row["patch"]), _optional(row["z0 (m)"])) for row in found)
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None

@@ -18,7 +18,8 @@ from pipeline.architecture.lots import Lot, lot_random
 from pipeline.architecture.parameters import House
 from pipeline.architecture.rules import Distribution
 from pipeline.data.errors import InputError
-from tiler.towns.synthetic_files import GPKG_TIME
+from tiler.formats.gpkg import fixed_time
+from tiler.towns.synthetic_files import DAY
 
 # Attributes that win over rules, by what they give: the first that a file has.
 NAMES = {
@@ -33,9 +34,7 @@ NAMES = {
 }
 _SHAPES = {"skillion": "shed", **{name: name for name in ("flat", "shed", "gabled", "hipped", "pyramidal")}}
 _WORDS = {"shed": "skillion"}  # of OpenStreetMap, where they are other ones
-RECTANGLE = (
-    0.97  # of the area of the least rectangle around: outlines that fill it are houses with walls and openings
-)
+RECTANGLE = 0.97  # of the least rectangle around: outlines that fill so much are houses with walls and openings
 _BESIDE = 0.15  # m from a wall: what lies there shares it
 
 
@@ -122,8 +121,7 @@ def augment(path: Path, rules: Mapping[str, Distribution], *, seed: int) -> Augm
 def write_augmented(path: Path, found: Augmented) -> None:
     """Write footprints with their attributes as a GeoPackage that `citystitch run` takes roofs from."""
     path.unlink(missing_ok=True)
-    pyogrio.set_gdal_config_options(GPKG_TIME)
-    try:
+    with fixed_time(DAY):
         single = bool((shapely.get_type_id(found.outlines) == shapely.GeometryType.POLYGON).all())
         pyogrio.raw.write(
             path,
@@ -134,8 +132,6 @@ def write_augmented(path: Path, found: Augmented) -> None:
             crs=found.crs,
             layer="footprints",
         )
-    finally:
-        pyogrio.set_gdal_config_options(dict.fromkeys(GPKG_TIME))
 
 
 @dataclass(frozen=True)

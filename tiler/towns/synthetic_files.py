@@ -14,7 +14,6 @@ from pipeline.data.pointcloud import PointCloud
 
 SCALE = 0.01  # m
 DAY = date(2022, 1, 1)  # in all files, so that the same seed gives the same bytes
-GPKG_TIME = {"OGR_CURRENT_DATE": f"{DAY.isoformat()}T00:00:00.000Z"}
 
 
 def write_laz(path: Path, cloud: PointCloud, bounds: tuple[float, float, float, float], crs: str) -> None:

@@ -21,10 +21,11 @@ from pipeline.architecture.representations import list_representations
 from pipeline.data.errors import ConfigError, OutputError
 from pipeline.points_terrain.synthetic import ORIGIN
 from tiler.executors.in_order import map_in_order
+from tiler.formats.gpkg import fixed_time
 from tiler.towns.parameter_files import XML_END, XML_HEAD
 from tiler.towns.rule_files import read_rules
 from tiler.towns.styles import Box, Town, make_town
-from tiler.towns.synthetic_files import GPKG_TIME
+from tiler.towns.synthetic_files import DAY
 from tiler.towns.town_models import fault_feature, model_head
 from tiler.towns.town_scan import check_flight
 from tiler.towns.town_tile import CRS, ModelOptions, Output, TownTile, house_outline, write_tile
@@ -141,6 +142,8 @@ def write_town(
             raise ConfigError(f"--{name} {value:g}: expected 0 to {MOST_DENSITY:g} points per m2")
     if not 0 <= class_errors <= 1:
         raise ConfigError(f"--class-errors {class_errors:g}: expected 0 to 1")
+    if workers < 0:
+        raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
     if lidar > 0:
         check_flight(town)
     tile = TownTile(directory, town, town.bounds, (0, 0), density, lidar, class_errors, output)
@@ -289,8 +292,7 @@ def _append_footprints(rows: Sequence[tuple[str, float, list[list[float]]]], pat
         "id": np.array([name for name, *_ in rows], object),
         "height": np.array([height for _, height, _ in rows], np.float64),
     }
-    pyogrio.set_gdal_config_options(GPKG_TIME)
-    try:
+    with fixed_time(DAY):
         pyogrio.raw.write(
             path,
             shapely.to_wkb(polygons),
@@ -301,5 +303,3 @@ def _append_footprints(rows: Sequence[tuple[str, float, list[list[float]]]], pat
             layer="footprints",
             append=path.exists(),
         )
-    finally:
-        pyogrio.set_gdal_config_options(dict.fromkeys(GPKG_TIME))

@@ -582,6 +582,16 @@ def test_one_tile_is_divided_evenly_and_interfaces_are_counted(one_tile_run: Pat
 
 
 @pytest.mark.long
+def test_decompose_par_divides_a_whole_case_as_it_comes(small_run: Path, tmp_path: Path) -> None:
+    case = tmp_path / "case"
+    export_run(small_run, case, name="openfoam", options={})
+    run_foam("decomposePar", case)
+    cells = [len(read_labels(case / f"processor{n}" / MESH / "cellProcAddressing")) for n in range(4)]
+    assert sum(cells) == json.loads((small_run / "run.json").read_text())["counts"]["cells"]
+    assert max(cells) < 1.01 * min(cells)
+
+
+@pytest.mark.long
 @pytest.mark.timeout(1200)
 def test_openfoam_reads_and_solves_a_small_city(small_run: Path, tmp_path: Path) -> None:
     one, two = export_cases(small_run, tmp_path)

@@ -112,6 +112,9 @@ def test_what_is_no_such_file_is_told(tmp_path: Path, capsys: pytest.CaptureFixt
         (["--footprints", str(tmp_path / "none.gpkg")], "cannot be read"),
         (["--degrade", "-1"], "--degrade -1"),
         (["--variants", "LOD9"], "--variants LOD9: no such representation"),
+        (["--workers", "-2"], "--workers -2: expected 0, for this process, or more"),
+        (["--class-errors", "0.2"], "--class-errors: are those of the points of --lidar"),
+        (["--footprints", "f.gpkg", "--trees", "0.5"], "--trees: goes with towns that are drawn"),
     ):
         assert main(["synth", str(tmp_path / "t"), "--style", "grid", "--size", "50", *words]) in (1, 2)
         assert told in capsys.readouterr().err

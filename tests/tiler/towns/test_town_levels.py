@@ -42,3 +42,7 @@ def test_each_level_is_a_mesh_of_its_own(tmp_path: Path) -> None:
 def test_levels_need_a_city_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", str(tmp_path), "--out", str(tmp_path / "o"), "--lods", "1.2,2.2"]) == 2
     assert "--lods: takes levels of --buildings" in capsys.readouterr().err
+    config = tmp_path / "city.toml"
+    config.write_text(f'[input]\npointcloud = ["{tmp_path}"]\nbuildings = ["{tmp_path / "none.city.json"}"]\n')
+    assert main(["run", str(config), "--out", str(tmp_path / "o"), "--lods", "1.2,2.2"]) != 0
+    assert "--lods" not in capsys.readouterr().err
