@@ -18,16 +18,8 @@ from tiler.store.out_folder import CITY_MODEL
 
 LOD = "2.2"
 HEAD = (
-    "main roof",
-    "houses",
-    "not in the model",
-    "right type",
-    "right number of planes",
-    "angle, median (degrees)",
-    "angle, 95 % below",
-    "outline (m)",
-    "height, median (m)",
-    "height, RMSE (m)",
+    *("main roof", "houses", "not found", "right type", "right planes"),
+    *("angle (°)", "95 % below (°)", "outline (m)", "height (m)", "RMSE (m)"),
 )
 SHARES = ("right_type", "right_planes")
 NUMBERS = ("angle_50", "angle_95", "outline", "height_50", "height_rmse")
@@ -114,7 +106,8 @@ def describe_truth(rows: list[dict[str, Any]]) -> Iterator[str]:
     """Show how the roofs of the city model differ from the true ones."""
     yield paragraph(
         "Roofs of the city model against the town that was scanned. The type is that of the main roof; planes are "
-        "those of dormers and parts, too. Angles and heights are of the main roof, outlines of the whole house."
+        "those of dormers and parts, too: right if there are as many. Angles and heights are of the main roof, "
+        "outlines of the whole house; they are medians where nothing else is said."
     )
     shown = [
         [
