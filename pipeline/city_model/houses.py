@@ -15,12 +15,12 @@ from pipeline.city_model.building_points import (
 )
 from pipeline.city_model.city import City, CityOptions
 from pipeline.city_model.heights import ROOF_SOURCES
-from pipeline.city_model.model_roofs import lay_surfaces
+from pipeline.city_model.model_roofs import MODEL, lay_surfaces
 from pipeline.city_model.shaped_roofs import form_roofs, shape_roofs
 from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
 from pipeline.data.roof_forms import NO_FORM, POINTS_TELL, SHAPE
-from pipeline.data.roofs import Roofs, flat_roofs, join_roofs, take_roofs
+from pipeline.data.roofs import Roofs, choose_roofs, flat_roofs, join_roofs, take_roofs
 from pipeline.geometry.inside import find_inside
 from pipeline.roofs.house_levels import HouseParts, LevelOptions, split_levels
 from pipeline.roofs.house_roofs import FLAT, HouseRoofs, RoofOptions, fit_roofs, replace_roofs
@@ -202,6 +202,14 @@ def _deal_out_roofs(
     found = add_roof_points(no_roof_points(len(mine)), np.flatnonzero(~mine), marked)
     found = add_roof_points(found, np.flatnonzero(mine), make_roof_points(start, roofs.xyz[point[own]]))
     return found.start, found.z
+
+
+def find_model_roofs(houses: Houses) -> Roofs | None:
+    """Give the roofs of the parts that a city model tells, NaN for others; None if there is no such part."""
+    told = houses.method[houses.parts.house] == MODEL
+    if not told.any():
+        return None
+    return choose_roofs(told, houses.roofs, flat_roofs(np.full(len(told), np.nan)))
 
 
 def take_houses(houses: Houses, rows: NDArray[np.int64]) -> Houses:

@@ -14,6 +14,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.city import CityOptions
+from pipeline.data.roofs import Roofs, take_roofs
 from pipeline.geometry.components import join_pairs
 from pipeline.roofs.house_levels import HouseParts
 from pipeline.simplification.graph import MILLIMETRES
@@ -56,7 +57,9 @@ class Shapes:
         return len(self.polygons)
 
 
-def shape_clusters(parts: HouseParts, cluster: NDArray[np.int64], options: CityOptions) -> Shapes:
+def shape_clusters(
+    parts: HouseParts, cluster: NDArray[np.int64], options: CityOptions, roofs: Roofs | None = None
+) -> Shapes:
     """Simplify some clusters, each from its own houses.
 
     Parameters
@@ -67,15 +70,19 @@ def shape_clusters(parts: HouseParts, cluster: NDArray[np.int64], options: CityO
         Cluster of each house; -1 for houses to leave out.
     options : CityOptions
         Parameters; `simplify` chooses the way.
+    roofs : Roofs, optional
+        Known roofs of the parts, NaN where there is none, as for `shape_planar`; not used by the paper's way.
     """
     of_part = cluster[parts.house]
     rows = np.flatnonzero(of_part >= 0)
     if options.simplify == "paper":
         return _merge_clusters(parts.polygons, rows, of_part, options)
-    return _shape_planar_clusters(parts.polygons, rows, of_part, options)
+    return _shape_planar_clusters(parts.polygons, rows, of_part, options, roofs)
 
 
-def simplify_houses(parts: HouseParts, outlines: NDArray[np.object_], options: CityOptions) -> Shapes:
+def simplify_houses(
+    parts: HouseParts, outlines: NDArray[np.object_], options: CityOptions, roofs: Roofs | None = None
+) -> Shapes:
     """Simplify all houses in rounds, in memory: what the tiles of a region do together.
 
     Parameters
@@ -86,11 +93,13 @@ def simplify_houses(parts: HouseParts, outlines: NDArray[np.object_], options: C
         Outlines of the houses (m).
     options : CityOptions
         Parameters.
+    roofs : Roofs, optional
+        As for `shape_clusters`.
     """
     cluster = join_pairs(len(outlines), find_close(outlines, options.clearance))
     shapes, todo, counts = join_shapes([]), cluster, Counter[str]()
     while True:
-        piece = shape_clusters(parts, todo, options)
+        piece = shape_clusters(parts, todo, options, roofs)
         add_counts(counts, piece.counts)
         shapes = join_shapes([shapes, piece])
         close = shapes.cluster[find_close(shapes.polygons, options.clearance)]
@@ -221,26 +230,34 @@ def _merge_clusters(
 
 
 def _shape_planar_clusters(
-    polygons: NDArray[np.object_], rows: NDArray[np.int64], cluster: NDArray[np.int64], options: CityOptions
+    polygons: NDArray[np.object_],
+    rows: NDArray[np.int64],
+    cluster: NDArray[np.int64],
+    options: CityOptions,
+    roofs: Roofs | None,
 ) -> Shapes:
     """Shape each cluster as one planar graph; where a house loses most of itself, by its closed outline.
 
     A comb of thin walls does that. Other clusters come out as before, to the bit.
     """
-    planar = _shape_planar(polygons, rows, cluster, options)
+    planar = _shape_planar(polygons, rows, cluster, options, roofs)
     closable, outlines = _find_closable(polygons, rows, cluster, planar, options.clearance)
     if not len(closable):
         return planar
     shapes = polygons.copy()
     shapes[closable] = outlines
     again = np.unique(cluster[closable])
-    redone = _shape_planar(shapes, rows[np.isin(cluster[rows], again)], cluster, options)
+    redone = _shape_planar(shapes, rows[np.isin(cluster[rows], again)], cluster, options, roofs)
     closed = np.column_stack((closable, cluster[closable]))
     return join_shapes([leave_out(planar, again), replace(redone, closed=closed)])
 
 
 def _shape_planar(
-    polygons: NDArray[np.object_], rows: NDArray[np.int64], cluster: NDArray[np.int64], options: CityOptions
+    polygons: NDArray[np.object_],
+    rows: NDArray[np.int64],
+    cluster: NDArray[np.int64],
+    options: CityOptions,
+    roofs: Roofs | None,
 ) -> Shapes:
     planar: PlanarCity = shape_planar(
         polygons[rows],
@@ -249,6 +266,7 @@ def _shape_planar(
         min_area=options.min_building_area,
         min_courtyard_area=options.min_courtyard_area,
         manifold=options.manifold,
+        roofs=None if roofs is None else take_roofs(roofs, rows),
     )
     member = rows[planar.house]
     return Shapes(

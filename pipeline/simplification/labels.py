@@ -6,7 +6,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.simplification.graph import Faces, WallGraph, trace_faces
+from pipeline.data.roofs import Roofs, roof_heights
+from pipeline.simplification.graph import MILLIMETRES, Faces, WallGraph, trace_faces
 
 OPEN = -1  # label of open ground and courtyards
 # A face is built if houses cover at least this share of it.
@@ -33,9 +34,9 @@ class Territories:
 
 
 def claim_ground(
-    graph: WallGraph, houses: NDArray[np.object_], cluster: NDArray[np.int64]
+    graph: WallGraph, houses: NDArray[np.object_], cluster: NDArray[np.int64], roofs: Roofs | None = None
 ) -> tuple[WallGraph, Territories]:
-    """Share out the faces of the noded walls: what several houses cover goes to the smallest of them.
+    """Share out the faces of the noded walls: what several houses cover goes to the highest or smallest of them.
 
     Parameters
     ----------
@@ -45,6 +46,9 @@ def claim_ground(
         Valid shapely Polygons (mm).
     cluster : int64, (n,)
         Their clusters.
+    roofs : Roofs, optional
+        Known roofs of the houses, NaN where there is none. A face goes to the highest house if the roofs of all
+        that cover it are known, or else to the smallest.
 
     Returns
     -------
@@ -54,10 +58,16 @@ def claim_ground(
         What each house has; of two equal ones the first has all.
     """
     faces = trace_faces(graph)
-    at, by = shapely.STRtree(houses).query(shapely.point_on_surface(faces.polygons), predicate="intersects")
+    place = shapely.point_on_surface(faces.polygons)
+    at, by = shapely.STRtree(houses).query(place, predicate="intersects")
     same = faces.cluster[at] == cluster[by]
     at, by = at[same], by[same]
-    order = np.lexsort((by, shapely.area(houses)[by], at))
+    drop = np.zeros(len(at))
+    if roofs is not None:
+        drop = -roof_heights(roofs, by, shapely.get_coordinates(place)[at] / MILLIMETRES)
+        unknown = np.bincount(at, np.isnan(drop), len(place)) > 0
+        drop[unknown[at]] = 0.0
+    order = np.lexsort((by, shapely.area(houses)[by], drop, at))
     face, first = np.unique(at[order], return_index=True)
     label = np.full(len(faces.polygons), OPEN)
     label[face] = by[order][first]

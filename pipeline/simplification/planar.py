@@ -8,6 +8,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import GeometryError
+from pipeline.data.roofs import Roofs, take_roofs
 from pipeline.geometry.components import join_pairs
 from pipeline.geometry.rings import make_canonical, sort_canonically
 from pipeline.simplification.graph import MILLIMETRES
@@ -141,6 +142,7 @@ def shape_planar(
     min_area: float,
     min_courtyard_area: float,
     manifold: bool = False,
+    roofs: Roofs | None = None,
 ) -> PlanarCity:
     """Give all walls of each cluster a least distance, whatever the distance of clusters.
 
@@ -152,9 +154,13 @@ def shape_planar(
         Their clusters, numbered from 0 to at most ``n - 1``.
     clearance, chain_tolerance, min_area, min_courtyard_area, manifold
         As in `simplify_planar`, and so are errors and the result of each cluster.
+    roofs : Roofs, optional
+        Known roofs of the polygons, NaN where there is none: ground covered by several polygons whose roofs are
+        known goes to the highest one there.
     """
     houses, order, rules = _prepare(polygons, clearance, chain_tolerance, min_area, min_courtyard_area, manifold)
-    shaped, counts = shape_clusters(houses, cluster[order], rules)
+    known = None if roofs is None else take_roofs(roofs, order)
+    shaped, counts = shape_clusters(houses, cluster[order], rules, known)
     return _finish(shaped, cluster[order], counts, order, polygons)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from pipeline.data.roofs import Roofs
 from pipeline.simplification.corners import find_touches, mend_corners
 from pipeline.simplification.graph import (
     Faces,
@@ -96,7 +97,7 @@ def join_shaped(pieces: list[Shaped]) -> Shaped:
 
 
 def shape_clusters(
-    houses: NDArray[np.object_], cluster: NDArray[np.int64], rules: Rules
+    houses: NDArray[np.object_], cluster: NDArray[np.int64], rules: Rules, roofs: Roofs | None = None
 ) -> tuple[Shaped, Counter[str]]:
     """Shape the houses of some clusters, each by the first rung that keeps the rules.
 
@@ -108,6 +109,8 @@ def shape_clusters(
         Their clusters, -1 for houses to leave out.
     rules : Rules
         What to keep.
+    roofs : Roofs, optional
+        Known roofs of the houses, as for `claim_ground`.
 
     Returns
     -------
@@ -124,7 +127,7 @@ def shape_clusters(
     cannot fail.
     """
     mine = cluster >= 0
-    walls, territories = claim_ground(node_walls(houses[mine], cluster[mine]), houses, cluster)
+    walls, territories = claim_ground(node_walls(houses[mine], cluster[mine]), houses, cluster, roofs)
     left = np.unique(cluster[mine])
     pieces: list[Shaped] = []
     counts = Counter[str]()

@@ -20,7 +20,7 @@ from pipeline.city_model.city import (
 )
 from pipeline.city_model.groups import adjacent_houses, group_roofs
 from pipeline.city_model.heights import Heights, highest_wall_ground, raise_low_roofs
-from pipeline.city_model.houses import Houses, divide_houses
+from pipeline.city_model.houses import Houses, divide_houses, find_model_roofs
 from pipeline.city_model.model_roofs import MODEL
 from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
@@ -63,7 +63,7 @@ def simplify_city(city: City, cloud: PointCloud, dtm: Dtm, options: CityOptions,
     with trace("2.0 split levels"):
         houses = divide_houses(city, cloud, options)
     with trace("2.1 simplify"):
-        shapes = simplify_houses(houses.parts, houses.polygons, options)
+        shapes = simplify_houses(houses.parts, houses.polygons, options, find_model_roofs(houses))
     located = locate_roof_points(cloud, shapes.polygons, building_class=has_building_class(cloud))
     reserved = set(city.model.ids.tolist())
     simple = raise_buildings(houses, shapes, dtm, options, reserved=reserved, roof_points=located, trace=trace)

@@ -111,7 +111,8 @@ def read_model_blocks(path: Path, frame: Frame, bounds: Box, wanted: Wanted) -> 
     Notes
     -----
     Points on roofs are the nodes of a grid of 0.5 m that lies fixed in the CRS; where several surfaces lie over
-    each other, on the highest, and within the outline alone. Memory is that of a thousand buildings.
+    each other, those of overlapping buildings included, on the highest, and within the outline alone. Memory is
+    that of a thousand buildings.
     """
     batch: list[ModelBuilding] = []
     given = False
@@ -159,12 +160,14 @@ def _within(xy: Array, bounds: Box) -> NDArray[np.bool_]:
 
 
 def _sample_roofs(rows: ModelRows) -> Array:
-    """Points on roofs: of surfaces over each other on the highest, within outlines alone."""
+    """Points on roofs: of surfaces and houses over each other on the highest, within outlines alone."""
     surface, node = grid_polygons(rows.surfaces, STEP)
     owner = np.repeat(np.arange(len(rows)), np.diff(rows.start))[surface]
     xy = np.asarray((node + 0.5) * STEP, np.float64)
     z = plane_heights(rows.roofs, surface, xy)
     top = highest_nodes(owner, node, z, grid_polygons(rows.outlines, STEP))
+    all_houses = np.zeros(len(top), np.int64)
+    top = top[highest_nodes(all_houses, node[top], z[top], (all_houses, node[top]))]
     return np.column_stack((xy, z))[top]
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.city_model.building_points import reach_of_points
 from pipeline.city_model.city_steps import measure_city, prepare_footprints
 from pipeline.city_model.groups import adjacent_houses
-from pipeline.city_model.houses import Houses, divide_houses, join_houses, take_houses
+from pipeline.city_model.houses import Houses, divide_houses, find_model_roofs, join_houses, take_houses
 from pipeline.city_model.model_roofs import MODEL
 from pipeline.city_model.unmarked_roofs import MAY_BE_ROOF
 from pipeline.columns.adaptive import AdaptiveOptions
@@ -281,9 +281,9 @@ def list_members(task: Task) -> Facts:
 def shape_members(task: Task) -> Facts:
     """Simplify the clusters that a tile owns and that are new (step 2.1)."""
     gathered = _gather(task, _members(task), ARRAYS_TO_SHAPE)
-    fresh = np.where(gathered.changed, gathered.cluster, -1)
+    houses, fresh = gathered.houses, np.where(gathered.changed, gathered.cluster, -1)
     with task.step("2.1 simplify"):
-        shapes = shape_clusters(gathered.houses.parts, fresh, city_options(task.parameters))
+        shapes = shape_clusters(houses.parts, fresh, city_options(task.parameters), find_model_roofs(houses))
     counts = shapes.counts
     shapes = join_shapes([_earlier_shapes(task, gathered), shapes])
     task.put(

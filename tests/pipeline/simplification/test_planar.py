@@ -14,10 +14,11 @@ import pipeline.simplification.graph
 import pipeline.simplification.shaping
 import pipeline.simplification.snap
 from pipeline.data.errors import GeometryError
+from pipeline.data.roofs import Roofs, flat_roofs, join_roofs
 from pipeline.simplification.fidelity import FARTHEST, measure_simplification
 from pipeline.simplification.graph import WallGraph, find_near, make_graph, node_walls, trace_faces
 from pipeline.simplification.labels import Territories
-from pipeline.simplification.planar import COUNTS, PlanarCity, find_clusters, simplify_planar
+from pipeline.simplification.planar import COUNTS, PlanarCity, find_clusters, shape_planar, simplify_planar
 from pipeline.simplification.snap import node_crossings, straighten
 from pipeline.simplification.square_cells import draw_cells
 from tests.helpers.campaigns import examples
@@ -177,6 +178,22 @@ def test_common_ground_goes_to_the_smaller_house() -> None:
     city = simplify(box(0, 0, 10, 10), box(8, 2, 12, 6))
     assert shapely.area(city.polygons[city.house == 1]).tolist() == [16.0]
     assert shapely.area(city.polygons[city.house == 0]).tolist() == [92.0]
+
+
+@pytest.mark.parametrize(("height", "areas"), [(15.0, [100.0, 8.0]), (25.0, [92.0, 16.0]), (np.nan, [92.0, 16.0])])
+def test_common_ground_goes_to_the_higher_house_where_roofs_are_known(height: float, areas: list[float]) -> None:
+    """The large house slopes from 10 m in the west to 20 m in the east, 18 m at least where they overlap."""
+    slope = Roofs(np.array([[1.0, 0.0, 10.0]]), np.zeros((1, 2)), np.array([[10.0, 20.0]]))
+    houses = np.array([box(0, 0, 10, 10), box(8, 2, 12, 6)], dtype=object)
+    city = shape_planar(
+        houses,
+        np.zeros(2, np.int64),
+        clearance=EPS,
+        min_area=MIN_AREA,
+        min_courtyard_area=MIN_COURTYARD,
+        roofs=join_roofs([slope, flat_roofs(np.array([height]))]),
+    )
+    assert np.bincount(city.house, shapely.area(city.polygons)).tolist() == areas
 
 
 def test_houses_that_touch_in_a_corner_are_counted_or_parted() -> None:

@@ -252,6 +252,22 @@ def test_points_lie_on_the_roof_and_along_its_foot(tmp_path: Path) -> None:
     assert set(foot[:, 2].tolist()) == {2.0}
 
 
+def test_points_of_overlapping_houses_lie_on_the_higher_one(tmp_path: Path) -> None:
+    low, corners = box_solid(8.0, 2.2, len(CORNERS))
+    moved = [[x + 5.0, y, z] for x, y, z in corners]
+    houses = {
+        "gable": {"type": "Building", "geometry": [solid(2.2)]},
+        "box": {"type": "Building", "geometry": [low]},
+    }
+    document = city_json(houses, [[*corner] for corner in CORNERS] + moved)
+    block = block_of(write_json(tmp_path / "a.json", document))
+    roof = block.xyz[block.classification == 6] - np.array(PLACE)
+    assert len(roof) == len(np.unique(roof[:, :2], axis=0)) == 30 * 16
+    gable = 9 - 0.75 * np.abs(roof[:, 1] - 4)
+    x = roof[:, 0]
+    assert roof[:, 2] == pytest.approx(np.where(x < 5, gable, np.where(x < 10, np.maximum(gable, 8.0), 8.0)))
+
+
 def test_points_are_made_where_they_are_wanted(tmp_path: Path) -> None:
     path = write_json(tmp_path / "a.json", house_json())
     assert len(block_of(path, Wanted("auto", "", roof_points=False, ground_points=False)).xyz) == 0
