@@ -16,6 +16,7 @@ from tiler.engine.run_context import choose_tiles, make_layout, tile_key
 from tiler.engine.stage import FileItem, Layout
 from tiler.georeference.crs import boxes_meet, crs_text
 from tiler.georeference.operation import Operation
+from tiler.landcover.cover_files import refuse_missing_files
 from tiler.landcover.cover_table import read_table
 from tiler.objects.places import place
 from tiler.objects.requests import trust_addresses
@@ -137,6 +138,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     Tiles stay arrays: a country of half a million tiles takes no longer than its headers.
     """
     check_sources(config)
+    refuse_missing_files(config)
     paths = find_clouds(config.pointcloud) if config.pointcloud else []
     headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
     others, unread = read_other_headers(config)

@@ -16,7 +16,7 @@ from tiler.landcover.canopy_stages import canopy_stages, tree_file_stages
 from tiler.landcover.cover_stages import cover_file_stages, cover_stages
 from tiler.landcover.cover_table import read_table
 from tiler.landcover.water_points import water_point_stages
-from tiler.objects.places import identify, is_missing, place
+from tiler.objects.places import identify, place
 from tiler.planning.own_stages import CORE_STAGE, OwnStages
 from tiler.planning.plan import Plan
 from tiler.planning.refinements import read_refinements
@@ -147,12 +147,8 @@ def make_engine(
         footprints_shift=(0.0, 0.0),
         refinements=read_refinements(config, plan.region),
         cover_table=tuple(map(dataclasses.astuple, read_table(config))),
-        land_cover_identity=tuple(
-            identify(path) for path in map(place, config.land_cover) if not is_missing(path)
-        ),
-        trees_identity=identify(place(config.trees))
-        if config.trees and not is_missing(place(config.trees))
-        else "",
+        land_cover_identity=tuple(map(identify, map(place, config.land_cover))),
+        trees_identity=identify(place(config.trees)) if config.trees else "",
         cover_reach=cover_reach(config) if config.covered else 0.0,
     )
     return Engine(
