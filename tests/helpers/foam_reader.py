@@ -153,3 +153,12 @@ def read_field(path: Path, width: int) -> Floats:
     assert found, f"{path} has no values"
     values = np.frombuffer(data, "<f8", int(found[1]) * width, found.end())
     return values.reshape(-1, width)
+
+
+def read_patch(path: Path, patch: str, width: int) -> Floats:
+    """Read the values on a patch of a binary field that OpenFOAM wrote, where they are not uniform."""
+    data = path.read_bytes()
+    begin = data.index(b"\n    " + patch.encode() + b"\n", data.index(b"boundaryField"))
+    found = re.compile(rb"value\s+nonuniform List<\w+>\s+(\d+)\s*\(").search(data, begin)
+    assert found, f"{path}: {patch} has no values"
+    return np.frombuffer(data, "<f8", int(found[1]) * width, found.end()).reshape(-1, width)

@@ -483,6 +483,10 @@ def _add_export(export: argparse.ArgumentParser) -> None:
             "metavar": "M",
             "help": "height of that speed above the inlet's lowest ground (default: 10)",
         },
+        "wind_table": {
+            "metavar": "FILE",
+            "help": "CSV of the profile by height (m): speed (m/s), and k and epsilon if it has them",
+        },
         "roughness": {
             "type": float,
             "metavar": "M",

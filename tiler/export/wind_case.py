@@ -1,7 +1,7 @@
 """The wind case of OpenFOAM: steady flow of air at constant density (simpleFoam, k-epsilon) from any direction.
 
-A logarithmic profile at the sides that the wind enters, pressure at those that it leaves by, rough ground, and a
-top that drives the flow by the shear of the profile.
+A logarithmic profile or a table at the sides that the wind enters, pressure at those that it leaves by, rough
+ground, and a top that drives the flow by the shear of the profile.
 """
 
 import shutil
@@ -27,6 +27,7 @@ from tiler.export.wind_profile import (
     SIDES,
     SIGMA_EPSILON,
     Wind,
+    WindTable,
     case_name,
     flow_of,
     split_sides,
@@ -242,10 +243,11 @@ def _write_case(case: Path, domain: Domain, wind: Wind, direction: float, *, par
     (case / "constant").mkdir(exist_ok=True)
     for name, text in constants.items():
         (case / "constant" / name).write_text(foam_header(name, "dictionary", location="constant") + text)
-    words = {"speed": wind.speed, "height": wind.height, "roughness": wind.roughness, "ground": ground}
-    (case / "constant" / "wind").write_text(
-        CONDITIONS.format(**words, direction=direction, sides=", ".join(inlets), east=east, north=north)
-    )
+    if wind.table is None:
+        words = {"speed": wind.speed, "height": wind.height, "roughness": wind.roughness, "ground": ground}
+        (case / "constant" / "wind").write_text(
+            CONDITIONS.format(**words, direction=direction, sides=", ".join(inlets), east=east, north=north)
+        )
     if domain.leaves:
         drag = [(zone, 2 * DRAG * float(zone.rpartition("_")[2])) for zone in domain.leaves]
         sources = "".join(POROUS.format(zone=zone, f=f) for zone, f in drag)
@@ -298,8 +300,8 @@ def _fields(domain: Domain, wind: Wind, flow: tuple[float, float], top: float, r
     """Make the fields at the start, by name."""
     east, north = flow
     start = f"uniform ({wind.speed * east:.6g} {wind.speed * north:.6g} 0)"
-    k, epsilon = f"uniform {wind.k:.6g}", f"uniform {wind.epsilon_at(wind.height):.6g}"
-    inflow = '#include "$FOAM_CASE/constant/wind"\n   '
+    k, epsilon = f"uniform {wind.k_at(wind.height):.6g}", f"uniform {wind.epsilon_at(wind.height):.6g}"
+    inlets = _inlets(wind, flow, domain.ground_at(roles.inlets))
     slip = "type slip;"
     # The shear that the profile has at any height; the top so takes no momentum from it.
     shear = f"type fixedShearStress; tau ({wind.friction**2 * east:.8g} {wind.friction**2 * north:.8g} 0);"
@@ -313,7 +315,7 @@ def _fields(domain: Domain, wind: Wind, flow: tuple[float, float], top: float, r
             "[0 1 -1 0 0 0 0]",
             start,
             {
-                "inlet": f"type atmBoundaryLayerInletVelocity; {inflow}",
+                "inlet": inlets["U"],
                 "outlet": f"type inletOutlet; inletValue {zero}; value {start};",
                 "solid": "type noSlip;",
                 "top": f"{shear} value uniform {u_top};" if moving else slip,
@@ -335,10 +337,10 @@ def _fields(domain: Domain, wind: Wind, flow: tuple[float, float], top: float, r
             "[0 2 -2 0 0 0 0]",
             k,
             {
-                "inlet": f"type atmBoundaryLayerInletK; {inflow}",
+                "inlet": inlets["k"],
                 "outlet": f"type inletOutlet; inletValue {k}; value {k};",
                 "solid": f"type kqRWallFunction; value {k};",
-                "top": f"type fixedValue; value {k};" if moving else slip,
+                "top": f"type fixedValue; value uniform {wind.k_at(top):.6g};" if moving else slip,
             },
         ),
         "epsilon": (
@@ -346,7 +348,7 @@ def _fields(domain: Domain, wind: Wind, flow: tuple[float, float], top: float, r
             "[0 2 -3 0 0 0 0]",
             epsilon,
             {
-                "inlet": f"type atmBoundaryLayerInletEpsilon; {inflow}",
+                "inlet": inlets["epsilon"],
                 "outlet": f"type inletOutlet; inletValue {epsilon}; value {epsilon};",
                 "solid": f"type epsilonWallFunction; value {epsilon};",
                 "top": f"type fixedValue; value uniform {wind.epsilon_at(top):.6g};" if moving else slip,
@@ -370,6 +372,8 @@ def _fields(domain: Domain, wind: Wind, flow: tuple[float, float], top: float, r
         "U": lambda h: np.multiply.outer(wind.speed_at(h), np.array([east, north, 0.0])),
         "epsilon": wind.epsilon_at,
     }
+    if wind.table is not None and wind.table.k:
+        inner["k"] = wind.k_at
     fields = {}
     for name, (kind, dimensions, inside, of_role) in tables.items():
         conditions = {
@@ -386,6 +390,33 @@ def _fields(domain: Domain, wind: Wind, flow: tuple[float, float], top: float, r
         head = f"dimensions      {dimensions};\n"
         fields[name] = Field(kind, head, inside, inner.get(name), f"{rows}\n")
     return fields
+
+
+def _inlets(wind: Wind, flow: tuple[float, float], ground: float) -> dict[str, str]:
+    """Conditions of U, k and epsilon where the wind enters: the logarithmic profile, or a table of it."""
+    if wind.table is None:
+        inflow = '#include "$FOAM_CASE/constant/wind"\n   '
+        kinds = {"U": "Velocity", "k": "K", "epsilon": "Epsilon"}
+        return {name: f"type atmBoundaryLayerInlet{kind}; {inflow}" for name, kind in kinds.items()}
+    heights = _table_heights(wind.table)
+    speeds = np.multiply.outer(wind.speed_at(heights), flow)
+    rows = {
+        "U": [f"({east:.9g} {north:.9g} 0)" for east, north in speeds],
+        "k": [f"{value:.9g}" for value in wind.k_at(heights)],
+        "epsilon": [f"{value:.9g}" for value in wind.epsilon_at(heights)],
+    }
+    return {
+        name: f"type fixedProfile; profile table ({' '.join(map('({:.9g} {})'.format, heights, values))}); "
+        f"direction (0 0 1); origin {ground:.9g};"
+        for name, values in rows.items()
+    }
+
+
+def _table_heights(table: WindTable) -> NDArray[np.float64]:
+    """Heights at which OpenFOAM gets a table (m): its own; where epsilon is computed, closer ones between them."""
+    if table.epsilon:
+        return np.array(table.height)
+    return np.union1d(table.height, np.concatenate(([0.0], np.geomspace(0.1, max(table.height[-1], 1.0), 40))))
 
 
 def _write_field(path: Path, field: Field, heights: Path, ground: float) -> None:

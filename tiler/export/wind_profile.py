@@ -1,8 +1,10 @@
-"""The wind before it meets the city: its direction, the logarithmic profile, and what k-epsilon makes of it."""
+"""The wind before it meets the city: its direction, its profile, logarithmic or a table, and its k and epsilon."""
 
+import csv
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
@@ -18,6 +20,7 @@ PARALLEL = 1e-6  # a side is along the wind if the cosine of its normal with it 
 PEDESTRIAN_HEIGHT = 1.75  # m above ground, at which the comfort of people is told
 SIDES = {"west": (-1.0, 0.0), "east": (1.0, 0.0), "south": (0.0, -1.0), "north": (0.0, 1.0)}
 WEST = 270.0
+COLUMNS = ("height", "speed", "k", "epsilon")  # of a table of the profile
 
 
 class WindWords(TypedDict, total=False):
@@ -27,7 +30,28 @@ class WindWords(TypedDict, total=False):
     wind_speed: float
     wind_height: float
     roughness: float
+    wind_table: str
     patch_roughness: list[str]
+
+
+@dataclass(frozen=True)
+class WindTable:
+    """The wind at some heights; between them it is linear, beyond the first and last it stays.
+
+    Attributes
+    ----------
+    height : tuple of float
+        Heights above the inlet's lowest ground (m), ascending.
+    speed : tuple of float
+        Speeds (m/s).
+    k, epsilon : tuple of float
+        Turbulent kinetic energy (m2/s2) and its dissipation (m2/s3); empty where the file has none.
+    """
+
+    height: tuple[float, ...]
+    speed: tuple[float, ...]
+    k: tuple[float, ...] = ()
+    epsilon: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -44,6 +68,8 @@ class Wind:
         Roughness length upstream, and of the ground (m).
     patches : mapping of str to float
         Roughness lengths of patches that differ (m).
+    table : WindTable, optional
+        The profile, instead of the logarithmic one; `speed` is then that of the table at `height`.
     """
 
     directions: tuple[float, ...] = (WEST,)
@@ -51,25 +77,43 @@ class Wind:
     height: float = 10.0
     roughness: float = 0.5
     patches: Mapping[str, float] = field(default_factory=dict)
+    table: WindTable | None = None
 
     @property
     def friction(self) -> float:
-        """Friction velocity (m/s): speed = friction / kappa ln((height + roughness) / roughness)."""
-        return KAPPA * self.speed / math.log((self.height + self.roughness) / self.roughness)
+        """Friction velocity (m/s): speed = friction / kappa ln((height + roughness) / roughness).
 
-    @property
-    def k(self) -> float:
-        """Turbulent kinetic energy (m2/s2), the same at all heights."""
-        return self.friction**2 / math.sqrt(C_MU)
+        Of a table, that of the logarithmic profile closest to its speeds (least squares).
+        """
+        if self.table is None:
+            return KAPPA * self.speed / self._log(self.height)
+        logs = [self._log(height) for height in self.table.height]
+        products = sum(u * log for u, log in zip(self.table.speed, logs, strict=True))
+        return KAPPA * products / sum(log**2 for log in logs)
+
+    def _log(self, height: float) -> float:
+        return math.log((height + self.roughness) / self.roughness)
+
+    def k_at(self, height: ArrayLike) -> Floats:
+        """Return the turbulent kinetic energy (m2/s2): the same at all heights, if no table has it."""
+        above = np.asarray(height, np.float64)
+        if self.table is not None and self.table.k:
+            return np.asarray(np.interp(above, self.table.height, self.table.k))
+        return np.full_like(above, self.friction**2 / math.sqrt(C_MU))
 
     def speed_at(self, height: ArrayLike) -> Floats:
         """Return the speed (m/s) at heights above the ground (m)."""
         above = np.asarray(height, np.float64)
+        if self.table is not None:
+            return np.asarray(np.interp(above, self.table.height, self.table.speed))
         return np.asarray(self.friction / KAPPA * np.log((above + self.roughness) / self.roughness))
 
     def epsilon_at(self, height: ArrayLike) -> Floats:
         """Return the dissipation (m2/s3) at heights above the ground (m)."""
-        return np.asarray(self.friction**3 / (KAPPA * (np.asarray(height, np.float64) + self.roughness)))
+        above = np.asarray(height, np.float64)
+        if self.table is not None and self.table.epsilon:
+            return np.asarray(np.interp(above, self.table.height, self.table.epsilon))
+        return np.asarray(self.friction**3 / (KAPPA * (above + self.roughness)))
 
 
 def make_wind(words: WindWords) -> Wind:
@@ -78,7 +122,7 @@ def make_wind(words: WindWords) -> Wind:
     Raises
     ------
     ConfigError
-        If one is out of range, or a direction is there twice.
+        If one is out of range, a direction is there twice, or a table is wrong or beside a speed.
     """
     base = Wind()
     directions = tuple(value % 360.0 for value in words.get("direction", base.directions))
@@ -92,7 +136,63 @@ def make_wind(words: WindWords) -> Wind:
         numbers[name] = value = float(words.get(option, default))  # type: ignore[arg-type]
         if not 0 < value < math.inf:
             raise ConfigError(f"--{option.replace('_', '-')} {value:g}: must be more than 0")
-    return Wind(directions, patches=_read_patches(words.get("patch_roughness", ())), **numbers)
+    patches = _read_patches(words.get("patch_roughness", ()))
+    wind = Wind(directions, numbers["speed"], numbers["height"], numbers["roughness"], patches)
+    if "wind_table" not in words:
+        return wind
+    if "wind_speed" in words:
+        raise ConfigError("--wind-speed: the speed is that of --wind-table; leave one out")
+    wind = replace(wind, table=read_wind_table(Path(words["wind_table"])))
+    if not (speed := float(wind.speed_at(wind.height))) > 0:
+        raise ConfigError(
+            f"--wind-height {wind.height:g}: --wind-table has no speed there; give a height where it has"
+        )
+    return replace(wind, speed=speed)
+
+
+def read_wind_table(path: Path) -> WindTable:
+    """Read a CSV file with a head line: ``height`` and ``speed``, and ``k`` and ``epsilon`` if it has these.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be read, a column is missing or unknown, or a row is wrong: names the line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--wind-table {path}: cannot be read ({error}); check the path") from None
+    rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
+    head, body = (rows[0] if rows else []), rows[1:]
+    if len(set(head)) < len(head) or not {"height", "speed"} <= set(head) <= set(COLUMNS):
+        raise ConfigError(
+            f"--wind-table {path}: its first line is {','.join(head)!r}; it must name height and speed, and may "
+            "name k and epsilon"
+        )
+    columns: dict[str, list[float]] = {name: [] for name in head}
+    for line, row in enumerate(body, start=2):
+        if not any(row):
+            continue
+        try:
+            values = dict(zip(head, map(float, row), strict=True))
+        except ValueError:
+            raise ConfigError(
+                f"--wind-table {path}, line {line}: {len(head)} numbers are needed: {','.join(row)}"
+            ) from None
+        least = {"height": 0.0, "speed": 0.0, "k": math.ulp(0.0), "epsilon": math.ulp(0.0)}
+        for name, value in values.items():
+            if not least[name] <= value < math.inf:
+                bound = "more than 0" if least[name] else "0 or more"
+                raise ConfigError(f"--wind-table {path}, line {line}: {name} {value:g} must be {bound}")
+            columns[name].append(value)
+        heights = columns["height"]
+        if len(heights) > 1 and heights[-1] <= heights[-2]:
+            raise ConfigError(
+                f"--wind-table {path}, line {line}: height {heights[-1]:g} must be above {heights[-2]:g} m"
+            )
+    if len(columns["height"]) < 2 or not max(columns["speed"]) > 0:
+        raise ConfigError(f"--wind-table {path}: needs two heights or more, and a speed above 0")
+    return WindTable(**{name: tuple(values) for name, values in columns.items()})
 
 
 def _read_patches(words: Iterable[str]) -> dict[str, float]:

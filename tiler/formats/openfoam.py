@@ -36,7 +36,7 @@ from tiler.store.atomic import replacing_folder
 # Roughness lengths between rough ground and the centres of its cells. Over bare ground the profile stays within
 # 2 % at 3 of them, and is 19 % off at 0.6: docs/wind.md.
 LEAST_DISTANCE = 2.5
-WIND_OPTIONS = ("direction", "wind_speed", "wind_height", "roughness", "patch_roughness")
+WIND_OPTIONS = ("direction", "wind_speed", "wind_height", "wind_table", "roughness", "patch_roughness")
 
 
 def export_openfoam(

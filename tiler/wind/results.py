@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import InputError
 from tiler.export.export import EXPORT_RECORD
 from tiler.export.wind_case import PEDESTRIAN
-from tiler.export.wind_profile import Wind, case_name
+from tiler.export.wind_profile import Wind, WindTable, case_name
 
 Floats = NDArray[np.float64]
 NEAR = 0.01  # m; how far a sample may be from the centre of its triangle
@@ -90,6 +90,7 @@ def open_case(folder: Path) -> WindCase:
             float(words["speed"]),
             float(words["height"]),
             float(words["roughness"]),
+            table=WindTable(**{k: tuple(v) for k, v in words["table"].items()}) if words.get("table") else None,
         )
         if not wind.directions or not math.isfinite(wind.speed_at(wind.height)) or not wind.speed > 0:
             raise ValueError(f"wind {wind}")
