@@ -21,7 +21,7 @@ from tiler.planning.region import Region
 from tiler.pointclouds.clouds import CloudHeader
 from tiler.vectors.layers import BATCH, scan_layer
 
-SAMPLE_FEATURES = 500_000  # features that are read; of a larger file the first ones, and they stand for all
+SAMPLE_FEATURES = 100_000  # features that are read; of a larger file the first ones, and they stand for all
 CHAIN_TOLERANCE = 0.2  # m; what a run takes from outlines before anything else
 
 
