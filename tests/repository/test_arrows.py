@@ -73,11 +73,11 @@ ORDER = {
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
         "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "landcover", "planning",
         "dashboard", "executors", "jobs", "pictures", "report", "workflow", "export", "wind", "check", "formats",
-        "convert", "towns", "interface", "cli",
+        "convert", "towns", "generalisation", "interface", "cli",
     ],
     "pipeline": [
-        "data", "geometry", "points_terrain", "architecture", "skeletons", "roofs", "city_model", "simplification",
-        "plane_mesh", "quality", "smoothing", "columns",
+        "data", "geometry", "points_terrain", "generalisation", "architecture", "skeletons", "roofs", "city_model",
+        "simplification", "plane_mesh", "quality", "smoothing", "columns",
     ],
     "stitch": ["tiling", "seams", "pieces"],
 }  # fmt: skip

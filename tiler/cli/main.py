@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.data.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
-from tiler.cli.parser import EXPORT_OPTION, SYNTH_BUILDINGS, Handler, build_parser
+from tiler.cli.parser import EXPORT_OPTION, GENERALISE_OPTIONS, SYNTH_BUILDINGS, Handler, build_parser
 from tiler.config.config import Config, make_config
 from tiler.config.config_file import annotated_defaults, with_file
 from tiler.jobs.submission import describe_job, find_run, job_line
@@ -449,6 +449,24 @@ def _convert(options: argparse.Namespace) -> int:
     return 0
 
 
+def _generalise(options: argparse.Namespace) -> int:
+    from tiler.generalisation.generalise import generalise
+    from tiler.generalisation.options import Asked, Inputs, Landmarks, read_ids
+
+    files = ("models", "footprints", "layer", "id_attribute", "height_attribute", "crs", "roads", "railways")
+    inputs = Inputs(**{name: getattr(options, name) for name in (*files, "water", "others", "bounds")})
+    marks = ("height", "volume", "tag")
+    landmarks = Landmarks(
+        **{name: getattr(options, f"landmark_{name}") for name in marks}, ids=read_ids(options.landmarks)
+    )
+    asked = Asked(**{name: getattr(options, name) for name in GENERALISE_OPTIONS}, landmarks=landmarks)
+    words = {"workers": options.workers, "overwrite": options.overwrite}
+    for line in generalise(inputs, options.output, asked, **words):
+        say(line)
+    say(str(options.output))
+    return 0
+
+
 def _wind(options: argparse.Namespace) -> int:
     from tiler.wind.study import WindMaps, assess_wind
 
@@ -487,6 +505,7 @@ HANDLERS: Mapping[str, Handler] = {
     "render": _render,
     "export": _export,
     "convert": _convert,
+    "generalise": _generalise,
     "wind": _wind,
     "kernels": _kernels,
     "config": _config,

@@ -15,6 +15,7 @@ from tiler.config.config_file import POSITIONAL
 from tiler.config.domain_height import Height
 from tiler.convert import NAMES
 from tiler.export.export import list_formats, load_format
+from tiler.generalisation import HEIGHTS as BLOCK_KEEPS
 from tiler.jobs.submission import add_job_commands
 from tiler.objects.places import place, refuse_bucket
 from tiler.words.plain_text import suggest
@@ -40,6 +41,19 @@ SYNTH_BUILDINGS = 500  # of a city of boxes
 # What `pipeline.architecture` and `tiler.towns` have, without their numpy; a test holds these against theirs.
 TOWN_STYLES = ("boxes", "detached", "grid", "terraces", "blocks", "apartments", "towers")
 TOWN_WALLS, BLOCK_HEIGHTS = ("walls", "eaves"), ("eaves", "third", "half", "two-thirds", "ridge")
+# What `tiler.generalisation` has, without its imports; a test holds these against the defaults there.
+GENERALISE_NUMBERS = (
+    ("least_share", 0.3, "SHARE", "Th1: share of a cell that buildings cover, from which they become a block"),
+    ("most_area", 20_000.0, "M2", "Th2: cells up to this are aggregated for LoD0A"),
+    ("fragment", 400.0, "M2", "smaller cells are joined to a neighbour"),
+    ("street_width", 6.0, "M", "of streets along cells, half of which is cut from a block"),
+    ("yard_width", 0.0, "M", "a block keeps open space between buildings up to this; 0: all of the cell"),
+    ("block_gap", 6.0, "M", "without roads: buildings that are closer are of one block"),
+    ("adjacent", 0.1, "M", "buildings up to this apart are adjacent"),
+    ("default_height", 6.0, "M", "of buildings whose height is not known"),
+    ("tile_size", 1000.0, "M", "side of the squares that are worked on one by one"),
+)
+GENERALISE_OPTIONS = (*(name for name, *_ in GENERALISE_NUMBERS), "block_height")
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
 # What a first run needs stands first in the help of a run, what is for studies of the method last.
 ESSENTIAL = (
@@ -184,6 +198,9 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     add_job_commands(add, _add_inputs)
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
     _add_convert(command("convert", "write city models, or that of a run, as another format of city models"))
+    _add_generalise(
+        command("generalise", "make blocks of buildings between streets: cells and LoD0C, LoD0B, LoD0A")
+    )
     _add_wind(command("wind", "map mean wind and comfort from results of a wind case and a wind rose"))
     command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
     command("config", "print all parameters of a run, annotated, as a configuration file")
@@ -553,6 +570,55 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
         help="write a folder with a file for each tile of this size; a building is in that of its middle",
     )
     convert.add_argument("--overwrite", action="store_true", help="replace the file or folder if it exists")
+
+
+def _add_generalise(parser: argparse.ArgumentParser) -> None:
+    """Add buildings, barriers, thresholds and output of a generalisation."""
+    parser.add_argument(
+        "models", nargs="*", type=_on_disk, metavar="MODEL|DIR", help="city models, or the folder of a run"
+    )
+    parser.add_argument("--footprints", type=_on_disk, metavar="FILE", help="vector file of buildings instead")
+    parser.add_argument(
+        "-o", "--output", type=_on_disk, required=True, metavar="FILE.gpkg",
+        help="GeoPackage of all levels; FILE.city.json and FILE.levels.json go beside it",
+    )  # fmt: skip
+    parser.add_argument("--overwrite", action="store_true", help="replace the files if they exist")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: 0, this one)")
+    source = parser.add_argument_group("buildings")
+    source.add_argument("--layer", default="", help="of --footprints (default: the only one)")
+    source.add_argument("--id-attribute", default="", metavar="ATTRIBUTE", help="with the id of a footprint")
+    source.add_argument("--height-attribute", default="", metavar="ATTRIBUTE", help="with its height (m)")
+    source.add_argument("--crs", default="", metavar="EPSG", help="metric CRS (default: that of the buildings)")
+    source.add_argument(
+        "--bounds", type=float, nargs=4, metavar=("XMIN", "YMIN", "XMAX", "YMAX"), help="of the region (m)"
+    )
+    lines = parser.add_argument_group("barriers and other objects, vector files")
+    for name, text in (
+        ("roads", "streets (default: the medial axis of the open space between buildings)"),
+        ("railways", "further barriers"),
+        ("water", "further barriers; areas are cut out of blocks"),
+        ("others", "areas that are no barriers but cut out of blocks, as parks"),
+    ):
+        lines.add_argument(f"--{name}", nargs="+", type=_on_disk, default=(), metavar="FILE", help=text)
+    limits = parser.add_argument_group("thresholds (docs/generalisation.md)")
+    for name, default, unit, text in GENERALISE_NUMBERS:
+        limits.add_argument(
+            f"--{name.replace('_', '-')}", type=float, default=default, metavar=unit,
+            help=f"{text} (default: {default:g})",
+        )  # fmt: skip
+    limits.add_argument(
+        "--block-height",
+        choices=BLOCK_KEEPS,
+        default=BLOCK_KEEPS[0],
+        help="mean height of a block: of its buildings by area, or what keeps their volume (default: area)",
+    )
+    marks = parser.add_argument_group("landmarks, which stay as they are at every level")
+    marks.add_argument("--landmark-height", type=float, default=0.0, metavar="M", help="from this height on")
+    marks.add_argument("--landmark-volume", type=float, default=0.0, metavar="M3", help="from this volume on")
+    marks.add_argument("--landmark-tag", default="", metavar="ATTRIBUTE[=VALUE]", help="with this attribute")
+    marks.add_argument(
+        "--landmarks", default="", metavar="FILE|ID,...", help="of these ids; a file has one a line"
+    )
 
 
 def _on_disk(text: str) -> Path:

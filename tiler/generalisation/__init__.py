@@ -1,0 +1,3 @@
+"""Levels of a city between buildings and blocks: `citystitch generalise`."""
+
+HEIGHTS = ("area", "volume")

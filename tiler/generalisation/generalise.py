@@ -1,0 +1,308 @@
+"""`citystitch generalise`: buildings and barriers in, cells and levels out, tile by tile."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import Protocol, TypeVar
+
+import numpy as np
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.data.errors import ConfigError, GeometryError, InputError
+from pipeline.generalisation.barriers import GRID, deal_segments, explode_lines, split_at_grid
+from pipeline.generalisation.cell_graph import join_small
+from pipeline.geometry.components import join_pairs
+from tiler.executors.in_order import map_in_order
+from tiler.formats.gpkg import fixed_time
+from tiler.generalisation.barrier_files import scan_geometries
+from tiler.generalisation.buildings import open_buildings
+from tiler.generalisation.city_json import HierarchyWriter
+from tiler.generalisation.gpkg_layers import LayerWriter
+from tiler.generalisation.options import Asked, Inputs
+from tiler.generalisation.region_cells import Cells, join_cells
+from tiler.generalisation.rows import LEVELS
+from tiler.generalisation.shards import Shards, Tile, by_tile
+from tiler.generalisation.summary import LevelSum, describe_levels, json_text, table_lines
+from tiler.generalisation.tile_cells import Work, at_tile, count_buildings, pair_buildings, part_tile
+from tiler.generalisation.tile_levels import CellList, CellRecord, GroupList, make_cells, make_levels
+from tiler.generalisation.told import Told
+from tiler.georeference.crs import box_words, crs_text
+from tiler.store.atomic import replacing
+from tiler.vectors.features import to_objects
+from tiler.vectors.gdal_layer import list_some
+
+MOST_TILES = 1_000_000
+Result = TypeVar("Result")
+Index = NDArray[np.int64]
+
+
+class Each(Protocol):
+    """Does a step for each of some tiles, results in their order."""
+
+    def __call__(self, step: Callable[[Work], Result], tiles: Sequence[Tile], /) -> Iterator[Result]:
+        """Do it."""
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Files that a generalisation writes: all levels as GeoPackage, and beside it CityJSON and the numbers."""
+
+    gpkg: Path
+
+    @property
+    def city_json(self) -> Path:
+        """The hierarchy as CityJSON."""
+        return self.gpkg.with_suffix(".city.json")
+
+    @property
+    def numbers(self) -> Path:
+        """The table of levels and what was told, as JSON."""
+        return self.gpkg.with_suffix(".levels.json")
+
+    @property
+    def all(self) -> tuple[Path, ...]:
+        """List them."""
+        return self.gpkg, self.city_json, self.numbers
+
+
+def generalise(
+    inputs: Inputs, output: Path, asked: Asked, *, workers: int = 0, overwrite: bool = False
+) -> list[str]:
+    """Make cells, LoD0C, LoD0B and LoD0A of buildings.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        Buildings, barriers and other objects.
+    output : Path
+        GeoPackage to write; CityJSON and numbers go beside it. Each file appears whole or not at all.
+    asked : Asked
+        Options.
+    workers : int
+        Processes; 0 for this one. The bytes are the same.
+    overwrite : bool
+        Whether files that exist are replaced.
+
+    Returns
+    -------
+    list of str
+        The table of levels, and what must be known, a line each.
+
+    Raises
+    ------
+    ConfigError
+        If options do not go together, or a file exists.
+    InputError
+        If a file cannot be read, or there is no building.
+    OutputError
+        If a file cannot be written.
+
+    Notes
+    -----
+    The inputs are read once, and dealt out to tiles in a temporary folder; then each step works on a tile, or on
+    the cells that a tile owns: those whose first piece lies in it. Memory holds a tile with its neighbours, the
+    largest cell, and some hundred bytes for each cell of the region.
+    """
+    files = Outputs(output)
+    if output.suffix != ".gpkg":
+        raise ConfigError(f"{output}: a GeoPackage ends with .gpkg; rename --output")
+    if not output.parent.is_dir():
+        raise ConfigError(f"{output.parent}: no such folder; make it, or give another --output")
+    if workers < 0:
+        raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
+    if not overwrite and (there := [path for path in files.all if path.exists()]):
+        raise ConfigError(f"{there[0]}: exists; give another --output, or --overwrite")
+    told = Told()
+    with TemporaryDirectory(prefix="citystitch-") as folder:
+        shards = Shards(Path(folder), asked.tile_size)
+        crs, rim = _deal_inputs(inputs, asked, shards, told)
+        work = Work(shards, (0, 0), asked, axis=not inputs.roads, rim=shapely.to_wkb(rim))
+        if work.axis:
+            told.say("no roads: streets are the medial axis of the open space between buildings")
+
+        def each(step: Callable[[Work], Result], tiles: Sequence[Tile], /) -> Iterator[Result]:
+            return map_in_order(step, (at_tile(work, tile) for tile in tiles), workers)
+
+        if (n := shards.count(rim.bounds)) > MOST_TILES:
+            raise InputError(
+                f"the layers reach over {n:,} tiles of {asked.tile_size:g} m, more than {MOST_TILES:,}: "
+                f"{box_words(rim.bounds)}; is a coordinate wrong? --bounds takes a part, --tile-size larger tiles"
+            )
+        tiles = [t for t in shards.covered(rim.bounds) if rim.intersects(shapely.box(*shards.box(t)))]
+        cells = _make_cells(tiles, work, each)
+        owners = _make_levels(cells, work, each)
+        told.counts["fragments joined to a neighbour"] = cells.fragments
+        levels = _write(files, owners, shards, crs, told)
+    with replacing(files.numbers) as part:
+        part.write_text(json_text({"levels": levels, "counts": told.known(), "notes": told.said}))
+    return [*table_lines(levels), *told.lines()]
+
+
+def _deal_inputs(inputs: Inputs, asked: Asked, shards: Shards, told: Told) -> tuple[pyproj.CRS, shapely.Polygon]:
+    """Deal buildings, barriers and other objects out to tiles; gives the CRS and the rim of the region."""
+    hull, missing = shapely.MultiPoint(), set(asked.landmarks.ids)
+    with open_buildings(inputs, asked, told) as source:
+        for batch in source.batches:
+            if not len(batch):
+                continue
+            hull = _hull(hull, batch.outlines)
+            middle = shapely.get_coordinates(shapely.point_on_surface(batch.outlines))
+            for tile, rows in by_tile(np.floor(middle / shards.size).astype(np.int64)):
+                shards.append("buildings", tile, batch.take(rows))
+            told.counts["landmarks"] += int(batch.landmark.sum())
+            missing.difference_update(batch.ids.tolist())
+        crs = source.crs
+    if hull.is_empty:
+        raise InputError(f"{inputs.footprints or inputs.models[0]}: no building in the region; give other files")
+    if missing:
+        told.say(f"--landmarks: {len(missing)} of no building: {list_some(sorted(missing))}")
+    around = hull.bounds
+    read = partial(scan_geometries, crs=crs, around=around, bounds=inputs.bounds, told=told)
+    for paths, is_barrier, cuts in (
+        (inputs.roads, True, True),
+        (inputs.railways, True, False),
+        (inputs.water, True, True),
+        (inputs.others, False, True),
+    ):
+        for path in paths:
+            n = 0
+            for geometry in read(path):
+                n += len(geometry)
+                hull = _hull(hull, geometry)
+                if is_barrier:
+                    _deal_barriers(geometry, shards)
+                if cuts:
+                    _deal_others(geometry, shards)
+            if not n:
+                told.say(f"{path.name}: has nothing in the region")
+    rim = shapely.set_precision(hull, GRID)
+    _deal_barriers(np.array([rim], object), shards)
+    return crs, rim
+
+
+def _hull(hull: shapely.Geometry, geometry: NDArray[np.object_]) -> shapely.Geometry:
+    return shapely.convex_hull(shapely.geometrycollections([hull, *shapely.convex_hull(geometry)]))
+
+
+def _deal_barriers(geometry: NDArray[np.object_], shards: Shards) -> None:
+    segments = split_at_grid(explode_lines(geometry), shards.size)
+    for tile, own in deal_segments(segments, shards.size).items():
+        shards.append("segments", tile, own)
+
+
+def _deal_others(geometry: NDArray[np.object_], shards: Shards) -> None:
+    """Deal areas out to the tiles that they touch, cut at their borders."""
+    parts = shapely.get_parts(shapely.get_parts(geometry))
+    parts = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
+    wrong = ~shapely.is_valid(parts)
+    parts[wrong] = shapely.make_valid(parts[wrong], method="structure", keep_collapsed=False)
+    boxes = np.floor(shapely.bounds(parts).reshape(-1, 4) / shards.size).astype(np.int64)
+    for k in np.flatnonzero(shapely.area(parts) > 0).tolist():
+        low_i, low_j, high_i, high_j = boxes[k].tolist()
+        for tile in ((i, j) for i in range(low_i, high_i + 1) for j in range(low_j, high_j + 1)):
+            whole = (low_i, low_j) == (high_i, high_j)
+            own = parts[k] if whole else shapely.intersection(parts[k], shapely.box(*shards.box(tile)))
+            own = shapely.set_precision(own, GRID)
+            if own.area > 0:
+                shards.append("others", tile, to_objects([own]))
+
+
+def _make_cells(tiles: Sequence[Tile], work: Work, each: Each) -> Cells:
+    shards = work.shards
+    if work.axis:
+        own = shards.tiles("buildings")
+        counts = list(each(count_buildings, own))
+        start = dict(zip(own, np.cumsum([0, *counts]).tolist(), strict=False))
+        pairs = [np.empty((0, 2), np.int64)]
+        for tile, found in zip(own, each(pair_buildings, own), strict=True):
+            pairs += [near + np.array([start[tile], start[other]]) for other, near in found]
+        names = join_pairs(sum(counts), np.concatenate(pairs))
+        for tile, n in zip(own, counts, strict=True):
+            shards.append("blocks", tile, names[start[tile] : start[tile] + n])
+    return join_cells(dict(zip(tiles, each(part_tile, tiles), strict=True)), work.asked.fragment)
+
+
+def _make_levels(cells: Cells, work: Work, each: Each) -> list[Tile]:
+    """Make all levels tile by tile; gives the tiles that own cells."""
+    shards, n = work.shards, len(cells.area)
+    first = np.full(n, len(cells.cell))
+    np.minimum.at(first, cells.cell, np.arange(len(cells.cell)))
+    owner = cells.tile[first]
+    order = np.argsort(cells.cell, kind="stable")
+    start = np.searchsorted(cells.cell[order], np.arange(n + 1))
+    owners = []
+    for tile, numbers in by_tile(owner):
+        rows = np.sort(np.concatenate([order[start[k] : start[k + 1]] for k in numbers.tolist()]))
+        shards.append("cells", tile, CellList(numbers, cells.cell[rows], cells.tile[rows], cells.piece[rows]))
+        owners.append(tile)
+    records: list[CellRecord] = list(each(make_cells, owners))
+    number = np.concatenate([record.number for record in records])
+    ids, use = np.empty(n, object), np.zeros(n, np.bool_)
+    ids[number] = np.concatenate([record.id for record in records])
+    use[number] = np.concatenate([record.use for record in records])
+    group = join_small(
+        cells.area, cells.pairs, cells.length, work.asked.most_area,
+        among=use & (cells.area <= work.asked.most_area),
+    )  # fmt: skip
+    _deal_groups(owners, owner, use, group, ids, shards)
+    _deal_cuts(owners, shards)
+    list(each(make_levels, owners))
+    return owners
+
+
+def _deal_groups(
+    owners: Sequence[Tile], owner: Index, use: NDArray[np.bool_], group: Index, ids: NDArray[np.object_],
+    shards: Shards,
+) -> None:  # fmt: skip
+    """Tell each tile the objects of LoD0A of its cells, and the cells of the objects that it owns."""
+    name = np.where(use, np.array([f"A{ids[k][1:]}" for k in group.tolist()], object), "")
+    member = np.flatnonzero(use)
+    member = member[np.lexsort((member, group[member]))]
+    cells_of = dict(by_tile(owner))
+    of_tile = {tile: member[rows] for tile, rows in by_tile(owner[group[member]])}
+    for tile in owners:
+        mine = of_tile.get(tile, np.empty(0, np.int64))
+        heads, row = np.unique(group[mine], return_inverse=True)
+        groups = GroupList(
+            name[cells_of[tile]], to_objects([name[k] for k in heads.tolist()]), row.ravel(), mine, owner[mine]
+        )
+        shards.append("groups", tile, groups)
+
+
+def _deal_cuts(owners: Sequence[Tile], shards: Shards) -> None:
+    """Deal out what stands for itself to the tiles where it may stand in a block."""
+    for tile in owners:
+        for outline in shards.read("standing", tile)[0]:
+            for near in shards.covered(outline.bounds):
+                shards.append("cuts", near, to_objects([outline]))
+
+
+def _write(
+    files: Outputs, owners: Sequence[Tile], shards: Shards, crs: pyproj.CRS, told: Told
+) -> dict[str, dict[str, object]]:
+    sums = {level: LevelSum() for level in LEVELS}
+    origin = [float(min(tile[axis] for tile in owners) * shards.size) for axis in (0, 1)]
+    with replacing(files.gpkg) as gpkg, replacing(files.city_json) as city, fixed_time():
+        layers = LayerWriter(gpkg, crs_text(crs))
+        with city.open("wb") as file, TemporaryFile() as spool:
+            hierarchy = HierarchyWriter(file, spool, crs, origin)
+            for tile in owners:
+                ((cells, rows, children),) = shards.read("rows", tile)
+                layers.add(cells, rows)
+                hierarchy.add(rows, children)
+                for level, found in sums.items():
+                    found.add(rows[level])
+                told.counts["cells"] += len(cells.id)
+                told.counts["cells of land use Building"] += int(cells.use.sum())
+            hierarchy.finish()
+        layers.finish()
+        told.counts["objects without a solid in CityJSON"] += hierarchy.without_solid
+        n = sums[LEVELS[0]].members
+        for level, found in sums.items():
+            if found.members != n:
+                raise GeometryError(f"{level}: stands for {found.members} of {n} buildings; report this")
+    return describe_levels(sums)

@@ -1,0 +1,95 @@
+"""What waits in a folder tile by tile, so that memory holds a tile and not the region."""
+
+import pickle
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely import Geometry
+
+Tile = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Shards:
+    """A temporary folder of our own with files by kind and tile, and the side of a tile (m)."""
+
+    folder: Path
+    size: float
+
+    def append(self, kind: str, tile: Tile, value: Any) -> None:
+        """Put a value behind those of its tile."""
+        path = self._path(kind, tile)
+        path.parent.mkdir(exist_ok=True)
+        with path.open("ab") as file:
+            _Pickler(file, protocol=5).dump(value)
+
+    def read(self, kind: str, tile: Tile) -> list[Any]:
+        """Give the values of a tile in their order; none where there are none."""
+        path = self._path(kind, tile)
+        if not path.exists():
+            return []
+        found = []
+        with path.open("rb") as file:
+            while file.peek(1):
+                found.append(pickle.load(file))
+        return found
+
+    def tiles(self, kind: str) -> list[Tile]:
+        """List the tiles that have values of a kind, in order."""
+        paths = (self.folder / kind).glob("*.pkl")
+        return sorted((int(i), int(j)) for i, j in (path.stem.split("_") for path in paths))
+
+    def box(self, tile: Tile) -> tuple[float, float, float, float]:
+        """Give xmin, ymin, xmax, ymax of a tile (m)."""
+        i, j = tile
+        return i * self.size, j * self.size, (i + 1) * self.size, (j + 1) * self.size
+
+    def covered(self, box: Iterable[float]) -> Iterator[Tile]:
+        """Give the tiles that a box touches."""
+        low_x, low_y, high_x, high_y = (int(np.floor(value / self.size)) for value in box)
+        yield from ((i, j) for i in range(low_x, high_x + 1) for j in range(low_y, high_y + 1))
+
+    def count(self, box: Iterable[float]) -> int:
+        """Count the tiles that a box touches."""
+        low_x, low_y, high_x, high_y = (int(np.floor(value / self.size)) for value in box)
+        return (high_x - low_x + 1) * (high_y - low_y + 1)
+
+    def _path(self, kind: str, tile: Tile) -> Path:
+        return self.folder / kind / f"{tile[0]}_{tile[1]}.pkl"
+
+
+class _Pickler(pickle.Pickler):
+    """Writes arrays of geometries at once, not one by one."""
+
+    def reducer_override(self, value: Any) -> Any:
+        """Give WKB for an array of geometries, and leave all else."""
+        if (
+            isinstance(value, np.ndarray)
+            and value.dtype == object
+            and isinstance(next(iter(value), None), Geometry)
+        ):
+            return _read_geometries, (shapely.to_wkb(value).tolist(),)
+        return NotImplemented
+
+
+def _read_geometries(wkb: list[bytes]) -> NDArray[np.object_]:
+    return np.asarray(shapely.from_wkb(wkb), np.object_)
+
+
+def around(tile: Tile) -> list[Tile]:
+    """List a tile and its eight neighbours, in order."""
+    return [(tile[0] + i, tile[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+
+
+def by_tile(tiles: NDArray[np.int64]) -> Iterator[tuple[Tile, NDArray[np.int64]]]:
+    """Give the rows of each tile of int64 (n, 2), tiles in order."""
+    order = np.lexsort((np.arange(len(tiles)), tiles[:, 1], tiles[:, 0]))
+    sorted_tiles = tiles[order]
+    starts = np.flatnonzero(np.diff(sorted_tiles, axis=0, prepend=sorted_tiles[:1] - 1).any(axis=1))
+    for rows in np.split(order, starts[1:]) if len(starts) else []:
+        yield (int(tiles[rows[0], 0]), int(tiles[rows[0], 1])), rows
