@@ -166,7 +166,7 @@ def _fit_sloped(
     new, told_of = ({}, []) if surfaces is None else lay_surfaces(city, surfaces, clearance=options.clearance)
     laid = np.zeros(len(model), np.bool_)
     laid[list(new)] = True
-    used = points if prefer_points else _leave_out(points, laid)
+    used = points if prefer_points else leave_out_points(points, laid)
     fitted = fit_roofs(model.polygons, used, RoofOptions(clearance=options.clearance))
     if prefer_points:
         laid &= fitted.too_few
@@ -181,8 +181,8 @@ def _fit_sloped(
     return shape_roofs(fitted, model.polygons, hipped, model.ground, model.roof), form, [*told_of, *notes]
 
 
-def _leave_out(points: RoofPoints, without: NDArray[np.bool_]) -> RoofPoints:
-    """Take the points of some houses away."""
+def leave_out_points(points: RoofPoints, without: NDArray[np.bool_]) -> RoofPoints:
+    """Take the points of some houses, bool (h,), away."""
     if not without.any():
         return points
     kept = keep_roof_points(points, ~without)

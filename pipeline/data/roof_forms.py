@@ -16,6 +16,30 @@ NO_FORM = -1
 POINTS_TELL, TOO_LOW, NO_SKELETON, NO_HEIGHT = -2, -3, -4, -5
 
 
+def block_forms(level: int, x: float, y: float) -> NDArray[np.float64]:
+    """Give a block of generalised buildings its form, float64 (6,): flat.
+
+    No roof has a negative slope: its own is -`level`, 1 or more. The next two columns, which no flat roof needs,
+    are the place that decides on its zone (m).
+
+    Examples
+    --------
+    >>> level, place = find_blocks(np.array([block_forms(3, 10.0, 20.0)]))
+    >>> level.tolist(), place.tolist()
+    ([3], [[10.0, 20.0]])
+    """
+    form = np.full(N_COLUMNS, np.nan)
+    form[[SHAPE, SLOPE, DIRECTION, ACROSS]] = ROOF_SHAPES.index("flat"), -level, x, y
+    return form
+
+
+def find_blocks(forms: NDArray[np.float64]) -> tuple[NDArray[np.int8], NDArray[np.float64]]:
+    """Level, int8 (n,), and place, float64 (n, 2), of those that are blocks; -1 and NaN of all others."""
+    block = forms[:, SLOPE] < 0
+    place = np.where(block[:, None], forms[:, [DIRECTION, ACROSS]], np.nan)
+    return np.where(block, -forms[:, SLOPE], -1).astype(np.int8), place
+
+
 def no_forms(n: int) -> NDArray[np.float64]:
     """Give n footprints no form, float64 (n, 6)."""
     return np.full((n, N_COLUMNS), np.nan)

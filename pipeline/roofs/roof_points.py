@@ -100,6 +100,27 @@ def keep_roof_points(points: RoofPoints, kept: NDArray[np.bool_]) -> RoofPoints:
     return RoofPoints(np.concatenate(([0], np.cumsum(count[kept]))), points.xyz[rows], points.z[rows])
 
 
+def merge_roof_points(points: RoofPoints, row: NDArray[np.int64]) -> RoofPoints:
+    """Pool the points of buildings that became one.
+
+    Parameters
+    ----------
+    points : RoofPoints
+        Points of n buildings.
+    row : int64, (n,)
+        Which building each became: 0, 1, ..., none left out.
+
+    Examples
+    --------
+    >>> points = make_roof_points(np.array([0, 1, 2]), np.array([[0.0, 0, 9], [1, 0, 5]]))
+    >>> merge_roof_points(points, np.array([0, 0])).z.tolist()
+    [5.0, 9.0]
+    """
+    owner = np.repeat(row, np.diff(points.start))
+    start = np.concatenate(([0], np.cumsum(np.bincount(owner, minlength=int(row.max(initial=-1)) + 1))))
+    return make_roof_points(start, points.xyz[np.argsort(owner, kind="stable")])
+
+
 def add_roof_points(points: RoofPoints, rows: NDArray[np.int64], more: RoofPoints) -> RoofPoints:
     """Give some buildings further points.
 

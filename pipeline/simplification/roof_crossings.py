@@ -41,7 +41,7 @@ def add_crossings(
     int
         Number of walls without room for one: the mesher joins the roofs at the end where they are closer.
     """
-    ends, sides = _party_walls(polygons)
+    ends, sides = party_walls(polygons)
     sloped = ~is_flat(roofs)
     some = sloped[sides].any(axis=1)
     ends, sides = ends[some], sides[some]
@@ -59,7 +59,7 @@ def add_crossings(
     return added, int(room.sum()), len(np.unique(wall[~room]))
 
 
-def _party_walls(polygons: NDArray[np.object_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def party_walls(polygons: NDArray[np.object_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Walls between two polygons: ends (w, 2, 2), the smaller first, and both polygons (w, 2)."""
     edges = list_edges(polygons)
     a, b, of = edges.a, edges.b, np.repeat(np.arange(len(polygons)), np.diff(edges.start))

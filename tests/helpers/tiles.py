@@ -27,6 +27,7 @@ from tiler.engine.executor import Serial
 from tiler.engine.run_context import RunContext, pack_tiles
 from tiler.engine.stage import REGION_ITEM
 from tiler.objects.places import identify
+from tiler.planning.lod_zones import read_zones
 from tiler.planning.plan import Plan, make_plan
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.mesh import mesh_stages
@@ -192,6 +193,8 @@ def open_engine(config: Config) -> Iterator[tuple[Engine, Plan]]:
         footprints_identity=identify(Path(config.footprints)),
         footprints_frame=dataclasses.astuple(plan.georeference.footprints),
         footprints_shift=(0.0, 0.0),
+        zones=read_zones(config, plan.region),
+        generalised_identity="",
     )
     with nullcontext(Serial()) as executor:
         yield (
@@ -239,7 +242,7 @@ def shape_city(values: dict[str, Any], out: Path) -> tuple[list[int], int]:
     config = make_config(values | {"out": str(out)})
     with open_engine(config) as (engine, plan):
         last = run_city_stages(engine, config)
-        engine.run(*city_model_stages())
+        engine.run(*city_model_stages(config))
         joined = [engine.records[f"join-{k}", REGION_ITEM].facts["joined"] for k in range(last + 1)]
         shapes = (engine.store.read(f"shapes-{last - 1}", tile, names=("closed",)) for tile in plan.layout.tiles)
         return joined, sum(len(arrays["closed"]) for arrays, _ in shapes)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,13 @@ from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proo
 from tiler.check.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
 from tiler.check.proofs import Bounds, Dtm, Fault, Finding, Proof, Vertices
 from tiler.check.solid_proofs import SolidProofs
+from tiler.check.zone_proofs import ZoneProofs
 from tiler.citymodels.building_index import BuildingIndex, index_buildings
 from tiler.landcover.stored_cover import StoredCanopy, StoredCover
 from tiler.mesh_files.mesh_parts import report_parts
 from tiler.mesh_files.mesh_pieces import read_leaves
 from tiler.mesh_files.vtk_files import read_piece_paths, read_vtu
-from tiler.store.out_folder import CITY_MODEL, RUN_RECORD, STORE
+from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
 from tiler.store.run_folder import PARTS, RunRecord, read_run_record
 
 VOLUME_INDEX = "mesh.pvtu"
@@ -102,8 +104,14 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
     besides some 100 bytes a building and 500 a piece.
     """
     record = read_run_record(directory / RUN_RECORD)
-    solids = SolidProofs()
-    with index_buildings(directory / CITY_MODEL, solids.add) as index:
+    solids, levels = SolidProofs(), ZoneProofs(record.zones)
+
+    def see(*found: Any) -> None:
+        solids.add(*found)
+        if record.zones:
+            levels.add(*found)
+
+    with index_buildings(directory / CITY_MODEL, see) as index:
         files = _in_order(_pair_pieces(directory), record)
         dtm = load_dtm(directory / STORE)
         cover = _open_cover(directory / STORE, record) if record.ground else None
@@ -124,6 +132,7 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
         sums.add_rim_walls()
         claims, facts = _conclude(sums, len(files), record, index)
         claims += (solids.prove(),)
+        claims += (levels.prove(directory / FULL_CITY_MODEL),) if record.zones else ()
         parts = sums.count_parts()
         remarks = (report_parts(parts),) if len(parts) > 1 else ()
         return CheckReport(directory, claims, {**facts, "parts": len(parts)}, remarks)

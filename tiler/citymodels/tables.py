@@ -1,7 +1,7 @@
 """Houses and city models as plain arrays for the store, and back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import chain, pairwise
 from typing import Any, TypeVar
 
@@ -42,6 +42,10 @@ class Buildings:
         How the roof fits its points.
     roof_method, roof_fallback, roof_form : int8, (n,)
         As of `City`.
+    level : int8, (n,)
+        Level of detail that the zone of its house asks for: index into `zones.LEVELS`; -1 without zones.
+    place : float64, (n, 2)
+        Representative point of the house, which decides on its zone (m); NaN without zones.
     """
 
     model: CityModel
@@ -54,6 +58,14 @@ class Buildings:
     roof_method: NDArray[np.int8]
     roof_fallback: NDArray[np.int8]
     roof_form: NDArray[np.int8]
+    level: NDArray[np.int8] = field(default_factory=lambda: np.empty(0, np.int8))
+    place: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
+
+    def __post_init__(self) -> None:
+        """Put no building into a zone where none is stated."""
+        if len(self.level) != len(self.model):
+            object.__setattr__(self, "level", np.full(len(self.model), -1, np.int8))
+            object.__setattr__(self, "place", np.full((len(self.model), 2), np.nan))
 
     def __len__(self) -> int:
         return len(self.model)
@@ -185,8 +197,8 @@ def make_buildings(city: City, fidelity: HouseFidelity, layers: NDArray[np.int32
     )
 
 
-def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
-    """Write buildings as arrays."""
+def pack_buildings(buildings: Buildings, prefix: str = "", *, zoned: bool = False) -> Arrays:
+    """Write buildings as arrays, `zoned` with the level that zones ask for."""
     model, fidelity = buildings.model, buildings.fidelity
     members = [name for names in model.members for name in names]
     arrays: Arrays = {
@@ -207,8 +219,10 @@ def pack_buildings(buildings: Buildings, prefix: str = "") -> Arrays:
         "roof_method": buildings.roof_method,
         "roof_fallback": buildings.roof_fallback,
         "roof_form": buildings.roof_form,
-        **{name: getattr(fidelity, field) for field, name in FIDELITY_ARRAYS.items()},
+        **{name: getattr(fidelity, key) for key, name in FIDELITY_ARRAYS.items()},
     }
+    if zoned:
+        arrays |= {"level": buildings.level, "place": buildings.place}
     return {prefix + name: values for name, values in arrays.items()}
 
 
@@ -223,6 +237,7 @@ BUILDING_ARRAYS = (
     *("roof_method", "roof_fallback", "roof_form"),
     *FIDELITY_ARRAYS.values(),
 )
+ZONE_ARRAYS = ("level", "place")  # further ones of a run with zones
 
 
 def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
@@ -238,7 +253,7 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
         tuple(tuple(names[a:b]) for a, b in pairwise(start)),
         arrays["house"],
     )
-    fidelity = HouseFidelity(**{field: arrays[name] for field, name in FIDELITY_ARRAYS.items()})
+    fidelity = HouseFidelity(**{key: arrays[name] for key, name in FIDELITY_ARRAYS.items()})
     return Buildings(
         model,
         arrays["roof_source"],
@@ -250,6 +265,7 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
         arrays["roof_method"],
         arrays["roof_fallback"],
         arrays["roof_form"],
+        *(arrays[name] for name in ZONE_ARRAYS if name in arrays),
     )
 
 
@@ -260,9 +276,9 @@ NEAR_ARRAYS = (
 )
 
 
-def pack_model(buildings: Buildings) -> Arrays:
+def pack_model(buildings: Buildings, *, zoned: bool = False) -> Arrays:
     """Write the buildings of the stage ``model`` as arrays, with the boxes by which `take_near` finds some."""
-    return pack_buildings(buildings) | {"extents": shapely.bounds(buildings.model.polygons)}
+    return pack_buildings(buildings, zoned=zoned) | {"extents": shapely.bounds(buildings.model.polygons)}
 
 
 def take_near(arrays: Arrays, box: shapely.Polygon, layers: NDArray[np.int32] | None = None) -> NearBuildings:
@@ -352,4 +368,4 @@ def _take(table: Any, rows: NDArray[np.integer[Any]]) -> Any:
 
 def _columns(table: Any) -> list[str]:
     """Names of what a dataclass is made of; none for anything else."""
-    return [field.name for field in fields(table)] if is_dataclass(table) else []
+    return [column.name for column in fields(table)] if is_dataclass(table) else []

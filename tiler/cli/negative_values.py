@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from decimal import Decimal
 
-_WORD = re.compile(r"-?\d+_-?\d+|-[\d.eE+-]+(,[\d.eE+-]+)+")  # a tile, or numbers with commas
+_WORD = re.compile(r"-?\d+_-?\d+|-[\d.eE+-]+(,[\d.eE+-]+|,0[ABC])+")  # a tile, or numbers and levels with commas
 _PLAIN = re.compile(r"-\d+|-\d*\.\d+")  # what argparse takes as a number, Python 3.11 to 3.14
 
 

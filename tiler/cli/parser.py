@@ -32,9 +32,12 @@ KINDS = {
     **dict.fromkeys(("footprints", "refine_areas", "land_cover_table", "trees", "cluster"), "FILE"),
     **dict.fromkeys(("tls_ca", "tls_cert", "tls_key"), "FILE"),
     **{"out": "DIR", "crs": "EPSG", "layer": "LAYER", "scheduler": "ADDRESS"},
+    **{"generalised": "FILE", "focus": "X,Y,RADIUS"},
     **dict.fromkeys(("id_attribute", "height_attribute", "roof_attribute"), "ATTRIBUTE"),
     **dict.fromkeys(("refine_attribute", "land_cover_field"), "ATTRIBUTE"),
 }
+# Options that are given once for each value.
+APPENDED = {"refine": "PLACE,SIZE", "lod_zones": "FILE|PLACE,LEVEL,SIZE"}
 WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)")
 LODS = next(entry.metadata["choices"] for entry in dataclasses.fields(Config) if entry.name == "lod")
 SYNTH_BUILDINGS = 500  # of a city of boxes
@@ -190,10 +193,10 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     render.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="PNG file to write")
     render.add_argument(
         "--what",
-        choices=("boundary", "mesh", "overview", "tiles", "sizes", "quality", "citymodel"),
+        choices=("boundary", "mesh", "overview", "tiles", "sizes", "quality", "citymodel", "levels"),
         default="boundary",
         help="what to draw; sizes: triangles from above, by the length of their edges; quality: the boundary by "
-        "the cells behind it; citymodel: its solids on the terrain",
+        "the cells behind it; citymodel: its solids on the terrain; levels: the boundary by level of detail",
     )
     add_job_commands(add, _add_inputs)
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
@@ -243,8 +246,8 @@ def _add_parameters(parser: argparse.ArgumentParser) -> Group:
             words |= {"type": str, "nargs": "+", "metavar": "M|nH"}
         elif get_origin(wanted) is tuple and get_args(wanted)[0] is int:
             words |= {"type": str, "metavar": "N,N"}
-        elif entry.name == "refine":
-            words |= {"type": str, "action": "append", "metavar": "PLACE,SIZE"}
+        elif entry.name in APPENDED:
+            words |= {"type": str, "action": "append", "metavar": APPENDED[entry.name]}
         elif get_origin(wanted) is tuple and get_args(wanted)[0] is str:
             words |= {"type": str, "nargs": "+", "metavar": "FILE"}
         elif get_origin(wanted) is tuple:

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -20,6 +20,7 @@ from tiler.config.domain_height import (
     height_in_metres,
     read_height,
 )
+from tiler.config.zones import BLOCKS, ZonesAsked, is_file, read_zones_asked
 from tiler.objects.places import absolute, check_url, is_url
 from tiler.words.plain_text import shorten
 
@@ -36,7 +37,10 @@ LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solv
 
 
 # What may be given as a URL.
-URLS = ("pointcloud", "footprints", "buildings", "terrain", "refine_areas", "land_cover", "trees", "out")
+URLS = (
+    *("pointcloud", "footprints", "buildings", "terrain", "refine_areas", "land_cover", "trees", "out"),
+    *("lod_zones", "generalised"),
+)
 
 
 class Above(float):
@@ -268,6 +272,19 @@ class Config:
         1.2, "mesh", "with refine or refine_areas: ratio by which each edge is longer than the one before it on "
         "the way from a box or an area", least=Above(1), most=2,
     )  # fmt: skip
+    focus: str = _parameter(
+        UNSET, "mesh", "place of interest, x,y,RADIUS or x,y,RADIUS,SIZE: full detail and cells of SIZE (a "
+        "quarter of mesh_size by default), rings of less detail and coarser cells around it, up to mesh_size",
+        unit="m",
+    )  # fmt: skip
+    lod_zones: tuple[str, ...] = _parameter(
+        (), "mesh", "zones with a level of detail (2.2, 1.3, 1.2, 0C, 0B, 0A) and a target edge length of their "
+        "own, at most mesh_size: circles x,y,RADIUS,LEVEL,SIZE, vector files of polygons with the attributes "
+        "level and size, and rest,LEVEL for all that is in none, 2.2 by default; the finest counts",
+    )  # fmt: skip
+    generalised: str = _parameter(
+        UNSET, "mesh", "GeoPackage of citystitch generalise with the blocks of zones of level 0C, 0B and 0A"
+    )
     pad: tuple[float | str, ...] = _parameter(
         (), "mesh", "width of a margin of bare ground around the region, which flattens outwards and has coarser "
         "cells: one for all sides, or west east south north; metres, or 5H for five times the height of the "
@@ -418,7 +435,31 @@ class Config:
     @property
     def refined(self) -> bool:
         """Whether walls or areas are finer than the rest."""
-        return bool(self.wall_size or self.refine or self.refine_areas)
+        return bool(self.wall_size or self.refine or self.refine_areas or self.zoned)
+
+    @property
+    def zoned(self) -> bool:
+        """Whether places have levels of detail of their own."""
+        return bool(self.focus or self.lod_zones)
+
+    @property
+    def has_blocks(self) -> bool:
+        """Whether blocks of generalised buildings may stand for those of some zones."""
+        return bool(self.zoned and self.generalised)
+
+    @property
+    def zones_asked(self) -> ZonesAsked:
+        """What options say of zones."""
+        return read_zones_asked(
+            self.lod_zones, self.focus, mesh_size=self.mesh_size, blocks=bool(self.generalised)
+        )
+
+    @property
+    def finest_size(self) -> float:
+        """Target edge length (m) that the city model is made for: that of the finest circle of all zones."""
+        if not self.zoned:
+            return self.mesh_size
+        return min([self.mesh_size, *(circle.size for circle in self.zones_asked.circles)])
 
     @property
     def covered(self) -> bool:
@@ -458,7 +499,7 @@ class Config:
     @property
     def tile_size_or_default(self) -> float:
         """Side of a tile (m), which follows the mesh size where none is given."""
-        return self.tile_size or choose_tile_size(self.mesh_size, self.largest_size)
+        return self.tile_size or choose_tile_size(self.finest_size, self.largest_size)
 
     @property
     def expected_height(self) -> float:
@@ -518,8 +559,15 @@ def idle_parameters(config: Config) -> list[str]:
         idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
     if config.wall_growth != default.wall_growth and not config.wall_size:
         idle.append(f"wall_growth = {config.wall_growth:g} has no effect: it counts with wall_size above 0")
-    if config.refine_growth != default.refine_growth and not (config.refine or config.refine_areas):
-        idle.append(f"refine_growth = {config.refine_growth:g} has no effect: it counts with refine, refine_areas")
+    if config.refine_growth != default.refine_growth and not (
+        config.refine or config.refine_areas or config.zoned
+    ):
+        idle.append(
+            f"refine_growth = {config.refine_growth:g} has no effect: it counts with refine, refine_areas, "
+            "focus, lod_zones"
+        )
+    if config.generalised and not config.zoned:
+        idle.append("generalised has no effect: it counts with lod_zones, focus")
     if config.refine_attribute != default.refine_attribute and not config.refine_areas:
         idle.append(f"refine_attribute = {config.refine_attribute} has no effect: it counts with refine_areas")
     idle += [
@@ -570,6 +618,8 @@ def with_absolute_inputs(config: Config) -> Config:
         terrain=tuple(map(absolute, config.terrain)),
         footprints=absolute(config.footprints) if config.footprints else "",
         refine_areas=absolute(config.refine_areas) if config.refine_areas else "",
+        lod_zones=tuple(absolute(text) if is_file(text) else text for text in config.lod_zones),
+        generalised=absolute(config.generalised) if config.generalised else "",
         land_cover=tuple(map(absolute, config.land_cover)),
         land_cover_table=absolute(config.land_cover_table) if config.land_cover_table else "",
         trees=absolute(config.trees) if config.trees else "",
@@ -699,6 +749,7 @@ def _check_together(config: Config) -> None:
             f"{config.mesh_size:g} m; raise --first-layer or lower --mesh-size"
         )
     _check_pad(config)
+    _check_zones(config)
     _check_way(config)
     if not isinstance(config.domain_height, str):
         check_height(config, config.domain_height)
@@ -717,6 +768,29 @@ def _check_sizes(config: Config) -> None:
         )
     for text in config.refine:
         read_refinement(text, config.largest_size)
+
+
+def _check_zones(config: Config) -> None:
+    if not config.zoned:
+        return
+    if not config.has_sloped_roofs:
+        raise ConfigError(
+            f"zones of detail with roofs = {config.roofs}, mesher = {config.mesher}, simplify = "
+            f"{config.simplify}: level 2.2 has sloped roofs; give --roofs planes or skeleton, with --mesher "
+            "adaptive and --simplify clearance"
+        )
+    asked = config.zones_asked
+    check_blocks([asked.rest, *(circle.level for circle in asked.circles)], config, "lod_zones")
+
+
+def check_blocks(levels: Iterable[str], config: Config, subject: str) -> None:
+    """Raise ConfigError if a level takes blocks, and there are none; `subject` begins the message."""
+    found = sorted({level for level in levels if level in BLOCKS})
+    if found and not config.generalised:
+        raise ConfigError(
+            f"{subject}: level {found[0]} takes blocks of generalised buildings; make them with `citystitch "
+            "generalise` and give --generalised FILE.gpkg"
+        )
 
 
 def read_refinement(text: str, largest: float) -> tuple[float, tuple[float, ...]]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from pipeline.data.errors import ConfigError
 from tiler.config.config import TLS, UNSET, Config
+from tiler.config.zones import is_file
 from tiler.objects.places import is_url
 from tiler.words.plain_text import shorten, suggest
 
@@ -159,8 +160,11 @@ def _relative_to(folder: Path, name: str, value: Any) -> Any:
     if name in ("pointcloud", "buildings", "terrain", "land_cover") and isinstance(value, (str, list)):
         value = [value] if isinstance(value, str) else value
         return [_below(folder, item) if isinstance(item, str) else item for item in value]
+    if name == "lod_zones" and isinstance(value, (str, list)):
+        value = [value] if isinstance(value, str) else value
+        return [_below(folder, item) if isinstance(item, str) and is_file(item) else item for item in value]
     if (
-        name in ("footprints", "refine_areas", "land_cover_table", "trees", "out", *TLS)
+        name in ("footprints", "refine_areas", "generalised", "land_cover_table", "trees", "out", *TLS)
         and isinstance(value, str)
         and value
     ):

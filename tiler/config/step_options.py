@@ -41,6 +41,10 @@ PLANE_PARAMETERS = ("mesh_size", "min_angle", "mesher")
 SIZE_PARAMETERS = ("open_size", "grading")
 # Further ones of both where walls or areas are finer than the rest.
 REFINE_PARAMETERS = ("wall_size", "wall_growth", "refinements", "refine_growth")
+# Further ones of the city model where zones have levels of detail.
+ZONE_PARAMETERS = ("zones",)
+# Further one where blocks stand for the buildings of some zones.
+BLOCK_PARAMETERS = ("blocks_given",)
 # Further ones of both where there is a pad; the first also of what reads its terrain.
 PAD_PARAMETERS = ("core_bounds", "graded_size")
 # Further ones of both where there is land cover: of a run, and what follows from it for its stages.
@@ -60,11 +64,12 @@ def derived_parameters(config: Config) -> dict[str, float | str | bool]:
     ``graded_size`` is the largest target edge length of region and pad, ``tile_size_or_default`` the side of a
     tile (m).
     ``roof_clearance_or_spacing`` and ``roof_group_or_spacing`` (m) are at least the least vertical spacing of the
-    adaptive mesher: heights closer than that cannot both be exact in a column. ``roofs_or_flat`` is "flat" where
-    the mesher or the way to simplify knows no sloped roofs. ``points_of_models`` says whether points are made on
-    the roofs of city models, ``ground_of_models`` whether they give the ground, too: where nothing else does.
+    adaptive mesher, with zones that of the finest: heights closer than that cannot both be exact in a column.
+    ``roofs_or_flat`` is "flat" where the mesher or the way to simplify knows no sloped roofs. ``points_of_models``
+    says whether points are made on the roofs of city models, ``ground_of_models`` whether they give the ground,
+    too: where nothing else does.
     """
-    spacing = config.least_spacing * config.mesh_size if config.mesher == "adaptive" else 0.0
+    spacing = config.least_spacing * config.finest_size if config.mesher == "adaptive" else 0.0
     return {
         "roofs_or_flat": config.roofs if config.has_sloped_roofs else "flat",
         "layer_height_or_default": config.layer_height_or_default,
@@ -75,6 +80,7 @@ def derived_parameters(config: Config) -> dict[str, float | str | bool]:
         "covered": config.covered,
         "trees_given": bool(config.trees),
         "buildings_given": bool(config.buildings),
+        "blocks_given": config.has_blocks,
         "terrain_given": bool(config.terrain),
         "points_of_models": not config.pointcloud,
         "ground_of_models": not config.pointcloud and not config.terrain,
@@ -164,8 +170,9 @@ def size_rule(given: Any, largest: float) -> SizeRule:
 
 
 def is_refined(given: Any) -> bool:
-    """Whether walls or areas are finer than the rest."""
-    return bool(_optional(given, "wall_size", 0.0) or _optional(given, "refinements", ()))
+    """Whether walls or areas are finer than the rest; of a run with zones, before its areas are read, too."""
+    zoned = isinstance(given, Config) and given.zoned
+    return bool(_optional(given, "wall_size", 0.0) or _optional(given, "refinements", ()) or zoned)
 
 
 def refined_areas(given: Any) -> list[Finer]:

@@ -83,7 +83,7 @@ def give_way(footprints: Footprints, places: ModelPlaces, bounds: Box) -> tuple[
             str(names[k]),
             *_place(footprints.polygons[k], bounds),
             f"{covered[k]:.2f} of its {shapely.area(footprints.polygons[k]):.2f} m2 are under buildings of the "
-            f"city model; {end}",
+            f"city model or blocks; {end}",
         )
         for kind, chosen, names, end in told
         for k in np.flatnonzero(chosen).tolist()

@@ -14,9 +14,9 @@ from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.landcover.tree_files import BASE_COLUMN, scan_trees
 from tiler.objects.places import place
-from tiler.stages.inputs import own_window, put_rows
+from tiler.stages.inputs import own_window
 from tiler.stages.pieces import CANOPY
-from tiler.stages.readers import grow, read_bands, read_known_terrain, read_rows
+from tiler.stages.readers import grow, put_rows, read_bands, read_known_terrain, read_rows
 
 TREES = "trees"
 UNNAMED = (0, 1, 3, 4, 5)  # classes of points that are leaves within a crown of the file

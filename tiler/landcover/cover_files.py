@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from pipeline.data.citymodel import Footprints, make_ids
 from pipeline.data.errors import InputError
 from pipeline.data.notes import Note
-from tiler.config.config import Config
 from tiler.footprints.footprint_attributes import known_attribute
 from tiler.footprints.footprint_index import FootprintBlock, block_footprints
 from tiler.footprints.footprint_source import FootprintSource, open_source
 from tiler.footprints.plan_outlines import outline_all
 from tiler.georeference.frame import to_region
 from tiler.landcover.cover_table import class_word
-from tiler.objects.places import is_missing, place
+from tiler.objects.places import is_missing
 from tiler.pointclouds.las_header import COORDINATE_LIMIT
 from tiler.vectors.features import Box, Features
 from tiler.vectors.layers import scan_layer
@@ -100,25 +99,13 @@ def scan_cover(
     yield block_footprints(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), notes)
 
 
-def refuse_missing_files(config: Config) -> None:
-    """Raise InputError if a file of land cover or of trees is not there: before a run begins, not at its stage."""
-    given = {"land_cover": config.land_cover, "trees": (config.trees,) if config.trees else ()}
-    for parameter, names in given.items():
-        for path in map(place, names):
-            _refuse_missing(path, parameter)
-
-
-def _refuse_missing(path: Path, parameter: str) -> None:
-    if is_missing(path):
-        raise InputError(f"{path}: no such file; check the path of {parameter}")
-
-
 def open_file(path: Path, parameter: str, hint: str, *, crs: pyproj.CRS, bounds: Box) -> FootprintSource:
     """Open a vector file that a parameter names; InputError where it is missing, or an extract of OpenStreetMap.
 
     `hint` says how areas or trees of an extract are made into a file.
     """
-    _refuse_missing(path, parameter)
+    if is_missing(path):
+        raise InputError(f"{path}: no such file; check the path of {parameter}")
     source = open_source(path, crs=crs, bounds=bounds, layer="", id_attribute="", height_attribute="")
     if source.layer.gdal is not None and source.layer.gdal.driver == "OSM":
         raise InputError(

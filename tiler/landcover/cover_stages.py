@@ -17,8 +17,7 @@ from tiler.landcover.cover_table import CoverRow
 from tiler.landcover.water import water_stages
 from tiler.landcover.water_points import WET
 from tiler.objects.places import place
-from tiler.stages.inputs import put_rows
-from tiler.stages.readers import grow, read_rows
+from tiler.stages.readers import grow, put_rows, read_rows
 from tiler.stages.surroundings import COVERED, rows_of_cover
 
 COVER = "cover"

@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker, Region
 from stitch.tiling.grid import Key
+from tiler.config.zone_levels import find_levels
 from tiler.engine.run_context import tile_key
 from tiler.mesh_files.facet_quality import measure_facets, name_facets
 from tiler.mesh_files.vtk_files import TETRA, BoundaryPiece, read_piece_paths, read_vtp, read_vtu
-from tiler.store.run_folder import REGION
+from tiler.store.out_folder import RUN_RECORD, STORE
+from tiler.store.run_folder import REGION, read_run_record
+from tiler.store.store import Store
 
 BOUNDARY_INDEX, VOLUME_INDEX = "boundary.pvtp", "mesh.pvtu"
 SHOWN = (Marker.GROUND, Marker.WALL, Marker.ROOF)
@@ -139,6 +142,8 @@ class City:
         Radius ratio of the cell behind each facet; NaN where nobody asked.
     step : float
         Vertices closer than some of this are one (m); 0 where all are shown.
+    level : int8, (k,)
+        Level of detail of each facet, see `load_levels`; none where nobody asked.
     """
 
     points: NDArray[np.float64]
@@ -150,6 +155,7 @@ class City:
     origin: NDArray[np.float64]
     quality: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
     step: float = 0.0
+    level: NDArray[np.int8] = field(default_factory=lambda: np.empty(0, np.int8))
 
 
 def find_middle(directory: Path, *, most: int = MOST_BYTES) -> frozenset[str] | None:
@@ -253,6 +259,41 @@ def load_city(
         quality=found.quality,
         step=step,
     )
+
+
+def load_levels(directory: Path, city: City) -> NDArray[np.int8]:
+    """Find the level of detail of each facet: that of its building, and of the zone on the ground.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of a run with zones of detail.
+    city : City
+        Its boundary.
+
+    Returns
+    -------
+    int8, (k,)
+        Index into `zones.LEVELS`.
+
+    Raises
+    ------
+    InputError
+        If the run has no zones, or a result is missing or damaged.
+    """
+    zones = read_run_record(directory / RUN_RECORD).zones
+    if not zones:
+        raise InputError(f"{directory}: the run has no zones of detail; run with --focus or --lod-zones")
+    store = Store(directory / STORE)
+    found = [store.read("model", name, names=("number", "level"))[0] for name in store.names("model")]
+    number, level = (np.concatenate([part[name] for part in found]) for name in ("number", "level"))
+    order = np.argsort(number, kind="stable")
+    row = np.searchsorted(number[order], city.building).clip(max=max(len(order) - 1, 0))
+    centre = city.points[city.facets].mean(axis=1) + city.origin
+    levels = find_levels(zones, centre[:, :2])
+    built = city.building >= 0
+    levels[built] = level[order][row[built]]
+    return levels
 
 
 def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[str] | None = None) -> Any:

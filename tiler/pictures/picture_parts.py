@@ -29,6 +29,8 @@ WALL_COLOUR = "#fffaf0"
 TILE_COLOURS = (("#6699cc", "#994455"), ("#eecc66", "#ee99aa"))
 # How much white is mixed into a tile's colour, so that buildings stand out from the ground.
 TILE_WHITE = {Marker.GROUND: 0.3, Marker.WALL: 0.6, Marker.ROOF: 0.0}
+# By level of detail, the finest first.
+LEVEL_COLOURS = ("#b2182b", "#ef8a62", "#fddbc7", "#92c5de", "#4393c3", "#2166ac")
 SKIRT_COLOUR = "#c9bfae"
 LINE_COLOUR = "#3c3530"
 # From bad to good; lightness rises all the way, so that grey prints tell the same.
@@ -87,11 +89,23 @@ def tile_colours(city: City) -> NDArray[np.uint8]:
     InputError
         If a piece is not named after a tile.
     """
-    odd, white = (tile_keys(city) % 2)[city.piece], np.zeros(max(Marker) + 1)
-    white[list(TILE_WHITE)] = list(TILE_WHITE.values())
+    odd = (tile_keys(city) % 2)[city.piece]
     colours = np.array([[list(bytes.fromhex(colour[1:])) for colour in row] for row in TILE_COLOURS])
+    return _pale(colours[odd[:, 0], odd[:, 1]], city)
+
+
+def level_colours(city: City) -> NDArray[np.uint8]:
+    """Colour facets by level of detail: walls and ground paler than roofs."""
+    colours = np.array([list(bytes.fromhex(colour[1:])) for colour in LEVEL_COLOURS])
+    return _pale(colours[city.level], city)
+
+
+def _pale(colours: NDArray[np.int64], city: City) -> NDArray[np.uint8]:
+    """Mix white into the colours (k, 3) of walls and of the ground."""
+    white = np.zeros(max(Marker) + 1)
+    white[list(TILE_WHITE)] = list(TILE_WHITE.values())
     share = white[city.marker][:, None]
-    rgb: NDArray[np.uint8] = np.rint(colours[odd[:, 0], odd[:, 1]] * (1 - share) + 255 * share).astype(np.uint8)
+    rgb: NDArray[np.uint8] = np.rint(colours * (1 - share) + 255 * share).astype(np.uint8)
     return rgb
 
 
@@ -109,7 +123,7 @@ def add_city(
     size : (int, int)
         Width and height of a picture that holds all of it (pixels).
     colours : str
-        ``"height"``, ``"tile"``, or ``"quality"``, with a legend.
+        ``"height"``, ``"tile"``, ``"level"``, or ``"quality"``, with a legend.
     edges : bool
         Whether edges of triangles are drawn where they are long enough.
     """
@@ -123,7 +137,8 @@ def add_city(
         worst = float(np.nanmin(city.quality, initial=1.0))
         add_legend(plotter, table, f"radius ratio, worst {worst:.3f}", (0.68, 0.05))
     else:
-        shown, painted = tile_colours(city) if colours == "tile" else height_colours(city), {"rgb": True}
+        paint = {"tile": tile_colours, "level": level_colours}.get(colours, height_colours)
+        shown, painted = paint(city), {"rgb": True}
     built = city.marker != Marker.GROUND
     for part, smooth in ((~built, True), (built, False)):
         if part.any():

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from pipeline.data.mesh import Marker
 from tiler.pictures.city_model_data import load_blocks
-from tiler.pictures.picture_data import City, find_middle, load_air, load_city
+from tiler.pictures.picture_data import City, find_middle, load_air, load_city, load_levels
 from tiler.pictures.picture_parts import add_air, add_city, add_sizes, plan_edges
 from tiler.pictures.plain_picture import PlainPlotter, has_graphics
 from tiler.store.atomic import replacing
@@ -32,9 +33,10 @@ SIZES = {
     "sizes": (1000, 1046),
     "quality": (1600, 1000),
     "citymodel": (1600, 1000),
+    "levels": (1600, 1000),
 }
 CELL_BY_CELL = ("mesh", "overview", "sizes")  # pictures that show each cell or triangle
-COLOURS = {"tiles": "tile", "quality": "quality"}
+COLOURS = {"tiles": "tile", "quality": "quality", "levels": "level"}
 # Length up to which one surface darkens another (m), in regions below 2 km.
 OCCLUSION_RADIUS = 20.0
 CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
@@ -115,6 +117,7 @@ def render_run(
         ``"sizes"``: triangles from above, coloured by the length of their edges, and by tile.
         ``"quality"``: as ``"boundary"``, but coloured by the radius ratio of the cell behind each facet.
         ``"citymodel"``: the city model with its roofs on its terrain, from the run's store.
+        ``"levels"``: as ``"boundary"``, but coloured by level of detail, of a run with zones.
     size : (int, int), optional
         Width and height (pixels), at least 2; `SIZES` by default.
     say : callable, optional
@@ -284,6 +287,8 @@ def _draw(directory: Path, what: str, size: tuple[int, int], say: Callable[[str]
         say(f"of this large region, vertices within {city.step:g} m are drawn as one")
     if what == "sizes":
         return draw_sizes(city, size)
+    if what == "levels":
+        city = replace(city, level=load_levels(directory, city))
     if what not in CELL_BY_CELL:
         return draw_city(city, size, colours=COLOURS.get(what, "height"))
     air = load_air(directory, city.origin, only=frozenset(city.names))

@@ -1,7 +1,7 @@
 """What a run will take, estimated before it: cells, tasks, memory, disk and hours."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,8 +14,11 @@ from stitch.tiling.grid import Bounds, TileGrid, seams_present, tiles_present
 from stitch.tiling.smallest_tile import LEAST_TILE
 from tiler.config.config import Config
 from tiler.config.step_options import expected_levels, refined_areas, size_rule
+from tiler.config.zone_levels import find_levels
+from tiler.config.zones import LEVELS
 from tiler.engine.stage import Scope
 from tiler.planning.footprint_sample import FootprintSample
+from tiler.planning.lod_zones import read_zones
 from tiler.planning.own_stages import list_stages, stages_of_pad
 from tiler.planning.plan import Survey
 from tiler.planning.refinements import read_refinements
@@ -105,6 +108,8 @@ class Forecast:
         Seconds that no number of workers shortens.
     warnings : list of str
         What may go wrong, and the next move.
+    cells_by_level : dict of str to float
+        Cells by level of detail of the zone that they lie in; empty without zones.
     """
 
     loads: TileLoads
@@ -114,6 +119,7 @@ class Forecast:
     work: float
     driver: float
     warnings: list[str]
+    cells_by_level: dict[str, float] = field(default_factory=dict)
 
     def seconds(self, workers: int) -> float:
         """Estimate the wall time with some workers, a core each (s)."""
@@ -158,7 +164,8 @@ def forecast_run(
     work = SECONDS_A_CELL * cells + SECONDS_A_LIDAR_POINT * points + SECONDS_A_HOUSE * houses
     work += SECONDS_A_TASK * n_tasks
     warnings = [] if memory is None else _memory_warnings(tile_memory, loads.area, config, memory)
-    return Forecast(loads, tasks, float(disk), tile_memory, float(work), SECONDS_OF_DRIVER * n_tasks, warnings)
+    driver, by_level = SECONDS_OF_DRIVER * n_tasks, _by_level(survey, sample, config, loads)
+    return Forecast(loads, tasks, float(disk), tile_memory, float(work), driver, warnings, by_level)
 
 
 def count_tasks(survey: Survey, config: Config) -> list[Tasks]:
@@ -241,16 +248,34 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
 
 
 def _thinning(survey: Survey, sample: FootprintSample | None, config: Config) -> NDArray[np.float64]:
-    """How many cells open ground has with graded or finer sizes, of those without, in each tile: float64 (nx, ny).
+    """How many cells open ground has with graded or finer sizes, of those without: float64 (nx, ny), by tile."""
+    x, y = survey.meshed.lines
+    found = _look_up(survey, sample, config)
+    if found is None:
+        return np.ones((len(x) - 1, len(y) - 1))
+    mean: NDArray[np.float64] = found[1].mean(axis=(1, 3))
+    return mean
 
-    Sizes are looked up in some places of each tile. Footprints that are not known are taken to be everywhere.
+
+def _look_up(
+    survey: Survey, sample: FootprintSample | None, config: Config
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Look sizes up in some places of each tile.
+
+    Returns
+    -------
+    xy : float64, (nx, side, ny, side, 2)
+        The places (m).
+    share : float64, (nx, side, ny, side)
+        How many cells open ground has there, of those without graded or finer sizes. Footprints that are not known
+        are taken to be everywhere. None where sizes are the same everywhere.
     """
     x, y = survey.meshed.lines
     shape = len(x) - 1, len(y) - 1
     known = sample.complete if sample is not None else not config.has_buildings
     largest = 0.0 if config.open_size and not known else config.graded_size
     if not largest and not config.refined:
-        return np.ones(shape)
+        return None
     most = LOOKS_OF_FINER if config.refined else LOOKS_A_SIDE
     side = int(np.clip(np.sqrt(MOST_LOOKS / (shape[0] * shape[1])), 2, most))
     places = (np.arange(side) + 0.5) / side
@@ -259,18 +284,33 @@ def _thinning(survey: Survey, sample: FootprintSample | None, config: Config) ->
     rule = size_rule(config, largest)
     houses = sample.polygons if sample is not None else np.empty(0, np.object_)
     if config.open_size or not largest:
-        field = SizeField(rule, shapely.STRtree(houses))
+        sizes = SizeField(rule, shapely.STRtree(houses))
     else:
-        field = size_field_around(survey.region.bounds, rule)
+        sizes = size_field_around(survey.region.bounds, rule)
     areas = refined_areas(SimpleNamespace(**vars(config), refinements=read_refinements(config, survey.region)))
-    field = replace(field, finer=(*areas, *finer_walls(shapely.STRtree(shapely.boundary(houses)), rule)))
-    size = local_sizes(field, xy, mesh_size=config.mesh_size)
+    sizes = replace(sizes, finer=(*areas, *finer_walls(shapely.STRtree(shapely.boundary(houses)), rule)))
+    size = local_sizes(sizes, xy, mesh_size=config.mesh_size)
     share = (config.mesh_size / size) ** 2
     if config.mesher == "adaptive":
-        upright = local_sizes(field, xy, mesh_size=config.mesh_size, upright=True)
+        upright = local_sizes(sizes, xy, mesh_size=config.mesh_size, upright=True)
         share *= config.mesh_size / np.minimum(upright, TALLEST * size)
-    mean: NDArray[np.float64] = share.reshape(shape[0], side, shape[1], side).mean(axis=(1, 3))
-    return mean
+    grid = shape[0], side, shape[1], side
+    return xy.reshape(*grid, 2), share.reshape(grid)
+
+
+def _by_level(
+    survey: Survey, sample: FootprintSample | None, config: Config, loads: TileLoads
+) -> dict[str, float]:
+    """Cells by level of detail of the zone that they lie in; nothing without zones."""
+    found = _look_up(survey, sample, config) if config.zoned else None
+    if found is None:
+        return {}
+    xy, share = found
+    level = find_levels(read_zones(config, survey.region), xy.reshape(-1, 2)).reshape(share.shape)
+    column, row = (loads.index - survey.meshed.first).T
+    cells = loads.cells / share.sum(axis=(1, 3))[column, row]
+    parts = ((name, (share * (level == k)).sum(axis=(1, 3))[column, row]) for k, name in enumerate(LEVELS))
+    return {name: float((cells * part).sum()) for name, part in parts if part.any()}
 
 
 def _core_area(grid: TileGrid, core: Bounds) -> NDArray[np.float64]:

@@ -46,7 +46,7 @@ def list_stages(config: Config) -> list[Stage]:
     stages = [*input_stages(config), fill_stage(), house_stage(config), *first_round(config), shape_stage(0)]
     stages += [*later_round(config, 1), model_stage(config, 0), *domain_stages(config)]
     stages += [*approach_stages(config), *layer_stages(config, Domain(config.expected_height, None))]
-    stages += [*city_model_stages(), fit_stage(config)]
+    stages += [*city_model_stages(config), fit_stage(config)]
     stages += alignment_stages(config) if config.footprints else []
     return [*stages, *of_cover(config), *mesh_stages(config), *piece_stages(config)]
 
@@ -80,9 +80,9 @@ def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, 
     if taken:
         raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")
     given = {*dataclasses.asdict(config), *derived_parameters(config), "footprints_identity", "top_elevation"}
-    given |= {"footprints_frame", "footprints_shift", "refinements"}
+    given |= {"footprints_frame", "footprints_shift", "refinements", "zones"}
     given |= {"core_bounds", "rim_store", "rim_digest", "land_cover_identity", "cover_table", "cover_reach"}
-    given |= {"levels_store", "levels_digest", "trees_identity"}
+    given |= {"levels_store", "levels_digest", "trees_identity", "generalised_identity"}
     clash = sorted(own.parameters.keys() & given)
     if clash:
         raise ValueError(f"parameter {', '.join(clash)}: the run has one of this name; name yours otherwise")

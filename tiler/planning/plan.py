@@ -16,9 +16,8 @@ from tiler.engine.run_context import choose_tiles, make_layout, tile_key
 from tiler.engine.stage import FileItem, Layout
 from tiler.georeference.crs import boxes_meet, crs_text
 from tiler.georeference.operation import Operation
-from tiler.landcover.cover_files import refuse_missing_files
 from tiler.landcover.cover_table import read_table
-from tiler.objects.places import place
+from tiler.objects.places import is_missing, place
 from tiler.objects.requests import trust_addresses
 from tiler.planning.establish_georeference import FOOTPRINTS, Georeference, establish_georeference, find_inexact
 from tiler.planning.model_inputs import (
@@ -95,6 +94,15 @@ def check_sources(config: Config) -> None:
         )
 
 
+def _refuse_missing(config: Config) -> None:
+    """Raise InputError if a file that only a later stage reads is not there."""
+    given = {"land_cover": config.land_cover, "trees": (config.trees,), "generalised": (config.generalised,)}
+    for parameter, names in given.items():
+        for path in map(place, filter(None, names)):
+            if is_missing(path):
+                raise InputError(f"{path}: no such file; check the path of {parameter}")
+
+
 def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
     """Find out what a run has to do, from headers alone.
 
@@ -138,7 +146,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     Tiles stay arrays: a country of half a million tiles takes no longer than its headers.
     """
     check_sources(config)
-    refuse_missing_files(config)
+    _refuse_missing(config)
     paths = find_clouds(config.pointcloud) if config.pointcloud else []
     headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
     others, unread = read_other_headers(config)

@@ -5,8 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
+from tiler.config.zones import LEVELS, Zones
 from tiler.report.charts import wrap_svg
 from tiler.report.page import text
 from tiler.report.svg_map import draw_image, draw_scale_bar, encode_png
@@ -157,6 +159,40 @@ def draw_map(
     }
     keys = [(style, words) for style, (words, there) in kinds.items() if there]
     return f'<div class="map">{chart}</div>' + _legend(limits, unit, keys)
+
+
+def draw_levels(bounds: tuple[float, float, float, float], zones: Zones) -> str:
+    """Draw the zones of detail over the footprints of the page's first map, the finest darkest, with a legend.
+
+    Parameters
+    ----------
+    bounds : (xmin, ymin, xmax, ymax)
+        The region (m).
+    zones : Zones
+        With the rest.
+    """
+    west, south, east, north = bounds
+    scale = SIDE / max(east - west, north - south)
+    width, height = (east - west) * scale, (north - south) * scale
+    region, parts = shapely.box(*bounds), list[str]()
+    finest_last = sorted(zones, key=lambda zone: (bool(zone[2]), LEVELS.index(zone[0])), reverse=True)
+    for level, size, place in [finest_last[-1], *finest_last[:-1]]:
+        inside = shapely.intersection(region, shapely.from_wkb(place)) if place else region
+        rings = shapely.get_rings(shapely.get_parts(inside[()] if isinstance(inside, np.ndarray) else inside))
+        lines = [(shapely.get_coordinates(ring) - (west, north)) * (scale, -scale) for ring in rings]
+        path = "".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in line.tolist()) + "Z" for line in lines)
+        words = f"level {level}, cells of {size:g} m"
+        style = f'class="{_level_style(level)}" fill-rule="evenodd"'
+        parts.append(f'<path {style} d="{path}"><title>{words}</title></path>')
+    parts += [_footprints(None, width, height), draw_scale_bar(width, height, scale)]
+    chart = wrap_svg("Zones of detail", (round(width, 1), round(height + FOOT, 1)), "".join(parts))
+    shown = [level for level in LEVELS if level in {level for level, _, _ in zones}]
+    keys = "".join(f'<li><span class="key {_level_style(level)}"></span> level {level}</li>' for level in shown)
+    return f'<div class="map">{chart}</div><ul class="legend">{keys}</ul>'
+
+
+def _level_style(level: str) -> str:
+    return f"shade{SHADES - 1 - LEVELS.index(level)}"
 
 
 def shade(value: NDArray[np.float64], limits: tuple[float, float]) -> NDArray[np.int64]:

@@ -83,7 +83,7 @@ def describe_plan(
     survey: Survey, sample: FootprintSample | None, forecast: Forecast, config: Config, memory: float | None
 ) -> dict[str, Any]:
     """Put a plan into plain values, for JSON; parameters as `plan_run` makes them."""
-    loads, grid = forecast.loads, survey.meshed
+    loads, grid, by_level = forecast.loads, survey.meshed, forecast.cells_by_level
     there = tiles_present(grid)
     numbers = sorted({*WORKERS, max(config.workers, 1)})
     names = [f"{i}_{j}" for i, j in loads.index[np.argsort(-loads.cells, kind="stable")[:BUSIEST]].tolist()]
@@ -127,7 +127,8 @@ def describe_plan(
             "cells": _rounded(loads.cells.sum()),
             "points": _rounded(loads.cells.sum() / CELLS_A_POINT),
             "cells_of_largest_tile": _rounded(loads.cells.max(initial=0.0)),
-        },
+        }
+        | ({"cells_by_level": {k: _rounded(n) for k, n in by_level.items()}} if by_level else {}),
         "tasks": {entry.stage: {"scope": entry.scope.value, "number": entry.number} for entry in forecast.tasks},
         "memory": {
             "worker_bytes": _rounded(forecast.tile_memory.max(initial=0.0)),
@@ -190,6 +191,9 @@ def _print_plan(plan: dict[str, Any], console: Console) -> None:
             f"({mesh['mesher']}, {mesh['mesh_size']:g} m); largest tile {_count(mesh['cells_of_largest_tile'])}",
         )
     )
+    if "cells_by_level" in mesh:
+        parts = (f"{_count(n)} at {level}" for level, n in mesh["cells_by_level"].items())
+        rows.append(("", f"in zones of detail: {', '.join(parts)}"))
     rows += _task_rows(plan["tasks"])
     machine = plan["memory"]["machine_bytes"]
     of = f" of {machine / 2**30:.0f} GiB here" if machine else "; the scheduler's machines are not known"

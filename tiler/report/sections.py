@@ -12,13 +12,15 @@ from pipeline.quality.point_fidelity import KINDS
 from pipeline.quality.residuals import ResidualSums, conclude
 from stitch.tiling.grid import make_grid, tile_box
 from tiler.config.config import Config
+from tiler.config.zone_levels import read_described
+from tiler.config.zones import LEVELS
 from tiler.engine.run_context import tile_key
 from tiler.mesh_files.mesh_parts import report_parts
 from tiler.monitoring.progress import command_line
 from tiler.report.charts import Series, draw_bars, draw_gantt, draw_histogram, rebin
 from tiler.report.collect import Bins, Numbers
 from tiler.report.left_out import report_left_out
-from tiler.report.maps import draw_map, gather_tiles
+from tiler.report.maps import draw_levels, draw_map, gather_tiles
 from tiler.report.page import figure, figures, folded, heading, number, paragraph, table, text
 from tiler.report.record import PLACES, SHOWN, NoteGroup, RunFacts
 from tiler.report.samples import NEAR, Samples
@@ -163,6 +165,11 @@ def describe_map(facts: RunFacts, numbers: Numbers, timeline: Timeline | None) -
         )
         maps.append(figure(chart, caption))
     yield f'<div class="pair">{"".join(maps)}</div>'
+    if zones := read_described(members.get("zones") or ()):
+        parts = {level: members["counts"].get(f"parts at level {level}", 0) for level in LEVELS}
+        told = ", ".join(f"{n:,} at {level}" for level, n in parts.items() if n)
+        words = "Zones of detail: a building has the level of the finest one that its point lies in."
+        yield figure(draw_levels(bounds, zones), f"{words} Building parts: {told or 'none'}.")
 
 
 def describe_quality(facts: RunFacts, numbers: Numbers, samples: Samples) -> Iterator[str]:

@@ -8,9 +8,17 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.city_model.building_points import reach_of_points
+from pipeline.city_model.city import City, CityOptions
 from pipeline.city_model.city_steps import measure_city, prepare_footprints
 from pipeline.city_model.groups import adjacent_houses
-from pipeline.city_model.houses import Houses, divide_houses, find_model_roofs, join_houses, take_houses
+from pipeline.city_model.houses import (
+    Houses,
+    divide_houses,
+    find_model_roofs,
+    join_houses,
+    leave_out_points,
+    take_houses,
+)
 from pipeline.city_model.model_roofs import MODEL
 from pipeline.city_model.unmarked_roofs import MAY_BE_ROOF
 from pipeline.columns.adaptive import AdaptiveOptions
@@ -18,12 +26,18 @@ from pipeline.columns.layered import LayeredOptions, choose_layers, terrain_reac
 from pipeline.data.citymodel import Footprints, take_footprints
 from pipeline.data.classes import BUILDING, GROUND, WATER
 from pipeline.data.notes import Note
-from pipeline.data.roof_forms import POINTS_TELL
+from pipeline.data.roof_forms import POINTS_TELL, find_blocks
 from pipeline.geometry.components import join_pairs
 from pipeline.points_terrain.raster import Dtm, window_of
 from pipeline.points_terrain.terrain import cut_terrain
 from pipeline.quality.point_fidelity import measure_houses
-from pipeline.roofs.roof_points import add_roof_points, keep_roof_points, locate_roof_points
+from pipeline.roofs.roof_points import (
+    RoofPoints,
+    add_roof_points,
+    keep_roof_points,
+    locate_roof_points,
+    merge_roof_points,
+)
 from pipeline.simplification.house_clusters import (
     Shapes,
     find_close,
@@ -32,6 +46,7 @@ from pipeline.simplification.house_clusters import (
     leave_out,
     shape_clusters,
 )
+from pipeline.simplification.reduced_detail import BLOCK, reduce_detail
 from pipeline.simplification.simplify import raise_buildings
 from stitch.tiling.grid import Key
 from tiler.citymodels.clusters import pack_clusters, place_in_grid, unpack_clusters
@@ -47,7 +62,17 @@ from tiler.citymodels.tables import (
     unpack_polygons,
 )
 from tiler.config.config import Config
-from tiler.config.step_options import CITY_PARAMETERS, city_options, layer_parameters, mesh_options, needs_region
+from tiler.config.step_options import (
+    BLOCK_PARAMETERS,
+    CITY_PARAMETERS,
+    ZONE_PARAMETERS,
+    city_options,
+    layer_parameters,
+    mesh_options,
+    needs_region,
+)
+from tiler.config.zone_levels import find_levels
+from tiler.config.zones import LEVELS, Zones
 from tiler.engine.run_context import find_owned, region_around, tile_key
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage
 from tiler.engine.task import Result, Task
@@ -58,6 +83,7 @@ from tiler.stages.readers import extent_of, grow, hull, read_known_terrain, read
 from tiler.store.run_folder import PARTS
 
 TERRAIN = ("dtm_spacing", "ground_filter")
+OF_BLOCKS = ("block", "block_place")  # arrays of the houses: level and point of those that are blocks
 
 
 def house_stage(config: Config) -> Stage:
@@ -68,7 +94,9 @@ def house_stage(config: Config) -> Stage:
         Read("terrain", 2 * config.dtm_spacing, around="outlines"),
     )
     models = ("buildings_given", "ground_of_models", "prefer") if config.buildings else ()
-    return Stage("houses", Scope.TILE, make_houses, reads, (*CITY_PARAMETERS, *TERRAIN, *models), version=6)
+    blocks = BLOCK_PARAMETERS if config.has_blocks else ()
+    parameters = (*CITY_PARAMETERS, *TERRAIN, *models, *blocks)
+    return Stage("houses", Scope.TILE, make_houses, reads, parameters, version=6)
 
 
 def first_round(config: Config) -> list[Stage]:
@@ -138,7 +166,8 @@ def model_stage(config: Config, last: int) -> Stage:
     mesh = layer_parameters(config) if layered else ("mesher",)
     make = make_model if config.mesher == "adaptive" or layered else make_model_without_layers
     version = 9 if layered else 7
-    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh), version=version)
+    zones = (*(ZONE_PARAMETERS if config.zoned else ()), *(BLOCK_PARAMETERS if config.has_blocks else ()))
+    return Stage("model", Scope.TILE, make, reads, (*CITY_PARAMETERS, *TERRAIN, *mesh, *zones), version=version)
 
 
 def chooses_layers_later(config: Config) -> bool:
@@ -168,6 +197,8 @@ def make_houses(task: Task) -> Facts:
     with task.step("1.5 extract building points"):
         roofs = locate_roof_points(cloud, own.polygons, building_class=True)
         roofs, unmarked = add_unmarked(task, own, roofs, cloud, terrain)
+        blocks = task.parameters.get("blocks_given", False)
+        roofs = leave_out_points(roofs, find_blocks(own.forms)[0] >= 0) if blocks else roofs
     city = measure_city(cloud, own, terrain, options, building_class=True, roofs=roofs, trace=task.step)
     task.notes(city.notes)
     roofs = keep_roof_points(roofs, np.isin(own.ids, city.model.ids))
@@ -197,6 +228,9 @@ def make_houses(task: Task) -> Facts:
         full = make_buildings(city, fidelity, np.zeros(len(city.model), np.int32))
     task.notes(houses.notes)
     task.put(**pack_houses(houses), **pack_buildings(full, "full_"), unmarked=others)
+    if blocks:
+        level, place = find_blocks(city.forms)
+        task.put(block=level, block_place=place)
     parts = {"house parts": len(houses.parts.polygons)}
     counts = {"buildings before merging": len(houses), **parts, **_count_forms(houses)}
     counts |= {"roofs from other classes": int(others.sum())} if others.any() else {}
@@ -310,7 +344,8 @@ def make_model_without_layers(task: Task) -> Facts:
 def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Facts:
     given, bounds = task.parameters, task.context.bounds
     options = city_options(given)
-    gathered = _gather(task, _members(task), ARRAYS_TO_RAISE)
+    blocks = OF_BLOCKS if given.get("blocks_given", False) else ()
+    gathered = _gather(task, _members(task), (*ARRAYS_TO_RAISE, *blocks))
     shapes = _earlier_shapes(task, replace(gathered, changed=np.zeros(len(gathered.houses), np.bool_)))
     reach = terrain_reach(mesh) if isinstance(mesh, LayeredOptions) else 0.0
     shapes = _keep_within(task, shapes, gathered.houses)
@@ -329,6 +364,14 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
         gathered.houses, shapes, terrain, options, reserved=reserved, roof_points=roofs, trace=task.step
     )
     task.notes(city.notes)
+    kept = np.zeros(len(shapes), np.bool_)
+    kept[city.row] = True
+    roofs = keep_roof_points(roofs, kept)
+    zoned = bool(given.get("zones", ()))
+    level, place = np.empty(0, np.int8), np.empty((0, 2))
+    if zoned:
+        with task.step("2.3 zones of detail"):
+            city, roofs, level, place = _lower_detail(city, roofs, gathered, given.zones, options)
     model = city.model
     layers, parted = np.zeros(len(model), np.int32), 0
     if isinstance(mesh, LayeredOptions):
@@ -338,14 +381,41 @@ def _make_model(task: Task, mesh: LayeredOptions | AdaptiveOptions | None) -> Fa
                 model.polygons, model.roof, city.wall_ground, city.group, pairs, dtm, bounds, mesh
             )
     with task.step("2.4 fit of roofs"):
-        kept = np.zeros(len(shapes), np.bool_)
-        kept[city.row] = True
-        fidelity = measure_houses(keep_roof_points(roofs, kept), model.polygons, model.roofs)
-    task.put(**pack_model(make_buildings(city, fidelity, layers)))
+        fidelity = measure_houses(roofs, model.polygons, model.roofs)
+    buildings = replace(make_buildings(city, fidelity, layers), level=level, place=place)
+    task.put(**pack_model(buildings, zoned=zoned))
     counts = {"buildings": len(np.unique(model.house)), PARTS: len(model)}
     counts |= {name: n for name, n in city.counts.items() if name not in shapes.counts}
     counts |= {"roofs on another layer": parted} if parted else {}
+    counts |= {f"parts at level {LEVELS[k]}": int((level == k).sum()) for k in np.unique(level).tolist()}
     return {"n": len(model), "extent": extent, "counts": counts, "outline": city.outline}
+
+
+def _lower_detail(
+    city: City, roofs: RoofPoints, gathered: "_Gathered", zones: Zones, options: CityOptions
+) -> tuple[City, RoofPoints, NDArray[np.int8], NDArray[np.float64]]:
+    """Give each house the level of the zone that its point lies in, and tell levels and points.
+
+    A block has its own level, and its cell's point. In a zone of blocks, what is in no cell there is at 1.2.
+    """
+    houses = gathered.houses
+    house = np.searchsorted(houses.ids, city.model.house)  # ascending, see `_gather`
+    place = shapely.get_coordinates(shapely.point_on_surface(houses.polygons)).reshape(-1, 2)
+    block = gathered.block >= 0
+    level = np.where(block, gathered.block, np.minimum(find_levels(zones, place), BLOCK)).astype(np.int8)[house]
+    place = np.where(block[:, None], gathered.block_place, place)[house]
+    if not len(level):
+        return city, roofs, level, place
+    detail = np.minimum(level, BLOCK)
+    city, row = reduce_detail(
+        city,
+        detail,
+        step=options.roof_group,
+        clearance=options.roof_clearance,
+        tolerance=options.vertex_tolerance,
+    )
+    _, first = np.unique(row, return_index=True)
+    return city, merge_roof_points(roofs, row), level[first], place[first]
 
 
 def _keep_within(task: Task, shapes: Shapes, houses: Houses) -> Shapes:
@@ -407,11 +477,15 @@ def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
     """Read some arrays of the houses of the tile's clusters, by ascending id."""
     house, cluster, changed = (members.arrays[name] for name in ("house", "cluster", "changed"))
     several, order, other = [], [], [np.empty(0, np.bool_)]
+    level, at = [np.empty(0, np.int8)], [np.empty((0, 2))]
     for result in task.read("houses", (*arrays, "unmarked")):
         mine = np.flatnonzero((house[:, :2] == tile_key(result.name)).all(axis=1))
         several.append(take_houses(unpack_houses(result.arrays), house[mine, 2]))
         order.append(mine)
         other.append(result.arrays["unmarked"][house[mine, 2]])
+        n = len(result.arrays["unmarked"])
+        level.append(result.arrays.get("block", np.full(n, -1, np.int8))[house[mine, 2]])
+        at.append(result.arrays.get("block_place", np.full((n, 2), np.nan))[house[mine, 2]])
     rows = np.concatenate([np.empty(0, np.int64), *order])
     joined = join_houses(several)
     by_id = np.argsort(joined.ids, kind="stable")
@@ -419,21 +493,32 @@ def _gather(task: Task, members: Result, arrays: Sequence[str]) -> "_Gathered":
     of_part = houses.parts.house
     number = np.arange(len(of_part)) - np.searchsorted(of_part, of_part)
     place = np.column_stack((house[rows].reshape(-1, 3)[of_part], number)).astype(np.int64)
-    return _Gathered(houses, cluster[rows], changed[rows], np.concatenate(other)[by_id], place.reshape(-1, 4))
+    return _Gathered(
+        houses,
+        cluster[rows],
+        changed[rows],
+        place.reshape(-1, 4),
+        np.concatenate(other)[by_id],
+        np.concatenate(level)[by_id],
+        np.concatenate(at)[by_id],
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Gathered:
     """Houses of a tile's clusters, and whether roofs are of other classes than that of buildings.
 
-    ``place`` (p, 4) holds of each part its house's tile, row there, and number.
+    ``place`` (p, 4) holds of each part its house's tile, row there, and number; ``block`` (h,) and ``block_place``
+    (h, 2) level and point (m) of the houses that are blocks, -1 and NaN for others.
     """
 
     houses: Houses
     cluster: NDArray[np.int64]
     changed: NDArray[np.bool_]
-    unmarked: NDArray[np.bool_]
     place: NDArray[np.int64]
+    unmarked: NDArray[np.bool_]
+    block: NDArray[np.int8]
+    block_place: NDArray[np.float64]
 
 
 def _earlier_shapes(task: Task, gathered: _Gathered) -> Shapes:

@@ -17,6 +17,7 @@ from tiler.citymodels.cityjson import Attributes, write_city_blocks
 from tiler.citymodels.tables import (
     BUILDING_ARRAYS,
     ROOF_ARRAYS,
+    ZONE_ARRAYS,
     Buildings,
     join_buildings,
     take_buildings,
@@ -24,6 +25,9 @@ from tiler.citymodels.tables import (
     unpack_polygons,
     unpack_roofs,
 )
+from tiler.config.config import Config
+from tiler.config.step_options import ZONE_PARAMETERS
+from tiler.config.zones import LEVELS, LOD, LOD_POINT
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.store.checksums import FILES, state_files
@@ -32,11 +36,12 @@ from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL
 CELL = 1024.0  # side of the cells that buildings are sorted by (m), in the CRS
 
 
-def city_model_stages() -> list[Stage]:
+def city_model_stages(config: Config) -> list[Stage]:
     """Stages that write the city models."""
+    zones = ZONE_PARAMETERS if config.zoned else ()
     return [
         Stage("citymodel-full", Scope.REGION, write_full_model, (Read("houses"),)),
-        Stage("citymodel", Scope.REGION, write_simple_model, (Read("model"),)),
+        Stage("citymodel", Scope.REGION, write_simple_model, (Read("model"),), zones),
     ]
 
 
@@ -182,7 +187,8 @@ def _check_numbers(task: Task, stage: str, prefix: str, survey: _Survey) -> None
 
 def _by_cell(task: Task, stage: str, prefix: str, survey: _Survey) -> Iterator[Buildings]:
     """Give the buildings of one cell after the other, by id, holding the tiles of a cell and of the one before."""
-    arrays = [prefix + array for array in BUILDING_ARRAYS]
+    zoned = stage == "model" and task.parameters.get("zones", ())
+    arrays = [prefix + array for array in (*BUILDING_ARRAYS, *(ZONE_ARRAYS if zoned else ()))]
     held: dict[int, tuple[Buildings, NDArray[np.int64]]] = {}
     cells, start = np.unique(survey.cell, axis=0, return_index=True)
     for cell, tiles in zip(cells, np.split(survey.tile, start[1:]), strict=False):
@@ -201,6 +207,8 @@ def _tell(buildings: Buildings, fits: RoofFits | None) -> Attributes:
     told: dict[str, Sequence[object]] = report_buildings(
         buildings.model, buildings.roof_source, buildings.measured_roof, buildings.fidelity
     )
+    if (buildings.level >= 0).any():
+        told |= {LOD: [LEVELS[level] for level in buildings.level.tolist()], LOD_POINT: buildings.place.tolist()}
     method, fallback = buildings.roof_method, buildings.roof_fallback
     if fits is not None and (method != NOT_FITTED).any():
         roofs = describe_roofs(buildings.model, method, fallback, buildings.roof_form, buildings.fidelity)

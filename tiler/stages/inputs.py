@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from pipeline.data.citymodel import Footprints, number_ids, take_footprints
 from pipeline.data.classes import GROUND, KEY_POINT, WATER
 from pipeline.data.errors import InputError
-from pipeline.data.notes import Note
 from pipeline.data.pointcloud import rename_classes
 from pipeline.points_terrain.alignment import REACH
 from pipeline.points_terrain.ground_check import LEAST_STEP, compare_ground, is_upside_down
@@ -36,7 +35,7 @@ from tiler.cityinput.rasters import REACH as RASTER_REACH
 from tiler.cityinput.sources import CLOUD, MODEL, kind_of
 from tiler.citymodels.tables import pack_polygons
 from tiler.config.config import Config
-from tiler.engine.run_context import find_owned, tile_key
+from tiler.engine.run_context import tile_key
 from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.footprints.footprint_index import FootprintBlock, block_footprints, scan_footprints
@@ -44,6 +43,7 @@ from tiler.footprints.model_places import ModelPlaces, give_way
 from tiler.georeference.frame import Frame
 from tiler.objects.places import is_url, place
 from tiler.pointclouds.ingest import CELL, KEY_POINTS, read_cells
+from tiler.stages.blocks import BLOCK_ROWS, block_stages, replace_by_blocks
 from tiler.stages.city_files import (
     MODEL_PARAMETERS,
     list_kind,
@@ -52,7 +52,18 @@ from tiler.stages.city_files import (
     read_terrain_file,
     sample_rasters,
 )
-from tiler.stages.readers import clip, extent_of, grow, hull, join_rasters, read_bands, read_outlines, read_units
+from tiler.stages.readers import (
+    clip,
+    extent_of,
+    grow,
+    hull,
+    join_rasters,
+    own_notes,
+    put_rows,
+    read_bands,
+    read_outlines,
+    read_units,
+)
 
 MODEL_OUTLINES = "model-outlines"  # stage of the buildings of city models, where there are footprints, too
 
@@ -66,8 +77,14 @@ def input_stages(config: Config) -> list[Stage]:
     if config.terrain:
         ground, around = (*ground, "terrain_given"), max(around, RASTER_REACH)
     both = bool(config.buildings and config.footprints)
-    outlines = (Read("footprints"), *([Read(MODEL_OUTLINES)] if both else []))
+    blocks = block_stages(config)
+    outlines = (
+        Read("footprints"),
+        *([Read(MODEL_OUTLINES)] if both else []),
+        *(Read(stage.name) for stage in blocks),
+    )
     return [
+        *blocks,
         Stage(
             "points",
             Scope.FILE,
@@ -259,45 +276,15 @@ def read_models_beside(task: Task) -> Facts:
     return facts
 
 
-def put_rows(task: Task, found: Iterable[FootprintBlock], source: str, empty: str = "terrain only") -> Facts:
-    """Write footprints or other polygons one behind the other.
-
-    A note says what it means that there is none, unless `source` is empty.
-    """
-    n = first = n_bytes = n_letters = 0
-    blocks, part_like = [0], set[str]()
-    for block in found:
-        task.notes(block.notes)
-        rows = block.rows
-        names = [name.encode() for name in rows.ids.tolist()]
-        letters = np.frombuffer(b"".join(names), np.uint8)
-        # Where rows end in the whole: a tile finds its own without those before them.
-        task.append(
-            wkb=rows.wkb,
-            wkb_end=n_bytes + rows.wkb_start[1:] - rows.wkb_start[0],
-            id=letters,
-            id_end=n_letters + np.cumsum([len(name) for name in names], dtype=np.int64),
-            given_height=rows.given_height,
-            forms=rows.forms,
-            box=rows.box.reshape(-1, 4),
-            cell_box=block.cell_box.reshape(-1, 4),
-            cell_start=block.start[:-1] + n,
-        )
-        n, n_bytes, n_letters = n + len(rows), n_bytes + len(rows.wkb), n_letters + len(letters)
-        first += len(block.cell)
-        blocks.append(first)
-        part_like |= {name for name in rows.ids.tolist() if "-part" in name}
-    if n == 0 and source:
-        task.note(Note("no-footprints-in-region", source, detail=empty))
-    task.put(block=np.array(blocks), end=np.array([n]))
-    return {"n": n, "part_like": sorted(part_like)}
-
-
 def take_outlines(task: Task) -> Facts:
     """Take the footprints that meet a tile (step 1.2); beside a city model, its buildings and what these leave."""
     footprints = read_outlines(task, shift=task.parameters.footprints_shift)
     if MODEL_OUTLINES in task.refs:
         footprints = _join_models(task, footprints)
+    counts = {}
+    if BLOCK_ROWS in task.refs:
+        footprints, n_replaced = replace_by_blocks(task, footprints)
+        counts = {"counts": {"footprints replaced by blocks": n_replaced}}
     task.put(
         **pack_polygons(footprints.polygons, "outline"),
         ids=footprints.ids,
@@ -307,7 +294,7 @@ def take_outlines(task: Task) -> Facts:
     extent = extent_of(footprints.polygons)
     # A house keeps within its footprint, and within the region.
     inside = None if extent is None else clip(extent, task.context.bounds)
-    return {"n": len(footprints.ids), "extent": inside}
+    return {"n": len(footprints.ids), "extent": inside, **counts}
 
 
 def _join_models(task: Task, footprints: Footprints) -> Footprints:
@@ -316,8 +303,7 @@ def _join_models(task: Task, footprints: Footprints) -> Footprints:
     near = read_outlines(task, hull(task.box, extent_of(footprints.polygons)), stage=MODEL_OUTLINES)
     (found,) = task.read(MODEL_OUTLINES, ("number",))
     left, notes = give_way(footprints, ModelPlaces(near.polygons, found.arrays["number"]), bounds)
-    mine = find_owned(task.box, bounds, np.array([(note.x, note.y) for note in notes]).reshape(-1, 2))
-    task.notes(note for note, own in zip(notes, mine, strict=True) if own)
+    task.notes(own_notes(task, notes))
     own = take_footprints(near, shapely.intersects(near.polygons, shapely.box(*task.box)))
     return Footprints(
         np.concatenate((own.polygons, left.polygons)),

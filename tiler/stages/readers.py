@@ -1,6 +1,6 @@
 """What stages read of each other's results: points, terrain, houses and buildings in a box."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.citymodel import Footprints
 from pipeline.data.classes import BUILDING, NEVER_ROOF
+from pipeline.data.notes import Note
 from pipeline.data.pointcloud import PointCloud
 from pipeline.geometry.inside import Cover, are_covered
 from pipeline.points_terrain.ground_filter import FILTER_REACH, classify_above, find_terrain
@@ -25,9 +26,10 @@ from pipeline.points_terrain.raster import (
 from pipeline.points_terrain.terrain import cut_terrain, join_terrain
 from stitch.tiling.grid import Bounds
 from tiler.citymodels.tables import NEAR_ARRAYS, NearBuildings, join_near, take_near, unpack_polygons
-from tiler.engine.stage import Box
+from tiler.engine.run_context import find_owned
+from tiler.engine.stage import Box, Facts
 from tiler.engine.task import Task
-from tiler.footprints.footprint_index import FootprintRows, join_footprints, select_footprints
+from tiler.footprints.footprint_index import FootprintBlock, FootprintRows, join_footprints, select_footprints
 from tiler.pointclouds.cells import select_cells
 from tiler.pointclouds.ingest import CELL
 from tiler.store.result_file import CHUNK_BYTES
@@ -284,6 +286,47 @@ def _cut_ranges(ends: NDArray[np.int64], ranges: Ranges) -> tuple[Ranges, NDArra
         spans.append((int(found[0]), int(found[-1])))
         sizes.append(np.diff(found))
     return spans, np.cumsum(np.concatenate(sizes))
+
+
+def put_rows(task: Task, found: Iterable[FootprintBlock], source: str, empty: str = "terrain only") -> Facts:
+    """Write footprints or other polygons one behind the other.
+
+    A note says what it means that there is none, unless `source` is empty.
+    """
+    n = first = n_bytes = n_letters = 0
+    blocks, part_like = [0], set[str]()
+    for block in found:
+        task.notes(block.notes)
+        rows = block.rows
+        names = [name.encode() for name in rows.ids.tolist()]
+        letters = np.frombuffer(b"".join(names), np.uint8)
+        # Where rows end in the whole: a tile finds its own without those before them.
+        task.append(
+            wkb=rows.wkb,
+            wkb_end=n_bytes + rows.wkb_start[1:] - rows.wkb_start[0],
+            id=letters,
+            id_end=n_letters + np.cumsum([len(name) for name in names], dtype=np.int64),
+            given_height=rows.given_height,
+            forms=rows.forms,
+            box=rows.box.reshape(-1, 4),
+            cell_box=block.cell_box.reshape(-1, 4),
+            cell_start=block.start[:-1] + n,
+        )
+        n, n_bytes, n_letters = n + len(rows), n_bytes + len(rows.wkb), n_letters + len(letters)
+        first += len(block.cell)
+        blocks.append(first)
+        part_like |= {name for name in rows.ids.tolist() if "-part" in name}
+    if n == 0 and source:
+        task.note(Note("no-footprints-in-region", source, detail=empty))
+    task.put(block=np.array(blocks), end=np.array([n]))
+    return {"n": n, "part_like": sorted(part_like)}
+
+
+def own_notes(task: Task, notes: Sequence[Note]) -> list[Note]:
+    """Take the notes whose place is the tile's."""
+    places = np.array([(note.x, note.y) for note in notes]).reshape(-1, 2)
+    mine = find_owned(task.box, task.context.bounds, places)
+    return [note for note, own in zip(notes, mine.tolist(), strict=True) if own]
 
 
 def read_buildings(task: Task, box: Box) -> NearBuildings:

@@ -15,10 +15,12 @@ from pipeline.data.errors import InputError
 from pipeline.data.mesh import Region, TetMesh
 from pipeline.data.roofs import Roofs, Weld
 from tiler.config.config import roofs_stay_flat
+from tiler.config.zone_levels import read_described
+from tiler.config.zones import Zones
 from tiler.store.json_stream import iterate_members, read_members
 
 SCHEMA = 1  # of run.json
-RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts", "land_cover")
+RECORD_MEMBERS = ("schema", "status", "error", "region", "counts", "parameters", "parts", "land_cover", "zones")
 TILES = "tiles"
 EASED = "roof nodes moved for cells"  # a count: roofs at vertices of outlines
 PARTS = "building parts"  # a count: those of the city model, of which a building has one or several
@@ -113,6 +115,8 @@ class RunRecord:
         Whether cells tell their leaf area density.
     leaf_column : float
         Side of the columns in which that is known (m).
+    zones : Zones
+        Zones of detail; none where all buildings have one level.
     """
 
     status: str
@@ -129,6 +133,7 @@ class RunRecord:
     dtm_spacing: float = 1.0
     leaves: bool = False
     leaf_column: float = 2.0
+    zones: Zones = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +197,7 @@ def read_run_record(path: Path) -> RunRecord:
         given = record.get("parameters", {})
         leaves = bool(given.get("vegetation_classes") or given.get("trees"))
         cell = float(given.get("leaf_column", 2.0))
+        zones = read_described(record.get("zones") or ())
         spacing = float(given.get("dtm_spacing", 1.0))
         ground = tuple(GroundPatch(str(row["patch"]), _optional(row["z0 (m)"])) for row in found)
     except WRONG_FIELD as error:
@@ -215,6 +221,7 @@ def read_run_record(path: Path) -> RunRecord:
         spacing,
         leaves,
         cell,
+        zones,
     )
 
 

@@ -50,10 +50,10 @@ WORDS: dict[str, Words] = {
         DROPPED, "{n} footprint[s] without an area [was|were] dropped", "it has no area at the tolerance"
     ),
     "footprint-in-model": Words(
-        DROPPED, "{n} footprint[s] [was|were] left out: buildings of the city model stand there"
+        DROPPED, "{n} footprint[s] [was|were] left out: buildings of the city model or blocks stand there"
     ),
     "footprint-cut-by-model": Words(
-        REPAIRED, "{n} footprint[s] [was|were] cut where a building of the city model stands"
+        REPAIRED, "{n} footprint[s] [was|were] cut where a building of the city model or a block stands"
     ),
     "footprint-lost": Words(
         DROPPED,

@@ -17,6 +17,8 @@ STAGES: dict[str, tuple[str, str]] = {
     "terrain": (TERRAIN, "grid"),
     "model-outlines": (BUILDINGS, "city models"),
     "footprints": (BUILDINGS, "footprint file"),
+    "block-cells": (BUILDINGS, "cells of blocks"),
+    "blocks": (BUILDINGS, "blocks"),
     "outlines": (BUILDINGS, "footprints of tiles"),
     "reserved": (BUILDINGS, "ids"),
     "alignment": (BUILDINGS, "footprints over roofs"),

@@ -231,8 +231,9 @@ def _run(
 def _plan(config: Config, out: Path, say: Callable[[str], None], *, fresh: bool) -> Plan:
     """Plan a run; refuse inputs among its results and, unless it begins anew, the folder of another region."""
     plan = make_plan(config, say)
-    more = [config.refine_areas, config.land_cover_table, config.trees]
-    files = [*config.building_files, *config.land_cover, *filter(None, more)]
+    more = [config.refine_areas, config.generalised, config.land_cover_table, config.trees]
+    zones = config.zones_asked.files if config.zoned else ()
+    files = [*config.building_files, *config.land_cover, *zones, *filter(None, more)]
     for warning in _foresee(plan, config):
         plan.messages.append(warning)
         say(warning)

@@ -17,6 +17,7 @@ from tiler.landcover.cover_stages import cover_file_stages, cover_stages
 from tiler.landcover.cover_table import read_table
 from tiler.landcover.water_points import water_point_stages
 from tiler.objects.places import identify, place
+from tiler.planning.lod_zones import read_zones
 from tiler.planning.own_stages import CORE_STAGE, OwnStages
 from tiler.planning.plan import Plan
 from tiler.planning.refinements import read_refinements
@@ -49,7 +50,7 @@ def run_stages(engine: Engine, config: Config) -> int:
     rounds = run_city_stages(engine, config)
     domain = settle_domain(engine, config)
     # Nothing waits for these: first in a call, so last of what may run, they fill the time in which others wait.
-    of_model = [fit_stage(config), *city_model_stages(), *canopy_stages(config)]
+    of_model = [fit_stage(config), *city_model_stages(config), *canopy_stages(config)]
     if config.footprints and not config.align:
         of_model = [*alignment_stages(config), *of_model]
     meshed = [*cover_stages(config), *mesh_stages(config, domain), *piece_stages(config)]
@@ -146,9 +147,11 @@ def make_engine(
         footprints_frame=dataclasses.astuple(plan.georeference.footprints),
         footprints_shift=(0.0, 0.0),
         refinements=read_refinements(config, plan.region),
+        zones=read_zones(config, plan.region),
         cover_table=tuple(map(dataclasses.astuple, read_table(config))),
         land_cover_identity=tuple(map(identify, map(place, config.land_cover))),
         trees_identity=identify(place(config.trees)) if config.trees else "",
+        generalised_identity=identify(place(config.generalised)) if config.generalised else "",
         cover_reach=cover_reach(config) if config.covered else 0.0,
     )
     return Engine(

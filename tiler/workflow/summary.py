@@ -12,6 +12,7 @@ from pipeline.points_terrain.terrain_fill import RIM as FAR_NODES
 from pipeline.simplification.house_clusters import add_counts
 from tiler.config.config import Config
 from tiler.config.domain_height import settle
+from tiler.config.zone_levels import describe_zones
 from tiler.engine.engine import Engine
 from tiler.engine.records import Records
 from tiler.engine.run_context import absent_tiles, tile_name
@@ -21,6 +22,7 @@ from tiler.landcover.cover_table import describe_patches, read_table
 from tiler.mesh_files.mesh_parts import MESH_IN_PARTS, describe_parts, note_parts
 from tiler.objects.places import place
 from tiler.planning.establish_georeference import FOOTPRINTS
+from tiler.planning.lod_zones import read_zones
 from tiler.planning.own_stages import CORE_STAGE
 from tiler.planning.plan import Plan
 from tiler.report.left_out import describe_left_out, report_left_out
@@ -119,6 +121,7 @@ def summarise_run(
             for name in sorted(plan.layout.tiles.keys() - missing.tiles.keys())
         },
         **({"land_cover": _describe_cover(records, config)} if config.covered else {}),
+        **({"zones": describe_zones(read_zones(config, plan.region))} if config.zoned else {}),
         **describe_missing(missing, place(config.out)),
         "counts": counts,
         **empty,

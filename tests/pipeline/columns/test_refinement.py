@@ -156,7 +156,7 @@ def test_only_a_refined_mesh_depends_on_what_is_refined() -> None:
     assert halos[1]["model"] >= halos[0]["model"] + 40
     assert idle_parameters(make_config({"wall_growth": 1.3, "refine_growth": 1.3, "refine_attribute": "a"})) == [
         "wall_growth = 1.3 has no effect: it counts with wall_size above 0",
-        "refine_growth = 1.3 has no effect: it counts with refine, refine_areas",
+        "refine_growth = 1.3 has no effect: it counts with refine, refine_areas, focus, lod_zones",
         "refine_attribute = a has no effect: it counts with refine_areas",
     ]
 

@@ -283,6 +283,7 @@ def test_what_is_printed_fits_into_80_columns(
         (["CITY", "--footprints", "missing.shp"], 1),
         (["CITY", "--land-cover", "missing.gpkg"], 1),
         (["CITY", "--trees", "missing.gpkg"], 1),
+        (["CITY", "--generalised", "missing.gpkg"], 1),
         (["CITY", "--tile-size", "100"], 2),
         (["CITY", "--bounds", "0", "0", "10", "10"], 1),
         (["CITY", "--footprints", "SHAPES", "--id-attribute", "none"], 2),

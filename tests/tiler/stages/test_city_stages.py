@@ -19,6 +19,7 @@ from tests.helpers.cityjson_rules import file_faults, solid_faults
 from tiler.citymodels import cityjson
 from tiler.citymodels.cityjson import read_city_model
 from tiler.citymodels.tables import Buildings, no_buildings, pack_buildings, take_buildings
+from tiler.config.config import Config
 from tiler.engine.engine import Engine
 from tiler.engine.executor import Serial
 from tiler.engine.stage import Box, Facts, Layout, Scope, Stage
@@ -104,7 +105,9 @@ def write_tiled(out: Path, town: Buildings, size: float) -> Store:
     context = Context(town, dict(owned), str(out))
     layout = Layout(tiles=tiles, bounds=BOUNDS)
     engine = Engine(out / "store.zarr", layout, parameters=None, context=context, executor=Serial())
-    engine.run(Stage("houses", Scope.TILE, put_town), Stage("model", Scope.TILE, put_town), *city_model_stages())
+    engine.run(
+        Stage("houses", Scope.TILE, put_town), Stage("model", Scope.TILE, put_town), *city_model_stages(Config())
+    )
     return engine.store
 
 

@@ -1,0 +1,166 @@
+"""Zones of detail in one run: levels by the points of houses, the focus as without, proved from the files."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+
+from pipeline.data.citymodel import Prisms
+from pipeline.data.errors import ConfigError
+from tests.helpers.tiles import CRS, hash_files, make_town, put_roofs, run_of, shape_city, terraces, write_town
+from tiler.check.check import check_run
+from tiler.check.zone_proofs import ZoneProofs
+from tiler.citymodels.building_index import index_buildings
+from tiler.citymodels.tables import unpack_buildings
+from tiler.config.config import make_config
+from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
+from tiler.pictures.picture_data import load_city, load_levels
+from tiler.planning.lod_zones import read_zones
+from tiler.planning.region import Region
+from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD
+from tiler.store.results import StoredTerrain
+from tiler.store.run_folder import read_run_record
+from tiler.store.store import Store
+
+SIZE = 84.0  # m, of a tile: the least for cells of 6 m
+WEST, SOUTH = 3786 * SIZE, 76179 * SIZE
+BOUNDS = (WEST, SOUTH, WEST + 2 * SIZE, SOUTH + SIZE)
+CENTRE = f"{WEST + SIZE:g},{SOUTH + SIZE / 2:g}"  # on the seam
+ZONES = {"lod_zones": [f"{CENTRE},25,2.2,4.5", f"{CENTRE},50,1.3,6", "rest,1.2"]}
+
+
+SIZES = {"tile_size": SIZE, "mesh_size": 6.0, "domain_height": 24.0}
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    houses = terraces(BOUNDS, seed=4)
+    values = write_town(tmp_path_factory.mktemp("town"), put_roofs(make_town(BOUNDS, houses, seed=4), seed=4))
+    return values | SIZES
+
+
+def models(out: Path) -> dict[str, tuple[bytes, ...]]:
+    """What the store has of each building part, by id."""
+    rows = {}
+    for tile in sorted((out / "store.zarr" / "model").iterdir()):
+        model: Prisms = unpack_buildings(Store(out / "store.zarr").read("model", tile.stem)[0]).model
+        wkb = shapely.to_wkb(model.polygons)
+        for k, name in enumerate(model.ids.tolist()):
+            roof = (model.roofs.plane, model.roofs.origin, model.roofs.limits, model.ground)
+            rows[name] = (wkb[k], *(values[k].tobytes() for values in roof))
+    return rows
+
+
+def prove_levels(text: str, zones: Zones, out: Path, folder: Path) -> set[str]:
+    """Faults of a city model in place of that of a run."""
+    (folder / CITY_MODEL).write_text(text)
+    proofs = ZoneProofs(zones)
+    with index_buildings(folder / CITY_MODEL, proofs.add):
+        return {fault.kind for fault in proofs.prove(out / FULL_CITY_MODEL).faults}
+
+
+def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path: Path) -> None:
+    out = tmp_path / "zones"
+    record = run_of(town, out, **ZONES)
+    report = check_run(out, StoredTerrain)
+    assert report.ok, "\n".join(report.lines())
+    assert {f"parts at level {level}" for level in LEVELS[:3]} <= record["counts"].keys()
+    shape_city(town, tmp_path / "full")
+    mine, full = models(out), models(tmp_path / "full")
+    text = (out / CITY_MODEL).read_text()
+    objects = json.loads(text)["CityObjects"]
+    told = {name: row["attributes"] for name, row in objects.items() if "attributes" in row}
+    focus = [name for name, row in told.items() if row[LOD] == "2.2"]
+    assert len(focus) > 10
+    assert all(mine[name] == full[name] for name in focus)
+    assert not all(mine[name] == full.get(name) for name in mine)
+    city = load_city(out)
+    level = {row["number"]: LEVELS.index(row[LOD]) for row in told.values()}
+    shown = load_levels(out, city)
+    built = city.building >= 0
+    assert shown[built].tolist() == [level[number] for number in city.building[built].tolist()]
+    assert set(shown[~built].tolist()) == {0, 1, 2}
+    # A building of another level than its zone asks for, one without, and a point elsewhere are found.
+    x, y = next(row[LOD_POINT] for row in told.values() if row[LOD] == "1.3")
+    zones = read_run_record(out / RUN_RECORD).zones
+    for was, now, kind in (
+        (f'"{LOD}":"1.2"', f'"{LOD}":"1.3"', "level-of-zone"),
+        (f'"{LOD}":"2.2"', f'"{LOD}":"1.2"', "level-parts"),
+        (f'"{LOD}":"1.2",', "", "level-not-stated"),
+        (f'"{LOD_POINT}":[{x!r},{y!r}]', f'"{LOD_POINT}":[{x + 60!r},{y!r}]', "level-point"),
+        (f'"{LOD}":"2.2"', f'"{LOD}":"1.3"', "level-roof"),
+    ):
+        assert was in text
+        assert kind in prove_levels(text.replace(was, now), zones, out, tmp_path)
+
+
+def write_blocks(path: Path) -> None:
+    """Two cells side by side, each with a block of LoD0C and of LoD0B, and one of LoD0A for both."""
+    middle = WEST + 0.9 * SIZE
+    cells = [shapely.box(WEST, SOUTH, middle, BOUNDS[3]), shapely.box(middle, SOUTH, *BOUNDS[2:])]
+    layers: dict[str, tuple[list[shapely.Geometry], dict[str, list[Any]]]] = {
+        "cells": (cells, {"id": ["west", "east"], "parent": ["both"] * 2}),
+        "lod0c": (
+            [cell.buffer(-12) for cell in cells],
+            {"id": ["west/a", "east/b"], "cell": ["west", "east"], "height": [9.0, 11.0]},
+        ),
+        "lod0b": (
+            [cell.buffer(-6) for cell in cells],
+            {"id": ["west", "east"], "cell": ["west", "east"], "height": [8.0, 10.0]},
+        ),
+        "lod0a": ([shapely.union_all(cells).buffer(-6)], {"id": ["both"], "cell": ["west"], "height": [9.0]}),
+    }
+    for name, (shapes, columns) in layers.items():
+        data = [np.array(values, object if isinstance(values[0], str) else float) for values in columns.values()]
+        wkb = np.array(shapely.to_wkb(shapes), object)
+        pyogrio.raw.write(
+            path, wkb, data, list(columns), layer=name, geometry_type="Polygon", crs=CRS, append=path.exists()
+        )
+
+
+def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp_path: Path) -> None:
+    write_blocks(tmp_path / "blocks.gpkg")
+    zones = [f"{WEST + 0.4 * SIZE:g},{SOUTH + SIZE / 2:g},20,2.2,5", "rest,0A"]
+    values = town | {
+        "lod_zones": zones,
+        "generalised": str(tmp_path / "blocks.gpkg"),
+        "out": str(tmp_path / "out"),
+    }
+    shape_city(values, tmp_path / "out")
+    text = (tmp_path / "out" / CITY_MODEL).read_text()
+    objects = json.loads(text)["CityObjects"]
+    told = {name: row["attributes"] for name, row in objects.items() if "attributes" in row}
+    # The western cell is not at 0A, so that the eastern one is at 0B; what is beyond the focus has one height.
+    assert {name for name, row in told.items() if row[LOD] == "0B"} == {"east"}
+    np.testing.assert_allclose(told["east"]["height"], 10.0)
+    assert {row[LOD] for row in told.values()} == {"2.2", "1.2", "0B"}
+    assert max(row[LOD_POINT][0] for row in told.values() if row[LOD] != "0B") < WEST + 0.9 * SIZE
+    config = make_config(values)
+    asked = read_zones(config, Region(BOUNDS, CRS, SIZE))
+    x, y = next(row[LOD_POINT] for row in told.values() if row[LOD] == "1.2")
+    assert not prove_levels(text, asked, tmp_path / "out", tmp_path)
+    assert prove_levels(text, (*asked[:-1], ("0C", 6.0, "")), tmp_path / "out", tmp_path) == {"level-of-zone"}
+    moved = text.replace(f"[{x!r},{y!r}]", f"[{WEST + 1.5 * SIZE!r},{y!r}]")
+    assert "building-in-block" in prove_levels(moved, asked, tmp_path / "out", tmp_path)
+    shape_city(values | {"lod_zones": [zones[0], "rest,1.2"]}, tmp_path / "none")  # no cell is at such a level
+    with pytest.raises(ConfigError, match=r"level 0A takes blocks .*--generalised"):
+        make_config(town | {"lod_zones": zones})
+
+
+@pytest.mark.long
+def test_zones_depend_on_no_region_and_no_worker(tmp_path: Path) -> None:
+    wide = (WEST - SIZE, SOUTH - SIZE, WEST + 3 * SIZE, SOUTH + 2 * SIZE)
+    houses = put_roofs(make_town(wide, terraces(wide, seed=5), relief=8, seed=5), seed=5)
+    values = write_town(tmp_path / "town", houses, files=(2, 1)) | SIZES
+    zones = {"lod_zones": [f"{WEST + SIZE:g},{SOUTH + SIZE / 2:g},60,2.2,4", "rest,1.2"]}
+    run_of(values, tmp_path / "one", **zones)
+    run_of(values, tmp_path / "two", workers=2, **zones)
+    assert hash_files(tmp_path / "one") == hash_files(tmp_path / "two")
+    run_of(values | {"bounds": (*wide[:2], WEST + 2 * SIZE, wide[3])}, tmp_path / "less", **zones)
+    for folder in ("mesh", "boundary"):
+        (path,) = (tmp_path / "one" / folder).glob("3786_76179.vt?")
+        assert path.read_bytes() == (tmp_path / "less" / folder / path.name).read_bytes()

@@ -1,0 +1,132 @@
+"""The proof of `citystitch check` that each building has the level of detail of the zone of its point."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from tiler.check.proofs import Fault, Proof, find_faults
+from tiler.citymodels.building_index import BuildingRow, Vertices, index_buildings
+from tiler.config.zone_levels import find_levels
+from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
+
+WITHIN = 0.002  # m; a point lies in its building's outline, whose coordinates are rounded to 1 mm
+COMMON = 0.01  # m; parts of a house share no longer wall than this where they have one height
+PLANES, BLOCK, TOP = LEVELS.index("2.2"), LEVELS.index("1.2"), LEVELS.index("0A")
+DETAILS = {
+    "level-not-stated": f"a building has no attribute {LOD!r}, or no point {LOD_POINT!r}; run again",
+    "level-of-zone": "a building has another level of detail than the zone of its point asks for",
+    "level-point": f"the point of a building is outside of its outline before simplification; bound: {WITHIN:g} m",
+    "level-roof": "a roof slopes, where its building's level has flat ones alone",
+    "building-in-block": "the point of a building lies in a block that stands for it",
+    "level-parts": "parts of a house at level 1.2 share a wall; they are one outline there",
+}
+
+
+class ZoneProofs:
+    """Reads the objects of a city model one at a time, and keeps level and point of each house.
+
+    Parameters
+    ----------
+    zones : Zones
+        The zones of the run.
+    """
+
+    def __init__(self, zones: Zones) -> None:
+        self._zones = zones
+        self._names: list[str] = []
+        self._rows: list[tuple[float, float, float, int]] = []
+        self._parts: dict[str, list[Any]] = {}
+        self._faults: list[tuple[str, float, float, float]] = []
+
+    def add(self, name: str, thing: Mapping[str, Any], _: Vertices, building: BuildingRow | None) -> None:
+        """Look at an object; parameters as of `SolidProofs.add`."""
+        if building is None:
+            return
+        values = thing["attributes"]
+        level, point = values.get(LOD), values.get(LOD_POINT)
+        house = thing.get("parents", [name])[0]
+        inside = building.footprint.representative_point()
+        place = (inside.x, inside.y, building.roof)
+        if level not in LEVELS or not isinstance(point, list) or len(point) != 2:
+            self._faults.append(("level-not-stated", *place))
+            return
+        number = LEVELS.index(level)
+        self._names.append(house)
+        self._rows.append((float(point[0]), float(point[1]), building.roof, number))
+        if number != PLANES and any(building.plane[:2]):
+            self._faults.append(("level-roof", *place))
+        if level == "1.2" and "parents" in thing:
+            self._parts.setdefault(house, []).append(building.footprint)
+
+    def prove(self, full_model: Path) -> Proof:
+        """Hold points against outlines of houses before they were simplified, and levels against zones.
+
+        Parameters
+        ----------
+        full_model : Path
+            The city model before it was simplified.
+        """
+        rows = np.array(self._rows, np.float64).reshape(-1, 4)
+        level = rows[:, 3].astype(np.int64)
+        found = find_levels(self._zones, rows[:, :2])
+        found = np.where(level <= BLOCK, np.minimum(found, BLOCK), found)  # a building that is in no cell
+        found = np.where(level == TOP - 1, np.minimum(found, TOP - 1), found)  # not all cells of a block are at 0A
+        within, blocks = self._look_up(full_model, rows)
+        covered = np.zeros(len(rows), np.bool_)
+        single = np.flatnonzero(level <= BLOCK)
+        tree = shapely.STRtree(blocks)
+        covered[single[tree.query(shapely.points(rows[single, :2]), predicate="within")[0]]] = True
+        faults = [
+            *self._told(),
+            *_fault("level-of-zone", rows[level != found]),
+            *_fault("level-point", rows[~within & (level <= BLOCK)]),
+            *_fault("building-in-block", rows[covered]),
+            *_fault("level-parts", np.array(self._common_walls()).reshape(-1, 3)),
+        ]
+        count = np.bincount(level, minlength=len(LEVELS))
+        shown = ", ".join(f"{n} of {name}" for name, n in zip(LEVELS, count.tolist(), strict=True) if n)
+        claim = f"{len(rows)} building parts have the level of detail of the zone of their point"
+        return Proof(f"{claim}: {shown or 'none'}", tuple(faults))
+
+    def _told(self) -> list[Fault]:
+        kinds = sorted({kind for kind, *_ in self._faults})
+        return [
+            fault
+            for kind in kinds
+            for fault in _fault(kind, np.array([place for other, *place in self._faults if other == kind]))
+        ]
+
+    def _look_up(self, full_model: Path, rows: NDArray[np.float64]) -> tuple[NDArray[np.bool_], list[Any]]:
+        """Tell which points are in the outline of their house before simplification, and give those of blocks."""
+        within, blocks, of_house = np.zeros(len(rows), np.bool_), list[Any](), dict[str, list[int]]()
+        for row, name in enumerate(self._names):
+            of_house.setdefault(name, []).append(row)
+
+        def see(name: str, _: Any, __: Vertices, building: BuildingRow | None) -> None:
+            mine = of_house.get(name, [])
+            if building is not None and mine:
+                within[mine] = shapely.dwithin(building.footprint, shapely.points(rows[mine, :2]), WITHIN)
+                if rows[mine[0], 3] > BLOCK:
+                    blocks.append(building.footprint)
+
+        with index_buildings(full_model, see):
+            return within, blocks
+
+    def _common_walls(self) -> list[tuple[float, float, float]]:
+        places = []
+        for parts in self._parts.values():
+            for k, part in enumerate(parts):
+                for other in parts[:k]:
+                    common = shapely.intersection(shapely.boundary(part), shapely.boundary(other))
+                    if shapely.length(common) > COMMON:
+                        x, y = shapely.get_coordinates(common)[0].tolist()
+                        places.append((x, y, 0.0))
+        return places
+
+
+def _fault(kind: str, places: NDArray[np.float64]) -> list[Fault]:
+    return list(find_faults(kind, places.reshape(len(places), -1)[:, :3], DETAILS[kind])) if len(places) else []

@@ -1,0 +1,69 @@
+"""Zones with a level of detail: circles, and polygons of vector files."""
+
+import numpy as np
+import pyproj
+import shapely
+
+from pipeline.data.errors import InputError
+from tiler.config.config import Config, check_blocks
+from tiler.config.zones import LEVELS, Zones, check_level, check_size
+from tiler.footprints.plan_shapes import scan_shapes
+from tiler.objects.places import place
+from tiler.planning.region import Region
+from tiler.vectors.lengths import number_of
+
+MOST_ZONES = 1000  # every task has them
+
+
+def read_zones(config: Config, region: Region) -> Zones:
+    """Read the zones of a run, and the level of the rest; none without zones.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters of the run.
+    region : Region
+        The region, in whose CRS places are given.
+
+    Returns
+    -------
+    Zones
+        The finest level first, the rest last; places as they are, wherever they lie.
+
+    Raises
+    ------
+    ConfigError
+        If a level or a size is out of bounds, or takes blocks that are not given.
+    InputError
+        If a file cannot be read, has features without level, size or area, or too many.
+    """
+    if not config.zoned:
+        return ()
+    asked = config.zones_asked
+    zones = {
+        (circle.level, circle.size, shapely.to_wkb(make_shape(*circle.place), hex=True, byte_order=1))
+        for circle in asked.circles
+    }
+    for name in asked.files:
+        crs = pyproj.CRS.from_user_input(region.crs)
+        shapes = scan_shapes(place(name), ["level", "size"], "lod_zones", crs=crs, bounds=region.bounds)
+        for subject, geometry, (level, value) in shapes:
+            size = number_of(value)
+            if np.isnan(size) or level is None or not geometry.area > 0:
+                raise InputError(f"{subject}: a level, a size in metres and an area expected; mend or remove it")
+            check_size(size, config.mesh_size, subject)
+            check_blocks([check_level(str(level).strip(), subject)], config, subject)
+            zones.add((str(level).strip(), size, shapely.to_wkb(geometry, hex=True, byte_order=1)))
+    if len(zones) > MOST_ZONES:
+        raise InputError(
+            f"{len(zones)} zones; at most {MOST_ZONES} are taken: dissolve those of one level and size"
+        )
+    return (*sorted(zones, key=lambda zone: (LEVELS.index(zone[0]), *zone)), (asked.rest, config.mesh_size, ""))
+
+
+def make_shape(*numbers: float) -> shapely.Polygon:
+    """Polygon of a box, or of a circle: 64 sides, vertices on whole millimetres, the same on any processor."""
+    if len(numbers) == 4:
+        return shapely.box(*numbers)
+    x, y, radius = numbers
+    return shapely.set_precision(shapely.Point(x, y).buffer(radius), 0.001, mode="pointwise")
