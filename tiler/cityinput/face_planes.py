@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from tiler.cityinput.faces import ROOF, Faces
@@ -88,3 +89,24 @@ def upward_area(faces: Faces) -> float:
     """Area of roofs in plan (m²), negative where they look down."""
     vectors = area_vectors(faces.xyz, faces.ring_start)
     return float(vectors[faces.face_start[:-1]][faces.kind == ROOF, 2].sum())
+
+
+def cut_face(rings: list[list[int]], xyz: Array) -> list[list[int]] | None:
+    """Cut a face into triangles, seen along the axis that it is largest from; None where it is no polygon."""
+    corners = xyz[rings[0]]
+    normal = area_vectors(corners, np.array([0, len(corners)]))[0]
+    axis = int(np.argmax(np.abs(normal)))
+    kept = [(axis + 1) % 3, (axis + 2) % 3]
+    plan = [xyz[ring][:, kept] for ring in rings]
+    outline = shapely.Polygon(plan[0], plan[1:])
+    if not outline.is_valid or not outline.area:
+        return None
+    place = {
+        tuple(xy): v
+        for ring, own in zip(rings, plan, strict=True)
+        for v, xy in zip(ring, own.tolist(), strict=True)
+    }
+    pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
+    ends = shapely.get_coordinates(shapely.orient_polygons(pieces)).reshape(-1, 4, 2)[:, :3].tolist()
+    triangles = [[place[tuple(xy)] for xy in one] for one in ends]
+    return triangles if normal[axis] > 0 else [one[::-1] for one in triangles]

@@ -237,6 +237,13 @@ def _dashboard(options: argparse.Namespace) -> int:
     return 0
 
 
+def _view(options: argparse.Namespace) -> int:
+    from tiler.tiles3d.view import show_tiles
+
+    show_tiles(options.directory, f"{options.host}:{options.port}", say)
+    return 0
+
+
 def _report(options: argparse.Namespace) -> int:
     from tiler.report import write_report
 
@@ -498,6 +505,7 @@ HANDLERS: Mapping[str, Handler] = {
     "check": _check,
     "status": _status,
     "dashboard": _dashboard,
+    "view": _view,
     "report": _report,
     "fetch": _fetch,
     "synth": _synth,

@@ -143,7 +143,44 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     def command(name: str, text: str) -> argparse.ArgumentParser:
         return add(name, handlers[name], text)
 
-    run = command("run", "mesh a region from point clouds and footprints")
+    _add_run(command("run", "mesh a region from point clouds and footprints"))
+    plan = command("plan", "tell what a run would do and take, without doing it")
+    plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
+    plan.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw tiles, files and footprints")
+    _add_inputs(plan)
+    _add_check(command("check", "prove from the written files that a mesh is right"))
+    status = command("status", "tell how far a run is, whether it is alive, and how to go on")
+    status.add_argument("job", metavar="DIR|JOB", help="folder of a run, or number of its job")
+    status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
+    board = command("dashboard", "show the page of a run, at work, ended or dead, from its folder")
+    board.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
+    view = command("view", "show 3D Tiles that were exported, in a browser")
+    view.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of the tiles")
+    _add_address(board, view)
+    _add_report(command("report", "write report.html: what a run made, how good it is, what was left out"))
+    _add_fetch(command("fetch", "fetch the folder of a run from a bucket, and verify its checksums"))
+    synth = command(
+        "synth", "write a synthetic city: point cloud and footprints, or a town of houses with architecture"
+    )
+    synth.add_argument("directory", type=Path, metavar="DIR", help="folder to write to")
+    _add_city(synth, size=1000.0, buildings=SYNTH_BUILDINGS)
+    _add_town(synth)
+    _add_demo(command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one"))
+    _add_render(command("render", "draw a picture of a run"))
+    add_job_commands(add, _add_inputs)
+    _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
+    _add_convert(command("convert", "write city models, or that of a run, as another format of city models"))
+    _add_generalise(
+        command("generalise", "make blocks of buildings between streets: cells and LoD0C, LoD0B, LoD0A")
+    )
+    _add_wind(command("wind", "map mean wind and comfort from results of a wind case and a wind rose"))
+    command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
+    command("config", "print all parameters of a run, annotated, as a configuration file")
+    return parser
+
+
+def _add_run(run: argparse.ArgumentParser) -> None:
+    """Add the inputs and parameters of a run, and what it shows and writes."""
     shown = _add_inputs(run)
     shown.add_argument(
         "--dashboard-address",
@@ -163,32 +200,10 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
         default=False,
         help="write report.html at the end, as `citystitch report` does",
     )
-    plan = command("plan", "tell what a run would do and take, without doing it")
-    plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
-    plan.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw tiles, files and footprints")
-    _add_inputs(plan)
-    _add_check(command("check", "prove from the written files that a mesh is right"))
-    status = command("status", "tell how far a run is, whether it is alive, and how to go on")
-    status.add_argument("job", metavar="DIR|JOB", help="folder of a run, or number of its job")
-    status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
-    board = command("dashboard", "show the page of a run, at work, ended or dead, from its folder")
-    board.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
-    board.add_argument(
-        "--port", type=int, default=0, metavar="N", help="port to listen at; 0: a free one (default)"
-    )
-    board.add_argument(
-        "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
-    )
-    _add_report(command("report", "write report.html: what a run made, how good it is, what was left out"))
-    _add_fetch(command("fetch", "fetch the folder of a run from a bucket, and verify its checksums"))
-    synth = command(
-        "synth", "write a synthetic city: point cloud and footprints, or a town of houses with architecture"
-    )
-    synth.add_argument("directory", type=Path, metavar="DIR", help="folder to write to")
-    _add_city(synth, size=1000.0, buildings=SYNTH_BUILDINGS)
-    _add_town(synth)
-    _add_demo(command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one"))
-    render = command("render", "draw a picture of a run")
+
+
+def _add_render(render: argparse.ArgumentParser) -> None:
+    """Add which picture of a run is drawn."""
     render.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
     render.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="PNG file to write")
     render.add_argument(
@@ -198,16 +213,6 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
         help="what to draw; sizes: triangles from above, by the length of their edges; quality: the boundary by "
         "the cells behind it; citymodel: its solids on the terrain; levels: the boundary by level of detail",
     )
-    add_job_commands(add, _add_inputs)
-    _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
-    _add_convert(command("convert", "write city models, or that of a run, as another format of city models"))
-    _add_generalise(
-        command("generalise", "make blocks of buildings between streets: cells and LoD0C, LoD0B, LoD0A")
-    )
-    _add_wind(command("wind", "map mean wind and comfort from results of a wind case and a wind rose"))
-    command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
-    command("config", "print all parameters of a run, annotated, as a configuration file")
-    return parser
 
 
 def _add_demo(demo: argparse.ArgumentParser) -> None:
@@ -477,6 +482,16 @@ class _ExportHelp(argparse.Action):
         parser.exit()
 
 
+def _add_address(*servers: argparse.ArgumentParser) -> None:
+    for server in servers:
+        server.add_argument(
+            "--port", type=int, default=0, metavar="N", help="port to listen at; 0: a free one (default)"
+        )
+        server.add_argument(
+            "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
+        )
+
+
 def _add_export(export: argparse.ArgumentParser) -> None:
     """Add the options of all formats; each format names those that it takes."""
     export.add_argument("-h", "--help", nargs=0, action=_ExportHelp, help="show this help message and exit")
@@ -528,6 +543,26 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         "origin": {
             "metavar": "X,Y,Z|auto",
             "help": "whole metres that coordinates count from; auto: the region's south-western corner",
+        },
+        "geoid_height": {
+            "type": float,
+            "metavar": "M",
+            "help": "height of the geoid above the ellipsoid, which is added to all heights (default: 0)",
+        },
+        "vertical_crs": {
+            "metavar": "EPSG",
+            "help": "CRS of the heights, EPSG:5709 say: PROJ adds the geoid's height at each place",
+        },
+        "slice_height": {
+            "type": float,
+            "action": "append",
+            "metavar": "M",
+            "help": "add the cells at this height above the ground; repeat for others",
+        },
+        "slice_line": {
+            "action": "append",
+            "metavar": "X0,Y0,X1,Y1",
+            "help": "add the cells along an upright plane between two places of the CRS; repeat for others",
         },
         "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
     }

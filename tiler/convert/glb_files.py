@@ -18,8 +18,9 @@ from tiler.convert.features import origin_of
 from tiler.convert.inputs import ModelSource
 from tiler.convert.obj_files import GROUPS
 from tiler.convert.triangles import SolidBuilding, iter_triangles
-from tiler.formats.glb import AXES, COLOURS, FLOAT, INDICES, MOST_BYTES, UNSIGNED_INT, VERTICES
+from tiler.formats.glb import AXES
 from tiler.georeference.crs import crs_text
+from tiler.tiles3d.gltf import COLOURS, FLOAT, INDICES, MOST_BYTES, UNSIGNED_INT, VERTICES
 
 COPY_BYTES = 1 << 20
 MATERIALS = {ROOF: Marker.ROOF, WALL: Marker.WALL, GROUND: Marker.GROUND}

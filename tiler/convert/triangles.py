@@ -6,10 +6,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
-from tiler.cityinput.face_planes import area_vectors
+from tiler.cityinput.face_planes import cut_face
 from tiler.cityinput.faces import Faces
 from tiler.cityinput.levels import list_attempts
 from tiler.convert.features import plain_value, rings_of
@@ -89,31 +88,10 @@ def triangulate(
     for kind, rings in rings_of(faces, number):
         if not rings:
             continue
-        parts = [rings[0]] if len(rings) == 1 and len(rings[0]) == 3 else _cut(rings, xyz)
+        parts = [rings[0]] if len(rings) == 1 and len(rings[0]) == 3 else cut_face(rings, xyz)
         if parts is None:
             n_fans += 1
             parts = [[rings[0][0], a, b] for a, b in pairwise(rings[0][1:])]
         found += parts
         kinds += [kind] * len(parts)
     return np.array(found, np.int64).reshape(-1, 3), np.array(kinds, np.int8), n_fans
-
-
-def _cut(rings: list[list[int]], xyz: NDArray[np.float64]) -> list[list[int]] | None:
-    """Cut a face into triangles, seen along the axis that it is largest from; None where it is no polygon."""
-    corners = xyz[rings[0]]
-    normal = area_vectors(corners, np.array([0, len(corners)]))[0]
-    axis = int(np.argmax(np.abs(normal)))
-    kept = [(axis + 1) % 3, (axis + 2) % 3]
-    plan = [xyz[ring][:, kept] for ring in rings]
-    outline = shapely.Polygon(plan[0], plan[1:])
-    if not outline.is_valid or not outline.area:
-        return None
-    place = {
-        tuple(xy): v
-        for ring, own in zip(rings, plan, strict=True)
-        for v, xy in zip(ring, own.tolist(), strict=True)
-    }
-    pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
-    ends = shapely.get_coordinates(shapely.orient_polygons(pieces)).reshape(-1, 4, 2)[:, :3].tolist()
-    triangles = [[place[tuple(xy)] for xy in one] for one in ends]
-    return triangles if normal[axis] > 0 else [one[::-1] for one in triangles]

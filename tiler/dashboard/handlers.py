@@ -39,23 +39,17 @@ LOOPBACK = {"127.0.0.1", "localhost", "::1"}
 LEAST_ZIPPED = 1000  # bytes
 
 
-class Base(RequestHandler):
-    """What all paths have in common.
+class Guarded(RequestHandler):
+    """What is said and refused on all paths of ours.
 
-    Parameters
+    Attributes
     ----------
-    follower : Follower
-        The run.
     loopback : bool
         Answer only who asks for this machine by a name of its own: a page of the web that has its name point here
         gets nothing.
-    dask : bool
-        Whether Dask's own pages are served beside.
     """
 
-    def initialize(self, follower: Follower, loopback: bool, dask: bool) -> None:
-        """Take the parameters."""
-        self.follower, self.loopback, self.dask = follower, loopback, dask
+    loopback: bool
 
     def set_default_headers(self) -> None:
         """Add the headers on what the browser may do."""
@@ -73,6 +67,24 @@ class Base(RequestHandler):
         reason = getattr(error, "reason", None) or responses.get(status_code, "unknown")
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(f"{status_code} {reason}\n")
+
+
+class Base(Guarded):
+    """What the paths of a run have in common.
+
+    Parameters
+    ----------
+    follower : Follower
+        The run.
+    loopback : bool
+        See `Guarded`.
+    dask : bool
+        Whether Dask's own pages are served beside.
+    """
+
+    def initialize(self, follower: Follower, loopback: bool, dask: bool) -> None:
+        """Take the parameters."""
+        self.follower, self.loopback, self.dask = follower, loopback, dask
 
     async def reply(self, make: Callable[[], tuple[str, str]]) -> None:
         """Make an answer and its type in a thread of its own, and send it, packed where that is worth it."""

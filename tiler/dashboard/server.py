@@ -84,15 +84,37 @@ def serve(follower: Follower, address: str = ANYWHERE) -> Iterator[str]:
     ConfigError
         If nobody can listen there.
     """
+    from tiler.dashboard.handlers import make_rules
+
+    def rules(loopback: bool) -> list[Any]:
+        return make_rules(follower, loopback=loopback, dask=False, root=True)
+
+    with serve_rules(rules, address) as root:
+        yield f"{root}{PREFIX}/"
+
+
+@contextmanager
+def serve_rules(make_rules: Callable[[bool], list[Any]], address: str) -> Iterator[str]:
+    """Serve paths by a server of its own, in a thread; gives its URL, without a slash at its end.
+
+    Parameters
+    ----------
+    make_rules : callable
+        Lists the paths for tornado, given whether only this machine reaches the address.
+    address : str
+        Where to listen, see `read_address`.
+
+    Raises
+    ------
+    ConfigError
+        If nobody can listen there.
+    """
     from tornado.httpserver import HTTPServer
     from tornado.netutil import bind_sockets
     from tornado.web import Application
 
-    from tiler.dashboard.handlers import make_rules
-
     host, port = read_address(address)
-    rules = make_rules(follower, loopback=is_loopback(host), dask=False, root=True)
-    app = Application(rules, log_function=_silent)
+    app = Application(make_rules(is_loopback(host)), log_function=_silent)
     sockets = bind_sockets(port, host)
     loop = asyncio.new_event_loop()
     ready = threading.Event()
@@ -116,7 +138,7 @@ def serve(follower: Follower, address: str = ANYWHERE) -> Iterator[str]:
     thread.start()
     ready.wait()
     try:
-        yield _url(host, sockets[0].getsockname()[1])
+        yield _root(host, sockets[0].getsockname()[1])
     finally:
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
@@ -146,7 +168,7 @@ def mounted(follower: Follower, scheduler: Any, address: str) -> Iterator[str]:
     rules = make_rules(follower, loopback=is_loopback(host), dask=True)
     scheduler.http_application.add_handlers(".*", rules)
     with _registered(follower):
-        yield _url(host, scheduler.http_server.port)
+        yield f"{_root(host, scheduler.http_server.port)}{PREFIX}/"
 
 
 @contextmanager
@@ -235,9 +257,9 @@ def _registered(follower: Follower) -> Iterator[None]:
             REGISTRY.unregister(collector)
 
 
-def _url(host: str, port: int) -> str:
+def _root(host: str, port: int) -> str:
     name = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
-    return f"http://{name}:{port}{PREFIX}/"
+    return f"http://{name}:{port}"
 
 
 def _silent(_: Any) -> None:

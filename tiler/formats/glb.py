@@ -4,7 +4,6 @@ glTF has float32 and y up: coordinates are shifted to a local origin and turned,
 """
 
 import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import GROUND_PATCHES, Marker
+from pipeline.data.mesh import Marker
 from tiler.export.export import LARGEST_PART, Format
 from tiler.export.foam_patches import FIRST_BUILDING, building_name, facets_by_key, is_house, patch_of_key
 from tiler.export.surface import (
@@ -26,31 +25,10 @@ from tiler.export.surface import (
 )
 from tiler.mesh_files.run_files import RunSource, crs_of
 from tiler.store.atomic import replacing
+from tiler.tiles3d.gltf import FLOAT, INDICES, MOST_BYTES, UNSIGNED_INT, VERTICES, begin_glb, make_material
 
-FLOAT, UNSIGNED_INT = 5126, 5125
-VERTICES, INDICES = 34962, 34963  # targets of buffer views
 VERTEX_BYTES = FACET_BYTES = 12
-MOST_BYTES = 2**32 - 1  # of a GLB file: its length has 32 bits
 AXES = "x east, y up, z south; easting = origin[0] + x, northing = origin[1] - z, height = origin[2] + y"
-EARTH = (0.42, 0.33, 0.24)
-COLOURS = {
-    Marker.GROUND: (0.45, 0.5, 0.38),
-    Marker.WALL: (0.82, 0.78, 0.7),
-    Marker.ROOF: (0.66, 0.33, 0.25),
-    Marker.BOTTOM: EARTH,
-    Marker.FOUNDATION: EARTH,
-}
-GROUND_COLOURS = {
-    "ground_water": (0.3, 0.46, 0.62),
-    "ground_street": (0.42, 0.42, 0.43),
-    "ground_rail": (0.5, 0.44, 0.4),
-    "ground_sand": (0.8, 0.74, 0.58),
-    "ground_forest": (0.2, 0.36, 0.2),
-    "ground_scrub": (0.4, 0.48, 0.28),
-    "ground_grass": (0.47, 0.62, 0.35),
-    "ground_field": (0.68, 0.64, 0.4),
-}
-SIDE_COLOUR, SIDE_OPACITY = (0.6, 0.75, 0.9), 0.1  # of top and sides, through which the city is seen
 
 
 def export_glb(output: Path, source: RunSource, *, buildings: str | None = None) -> None:
@@ -109,16 +87,15 @@ def write_glb(path: Path, surface: Surface, *, crs: str, buildings: str | None =
         raise InputError("boundary: has no facets, and GLB no empty meshes; mesh the region again")
     origin = np.floor([*(survey.low + survey.high)[:2] / 2, survey.low[2]])
     text = json.dumps(_document(survey, origin, crs, surface.ground), separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
     data = _data_bytes(survey)
-    total = 28 + len(text) + data
+    head = begin_glb(text, data)
+    total = len(head) + data
     if total > MOST_BYTES:
         raise InputError(
             f"boundary: {total} bytes as GLB; bound: {MOST_BYTES}; use --format ply, or mesh a part of the region"
         )
     with path.open("wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", data, b"BIN\0"))
+        file.write(head)
         start = file.tell()
         places, place = {}, start + survey.n_vertices * VERTEX_BYTES
         for key, n in survey.facets.items():
@@ -205,7 +182,7 @@ def _document(
         "scenes": [{"nodes": list(range(len(nodes)))}],
         "nodes": nodes,
         "meshes": [{"name": names[number], "primitives": parts} for number, parts in primitives.items()],
-        "materials": [_material(marker, patch_of_key(marker, ground).name) for marker in materials],
+        "materials": [make_material(marker, patch_of_key(marker, ground).name) for marker in materials],
         "accessors": [position, *indices],
         "bufferViews": [
             {"buffer": 0, "byteLength": split, "target": VERTICES},
@@ -213,19 +190,6 @@ def _document(
         ],
         "buffers": [{"byteLength": _data_bytes(survey)}],
     }
-
-
-def _material(marker: int, name: str) -> dict[str, Any]:
-    """Colour a patch; its back is what one sees from the air."""
-    colours = {int(key): colour for key, colour in COLOURS.items()}
-    if marker > GROUND_PATCHES:
-        colours[marker] = GROUND_COLOURS.get(name, COLOURS[Marker.GROUND])
-    known = colours.get(marker)
-    solid = known is not None
-    colour = [*(known or SIDE_COLOUR), 1.0 if solid else SIDE_OPACITY]
-    surface = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
-    material = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
-    return material if solid else material | {"alphaMode": "BLEND"}
 
 
 FORMAT = Format(

@@ -210,7 +210,7 @@ def test_what_is_no_finished_run_is_refused(
 
 
 def test_wrong_arguments_and_places(tiled: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="format 'nope' must be one of cgns, cityjsonseq"):
+    with pytest.raises(ValueError, match="format 'nope' must be one of 3dtiles, cgns, cityjsonseq"):
         export_run(tiled, tmp_path / "all.obj", name="nope")
     with pytest.raises(OutputError, match=r"all.vtu: cannot be written \(No such file or directory\)"):
         export_run(tiled, tmp_path / "none" / "all.vtu", name="vtu")

@@ -1,0 +1,349 @@
+"""The buildings of tiles: as the city model has them, and in fewer and fewer triangles from level to level.
+
+In the smallest cells each building, or part of one, has the most detailed solid of the city model. In those
+above, a distance from these is allowed. What is lower than half of that is left out; parts of a house whose
+roofs are within it of one height become a block, of an outline with fewer vertices; parts that are not stay. So
+a house is of LoD2.2, then 1.3, then 1.2. Units that stand for several houses have their place in `generalise`.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from pipeline.city_model.sloped_solids import ROOF, WALL
+from pipeline.data.errors import InputError
+from pipeline.data.mesh import Marker
+from tiler.cityinput.face_planes import cut_face
+from tiler.citymodels.building_index import (
+    BuildingRow,
+    Vertices,
+    check_indices,
+    has_parts,
+    read_building,
+    read_objects,
+    spool_vertices,
+)
+from tiler.store.run_folder import WRONG_FIELD
+from tiler.tiles3d.content import Ints, Layer, Surface, join_surfaces
+from tiler.tiles3d.globe import Array
+from tiler.tiles3d.metadata import NO_NUMBER, Column
+
+TEXTS = ("roof_method", "roof_source")
+NUMBERS = ("ground_height", "roof_height", "height", "roof_rmse", "roof_within")
+BLOCKS = "1.2", "1.3"  # levels of detail of a house's only block, and of one of several
+LOW = 0.5  # of the distance that a level allows: what is lower is left out
+PLAN_SHARE = 0.5  # of the distance that a level allows: for outlines, the rest is for those of levels below
+SIDE_SHARE = 0.2  # of the side of a square of its area: by more an outline loses its shape
+STEP = 0.001  # of coordinates of the city model (m)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A building, or part of one, at its most detailed level.
+
+    Attributes
+    ----------
+    id, house : str
+        Its id, and that of the building that it is a part of.
+    lod : str
+        Level of detail.
+    attributes : dict
+        Those of `TEXTS` and `NUMBERS` that it has.
+    footprint : str
+        Its outline, as WKB in hexadecimal digits.
+    xyz : list of [float, float, float]
+        Vertices (m); those at the bottom are at the lowest ground beside it.
+    triangles : list of [int, int, int]
+        Their corners.
+    roof : list of bool
+        Whether each triangle is of the roof.
+    """
+
+    id: str
+    house: str
+    lod: str
+    attributes: dict[str, Any]
+    footprint: str
+    xyz: list[list[float]]
+    triangles: list[list[int]]
+    roof: list[bool]
+
+
+@dataclass(frozen=True, eq=False)
+class Unit:
+    """A part as it is, or a block that stands for parts of a house.
+
+    Attributes
+    ----------
+    house : str
+        Id of the house.
+    outline : shapely geometry
+        Outline in the CRS (m).
+    bottom, low, high : float
+        Lowest ground beside it, and lowest and highest place of the roofs that it stands for (m). A block ends in
+        the middle between these.
+    attributes : dict
+        Those of `TEXTS` and `NUMBERS` that it has.
+    moved : float
+        How far its outline is from that of the parts (m), at most.
+    part : Part or None
+        The part itself; None for a block.
+    """
+
+    house: str
+    outline: Any
+    bottom: float
+    low: float
+    high: float
+    attributes: dict[str, Any]
+    moved: float = 0.0
+    part: Part | None = None
+
+    @property
+    def rise(self) -> float:
+        """Distance of its roofs from one height (m)."""
+        return (self.high - self.low) / 2
+
+    @property
+    def error(self) -> float:
+        """Distance from the parts that it stands for (m)."""
+        return max(self.rise, self.moved) if self.part is None else 0.0
+
+
+def read_parts(model: Path, lowest: Mapping[int, float], told: Counter[str]) -> Iterator[Part]:
+    """Read the buildings of a run's city model that have a solid.
+
+    Parameters
+    ----------
+    model : Path
+        CityJSON file of the run.
+    lowest : mapping of int to float
+        Lowest place of the walls in the mesh (m), by number of building.
+    told : Counter of str
+        What must be known of them is counted here.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged.
+
+    Notes
+    -----
+    The file is read twice, an object at a time.
+    """
+    with TemporaryFile() as spool:
+        vertices = spool_vertices(model, spool)
+        for name, thing in read_objects(model):
+            if has_parts(model, thing):
+                continue
+            row = read_building(model, name, thing, vertices)
+            try:
+                part = _read_part(name, thing, vertices, row, lowest, told)
+            except WRONG_FIELD as error:
+                raise InputError(
+                    f"{model}: building {name!r}: a field is missing or wrong ({error!r}); run again"
+                ) from None
+            if part is not None:
+                yield part
+
+
+def _read_part(
+    name: str,
+    thing: Mapping[str, Any],
+    vertices: Vertices,
+    row: BuildingRow,
+    lowest: Mapping[int, float],
+    told: Counter[str],
+) -> Part | None:
+    solids = [item for item in thing["geometry"] if item["type"] == "Solid"]
+    told["buildings without a solid, which are left out"] += not solids
+    if not solids:
+        return None
+    solid = max(solids, key=lambda item: float(item["lod"]))
+    (shell,) = solid["boundaries"]
+    (kinds,) = solid["semantics"]["values"]
+    used = np.unique(np.concatenate([check_indices(ring, len(vertices)) for face in shell for ring in face]))
+    xyz = vertices.take(used)
+    places = dict(zip(used.tolist(), range(len(used)), strict=True))
+    floor = xyz[:, 2].min()
+    xyz[xyz[:, 2] == floor, 2] = min(floor, lowest.get(row.number, floor))
+    out: list[int] = []
+    triangles: list[list[int]] = []
+    roof: list[bool] = []
+    for face, kind in zip(shell, kinds, strict=True):
+        if kind not in (ROOF, WALL):
+            continue
+        rings = [[places[vertex] for vertex in ring] for ring in face]
+        own = _cut(rings, xyz, told, wall=kind == WALL)
+        # A face has vertices of its own, as its normal is its own.
+        corners = sorted({corner for one in own for corner in one})
+        number = {corner: len(out) + k for k, corner in enumerate(corners)}
+        out += corners
+        triangles += [[number[corner] for corner in one] for one in own]
+        roof += [kind == ROOF] * len(own)
+    if not triangles:
+        return None
+    values = thing["attributes"]
+    return Part(
+        name,
+        thing["parents"][0] if thing.get("parents") else name,
+        str(solid["lod"]),
+        {key: values[key] for key in (*TEXTS, *NUMBERS) if values.get(key) is not None},
+        shapely.to_wkb(row.footprint, hex=True),
+        (np.round(xyz[out] / STEP) * STEP).tolist(),
+        triangles,
+        roof,
+    )
+
+
+def _cut(rings: list[list[int]], xyz: Array, told: Counter[str], *, wall: bool) -> list[list[int]]:
+    """Cut a face into triangles."""
+    ring = rings[0]
+    if len(rings) == 1 and (len(ring) == 3 or (wall and len(ring) == 4)):
+        return [[ring[0], a, b] for a, b in pairwise(ring[1:])]
+    found = cut_face(rings, xyz)
+    told["faces that cross themselves, cut into triangles around a corner"] += found is None
+    return [[ring[0], a, b] for a, b in pairwise(ring[1:])] if found is None else found
+
+
+def write_part(part: Part) -> bytes:
+    """Write a part as a line."""
+    return (json.dumps(vars(part), separators=(",", ":")) + "\n").encode()
+
+
+def load_parts(data: bytes) -> list[Part]:
+    """Read lines of `write_part`."""
+    return [Part(**json.loads(line)) for line in data.splitlines()]
+
+
+def make_units(parts: Sequence[Part]) -> list[Unit]:
+    """Make a unit of each part, in the order of their ids."""
+    found = []
+    for part in sorted(parts, key=lambda part: part.id):
+        roofs = [
+            part.xyz[k][2] for one, is_roof in zip(part.triangles, part.roof, strict=True) if is_roof for k in one
+        ]
+        top = part.attributes["roof_height"]
+        low, high = (min(roofs), max(roofs)) if roofs else (top, top)
+        bottom = min(z for _, _, z in part.xyz)
+        found.append(
+            Unit(part.house, shapely.from_wkb(part.footprint), bottom, low, high, part.attributes, part=part)
+        )
+    return found
+
+
+def generalise(units: Sequence[Unit], allowed: float) -> tuple[list[Unit], float]:
+    """Make what stands for the units of the level below.
+
+    Parameters
+    ----------
+    units : sequence of Unit
+        Those of the level below.
+    allowed : float
+        Distance from the buildings that the level allows (m).
+
+    Returns
+    -------
+    list of Unit
+        What is left.
+    float
+        The largest distance of these from the buildings (m); of one that is left out its height.
+    """
+    error = 0.0
+    own: dict[str, list[Unit]] = {}
+    for unit in units:
+        if unit.high - unit.bottom <= LOW * allowed:
+            error = max(error, unit.high - unit.bottom)
+        else:
+            own.setdefault(unit.house, []).append(unit)
+    kept: list[Unit] = []
+    for house in sorted(own):
+        group: list[Unit] = []
+        for unit in sorted(own[house], key=lambda unit: (unit.low, unit.high)):
+            if unit.rise > allowed:
+                kept.append(unit)
+            elif group and max(unit.high, *(one.high for one in group)) - group[0].low > 2 * allowed:
+                kept.append(_merge(group, allowed))
+                group = [unit]
+            else:
+                group.append(unit)
+        if group:
+            kept.append(_merge(group, allowed))
+    return kept, max([error, *(unit.error for unit in kept)])
+
+
+def _merge(units: list[Unit], allowed: float) -> Unit:
+    """Put units of a house that are nearly of one height under one roof, with an outline of fewer vertices."""
+    whole = shapely.union_all([unit.outline for unit in units], grid_size=STEP)
+    outline = shapely.simplify(whole, min(allowed * PLAN_SHARE, whole.area**0.5 * SIDE_SHARE))
+    moved = max(unit.moved for unit in units) + float(shapely.hausdorff_distance(whole, outline))
+    largest = units[int(np.argmax(shapely.area([unit.outline for unit in units])))]
+    low, high = min(unit.low for unit in units), max(unit.high for unit in units)
+    ground = min(unit.attributes["ground_height"] for unit in units)
+    attributes = {key: largest.attributes[key] for key in TEXTS if key in largest.attributes}
+    attributes |= {"ground_height": ground, "roof_height": high, "height": high - ground}
+    return Unit(largest.house, outline, min(unit.bottom for unit in units), low, high, attributes, moved)
+
+
+def draw_units(units: Sequence[Unit]) -> Layer | None:
+    """Make the layer of units; None where there are none."""
+    several = Counter(unit.house for unit in units)
+    rows: list[dict[str, Any]] = []
+    surfaces: list[Surface] = []
+    for unit in units:
+        surface = _extrude(unit) if unit.part is None else _draw_part(unit.part)
+        if surface is None:
+            continue
+        surfaces.append(replace(surface, feature=np.full(len(surface.xyz), len(rows))))
+        name, lod = (
+            (unit.house, BLOCKS[several[unit.house] > 1]) if unit.part is None else (unit.part.id, unit.part.lod)
+        )
+        rows.append(unit.attributes | {"id": name, "house": unit.house, "lod": lod, "error": unit.error})
+    if not rows:
+        return None
+    columns: dict[str, Column] = {
+        key: [str(row.get(key, "")) for row in rows] for key in ("id", "house", "lod", *TEXTS)
+    }
+    columns |= {
+        key: np.array([row.get(key, NO_NUMBER) for row in rows], np.float32) for key in (*NUMBERS, "error")
+    }
+    return Layer("buildings", join_surfaces(surfaces), columns)
+
+
+def _draw_part(part: Part) -> Surface:
+    material = np.where(part.roof, int(Marker.ROOF), int(Marker.WALL))
+    return Surface(np.array(part.xyz), np.array(part.triangles, np.int64), material, np.empty(0, np.int64))
+
+
+def _extrude(unit: Unit) -> Surface | None:
+    """Make walls and roof of a block; None where its outline has no area."""
+    outline = shapely.orient_polygons(unit.outline)
+    cut = shapely.get_coordinates(shapely.orient_polygons(shapely.constrained_delaunay_triangles(outline)))
+    roof = cut.reshape(-1, 4, 2)[:, :3].reshape(-1, 2)
+    if not len(roof):
+        return None
+    top = (unit.low + unit.high) / 2
+    places, inverse = np.unique(roof, axis=0, return_inverse=True)
+    corners: Ints = inverse.reshape(-1, 3).astype(np.int64)
+    xy, ring = shapely.get_coordinates(shapely.get_rings(shapely.get_parts(outline)), return_index=True)
+    first = np.flatnonzero(ring[1:] == ring[:-1])
+    a, b = xy[first], xy[first + 1]
+    n, k = len(places), 4 * np.arange(len(a))[:, np.newaxis]
+    walls = np.stack((_at(a, unit.bottom), _at(b, unit.bottom), _at(b, top), _at(a, top)), axis=1)
+    triangles: Ints = np.concatenate((corners, n + k + [0, 1, 2], n + k + [0, 2, 3]))
+    material = np.repeat(np.array([Marker.ROOF, Marker.WALL], np.int64), [len(roof) // 3, 2 * len(a)])
+    xyz = np.concatenate((_at(places, top), walls.reshape(-1, 3)))
+    return Surface(xyz, triangles, material, np.empty(0, np.int64))
+
+
+def _at(xy: Array, z: float) -> NDArray[np.float64]:
+    return np.column_stack((xy, np.full(len(xy), z)))

@@ -1,0 +1,74 @@
+"""A page that shows a folder of 3D Tiles, and the web server for both: `citystitch view`.
+
+The page and the libraries that it needs are in ``viewer/``: nothing is fetched from elsewhere.
+"""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from tornado.web import StaticFileHandler
+
+from pipeline.data.errors import InputError
+from tiler.dashboard.handlers import Guarded
+from tiler.dashboard.server import serve_rules
+from tiler.tiles3d.subtrees import TILESET
+
+VIEWER = Path(__file__).parent / "viewer"
+
+
+class _Files(Guarded, StaticFileHandler):
+    """Files of a folder; a browser asks each time whether one has changed."""
+
+    loopback = False
+
+    def set_extra_headers(self, _path: str) -> None:
+        self.set_header("Cache-Control", "no-cache")
+
+
+class _LoopbackFiles(_Files):
+    """These for this machine alone."""
+
+    loopback = True
+
+
+@contextmanager
+def serve_tiles(folder: Path, address: str) -> Iterator[str]:
+    """Serve a folder of 3D Tiles and its page, in a thread; gives its URL.
+
+    Parameters
+    ----------
+    folder : Path
+        What `citystitch export --format 3dtiles` wrote, or any other tileset.
+    address : str
+        Where to listen, ``HOST:PORT``; port 0 is a free one.
+
+    Raises
+    ------
+    InputError
+        If there is no tileset.
+    ConfigError
+        If nobody can listen there.
+    """
+    if not (folder / TILESET).is_file():
+        raise InputError(
+            f"{folder}: has no {TILESET}; write one by citystitch export RUN --format 3dtiles -o {folder.name}"
+        )
+
+    def rules(loopback: bool) -> list[Any]:
+        files = _LoopbackFiles if loopback else _Files
+        page = {"path": str(VIEWER), "default_filename": "page.html"}
+        return [("/tiles/(.*)", files, {"path": str(folder.resolve())}), ("/(.*)", files, page)]
+
+    with serve_rules(rules, address) as root:
+        yield f"{root}/"
+
+
+def show_tiles(folder: Path, address: str, say: Callable[[str], None]) -> None:
+    """Serve a folder of 3D Tiles until the process is interrupted; errors as of `serve_tiles`."""
+    with serve_tiles(folder, address) as url:
+        say(f"view: {url} (Ctrl-C ends it)")
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait()
