@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pipeline.data.classes import BUILDING, GROUND, HIGH_NOISE, HIGH_VEGETATION, LOW_NOISE, UNCLASSIFIED, WATER
 from pipeline.data.errors import GeometryError
 from pipeline.data.pointcloud import PointCloud
+from pipeline.geometry.inside import find_inside
 from pipeline.points_terrain.synthetic_roofs import (
     RoofShapes,
     draw_roofs,
@@ -288,6 +288,8 @@ def _place(
         centres[left] = radii[left, None] + rng.random((len(left), 2)) * (size - 2 * radii[left, None])
         pending = np.zeros(len(radii), bool)
         pending[left] = True
+        from scipy.spatial import cKDTree  # 0.3 s, which the parts of a city need not wait for
+
         pairs = cKDTree(centres).query_pairs(2 * float(radii.max()) + gap, output_type="ndarray")
         i, j = pairs.min(axis=1), pairs.max(axis=1)
         close = np.hypot(*(centres[i] - centres[j]).T) < radii[i] + radii[j] + gap
@@ -383,7 +385,8 @@ def _roof_at(
     """Give the highest roof above each point, NaN in the open."""
     near = shapely.STRtree(city.polygons).query(shapely.box(*bounds))
     roof = np.full(len(x), -np.inf)
-    hits, which = shapely.STRtree(city.polygons[near]).query(shapely.points(x, y), predicate="intersects")
-    np.maximum.at(roof, hits, shape_heights(city.shapes, near[which], np.column_stack((x, y))[hits]))
+    xy = np.column_stack((x, y))
+    which, hits = find_inside(xy, city.polygons[near])
+    np.maximum.at(roof, hits, shape_heights(city.shapes, near[which], xy[hits]))
     roof[np.isneginf(roof)] = np.nan
     return roof

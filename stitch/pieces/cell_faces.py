@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
-from stitch.pieces.conformity import FACES, group_rows
-
-NO_MATE, CROWDED = -1, -2
-MOST_CELLS = 2**29 - 1  # four faces each have numbers of 32 bits
+from stitch.pieces.conformity import group_rows
+from stitch.pieces.face_mates import CROWDED, FACES, NO_MATE, find_mates, take_faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +55,8 @@ def find_cell_faces(cells: NDArray[np.int32], facets: NDArray[np.int32], n_point
     Raises
     ------
     ValueError
-        If more than two cells have a face, a facet is no exterior face or is there twice, or there are more than
-        `MOST_CELLS` cells.
+        If more than two cells have a face, a facet is no exterior face or is there twice, or there are too many
+        cells, see `find_mates`.
 
     Notes
     -----
@@ -74,15 +72,13 @@ def find_cell_faces(cells: NDArray[np.int32], facets: NDArray[np.int32], n_point
     >>> faces.inner.tolist(), faces.facet_cell.tolist(), faces.shared.tolist()
     ([[1, 2, 3]], [0, 0, 0, 1, 1], [[2, 3, 4]])
     """
-    if len(cells) > MOST_CELLS:
-        raise ValueError(f"{len(cells)} cells in one piece, at most {MOST_CELLS} can be paired")
     cells = np.ascontiguousarray(cells)
-    mate = _pair(cells, n_points)
+    mate = find_mates(cells, n_points)
     crowded = np.flatnonzero(mate == CROWDED)
     if len(crowded):
-        raise ValueError(f"more than two cells have the face {_corners(cells, crowded[:1])[0].tolist()}")
+        raise ValueError(f"more than two cells have the face {take_faces(cells, crowded[:1])[0].tolist()}")
     outer = np.flatnonzero(mate == NO_MATE)
-    facet = _find_facets(_corners(cells, outer), facets)
+    facet = _find_facets(take_faces(cells, outer), facets)
     is_shared = np.ones(len(outer), np.bool_)
     is_shared[facet] = False
     owner, neighbour, inner = _take_inner(cells, mate, (len(mate) - len(outer)) // 2)
@@ -92,13 +88,8 @@ def find_cell_faces(cells: NDArray[np.int32], facets: NDArray[np.int32], n_point
         inner,
         (outer[facet] // 4).astype(np.int32),
         (outer[is_shared] // 4).astype(np.int32),
-        _corners(cells, outer[is_shared]),
+        take_faces(cells, outer[is_shared]),
     )
-
-
-def _corners(cells: NDArray[np.int32], face: NDArray[np.int64]) -> NDArray[np.int32]:
-    corners: NDArray[np.int32] = cells[(face // 4)[:, None], FACES[face % 4]]
-    return corners
 
 
 def _find_facets(outer: NDArray[np.int32], facets: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -109,43 +100,9 @@ def _find_facets(outer: NDArray[np.int32], facets: NDArray[np.int32]) -> NDArray
     found: NDArray[np.int64] = row[group[len(outer) :]]
     if (found < 0).any():
         raise ValueError(f"the facet {facets[found < 0][0].tolist()} is no exterior face of a cell")
-    if len(np.unique(found)) < len(found):
+    if np.bincount(found).max(initial=0) > 1:
         raise ValueError("a facet is there twice")
     return found
-
-
-@kernel
-def _sorted_face(cells, face):  # type: ignore[no-untyped-def]  # pragma: no cover
-    i, k = face // 4, face % 4
-    a, b, c = cells[i, FACES[k, 0]], cells[i, FACES[k, 1]], cells[i, FACES[k, 2]]
-    low, high = min(a, b, c), max(a, b, c)
-    return low, np.int64(a) + np.int64(b) + np.int64(c) - low - high, high
-
-
-@kernel
-def _pair(cells, n_points):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Find for each of the 4 m faces the other that has the same vertices, `NO_MATE` or `CROWDED`."""
-    n_faces = 4 * len(cells)
-    mate = np.full(n_faces, NO_MATE, np.int32)
-    # Faces by their smallest vertex, as linked lists: few faces have the same one.
-    last = np.full(n_points, -1, np.int32)
-    before = np.empty(n_faces, np.int32)
-    for face in range(n_faces):
-        low, middle, high = _sorted_face(cells, face)
-        other = last[low]
-        while other >= 0:
-            _, m, h = _sorted_face(cells, other)
-            if m == middle and h == high:
-                break
-            other = before[other]
-        if other < 0:
-            before[face] = last[low]
-            last[low] = face
-        elif mate[other] == NO_MATE:
-            mate[face], mate[other] = other, face
-        else:
-            mate[face] = CROWDED
-    return mate
 
 
 @kernel

@@ -10,14 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.kernel import kernel
-from pipeline.geometry.components import join_pairs
+from stitch.pieces.face_mates import CROWDED, FACES, NO_MATE, iterate_mates, take_faces
 
-# The faces of a cell of positive volume, counter-clockwise seen from outside.
-FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int8)
 # A cell counts as flat when its volume is below this part of the cube of its longest edge.
 FLAT = 1e-12
-
-INTERIOR, EXTERIOR, SAME_SIDE, SHARED = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +98,7 @@ def pair_cell_faces(cells: NDArray[np.int32], n_points: int) -> FacePairs:
 
     Notes
     -----
-    Faces are dealt out by their smallest vertex and sorted there: linear in the cells, some 160 bytes each.
+    Linear in the cells, some 5 bytes each and a few tens of MB (`iterate_mates`).
 
     Examples
     --------
@@ -112,13 +108,18 @@ def pair_cell_faces(cells: NDArray[np.int32], n_points: int) -> FacePairs:
     >>> len(pairs.exterior), len(pairs.same_side), len(pairs.shared)
     (6, 0, 0)
     """
-    state, beyond = _face_states(np.ascontiguousarray(cells), n_points)
-    face = np.flatnonzero(beyond >= 0)
-    name = join_pairs(len(cells), np.column_stack(((face // 4).astype(np.int32), beyond[face])))
-    _, part = np.unique(name, return_inverse=True)
-    chosen = [np.flatnonzero(state == kind) for kind in (EXTERIOR, SAME_SIDE, SHARED)]
-    exterior, same_side, shared = (cells[i // 4][np.arange(len(i))[:, None], FACES[i % 4]] for i in chosen)
-    return FacePairs(exterior, same_side, shared, chosen[0] // 4, part.astype(np.int32))
+    cells = np.ascontiguousarray(cells)
+    above = np.arange(len(cells), dtype=np.int32)  # a cell of the same part, itself if it is the first one
+    kinds: tuple[list[NDArray[np.int32]], ...] = ([], [], [])
+    for face, mate in iterate_mates(cells, n_points):
+        one_sided = _join_cells(cells, face, mate, above)
+        for kind, rows in zip(kinds, (mate == NO_MATE, one_sided, mate == CROWDED), strict=True):
+            kind.append(face[rows])
+    _number_parts(above)
+    none = np.empty(0, np.int32)
+    outer, one_sided, crowded = (np.sort(np.concatenate((none, *kind))) for kind in kinds)
+    exterior, same_side, shared = (take_faces(cells, rows) for rows in (outer, one_sided, crowded))
+    return FacePairs(exterior, same_side, shared, (outer // 4).astype(np.int64), above)
 
 
 def pair_faces(facets: NDArray[np.int32]) -> FacePairs:
@@ -244,8 +245,15 @@ def find_duplicate_points(points: NDArray[np.float64]) -> NDArray[np.int64]:
     int64, (k,)
         Their indices, ascending.
     """
+    if _ascend(points):
+        return np.empty(0, np.int64)
     group, n_groups = group_rows(points)
     return np.flatnonzero(_first_of_group(group, n_groups)[group] != np.arange(len(points)))
+
+
+def find_used_points(rows: NDArray[np.int32], n_points: int) -> NDArray[np.bool_]:
+    """Tell which points, (n_points,), rows (m, k) of cells or facets use."""
+    return _mark(np.ascontiguousarray(rows), n_points)  # type: ignore[no-any-return]
 
 
 def find_unused_points(rows: NDArray[np.int32], n_points: int) -> NDArray[np.int64]:
@@ -263,9 +271,7 @@ def find_unused_points(rows: NDArray[np.int32], n_points: int) -> NDArray[np.int
     int64, (n,)
         Their indices, ascending.
     """
-    used = np.zeros(n_points, np.bool_)
-    used[rows.ravel()] = True
-    return np.flatnonzero(~used)
+    return np.flatnonzero(~find_used_points(rows, n_points))
 
 
 def compute_cell_volumes(
@@ -316,6 +322,13 @@ def compute_facet_areas(
     return area, area * (a[:, 2] + b[:, 2] + c[:, 2]) / 3
 
 
+def _ascend(points: NDArray[np.float64]) -> bool:
+    """Tell whether points ascend by x, then y, then z: those of a mesh of ours do."""
+    above, equal = (compare(points[1:], points[:-1]) for compare in (np.greater, np.equal))
+    higher = above[:, 0] | (equal[:, 0] & (above[:, 1] | (equal[:, 1] & above[:, 2])))
+    return bool(higher.all())
+
+
 def _first_of_group(group: NDArray[np.int64], n_groups: int) -> NDArray[np.int64]:
     """Return the first row of each group, -1 for an empty one."""
     first = np.full(n_groups, -1)
@@ -332,61 +345,57 @@ def _is_even(facets: NDArray[np.int32]) -> NDArray[np.bool_]:
 
 
 @kernel
-def _ordered_face(cells, i, k):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return the vertices of a face in ascending order, and 1 if a rotation suffices for that."""
+def _turns(cells, face):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Tell whether a rotation brings the vertices of a face into ascending order."""
+    i, k = face // 4, face % 4
     a, b, c = cells[i, FACES[k, 0]], cells[i, FACES[k, 1]], cells[i, FACES[k, 2]]
-    even = np.int64(a < b) + np.int64(b < c) + np.int64(c < a) == 2
-    low, high = min(a, b, c), max(a, b, c)
-    middle = np.int64(a) + np.int64(b) + np.int64(c) - low - high
-    return low, middle, high, np.int64(even)
+    return (a < b) + (b < c) + (c < a) == 2
 
 
 @kernel
-def _face_states(cells, n_points):  # type: ignore[no-untyped-def]  # noqa: PLR0912  # pragma: no cover
-    """Mark each of the 4 m faces as interior, exterior, same-side or shared.
+def _find_first(above, i):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Find the first thing of a part, where each thing names another one before it, and the first itself."""
+    while above[i] != i:
+        above[i] = above[above[i]]
+        i = above[i]
+    return i
 
-    Of the two faces that meet, one gets the cell of the other; all others get -1.
-    """
-    n_faces = 4 * len(cells)
-    start = np.zeros(n_points + 1, np.int64)
-    for i in range(len(cells)):
-        for k in range(4):
-            start[_ordered_face(cells, i, k)[0] + 1] += 1
-    for p in range(n_points):
-        start[p + 1] += start[p]
-    place = start[:-1].copy()
-    key = np.empty(n_faces, np.int64)
-    face = np.empty(n_faces, np.int64)
-    for i in range(len(cells)):
-        for k in range(4):
-            low, middle, high, even = _ordered_face(cells, i, k)
-            # Both vertices are below 2**31: the key has 31 + 31 + 1 bits.
-            key[place[low]] = (np.int64(middle) << 32) | (np.int64(high) << 1) | even
-            face[place[low]] = 4 * i + k
-            place[low] += 1
-    state = np.zeros(n_faces, np.uint8)
-    beyond = np.full(n_faces, -1, np.int32)
-    for p in range(n_points):
-        keys, faces = key[start[p] : start[p + 1]], face[start[p] : start[p + 1]]
-        order = np.argsort(keys)
-        i = 0
-        while i < len(order):
-            j = i + 1
-            while j < len(order) and keys[order[j]] >> 1 == keys[order[i]] >> 1:
-                j += 1
-            kind = INTERIOR
-            if j - i == 1:
-                kind = EXTERIOR
-            elif j - i > 2:
-                kind = SHARED
-            elif keys[order[i]] == keys[order[i + 1]]:
-                kind = SAME_SIDE
-            for at in range(i, j):
-                state[faces[order[at]]] = kind
-            if j - i == 2:
-                beyond[faces[order[i]]] = faces[order[i + 1]] // 4
-            i = j
-    return state, beyond
+
+@kernel
+def _join_cells(cells, faces, mates, above):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Put cells on both sides of faces into one part, and tell which faces have both on one side."""
+    one_sided = np.zeros(len(faces), np.bool_)
+    for at in range(len(faces)):
+        face, other = faces[at], mates[at]
+        if other < 0:
+            continue
+        one_sided[at] = _turns(cells, face) == _turns(cells, other)
+        if other < face:
+            continue
+        one, two = _find_first(above, face // 4), _find_first(above, other // 4)
+        above[max(one, two)] = min(one, two)
+    return one_sided
+
+
+@kernel
+def _number_parts(above):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Number the parts from 0, in the order of their first cells."""
+    n = 0
+    for cell in range(len(above)):
+        if above[cell] == cell:
+            above[cell] = n
+            n += 1
+        else:  # of a smaller cell, which has its number
+            above[cell] = above[above[cell]]
+
+
+@kernel
+def _mark(rows, n_points):  # type: ignore[no-untyped-def]  # pragma: no cover
+    used = np.zeros(n_points, np.bool_)
+    for i in range(rows.shape[0]):
+        for k in range(rows.shape[1]):
+            used[rows[i, k]] = True
+    return used
 
 
 @kernel

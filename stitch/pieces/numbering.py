@@ -227,7 +227,7 @@ def collect_ids(pieces: Iterable[Ints]) -> Numbering:
     waiting: list[Ints] = []
     n_waiting = 0
     for ids in pieces:
-        waiting.append(_runs(ids))
+        waiting.append(_join_runs([_runs(ids)]))
         n_waiting += len(waiting[-1])
         if n_waiting > len(runs):  # each run is moved a few times at most, however many pieces there are
             runs, waiting, n_waiting = _join_runs([runs, *waiting]), [], 0
@@ -251,12 +251,11 @@ def _part(kind: int, i: int, j: int) -> int:
 
 
 def _runs(ids: Ints) -> Ints:
-    """Runs (r, 2) of ids that follow each other."""
-    ordered = np.unique(ids)
-    if len(ordered) == 0:
+    """Runs (r, 2) of ids that follow each other, as they stand."""
+    if len(ids) == 0:
         return np.empty((0, 2), np.int64)
-    last = np.append(np.flatnonzero(np.diff(ordered) != 1), len(ordered) - 1)
-    return np.stack((ordered[np.append(0, last[:-1] + 1)], ordered[last] + 1), axis=1)
+    last = np.append(np.flatnonzero(np.diff(ids) != 1), len(ids) - 1)
+    return np.stack((ids[np.append(0, last[:-1] + 1)], ids[last] + 1), axis=1)
 
 
 def _join_runs(several: Sequence[Ints]) -> Ints:

@@ -48,6 +48,11 @@ class PlaneDtm:
         return z
 
 
+def load_plane(path: Path) -> PlaneDtm:
+    """Give the terrain of a folder of `write_run` without looking at it, also to a worker."""
+    return PlaneDtm()
+
+
 @dataclass(frozen=True, eq=False)
 class TinyCity:
     """A city model, its terrain and its mesh: ``owner`` is the cell behind each boundary facet."""

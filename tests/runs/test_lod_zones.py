@@ -13,8 +13,7 @@ from pipeline.data.citymodel import Prisms
 from pipeline.data.errors import ConfigError
 from tests.helpers.tiles import CRS, hash_files, make_town, put_roofs, run_of, shape_city, terraces, write_town
 from tiler.check.check import check_run
-from tiler.check.zone_proofs import ZoneProofs
-from tiler.citymodels.building_index import index_buildings
+from tiler.check.zone_proofs import check_zones
 from tiler.citymodels.tables import unpack_buildings
 from tiler.config.config import make_config
 from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
@@ -58,9 +57,8 @@ def models(out: Path) -> dict[str, tuple[bytes, ...]]:
 def prove_levels(text: str, zones: Zones, out: Path, folder: Path) -> set[str]:
     """Faults of a city model in place of that of a run."""
     (folder / CITY_MODEL).write_text(text)
-    proofs = ZoneProofs(zones)
-    with index_buildings(folder / CITY_MODEL, proofs.add):
-        return {fault.kind for fault in proofs.prove(out / FULL_CITY_MODEL).faults}
+    proof = check_zones(zones, folder / CITY_MODEL, out / FULL_CITY_MODEL)
+    return {fault.kind for fault in proof.faults}
 
 
 def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path: Path) -> None:

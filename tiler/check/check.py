@@ -1,34 +1,31 @@
 """`citystitch check`: prove from the written files that a run's mesh is right."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import Marker
+from pipeline.geometry.components import join_pairs
 from stitch.pieces.frontier import Settled, add_rim, close_frontier, start_frontier
 from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proofs, wall_proofs
-from tiler.check.check_piece import ANY, GROUND, TOP, Piece, read_piece, take_vertices
-from tiler.check.proofs import Bounds, Dtm, Fault, Finding, Proof, Vertices
-from tiler.check.solid_proofs import SolidProofs
-from tiler.check.zone_proofs import ZoneProofs
-from tiler.citymodels.building_index import BuildingIndex, index_buildings
-from tiler.landcover.stored_cover import StoredCanopy, StoredCover
+from tiler.check.check_piece import ANY, GROUND, TOP
+from tiler.check.piece_survey import LoadDtm, PieceTask, Survey, load_survey, survey_piece
+from tiler.check.proofs import Fault, Finding, Proof, Vertices
+from tiler.check.solid_proofs import check_solids
+from tiler.check.zone_proofs import check_zones
+from tiler.citymodels.building_index import BuildingIndex, index_buildings, open_vertices
+from tiler.executors.in_order import check_workers, map_in_order
 from tiler.mesh_files.mesh_parts import report_parts
-from tiler.mesh_files.mesh_pieces import read_leaves
-from tiler.mesh_files.vtk_files import read_piece_paths, read_vtu
-from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
+from tiler.mesh_files.vtk_files import read_piece_paths
+from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD
 from tiler.store.run_folder import PARTS, RunRecord, read_run_record
 
 VOLUME_INDEX = "mesh.pvtu"
 BOUNDARY_INDEX = "boundary.pvtp"
-ALONE = 3.0  # spacings of the terrain; closer to other water a node may have its level
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,7 @@ class CheckReport:
         return [*lines, *(f"NOTE  {remark}" for remark in self.remarks), f"{self.directory}: {verdict}"]
 
 
-def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
+def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckReport:
     """Prove that the mesh in a run folder is conforming, watertight, and that of its city model and DTM.
 
     Parameters
@@ -85,57 +82,76 @@ def check_run(directory: Path, load_dtm: Callable[[Path], Dtm]) -> CheckReport:
     directory : Path
         The folder of a run.
     load_dtm : callable
-        Given the path of the store, returns the terrain, which has ``sample(xy (n, 2)) -> z (n,)``.
+        Given the path of the store, returns the terrain, which has ``sample(xy (n, 2)) -> z (n,)``. A function of
+        a module, so that workers can import it.
+    workers : int
+        Processes of this machine that look at pieces; with 0 this one does.
 
     Returns
     -------
     CheckReport
-        Claims and faults.
+        Claims and faults: the same whatever the workers.
 
     Raises
     ------
+    ConfigError
+        If there are less than 0 workers.
     InputError
         If a file is missing or damaged.
+    ClusterError
+        If a worker process died.
 
     Notes
     -----
-    Pieces are read one after the other, along the long side of the region: memory holds one piece with the
-    buildings and the terrain around it, what waits for a neighbour on the frontier (`stitch.pieces.frontier`),
-    besides some 100 bytes a building and 500 a piece.
+    A task reads a piece, with the buildings and the terrain around it, and leaves what it says in a temporary
+    file. These are put together here, piece after piece along the long side of the region: memory holds what waits
+    for a neighbour on the frontier (`stitch.pieces.frontier`), besides some 100 bytes a building and 500 a piece.
     """
+    check_workers(workers)
     record = read_run_record(directory / RUN_RECORD)
-    solids, levels = SolidProofs(), ZoneProofs(record.zones)
+    if workers:
+        from tiler.executors.dask_settings import start_fork_server
 
-    def see(*found: Any) -> None:
-        solids.add(*found)
-        if record.zones:
-            levels.add(*found)
-
-    with index_buildings(directory / CITY_MODEL, see) as index:
+        start_fork_server()  # which imports what workers need while buildings are read here
+    with (
+        TemporaryDirectory(prefix="citystitch-") as folder,
+        index_buildings(directory / CITY_MODEL, Path(folder)) as index,
+    ):
         files = _in_order(_pair_pieces(directory), record)
-        dtm = load_dtm(directory / STORE)
-        cover = _open_cover(directory / STORE, record) if record.ground else None
-        canopy = StoredCanopy(directory / STORE, _boxes(record), record.leaf_column) if record.leaves else None
-        sums = _Sums.start(len(index))
-        frontier = start_frontier()
-        for number, (volume, boundary) in enumerate(files):
-            piece = read_piece(directory / volume, directory / boundary, record.bounds, soil=record.depth > 0)
-            rim = replace(piece.rim, part=piece.rim.part + len(sums.part_cells))
+        tasks = [
+            PieceTask(directory, *names, Path(folder), Path(folder) / f"{k}.survey", load_dtm)
+            for k, names in enumerate(files)
+        ]
+        items: list[tuple[Path, Path] | PieceTask] = [(directory / CITY_MODEL, Path(folder)), *tasks]
+        sums, frontier = _Sums.start(len(index)), start_frontier()
+        looks = map_in_order(_look, items, workers)
+        (solids,) = next(looks)
+        for number, (task, _) in enumerate(zip(tasks, looks, strict=True)):
+            survey = load_survey(task.out)
+            rim = replace(survey.rim, part=survey.rim.part + len(sums.part_cells))
             frontier, settled, fresh = add_rim(frontier, rim, number)
-            sums.add_piece(piece, fresh, record, index, dtm)
-            if cover is not None:
-                sums.add_cover(piece, fresh, record, cover)
-            if canopy is not None:
-                sums.add_leaves(directory / volume, canopy)
+            sums.add_piece(survey)
+            sums.add_fresh(survey, fresh, record)
             sums.add_settled(settled)
         sums.add_settled(close_frontier(frontier))
         sums.add_rim_walls()
         claims, facts = _conclude(sums, len(files), record, index)
-        claims += (solids.prove(),)
-        claims += (levels.prove(directory / FULL_CITY_MODEL),) if record.zones else ()
+        claims += (solids,)
+        if record.zones:
+            claims += (check_zones(record.zones, directory / CITY_MODEL, directory / FULL_CITY_MODEL),)
         parts = sums.count_parts()
         remarks = (report_parts(parts),) if len(parts) > 1 else ()
         return CheckReport(directory, claims, {**facts, "parts": len(parts)}, remarks)
+
+
+def _look(item: tuple[Path, Path] | PieceTask) -> tuple[Proof, ...]:
+    """Look at the solids of a city model, which gives a proof, or at a piece."""
+    if isinstance(item, PieceTask):
+        survey_piece(item)
+        return ()
+    path, folder = item
+    with open_vertices(folder) as vertices:
+        return (check_solids(path, vertices),)
 
 
 @dataclass(eq=False)
@@ -162,61 +178,33 @@ class _Sums:
         walls = wall_proofs.no_walls()
         return cls({}, built, counts, np.inf, (), np.empty((0, 2)), pairs, *part, pairs, walls)
 
-    def add_piece(
-        self, piece: Piece, fresh: NDArray[np.bool_], record: RunRecord, index: BuildingIndex, dtm: Dtm
-    ) -> None:
-        """Add what a piece says; `fresh` are the points of its rim that no earlier piece had."""
-        surface = piece.surface
-        within, over_rim = wall_proofs.split_walls(surface, piece.on_rim)
-        self.rim_walls = wall_proofs.join_walls(self.rim_walls, over_rim)
-        rows = _find_buildings(index, piece)
-        buildings = index.take(rows)
-        ground = take_vertices(piece, Marker.GROUND, GROUND, fresh)
-        found = {
-            "same": piece.same_boundary,
-            "closed": piece.closed,
-            "marks": city_proofs.check_marks(surface, buildings, soil=record.depth > 0),
-            "box": proofs.check_box(surface, record.bounds, piece.rim.edges),
-            "top": proofs.check_top(take_vertices(piece, Marker.TOP, TOP, fresh), record.top),
-            "ground": proofs.check_ground(ground, dtm),
-            "roofs": city_proofs.check_roofs(surface, buildings, dtm, record.roofs),
-            "walls": city_proofs.check_walls(surface, buildings, dtm, record.roofs),
-            "overlap": wall_proofs.check_overlap(within),
-            "sizes": proofs.check_sizes(surface, piece.outline, piece.air),
-        }
-        if record.core is not None:
-            found["pad"] = pad_proofs.check_pad(surface, ground, record.bounds, record.core, record.rim)
-        if record.depth:
-            found |= {
-                "between": piece.ground,
-                "bottom": soil_proofs.check_bottom(surface, record.depth),
-                "foundations": soil_proofs.check_foundations(surface, dtm),
-                "soil": soil_proofs.check_soil_sizes(surface, piece.soil),
-            }
-        for name, finding in found.items():
+    def add_piece(self, survey: Survey) -> None:
+        """Add what a piece alone says."""
+        for name, finding in survey.found.items():
             self._join(name, finding)
-        city_proofs.add_built(self.built, rows, city_proofs.find_built(surface, buildings, piece.outline))
-        self.counts["cells"] += piece.n_cells
-        self.counts["points"] += piece.n_points + int((piece.rim.points[fresh, 3] == ANY).sum())
-        self.counts["facets"] += len(surface.boundary.facets)
-        self.smallest = min(self.smallest, piece.smallest)
-        self.faults = proofs.merge_faults((*self.faults, *piece.faults))
-        self._add_crowded(piece.crowded)
-        self.part_cells = np.concatenate((self.part_cells, piece.part_cells))
-        self.part_soil = np.concatenate((self.part_soil, piece.part_soil))
+        self.rim_walls = wall_proofs.join_walls(self.rim_walls, survey.rim_walls)
+        city_proofs.add_built(self.built, survey.rows, survey.built)
+        self.counts["cells"] += survey.n_cells
+        self.counts["points"] += survey.n_points
+        self.counts["facets"] += survey.n_facets
+        self.smallest = min(self.smallest, survey.smallest)
+        self.faults = proofs.merge_faults((*self.faults, *survey.faults))
+        self._add_crowded(survey.crowded)
+        self.part_cells = np.concatenate((self.part_cells, survey.part_cells))
+        self.part_soil = np.concatenate((self.part_soil, survey.part_soil))
 
-    def add_cover(self, piece: Piece, fresh: NDArray[np.bool_], record: RunRecord, cover: StoredCover) -> None:
-        """Add what a piece says of the patches of the ground, and of its water."""
-        self._join("cover", cover_proofs.check_cover(piece.surface, piece.patch, record.ground, cover))
-        ground = take_vertices(piece, Marker.GROUND, GROUND, fresh)
-        level = cover.levels_at(ground[:, :2], alone=ALONE * record.dtm_spacing)
-        self._join("levels", cover_proofs.check_levels(ground, level))
-
-    def add_leaves(self, path: Path, canopy: StoredCanopy) -> None:
-        """Add what a piece says of the leaves in its cells."""
-        volume = read_vtu(path)
-        leaves = read_leaves(path, volume)
-        self._join("leaves", cover_proofs.check_leaves(volume.mesh.points, volume.mesh.cells, leaves, canopy))
+    def add_fresh(self, survey: Survey, fresh: NDArray[np.bool_], record: RunRecord) -> None:
+        """Add the points over the rim of a piece that no earlier piece had."""
+        points, kind = survey.rim.points[:, :3], survey.rim.points[:, 3]
+        self.counts["points"] += int((fresh & (kind == ANY)).sum())
+        on_ground = fresh & (kind == GROUND)
+        ground = points[on_ground]
+        self._join("top", proofs.check_top(points[fresh & (kind == TOP)], record.top))
+        self._join("ground", proofs.check_ground(ground, survey.terrain[on_ground]))
+        if record.core is not None:
+            self._join("pad", pad_proofs.check_level(ground, record.bounds, record.core, record.rim))
+        if record.ground:
+            self._join("levels", cover_proofs.check_levels(ground, survey.level[on_ground]))
 
     def add_settled(self, settled: Settled) -> None:
         """Add what is settled between pieces."""
@@ -233,11 +221,8 @@ class _Sums:
 
     def count_parts(self) -> list[int]:
         """Cells of the parts of the air that share no face, the largest first."""
-        n = len(self.part_cells)
-        pairs = coo_array((np.ones(len(self.joined)), tuple(self.joined.T)), shape=(n, n))
-        n_parts, label = connected_components(pairs, directed=False)
-        air = ~self.part_soil
-        cells = np.bincount(label[air], self.part_cells[air], n_parts).astype(np.int64)
+        air, name = ~self.part_soil, join_pairs(len(self.part_cells), self.joined)
+        cells = np.bincount(name[air], self.part_cells[air]).astype(np.int64)
         return sorted(cells[cells > 0].tolist(), reverse=True)
 
     def _join(self, name: str, finding: Finding) -> None:
@@ -297,14 +282,6 @@ def _conclude(
     return claims, facts
 
 
-def _boxes(record: RunRecord) -> dict[str, Bounds]:
-    return {name: (box[0], box[1], box[2], box[3]) for name, box in record.tiles.items() if box is not None}
-
-
-def _open_cover(path: Path, record: RunRecord) -> StoredCover:
-    return StoredCover(path, _boxes(record), record.core, len(record.ground) - 1)
-
-
 def _tell(fault: Fault) -> str:
     places = "; ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in fault.places)
     return f"{fault.kind}: {fault.count}, {fault.detail}" + (f", at {places}" if places else "")
@@ -337,16 +314,6 @@ def _in_order(files: list[tuple[str, str]], record: RunRecord) -> list[tuple[str
         return files
     order = sorted(range(len(files)), key=lambda k: [known[k][axis] for axis in axes])
     return [files[k] for k in order]
-
-
-def _find_buildings(index: BuildingIndex, piece: Piece) -> NDArray[np.int64]:
-    """Find the buildings that a piece may have anything of: around its plan, and those that its facets name."""
-    named = index.find_rows(np.unique(piece.surface.boundary.building))
-    rows = [named[named >= 0]]
-    if len(piece.outline):
-        (west, south), (east, north) = (ends(piece.outline, axis=(0, 1)).tolist() for ends in (np.min, np.max))
-        rows.append(index.find_near((west, south, east, north)))
-    return np.unique(np.concatenate(rows))
 
 
 def _prove_cells(sums: _Sums, n_pieces: int) -> Proof:

@@ -2,18 +2,22 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.mesh import Boundary, Marker, Region, TetMesh
 from stitch.pieces import conformity
-from stitch.pieces.frontier import Rim, as_places, find_border, find_edges_below, find_outline
+from stitch.pieces.frontier import Rim, find_border, find_edges_below, find_outline, find_points_over
 from tiler.check import proofs
+from tiler.check.cover_proofs import DensityAt, check_leaves
 from tiler.check.proofs import Bounds, Fault, Finding, Mask, Surface, Vertices
 from tiler.check.soil_proofs import check_between
-from tiler.mesh_files.vtk_files import BoundaryPiece, read_vtp
-from tiler.store.run_folder import PATCH_OF_GROUND, ROOF_MOVED, read_volume
+from tiler.mesh_files.mesh_pieces import read_leaves, read_regions
+from tiler.mesh_files.vtk_files import BoundaryPiece, read_vtp, read_vtu
+from tiler.mesh_files.vtk_xml import damaged
+from tiler.store.run_folder import PATCH_OF_GROUND, ROOF_MOVED
 
 # Kinds of points over the rim, each counted once: any, of the ground, of the top.
 ANY, GROUND, TOP = range(3)
@@ -43,6 +47,8 @@ class Piece:
         What the piece alone says of these claims; of the ground only with soil below it.
     crowded : float64, (c, 2, 3)
         Boundary edges of more than two facets, paired, not over the rim.
+    leaves : Finding
+        What it alone says of the leaves in its cells.
     faults : tuple of Fault
         Of its cells.
     patch : int8, (k,), or None
@@ -64,25 +70,84 @@ class Piece:
     ground: Finding
     closed: Finding
     crowded: Vertices
+    leaves: Finding
     faults: tuple[Fault, ...]
     patch: NDArray[np.int8] | None
 
 
-def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: bool = False) -> Piece:
-    """Read the two files of a piece of the region with these bounds (m), which has soil or has not.
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """What is kept of the cells of a piece.
+
+    Attributes
+    ----------
+    n_cells : int
+        How many they are.
+    points : float64, (n, 3)
+        Points of the volume (m).
+    air, soil, smallest : float
+        As of `Piece`.
+    exterior : int32, (k, 3)
+        Faces of one cell, as rows of the points.
+    between : int32, (g, 3)
+        Faces between air and soil, as the air has them.
+    of_soil : bool, (k,)
+        Which exterior faces are the soil's.
+    part : int64, (k,)
+        Part of the mesh behind each exterior face.
+    part_cells, part_soil
+        As of `Piece`.
+    leaves : Finding
+        What was found of leaves.
+    faults : tuple of Fault
+        Of cells and faces.
+    """
+
+    n_cells: int
+    points: Vertices
+    air: float
+    soil: float
+    smallest: float
+    exterior: NDArray[np.int32]
+    between: NDArray[np.int32]
+    of_soil: Mask
+    part: NDArray[np.int64]
+    part_cells: NDArray[np.int64]
+    part_soil: Mask
+    leaves: Finding
+    faults: tuple[Fault, ...]
+
+
+def read_piece(
+    volume_path: Path,
+    boundary_path: Path,
+    bounds: Bounds,
+    *,
+    soil: bool = False,
+    density_at: DensityAt | None = None,
+) -> Piece:
+    """Read the two files of a piece of the region with these bounds (m), each once.
+
+    Parameters
+    ----------
+    volume_path, boundary_path : Path
+        The files.
+    bounds : (west, south, east, north)
+        Bounds of the region (m).
+    soil : bool
+        Whether the mesh has soil.
+    density_at : callable, optional
+        Gives the leaf area density of places, where the mesh has trees.
 
     Raises
     ------
     InputError
         If one is missing or damaged.
     """
-    (mesh, region), file = read_volume(volume_path, regions=soil), read_vtp(boundary_path)
-    pairs = conformity.pair_cell_faces(mesh.cells, len(mesh.points))
-    volumes, flat = conformity.compute_cell_volumes(mesh.points, mesh.cells)
-    between, of_soil = _part_regions(mesh, region, pairs.exterior)
-    label = _label_parts(mesh, region, pairs.part)
-    surface, rows = _join(mesh.points[np.concatenate((pairs.exterior, between))], file)
-    faces, between = rows[: len(pairs.exterior)], rows[len(pairs.exterior) :]
+    cells = _survey_cells(volume_path, soil=soil, density_at=density_at)
+    file = read_vtp(boundary_path)
+    surface, rows = _join(cells.points, np.concatenate((cells.exterior, cells.between)), file)
+    faces, between = rows[: len(cells.exterior)], rows[len(cells.exterior) :]
     # Faces of cells whose vertices are there twice meet where coordinates are equal.
     joined = conformity.pair_faces(faces)
     exterior = joined.exterior
@@ -93,22 +158,28 @@ def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: 
     known = np.ones(len(exterior), np.bool_)
     known[match.missing] = False
     of_air = known.copy()
-    of_air[np.setdiff1d(np.arange(len(exterior)), conformity.match_facets(faces[of_soil], exterior).extra)] = False
+    if soil:
+        of_soil = np.ones(len(exterior), np.bool_)
+        of_soil[conformity.match_facets(faces[cells.of_soil], exterior).extra] = False
+        of_air &= ~of_soil
     outline = find_outline(surface.points, _facing_up(surface.points, exterior[of_air]))
     edges = outline[~find_border(outline, bounds, tolerance=proofs.SIDE_TOLERANCE)]
-    over = find_edges_below(surface.points[exterior], edges) >= 0
-    part = label[pairs.row[joined.row]]
-    rim, on_rim = _find_rim(surface, facets, edges, (exterior[over], part[over]), known[over], faces)
+    on_rim = find_points_over(surface.points, edges)
+    over = np.all(on_rim[exterior], axis=1)
+    over[over] = find_edges_below(surface.points[exterior[over]], edges) >= 0
+    behind = (exterior[over], cells.part[joined.row[over]])
+    rim = _find_rim(surface, facets, edges, behind, known=known[over], faces=faces, on_rim=on_rim)
     open_edges, crowded = _pair_edges(surface.points, facets, on_rim)
+    inner = len(cells.points) - int(conformity.find_used_points(cells.exterior, len(cells.points)).sum())
     return Piece(
-        n_cells=len(mesh.cells),
-        n_points=len(mesh.points) - len(np.unique(pairs.exterior)) + int((~on_rim[np.unique(faces)]).sum()),
-        air=float(volumes[region == Region.AIR].sum()),
-        soil=float(volumes[region == Region.SOIL].sum()),
-        smallest=float(volumes.min(initial=np.inf)),
+        n_cells=cells.n_cells,
+        n_points=inner + int((conformity.find_used_points(faces, len(on_rim)) & ~on_rim).sum()),
+        air=cells.air,
+        soil=cells.soil,
+        smallest=cells.smallest,
         surface=surface,
-        part_cells=np.bincount(label),
-        part_soil=np.bincount(label, region == Region.SOIL) > 0,
+        part_cells=cells.part_cells,
+        part_soil=cells.part_soil,
         outline=outline,
         rim=rim,
         on_rim=on_rim,
@@ -116,11 +187,11 @@ def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: 
         ground=check_between(surface.points, ground, between) if soil else Finding(),
         closed=proofs.check_closed(open_edges, crowded),
         crowded=crowded,
+        leaves=cells.leaves,
         faults=proofs.merge_faults(
             [
-                *proofs.find_face_faults(mesh.points, pairs),
-                *proofs.find_cell_faults(mesh, volumes, flat),
-                *_find_link_faults(mesh, file),
+                *cells.faults,
+                *_find_link_faults(cells.points, file),
                 *proofs.find_face_faults(surface.points, joined),
             ]
         ),
@@ -128,19 +199,65 @@ def read_piece(volume_path: Path, boundary_path: Path, bounds: Bounds, *, soil: 
     )
 
 
-def take_vertices(piece: Piece, marker: Marker, kind: int, fresh: Mask) -> Vertices:
-    """Return the vertices with a marker (n, 3), but for those over the rim that an earlier piece had."""
-    row = np.unique(piece.surface.boundary.facets[piece.surface.marked(marker)])
-    rest = piece.rim.points[fresh & (piece.rim.points[:, 3] == kind), :3]
-    return np.concatenate((piece.surface.points[row[~piece.on_rim[row]]], rest))
+def _survey_cells(path: Path, *, soil: bool, density_at: DensityAt | None) -> _Cells:
+    """Read the volume, and let its cells go."""
+    volume = read_vtu(path)
+    mesh = volume.mesh
+    if not np.isfinite(mesh.points).all():
+        raise damaged(path, "a coordinate is not finite")
+    region = read_regions(path, volume) if soil else np.full(len(mesh.cells), Region.AIR, np.int8)
+    leaves = Finding()
+    if density_at is not None:
+        leaves = check_leaves(mesh.points, mesh.cells, read_leaves(path, volume), density_at)
+    del volume
+    sizes = proofs.check_cells(mesh, region)
+    pairs = conformity.pair_cell_faces(mesh.cells, len(mesh.points))
+    between, of_soil = _part_regions(mesh, region, pairs.exterior) if soil else _no_regions(pairs.exterior)
+    label = _label_parts(mesh, region, pairs.part) if soil else pairs.part
+    return _Cells(
+        n_cells=len(mesh.cells),
+        points=mesh.points,
+        air=sizes.sums["air"],
+        soil=sizes.sums["soil"],
+        smallest=-sizes.largest["-smallest"],
+        exterior=pairs.exterior,
+        between=between,
+        of_soil=of_soil,
+        part=label[pairs.row].astype(np.int64),
+        part_cells=_count_parts(label),
+        part_soil=_count_parts(label[region == Region.SOIL], int(label.max(initial=-1)) + 1) > 0,
+        leaves=leaves,
+        faults=proofs.merge_faults([*proofs.find_face_faults(mesh.points, pairs), *sizes.faults]),
+    )
+
+
+def take_vertices(piece: Piece, marker: Marker) -> Vertices:
+    """Return the vertices with a marker (n, 3), but for those over the rim."""
+    facets = piece.surface.boundary.facets[piece.surface.marked(marker)]
+    vertices: Vertices = piece.surface.points[
+        conformity.find_used_points(facets, len(piece.on_rim)) & ~piece.on_rim
+    ]
+    return vertices
+
+
+def _count_parts(label: NDArray[Any], n: int = 0) -> NDArray[np.int64]:
+    """Count the cells of each part, some cells at a time, as numpy makes numbers of 64 bits of them."""
+    n = max(n, int(label.max(initial=-1)) + 1)
+    blocks = range(0, len(label), proofs.CELLS_AT_ONCE)
+    total = np.zeros(n, np.int64)
+    for k in blocks:
+        total += np.bincount(label[k : k + proofs.CELLS_AT_ONCE], minlength=n)
+    return total
+
+
+def _no_regions(exterior: NDArray[np.int32]) -> tuple[NDArray[np.int32], Mask]:
+    return np.empty((0, 3), np.int32), np.zeros(len(exterior), np.bool_)
 
 
 def _part_regions(
     mesh: TetMesh, region: NDArray[np.int8], exterior: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], Mask]:
     """Find the faces between air and soil (g, 3), as the air has them, and which exterior faces are the soil's."""
-    if (region == Region.AIR).all():
-        return np.empty((0, 3), np.int32), np.zeros(len(exterior), np.bool_)
     air = conformity.pair_cell_faces(mesh.cells[region == Region.AIR], len(mesh.points)).exterior
     match = conformity.match_facets(exterior, air)
     of_soil = np.zeros(len(exterior), np.bool_)
@@ -160,22 +277,27 @@ def _label_parts(mesh: TetMesh, region: NDArray[np.int8], part: NDArray[np.int32
     return label
 
 
-def _join(exterior: Vertices, file: BoundaryPiece) -> tuple[Surface, NDArray[np.int32]]:
-    """Put the boundary and the exterior faces (k, 3, 3) on common points, equal where coordinates are."""
-    corners = file.points[file.boundary.facets]
-    rows = np.concatenate([exterior, corners]).reshape(-1, 3)
-    group, n_groups = conformity.group_rows(rows)
-    points = np.empty((n_groups, 3))
-    points[group] = rows
-    index = group.astype(np.int32).reshape(-1, 3)
-    boundary = Boundary(index[len(exterior) :], file.boundary.marker, file.boundary.building)
-    moved = file.point_data.get(ROOF_MOVED, np.zeros(len(file.points)))[file.boundary.facets]
-    return proofs.make_surface(points, boundary, moved), index[: len(exterior)]
+def _join(points: Vertices, faces: NDArray[np.int32], file: BoundaryPiece) -> tuple[Surface, NDArray[np.int32]]:
+    """Put the boundary and faces (k, 3) of the volume on common points, equal where coordinates are."""
+    facets = file.boundary.facets
+    used = np.flatnonzero(conformity.find_used_points(faces, len(points)))
+    kept = np.flatnonzero(conformity.find_used_points(facets, len(file.points)))
+    both = np.concatenate((points[used], file.points[kept]))
+    group, n_groups = conformity.group_rows(both)
+    common = np.empty((n_groups, 3))
+    common[group] = both
+    index = group.astype(np.int32)
+    of_volume, of_file = np.empty(len(points), np.int32), np.empty(len(file.points), np.int32)
+    of_volume[used], of_file[kept] = index[: len(used)], index[len(used) :]
+    boundary = Boundary(of_file[facets], file.boundary.marker, file.boundary.building)
+    moved = file.point_data.get(ROOF_MOVED, np.zeros(len(file.points)))[facets]
+    return proofs.make_surface(common, boundary, moved), of_volume[faces]
 
 
 def _facing_up(points: Vertices, faces: NDArray[np.int32]) -> NDArray[np.int32]:
     area, _ = conformity.compute_facet_areas(points, faces)
-    return faces[(area > 0) & (proofs.measure_plan_widths(points[faces], area) > proofs.SIDE_TOLERANCE)]
+    faces, area = faces[area > 0], area[area > 0]
+    return faces[proofs.measure_plan_widths(points[faces], area) > proofs.SIDE_TOLERANCE]
 
 
 def _find_rim(
@@ -183,24 +305,22 @@ def _find_rim(
     facets: NDArray[np.int32],
     edges: Vertices,
     over: tuple[NDArray[np.int32], NDArray[np.int64]],
+    *,
     known: Mask,
     faces: NDArray[np.int32],
-) -> tuple[Rim, Mask]:
+    on_rim: Mask,
+) -> Rim:
     """Gather what stands over the rim's edges: exterior faces `over` them with their parts, some `known`.
 
     Those `known` are in the boundary file; of that, `facets` are those that bound the cells.
     """
     boundary, points = surface.boundary, surface.points
-    on_rim = np.isin(as_places(points), as_places(edges))
     start, end = facets.ravel(), np.roll(facets, -1, axis=1).ravel()
     both = on_rim[start] & on_rim[end]
-    kinds = [
-        np.unique(faces),
-        *(np.unique(boundary.facets[surface.marked(m)]) for m in (Marker.GROUND, Marker.TOP)),
-    ]
-    chosen = [row[on_rim[row]] for row in kinds]
+    kinds = (faces, *(boundary.facets[surface.marked(m)] for m in (Marker.GROUND, Marker.TOP)))
+    chosen = [np.flatnonzero(conformity.find_used_points(rows, len(points)) & on_rim) for rows in kinds]
     rows = np.concatenate(chosen)
-    rim = Rim(
+    return Rim(
         edges=edges,
         faces=points[over[0]],
         is_boundary=known,
@@ -208,7 +328,6 @@ def _find_rim(
         lines=points[np.stack((start[both], end[both]), axis=1)],
         points=np.column_stack((points[rows], np.repeat((ANY, GROUND, TOP), [len(row) for row in chosen]))),
     )
-    return rim, on_rim
 
 
 def _pair_edges(points: Vertices, facets: NDArray[np.int32], on_rim: Mask) -> tuple[Vertices, Vertices]:
@@ -218,11 +337,11 @@ def _pair_edges(points: Vertices, facets: NDArray[np.int32], on_rim: Mask) -> tu
     return points[kept[0]], points[kept[1]]
 
 
-def _find_link_faults(mesh: TetMesh, piece: BoundaryPiece) -> list[Fault]:
+def _find_link_faults(points: Vertices, piece: BoundaryPiece) -> list[Fault]:
     """Find boundary points whose `vertex` is not the volume's point in the same place, or that repeat."""
-    known = (piece.vertex >= 0) & (piece.vertex < len(mesh.points))
+    known = (piece.vertex >= 0) & (piece.vertex < len(points))
     linked = known.copy()
-    linked[known] = np.all(mesh.points[piece.vertex[known]] == piece.points[known], axis=1)
+    linked[known] = np.all(points[piece.vertex[known]] == piece.points[known], axis=1)
     unused = conformity.find_unused_points(piece.boundary.facets, len(piece.points))
     duplicate = conformity.find_duplicate_points(piece.points)
     return [

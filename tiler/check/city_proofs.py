@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from pipeline.data.mesh import Marker
 from pipeline.data.roofs import roof_heights
+from stitch.pieces.conformity import group_rows
+from stitch.pieces.frontier import group_places
 from tiler.check.proofs import (
     HEIGHT_TOLERANCE,
     N_PLACES,
@@ -252,12 +254,32 @@ def _facets_of(
 
 
 def _all_near(shapes: NDArray[np.object_], row: NDArray[np.int64], corners: Vertices) -> Mask:
-    """Tell whether a facet's vertices and centre are within `OUTLINE_TOLERANCE` of its building's shape."""
+    """Tell whether a facet's vertices and centre are within `OUTLINE_TOLERANCE` of its building's shape.
+
+    Many facets of a wall have the same plan: each is looked at once.
+    """
     shapely.prepare(shapes[np.unique(row)])
-    places = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)
-    points = shapely.points(places[:, :, 0], places[:, :, 1])
-    near: Mask = shapely.dwithin(shapes[row][:, None], points, OUTLINE_TOLERANCE).all(axis=1)
-    return near
+
+    def are_near(row: NDArray[np.int64], xy: Vertices) -> Mask:
+        return shapely.dwithin(shapes[row], shapely.points(xy), OUTLINE_TOLERANCE)  # type: ignore[no-any-return]
+
+    places, number = group_places(corners.reshape(-1, 3))
+    plan = np.sort(number.reshape(-1, 3), axis=1)
+    first, group = _find_distinct(np.column_stack((row, plan)))
+    row, plan = row[first], plan[first]
+    corner, of = _find_distinct(np.column_stack((np.repeat(row, 3), plan.ravel())))
+    near = are_near(np.repeat(row, 3)[corner], places[plan.ravel()[corner]])[of].reshape(-1, 3).all(axis=1)
+    near &= are_near(row, places[plan].mean(axis=1))
+    found: Mask = near[group]
+    return found
+
+
+def _find_distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find a row of each group of equal rows, and the group of each row."""
+    group, n_groups = group_rows(rows)
+    first = np.empty(n_groups, np.int64)
+    first[group] = np.arange(len(rows))
+    return first, group
 
 
 def _needs_wall(row: int, index: BuildingIndex, bounds: Bounds, rules: RoofRules) -> bool:

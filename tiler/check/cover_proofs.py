@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.mesh import Marker
 from tiler.check.proofs import (
+    CELLS_AT_ONCE,
     HEIGHT_TOLERANCE,
     Finding,
     Proof,
@@ -14,6 +15,7 @@ from tiler.check.proofs import (
     Vertices,
     at_most,
     find_faults,
+    join_findings,
     merge_faults,
 )
 from tiler.store.run_folder import PATCH_OF_GROUND, GroundPatch
@@ -85,6 +87,16 @@ def check_leaves(
     points: Vertices, cells: NDArray[np.int32], leaves: NDArray[np.float32], density_at: DensityAt
 ) -> Finding:
     """Each cell (m, 4) has the leaf area density of the canopy at its middle, 0 where there is none."""
+    found = Finding(sums={"cells": 0, "volume": 0.0})
+    for start in range(0, len(cells), CELLS_AT_ONCE):
+        rows = slice(start, start + CELLS_AT_ONCE)
+        found = join_findings(found, _check_leaves(points, cells[rows], leaves[rows], density_at))
+    return found
+
+
+def _check_leaves(
+    points: Vertices, cells: NDArray[np.int32], leaves: NDArray[np.float32], density_at: DensityAt
+) -> Finding:
     a, b, c, d = (points[cells[:, k]] for k in range(4))
     middle = (a + b + c + d) / 4
     wrong = leaves != density_at(middle)

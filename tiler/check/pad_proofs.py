@@ -13,17 +13,14 @@ from tiler.check.proofs import (
     Vertices,
     at_most,
     find_faults,
-    merge_faults,
 )
 
 
-def check_pad(surface: Surface, ground: Vertices, bounds: Bounds, core: Bounds, rim: float) -> Finding:
-    """The ground's vertices (n, 3) on the outer sides of the pad lie at one height, and no house is in the pad.
+def check_level(ground: Vertices, bounds: Bounds, core: Bounds, rim: float) -> Finding:
+    """The ground's vertices (n, 3) on the outer sides of the pad lie at one height.
 
     Parameters
     ----------
-    surface : Surface
-        Boundary of a piece.
     ground : float64, (n, 3)
         Vertices of the ground (m).
     bounds, core : (west, south, east, north)
@@ -38,15 +35,17 @@ def check_pad(surface: Surface, ground: Vertices, bounds: Bounds, core: Bounds, 
     error = np.where(outer, np.abs(ground[:, 2] - rim), 0.0)
     worst = float(error.max(initial=0.0))
     off = ~(error <= HEIGHT_TOLERANCE)
+    detail = f"{worst:.3g} m off the height of the rim, {rim:.6f} m; {at_most(HEIGHT_TOLERANCE)}"
+    faults = find_faults("rim-uneven", ground[off], detail)
+    return Finding(tuple(faults), {"vertices": int(outer.sum())}, {"worst": worst})
+
+
+def check_houses(surface: Surface, core: Bounds) -> Finding:
+    """No house of a piece's boundary is in the pad, outside of `core` (m)."""
     corners = surface.corners[surface.marked(Marker.ROOF, Marker.WALL)]
     low, high = np.array(core[:2]) - SIDE_TOLERANCE, np.array(core[2:]) + SIDE_TOLERANCE
     beyond = ((corners[:, :, :2] < low) | (corners[:, :, :2] > high)).any(axis=(1, 2))
-    detail = f"{worst:.3g} m off the height of the rim, {rim:.6f} m; {at_most(HEIGHT_TOLERANCE)}"
-    faults = [
-        *find_faults("rim-uneven", ground[off], detail),
-        *find_faults("house-in-pad", corners[beyond].mean(axis=1), f"outside the region {core}"),
-    ]
-    return Finding(merge_faults(faults), {"vertices": int(outer.sum())}, {"worst": worst})
+    return Finding(tuple(find_faults("house-in-pad", corners[beyond].mean(axis=1), f"outside the region {core}")))
 
 
 def prove_pad(found: Finding, core: Bounds, rim: float) -> Proof:

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import Boundary, Marker, TetMesh
+from pipeline.data.mesh import Boundary, Marker, Region, TetMesh
 from stitch.pieces import conformity
 from stitch.pieces.frontier import Settled, find_edges_below
 from tiler.store.run_folder import RunRecord
@@ -18,6 +18,7 @@ from tiler.store.run_folder import RunRecord
 HEIGHT_TOLERANCE = 1e-6  # m, of a height against the DTM or the city model
 SIDE_TOLERANCE = 1e-6  # m, of a vertex against its side of the box, and of a wall against the vertical
 RELATIVE_TOLERANCE = 1e-9  # of areas and volumes that must be equal
+CELLS_AT_ONCE = 1 << 18  # that are looked at together
 N_PLACES = 3  # places that a fault names
 EXTRA = "a facet of the boundary file is no exterior face of the cells"
 SAME_SIDE = "2 cells on one side of a face"
@@ -159,20 +160,46 @@ def measure_plan_widths(corners: Vertices, area: NDArray[np.float64]) -> NDArray
     return width
 
 
-def find_cell_faults(mesh: TetMesh, volumes: NDArray[np.float64], flat: Mask) -> list[Fault]:
-    """Find inverted and flat cells, unused and duplicate vertices of one piece."""
-    centres = mesh.points[mesh.cells[flat | (volumes < 0)]].mean(axis=1)
-    inverted = (volumes < 0)[flat | (volumes < 0)]
+def check_cells(mesh: TetMesh, region: NDArray[np.int8]) -> Finding:
+    """Cells are not inverted or flat, and the vertices of a piece are used, each there once.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+        Cells of a piece.
+    region : int8, (m,)
+        `pipeline.data.mesh.Region` of each.
+
+    Returns
+    -------
+    Finding
+        Volumes of ``air`` and ``soil`` add up (m³); ``-smallest`` is that of the smallest cell with a minus sign.
+    """
+    found = Finding(sums={"air": 0.0, "soil": 0.0}, largest={"-smallest": -np.inf})
+    for start in range(0, len(mesh.cells), CELLS_AT_ONCE):
+        rows = slice(start, start + CELLS_AT_ONCE)
+        found = join_findings(found, _measure_cells(mesh.points, mesh.cells[rows], region[rows]))
     unused = conformity.find_unused_points(mesh.cells, len(mesh.points))
     duplicate = conformity.find_duplicate_points(mesh.points)
-    least = volumes.min(initial=np.inf)
-    bound = f"smallest volume {least:.3g} m³; bound: more than {conformity.FLAT:g} of its longest edge cubed"
-    return [
-        *find_faults("cell-inverted", centres[inverted], bound),
-        *find_faults("cell-flat", centres[~inverted], bound),
+    faults = [
         *find_faults("vertex-unused", mesh.points[unused], "no cell uses it"),
         *find_faults("vertex-duplicate", mesh.points[duplicate], "all coordinates equal another vertex's"),
     ]
+    return join_findings(found, Finding(tuple(faults)))
+
+
+def _measure_cells(points: Vertices, cells: NDArray[np.int32], region: NDArray[np.int8]) -> Finding:
+    volumes, flat = conformity.compute_cell_volumes(points, cells)
+    wrong = flat | (volumes < 0)
+    centres, inverted = points[cells[wrong]].mean(axis=1), volumes[wrong] < 0
+    least = float(volumes.min())
+    bound = f"smallest volume {least:.3g} m³; bound: more than {conformity.FLAT:g} of its longest edge cubed"
+    faults = [
+        *find_faults("cell-inverted", centres[inverted], bound),
+        *find_faults("cell-flat", centres[~inverted], bound),
+    ]
+    sums = {kind.name.lower(): float(volumes[region == kind].sum()) for kind in (Region.AIR, Region.SOIL)}
+    return Finding(tuple(faults), sums, {"-smallest": -least})
 
 
 def find_face_faults(points: Vertices, pairs: conformity.FacePairs) -> list[Fault]:
@@ -349,9 +376,9 @@ def prove_top(found: Finding, height: float) -> Proof:
     return Proof(f"the top lies between {low:.6f} and {high:.6f} m ({stated})", found.faults)
 
 
-def check_ground(vertices: Vertices, dtm: Dtm) -> Finding:
-    """Ground vertices (n, 3) lie on the DTM."""
-    error = np.abs(vertices[:, 2] - dtm.sample(vertices[:, :2]))
+def check_ground(vertices: Vertices, terrain: NDArray[np.float64]) -> Finding:
+    """Ground vertices (n, 3) lie on the DTM, which has the heights `terrain` (n,) there (m)."""
+    error = np.abs(vertices[:, 2] - terrain)
     off = ~(error <= HEIGHT_TOLERANCE)
     worst = float(error.max(initial=0))
     detail = f"{worst:.3g} m off; {at_most(HEIGHT_TOLERANCE)}"

@@ -12,6 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.roofs import roof_heights
+from stitch.pieces.frontier import group_places
 from tiler.check.proofs import HEIGHT_TOLERANCE, Dtm, Finding, Mask, Vertices, at_most, find_faults
 from tiler.store.run_folder import Buildings, RoofRules
 
@@ -105,8 +106,7 @@ def check_roof_heights(
     buildings, dtm, rules
         As in `find_roof_range`.
     """
-    places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
-    index = index.reshape(-1)
+    places, index = group_places(corners.reshape(-1, 3))
     allowed = find_roof_range(places, buildings, dtm, rules)
     way = moved.ravel()
     z, plane = corners[:, :, 2].ravel() - way, roof_heights(buildings.roofs, np.repeat(row, 3), places[index])
@@ -142,8 +142,7 @@ def are_above_roofs(
     """
     z, way = corners[:, :, 2], np.clip(moved, -rules.slack, rules.slack)
     if rules.sloped:
-        places, index = np.unique(corners[:, :, :2].reshape(-1, 2), axis=0, return_inverse=True)
-        index = index.reshape(-1)
+        places, index = group_places(corners.reshape(-1, 3))
         highest = find_roof_range(places, buildings, dtm, rules).high + HEIGHT_TOLERANCE
         order = np.lexsort((z.ravel(), index))
         top = order[np.searchsorted(index[order], np.arange(len(places)), side="right") - 1]

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,20 @@ from pipeline.city_model.roof_areas import measure_roof_areas
 from pipeline.city_model.sloped_solids import LEVEL_TOLERANCE, ROOM, STRAIGHT
 from pipeline.city_model.solids import repeated_corners
 from pipeline.data.errors import InputError
-from pipeline.data.roofs import Roofs, roof_heights
-from tiler.check.proofs import N_PLACES, Fault, Proof, Vertices
-from tiler.citymodels.building_index import BuildingRow, check_indices
+from pipeline.data.roofs import Roofs, roof_heights, take_roofs
+from stitch.pieces.conformity import group_rows
+from tiler.check.proofs import N_PLACES, Fault, Mask, Proof, Vertices
+from tiler.citymodels.building_index import (
+    BuildingRow,
+    check_indices,
+    has_parts,
+    read_building,
+    read_objects,
+)
 from tiler.citymodels.building_index import Vertices as ModelVertices
 from tiler.citymodels.cityjson import BLOCK_HEIGHTS
 
+TOGETHER = 1024  # buildings that are looked at together
 HEIGHT_STEP = 1e-3  # m: CityJSON rounds coordinates to 1 mm, the heights among the attributes are not rounded
 ROOF_TOLERANCE = LEVEL_TOLERANCE + HEIGHT_STEP  # m, up or down, of a corner of a sloped roof
 PLAN_TOLERANCE = STRAIGHT + HEIGHT_STEP  # m, in the plane, of a corner under a sloped roof
@@ -40,247 +49,344 @@ DETAILS = {
 }
 
 
-class SolidProofs:
-    """Reads the objects of a city model one at a time, and keeps what is wrong with them.
+def check_solids(path: Path, vertices: ModelVertices) -> Proof:
+    """Read the objects of a city model, some at a time, and tell how many solids are right.
+
+    Parameters
+    ----------
+    path : Path
+        The city model.
+    vertices : Vertices
+        Its vertices.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, or a field of a solid is missing or wrong.
 
     Notes
     -----
     The solid is held against the attributes and the LoD 0 footprint, and these against the mesh by the proofs of
     `tiler.check.city_proofs`: what one of them has otherwise is found.
     """
-
-    def __init__(self) -> None:
-        self.n_solids = self.n_sloped = self.n_flat = 0
-        self._places: dict[str, list[tuple[float, float, float]]] = {}
-        self._count: dict[str, int] = {}
-        self._kin = [0, 0]  # sums of hashes of (house, part), as houses and as parts have them
-
-    def add(
-        self,
-        name: str,
-        thing: Mapping[str, Any],
-        vertices: ModelVertices,
-        building: BuildingRow | None,
-    ) -> None:
-        """Look at an object.
-
-        Parameters
-        ----------
-        name : str
-            Its id.
-        thing : mapping
-            The object.
-        vertices : Vertices
-            Vertices of the city model.
-        building : BuildingRow, optional
-            What was read of it; none for a house of parts.
-
-        Raises
-        ------
-        InputError
-            If a field of the solid is missing or wrong.
-        """
+    proofs, batch = _Found(), _Batch()
+    for name, thing in read_objects(path):
+        building = None if has_parts(path, thing) else read_building(path, name, thing, vertices)
         try:
-            self._kin[0] += sum(_hash_pair(name, part) for part in thing.get("children", ()))
-            self._kin[1] += sum(_hash_pair(house, name) for house in thing.get("parents", ()))
-            if building is None:
-                return
-            for kind in self._find(thing, vertices, building):
-                place = building.footprint.representative_point()
-                self._count[kind] = self._count.get(kind, 0) + 1
-                places = self._places.setdefault(kind, [])
-                if len(places) < N_PLACES:
-                    places.append((place.x, place.y, building.roof))
+            proofs.add_kin(name, thing)
+            if building is not None:
+                batch.add(thing, len(vertices), building)
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise InputError(
                 f"city model: building {name!r}: its solid is damaged ({error!r}); run again"
             ) from None
+        if len(batch.buildings) == TOGETHER:
+            proofs.add(batch, vertices)
+            batch = _Batch()
+    proofs.add(batch, vertices)
+    return proofs.prove()
+
+
+class _Found:
+    """What is wrong with the solids of a city model."""
+
+    def __init__(self) -> None:
+        self._n_solids = self._n_sloped = self._n_flat = 0
+        self._places: dict[str, list[tuple[float, float, float]]] = {}
+        self._count: dict[str, int] = {}
+        self._kin = [0, 0]  # sums of hashes of (house, part), as houses and as parts have them
+
+    def add_kin(self, name: str, thing: Mapping[str, Any]) -> None:
+        self._kin[0] += sum(_hash_pair(name, part) for part in thing.get("children", ()))
+        self._kin[1] += sum(_hash_pair(house, name) for house in thing.get("parents", ()))
+
+    def add(self, batch: "_Batch", vertices: ModelVertices) -> None:
+        self._n_flat += batch.n_flat
+        self._n_solids += batch.n_solids
+        self._n_sloped += sum(batch.sloped)
+        for kind, wrong in batch.find_faults(vertices).items():
+            self._count[kind] = self._count.get(kind, 0) + int(wrong.sum())
+            places = self._places.setdefault(kind, [])
+            for k in np.flatnonzero(wrong)[: N_PLACES - len(places)].tolist():
+                place = batch.buildings[k].footprint.representative_point()
+                places.append((place.x, place.y, batch.buildings[k].roof))
 
     def prove(self) -> Proof:
-        """Tell how many solids are right."""
         faults = [
-            Fault(kind, n, tuple(self._places[kind]), DETAILS[kind]) for kind, n in sorted(self._count.items())
+            Fault(kind, n, tuple(self._places[kind]), DETAILS[kind])
+            for kind, n in sorted(self._count.items())
+            if n
         ]
         if self._kin[0] != self._kin[1]:
             faults.append(Fault("parts", 1, (), "children of houses and parents of parts differ"))
-        flat = f", {self.n_flat} flat buildings have none" if self.n_flat else ""
-        claim = f"{self.n_solids} solids of the city model are closed and stand from ground to roof{flat}"
+        flat = f", {self._n_flat} flat buildings have none" if self._n_flat else ""
+        claim = f"{self._n_solids} solids of the city model are closed and stand from ground to roof{flat}"
         bound = f"bound: {HEIGHT_STEP:g} m"
-        if self.n_sloped:
-            bound += f", {ROOF_TOLERANCE:g} m of the {self.n_sloped} with sloped roofs"
+        if self._n_sloped:
+            bound += f", {ROOF_TOLERANCE:g} m of the {self._n_sloped} with sloped roofs"
         return Proof(f"{claim}; {bound}", tuple(faults))
 
-    def _find(self, thing: Mapping[str, Any], vertices: ModelVertices, building: BuildingRow) -> list[str]:
-        ground, roof, footprint = building.ground, building.roof, building.footprint
-        attributes = thing["attributes"]
-        height = attributes.get("height", roof - ground)
-        found = [] if abs(height - (roof - ground)) <= HEIGHT_STEP else ["height-attribute"]
-        tops, mean = {"1.2": roof}, roof
-        roofs, flat = _roof_over_ground(building), building.plane[5] == building.plane[6]
+
+class _Batch:
+    """Some buildings of a city model, with the solids that have to be right, gathered to be looked at together.
+
+    Attributes
+    ----------
+    buildings : list of BuildingRow
+        The buildings.
+    n_solids, n_flat : int
+        Solids of all levels of detail, and buildings without any.
+    sloped : list of bool
+        Of each solid that must be there: whether it has a sloped roof.
+    """
+
+    def __init__(self) -> None:
+        self.buildings: list[BuildingRow] = []
+        self.n_solids = self.n_flat = 0
+        self.sloped: list[bool] = []
+        self._height: list[float] = []  # of each building: its attribute
+        self._block: list[float] = []  # of each building: its attribute for LoD1.3, or NaN
+        self._missing: list[bool] = []  # of each building
+        self._building: list[int] = []  # of each solid: its building,
+        self._top: list[float] = []  # and how high it must be
+        self._corners: list[NDArray[np.int64]] = []  # of each solid
+        self._sizes: list[int] = []  # of each ring
+        self._face: list[int] = []  # of each ring
+        self._kinds: list[int] = []  # of each face
+        self._solid: list[int] = []  # of each face
+
+    def add(self, thing: Mapping[str, Any], n_vertices: int, building: BuildingRow) -> None:
+        """Take a building and its solids; KeyError and the like if a field is missing or wrong."""
+        ground, roof, attributes = building.ground, building.roof, thing["attributes"]
+        flat, tops = building.plane[5] == building.plane[6], {"1.2": roof}
+        self._height.append(float(attributes.get("height", roof - ground)))
+        self._block.append(np.nan)
         if LOD12 in attributes:
             tops = {"1.2": float(attributes[LOD12]), "1.3": float(attributes[LOD13]), "2.2": roof}
-            block = roof
-            if not flat and footprint.area:
-                mean = float(measure_roof_areas(np.array([footprint]), roofs).mean[0])
-                block = float(measure_roof_areas(np.array([footprint]), _roof_of(building)).mean[0])
-            found += [] if abs(tops["1.3"] - block) <= ROOF_TOLERANCE else ["block-height"]
+            self._block[-1] = tops["1.3"]
         solids = {str(solid["lod"]): solid for solid in thing["geometry"] if solid["type"] == "Solid"}
         self.n_flat += not solids
         self.n_solids += len(solids)
+        self._missing.append(False)
         for lod, top in tops.items():
             if lod not in solids:
-                found += ["solid-missing"] if top - ground > 2 * HEIGHT_STEP else []
-            elif lod == "2.2" and not flat:
-                self.n_sloped += 1
-                found += _find_sloped_faults(_read_solid(solids[lod], vertices), building, roofs, mean)
-            else:
-                found += _find_faults(_read_solid(solids[lod], vertices), ground, top, footprint)
-        return list(dict.fromkeys(found))
+                self._missing[-1] |= top - ground > 2 * HEIGHT_STEP
+                continue
+            self._add_solid(solids[lod], n_vertices)
+            self._building.append(len(self.buildings))
+            self._top.append(top)
+            self.sloped.append(lod == "2.2" and not flat)
+        self.buildings.append(building)
+
+    def _add_solid(self, solid: Mapping[str, Any], n_vertices: int) -> None:
+        (faces,) = solid["boundaries"]
+        (values,) = solid["semantics"]["values"]
+        kinds = [KINDS.index(surface["type"]) for surface in solid["semantics"]["surfaces"]]
+        if len(values) != len(faces):
+            raise ValueError(f"{len(values)} values for {len(faces)} faces")
+        rings = [ring for face in faces for ring in face]
+        sizes = [len(ring) for ring in rings]
+        if 0 in sizes or not all(faces):
+            raise ValueError("a face without corners")
+        first = len(self._kinds)
+        self._corners.append(check_indices([vertex for ring in rings for vertex in ring], n_vertices))
+        self._sizes += sizes
+        self._face += [first + k for k, face in enumerate(faces) for _ in face]
+        self._kinds += [kinds[value] for value in values]
+        self._solid += [len(self._top)] * len(faces)
+
+    def find_faults(self, vertices: ModelVertices) -> dict[str, Mask]:
+        """Tell by the kind of a fault which buildings have it."""
+        rows, n = self.buildings, len(self.buildings)
+        if not n:
+            return {}
+        footprint = np.empty(n, np.object_)
+        footprint[:] = [row.footprint for row in rows]
+        ground, roof = (np.array([getattr(row, name) for row in rows]) for name in ("ground", "roof"))
+        plane = np.array([row.plane for row in rows])
+        roofs = Roofs(plane[:, :3], plane[:, 3:5], plane[:, 5:7])
+        # As solids have them: nowhere in the ground, but for flat ones.
+        least = np.where(plane[:, 5] < plane[:, 6], ground + ROOM, plane[:, 5])
+        over = replace(roofs, limits=np.maximum(roofs.limits, least[:, None]))
+        block, mean = roof.copy(), roof.copy()
+        uneven = np.flatnonzero((plane[:, 5] != plane[:, 6]) & (shapely.area(footprint) > 0))
+        for heights, kind in ((block, roofs), (mean, over)):
+            heights[uneven] = measure_roof_areas(footprint[uneven], take_roofs(kind, uneven)).mean
+        blocks = np.array(self._block)
+        found = {
+            "height-attribute": ~(np.abs(np.array(self._height) - (roof - ground)) <= HEIGHT_STEP),
+            "block-height": ~np.isnan(blocks) & ~(np.abs(blocks - block) <= ROOF_TOLERANCE),
+            "solid-missing": np.array(self._missing),
+        }
+        if self._top:
+            building = np.array(self._building)
+            shell = _Shells(footprint, building, ground[building], np.array(self._top), np.array(self.sloped))
+            faults = _find_faults(self._read(vertices), shell, over, mean[building])
+            found |= {kind: _any(building[wrong], n) for kind, wrong in faults.items()}
+        return found
+
+    def _read(self, vertices: ModelVertices) -> "_Solids":
+        corner, size = np.concatenate(self._corners), np.array(self._sizes)
+        after = np.arange(1, len(corner) + 1)
+        after[np.cumsum(size) - 1] -= size
+        face = np.repeat(np.array(self._face), size)
+        place = vertices.take(corner)
+        return _Solids(corner, after, place, face, np.array(self._kinds), np.array(self._solid))
 
 
 @dataclass(frozen=True, eq=False)
-class _Solid:
-    """Corners of the faces of a solid, ring after ring: vertex, place (m) and those of the next, face, kind."""
+class _Shells:
+    """What ``s`` solids must be: footprints of buildings, and of each solid its building, heights (m) and form."""
+
+    footprint: NDArray[np.object_]
+    building: NDArray[np.int64]
+    ground: NDArray[np.float64]
+    top: NDArray[np.float64]
+    sloped: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class _Solids:
+    """The ``c`` corners of the ``f`` faces of solids, ring after ring.
+
+    Vertex, row of the next corner of the ring, place (m) and face of each corner; kind and solid of each face.
+    """
 
     corner: NDArray[np.int64]
     after: NDArray[np.int64]
     place: Vertices
-    onward: Vertices
     face: NDArray[np.int64]
-    kinds: NDArray[np.int64]
-
-    def measure_volume(self) -> float:
-        """Volume (m³), by the edges of rings and the first corner of each face."""
-        first = self.place[np.searchsorted(self.face, self.face)]
-        at = self.place[0]
-        return _volume(first - at, self.place - at, self.onward - at)
+    kind: NDArray[np.int64]
+    solid: NDArray[np.int64]
 
     def measure_areas(self) -> Vertices:
         """Area times normal of each face, outwards (m²): half the sum of the cross products of its edges."""
         first = self.place[np.searchsorted(self.face, self.face)]
-        twice = np.cross(self.place - first, self.onward - first)
+        twice = np.cross(self.place - first, self.place[self.after] - first)
         return np.column_stack([np.bincount(self.face, axis) for axis in twice.T]) / 2
 
+    def measure_volumes(self) -> NDArray[np.float64]:
+        """Volume of each solid (m³), by the edges of rings and the first corner of each face."""
+        solid = self.solid[self.face]
+        at = self.place[np.searchsorted(solid, solid)]
+        first = self.place[np.searchsorted(self.face, self.face)]
+        part = np.einsum("ij,ij->i", first - at, np.cross(self.place - at, self.place[self.after] - at))
+        return np.bincount(solid, part) / 6
 
-def _read_solid(solid: Mapping[str, Any], vertices: ModelVertices) -> _Solid:
-    (faces,) = solid["boundaries"]
-    (values,) = solid["semantics"]["values"]
-    names = [surface["type"] for surface in solid["semantics"]["surfaces"]]
-    if len(values) != len(faces):
-        raise ValueError(f"{len(values)} values for {len(faces)} faces")
-    rings = [ring for face in faces for ring in face]
-    size = np.array([len(ring) for ring in rings])
-    corner = check_indices([vertex for ring in rings for vertex in ring], len(vertices))
-    place = vertices.take(corner)
-    after = np.arange(1, len(corner) + 1)
-    after[np.cumsum(size) - 1] -= size
-    face = np.repeat(np.repeat(np.arange(len(faces)), [len(face) for face in faces]), size)
-    kinds = np.array([KINDS.index(names[value]) for value in values])[face]
-    return _Solid(corner, corner[after], place, place[after], face, kinds)
+    def find_open(self) -> NDArray[np.int64]:
+        """Find the solids with an edge that is not used as often in one direction as in the other."""
+        vertex = np.unique(self.corner, return_inverse=True)[1].astype(np.int64)
+        n, solid = int(vertex.max()) + 1, self.solid[self.face]
+        after = vertex[self.after]
+        forth, back = np.sort((solid * n + vertex) * n + after), np.sort((solid * n + after) * n + vertex)
+        return np.unique(forth[forth != back] // n**2)
 
 
-def _find_faults(solid: _Solid, ground: float, roof: float, footprint: Any) -> list[str]:
-    """Name what is wrong with a prism."""
-    levels = np.array([[ground, ground], [roof, roof], [ground, roof]])[solid.kinds]
-    off = np.abs(solid.place[:, 2:] - levels).min(axis=1) > HEIGHT_STEP
-    found = ["solid-height"] if off.any() else []
-    if not _is_closed(solid.corner, solid.after):
-        found.append("solid-open")
-    met = _repeated_corners(footprint)
-    floor = _away_from(met, shapely.get_coordinates(footprint))
-    if any(not _same_places(_away_from(met, solid.place[solid.kinds == k, :2]), floor) for k in (0, 1)):
-        found.append("solid-plan")
-    wanted = footprint.area * (roof - ground)
-    slack = 2 * HEIGHT_STEP * footprint.area + 1e-6 * abs(wanted)
-    slack += PARTING * footprint.length * (roof - ground) if len(met) else 0.0
-    if abs(solid.measure_volume() - wanted) > slack:
-        found.append("solid-volume")
+def _find_faults(solids: _Solids, shell: _Shells, roofs: Roofs, mean: NDArray[np.float64]) -> dict[str, Mask]:
+    """Name what is wrong with each solid: of prisms, and of those under sloped roofs of these mean heights."""
+    n, solid, kind = len(shell.top), solids.solid[solids.face], solids.kind[solids.face]
+    sloped, z, floor, roof = shell.sloped[solid], solids.place[:, 2], kind == 0, kind == 1
+    building = shell.building[solid]
+    top = np.where(sloped, roof_heights(roofs, building, solids.place[:, :2]), shell.top[solid])
+    off_ground = ~(np.abs(z - shell.ground[solid]) <= HEIGHT_STEP)
+    off_top = ~(np.abs(z - top) <= np.where(sloped, ROOF_TOLERANCE, HEIGHT_STEP))
+    met = _find_meetings(shell.footprint)
+    near = _are_near(met, building, solids.place[:, :2])
+    plan = _find_other_plans(solids, shell, met, near)
+    found = {
+        "solid-height": _any(solid[np.where(roof, off_top & ~sloped, off_ground & (floor | off_top))], n),
+        "solid-roof": _any(solid[roof & off_top & sloped], n),
+        "solid-open": _any(solids.find_open(), n),
+        "solid-plan": plan & ~shell.sloped,
+    }
+    area, length = (measure(shell.footprint)[shell.building] for measure in (shapely.area, shapely.length))
+    parted = np.isin(shell.building, list(met))
+    slack = np.where(parted, PARTING, np.where(shell.sloped, PLAN_TOLERANCE, 0.0)) * length
+    wanted = area * (np.where(shell.sloped, mean, shell.top) - shell.ground)
+    least = np.where(shell.sloped, ROOF_TOLERANCE + HEIGHT_STEP, 2 * HEIGHT_STEP) * area
+    least += np.where(shell.sloped, 0.0, 1e-6 * np.abs(wanted))
+    high = np.where(shell.sloped, roofs.limits[shell.building, 1], shell.top)
+    error = np.abs(solids.measure_volumes() - wanted)
+    found["solid-volume"] = ~(error <= least + slack * (high - shell.ground))
+    if shell.sloped.any():
+        for name, wrong in _find_sloped_faults(solids, shell, ~near & floor & sloped, area, slack).items():
+            found[name] = found.get(name, False) | (wrong & shell.sloped)
     return found
 
 
-def _find_sloped_faults(solid: _Solid, building: BuildingRow, roofs: Roofs, mean: float) -> list[str]:
-    """Name what is wrong with a solid under a sloped roof, of this mean height."""
-    ground, footprint = building.ground, building.footprint
-    floor, roof = solid.kinds == KINDS.index(FLOOR), solid.kinds == KINDS.index(ROOF)
-    z = solid.place[:, 2]
-    expected = roof_heights(roofs, np.zeros(len(z), np.int64), solid.place[:, :2])
-    off_ground = np.abs(z - ground) > HEIGHT_STEP
-    off_roof = np.abs(z - expected) > ROOF_TOLERANCE
-    found = ["solid-height"] if (off_ground & ~roof & (floor | off_roof)).any() else []
-    found += ["solid-roof"] if (off_roof & roof).any() else []
-    found += [] if _is_closed(solid.corner, solid.after) else ["solid-open"]
-    areas = solid.measure_areas()
+def _find_sloped_faults(
+    solids: _Solids, shell: _Shells, on_floor: Mask, area: NDArray[np.float64], slack: NDArray[np.float64]
+) -> dict[str, Mask]:
+    """Name what is wrong with solids under sloped roofs besides; `on_floor` are corners that are on an outline."""
+    n, areas = len(shell.top), solids.measure_areas()
     size = np.linalg.norm(areas, axis=1)
     normal = areas / np.maximum(size, 1e-12)[:, None]
-    first = np.searchsorted(solid.face, solid.face)
-    apart = np.einsum("ij,ij->i", solid.place - solid.place[first], normal[solid.face])
-    found += ["solid-bent"] if np.ptp(apart) > PLANARITY and _is_bent(apart, solid.face) else []
-    kinds = solid.kinds[np.searchsorted(solid.face, np.arange(len(areas)))]
-    length = np.bincount(solid.face, np.linalg.norm(solid.onward - solid.place, axis=1))
-    turned = np.where(np.abs(areas[:, 2]) <= HEIGHT_STEP * HEIGHT_STEP * length, 2, (areas[:, 2] > 0).astype(int))
-    found += ["solid-semantics"] if (turned != kinds).any() else []
-    met = _repeated_corners(footprint)
-    outline = shapely.boundary(footprint)
-    slack = (PARTING if len(met) else PLAN_TOLERANCE) * footprint.length
-    plan = np.array([-areas[kinds == 0, 2].sum(), areas[kinds == 1, 2].sum()])
-    corners = shapely.points(_away_from(met, solid.place[floor, :2]))
-    astray = shapely.distance(outline, corners) > PLAN_TOLERANCE
-    found += ["solid-plan"] if astray.any() or (np.abs(plan - footprint.area) > slack).any() else []
-    slack = (ROOF_TOLERANCE + HEIGHT_STEP) * footprint.area + slack * (roofs.limits[0, 1] - ground)
-    found += ["solid-volume"] if abs(solid.measure_volume() - footprint.area * (mean - ground)) > slack else []
+    first = np.flatnonzero(np.diff(solids.face, prepend=-1))
+    apart = np.einsum("ij,ij->i", solids.place - solids.place[first[solids.face]], normal[solids.face])
+    spread = np.maximum.reduceat(apart, first) - np.minimum.reduceat(apart, first)
+    length = np.bincount(solids.face, np.linalg.norm(solids.place[solids.after] - solids.place, axis=1))
+    upright = np.abs(areas[:, 2]) <= HEIGHT_STEP * HEIGHT_STEP * length
+    turned = np.where(upright, 2, (areas[:, 2] > 0).astype(int))
+    sums = [np.bincount(solids.solid, areas[:, 2] * (solids.kind == kind), n) for kind in (0, 1)]
+    uneven = (np.abs(sums[0] + area) > slack) | (np.abs(sums[1] - area) > slack)
+    owner = solids.solid[solids.face[on_floor]]
+    outline = shapely.boundary(shell.footprint)
+    away = shapely.distance(outline[shell.building[owner]], shapely.points(solids.place[on_floor, :2]))
+    return {
+        "solid-bent": _any(solids.solid[spread > PLANARITY], n),
+        "solid-semantics": _any(solids.solid[turned != solids.kind], n),
+        "solid-plan": uneven | _any(owner[away > PLAN_TOLERANCE], n),
+    }
+
+
+def _find_other_plans(solids: _Solids, shell: _Shells, met: Mapping[int, Vertices], near: Mask) -> Mask:
+    """Tell of which solids floor or roof have other corners than the footprint."""
+    n, solid, kind = len(shell.top), solids.solid[solids.face], solids.kind[solids.face]
+    xy, building = shapely.get_coordinates(shell.footprint, return_index=True)
+    kept = ~_are_near(met, building, xy)
+    xy, building = xy[kept], building[kept]
+    # The corners of the footprint once for each solid of a building: these stand together.
+    first, last = (np.searchsorted(building, shell.building, side=side) for side in ("left", "right"))
+    owner = np.repeat(np.arange(n), last - first)
+    row = np.arange(len(owner)) + np.repeat(first - np.cumsum(last - first) + (last - first), last - first)
+    other = np.zeros(n, np.bool_)
+    for wanted in (0, 1):
+        chosen = (kind == wanted) & ~near
+        places = np.concatenate((solids.place[chosen, :2], xy[row]))
+        of = np.concatenate((solid[chosen], owner))
+        group, n_groups = group_rows(np.column_stack((of, places)))
+        seen = np.zeros((2, n_groups), np.bool_)
+        seen[0, group[: chosen.sum()]] = seen[1, group[chosen.sum() :]] = True
+        alone = seen[0] != seen[1]
+        other[of[alone[group]]] = True
+    return other
+
+
+def _any(rows: NDArray[np.int64], n: int) -> Mask:
+    """Tell which of n things are among the rows."""
+    found = np.zeros(n, np.bool_)
+    found[rows] = True
     return found
 
 
-def _is_bent(apart: NDArray[np.float64], face: NDArray[np.int64]) -> bool:
-    """Tell whether corners of a face are farther from each other along its normal than `PLANARITY`."""
-    start = np.flatnonzero(np.diff(face, prepend=-1))
-    spread = np.maximum.reduceat(apart, start) - np.minimum.reduceat(apart, start)
-    return bool((spread > PLANARITY).any())
+def _find_meetings(footprint: NDArray[np.object_]) -> dict[int, Vertices]:
+    """Places (k, 2) where rings of a footprint meet, by its row: solids are parted there."""
+    found = {}
+    parts, row = shapely.get_parts(footprint, return_index=True)
+    for k in np.unique(row[shapely.get_num_interior_rings(parts) > 0]).tolist():
+        places = np.concatenate([repeated_corners(polygon) for polygon in parts[row == k]])
+        if len(places):
+            found[k] = places
+    return found
 
 
-def _roof_of(building: BuildingRow) -> Roofs:
-    """Give the roof of a building, also where its plane is in the ground."""
-    return Roofs(*(np.array([part]) for part in (building.plane[:3], building.plane[3:5], building.plane[5:7])))
-
-
-def _roof_over_ground(building: BuildingRow) -> Roofs:
-    """Give the roof of a building as its solid has it: nowhere in the ground."""
-    roofs = _roof_of(building)
-    low, high = building.plane[5:7]
-    least = building.ground + ROOM if low < high else low
-    return replace(roofs, limits=np.maximum(roofs.limits, least))
-
-
-def _is_closed(start: NDArray[np.int64], end: NDArray[np.int64]) -> bool:
-    """Tell whether each edge is used as often in one direction as in the other."""
-    n = int(max(start.max(), end.max())) + 1
-    return np.array_equal(np.sort(start * n + end), np.sort(end * n + start))
-
-
-def _repeated_corners(footprint: Any) -> Vertices:
-    """Places (k, 2) where rings of a footprint meet: solids are parted there."""
-    polygons = shapely.get_parts(footprint)
-    if not (shapely.get_num_interior_rings(polygons) > 0).any():
-        return np.empty((0, 2))
-    return np.concatenate([repeated_corners(polygon) for polygon in polygons])
-
-
-def _away_from(met: Vertices, places: Vertices) -> Vertices:
-    """Leave out the places (n, 2) within `PARTING` of some others."""
-    if not len(met):
-        return places
-    near = shapely.dwithin(shapely.points(places), shapely.multipoints(met), PARTING)
-    away: Vertices = places[~near]
-    return away
-
-
-def _same_places(one: Vertices, other: Vertices) -> bool:
-    return np.array_equal(np.unique(one, axis=0), np.unique(other, axis=0))
-
-
-def _volume(first: Vertices, start: Vertices, end: Vertices) -> float:
-    """Volume (m³) within plane faces, by the edges of their rings and the first vertex of each ring."""
-    return float(np.einsum("ij,ij", first, np.cross(start, end)) / 6)
+def _are_near(met: Mapping[int, Vertices], row: NDArray[np.int64], places: Vertices) -> Mask:
+    """Tell which places (n, 2) of footprints of these rows are within `PARTING` of where rings meet."""
+    near = np.zeros(len(places), np.bool_)
+    for k, corners in met.items():
+        own = np.flatnonzero(row == k)
+        near[own] = shapely.dwithin(shapely.points(places[own]), shapely.multipoints(corners), PARTING)
+    return near
 
 
 def _hash_pair(house: str, part: str) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.mesh import Marker
+from stitch.pieces.conformity import group_rows
 from tiler.check.proofs import Finding, Mask, Proof, Surface, Vertices, find_faults
 
 OVERLAP = 1e-9  # of the area of walls over an edge: what may be there twice
@@ -86,9 +87,10 @@ def prove_overlap(found: Finding) -> Proof:
 
 
 def _group(ends: NDArray[np.float64], area: NDArray[np.float64], top: NDArray[np.float64]) -> Walls:
-    rows, index = np.unique(ends.reshape(-1, 4), axis=0, return_inverse=True)
-    index = index.reshape(-1)
-    sums = np.column_stack([np.bincount(index, area[:, k], len(rows)) for k in (0, 1)]).astype(np.float64)
-    highest = np.full(len(rows), -np.inf)
+    index, n = group_rows(ends.reshape(-1, 4))
+    rows = np.empty((n, 4))
+    rows[index] = ends.reshape(-1, 4)
+    sums = np.column_stack([np.bincount(index, area[:, k], n) for k in (0, 1)]).astype(np.float64)
+    highest = np.full(n, -np.inf)
     np.maximum.at(highest, index, top)
     return Walls(rows.reshape(-1, 2, 2), sums.reshape(-1, 2), highest)

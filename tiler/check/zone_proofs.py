@@ -1,7 +1,8 @@
 """The proof of `citystitch check` that each building has the level of detail of the zone of its point."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from tiler.check.proofs import Fault, Proof, find_faults
-from tiler.citymodels.building_index import BuildingRow, Vertices, index_buildings
+from tiler.citymodels.building_index import BuildingRow, has_parts, read_building, read_objects, spool_vertices
 from tiler.config.zone_levels import find_levels
 from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
 
@@ -26,14 +27,40 @@ DETAILS = {
 }
 
 
-class ZoneProofs:
-    """Reads the objects of a city model one at a time, and keeps level and point of each house.
+def check_zones(zones: Zones, model: Path, full_model: Path) -> Proof:
+    """Hold points against outlines of houses before they were simplified, and levels against zones.
 
     Parameters
     ----------
     zones : Zones
         The zones of the run.
+    model : Path
+        The city model that was meshed.
+    full_model : Path
+        The city model before it was simplified.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged.
     """
+    found = _Found(zones)
+    for name, thing, building in _iterate(model):
+        found.add(name, thing, building)
+    return found.prove(full_model)
+
+
+def _iterate(path: Path) -> Iterator[tuple[str, Mapping[str, Any], BuildingRow]]:
+    """Read the buildings and parts of a city model one at a time: name, object and what is read of it."""
+    with TemporaryFile() as spool:
+        vertices = spool_vertices(path, spool)
+        for name, thing in read_objects(path):
+            if not has_parts(path, thing):
+                yield name, thing, read_building(path, name, thing, vertices)
+
+
+class _Found:
+    """Level and point of each house, and what is wrong with buildings alone."""
 
     def __init__(self, zones: Zones) -> None:
         self._zones = zones
@@ -42,10 +69,8 @@ class ZoneProofs:
         self._parts: dict[str, list[Any]] = {}
         self._faults: list[tuple[str, float, float, float]] = []
 
-    def add(self, name: str, thing: Mapping[str, Any], _: Vertices, building: BuildingRow | None) -> None:
-        """Look at an object; parameters as of `SolidProofs.add`."""
-        if building is None:
-            return
+    def add(self, name: str, thing: Mapping[str, Any], building: BuildingRow) -> None:
+        """Look at a building or part."""
         values = thing["attributes"]
         level, point = values.get(LOD), values.get(LOD_POINT)
         house = thing.get("parents", [name])[0]
@@ -63,13 +88,7 @@ class ZoneProofs:
             self._parts.setdefault(house, []).append(building.footprint)
 
     def prove(self, full_model: Path) -> Proof:
-        """Hold points against outlines of houses before they were simplified, and levels against zones.
-
-        Parameters
-        ----------
-        full_model : Path
-            The city model before it was simplified.
-        """
+        """Hold what was found against zones and the city model before it was simplified."""
         rows = np.array(self._rows, np.float64).reshape(-1, 4)
         level = rows[:, 3].astype(np.int64)
         found = find_levels(self._zones, rows[:, :2])
@@ -106,15 +125,12 @@ class ZoneProofs:
         for row, name in enumerate(self._names):
             of_house.setdefault(name, []).append(row)
 
-        def see(name: str, _: Any, __: Vertices, building: BuildingRow | None) -> None:
-            mine = of_house.get(name, [])
-            if building is not None and mine:
+        for name, _, building in _iterate(full_model):
+            if mine := of_house.get(name):
                 within[mine] = shapely.dwithin(building.footprint, shapely.points(rows[mine, :2]), WITHIN)
                 if rows[mine[0], 3] > BLOCK:
                     blocks.append(building.footprint)
-
-        with index_buildings(full_model, see):
-            return within, blocks
+        return within, blocks
 
     def _common_walls(self) -> list[tuple[float, float, float]]:
         places = []

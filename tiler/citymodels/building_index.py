@@ -1,7 +1,9 @@
 """The buildings of a city model larger than memory: indexed by number and by place, loaded where needed."""
 
+import json
+import os
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -25,6 +27,9 @@ BLOCK = 1 << 14  # vertices that are read at once
 KEPT_BLOCKS = 32
 PLANE = "roof_plane"  # attribute of a sloped roof: a, b, c, x0, y0, lowest and highest height
 PLANE_VALUES = 7
+VERTEX_BYTES = 24
+VERTICES, HEAD_MEMBERS = "vertices.f64", "head.json"  # files of the vertices
+SHAPES, COLUMNS = "buildings.wkb", ("numbers", "box", "start", "size")  # files of an index
 HEAD = np.dtype([("ground", "<f8"), ("roof", "<f8"), ("plane", "<f8", PLANE_VALUES)])
 Box = tuple[float, float, float, float]
 
@@ -42,9 +47,6 @@ class BuildingRow(NamedTuple):
     roof: float
     plane: tuple[float, ...]
     footprint: Any
-
-
-See = Callable[[str, Any, "Vertices", BuildingRow | None], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,16 +106,15 @@ class BuildingIndex:
 
 
 @contextmanager
-def index_buildings(path: Path, see: See | None = None) -> Iterator[BuildingIndex]:
+def index_buildings(path: Path, folder: Path | None = None) -> Iterator[BuildingIndex]:
     """Index the buildings of a CityJSON file, or their parts: numbers, heights and LoD 0 footprints.
 
     Parameters
     ----------
     path : Path
         The file, in any layout.
-    see : callable, optional
-        Is called with each object as it is read: its id, itself, the vertices, and what was read of it, or None
-        for a house of parts.
+    folder : Path, optional
+        Where the index and the vertices are put, for `open_index` and `open_vertices` in other processes.
 
     Raises
     ------
@@ -126,13 +127,34 @@ def index_buildings(path: Path, see: See | None = None) -> Iterator[BuildingInde
     file too, then what refers to them. Temporary files take about half of its size, where `tempfile` puts them
     (``TMPDIR``).
     """
-    with TemporaryFile() as file:
-        with TemporaryFile() as spool:
+    with TemporaryFile() if folder is None else (folder / SHAPES).open("w+b") as file:
+        with TemporaryFile() if folder is None else (folder / VERTICES).open("w+b") as spool:
             vertices = spool_vertices(path, spool)
-            index = _read_objects(path, vertices, file, see)
+            index = _read_objects(path, vertices, file)
         if np.any(index.numbers[1:] == index.numbers[:-1]):
             raise InputError(f"{path}: two buildings have one number; give each its own id and run again")
+        if folder is not None:
+            file.flush()
+            (folder / HEAD_MEMBERS).write_text(json.dumps(vertices.head))
+            for name in COLUMNS:
+                np.save(folder / f"{name}.npy", getattr(index, name))
         yield index
+
+
+@contextmanager
+def open_index(folder: Path) -> Iterator[BuildingIndex]:
+    """Open the index that `index_buildings` put into a folder; its columns are mapped."""
+    numbers, box, start, size = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in COLUMNS)
+    with (folder / SHAPES).open("rb") as file:
+        yield BuildingIndex(numbers, box, start, size, file)
+
+
+@contextmanager
+def open_vertices(folder: Path) -> Iterator["Vertices"]:
+    """Open the vertices that `index_buildings` put into a folder."""
+    with (folder / VERTICES).open("rb") as file:
+        n = file.seek(0, os.SEEK_END) // VERTEX_BYTES
+        yield Vertices(file, n, json.loads((folder / HEAD_MEMBERS).read_text()))
 
 
 class Vertices:
@@ -174,8 +196,8 @@ class Vertices:
     def _block(self, number: int) -> NDArray[np.float64]:
         block = self._blocks.pop(number, None)
         if block is None:
-            self._file.seek(number * BLOCK * 24)
-            block = np.frombuffer(self._file.read(BLOCK * 24)).reshape(-1, 3)
+            self._file.seek(number * BLOCK * VERTEX_BYTES)
+            block = np.frombuffer(self._file.read(BLOCK * VERTEX_BYTES)).reshape(-1, 3)
             while len(self._blocks) >= KEPT_BLOCKS:
                 del self._blocks[next(iter(self._blocks))]
         self._blocks[number] = block  # the youngest is the last
@@ -235,18 +257,14 @@ def _rows(vertices: list[Any]) -> NDArray[np.float64]:
     return rows
 
 
-def _read_objects(path: Path, vertices: Vertices, file: IO[bytes], see: See | None) -> BuildingIndex:
+def _read_objects(path: Path, vertices: Vertices, file: IO[bytes]) -> BuildingIndex:
     """Read the objects of a CityJSON file that have no parts, and write their heights and footprints."""
     numbers, boxes, starts, sizes = array("q"), array("f"), array("q"), array("i")
     start = 0
     for name, thing in read_objects(path):
         if has_parts(path, thing):
-            if see is not None:
-                see(name, thing, vertices, None)
             continue
         row = read_building(path, name, thing, vertices)
-        if see is not None:
-            see(name, thing, vertices, row)
         data = np.array([(row.ground, row.roof, row.plane)], HEAD).tobytes() + shapely.to_wkb(row.footprint)
         _write(file, data)
         numbers.append(row.number)

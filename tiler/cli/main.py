@@ -144,9 +144,10 @@ def _run_config(
     report: bool = False,
 ) -> int:
     from tiler.executors.dask_settings import GARBAGE, start_fork_server
+    from tiler.store.out_folder import has_record
 
-    if config.workers and not config.on_cluster:
-        start_fork_server()
+    if config.workers and not config.on_cluster and not has_record(config.out):
+        start_fork_server()  # at once, as there is something to do; else with the first task
     gc.set_threshold(GARBAGE)
     from tiler.monitoring.events import EventLog, open_log
     from tiler.monitoring.terminal import make_view, print_last_line, print_summary
@@ -181,6 +182,8 @@ def _plan(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
+    if options.workers and (options.store or options.cfd):
+        raise ConfigError("--workers: goes with check alone, not with --store or --cfd; leave it out")
     if options.store:
         from tiler.workflow.audit import audit_run
 
@@ -196,14 +199,14 @@ def _check(options: argparse.Namespace) -> int:
         return 0 if report.ok else EXIT_FAILED
     if options.direction:
         raise ConfigError("--direction: is for check --cfd; give that too")
-    return _check_folder(options.directory)
+    return _check_folder(options.directory, options.workers)
 
 
-def _check_folder(directory: Path) -> int:
+def _check_folder(directory: Path, workers: int = 0) -> int:
     from tiler.check.check import check_run
     from tiler.store.results import StoredTerrain
 
-    report = check_run(directory, StoredTerrain)
+    report = check_run(directory, StoredTerrain, workers=workers)
     print("\n".join(map(printable, report.lines())))
     return 0 if report.ok else EXIT_FAILED
 
@@ -276,13 +279,13 @@ def _fetch(options: argparse.Namespace) -> int:
 
 def _synth(options: argparse.Namespace) -> int:
     if options.style == "boxes":
-        names = ("lidar", "trees", "water", "workers", "variants", "degrade", "broken", "parameters", "footprints")
+        names = ("lidar", "trees", "water", "variants", "degrade", "broken", "parameters", "footprints")
         if given := [name for name in names if getattr(options, name)]:
             raise ConfigError(f"--{given[0]}: goes with a town; give its --style, as --style detached")
     if options.class_errors is not None and not options.lidar:
         raise ConfigError("--class-errors: are those of the points of --lidar; give both or neither")
     if options.style == "boxes":
-        _write_city(options.directory, options)
+        _write_city(options.directory, options, options.workers)
     else:
         _write_town(options.directory, options)
     return 0
@@ -359,7 +362,7 @@ def _write_given(directory: Path, options: argparse.Namespace, output: "Output")
     )
 
 
-def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":
+def _write_city(directory: Path, options: argparse.Namespace, workers: int = 0) -> "SynthFiles":
     from tiler.interface.synth import write_city
 
     files = write_city(
@@ -370,6 +373,7 @@ def _write_city(directory: Path, options: argparse.Namespace) -> "SynthFiles":
         relief=options.relief,
         seed=options.seed,
         roofs=options.roofs,
+        workers=workers,
     )
     clouds, shapefile = files.clouds[0].parent, files.shapefile
     say(f"{len(files.clouds)} LAZ files in {clouds}, footprints in {shapefile} and {files.footprints.name}")

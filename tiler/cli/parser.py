@@ -164,6 +164,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     )
     synth.add_argument("directory", type=Path, metavar="DIR", help="folder to write to")
     _add_city(synth, size=1000.0, buildings=SYNTH_BUILDINGS)
+    _add_workers(synth, "make tiles")
     _add_town(synth)
     _add_demo(command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one"))
     _add_render(command("render", "draw a picture of a run"))
@@ -375,9 +376,6 @@ def _add_town(synth: argparse.ArgumentParser) -> None:
         "--water", type=float, default=0.0, metavar="SHARE", help="of the relief, that lakes fill (default: 0)"
     )
     town.add_argument(
-        "--workers", type=int, default=0, metavar="N", help="processes that make tiles (default: 0, this one)"
-    )
-    town.add_argument(
         "--variants",
         default="",
         metavar="NAME,...",
@@ -423,6 +421,12 @@ def _add_fetch(fetch: argparse.ArgumentParser) -> None:
     fetch.add_argument("directory", type=Path, metavar="DIR", help="folder to write")
 
 
+def _add_workers(parser: Any, what: str) -> None:
+    parser.add_argument(
+        "--workers", type=int, default=0, metavar="N", help=f"processes that {what} (default: 0, this one)"
+    )
+
+
 def _add_check(check: argparse.ArgumentParser) -> None:
     check.add_argument("directory", type=place, metavar="DIR", help="folder of a run")
     what = check.add_mutually_exclusive_group()
@@ -434,6 +438,7 @@ def _add_check(check: argparse.ArgumentParser) -> None:
         action="store_true",
         help="instead hold domain and cells against the guidelines for wind simulations of COST 732 and AIJ",
     )
+    _add_workers(check, "look at pieces")
     check.add_argument(
         "--direction",
         type=float,

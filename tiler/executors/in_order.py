@@ -1,9 +1,10 @@
 """A function of each of many items, on workers of this machine, with results in the order of the items."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from typing import Any, TypeVar
 
+from pipeline.data.errors import ConfigError
 from tiler.engine.task_limits import Limits, share_memory
 from tiler.executors.dask_executor import ClusterError
 
@@ -13,7 +14,13 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
+def check_workers(workers: int) -> None:
+    """Raise ConfigError if there cannot be so many workers."""
+    if workers < 0:
+        raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
+
+
+def map_in_order(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Generator[Result]:
     """Call a function with each item and give small results in order.
 
     Parameters

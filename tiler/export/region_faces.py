@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
+from pipeline.data.kernel import kernel
 from pipeline.data.mesh import Region, is_ground
 from stitch.pieces.cell_faces import CellFaces, find_cell_faces
 from stitch.pieces.conformity import group_rows
@@ -299,8 +300,19 @@ def lowest_first(corners: NDArray[np.int32], ids: Ints) -> NDArray[np.int32]:
     array([[1, 2, 0],
            [1, 0, 2]], dtype=int32)
     """
-    turn = (ids[corners].argmin(axis=1)[:, None] + np.arange(3)) % 3
-    turned: NDArray[np.int32] = np.take_along_axis(corners, turn, axis=1)
+    return _turn(np.ascontiguousarray(corners), ids)  # type: ignore[no-any-return]
+
+
+@kernel
+def _turn(corners, ids):  # type: ignore[no-untyped-def]  # pragma: no cover
+    turned = np.empty_like(corners)
+    for i in range(len(corners)):
+        first = 0
+        for k in range(1, 3):
+            if ids[corners[i, k]] < ids[corners[i, first]]:
+                first = k
+        for k in range(3):
+            turned[i, k] = corners[i, (first + k) % 3]
     return turned
 
 

@@ -202,8 +202,13 @@ class CityMesh:
             raise ValueError(f"{self.folder}: no tile {tile!r}; there are {len(self)}: {_few(self.tiles)}")
         return self._pieces.read(self.tiles.index(tile))
 
-    def check(self) -> "CheckReport":
+    def check(self, *, workers: int = 0) -> "CheckReport":
         """Prove from the written files that the mesh is right: `citystitch check`.
+
+        Parameters
+        ----------
+        workers : int
+            Processes of this machine that look at pieces; with 0 this one does.
 
         Returns
         -------
@@ -218,7 +223,7 @@ class CityMesh:
         from tiler.check.check import check_run
         from tiler.store.results import StoredTerrain
 
-        return check_run(self.folder, StoredTerrain)
+        return check_run(self.folder, StoredTerrain, workers=workers)
 
     def export(self, name: str, path: Path | str, *, overwrite: bool = False, **options: Any) -> Path:
         """Write the mesh for other programs: `citystitch export`.

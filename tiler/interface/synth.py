@@ -4,8 +4,9 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyogrio
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, make_city
 from pipeline.points_terrain.synthetic_roofs import ROOF_TYPES, wing_rings
+from tiler.executors.in_order import check_workers, map_in_order
 from tiler.formats.gpkg import fixed_time
 from tiler.towns.synthetic_files import DAY, write_laz
 
@@ -61,8 +63,9 @@ def write_city(
     relief: float = RELIEF,
     seed: int = SEED,
     roofs: str = "flat",
+    workers: int = 0,
 ) -> SynthFiles:
-    """Make a synthetic city and write it: the same parameters give the same bytes.
+    """Make a synthetic city and write it: the same parameters give the same bytes, whatever the workers.
 
     Parameters
     ----------
@@ -70,6 +73,8 @@ def write_city(
         Folder to write to; made if it is missing.
     size, buildings, density, relief, seed, roofs
         See `pipeline.points_terrain.synthetic.make_city`.
+    workers : int
+        Processes of this machine that write point clouds; with 0 this one does.
 
     Returns
     -------
@@ -83,10 +88,12 @@ def write_city(
 
     Notes
     -----
-    One LAZ file at a time is in memory.
+    One LAZ file at a time is in memory. Each worker makes the city for itself, which is quick beside its points.
     """
+    check_workers(workers)
+    asked = _Asked(size, buildings, density, relief, seed, roofs)
     try:
-        city = make_city(size=size, buildings=buildings, density=density, relief=relief, seed=seed, roofs=roofs)
+        city = _make(asked)
     except ValueError as error:
         raise ConfigError(f"synth: {error}") from error
     tiles = _tiles(city, directory / "tiles")
@@ -98,16 +105,39 @@ def write_city(
         strangers = set((directory / "tiles").iterdir()) - set(tiles)
         if strangers:
             raise ConfigError(f"{min(strangers)}: is not of this city; give an empty folder or remove it")
-        for path, (part, bounds) in tiles.items():
-            write_laz(path, city_points(city, bounds, part), bounds, CRS)
+        for _ in map_in_order(partial(_write_cloud, asked), tiles.items(), workers):
+            pass
         _write_footprints(city, files)
         files.truth.write_text(json.dumps(_truth(city, buildings, relief), indent=1) + "\n")
     return files
 
 
-def _tiles(
-    city: SyntheticCity, folder: Path
-) -> dict[Path, tuple[tuple[int, int], tuple[float, float, float, float]]]:
+class _Asked(NamedTuple):
+    """Parameters of a city."""
+
+    size: float
+    buildings: int
+    density: float
+    relief: float
+    seed: int
+    roofs: str
+
+
+@lru_cache(maxsize=1)
+def _make(asked: _Asked) -> SyntheticCity:
+    return make_city(**asked._asdict())
+
+
+Tile = tuple[tuple[int, int], tuple[float, float, float, float]]  # column and row, and its box
+
+
+def _write_cloud(asked: _Asked, item: tuple[Path, Tile]) -> None:
+    """Write the points of a part of a city, which a process makes once."""
+    path, (part, bounds) = item
+    write_laz(path, city_points(_make(asked), bounds, part), bounds, CRS)
+
+
+def _tiles(city: SyntheticCity, folder: Path) -> dict[Path, Tile]:
     """Cut the city into files named by their lower left corner."""
     n = max(1, round(city.size / _TILE_SIZE))
     x, y = (corner + np.linspace(0, city.size, n + 1) for corner in ORIGIN)

@@ -1,6 +1,7 @@
 """The land cover of a run, read from its store tile by tile."""
 
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.geometry.inside import find_inside
-from pipeline.points_terrain.canopy import densities_at
+from pipeline.points_terrain.canopy import Canopy, densities_at
 from stitch.tiling.land_cover import LandCover, find_patches
 from tiler.citymodels.tables import unpack_polygons
 from tiler.engine.stage import REGION_ITEM, Box
@@ -16,6 +17,8 @@ from tiler.landcover.water import LEVELS
 from tiler.stages.pieces import CANOPY, make_canopy
 from tiler.stages.surroundings import COVERED, patch_of_ids, rows_of_cover
 from tiler.store.store import Store
+
+AROUND = 9  # canopies of tiles that stay in memory
 
 
 class StoredCanopy:
@@ -27,17 +30,18 @@ class StoredCanopy:
         self._names = [name for name in tiles if name in known]
         self._boxes = shapely.STRtree([shapely.box(*tiles[name]) for name in self._names])
         self._size = size
+        self._take = lru_cache(maxsize=AROUND)(self._read)
 
     def __call__(self, places: NDArray[np.float64], /) -> NDArray[np.float32]:
         """Density at each place (m2/m3), (n, 3) to float32 (n,)."""
         if len(places) == 0:
             return np.empty(0, np.float32)
         box = shapely.box(*places[:, :2].min(axis=0) - self._size, *places[:, :2].max(axis=0) + self._size)
-        canopies = []
-        for k in np.sort(self._boxes.query(box)).tolist():
-            arrays, attributes = self._store.read(CANOPY, self._names[k])
-            canopies.append(make_canopy(arrays, attributes["facts"], self._size))
-        return densities_at(canopies, places)
+        return densities_at([self._take(k) for k in np.sort(self._boxes.query(box)).tolist()], places)
+
+    def _read(self, k: int) -> Canopy:
+        arrays, attributes = self._store.read(CANOPY, self._names[k])
+        return make_canopy(arrays, attributes["facts"], self._size)
 
 
 class StoredCover:

@@ -106,7 +106,7 @@ class MeshPieces:
             mark_facets(self.files, self.files.boundaries[k], boundary),
             boundary.boundary.building,
             number_piece(path, volume.point_data.get(VERTEX_ID), self.numbering),
-            _regions(path, volume) if self.files.depth else None,
+            read_regions(path, volume) if self.files.depth else None,
             read_leaves(path, volume) if self.files.leaves else None,
         )
 
@@ -204,7 +204,8 @@ def read_leaves(path: Path, volume: VolumePiece) -> NDArray[np.float32]:
     return leaves
 
 
-def _regions(path: Path, volume: VolumePiece) -> NDArray[np.int8]:
+def read_regions(path: Path, volume: VolumePiece) -> NDArray[np.int8]:
+    """Take the `pipeline.data.mesh.Region` of each cell of a piece; InputError where it has none."""
     region = volume.cell_data.get(REGION)
     if region is None or region.dtype != np.int8 or not np.isin(region, list(Region)).all():
         raise InputError(f"{path}: has no cell array {REGION!r} of 0 (air) and 1 (soil) alone; run the tile again")

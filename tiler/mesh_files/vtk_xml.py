@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from deflate import zlib_compress
+from deflate import DeflateError, zlib_compress, zlib_decompress
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
@@ -276,7 +276,7 @@ def read_data_file(path: Path, kind: str) -> dict[str, dict[str, NDArray[Any]]]:
                 }
                 for section in head.piece
             }
-        except (ValueError, KeyError, TypeError, zlib.error) as error:
+        except (ValueError, KeyError, TypeError, DeflateError) as error:
             raise damaged(path, f"{error}") from None
     rows = "Cells" if kind == "UnstructuredGrid" else "Polys"
     missing = {"Points", "PointData", "CellData", rows} - sections.keys()
@@ -299,7 +299,7 @@ def read_point_array(path: Path, kind: str, name: str) -> NDArray[Any] | None:
         arrays = [array for array in head.piece.findall("PointData/DataArray") if array.get("Name") == name]
         try:
             return _read_array(file, head, arrays[0], "PointData", size) if arrays else None
-        except (ValueError, KeyError, TypeError, zlib.error) as error:
+        except (ValueError, KeyError, TypeError, DeflateError) as error:
             raise damaged(path, f"{error}") from None
 
 
@@ -314,7 +314,8 @@ def _read_array(file: BinaryIO, head: _Head, array: ET.Element, section: str, si
     file.seek(head.start + int(array.attrib["offset"]))
     data = np.empty(n_bytes, np.uint8)
     filled = 0
-    for block in _read_blocks(file, name, size):
+    for packed, most in _read_blocks(file, name, size):
+        block = zlib_decompress(packed, min(most, n_bytes - filled))
         data[filled : filled + len(block)] = np.frombuffer(block, np.uint8)
         filled += len(block)
     if filled != n_bytes:
@@ -330,11 +331,12 @@ def _expected_rows(piece: ET.Element, section: str, name: str) -> int:
     return n_rows * {"Polys": 3, "Cells": 4}.get(section, 1) if name == "connectivity" else n_rows
 
 
-def _read_blocks(file: BinaryIO, name: str, size: int) -> Iterator[bytes]:
+def _read_blocks(file: BinaryIO, name: str, size: int) -> Iterator[tuple[bytes, int]]:
+    """Read the blocks of an array, packed, and how many bytes each has at most."""
     n_blocks, block_bytes, _ = np.frombuffer(file.read(24), "<u8", 3).tolist()
     if n_blocks * 8 > size or not 0 < block_bytes <= MAX_RATIO * size:
         raise ValueError(f"array {name!r} of {n_blocks} blocks of {block_bytes} bytes in a file of {size}")
     for packed in np.frombuffer(file.read(8 * n_blocks), "<u8", n_blocks).tolist():
         if packed > size:
             raise ValueError(f"array {name!r} has a block of {packed} bytes in a file of {size}")
-        yield zlib.decompressobj().decompress(file.read(packed), block_bytes)
+        yield file.read(packed), block_bytes

@@ -12,7 +12,6 @@ from pipeline.data.mesh import Marker, Region
 from stitch.tiling.grid import Key
 from tiler.config.zone_levels import find_levels
 from tiler.engine.run_context import tile_key
-from tiler.mesh_files.facet_quality import measure_facets, name_facets
 from tiler.mesh_files.vtk_files import TETRA, BoundaryPiece, read_piece_paths, read_vtp, read_vtu
 from tiler.store.out_folder import RUN_RECORD, STORE
 from tiler.store.run_folder import REGION, read_run_record
@@ -21,7 +20,7 @@ from tiler.store.store import Store
 BOUNDARY_INDEX, VOLUME_INDEX = "boundary.pvtp", "mesh.pvtu"
 SHOWN = (Marker.GROUND, Marker.WALL, Marker.ROOF)
 MOST_BYTES = 80_000_000  # of the files of cells that are shown one by one: some 10 million cells
-MOST_FACETS = 2_000_000  # of a picture; those of larger regions are made coarser
+MOST_FACETS = 600_000  # of a picture of 1.6 million pixels; those of larger regions are made coarser
 FIRST_STEP = 1.0  # m, between vertices that are made one; doubled until there are few enough
 
 
@@ -92,6 +91,8 @@ def coarsen(facets: Facets, size: float) -> Facets:
     >>> coarse.points.tolist(), coarse.building.tolist()
     ([[1.0, 1.0, 0.0], [5.0, 1.0, 0.0], [5.0, 5.0, 0.0]], [0])
     """
+    from tiler.mesh_files.facet_quality import name_facets  # with numba
+
     cell = np.floor(facets.points / size).astype(np.int64)
     low = cell.min(axis=0)
     extent = cell.max(axis=0) - low + 1
@@ -327,7 +328,8 @@ def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[st
     shells = []
     for path in _find_pieces(directory / VOLUME_INDEX, only):
         piece = read_vtu(path)
-        north = piece.mesh.points[piece.mesh.cells, 1].mean(axis=1) > origin[1]
+        a, b, c, d = (piece.mesh.points[piece.mesh.cells[:, k], 1] for k in range(4))
+        north = (a + b + c + d) / 4 > origin[1]
         if REGION in piece.cell_data:
             north &= piece.cell_data[REGION] == Region.AIR
         if north.any():
@@ -377,6 +379,8 @@ def _take_shown(piece: BoundaryPiece, row: int, volume: Path | None) -> Facets:
     used, corners = np.unique(boundary.facets[shown], return_inverse=True)
     ratio = np.full(len(shown), np.nan, np.float32)
     if volume is not None:
+        from tiler.mesh_files.facet_quality import measure_facets
+
         ratio = measure_facets(read_vtu(volume).mesh, piece)
     return Facets(
         piece.points[used],

@@ -1,6 +1,7 @@
 """Pictures of a run's boundary, volume mesh and city model, drawn by VTK without a display (step 3.6)."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
 from pipeline.data.mesh import Marker
-from tiler.pictures.city_model_data import load_blocks
 from tiler.pictures.picture_data import City, find_middle, load_air, load_city, load_levels
 from tiler.pictures.picture_parts import add_air, add_city, add_sizes, plan_edges
 from tiler.pictures.plain_picture import PlainPlotter, has_graphics
@@ -41,6 +41,7 @@ COLOURS = {"tiles": "tile", "quality": "quality", "levels": "level"}
 OCCLUSION_RADIUS = 20.0
 CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
 SAMPLES = 2  # pixels drawn along each pixel shown
+SHADE = 32  # places around each pixel drawn that may darken it
 LEGEND = 0.1  # share of the picture of sizes that its legend takes
 LEAST_TRIANGLE = 3.0  # pixels that the middle triangle's edges need in the picture of sizes for lines to be drawn
 NEED_GRAPHICS = ("quality", "sizes")  # pictures with a legend
@@ -149,8 +150,10 @@ def render_run(
     columns, rows = size or SIZES[what]
     if columns < 2 or rows < 2:
         raise ValueError(f"size {columns} x {rows} must be at least 2 x 2")
-    need_pictures()
-    if not has_graphics():
+    with ThreadPoolExecutor(1) as pool:  # which asks another process, while pyvista is imported here
+        asked = pool.submit(has_graphics)
+        need_pictures()
+    if not asked.result():
         if what in NEED_GRAPHICS:
             raise ConfigError(f"picture {what}: {NO_GRAPHICS}")
         say(f"the picture is plain: {NO_GRAPHICS}")
@@ -158,7 +161,7 @@ def render_run(
     from PIL import Image as Pictures
 
     with replacing(output) as part:
-        Pictures.fromarray(image).save(part, format="png", optimize=True)
+        Pictures.fromarray(image).save(part, format="png")
 
 
 def need_pictures() -> None:
@@ -225,7 +228,7 @@ def draw_city(
         plotter.camera.position, plotter.camera.focal_point = _aim(shown, size, cut=air is not None)
         plotter.camera.up = (0.0, 0.0, 1.0)
         plotter.reset_camera_clipping_range()
-        plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=64)
+        plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=SHADE)
         return _shoot(plotter)
 
 
@@ -275,6 +278,8 @@ def draw_sizes(city: City, size: tuple[int, int]) -> Image:
 
 def _draw(directory: Path, what: str, size: tuple[int, int], say: Callable[[str], object]) -> Image:
     if what == "citymodel":
+        from tiler.pictures.city_model_data import load_blocks  # with all that reads a store
+
         blocks, n_buildings, n_shown = load_blocks(directory)
         if n_shown < n_buildings:
             say(f"the largest {n_shown:,} of {n_buildings:,} building parts are drawn")
@@ -312,11 +317,9 @@ def _plotter(size: tuple[int, int]) -> Iterator[Any]:
 
 
 def _shoot(plotter: Any) -> Image:
-    large = np.asarray(plotter.screenshot(return_img=True), np.float32)
-    rows, columns, channels = large.shape
-    small = large.reshape(rows // SAMPLES, SAMPLES, columns // SAMPLES, SAMPLES, channels).mean(axis=(1, 3))
-    image: Image = np.rint(small).astype(np.uint8)
-    return image
+    from PIL import Image as Pictures
+
+    return np.asarray(Pictures.fromarray(plotter.screenshot(return_img=True)).reduce(SAMPLES))
 
 
 def _light(plotter: Any) -> None:

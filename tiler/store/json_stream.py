@@ -12,6 +12,7 @@ from pipeline.data.errors import InputError
 DEEPEST = 100  # levels: ours have ten at most
 BUFFER = 1 << 18  # bytes that are read at once
 OPTIONS = {"use_float": True, "buf_size": BUFFER}
+BRACKETS = frozenset(("start_map", "start_array", "end_map", "end_array"))
 
 
 def read_members(path: Path, wanted: Callable[[str], bool]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -41,6 +42,8 @@ def read_members(path: Path, wanted: Callable[[str], bool]) -> tuple[dict[str, A
     depth, name, builder = 0, "", None
     with _opened(path) as file:
         for event, value in ijson.basic_parse(file, **OPTIONS):
+            if builder is None and depth > 1 and event not in BRACKETS:  # most of what there is
+                continue
             opens = event in ("start_map", "start_array")
             depth -= event in ("end_map", "end_array")
             if depth == 0 and event not in ("start_map", "end_map"):

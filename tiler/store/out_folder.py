@@ -38,6 +38,11 @@ OLD = (
 PLACE = "</header>"  # where the page says so
 
 
+def has_record(out: str) -> bool:
+    """Tell whether a folder on a disk has the record of a run."""
+    return (Path(out) / RUN_RECORD).is_file()
+
+
 def check_folder(out: Path, *, overwrite: bool) -> list[str]:
     """Refuse an output folder that holds something of others.
 

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import ColumnMesh, PlaneMesh
-from pipeline.points_terrain.raster import Dtm, NodeWindow, grow_window, node_window, sample_dtm
+from pipeline.points_terrain.raster import Dtm, NodeWindow, grow_window, node_window, sample_dtm, window_of
 from pipeline.points_terrain.terrain import cut_terrain, join_terrain
 from tiler.store.store import Store
 
 COLUMN_ARRAYS = ("xy", "triangles", "building", "z_start", "z", "bottom", "key", "moved")
 APPROACH, LEVELLED = "approach", "levelled"
-KEPT_CHUNKS = 9  # tiles of terrain that stay in memory
 
 
 def unpack_columns(arrays: Mapping[str, NDArray[Any]], order: Any) -> tuple[ColumnMesh, NDArray[np.int64]]:
@@ -38,7 +37,7 @@ def unpack_columns(arrays: Mapping[str, NDArray[Any]], order: Any) -> tuple[Colu
 
 
 class StoredTerrain:
-    """The terrain of a run, read from its store tile by tile.
+    """The terrain of a run, read from its store where it is asked for; the last window is kept.
 
     Parameters
     ----------
@@ -67,7 +66,7 @@ class StoredTerrain:
         some = self._windows[(self._windows[:, 2:] > 0).all(axis=1)]
         low, high = some[:, :2].min(axis=0), (some[:, :2] + some[:, 2:]).max(axis=0)
         self._region = NodeWindow(*low.tolist(), *(high - low).tolist())
-        self._chunks: dict[str, Dtm] = {}
+        self._last: Dtm | None = None
 
     def sample(self, xy: NDArray[np.float64], /) -> NDArray[np.float64]:
         """Ground height (m) at each place, (n, 2) to (n,). Memory is that of the terrain around them."""
@@ -76,19 +75,22 @@ class StoredTerrain:
         low, high = xy.min(axis=0), xy.max(axis=0)
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
         window = grow_window(node_window(box, self._spacing), 0, within=self._region)
+        if self._last is None or grow_window(window, 0, within=window_of(self._last)) != window:
+            self._last = None  # its memory is free before the next is read
+            self._last = self._read(window)
+        return sample_dtm(cut_terrain(self._last, window), xy)
+
+    def _read(self, window: NodeWindow) -> Dtm:
+        """Read the nodes of a window that tiles have."""
         low, size = self._windows[:, :2], self._windows[:, 2:]
         begin, end = (window.i0, window.j0), (window.i0 + window.nx, window.j0 + window.ny)
         met = ((low < end) & (low + size > begin) & (size > 0)).all(axis=1)
-        parts = [self._chunk(k) for k in np.flatnonzero(met).tolist()]
-        return sample_dtm(cut_terrain(join_terrain(parts, window), window), xy)
-
-    def _chunk(self, k: int) -> Dtm:
-        name = str(self._names[k])
-        chunk = self._chunks.pop(name, None)
-        if chunk is None:
-            while len(self._chunks) >= KEPT_CHUNKS:
-                del self._chunks[next(iter(self._chunks))]
-            i0, j0 = self._windows[k, :2].tolist()
-            chunk = Dtm(self._store.read(self._stage, name)[0]["z"], i0, j0, self._spacing)
-        self._chunks[name] = chunk  # the youngest is the last
-        return chunk
+        parts = []
+        for k in np.flatnonzero(met).tolist():
+            own = NodeWindow(*self._windows[k].tolist())
+            common = grow_window(own, 0, within=window)
+            rows, columns = common.j0 - own.j0, common.i0 - own.i0
+            spans = (rows, rows + common.ny), (columns, columns + common.nx)
+            z = self._store.read_window(self._stage, str(self._names[k]), "z", *spans)
+            parts.append(Dtm(z, common.i0, common.j0, self._spacing))
+        return join_terrain(parts, window)

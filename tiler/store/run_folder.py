@@ -12,7 +12,6 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import Region, TetMesh
 from pipeline.data.roofs import Roofs, Weld
 from tiler.config.config import roofs_stay_flat
 from tiler.config.zone_levels import read_described
@@ -275,63 +274,6 @@ def read_crs(path: Path) -> str:
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
     return crs
-
-
-def read_volume(path: Path, *, regions: bool = False) -> tuple[TetMesh, NDArray[np.int8]]:
-    """Read a VTU piece with meshio: a reader that is not ours.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    regions : bool
-        Whether its cells must tell their region.
-
-    Returns
-    -------
-    TetMesh
-        The mesh.
-    int8, (n_cells,)
-        `pipeline.data.mesh.Region` of each cell: all air if they need not tell.
-
-    Raises
-    ------
-    InputError
-        If meshio cannot read it, if it holds something else than finite points and tetrahedra, or lacks a region.
-
-    Notes
-    -----
-    meshio takes some 130 bytes a cell for a moment.
-    """
-    import meshio  # here, as it takes 50 ms and a run needs it not
-
-    try:
-        mesh = meshio.vtu.read(str(path))
-    # A damaged file shows in many ways, SystemExit among them.
-    except (Exception, SystemExit) as error:
-        raise InputError(
-            f"{path}: meshio cannot read it ({type(error).__name__}: {error}); run the tile again"
-        ) from None
-    blocks = [block.data for block in mesh.cells if block.type == "tetra"]
-    if len(blocks) != len(mesh.cells) or mesh.points.ndim != 2 or mesh.points.shape[1] != 3:
-        kinds = ", ".join(block.type for block in mesh.cells)
-        raise InputError(f"{path}: holds {kinds}, not tetrahedra; run the tile again")
-    cells = np.concatenate(blocks) if blocks else np.empty((0, 4), np.int64)
-    if cells.size and (cells.min() < 0 or cells.max() >= len(mesh.points)):
-        raise InputError(
-            f"{path}: vertex {cells.min()}..{cells.max()} of {len(mesh.points)} points; run the tile again"
-        )
-    if not np.isfinite(mesh.points).all():
-        raise InputError(f"{path}: a coordinate is not finite; run the tile again")
-    region = np.full(len(cells), Region.AIR, np.int8)
-    if regions:
-        known = mesh.cell_data.get(REGION, [])
-        if len(known) != 1 or known[0].shape != region.shape or not np.isin(known[0], list(Region)).all():
-            raise InputError(
-                f"{path}: has no cell array {REGION!r} of 0 (air) and 1 (soil) alone; run the tile again"
-            )
-        region = known[0].astype(np.int8)
-    return TetMesh(mesh.points.astype(np.float64, copy=False), cells.astype(np.int32)), region
 
 
 def broken_field(path: Path, error: Exception) -> InputError:

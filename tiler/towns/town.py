@@ -20,7 +20,7 @@ from pipeline.architecture.parameters import House
 from pipeline.architecture.representations import list_representations
 from pipeline.data.errors import ConfigError, OutputError
 from pipeline.points_terrain.synthetic import ORIGIN
-from tiler.executors.in_order import map_in_order
+from tiler.executors.in_order import check_workers, map_in_order
 from tiler.formats.gpkg import fixed_time
 from tiler.towns.parameter_files import XML_END, XML_HEAD
 from tiler.towns.rule_files import read_rules
@@ -142,8 +142,7 @@ def write_town(
             raise ConfigError(f"--{name} {value:g}: expected 0 to {MOST_DENSITY:g} points per m2")
     if not 0 <= class_errors <= 1:
         raise ConfigError(f"--class-errors {class_errors:g}: expected 0 to 1")
-    if workers < 0:
-        raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
+    check_workers(workers)
     if lidar > 0:
         check_flight(town)
     tile = TownTile(directory, town, town.bounds, (0, 0), density, lidar, class_errors, output)

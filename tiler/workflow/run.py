@@ -7,7 +7,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 from pipeline.data.errors import CityError, OutputError
 from tiler.config.config import ANYWHERE, Config, with_absolute_inputs
 from tiler.dashboard.server import read_address, watched
-from tiler.engine.executor import Executor, Serial
+from tiler.engine.executor import Executor, OnDemand, Serial
 from tiler.engine.keys import code_versions
 from tiler.engine.schedule import StoppedError
 from tiler.engine.stage import Stage
@@ -267,10 +267,7 @@ def _mesh_region(
     missing = Missing()
     if not config.on_cluster:
         _prepare(config, watchers.say)
-    with (
-        _executor(config, means, watchers.say) as executor,
-        watched(means.shown, means.dashboard, getattr(executor, "scheduler", None), watchers.say),
-    ):
+    with _executor(config, means, watchers.say) as executor:
         while True:
             engine = make_engine(config, out, plan, executor, own, watchers)
             with stops(engine.stop, watchers.say):
@@ -335,6 +332,29 @@ def _connect(config: Config) -> AbstractContextManager[Executor | None]:
 
 @contextmanager
 def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iterator[Executor]:
+    """Give the executor of a run, and show its page; workers of this machine start with the first task."""
+    with ExitStack() as stack:
+
+        def show(executor: Executor) -> Executor:
+            scheduler = getattr(executor, "scheduler", None)
+            stack.enter_context(watched(means.shown, means.dashboard, scheduler, say))
+            return executor
+
+        if config.workers and means.cluster is None and not config.cluster:
+
+            def start() -> Executor:
+                from tiler.executors.local_cluster import local
+
+                limits, where = limit_workers(config), means.dashboard or ANYWHERE
+                return show(stack.enter_context(local(config.workers, limits, dashboard=where)))
+
+            yield OnDemand(config.workers, start)
+        else:
+            yield show(stack.enter_context(_eager_executor(config, means, say)))
+
+
+@contextmanager
+def _eager_executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iterator[Executor]:
     if means.cluster is not None:
         yield means.cluster
     elif config.cluster:
@@ -344,11 +364,6 @@ def _executor(config: Config, means: _Means, say: Callable[[str], None]) -> Iter
         with worker_jobs(
             cluster, folder, config.time_limit, dashboard=means.dashboard or ANYWHERE, say=say
         ) as executor:
-            yield executor
-    elif config.workers:
-        from tiler.executors.local_cluster import local
-
-        with local(config.workers, limit_workers(config), dashboard=means.dashboard or ANYWHERE) as executor:
             yield executor
     else:
         yield Serial()

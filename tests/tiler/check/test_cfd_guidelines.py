@@ -100,6 +100,8 @@ def test_the_table_of_a_run(small_run: Path, capsys: pytest.CaptureFixture[str])
     assert "of 7 not met, AIJ: " in said
     assert main(["check", str(small_run), "--direction", "240"]) == 2
     assert "--direction: is for check --cfd" in capsys.readouterr().err
+    assert main(["check", str(small_run), "--cfd", "--workers", "2"]) == 2
+    assert "--workers: goes with check alone" in capsys.readouterr().err
     found = survey_domain(small_run)
     assert np.isfinite(found.cells_a_side).all()
     assert found.growth.minimum >= 1.0

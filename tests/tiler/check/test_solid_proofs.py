@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,9 @@ import shapely
 from pipeline.city_model.roof_areas import block_heights
 from pipeline.data.citymodel import CityModel
 from pipeline.data.roofs import Roofs
-from tests.helpers.iso19107 import check_solids
-from tiler.check.solid_proofs import SolidProofs
-from tiler.citymodels.building_index import index_buildings
+from tests.helpers import iso19107
+from tiler.check.solid_proofs import check_solids
+from tiler.citymodels.building_index import spool_vertices
 from tiler.citymodels.cityjson import read_city_model, write_city_model
 
 Json = dict[str, Any]
@@ -57,7 +58,7 @@ def test_a_courtyard_that_touches_a_wall_is_parted_from_it(tmp_path: Path, plane
     (note,) = write_city_model(file, model, crs="EPSG:28992", bounds=(0, 0, 0, 99, 99, 50), attributes=columns)
     assert (note.kind, note.detail) == ("solid-touching", "touches itself in 1 points, expected 0")
     document = json.loads(file.read_text())
-    assert check_solids(document) == {("a", lod): set() for lod in ("1.2", "1.3", "2.2")}
+    assert iso19107.check_solids(document) == {("a", lod): set() for lod in ("1.2", "1.3", "2.2")}
     assert prove(tmp_path, document)[1] == set()
     xy = np.array(document["vertices"])[:, :2].tolist()
     assert [5, 5000] in xy  # the corner of the courtyard, 5 mm into it
@@ -71,10 +72,8 @@ def prove(folder: Path, model: Json) -> tuple[str, set[str]]:
     """Claim of the proof, and kinds of its faults."""
     file = folder / "b.city.json"
     file.write_text(json.dumps(model))
-    proofs = SolidProofs()
-    with index_buildings(file, proofs.add):
-        pass
-    proof = proofs.prove()
+    with TemporaryFile() as spool:
+        proof = check_solids(file, spool_vertices(file, spool))
     return proof.claim, {fault.kind for fault in proof.faults}
 
 

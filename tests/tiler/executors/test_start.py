@@ -38,6 +38,7 @@ def test_the_tasks_of_a_run_import_nothing_more(tmp_path: Path) -> None:
         "scipy.sparse",
         "zarr",
     }
+    assert find_imported_by_a_run(tmp_path, DASK, workers=2) == [], "nothing is to do: no worker is started"
 
 
 @pytest.mark.parametrize("module", ["tiler.cli.main", "tiler.monitoring.status", "tiler.store.run_folder"])
@@ -47,8 +48,11 @@ def test_help_and_status_import_no_numba(module: str) -> None:
 
 def find_imported_by_a_run(tmp_path: Path, names: tuple[str, ...], workers: int) -> list[str]:
     """Which of the names the process of a command has imported when its run is done."""
-    city = write_city(tmp_path / "city", size=300, buildings=15, density=1.0)
-    words = ["run", *map(str, city.clouds), "--footprints", str(city.footprints), "--out", str(tmp_path / "out")]
+    folder = tmp_path / "city"
+    if not folder.exists():
+        write_city(folder, size=300, buildings=15, density=1.0)
+    footprints = ("--footprints", str(folder / "footprints.gpkg"))
+    words = ["run", str(folder / "tiles"), *footprints, "--out", str(tmp_path / "out")]
     code = f"""
 import sys
 from tiler.cli.main import main

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, InputError, OutputError
 from pipeline.data.mesh import Marker
-from stitch.pieces import cell_faces
+from stitch.pieces import face_mates
 from stitch.pieces.cell_faces import find_cell_faces
 from tests.helpers.foam_reader import PolyMesh, read_field, read_header, read_labels, read_poly_mesh, read_zones
 from tests.helpers.hand_pieces import HandPieces, box_pieces
@@ -296,9 +296,9 @@ def test_faces_of_cells_are_found_whatever_their_order() -> None:
 
 def test_more_cells_than_their_faces_have_numbers_for_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     piece = box_pieces((1, 1)).read(0)
-    monkeypatch.setattr(cell_faces, "MOST_CELLS", len(piece.cells))
+    monkeypatch.setattr(face_mates, "MOST_CELLS", len(piece.cells))
     find_cell_faces(piece.cells, piece.facets, len(piece.points))
-    monkeypatch.setattr(cell_faces, "MOST_CELLS", len(piece.cells) - 1)
+    monkeypatch.setattr(face_mates, "MOST_CELLS", len(piece.cells) - 1)
     with pytest.raises(ValueError, match=f"{len(piece.cells)} cells in one piece, at most {len(piece.cells) - 1}"):
         find_cell_faces(piece.cells, piece.facets, len(piece.points))
 
@@ -309,6 +309,7 @@ def test_the_size_of_blocks_changes_no_byte(
 ) -> None:
     at_once = write(tmp_path / "at_once", box, parts=parts)
     monkeypatch.setattr(region_faces, "BLOCK_CELLS", 7)
+    monkeypatch.setattr(face_mates, "AT_ONCE", 11)
     by_seven = write(tmp_path / "by_seven", box, parts=parts)
     files = sorted(path.relative_to(at_once) for path in at_once.rglob("*") if path.is_file())
     assert files == sorted(path.relative_to(by_seven) for path in by_seven.rglob("*") if path.is_file())
