@@ -281,6 +281,23 @@ def pack_model(buildings: Buildings, *, zoned: bool = False) -> Arrays:
     return pack_buildings(buildings, zoned=zoned) | {"extents": shapely.bounds(buildings.model.polygons)}
 
 
+def find_changed(old: Arrays, new: Arrays) -> list[tuple[float, float, float, float]]:
+    """Find where two states of `NEAR_ARRAYS` differ: boxes (m) of the buildings that changed, before and after."""
+    before, after = _rows_by_id(old), _rows_by_id(new)
+    changed = [name for name in before.keys() | after.keys() if before.get(name) != after.get(name)]
+    return [state[name][0] for name in changed for state in (before, after) if name in state]
+
+
+def _rows_by_id(arrays: Arrays) -> dict[str, tuple[Any, ...]]:
+    """Box, and all else as bytes, of each building by its id."""
+    data, ends = arrays["polygon"].tobytes(), arrays["polygon_start"].tolist()
+    others = [arrays[name] for name in NEAR_ARRAYS if name not in ("polygon", "polygon_start", "id")]
+    return {
+        name: (tuple(box), data[ends[k] : ends[k + 1]], *(values[k].tobytes() for values in others))
+        for k, (name, box) in enumerate(zip(arrays["id"].tolist(), arrays["extents"].tolist(), strict=True))
+    }
+
+
 def take_near(arrays: Arrays, box: shapely.Polygon, layers: NDArray[np.int32] | None = None) -> NearBuildings:
     """Read the buildings that meet a box from `NEAR_ARRAYS` of the stage ``model``.
 

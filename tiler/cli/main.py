@@ -498,6 +498,40 @@ def _kernels(_: argparse.Namespace) -> int:
     return 0
 
 
+def _edit(options: argparse.Namespace) -> int:
+    from tiler.editing.edit import city_at, edit_city, list_edits
+
+    directory, more = options.directory, {"workers": options.workers, "say": say}
+    if options.out and options.at is None:
+        raise ConfigError("--out: is for --at; an edit changes the folder itself, leave it out")
+    if options.as_list:
+        for edit in list_edits(directory, say):
+            say(f"{edit.number:>4}  {edit.date}  {edit.action:<7}  {', '.join(edit.ids)}  {edit.source}".rstrip())
+        return 0
+    if options.at is not None:
+        if options.out is None:
+            raise ConfigError("--at: makes the city of a day in another folder; name it with --out")
+        record = city_at(directory, options.at, options.out, **more)
+        say(f"{options.out}: the city of {options.at}, {_count_tasks(record)}")
+        return int(record["exit_code"])
+    name, upload = options.replace or (options.remove or "", options.add)
+    action = "replace" if options.replace else "remove" if options.remove is not None else "add"
+    upload = None if upload is None else Path(upload)
+    done = edit_city(directory, action, name, upload, date=options.date, base=options.base, **more)
+    edit = done.edit
+    say(
+        f"edit {edit.number} of {edit.date} is done: {edit.action} {', '.join(edit.ids)}; "
+        f"{_count_tasks(done.record)}, {done.files} files changed"
+    )
+    return int(done.record["exit_code"])
+
+
+def _count_tasks(record: Mapping[str, Any]) -> str:
+    """Write how much of a run was computed."""
+    tasks = record["tasks"]
+    return f"{tasks['ran']} of {tasks['all']} tasks ran in {record['seconds_total']:.1f} s"
+
+
 def _config(_: argparse.Namespace) -> int:
     print(annotated_defaults())
     return 0
@@ -516,6 +550,7 @@ HANDLERS: Mapping[str, Handler] = {
     "demo": _demo,
     "render": _render,
     "export": _export,
+    "edit": _edit,
     "convert": _convert,
     "generalise": _generalise,
     "wind": _wind,

@@ -169,6 +169,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     _add_demo(command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one"))
     _add_render(command("render", "draw a picture of a run"))
     add_job_commands(add, _add_inputs)
+    _add_edit(command("edit", "replace, remove or add buildings in a finished run, and mesh what that touches"))
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
     _add_convert(command("convert", "write city models, or that of a run, as another format of city models"))
     _add_generalise(
@@ -495,6 +496,28 @@ def _add_address(*servers: argparse.ArgumentParser) -> None:
         server.add_argument(
             "--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1, this machine alone)"
         )
+
+
+def _add_edit(edit: argparse.ArgumentParser) -> None:
+    """Add what is done with a city and its journal."""
+    edit.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a finished run")
+    what = edit.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "--replace",
+        nargs=2,
+        metavar=("ID", "FILE"),
+        help="put the footprint of a vector file in a building's place",
+    )
+    what.add_argument("--remove", metavar="ID", help="take a building away")
+    what.add_argument("--add", type=Path, metavar="FILE", help="add the footprints of a vector file")
+    what.add_argument("--list", action="store_true", dest="as_list", help="print the edits so far")
+    what.add_argument("--at", metavar="DATE", help="make the city of a day, YYYY-MM-DD, in --out")
+    edit.add_argument("--out", type=_on_disk, metavar="DIR", help="folder for the city of a day")
+    edit.add_argument("--date", default="", help="day from which on the edit holds, YYYY-MM-DD (default: today)")
+    edit.add_argument(
+        "--base", type=int, metavar="N", help="refuse the edit if one after number N is of the same building"
+    )
+    edit.add_argument("--workers", type=int, default=0, metavar="N", help="worker processes (default: this one)")
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:

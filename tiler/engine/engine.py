@@ -76,6 +76,9 @@ class Engine:
         What stages were run over, by their names.
     stopped : bool
         Whether `stop` was called.
+    changes : dict of (str, str) to (str, list of box)
+        Results that differ from the store that this one was copied from: their digest there, and boxes of what
+        differs.
     """
 
     def __init__(
@@ -94,6 +97,7 @@ class Engine:
         self.records = Records(self.store)
         self.set_aside: dict[Item, SetAside] = {}
         self.blocked: dict[Item, Item] = {}
+        self.changes: dict[Item, tuple[str, list[Box]]] = {}
         self.policy = policy or Policy()
         self.stopped = False
         self._gaps = Gaps(layout.absent)

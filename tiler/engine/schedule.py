@@ -3,7 +3,7 @@
 import heapq
 from collections import Counter, defaultdict
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from pipeline.data.errors import CityError
 from tiler.config.declared import Declared
 from tiler.engine.failures import SetAside, describe_reason, ends_the_run, tries
 from tiler.engine.keys import OpenKey, file_identity
-from tiler.engine.stage import Scope, Stage
+from tiler.engine.stage import Scope, Stage, boxes_touch
 from tiler.engine.submission import Item, Outcome, Part
 from tiler.engine.task import Failure, Later, Record, Task
 from tiler.engine.task_graph import Items, Refs, chain_seams, invert, own_refs, readers
@@ -219,8 +219,21 @@ class Schedule:
         task = Task(
             *(stage, name, scope, box, planned.parameters, engine.context, path, engine.store, refs, key or ""),
             *(engine.store.path.parent, frame),
+            former="" if key is None else self._former_key(planned.stage, made),
         )
         return Part(planned.stage.function, task, made if key is None else None)
+
+    def _former_key(self, stage: Stage, key: OpenKey) -> str:
+        """Key of the same result before changes that do not reach it; nothing where there is none."""
+        former = {source: dict(found) for source, found in key.refs.items()}
+        for read in stage.reads if self.engine.changes else ():
+            xmin, ymin, xmax, ymax = key.box
+            reach = (xmin - read.halo, ymin - read.halo, xmax + read.halo, ymax + read.halo)
+            for name in former[read.stage] if read.within else ():
+                digest, boxes = self.engine.changes.get((read.stage, name), ("", []))
+                if digest and not any(boxes_touch(reach, box) for box in boxes):
+                    former[read.stage][name] = digest
+        return "" if former == key.refs else replace(key, refs=former).close({}, self.engine.store)[0]
 
     def _find_reads(self, ticket: int, before: Collection[Item]) -> tuple[dict[str, tuple[str, ...]], list[Item]]:
         """Find what a task reads and is there, by stage, and what it cannot do without and is not there.

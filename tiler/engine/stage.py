@@ -60,6 +60,9 @@ class Read:
         Of all items but the one of the reader's own name it counts only that they are there, not what they hold:
         their content is in no key, and the reader must not look at it. It does not wait for them either: they are
         taken to be there, and the reader runs again in the end if one of them failed.
+    within : bool
+        Of each result the function looks only at what lies at the reader's box grown by the halo: a change
+        elsewhere in it, as `Engine.changes` knows of one, leaves the reader's result as it is.
     """
 
     stage: str
@@ -71,6 +74,7 @@ class Read:
     optional: bool = False
     beside: bool = False
     others_by_name: bool = False
+    within: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.halo) and self.halo >= 0):
@@ -187,6 +191,11 @@ class Layout:
                 return self.seams
             case Scope.REGION:
                 return {REGION_ITEM: self.bounds}
+
+
+def boxes_touch(one: Box, other: Box) -> bool:
+    """Return whether two boxes have a point in common; their borders belong to them."""
+    return one[0] <= other[2] and other[0] <= one[2] and one[1] <= other[3] and other[1] <= one[3]
 
 
 def check_box(name: str, box: Box) -> None:

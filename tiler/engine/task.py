@@ -141,6 +141,8 @@ class Task:
         Where the files are that results state as the fact ``"files"``.
     frame : Frame
         How coordinates of the file become those of the region, for the scope FILE.
+    former : str
+        Key that the same result has in a copied store, before changes that do not reach it; empty for none.
     """
 
     stage: str
@@ -155,6 +157,7 @@ class Task:
     key: str
     folder: Path
     frame: Frame = AS_IT_IS
+    former: str = ""
     _writer: Writer | None = None
     _notes: list[Note] = field(default_factory=list)
     _seconds: dict[str, float] = field(default_factory=dict)
@@ -318,12 +321,14 @@ def _take_earlier(task: Task) -> Record | str:
         attributes, digest = store.describe(stage, name)
     except CityError as error:
         return f"{file} {store.find_damage(stage, name) or error}"
-    if attributes.get("key") != task.key:
+    if attributes.get("key") not in (task.key, task.former or task.key):
         return ""
     facts = attributes["facts"]
     damage = {file: store.find_damage(stage, name)} | find_changed_files(task.folder, facts.get(FILES, {}))
     if found := [f"{path} {what}" for path, what in damage.items() if what]:
         return found[0] + (f", and {len(found) - 1} more" if found[1:] else "")
+    if attributes["key"] != task.key:
+        store.change_key(stage, name, task.key)
     notes = count_notes(notes_from_json(attributes["notes"]))
     return Record(stage, name, task.key, digest, facts, notes, reused=True)
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from tiler.check.check import CheckReport
     from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces
+    from tiler.store.edit_journal import Edit
 
 MOST_CELLS = 5_000_000  # of a mesh that is put together in memory, some 0.5 GB
 # Facets up to which a notebook shows the picture unasked: a few seconds, and less than a gigabyte.
@@ -333,6 +334,76 @@ class CityMesh:
             regions = [part.region for part in parts if part.region is not None]
             data["region"] = [np.concatenate(regions), np.full(len(facets), -1, np.int8)]
         return meshio.Mesh(points, [("tetra", cells), ("triangle", facets)], cell_data=data)
+
+    def replace(self, building: str, file: Path | str, *, date: str = "", base: int | None = None) -> "CityMesh":
+        """Put the footprint of a vector file in the place of a building: `citystitch edit --replace`.
+
+        Parameters
+        ----------
+        building : str
+            Id of its footprint.
+        file : Path or str
+            Vector file with one footprint.
+        date : str
+            Day from which on it holds, YYYY-MM-DD; today by default.
+        base : int, optional
+            Number of the last edit that is known: a later one of the same building is a conflict.
+
+        Returns
+        -------
+        CityMesh
+            The city after the edit; this object is of what was there before.
+
+        Raises
+        ------
+        CityError
+            If the edit is refused or fails; the city is as before.
+        """
+        return self._edit("replace", building, Path(file), date=date, base=base)
+
+    def remove(self, building: str, *, date: str = "", base: int | None = None) -> "CityMesh":
+        """Take a building away: `citystitch edit --remove`; all else as for `replace`."""
+        return self._edit("remove", building, None, date=date, base=base)
+
+    def add(self, file: Path | str, *, date: str = "", base: int | None = None) -> "CityMesh":
+        """Add the footprints of a vector file: `citystitch edit --add`; all else as for `replace`."""
+        return self._edit("add", "", Path(file), date=date, base=base)
+
+    def at(self, date: str, out: Path | str) -> "CityMesh":
+        """Make the city of a day in another folder: `citystitch edit --at`.
+
+        Parameters
+        ----------
+        date : str
+            YYYY-MM-DD: edits of a later date are left out.
+        out : Path or str
+            Folder on the same disk, which is not there; it shares what is the same by hard links.
+
+        Returns
+        -------
+        CityMesh
+
+        Raises
+        ------
+        CityError
+            If there is such a folder, or the city cannot be made.
+        """
+        from tiler.editing.edit import city_at
+
+        city_at(self.folder, date, Path(out))
+        return CityMesh(out)
+
+    def edits(self) -> "list[Edit]":
+        """List the edits of the folder, by number: `citystitch edit --list`."""
+        from tiler.editing.edit import list_edits
+
+        return list_edits(self.folder)
+
+    def _edit(self, action: str, building: str, file: Path | None, *, date: str, base: int | None) -> "CityMesh":
+        from tiler.editing.edit import edit_city
+
+        edit_city(self.folder, action, building, file, date=date, base=base)
+        return CityMesh(self.folder)
 
     def buildings(self) -> Iterator[Building]:
         """Read the simplified city model that was meshed, building by building.

@@ -18,7 +18,7 @@ from tiler.stages.approach import approach_stages
 from tiler.stages.city import first_round, house_stage, later_round, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.domain import domain_stages, layer_stages
-from tiler.stages.inputs import fill_stage, input_stages, lake_stage
+from tiler.stages.inputs import EDITED, fill_stage, input_stages, lake_stage
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import fit_stage, piece_stages
 
@@ -75,12 +75,12 @@ def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, 
     """
     own = OwnStages(tuple(stages), dict(parameters or {}))
     # Rounds of simplification are numbered: near-0, near-1, and so on.
-    names = {stage.name.rstrip("0123456789") for stage in [*list_stages(config), lake_stage()]}
+    names = {stage.name.rstrip("0123456789") for stage in [*list_stages(config), lake_stage()]} | {EDITED}
     taken = sorted(stage.name for stage in own.stages if stage.name.rstrip("0123456789") in names)
     if taken:
         raise ValueError(f"stage {', '.join(taken)}: a stage of citystitch has such a name; name yours otherwise")
     given = {*dataclasses.asdict(config), *derived_parameters(config), "footprints_identity", "top_elevation"}
-    given |= {"footprints_frame", "footprints_shift", "refinements", "zones"}
+    given |= {"footprints_frame", "footprints_shift", "refinements", "zones", "edits"}
     given |= {"core_bounds", "rim_store", "rim_digest", "land_cover_identity", "cover_table", "cover_reach"}
     given |= {"levels_store", "levels_digest", "trees_identity", "generalised_identity"}
     clash = sorted(own.parameters.keys() & given)

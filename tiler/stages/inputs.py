@@ -1,7 +1,7 @@
 """Stages 1.1 to 1.3: points of each file, footprints, and the terrain of each tile."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from pipeline.data.citymodel import Footprints, number_ids, take_footprints
 from pipeline.data.classes import GROUND, KEY_POINT, WATER
 from pipeline.data.errors import InputError
 from pipeline.data.pointcloud import rename_classes
+from pipeline.data.roof_forms import N_COLUMNS
 from pipeline.points_terrain.alignment import REACH
 from pipeline.points_terrain.ground_check import LEAST_STEP, compare_ground, is_upside_down
 from pipeline.points_terrain.raster import Dtm, NodeWindow, grow_window, node_window
@@ -33,10 +34,10 @@ from pipeline.points_terrain.terrain_fill import (
 from stitch.tiling.grid import Key, has_tile
 from tiler.cityinput.rasters import REACH as RASTER_REACH
 from tiler.cityinput.sources import CLOUD, MODEL, kind_of
-from tiler.citymodels.tables import pack_polygons
+from tiler.citymodels.tables import pack_polygons, unpack_polygons
 from tiler.config.config import Config
 from tiler.engine.run_context import tile_key
-from tiler.engine.stage import Facts, Read, Scope, Stage
+from tiler.engine.stage import Box, Facts, Read, Scope, Stage, boxes_touch
 from tiler.engine.task import Task
 from tiler.footprints.footprint_index import FootprintBlock, block_footprints, scan_footprints
 from tiler.footprints.model_places import ModelPlaces, give_way
@@ -64,12 +65,14 @@ from tiler.stages.readers import (
     read_outlines,
     read_units,
 )
+from tiler.store.edit_journal import Edits
 
 MODEL_OUTLINES = "model-outlines"  # stage of the buildings of city models, where there are footprints, too
+EDITED = "edits"  # stage of what edits changed in a tile, for these tiles alone
 
 
-def input_stages(config: Config) -> list[Stage]:
-    """Stages from the files to the coarse level of the terrain."""
+def input_stages(config: Config, *, edited: bool = False) -> list[Stage]:
+    """Stages from the files to the coarse level of the terrain; `edited`: the run folder has edits."""
     spacing = config.dtm_spacing
     ground: tuple[str, ...] = ("dtm_spacing", "ground_filter")
     of_models = MODEL_PARAMETERS if config.buildings else ()
@@ -83,6 +86,7 @@ def input_stages(config: Config) -> list[Stage]:
         *([Read(MODEL_OUTLINES)] if both else []),
         *(Read(stage.name) for stage in blocks),
     )
+    edits = (Read(EDITED, own=True, optional=True),) if edited else ()
     return [
         *blocks,
         Stage(
@@ -106,9 +110,10 @@ def input_stages(config: Config) -> list[Stage]:
             ),
             version=4,
         ),
+        *([Stage(EDITED, Scope.TILE, take_edits, (), ("edits",))] if edited else []),
         # What a tile needs of the footprints: it does not run again when others change.
         Stage(
-            *("outlines", Scope.TILE, take_outlines, outlines, ("footprints_shift",)),
+            *("outlines", Scope.TILE, take_outlines, (*outlines, *edits), ("footprints_shift",)),
             version=4,
             after="ground",
         ),
@@ -276,9 +281,47 @@ def read_models_beside(task: Task) -> Facts:
     return facts
 
 
+def edited_tiles(tiles: Mapping[str, Box], edits: Edits) -> list[str]:
+    """List the tiles that edits touch."""
+    return [name for name, box in tiles.items() if any(boxes_touch(box, other) for other in edits.boxes)]
+
+
+def take_edits(task: Task) -> Facts:
+    """Take what edits changed in a tile: ids that are gone, and footprints that came."""
+    removed, outlines = task.parameters.edits["removed"], task.parameters.edits["outlines"]
+    mine = [outline for outline, box in outlines if boxes_touch(task.box, box)]
+    forms = [[np.nan if v is None else v for v in form] or [np.nan] * N_COLUMNS for _, _, _, form in mine]
+    task.put(
+        removed=np.array([name for name, box in removed if boxes_touch(task.box, box)], np.str_),
+        **pack_polygons(shapely.from_wkb([wkb for _, wkb, _, _ in mine]).astype(np.object_), "outline"),
+        ids=np.array([name for name, _, _, _ in mine], np.str_),
+        given_height=np.array([np.nan if height is None else height for _, _, height, _ in mine], np.float64),
+        forms=np.array(forms, np.float64).reshape(-1, N_COLUMNS),
+    )
+    return {"n": len(mine)}
+
+
+def _edit(task: Task, footprints: Footprints) -> Footprints:
+    """Apply the edits of a tile to its footprints."""
+    (found,) = (result.arrays for result in task.read(EDITED))
+    kept = take_footprints(footprints, ~np.isin(footprints.ids, found["removed"]))
+    came = unpack_polygons(found, "outline")
+    near = shapely.intersects(came, shapely.box(*task.box))
+    ids = np.concatenate((kept.ids, found["ids"][near]))
+    both = Footprints(
+        np.concatenate((kept.polygons, came[near])),
+        ids,
+        np.concatenate((kept.given_height, found["given_height"][near])),
+        np.concatenate((kept.forms, found["forms"][near])),
+    )
+    return take_footprints(both, np.argsort(ids, kind="stable"))
+
+
 def take_outlines(task: Task) -> Facts:
     """Take the footprints that meet a tile (step 1.2); beside a city model, its buildings and what these leave."""
     footprints = read_outlines(task, shift=task.parameters.footprints_shift)
+    if task.refs.get(EDITED):
+        footprints = _edit(task, footprints)
     if MODEL_OUTLINES in task.refs:
         footprints = _join_models(task, footprints)
     counts = {}

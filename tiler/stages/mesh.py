@@ -79,7 +79,7 @@ def mesh_stages(config: Config, domain: Domain | None = None) -> list[Stage]:
     halo, see = halos(config, config.graded_size, around_walls=config.open_size > 0)
     domain = domain or Domain(config.expected_height, None)
     reads = [
-        Read("model", see, by_extent=True),
+        Read("model", see, by_extent=True, within=True),
         Read(terrain_stage(config), halo + terrain_halo(config, domain)),
     ]
     reads += [Read("layers", see, by_extent=True)] if chooses_layers_later(config) else []

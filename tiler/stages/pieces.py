@@ -67,7 +67,7 @@ def fit_stage(config: Config) -> Stage:
     reads = (
         Read("points", halo_of_points(config, 0.0)),
         Read("terrain", 2 * config.dtm_spacing),
-        Read("model", by_extent=True),
+        Read("model", by_extent=True, within=True),
         Read("outlines", own=True),
     )
     parameters = ("dtm_spacing", "ground_filter")

@@ -1,19 +1,22 @@
 """The store: results by stage and name, a file each (`tiler.store.result_file`), whole or not at all."""
 
+import json
 import os
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile, ZipInfo
 
 from blake3 import blake3
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.data.errors import OutputError
 from tiler.objects.places import in_bucket
-from tiler.store.checksums import find_file_damage
-from tiler.store.result_file import ResultFile
+from tiler.store.atomic import disk_errors, replacing
+from tiler.store.checksums import find_file_damage, seal_file
+from tiler.store.result_file import GROUP, ResultFile
 from tiler.store.result_writer import DIGEST_BYTES, Writer, hash_content, raw_bytes
 
 MANIFEST = "manifest.jsonl"  # the only file beside the stages, see `tiler.workflow.audit`
@@ -114,6 +117,22 @@ class Store:
         """Return the shape of every array of a result; InputError as for `read`."""
         with self.open(stage, name) as result:
             return {array: result.shape(array) for array in result.names}
+
+    def change_key(self, stage: str, name: str, key: str) -> None:
+        """Give a result another key, and nothing else: the bytes are those of a result that was made with it."""
+        path = self.file(stage, name)
+        with disk_errors(path), replacing(path) as part:
+            with ZipFile(path) as old, ZipFile(part, "w") as new:
+                new.comment = old.comment
+                for each in old.namelist():
+                    content = old.read(each)
+                    if each == GROUP:
+                        group = json.loads(content)
+                        group["attributes"]["key"] = key
+                        content = json.dumps(group).encode()
+                    with new.open(ZipInfo(each), "w") as entry:
+                        entry.write(content)
+            seal_file(part)
 
     def has(self, stage: str, name: str) -> bool:
         """Whether there is a committed result; its arrays are not looked at."""

@@ -19,6 +19,7 @@ STAGES: dict[str, tuple[str, str]] = {
     "footprints": (BUILDINGS, "footprint file"),
     "block-cells": (BUILDINGS, "cells of blocks"),
     "blocks": (BUILDINGS, "blocks"),
+    "edits": (BUILDINGS, "edits of tiles"),
     "outlines": (BUILDINGS, "footprints of tiles"),
     "reserved": (BUILDINGS, "ids"),
     "alignment": (BUILDINGS, "footprints over roofs"),

@@ -12,6 +12,7 @@ from tiler.engine.records import Records
 from tiler.engine.task import APART
 from tiler.store.atomic import replacing
 from tiler.store.checksums import FILES, GONE, TAIL, find_change, find_file_damage, is_sealed, seal_file
+from tiler.store.edit_journal import JOURNAL, read_journal
 from tiler.store.folder_lock import is_held
 from tiler.store.out_folder import INDEXES, MANIFEST_PATH, PIECES, RUN_RECORD, STORE
 from tiler.store.store import SUFFIX, Store
@@ -140,6 +141,7 @@ class Audit:
         if change:
             yield Damage(RUN_RECORD, change)
         self.finished = record.get("status") == "done" if not change else self._manifest.exists()
+        yield from self._check_journal(record.get("edits", []) if self.finished and not change else None)
         if not self.finished:
             return
         try:
@@ -151,6 +153,16 @@ class Audit:
             for name in INDEXES:
                 if not (self.directory / name).exists():
                     yield Damage(name, GONE)
+
+    def _check_journal(self, made_of: list[int] | None) -> Iterator[Damage]:
+        """Check that every edit is as it was written, and that the mesh is made of all of them and no others."""
+        try:
+            numbers = [edit.number for edit in read_journal(self.directory)]
+        except InputError as error:
+            yield Damage(JOURNAL, str(error))
+            return
+        if made_of is not None and made_of != numbers:
+            yield Damage(JOURNAL, f"has the edits {numbers}, the mesh is of {made_of}")
 
     def check_results(self) -> Iterator[Damage]:
         """Check all results and their files, and look for what is neither; after `check_top`."""

@@ -117,7 +117,7 @@ def save_config(config: Config, out: Path) -> None:
     """Write the parameters of a run into its folder, paths absolute: any place will do to run it from."""
     saved = dataclasses.replace(
         with_absolute_inputs(config),
-        out=absolute(str(out)),
+        out=absolute(config.out),
         scheduler="",  # which no file may name
         tls_ca="",
         tls_cert="",

@@ -37,6 +37,7 @@ from tiler.planning.plan import Plan, check_sources, make_plan
 from tiler.planning.region import Pad
 from tiler.store.atomic import replacing, sync_meanwhile
 from tiler.store.checksums import seal, state_files
+from tiler.store.edit_journal import Edits, add_up, read_journal
 from tiler.store.folder_lock import only_run
 from tiler.store.out_folder import (
     INDEXES,
@@ -100,6 +101,7 @@ def run(
     parameters: Mapping[str, Any] | None = None,
     watchers: Sequence[Watcher] = (),
     dashboard: str | None = None,
+    within: Path | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -116,6 +118,8 @@ def run(
     dashboard : str, optional
         Where the page of the run is shown while it is at work, ``HOST:PORT``; port 0 is a free one. Nowhere by
         default. Watchers get its URL.
+    within : Path, optional
+        Folder of a disk to work in, whose files are moved to ``out`` of `config` later; ``out`` itself by default.
 
     Returns
     -------
@@ -148,7 +152,7 @@ def run(
             read_cluster(Path(config.cluster))
         if dashboard is not None:
             read_address(dashboard)
-        out = place(config.out, config.store_patience)
+        out = within or place(config.out, config.store_patience)
         own = check_own(config, stages, parameters)
         made = find_missing_folders(out)
         check_folder(out, overwrite=config.overwrite)
@@ -192,6 +196,7 @@ def _run(
     try:
         # Nothing of an earlier run is touched before the inputs are known to be there; then, before anything else
         # changes, its record no longer says that it is done, whatever happens to the power.
+        journal = read_journal(out)
         plan = _plan(config, out, say, fresh=config.overwrite or not earlier)
         given, (config, plan) = config, settle_shift(config, plan, say)
         untouched = False
@@ -203,7 +208,8 @@ def _run(
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(given, out)
         progress = begin_watching(config, out, plan, own, watchers, shown=means.shown)
-        record |= _mesh_region(config, out, plan, own, watchers, damage, means)
+        record |= _mesh_region(config, out, plan, own, watchers, damage, means, add_up(journal))
+        record |= {"edits": [edit.number for edit in journal]} if journal else {}
         record["finished"] = progress.finished
         for message in record["messages"][len(plan.messages) :]:
             say(message)
@@ -258,6 +264,7 @@ def _mesh_region(
     watchers: Watchers,
     damage: Mapping[str, str],
     means: _Means,
+    edits: Edits,
 ) -> dict[str, Any]:
     """Run all stages, and write the indexes of their pieces and the manifest.
 
@@ -265,6 +272,7 @@ def _mesh_region(
     does not touch has its result already. Where one fails later, its neighbours keep the seam with it.
     """
     missing = Missing()
+    former = None if out == place(config.out) else Path(config.out) / STORE
     if not config.on_cluster:
         _prepare(config, watchers.say)
     with _executor(config, means, watchers.say) as executor:
@@ -272,7 +280,7 @@ def _mesh_region(
             engine = make_engine(config, out, plan, executor, own, watchers)
             with stops(engine.stop, watchers.say):
                 try:
-                    rounds = run_stages(engine, config)
+                    rounds = run_stages(engine, config, edits, former=former)
                 except HolesError:
                     plan, missing = leave_holes(plan, missing, engine)
                     watchers.say(f"left out so far: {', '.join(sorted(missing.tiles))}; going on with the rest")

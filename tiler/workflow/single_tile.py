@@ -18,6 +18,7 @@ from tiler.planning.plan import check_sources, make_plan
 from tiler.stages.alignment import shift_of_run
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import piece_stages
+from tiler.store.edit_journal import add_up, read_journal
 from tiler.store.folder_lock import only_run
 from tiler.store.out_folder import PIECES, STORE
 from tiler.words.plain_text import say_nothing
@@ -67,7 +68,7 @@ def run_alone(config: Config, tile: str, *, say: Callable[[str], None] | None = 
         for folder in PIECES:
             (out / folder).mkdir(exist_ok=True)
         engine = make_engine(alone, out, plan, Serial(), OwnStages(), set_aside=False)
-        run_city_stages(engine, alone, shift=shift)
+        run_city_stages(engine, alone, add_up(read_journal(Path(config.out))), shift=shift)
         seams = [seam_name(key) for key in seams_of_tile(tile_key(tile))]
         take_domain(engine, alone, domain, pad, store)
         stages = cover_stages(alone)

@@ -1,16 +1,18 @@
 """The stages of a run in their order, over an engine."""
 
 import dataclasses
+from collections.abc import Collection
 from pathlib import Path
 from types import SimpleNamespace
 
+from tiler.citymodels.tables import NEAR_ARRAYS, find_changed
 from tiler.config.config import Config
 from tiler.config.step_options import derived_parameters
 from tiler.engine.engine import Engine
 from tiler.engine.executor import Executor
 from tiler.engine.failures import Policy
 from tiler.engine.run_context import RunContext, pack_tiles
-from tiler.engine.stage import REGION_ITEM
+from tiler.engine.stage import REGION_ITEM, Box
 from tiler.engine.watcher import Watcher
 from tiler.landcover.canopy_stages import canopy_stages, tree_file_stages
 from tiler.landcover.cover_stages import cover_file_stages, cover_stages
@@ -24,20 +26,25 @@ from tiler.planning.refinements import read_refinements
 from tiler.stages.alignment import alignment_stages, shift_of
 from tiler.stages.city import first_round, house_stage, later_round, member_stage, model_stage, shape_stage
 from tiler.stages.citymodel import city_model_stages
-from tiler.stages.inputs import fill_stage, input_stages, lake_stage
+from tiler.stages.inputs import EDITED, edited_tiles, fill_stage, input_stages, lake_stage
 from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import fit_stage, piece_stages
 from tiler.stages.surroundings import cover_reach
+from tiler.store.edit_journal import Edits
 from tiler.store.out_folder import (
     STORE,
 )
+from tiler.store.store import Store
 from tiler.workflow.failed_tiles import (
     stop_at_holes,
 )
 from tiler.workflow.settled_domain import settle_domain
 
+NO_EDITS = Edits()
+MODEL = "model"
 
-def run_stages(engine: Engine, config: Config) -> int:
+
+def run_stages(engine: Engine, config: Config, edits: Edits = NO_EDITS, *, former: Path | None = None) -> int:
     """Run all stages in their order; returns how often clusters of houses were simplified.
 
     Parameters
@@ -46,8 +53,14 @@ def run_stages(engine: Engine, config: Config) -> int:
         Engine over the region's items.
     config : Config
         Parameters of the run.
+    edits : Edits
+        What edits of its folder come to.
+    former : Path, optional
+        Store of which that of the engine was a copy when the run began.
     """
-    rounds = run_city_stages(engine, config)
+    rounds = run_city_stages(engine, config, edits)
+    if former is not None:
+        engine.changes = _find_changes(engine, Store(former))
     domain = settle_domain(engine, config)
     # Nothing waits for these: first in a call, so last of what may run, they fill the time in which others wait.
     of_model = [fit_stage(config), *city_model_stages(config), *canopy_stages(config)]
@@ -71,7 +84,19 @@ def run_stages(engine: Engine, config: Config) -> int:
     return rounds
 
 
-def run_city_stages(engine: Engine, config: Config, *, shift: tuple[float, float] | None = None) -> int:
+def _find_changes(engine: Engine, former: Store) -> dict[tuple[str, str], tuple[str, list[Box]]]:
+    """Find where the city models of tiles that were made anew differ from those of another store."""
+    found = {}
+    for tile in engine.items[MODEL][1].names:
+        if (MODEL, tile) in engine.records and engine.records.made(MODEL, tile)[1] and former.has(MODEL, tile):
+            old, new = (store.read(MODEL, tile, names=NEAR_ARRAYS)[0] for store in (former, engine.store))
+            found[MODEL, tile] = former.describe(MODEL, tile)[1], find_changed(old, new)
+    return found
+
+
+def run_city_stages(
+    engine: Engine, config: Config, edits: Edits = NO_EDITS, *, shift: tuple[float, float] | None = None
+) -> int:
     """Run the stages up to the simplified city model; parameters and result as for `run_stages`.
 
     A shift of the footprints (m) that is known is taken, and not measured.
@@ -87,7 +112,11 @@ def run_city_stages(engine: Engine, config: Config, *, shift: tuple[float, float
         _align(engine, config)
     files = [*water_point_stages(config), *cover_file_stages(config), *tree_file_stages(config)]
     # The terrain of tiles with deep lakes waits for the coarse level, that of all others does not.
-    engine.run(*input_stages(config), *files, lake_stage(), fill_stage(), items={"lakes": ()})
+    some: dict[str, Collection[str]] = {"lakes": ()}
+    if edited := bool(edits.boxes):
+        engine.add_parameters(edits=dataclasses.asdict(edits))
+        some[EDITED] = edited_tiles(engine.layout.tiles, edits)
+    engine.run(*input_stages(config, edited=edited), *files, lake_stage(), fill_stage(), items=some)
     stop_at_holes(engine)
     if deep := engine.records["coarse", REGION_ITEM].facts["deep"]:
         engine.run(lake_stage(), fill_stage(), items={"lakes": deep, "terrain": deep})

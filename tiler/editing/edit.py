@@ -1,0 +1,205 @@
+"""Edits of the city of a run folder, its journal as a table, and the city of a day."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.data.errors import ConfigError, InputError
+from tiler.config.config import Config, make_config
+from tiler.config.config_file import with_file
+from tiler.editing.requests import find_buildings, find_unused_heights, make_edit, read_date
+from tiler.editing.staging import begin, commit, forget, link_folder, settle
+from tiler.editing.uploads import read_upload
+from tiler.engine.watcher import Watcher
+from tiler.mesh_files.run_files import find_files
+from tiler.objects.places import refuse_bucket
+from tiler.store.atomic import replacing_folder
+from tiler.store.edit_journal import Edit, edit_path, read_journal, write_edit
+from tiler.store.folder_lock import is_held, only_run
+from tiler.store.out_folder import CONFIG, RUN_RECORD
+from tiler.words.plain_text import say_nothing
+from tiler.workflow.audit import read_sealed_record
+from tiler.workflow.run import run
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """An edit that is done.
+
+    Attributes
+    ----------
+    edit : Edit
+        As the journal has it.
+    record : dict
+        What ``run.json`` holds now.
+    files : int
+        Files of the folder that changed.
+    """
+
+    edit: Edit
+    record: dict[str, Any]
+    files: int
+
+
+def edit_city(
+    directory: Path,
+    action: str,
+    name: str = "",
+    upload: Path | None = None,
+    *,
+    date: str = "",
+    base: int | None = None,
+    workers: int = 0,
+    say: Callable[[str], None] = say_nothing,
+    watchers: Sequence[Watcher] = (),
+) -> Outcome:
+    """Replace, remove or add buildings in the city of a finished run, and mesh anew what that touches.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of the run.
+    action : str
+        ``"replace"``, ``"remove"`` or ``"add"``.
+    name : str
+        Id of the building that is replaced or removed.
+    upload : Path, optional
+        Vector file of the footprint, or footprints, that come.
+    date : str
+        Day from which on the edit holds, YYYY-MM-DD; today by default.
+    base : int, optional
+        Number of the last edit that the client has seen: a later one of the same building is a conflict.
+    workers : int
+        Worker processes; 0 for this one.
+    say : callable
+        Called with sentences that the user should read.
+    watchers : sequence of Watcher
+        Of the run that makes the mesh.
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    CityError
+        If the edit is refused or fails: the city is as before then.
+
+    Notes
+    -----
+    The edit is worked out in a second folder, which shares all results by hard links, and moved when it is there:
+    whenever this is killed, the next call finishes or forgets it.
+    """
+    refuse_bucket(directory, "an edit")
+    day = read_date(date)
+    with only_run(_finished(directory), say):
+        settle(directory, say)
+        record, config = _read_run(directory, workers)
+        journal = read_journal(directory)
+        region = record["region"]
+        bounds = region.get("core", region["bounds"])
+        found = None if upload is None else read_upload(upload, config, crs=region["crs"], bounds=tuple(bounds))
+        edit = make_edit(
+            *(action, name, found, "" if upload is None else upload.name),
+            buildings=find_buildings(directory, journal),
+            journal=journal,
+            date=day,
+            base=base,
+        )
+        try:
+            work = begin(directory)
+            write_edit(work, edit)
+            made = run(config, watchers=watchers, within=work)
+            if lost := sorted(made["missing"].keys() - record["missing"].keys()):
+                raise InputError(
+                    f"edit of {', '.join(edit.ids)}: tile {lost[0]} cannot be meshed with it "
+                    f"({made['missing'][lost[0]]['reason']}); the city is as before"
+                )
+            if unused := find_unused_heights(work, edit):
+                say(f"roof points in the cloud give the height, not the upload: {', '.join(unused)}")
+            return Outcome(edit, made, commit(directory))
+        finally:
+            forget(directory)
+
+
+def city_at(
+    directory: Path,
+    date: str,
+    out: Path,
+    *,
+    workers: int = 0,
+    say: Callable[[str], None] = say_nothing,
+    watchers: Sequence[Watcher] = (),
+) -> dict[str, Any]:
+    """Make the city of a day in another folder: without the edits of a later date.
+
+    What is the same is shared by hard links, and not computed again. The folder appears whole or not at all.
+
+    Parameters
+    ----------
+    directory, date, workers, say, watchers
+        As for `edit_city`.
+    out : Path
+        Folder on the same disk, which is not there.
+
+    Raises
+    ------
+    CityError
+        If there is such a folder, or the city cannot be made.
+    """
+    refuse_bucket(directory, "the city of a day")
+    day = read_date(date)
+    if out.exists():
+        raise ConfigError(f"{out}: is there already; give another --out")
+    with only_run(_finished(directory), say):
+        settle(directory, say)
+        _, config = _read_run(directory, workers, out)
+        with replacing_folder(out) as work:
+            link_folder(directory, work)
+            for edit in read_journal(directory):
+                if edit.date > day:
+                    edit_path(work, edit.number).unlink()
+            return run(config, watchers=watchers, within=work)
+
+
+def list_edits(directory: Path, say: Callable[[str], None] = say_nothing) -> list[Edit]:
+    """List the edits of a run folder, by number; what a killed one has left is finished or forgotten before.
+
+    InputError where it holds no run, or the journal is damaged.
+    """
+    refuse_bucket(directory, "the journal")
+    if not is_held(_finished(directory)):
+        with only_run(directory, say):
+            settle(directory, say)
+    return read_journal(directory)
+
+
+def _finished(directory: Path) -> Path:
+    """Refuse a folder that holds no run."""
+    if not (directory / RUN_RECORD).is_file():
+        raise InputError(f"{directory}: holds no {RUN_RECORD}; give the folder of a finished run")
+    return directory
+
+
+def _read_run(directory: Path, workers: int, out: Path | None = None) -> tuple[dict[str, Any], Config]:
+    """Read record and parameters of a finished run that can be edited."""
+    find_files(directory)  # refuses one that is not finished
+    record, damage = read_sealed_record(directory / RUN_RECORD)
+    if damage:
+        raise InputError(f"{directory / RUN_RECORD}: {damage}; run again")
+    config = make_config(
+        with_file(
+            {
+                "pointcloud": [str(directory / CONFIG)],
+                "out": str((out or directory).absolute()),
+                "workers": workers,
+            }
+        )
+    )
+    for name, why in (("buildings", "houses of a city model"), ("align", "footprints that are moved")):
+        if getattr(config, name):
+            raise ConfigError(f"{directory}: was run with --{name}: {why} cannot be edited yet; run again instead")
+    if not config.footprints:
+        raise ConfigError(f"{directory}: was run without footprints; run again with them")
+    return record, config

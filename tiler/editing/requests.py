@@ -1,0 +1,132 @@
+"""What is asked for, held against the city and its journal: ids, dates, and edits that came between."""
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.city_model.heights import ROOF_SOURCES
+from pipeline.data.citymodel import Footprints
+from pipeline.data.errors import ConfigError, InputError
+from tiler.editing.uploads import as_outlines
+from tiler.engine.stage import REGION_ITEM
+from tiler.store.edit_journal import Box, Edit, add_up
+from tiler.store.out_folder import STORE
+from tiler.store.store import Store
+
+ACTIONS = ("replace", "remove", "add")
+
+
+def find_buildings(out: Path, journal: Sequence[Edit]) -> dict[str, Box]:
+    """List the footprints of a city as its edits have left them: id and box (m) of each."""
+    store = Store(out / STORE)
+    found: dict[str, Box] = {}
+    if store.attributes("footprints", REGION_ITEM)["facts"]["n"]:
+        arrays, _ = store.read("footprints", REGION_ITEM, names=("id", "id_end", "box"))
+        text, ends = arrays["id"].tobytes(), [0, *arrays["id_end"].tolist()]
+        for (first, last), box in zip(pairwise(ends), arrays["box"].tolist(), strict=True):
+            found[text[first:last].decode()] = tuple(box)
+    edits = add_up(journal)
+    for name, _ in edits.removed:
+        found.pop(name, None)
+    return found | {outline[0]: box for outline, box in edits.outlines}
+
+
+def find_unused_heights(out: Path, edit: Edit) -> list[str]:
+    """List the buildings whose uploaded height does not count, as roof points in the cloud tell theirs."""
+    given = [name for name, _, height, _ in edit.outlines if height is not None]
+    store, found = Store(out / STORE), set[str]()
+    for tile in store.names("houses") if given else []:
+        arrays, _ = store.read("houses", tile, names=("full_id", "full_roof_source"))
+        found |= set(arrays["full_id"][arrays["full_roof_source"] == ROOF_SOURCES.index("points")].tolist())
+    return sorted(found.intersection(given))
+
+
+def read_date(text: str) -> str:
+    """Check a date, by default today's; ConfigError unless it is YYYY-MM-DD."""
+    try:
+        return (datetime.date.fromisoformat(text) if text else datetime.date.today()).isoformat()
+    except ValueError:
+        raise ConfigError(f"date {text!r}: is no day; give YYYY-MM-DD") from None
+
+
+def make_edit(
+    action: str,
+    name: str,
+    upload: Footprints | None,
+    source: str,
+    *,
+    buildings: dict[str, Box],
+    journal: Sequence[Edit],
+    date: str,
+    base: int | None,
+) -> Edit:
+    """Make the next edit of a journal.
+
+    Parameters
+    ----------
+    action : str
+        One of `ACTIONS`.
+    name : str
+        Id of the building; ``""`` to add those of the upload.
+    upload : Footprints or None
+        What comes.
+    source : str
+        Name of its file.
+    buildings : dict of str to box
+        From `find_buildings`.
+    journal : sequence of Edit
+        All earlier edits.
+    date : str
+        From `read_date`.
+    base : int or None
+        Number of the last edit that the client knows of; by default of all.
+
+    Raises
+    ------
+    ConfigError
+        For an id that is not there, or is there already; for a building that an edit after `base` has touched;
+        for a date before that of its last edit.
+    """
+    last = journal[-1].number if journal else 0
+    if base is not None and not 0 <= base <= last:
+        raise ConfigError(f"--base {base}: the last edit is number {last}; citystitch edit DIR --list tells all")
+    if action == "replace" and upload is not None:
+        upload = replace(upload, ids=np.full(len(upload.ids), name))
+    outlines, boxes = ((), ()) if upload is None else as_outlines(upload)
+    ids = {name} if action != "add" else {outline[0] for outline in outlines}
+    _refuse_conflicts(ids, journal, date, last if base is None else base)
+    if action == "add":
+        if there := sorted(ids.intersection(buildings)):
+            raise ConfigError(f"building {there[0]!r}: is there already; replace it, or give another id")
+        if len(ids) < len(outlines):
+            raise InputError(f"{source}: an id comes twice; give each building its own")
+        # The parts of a house get such names: a footprint of the input with one makes all tiles look for it.
+        if parts := sorted(one for one in ids if "-part" in one):
+            raise ConfigError(f"building {parts[0]!r}: ids with '-part' are those of parts; give another id")
+        removed: tuple[tuple[str, Box], ...] = ()
+    else:
+        if name not in buildings:
+            raise ConfigError(f"building {name!r}: is not in the city; ids are those of its footprints")
+        if action == "replace" and len(outlines) != 1:
+            raise InputError(
+                f"{source}: has {len(outlines)} footprints, one takes the place of a building; give one"
+            )
+        removed = ((name, buildings[name]),)
+    return Edit(last + 1, date, action, source, removed, outlines, boxes)
+
+
+def _refuse_conflicts(ids: set[str], journal: Sequence[Edit], date: str, base: int) -> None:
+    """Refuse an edit of a building that a later edit than `base` has touched, or one of a later day."""
+    for edit in journal:
+        for one in sorted(ids.intersection(edit.ids)):
+            told = f"building {one!r}: edit {edit.number} of {edit.date} ({edit.action}"
+            told += f", {edit.source})" if edit.source else ")"
+            if edit.number > base:
+                last = journal[-1].number
+                raise ConfigError(f"{told} came after state {base}; look at it, then give --base {last}")
+            if date < edit.date:
+                raise ConfigError(f"{told} is later than {date}; give a date from {edit.date} on")

@@ -1,0 +1,110 @@
+"""The second folder in which an edit is worked out, and its move to the first: all of it or nothing."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from tiler.store.atomic import disk_errors, replacing
+from tiler.store.checksums import seal
+from tiler.store.edit_journal import JOURNAL
+from tiler.store.out_folder import CONFIG, EARLIER_REPORT, EVENTS, RESULTS, RUN_RECORD, TASKS
+
+STAGING, DONE = ".edit", ".edit.done"  # folders below that of a run: what an edit leaves that was killed
+WORK, COMMIT = "city", "commit.json"  # in it: the city as it will be; what is to be moved, once all is there
+DONE_NOW = "the last edit was killed when all of it was there: it is done now"
+NOT_DONE = "the last edit was killed before it was done: the city is as before it"
+OWN = {EARLIER_REPORT, EVENTS, TASKS, "only"}  # what is of one run alone
+
+
+def link_folder(source: Path, target: Path) -> None:
+    """Make a folder of a run with the results of another, which both share: hard links, no copies.
+
+    A file that a run changes is written beside its place and renamed, so the other folder keeps its own.
+
+    Raises
+    ------
+    OutputError
+        If there are no hard links between the two: they must lie on one disk.
+    """
+    with disk_errors(target):
+        for name in _files(source):
+            place = target / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            os.link(source / name, place)
+
+
+def begin(directory: Path) -> Path:
+    """Make the folder in which the next state of a city is worked out; it begins as the city is."""
+    work = directory / STAGING / WORK
+    link_folder(directory, work)
+    return work
+
+
+def commit(directory: Path) -> int:
+    """Move what has changed in the second folder to the first; gives the number of files.
+
+    From the moment at which the list of these is on the disk the edit is done: a later call of `settle` goes on
+    with the moves where a kill has ended them.
+    """
+    work = directory / STAGING / WORK
+    new, old = set(_files(work)), set(_files(directory))
+    changed = [name for name in new if name not in old or not os.path.samefile(work / name, directory / name)]
+    listed = {"move": sorted(set(changed) - {CONFIG}), "remove": sorted(old - new - {CONFIG})}
+    with disk_errors(directory), replacing(directory / STAGING / COMMIT, durable=True) as part:
+        part.write_text(json.dumps(listed))
+    _move(directory)
+    return len(changed)
+
+
+def settle(directory: Path, say: Callable[[str], None]) -> None:
+    """Finish or forget what a killed edit has left, and say which; whoever calls this holds the folder."""
+    shutil.rmtree(directory / DONE, ignore_errors=True)
+    staging = directory / STAGING
+    if not staging.exists():
+        return
+    if (staging / COMMIT).exists():
+        _move(directory)
+        say(DONE_NOW)
+    else:
+        shutil.rmtree(staging)
+        say(NOT_DONE)
+
+
+def forget(directory: Path) -> None:
+    """Remove the second folder of an edit that failed before it was done."""
+    if not (directory / STAGING / COMMIT).exists():
+        shutil.rmtree(directory / STAGING, ignore_errors=True)
+
+
+def _move(directory: Path) -> None:
+    """Do what the list says; what was done already is passed over."""
+    work = directory / STAGING / WORK
+    listed = json.loads((directory / STAGING / COMMIT).read_bytes())
+    with disk_errors(directory):
+        if (work / RUN_RECORD).exists():
+            # No reader takes files of two states for one city.
+            record = json.loads((work / RUN_RECORD).read_bytes()) | {"checksum": "0" * 8, "status": "running"}
+            with replacing(directory / RUN_RECORD) as part:
+                part.write_bytes(seal(json.dumps(record, indent=1).encode() + b"\n"))
+        for name in listed["remove"]:
+            (directory / name).unlink(missing_ok=True)
+        for name in sorted(listed["move"], key=RUN_RECORD.__eq__):  # the record last
+            if (work / name).exists():
+                (directory / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(work / name, directory / name)
+        os.rename(directory / STAGING, directory / DONE)
+        shutil.rmtree(directory / DONE)
+
+
+def _files(folder: Path) -> Iterator[str]:
+    """List the files of a run, by their paths below its folder."""
+    for top in {*RESULTS, JOURNAL} - OWN:
+        place = folder / top
+        if place.is_file():
+            yield top
+        elif place.is_dir():
+            for path in place.rglob("*"):
+                if path.is_file():
+                    yield path.relative_to(folder).as_posix()

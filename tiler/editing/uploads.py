@@ -1,0 +1,96 @@
+"""Uploaded footprints: the features of a vector file, in the region's CRS, as an edit keeps them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import shapely
+
+from pipeline.data.citymodel import Footprints
+from pipeline.data.errors import InputError
+from tiler.config.config import Config
+from tiler.footprints.footprint_index import FootprintRows, join_footprints, scan_footprints
+from tiler.objects.places import is_missing
+from tiler.store.edit_journal import Box, Outline
+from tiler.vectors.layers import describe_layer
+
+# Notes that say that a feature is not what it should be: of a file of a city it is left out, an edit is refused.
+REFUSED = {
+    *("footprint-unreadable", "footprint-not-finite", "footprint-not-polygon", "footprint-too-many-vertices"),
+    *("footprint-height-missing", "footprint-roof-unread"),
+}
+
+
+def read_upload(path: Path, config: Config, *, crs: str, bounds: Box) -> Footprints:
+    """Read the footprints of an uploaded file.
+
+    Parameters
+    ----------
+    path : Path
+        Any vector file that `citystitch run` takes as footprints; ids, heights and roofs from the same attributes.
+    config : Config
+        Parameters of the run that is edited.
+    crs : str
+        CRS of its region, to which footprints in another one are reprojected.
+    bounds : tuple of 4 floats
+        Its region (m).
+
+    Returns
+    -------
+    Footprints
+        One or more, by id.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a feature is no valid polygon or lies outside the region.
+    """
+    if is_missing(path):
+        raise InputError(f"{path}: no such file; check the path of the upload")
+    layer = describe_layer(path)
+    # An upload may say less than the file of the city: what has no height takes that of the points.
+    names = {name: name if name in layer.fields else "" for name in (config.height_attribute, config.id_attribute)}
+    found = list(
+        scan_footprints(
+            path,
+            crs=pyproj.CRS.from_user_input(crs),
+            bounds=bounds,
+            id_attribute=names[config.id_attribute],
+            height_attribute=names[config.height_attribute],
+            roof_attribute=config.roof_attribute if config.roof_attribute in layer.fields else "",
+        )
+    )
+    for note in (note for block in found for note in block.notes):
+        if note.kind in REFUSED:
+            raise InputError(f"{path}: {note.subject} {note.detail} ({note.kind}); mend the file")
+    rows: Sequence[FootprintRows] = [block.rows for block in found]
+    n = sum(map(len, rows))
+    if n == 0 or (layer.n_features >= 0 and n < layer.n_features):
+        raise InputError(
+            f"{path}: {n} of {layer.n_features} features meet the region "
+            f"({', '.join(f'{value:.10g}' for value in bounds)}, {crs}); check their place and CRS"
+        )
+    footprints = join_footprints(rows, bounds)
+    for polygon, name in zip(footprints.polygons, footprints.ids, strict=True):
+        if not shapely.is_valid(polygon):
+            raise InputError(f"{path}: {name}: {shapely.is_valid_reason(polygon)}; mend the polygon")
+    return footprints
+
+
+def as_outlines(footprints: Footprints) -> tuple[tuple[Outline, ...], tuple[Box, ...]]:
+    """Write footprints as an edit keeps them, and the box of each (m)."""
+    blobs = shapely.to_wkb(footprints.polygons, hex=True, output_dimension=2, byte_order=1)
+    outlines = tuple(
+        (str(name), str(blob), None if np.isnan(height) else float(height), _form(form.tolist()))
+        for name, blob, height, form in zip(
+            footprints.ids, blobs, footprints.given_height, footprints.forms, strict=True
+        )
+    )
+    boxes = shapely.bounds(footprints.polygons).reshape(-1, 4).tolist()
+    return outlines, tuple((xmin, ymin, xmax, ymax) for xmin, ymin, xmax, ymax in boxes)
+
+
+def _form(values: list[float]) -> tuple[float | None, ...]:
+    form = tuple(None if np.isnan(value) else value for value in values)
+    return () if form == (None,) * len(form) else form

@@ -1,0 +1,140 @@
+"""The journal of a run folder: numbered, dated edits of its footprints, one file each."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from pipeline.data.errors import InputError
+from tiler.objects.places import in_bucket
+from tiler.store.atomic import replacing
+from tiler.store.checksums import is_sealed, seal
+
+JOURNAL = "edits"  # folder below a run's
+Box = tuple[float, float, float, float]
+# Id, well-known binary of the polygon in hexadecimal digits, height above ground (m) or None, form of the roof.
+Outline = tuple[str, str, float | None, tuple[float | None, ...]]
+Place = tuple[str, Box]
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One edit: what is taken away, and what comes.
+
+    Attributes
+    ----------
+    number : int
+        From 1, ascending.
+    date : str
+        Day from which on it holds, YYYY-MM-DD.
+    action : str
+        ``"replace"``, ``"remove"`` or ``"add"``.
+    source : str
+        Name of the file that was uploaded; ``""`` for none.
+    removed : tuple of (str, box)
+        Ids that are taken away, each with the box of its outline (m).
+    outlines : tuple of Outline
+        Footprints that come, in the region's CRS.
+    boxes : tuple of box
+        That of each of these (m).
+    """
+
+    number: int
+    date: str
+    action: str
+    source: str
+    removed: tuple[Place, ...]
+    outlines: tuple[Outline, ...]
+    boxes: tuple[Box, ...]
+
+    @property
+    def ids(self) -> list[str]:
+        """Buildings that it touches, sorted."""
+        return sorted({*(name for name, _ in self.removed), *(name for name, *_ in self.outlines)})
+
+
+@dataclass(frozen=True)
+class Edits:
+    """What all edits of a journal come to.
+
+    Attributes
+    ----------
+    removed : tuple of (str, box)
+        Footprints of the input, and of earlier edits, that are gone; sorted.
+    outlines : tuple of (Outline, box)
+        Those that are there, by id.
+    """
+
+    removed: tuple[Place, ...] = ()
+    outlines: tuple[tuple[Outline, Box], ...] = ()
+
+    @property
+    def boxes(self) -> list[Box]:
+        """Where something changed (m)."""
+        return [box for _, box in (*self.removed, *self.outlines)]
+
+
+def add_up(journal: Sequence[Edit]) -> Edits:
+    """Apply edits one after the other.
+
+    Examples
+    --------
+    >>> box = (0.0, 0.0, 1.0, 1.0)
+    >>> added = Edit(1, "2027-01-01", "add", "a.gpkg", (), (("a", "00", None, ()),), (box,))
+    >>> gone = Edit(2, "2027-01-02", "remove", "", (("a", box),), (), ())
+    >>> len(add_up([added]).outlines), len(add_up([added, gone]).outlines)
+    (1, 0)
+    """
+    removed: set[Place] = set()
+    there: dict[str, tuple[Outline, Box]] = {}
+    for edit in journal:
+        removed |= set(edit.removed)
+        for name, _ in edit.removed:
+            there.pop(name, None)
+        there |= {row[0]: (row, box) for row, box in zip(edit.outlines, edit.boxes, strict=True)}
+    return Edits(tuple(sorted(removed)), tuple(there[name] for name in sorted(there)))
+
+
+def read_journal(out: Path) -> list[Edit]:
+    """Read the edits of a run folder, by number; none where there is no journal, and in a bucket.
+
+    Raises
+    ------
+    InputError
+        If an edit cannot be read, or is not as it was written.
+    """
+    if in_bucket(out):
+        return []
+    return [_read(path) for path in sorted((out / JOURNAL).glob("[0-9]*.json"))]
+
+
+def edit_path(out: Path, number: int) -> Path:
+    """Path of the edit of a number."""
+    return out / JOURNAL / f"{number:06d}.json"
+
+
+def write_edit(out: Path, edit: Edit) -> None:
+    """Write an edit into the journal of a folder: whole or not at all, on the disk when this returns."""
+    path = edit_path(out, edit.number)
+    path.parent.mkdir(exist_ok=True)
+    with replacing(path, durable=True) as part:
+        part.write_bytes(seal(json.dumps({"checksum": "0" * 8} | asdict(edit), indent=1).encode() + b"\n"))
+
+
+def _read(path: Path) -> Edit:
+    try:
+        text = path.read_bytes()
+        found = json.loads(text)
+        if not is_sealed(text) or found.pop("checksum") is None or path.stem != f"{found['number']:06d}":
+            raise ValueError("its checksum differs")
+        removed = tuple((str(name), _box(box)) for name, box in found.pop("removed"))
+        outlines = tuple((name, wkb, height, tuple(form)) for name, wkb, height, form in found.pop("outlines"))
+        boxes = tuple(map(_box, found.pop("boxes")))
+        return Edit(**found, removed=removed, outlines=outlines, boxes=boxes)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path}: is no edit as it was written ({error}); put it back from a copy") from None
+
+
+def _box(values: Sequence[float]) -> Box:
+    xmin, ymin, xmax, ymax = map(float, values)
+    return xmin, ymin, xmax, ymax
