@@ -12,7 +12,7 @@ from pipeline.architecture.roof_sides import (
     place,
     wall_ring,
 )
-from pipeline.architecture.surfaces import CLOSURE, DOOR, GROUND, ROOF, WALL, WINDOW, Surface
+from pipeline.architecture.surfaces import CLOSURE, DOOR, GROUND, ROOF, WALL, WINDOW, Surface, fill_hole
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,7 @@ def _set_opening(house: House, wall: Surface, opening: Opening, depth: float) ->
     corners = [(left, low), (right, low), (right, high), (left, high)]
     outer = [place(house, opening.wall, along, 0.0, z) for along, z in corners]
     inner = [place(house, opening.wall, along, depth, z) for along, z in corners]
-    wall.cut(outer)
-    pane = Surface(WINDOW if opening.kind == "window" else DOOR, inner, [])
-    return [*_reveals(outer, inner), pane] if depth > 0 else [pane]
-
-
-def _reveals(outer: list[Point], inner: list[Point]) -> list[Surface]:
-    n = len(outer)
-    return [Surface(WALL, [outer[k], outer[(k + 1) % n], inner[(k + 1) % n], inner[k]], []) for k in range(n)]
+    return fill_hole(wall, outer, inner, WINDOW if opening.kind == "window" else DOOR)
 
 
 def _put_dormer(house: House, side: RoofSide, roof: Surface, dormer: Dormer, detail: Detail) -> list[Surface]:

@@ -43,6 +43,34 @@ class Surface:
         self.holes.append(list(reversed(hole)))
 
 
+def fill_hole(surface: Surface, outer: Sequence[Point], inner: Sequence[Point], kind: str) -> list[Surface]:
+    """Cut a hole into a surface and close it again: by a pane in it, or with sides to one before or behind it.
+
+    Parameters
+    ----------
+    surface : Surface
+        Gets the hole.
+    outer : sequence of (float, float, float)
+        Corners of the hole, counter-clockwise as seen from outside (m).
+    inner : sequence of (float, float, float)
+        Those of the pane, each opposite the one of `outer`.
+    kind : str
+        Of the pane; sides are walls.
+
+    Returns
+    -------
+    list of Surface
+        The sides, none where the pane is in the hole, then the pane.
+    """
+    surface.cut(outer)
+    n = len(outer)
+    sides = [
+        Surface(WALL, [outer[k], outer[(k + 1) % n], inner[(k + 1) % n], inner[k]], [])
+        for k in range(n if list(inner) != list(outer) else 0)
+    ]
+    return [*sides, Surface(kind, list(inner), [])]
+
+
 def prism(ring: Sequence[tuple[float, float]], low: float, high: float) -> list[Surface]:
     """Give the surfaces of a block over an outline: ground, roof and walls.
 

@@ -29,7 +29,7 @@ def check_solids(
     Parameters
     ----------
     document : dict
-        CityJSON whose coordinates are whole millimetres.
+        CityJSON whose coordinates are whole millimetres, or tenths of them.
     lods : collection of str
         Levels of detail to check.
 
@@ -39,45 +39,47 @@ def check_solids(
         What is wrong with each solid, by the codes of val3dity; an empty set for a valid one.
     """
     scale = document["transform"]["scale"]
-    if scale != [SNAP] * 3:
-        raise ValueError(f"scale {scale}; expected {SNAP}: the determinants are those of whole millimetres")
+    if scale not in ([SNAP] * 3, [SNAP / 10] * 3):
+        raise ValueError(
+            f"scale {scale}; expected {SNAP}, or a tenth: the determinants are those of whole numbers"
+        )
     vertices = np.array(document["vertices"], np.int64).reshape(-1, 3)
     return {
-        (name, item["lod"]): set(check_shell(item["boundaries"][0], vertices))
+        (name, item["lod"]): set(check_shell(item["boundaries"][0], vertices, scale[0]))
         for name, thing in document["CityObjects"].items()
         for item in thing.get("geometry", [])
         if item["type"] == "Solid" and item["lod"] in lods
     }
 
 
-def check_shell(faces: list[list[list[int]]], vertices: Ints) -> Iterator[str]:
-    """Check the shell of a solid without cavities; vertices in millimetres."""
+def check_shell(faces: list[list[list[int]]], vertices: Ints, unit: float = SNAP) -> Iterator[str]:
+    """Check the shell of a solid without cavities; vertices in units (m)."""
     if len(faces) < 4:
         yield "301 too few faces"
         return
     used = np.unique([vertex for face in faces for ring in face for vertex in ring])
     number = {vertex: k for k, vertex in enumerate(used.tolist())}
     places = vertices[used] - vertices[used[0]]
-    if _has_close(places):
+    if _has_close(places, SNAP / unit):
         yield "000 vertices within the snapping tolerance"
     triangles = []
     for face in faces:
         rings = [[number[vertex] for vertex in ring] for ring in face]
         faults = set(_check_rings(rings))
         if not faults:
-            found, faults = _check_face(rings, places)
+            found, faults = _check_face(rings, places, unit)
             triangles += found
         yield from faults
     if triangles:
-        yield from _check_surface(np.array(triangles, np.int64), places)
+        yield from _check_surface(np.array(triangles, np.int64), places, unit)
 
 
-def _has_close(places: Ints) -> bool:
+def _has_close(places: Ints, distance: float) -> bool:
     found = shapely.STRtree(shapely.points(places[:, :2].astype(np.float64))).query(
-        shapely.points(places[:, :2].astype(np.float64)), predicate="dwithin", distance=1.0
+        shapely.points(places[:, :2].astype(np.float64)), predicate="dwithin", distance=distance
     )
     one, other = found[:, found[0] < found[1]]
-    return bool((((places[one] - places[other]) ** 2).sum(axis=1) <= 1).any())
+    return bool((((places[one] - places[other]) ** 2).sum(axis=1) <= distance**2).any())
 
 
 def _check_rings(rings: list[list[int]]) -> Iterator[str]:
@@ -90,17 +92,17 @@ def _check_rings(rings: list[list[int]]) -> Iterator[str]:
             yield "104 ring meets itself"
 
 
-def _check_face(rings: list[list[int]], places: Ints) -> tuple[list[tuple[int, ...]], set[str]]:
+def _check_face(rings: list[list[int]], places: Ints, unit: float) -> tuple[list[tuple[int, ...]], set[str]]:
     """Triangulate a face in its plane; its triangles, and what is wrong with it."""
     corners = [vertex for ring in rings for vertex in ring]
-    xyz = places[corners] * SNAP
+    xyz = places[corners] * unit
     middle = xyz.mean(axis=0)
     normal = np.linalg.svd(xyz - middle)[2][2]
-    normal *= 1 if _newell(places[rings[0]] * SNAP) @ normal > 0 else -1
+    normal *= 1 if _newell(places[rings[0]] * unit) @ normal > 0 else -1
     faults = {"203 not planar"} if np.abs((xyz - middle) @ normal).max() > PLANARITY else set()
     east = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     east /= np.linalg.norm(east)
-    plan = (places * SNAP - middle) @ np.column_stack((east, np.cross(normal, east)))
+    plan = (places * unit - middle) @ np.column_stack((east, np.cross(normal, east)))
     outline = shapely.Polygon(plan[rings[0]], [plan[ring] for ring in rings[1:]])
     if not outline.is_valid:
         return [], faults | {f"20x {shapely.is_valid_reason(outline).partition('[')[0]}"}
@@ -109,7 +111,7 @@ def _check_face(rings: list[list[int]], places: Ints) -> tuple[list[tuple[int, .
     index = {tuple(plan[vertex].tolist()): vertex for vertex in corners}
     parts = shapely.get_parts(shapely.orient_polygons(shapely.constrained_delaunay_triangles(outline)))
     triangles = [tuple(index[place] for place in part.exterior.coords[:3]) for part in parts]
-    turned = np.array([_newell(places[list(triangle)] * SNAP) for triangle in triangles])
+    turned = np.array([_newell(places[list(triangle)] * unit) for triangle in triangles])
     turned /= np.maximum(np.linalg.norm(turned, axis=1), 1e-12)[:, None]
     if (turned @ turned.T).min() < np.cos(np.radians(MOST_BEND)):
         faults.add("204 bent")
@@ -122,8 +124,8 @@ def _newell(corners: NDArray[np.floating]) -> Floats:
     return area
 
 
-def _check_surface(triangles: Ints, places: Ints) -> Iterator[str]:
-    surface = pyvista.PolyData.from_regular_faces(places * SNAP, triangles)
+def _check_surface(triangles: Ints, places: Ints, unit: float) -> Iterator[str]:
+    surface = pyvista.PolyData.from_regular_faces(places * unit, triangles)
     if surface.n_open_edges:
         yield "302 not closed"
     if surface.extract_feature_edges(
@@ -142,7 +144,7 @@ def _check_surface(triangles: Ints, places: Ints) -> Iterator[str]:
             edges.add((first, second))
     if any(_n_umbrellas(fan) > 1 for fan in around.values()):
         yield "303 shells meet in a vertex"
-    corners = places[triangles] * SNAP
+    corners = places[triangles] * unit
     if np.einsum("ij,ij", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) <= 0:
         yield "405 looks inwards"
     if _meets_itself(triangles, places):

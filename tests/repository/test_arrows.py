@@ -73,10 +73,11 @@ ORDER = {
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
         "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "landcover", "planning",
         "dashboard", "executors", "jobs", "pictures", "report", "workflow", "editing", "export", "tiles3d", "wind",
-        "check", "formats", "convert", "towns", "generalisation", "interface", "cli",
+        "check", "formats", "convert", "towns", "generalisation", "detail", "interface", "cli",
     ],
     "pipeline": [
-        "data", "geometry", "points_terrain", "generalisation", "architecture", "skeletons", "roofs", "city_model",
+        "data", "geometry", "points_terrain", "generalisation", "architecture", "facades", "skeletons", "roofs",
+        "city_model",
         "simplification", "plane_mesh", "quality", "smoothing", "columns",
     ],
     "stitch": ["tiling", "seams", "pieces"],

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 # What a face is; outlines are polygons that say where a building stands, without being a part of its surface.
 UNKNOWN, ROOF, GROUND, WALL, OUTLINE = range(5)
+WINDOW, DOOR, INSTALLATION = range(5, 8)  # of buildings that rules have detailed; files are read without them
 KINDS = {
     "RoofSurface": ROOF,
     "OuterCeilingSurface": WALL,
@@ -93,6 +94,8 @@ class ModelBuilding:
         What could not be read.
     attributes : mapping of str to mapping
         Attributes of the building and of each of its parts, by id; those of a GeoPackage only where asked for.
+    installations : mapping of str to str
+        Owners that are installations: the building or part of each, by id.
     """
 
     id: str
@@ -100,6 +103,7 @@ class ModelBuilding:
     height: float = float("nan")
     faults: tuple[str, ...] = ()
     attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    installations: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Which level of detail of a building is taken, and what comes after it where it has no roof."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from tiler.cityinput.faces import NO_LOD, OUTLINE, ROOF, UNKNOWN, Faces, ModelBuilding, Shape, join_faces
 
@@ -46,9 +46,19 @@ def list_attempts(building: ModelBuilding, asked: str) -> list[tuple[float, Face
     list of (float, Faces)
         The best level among the faces, and these; none where the building has no level from 1 on.
     """
+    attempts = _choose_shapes(building, asked)
+    return [(level, join_faces(shape.faces for shape in chosen)) for level, chosen in attempts]
+
+
+def best_shapes(building: ModelBuilding, asked: str) -> tuple[Shape, ...]:
+    """Give the shapes of the first attempt of `list_attempts`; none where there is none."""
+    return next((tuple(chosen) for _, chosen in _choose_shapes(building, asked)), ())
+
+
+def _choose_shapes(building: ModelBuilding, asked: str) -> Iterator[tuple[float, list[Shape]]]:
+    """Give the best level and the shapes of each attempt."""
     shapes = [shape for shape in building.shapes if len(shape.faces) and (shape.lod >= 1 or shape.lod == NO_LOD)]
     ranked = rank_levels([shape.lod for shape in shapes], asked)
-    found = []
     for first in range(len(ranked)):
         chosen: list[Shape] = []
         best: dict[str, int] = {}
@@ -62,8 +72,7 @@ def list_attempts(building: ModelBuilding, asked: str) -> list[tuple[float, Face
                 continue
             chosen += _of_one_kind([s for s in shapes if s.owner == owner and s.lod == ranked[rank]])
         if chosen:
-            found.append((ranked[min(best.values())], join_faces(shape.faces for shape in chosen)))
-    return found
+            yield ranked[min(best.values())], chosen
 
 
 def find_outline(building: ModelBuilding) -> Faces:

@@ -478,6 +478,28 @@ def _generalise(options: argparse.Namespace) -> int:
     return 0
 
 
+def _detail(options: argparse.Namespace) -> int:
+    from tiler.detail.detail import DetailAsked, detail_models
+
+    names = (
+        "rules",
+        "viewpoint",
+        "distance",
+        "facing",
+        "keep",
+        "lod",
+        "crs",
+        "axis_order",
+        "json_file",
+        "overwrite",
+    )
+    asked = DetailAsked(**{name: getattr(options, name) for name in names})
+    for line in detail_models(options.inputs, options.output, asked):
+        say(line)
+    say(str(options.output))
+    return 0
+
+
 def _wind(options: argparse.Namespace) -> int:
     from tiler.wind.study import WindMaps, assess_wind
 
@@ -553,6 +575,7 @@ HANDLERS: Mapping[str, Handler] = {
     "edit": _edit,
     "convert": _convert,
     "generalise": _generalise,
+    "detail": _detail,
     "wind": _wind,
     "kernels": _kernels,
     "config": _config,

@@ -14,6 +14,7 @@ from tiler.config.config import ANYWHERE, Config
 from tiler.config.config_file import POSITIONAL
 from tiler.config.domain_height import Height
 from tiler.convert import NAMES
+from tiler.detail import RULES
 from tiler.export.export import list_formats, load_format
 from tiler.generalisation import HEIGHTS as BLOCK_KEEPS
 from tiler.jobs.submission import add_job_commands
@@ -172,6 +173,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     _add_edit(command("edit", "replace, remove or add buildings in a finished run, and mesh what that touches"))
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
     _add_convert(command("convert", "write city models, or that of a run, as another format of city models"))
+    _add_detail(command("detail", "write city models with windows, doors and balconies by rules, at LoD3"))
     _add_generalise(
         command("generalise", "make blocks of buildings between streets: cells and LoD0C, LoD0B, LoD0A")
     )
@@ -602,10 +604,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
 
 def _add_convert(convert: argparse.ArgumentParser) -> None:
     """Add inputs, output and options of a conversion."""
-    convert.add_argument(
-        "inputs", nargs="+", type=_on_disk, metavar="MODEL|DIR",
-        help="CityJSON, CityJSONSeq, CityGML or GeoPackage files; or the folder of a run",
-    )  # fmt: skip
+    _add_models(convert)
     convert.add_argument("--format", choices=NAMES, required=True, help="what to write")
     convert.add_argument(
         "-o",
@@ -620,13 +619,6 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
         choices=LODS,
         default="auto",
         help="level of detail in an OBJ or GLB; others have all (default: auto)",
-    )
-    convert.add_argument("--crs", default="", metavar="EPSG", help="reproject to this CRS, in plan")
-    convert.add_argument(
-        "--axis-order",
-        choices=("xy", "yx"),
-        default="",
-        help="which coordinate comes first, against what files show",
     )
     convert.add_argument(
         "--tile-size",
@@ -685,6 +677,50 @@ def _add_generalise(parser: argparse.ArgumentParser) -> None:
     marks.add_argument(
         "--landmarks", default="", metavar="FILE|ID,...", help="of these ids; a file has one a line"
     )
+
+
+def _add_models(parser: argparse.ArgumentParser) -> None:
+    """Add city models as input, and how their coordinates are read and written."""
+    parser.add_argument(
+        "inputs", nargs="+", type=_on_disk, metavar="MODEL|DIR",
+        help="CityJSON, CityJSONSeq, CityGML or GeoPackage files; or the folder of a run",
+    )  # fmt: skip
+    parser.add_argument("--crs", default="", metavar="EPSG", help="reproject to this CRS, in plan")
+    parser.add_argument(
+        "--axis-order",
+        choices=("xy", "yx"),
+        default="",
+        help="which coordinate comes first, against what files show",
+    )
+
+
+def _add_detail(detail: argparse.ArgumentParser) -> None:
+    """Add inputs, output and options of detail by rules."""
+    _add_models(detail)
+    add = detail.add_argument
+    add(
+        "-o", "--output", type=_on_disk, required=True, metavar="FILE", help="file .glb, .city.json or .city.jsonl"
+    )
+    add(
+        "--rules", default="residential", metavar="NAME|FILE",
+        help=f"{', '.join(RULES)}, or a file of rules, JSON or TOML (default: residential)",
+    )  # fmt: skip
+    add("--viewpoint", default="", metavar="X,Y,Z", help="where from the city is seen; without: full detail")
+    add(
+        "--distance", default="", metavar="FULL,REDUCED",
+        help="metres from the viewpoint up to which assets are full, and from which on flat (default: 50,200)",
+    )  # fmt: skip
+    add(
+        "--facing", type=float, default=None, metavar="DEGREES",
+        help="angle between façade and viewpoint from which on assets are flat; up to its half they are full",
+    )  # fmt: skip
+    add(
+        "--keep", default="", metavar="LABEL=PERCENT,...",
+        help="least share of polygons by semantics: floor, window, door, balcony",
+    )  # fmt: skip
+    add("--lod", choices=LODS, default="auto", help="level of detail that façades are put on (default: auto)")
+    add("--json", type=Path, default=None, dest="json_file", metavar="FILE", help="write the table as JSON too")
+    add("--overwrite", action="store_true", help="replace the files if they exist")
 
 
 def _on_disk(text: str) -> Path:

@@ -5,7 +5,8 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
-from tiler.convert.features import SURFACES, Feature, Geometry, iter_features, level_text, origin_of
+from tiler.cityinput.faces import WALL
+from tiler.convert.features import OPENINGS, SURFACES, Feature, Geometry, iter_features, level_text, origin_of
 from tiler.convert.inputs import ModelSource
 from tiler.georeference.crs import horizontal_crs
 
@@ -65,16 +66,19 @@ def _head(source: ModelSource) -> dict[str, Any]:
 
 def _objects(feature: Feature, source: ModelSource, first: int = 0) -> dict[str, Any]:
     """Give the objects of a feature by id; vertices are counted from `first`."""
-    house, *parts = feature.objects
+    house = feature.objects[0]
+    children: dict[str, list[str]] = {}
+    for one in feature.objects[1:]:
+        children.setdefault(one.parent or house.id, []).append(one.id)
     found: dict[str, Any] = {}
     for one in feature.objects:
         kept = [item for item in one.geometries if item.lod < HIGHEST]
         source.told["geometries of level 4, which CityJSON has not"] += len(one.geometries) - len(kept)
-        thing: dict[str, Any] = (
-            {"type": "BuildingPart", "parents": [house.id]}
-            if one is not house
-            else {"type": "Building"} | ({"children": [part.id for part in parts]} if parts else {})
+        kind = "Building" if one is house else "BuildingInstallation" if one.parent else "BuildingPart"
+        thing: dict[str, Any] = {"type": kind} | (
+            {"parents": [one.parent or house.id]} if one is not house else {}
         )
+        thing |= {"children": children[one.id]} if one.id in children else {}
         found[one.id] = thing | {
             "attributes": one.attributes,
             "geometry": [_geometry(item, first) for item in kept],
@@ -84,12 +88,18 @@ def _objects(feature: Feature, source: ModelSource, first: int = 0) -> dict[str,
 
 def _geometry(item: Geometry, first: int) -> dict[str, Any]:
     faces: Any = [[[vertex + first for vertex in ring] for ring in rings] for _, rings in item.faces]
-    kinds = [kind for kind in SURFACES if any(kind == other for other, _ in item.faces)]
+    known = SURFACES | OPENINGS
+    kinds = [kind for kind in known if any(kind == other for other, _ in item.faces)]
     values: Any = [kinds.index(kind) if kind in kinds else None for kind, _ in item.faces]
     told: dict[str, Any] = {"type": "Solid" if item.closed else "MultiSurface", "lod": level_text(item.lod)}
     told["boundaries"] = [faces] if item.closed else faces
     if kinds:
-        surfaces = [{"type": SURFACES[kind]} for kind in kinds]
+        surfaces: list[dict[str, Any]] = [{"type": known[kind]} for kind in kinds]
+        if openings := [k for k, kind in enumerate(kinds) if kind in OPENINGS]:
+            wall = kinds.index(WALL)
+            surfaces[wall]["children"] = openings
+            for k in openings:
+                surfaces[k]["parent"] = wall
         told["semantics"] = {"surfaces": surfaces, "values": [values] if item.closed else values}
     return told
 

@@ -113,10 +113,7 @@ def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[s
         )
     if asked.lod != "auto" and not target.one_level:
         raise ConfigError(f"--lod {asked.lod}: format {asked.name} has all levels side by side; leave --lod out")
-    if output.resolve() in {path.resolve() for path in inputs}:
-        raise ConfigError(f"{output}: is one of the inputs; give another --output")
-    if output.exists() and not asked.overwrite:
-        raise ConfigError(f"{output}: exists; give another --output, or --overwrite")
+    refuse_output(output, inputs, overwrite=asked.overwrite)
     if asked.tile_size and output.exists() and not _holds_tiles(output):
         raise ConfigError(f"{output}: is no folder of tiles, which would be replaced; give another --output")
     with open_source(inputs, crs=asked.crs, axis_order=asked.axis_order) as source:
@@ -132,6 +129,14 @@ def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[s
                 target.write(part, source, asked.lod)
             told = source.told
         return [*source.notes, *(f"{number} {what}" for what, number in told.items() if number)]
+
+
+def refuse_output(output: Path, inputs: Sequence[Path], *, overwrite: bool) -> None:
+    """Raise a `ConfigError` for an output that is an input, or exists where it may not be replaced."""
+    if output.resolve() in {path.resolve() for path in inputs}:
+        raise ConfigError(f"{output}: is one of the inputs; give another --output")
+    if output.exists() and not overwrite:
+        raise ConfigError(f"{output}: exists; give another --output, or --overwrite")
 
 
 def _holds_tiles(folder: Path) -> bool:

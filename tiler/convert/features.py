@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.cityinput.faces import GROUND, NO_LOD, ROOF, WALL, Faces, ModelBuilding, Shape
+from tiler.cityinput.faces import DOOR, GROUND, NO_LOD, ROOF, WALL, WINDOW, Faces, ModelBuilding, Shape
 from tiler.convert.inputs import ModelSource
 
 SURFACES = {GROUND: "GroundSurface", ROOF: "RoofSurface", WALL: "WallSurface"}
+OPENINGS = {WINDOW: "Window", DOOR: "Door"}
 WITHOUT_LEVEL = 2.0  # what geometries are taken for whose level is not stated
 
 Ring = list[int]
@@ -32,11 +33,12 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class CityObject:
-    """A building, or a part of one, with its id, attributes and geometries."""
+    """A building, a part or, with a `parent`, an installation of one, with its id, attributes and geometries."""
 
     id: str
     attributes: dict[str, Any]
     geometries: list[Geometry]
+    parent: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +77,7 @@ def iter_features(source: ModelSource) -> Iterator[Feature]:
                 name,
                 {key: plain_value(value) for key, value in building.attributes.get(owner, {}).items()},
                 geometries.get(owner, []),
+                names.get(building.installations.get(owner, ""), ""),
             )
             for owner, name in names.items()
         ]

@@ -13,7 +13,7 @@ from typing import IO, Any
 
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker
-from tiler.cityinput.faces import GROUND, ROOF, WALL
+from tiler.cityinput.faces import DOOR, GROUND, INSTALLATION, ROOF, WALL, WINDOW
 from tiler.convert.features import origin_of
 from tiler.convert.inputs import ModelSource
 from tiler.convert.obj_files import GROUPS
@@ -24,6 +24,12 @@ from tiler.tiles3d.gltf import COLOURS, FLOAT, INDICES, MOST_BYTES, UNSIGNED_INT
 
 COPY_BYTES = 1 << 20
 MATERIALS = {ROOF: Marker.ROOF, WALL: Marker.WALL, GROUND: Marker.GROUND}
+# Kinds that detailed buildings have beside those of `GROUPS`: names and colours.
+DETAILS = {
+    WINDOW: ("window", (0.2, 0.28, 0.36)),
+    DOOR: ("door", (0.4, 0.24, 0.14)),
+    INSTALLATION: ("installation", (0.6, 0.6, 0.6)),
+}
 LISTS = ("nodes", "meshes", "accessors")
 
 
@@ -31,6 +37,7 @@ LISTS = ("nodes", "meshes", "accessors")
 class _Spools:
     """Parts of the file as they grow, each in a temporary file: lists of the document, vertices, corners."""
 
+    groups: list[int]  # kinds of faces, in the order of their materials
     lists: dict[str, IO[bytes]]
     vertices: IO[bytes]
     corners: IO[bytes]
@@ -44,8 +51,10 @@ class _Spools:
         return self.n[name] - 1
 
 
-def write_glb(path: Path, source: ModelSource, lod: str) -> None:
+def write_glb(path: Path, source: ModelSource, lod: str, *, detailed: bool = False) -> None:
     """Write triangles of one level of detail, with ids as names of nodes and attributes as their extras.
+
+    `detailed`: with materials for windows, doors and installations.
 
     Raises
     ------
@@ -54,7 +63,8 @@ def write_glb(path: Path, source: ModelSource, lod: str) -> None:
     """
     with ExitStack() as stack:
         files = {name: stack.enter_context(TemporaryFile()) for name in (*LISTS, "vertices", "corners")}
-        spools = _Spools({name: files[name] for name in LISTS}, files["vertices"], files["corners"])
+        groups = [*GROUPS, *(DETAILS if detailed else ())]
+        spools = _Spools(groups, {name: files[name] for name in LISTS}, files["vertices"], files["corners"])
         origin = origin_of(source)
         for one in iter_triangles(source, lod):
             _add(spools, one, origin)
@@ -72,7 +82,7 @@ def _add(spools: _Spools, one: SolidBuilding, origin: Any) -> None:
     position = spools.append("accessors", place | {"type": "VEC3", "min": low, "max": high})
     spools.vertices.write(local.tobytes())
     primitives = []
-    for material, kind in enumerate(GROUPS):
+    for material, kind in enumerate(spools.groups):
         rows = one.triangles[one.kind == kind]
         if not len(rows):
             continue
@@ -100,7 +110,7 @@ def _assemble(path: Path, spools: _Spools, source: ModelSource) -> None:
             },
         },
         "scene": 0,
-        "materials": [_material(kind, name) for kind, name in GROUPS.items()],
+        "materials": [_material(kind) for kind in spools.groups],
         "bufferViews": [
             {"buffer": 0, "byteLength": split, "target": VERTICES},
             {"buffer": 0, "byteOffset": split, "byteLength": data, "target": INDICES},
@@ -138,7 +148,7 @@ def _copy(source: IO[bytes], target: IO[bytes]) -> None:
         target.write(piece)
 
 
-def _material(kind: int, name: str) -> dict[str, Any]:
-    colour = [*COLOURS[MATERIALS.get(kind, Marker.WALL)], 1.0]
-    surface = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+def _material(kind: int) -> dict[str, Any]:
+    name, colour = DETAILS[kind] if kind in DETAILS else (GROUPS[kind], COLOURS[MATERIALS.get(kind, Marker.WALL)])
+    surface = {"baseColorFactor": [*colour, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
     return {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}

@@ -52,7 +52,8 @@ def iter_triangles(source: ModelSource, lod: str) -> Iterator[SolidBuilding]:
         xyz = xyz * source.step
         triangles, kind, n_fans = triangulate(faces, xyz, number.ravel().tolist())
         source.told["faces that cross themselves, cut into triangles around a corner"] += n_fans
-        attributes = {key: value for own in building.attributes.values() for key, value in own.items()}
+        parts = [own for owner, own in building.attributes.items() if owner not in building.installations]
+        attributes = {key: value for own in parts for key, value in own.items()}
         attributes |= building.attributes.get(building.id, {})
         kept = {key: plain_value(value) for key, value in attributes.items()}
         if len(triangles):
