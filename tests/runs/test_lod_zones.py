@@ -10,7 +10,7 @@ import pytest
 import shapely
 
 from pipeline.data.citymodel import Prisms
-from pipeline.data.errors import ConfigError
+from pipeline.data.errors import ConfigError, InputError
 from tests.helpers.tiles import CRS, hash_files, make_town, put_roofs, run_of, shape_city, terraces, write_town
 from tiler.check.check import check_run
 from tiler.check.zone_proofs import check_zones
@@ -89,6 +89,7 @@ def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path:
         (f'"{LOD}":"1.2"', f'"{LOD}":"1.3"', "level-of-zone"),
         (f'"{LOD}":"2.2"', f'"{LOD}":"1.2"', "level-parts"),
         (f'"{LOD}":"1.2",', "", "level-not-stated"),
+        (f'"{LOD_POINT}":[{x!r},', f'"{LOD_POINT}":["a",', "level-not-stated"),
         (f'"{LOD_POINT}":[{x!r},{y!r}]', f'"{LOD_POINT}":[{x + 60!r},{y!r}]', "level-point"),
         (f'"{LOD}":"2.2"', f'"{LOD}":"1.3"', "level-roof"),
     ):
@@ -96,19 +97,22 @@ def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path:
         assert kind in prove_levels(text.replace(was, now), zones, out, tmp_path)
 
 
-def write_blocks(path: Path) -> None:
-    """Two cells side by side, each with a block of LoD0C and of LoD0B, and one of LoD0A for both."""
+def write_blocks(path: Path, eastern: str = "east") -> None:
+    """Two cells side by side, each with a block of LoD0C and of LoD0B, and one of LoD0A for both.
+
+    The eastern block of LoD0B may be of another cell.
+    """
     middle = WEST + 0.9 * SIZE
     cells = [shapely.box(WEST, SOUTH, middle, BOUNDS[3]), shapely.box(middle, SOUTH, *BOUNDS[2:])]
     layers: dict[str, tuple[list[shapely.Geometry], dict[str, list[Any]]]] = {
-        "cells": (cells, {"id": ["west", "east"], "parent": ["both"] * 2}),
+        "cells": (cells, {"id": ["west", "east"], "parent": ["both"] * 2, "members": [9.0, 9.0]}),
         "lod0c": (
             [cell.buffer(-12) for cell in cells],
             {"id": ["west/a", "east/b"], "cell": ["west", "east"], "height": [9.0, 11.0]},
         ),
         "lod0b": (
             [cell.buffer(-6) for cell in cells],
-            {"id": ["west", "east"], "cell": ["west", "east"], "height": [8.0, 10.0]},
+            {"id": ["west", "east"], "cell": ["west", eastern], "height": [8.0, 10.0]},
         ),
         "lod0a": ([shapely.union_all(cells).buffer(-6)], {"id": ["both"], "cell": ["west"], "height": [9.0]}),
     }
@@ -145,6 +149,9 @@ def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp
     moved = text.replace(f"[{x!r},{y!r}]", f"[{WEST + 1.5 * SIZE!r},{y!r}]")
     assert "building-in-block" in prove_levels(moved, asked, tmp_path / "out", tmp_path)
     shape_city(values | {"lod_zones": [zones[0], "rest,1.2"]}, tmp_path / "none")  # no cell is at such a level
+    write_blocks(tmp_path / "bare.gpkg", eastern="gone")
+    with pytest.raises(InputError, match="cell east has buildings, and layer lod0b nothing that stands for them"):
+        shape_city(values | {"generalised": str(tmp_path / "bare.gpkg")}, tmp_path / "bare")
     with pytest.raises(ConfigError, match=r"level 0A takes blocks .*--generalised"):
         make_config(town | {"lod_zones": zones})
 

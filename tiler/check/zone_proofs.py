@@ -76,7 +76,8 @@ class _Found:
         house = thing.get("parents", [name])[0]
         inside = building.footprint.representative_point()
         place = (inside.x, inside.y, building.roof)
-        if level not in LEVELS or not isinstance(point, list) or len(point) != 2:
+        numbers = isinstance(point, list) and all(isinstance(v, (int, float)) for v in point)
+        if level not in LEVELS or not numbers or len(point) != 2:
             self._faults.append(("level-not-stated", *place))
             return
         number = LEVELS.index(level)

@@ -99,7 +99,7 @@ def read_zones_asked(zones: Sequence[str], focus: str, *, mesh_size: float, bloc
     >>> read_zones_asked(["9,9,50,1.2,8", "rest,0B", "zones.gpkg"], "", mesh_size=20.0, blocks=True).rest
     '0B'
     """
-    circles, files, rest = list[Circle](), list[str](), LEVELS[0]
+    circles, files, rest, n_rest = list[Circle](), list[str](), LEVELS[0], 0
     if focus:
         rings, rest = _read_focus(focus, mesh_size, RINGS_OF_BLOCKS if blocks else RINGS)
         circles += rings
@@ -108,7 +108,9 @@ def read_zones_asked(zones: Sequence[str], focus: str, *, mesh_size: float, bloc
         if is_file(text):
             files.append(text)
         elif words[0] == REST and len(words) == 2:
-            rest = check_level(words[1], f"lod_zones = {shorten(text, 100)}")
+            rest, n_rest = check_level(words[1], f"lod_zones = {shorten(text, 100)}"), n_rest + 1
+            if n_rest > 1:
+                raise ConfigError(f"lod_zones = {shorten(text, 100)}: the rest has a level already; give one")
         else:
             circles.append(_read_circle(text, words, mesh_size))
     return ZonesAsked(tuple(circles), tuple(files), rest)

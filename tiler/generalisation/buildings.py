@@ -172,6 +172,8 @@ def _open_footprints(inputs: Inputs, asked: Asked, told: Told) -> tuple[pyproj.C
         told.say(f"{path.name}: in degrees, reprojected to {zone}, its UTM zone")
     if crs.axis_info[0].unit_name != "metre":
         raise ConfigError(f"{path}: {crs_name(crs)} is not in metres; give --crs EPSG:NNNN, a metric one")
+    if crs.coordinate_operation and "Pseudo" in crs.coordinate_operation.method_name:
+        raise ConfigError(f"{path}: {crs_name(crs)} stretches lengths; give --crs EPSG:NNNN, one of the place")
     bounds = inputs.bounds
     if bounds is None:
         frame = Frame() if own is None or own == crs else footprint_frame(own, crs, extent)[0]

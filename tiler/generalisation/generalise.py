@@ -16,6 +16,7 @@ from pipeline.data.errors import ConfigError, GeometryError, InputError
 from pipeline.generalisation.barriers import GRID, deal_segments, explode_lines, split_at_grid
 from pipeline.generalisation.cell_graph import join_small
 from pipeline.geometry.components import join_pairs
+from tiler.convert.convert import refuse_output
 from tiler.executors.in_order import map_in_order
 from tiler.formats.gpkg import fixed_time
 from tiler.generalisation.barrier_files import scan_geometries
@@ -114,8 +115,9 @@ def generalise(
         raise ConfigError(f"{output.parent}: no such folder; make it, or give another --output")
     if workers < 0:
         raise ConfigError(f"--workers {workers}: expected 0, for this process, or more")
-    if not overwrite and (there := [path for path in files.all if path.exists()]):
-        raise ConfigError(f"{there[0]}: exists; give another --output, or --overwrite")
+    given = [*inputs.models, *filter(None, [inputs.footprints]), *inputs.roads, *inputs.railways]
+    for path in files.all:
+        refuse_output(path, [*given, *inputs.water, *inputs.others], overwrite=overwrite)
     told = Told()
     with TemporaryDirectory(prefix="citystitch-") as folder:
         shards = Shards(Path(folder), asked.tile_size)

@@ -34,6 +34,8 @@ class Landmarks:
 def read_ids(text: str) -> frozenset[str]:
     """Read ids: a file with one a line, or a list with commas; InputError if the file cannot be read."""
     path = Path(text)
+    if path.suffix in (".txt", ".csv") and not path.is_file():
+        raise InputError(f"{path}: no such file; check the path of --landmarks")
     if not text or not path.is_file():
         return frozenset(filter(None, map(str.strip, text.split(","))))
     try:

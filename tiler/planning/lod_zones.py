@@ -8,11 +8,14 @@ from pipeline.data.errors import InputError
 from tiler.config.config import Config, check_blocks
 from tiler.config.zones import LEVELS, Zones, check_level, check_size
 from tiler.footprints.plan_shapes import scan_shapes
+from tiler.georeference.crs import crs_name
 from tiler.objects.places import place
 from tiler.planning.region import Region
+from tiler.vectors.layers import describe_layer
 from tiler.vectors.lengths import number_of
 
 MOST_ZONES = 1000  # every task has them
+BLOCKS = {"0C": "lod0c", "0B": "lod0b", "0A": "lod0a"}  # layers of blocks, by level
 
 
 def read_zones(config: Config, region: Region) -> Zones:
@@ -59,6 +62,26 @@ def read_zones(config: Config, region: Region) -> Zones:
             f"{len(zones)} zones; at most {MOST_ZONES} are taken: dissolve those of one level and size"
         )
     return (*sorted(zones, key=lambda zone: (LEVELS.index(zone[0]), *zone)), (asked.rest, config.mesh_size, ""))
+
+
+def describe_absent(zones: Zones, region: Region) -> list[str]:
+    """Tell of zones that lie outside of the region: a part of a larger one, or coordinates that are wrong."""
+    shapes = shapely.from_wkb([place for _, _, place in zones if place])
+    absent = shapes[~shapely.intersects(shapes, shapely.box(*region.bounds))]
+    if not len(absent):
+        return []
+    x, y = shapely.get_coordinates(shapely.centroid(absent[:1]))[0].tolist()
+    return [
+        f"{len(absent)} of {len(shapes)} zones lie outside of the region, the first one at {x:.10g}, {y:.10g}: "
+        f"no cell or building has their level; are x and y those of {crs_name(pyproj.CRS(region.crs))}?"
+    ]
+
+
+def check_generalised(config: Config, zones: Zones) -> None:
+    """Refuse a file of blocks that has not the layers which the zones take; InputError."""
+    if config.generalised and {level for level, _, _ in zones} & BLOCKS.keys():
+        for layer in ("cells", *BLOCKS.values()):
+            describe_layer(place(config.generalised), layer)
 
 
 def make_shape(*numbers: float) -> shapely.Polygon:

@@ -20,6 +20,7 @@ from tiler.landcover.cover_table import read_table
 from tiler.objects.places import is_missing, place
 from tiler.objects.requests import trust_addresses
 from tiler.planning.establish_georeference import FOOTPRINTS, Georeference, establish_georeference, find_inexact
+from tiler.planning.lod_zones import check_generalised, describe_absent, read_zones
 from tiler.planning.model_inputs import (
     describe_others,
     headers_of_region,
@@ -175,6 +176,9 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
             f"or --tile-size {2 * side}"
         )
     messages += [*describe_overhang(region.bounds, headers_of_tiles(headers)), *idle_parameters(config)]
+    zones = read_zones(config, region)
+    check_generalised(config, zones)
+    messages += describe_absent(zones, region) if zones else []
     messages += describe_pad(region.bounds, with_points) if config.padded else []
     if n_absent:
         messages.append(f"{n_absent} of {n_absent + n_tiles} tiles have no point cloud and are left out")

@@ -25,7 +25,7 @@ from tiler.vectors.features import to_objects
 from tiler.vectors.lengths import number_of
 
 CELLS, BLOCK_ROWS = "block-cells", "blocks"  # stages; the first is also the layer of cells
-LAYERS = {"0C": "lod0c", "0B": "lod0b", "0A": "lod0a"}
+LAYERS = {"0C": "lod0c", "0B": "lod0b", "0A": "lod0a"}  # of `citystitch generalise`
 BATCH = 5000  # rows that are held at once
 Row = tuple[shapely.Geometry, str, float, NDArray[np.float64]]  # outline, id, height (m) and form
 OPTION = "generalised"
@@ -50,6 +50,8 @@ def read_cells(task: Task) -> Facts:
     """
     zones, level, parent = task.parameters.zones, dict[str, int](), dict[str, str]()
     for _, geometry, (name, above) in _scan(task, "cells", ["id", "parent"]):
+        if str(name) in level:
+            raise InputError(f"{task.parameters.generalised}: two cells are called {name}; make the file anew")
         point = geometry.representative_point()
         level[str(name)] = int(find_levels(zones, np.array([[point.x, point.y]]))[0])
         parent[str(name)] = str(above or "")
@@ -79,6 +81,8 @@ def read_blocks(task: Task) -> Facts:
         level, x, y, name = text[first:last].decode().split(" ", 3)
         points[level][name] = float(x), float(y)
 
+    seen: dict[str, set[str]] = {level: set() for level in BLOCKS}
+
     def rows() -> Iterator[Row]:
         for level in (level for level in BLOCKS if points[level]):
             for subject, geometry, (name, height, cell) in _scan(task, LAYERS[level], ["id", "height", "cell"]):
@@ -87,9 +91,26 @@ def read_blocks(task: Task) -> Facts:
                     continue
                 if not metres > 0:
                     raise InputError(f"{subject}: a height of {height} m; above 0 expected, mend or remove it")
+                seen[level].add(str(name) if level == "0A" else str(cell))
                 yield geometry, str(name), metres, block_forms(LEVELS.index(level), *at)
 
-    return put_rows(task, _pack(task, rows()), "")
+    facts = put_rows(task, _pack(task, rows()), "")
+    _refuse_bare_cells(task, points, seen)
+    return facts
+
+
+def _refuse_bare_cells(
+    task: Task, points: dict[str, dict[str, tuple[float, float]]], seen: dict[str, set[str]]
+) -> None:
+    """Raise InputError if a cell whose buildings are left out has nothing that stands for them."""
+    for _, _, (name, above, members) in _scan(task, "cells", ["id", "parent", "members"]):
+        for level in BLOCKS:
+            wanted = str(above) if level == "0A" else str(name)
+            if str(name) in points[level] and not number_of(members) == 0 and wanted not in seen[level]:
+                raise InputError(
+                    f"{task.parameters.generalised}: cell {name} has buildings, and layer {LAYERS[level]} nothing "
+                    "that stands for them; make the file anew with citystitch generalise"
+                )
 
 
 def replace_by_blocks(task: Task, footprints: Footprints) -> tuple[Footprints, int]:

@@ -197,6 +197,8 @@ def read_run_record(path: Path) -> RunRecord:
         leaves = bool(given.get("vegetation_classes") or given.get("trees"))
         cell = float(given.get("leaf_column", 2.0))
         zones = read_described(record.get("zones") or ())
+        if not zones and (given.get("focus") or given.get("lod_zones")):
+            raise InputError(f"{path}: its parameters name zones of detail, and the zones are missing; run again")
         spacing = float(given.get("dtm_spacing", 1.0))
         ground = tuple(GroundPatch(str(row["patch"]), _optional(row["z0 (m)"])) for row in found)
     except WRONG_FIELD as error:

@@ -14,6 +14,7 @@ from tornado.web import StaticFileHandler
 from pipeline.data.errors import InputError
 from tiler.dashboard.handlers import Guarded
 from tiler.dashboard.server import serve_rules
+from tiler.store.out_folder import RUN_RECORD
 from tiler.tiles3d.subtrees import TILESET
 
 VIEWER = Path(__file__).parent / "viewer"
@@ -53,8 +54,10 @@ def serve_tiles(folder: Path, address: str) -> Iterator[str]:
         If nobody can listen there.
     """
     if not (folder / TILESET).is_file():
+        if (folder / RUN_RECORD).is_file():
+            raise InputError(f"{folder}: is a run; first citystitch export {folder} --format 3dtiles -o tiles")
         raise InputError(
-            f"{folder}: has no {TILESET}; write one by citystitch export RUN --format 3dtiles -o {folder.name}"
+            f"{folder}: has no {TILESET}; write one by citystitch export RUN --format 3dtiles -o tiles"
         )
 
     def rules(loopback: bool) -> list[Any]:

@@ -252,6 +252,9 @@ def test_what_cannot_be_done_is_one_clear_error(
         (("--bounds", "0", "0", "1", "1"), "no building in the region"),
         (("--landmark-tag", "listed"), "has no attribute 'listed'"),
         (("--crs", "EPSG:4326"), "is in degrees"),
+        (("--crs", "EPSG:3857"), "stretches lengths"),
+        (("--landmarks", "none.txt"), "none.txt: no such file"),
+        (("-o", str(tmp_path / "roads.gpkg"), "--overwrite"), "roads.gpkg: is one of the inputs"),
     ]
     for more, message in cases:
         output = "out.gpkg" if more else "there.gpkg"

@@ -12,7 +12,7 @@ from pipeline.data.errors import CityError, ConfigError
 from tiler.config.config import Config, idle_parameters, make_config
 from tiler.config.zone_levels import describe_zones, find_levels, read_described
 from tiler.config.zones import LEVELS
-from tiler.planning.lod_zones import read_zones
+from tiler.planning.lod_zones import check_generalised, describe_absent, read_zones
 from tiler.planning.refinements import read_refinements
 from tiler.planning.region import Region
 
@@ -55,6 +55,7 @@ def test_the_finest_zone_of_a_place_counts(tmp_path: Path) -> None:
         ({"focus": "1,2,9,11"}, "a size of 11 m; must be at least 0.1 m and at most that of the rest"),
         ({"lod_zones": ["1,2,9,2.1,5"]}, "level '2.1'; must be one of 2.2, 1.3, 1.2, 0C, 0B, 0A"),
         ({"lod_zones": ["1,2,9,2.2"]}, "a circle x,y,RADIUS,LEVEL,SIZE, or rest,LEVEL"),
+        ({"lod_zones": ["rest,1.2", "rest,1.3"]}, "lod_zones = rest,1.3: the rest has a level already"),
         ({"lod_zones": ["rest,0B"]}, "level 0B takes blocks of generalised buildings; make them with"),
         ({"focus": "1,2,3", "roofs": "flat"}, "roofs = flat.*level 2.2 has sloped roofs; give --roofs planes"),
     ],
@@ -62,6 +63,21 @@ def test_the_finest_zone_of_a_place_counts(tmp_path: Path) -> None:
 def test_wrong_zones_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make_config(values)
+
+
+def test_zones_outside_of_the_region_are_told(tmp_path: Path) -> None:
+    inside, swapped = f"{X},{Y},50,2.2,5", f"{Y},{X},50,1.3,5"
+    zones = read_zones(make_config({"lod_zones": [inside, swapped]}), REGION)
+    (said,) = describe_absent(zones, REGION)
+    assert said.startswith("1 of 2 zones lie outside of the region, the first one at 6399500, 318500: ")
+    assert describe_absent(read_zones(make_config({"lod_zones": [inside]}), REGION), REGION) == []
+
+
+def test_blocks_need_their_layers_before_anything_is_read(tmp_path: Path) -> None:
+    write_zones(tmp_path / "other.gpkg", ["1.2"], ["5"])
+    config = make_config({"lod_zones": ["rest,0B"], "generalised": str(tmp_path / "other.gpkg")})
+    with pytest.raises(CityError, match="has no layer 'cells'"):
+        check_generalised(config, read_zones(config, REGION))
 
 
 @pytest.mark.parametrize(
