@@ -80,7 +80,9 @@ def scan_geometries(
         limits = shapely.bounds(geometry).reshape(-1, 4)
         finite = (np.abs(limits) <= COORDINATE_LIMIT).all(axis=1)  # not so for NaN, too
         lines = shapely.get_dimensions(geometry) > 0
-        told.counts[f"points, and features without a place, of {path.name}"] += int((~(finite & lines)).sum())
+        told.counts[f"points and features without a place in {path.name}, left out: lines or areas are taken"] += (
+            int((~(finite & lines)).sum())
+        )
         geometry = geometry[finite & lines]
         if bounds is not None:
             wrong = ~shapely.is_valid(geometry)

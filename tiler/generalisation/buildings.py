@@ -131,7 +131,7 @@ def _tell(notes: Sequence[Note], file: str, told: Told) -> None:
         if note.subject == file:
             told.say(f"{file}: {note.detail}")
         else:
-            told.counts[f"buildings noted as {note.kind}"] += 1
+            told.notes[note.kind] += 1
 
 
 def mean_roofs(rows: ModelRows) -> Array:

@@ -100,7 +100,8 @@ class Asked:
         ):
             value = float(getattr(self, name))
             if not (math.isfinite(value) and low <= value <= high):
-                raise ConfigError(f"--{name.replace('_', '-')} {value:g}: expected {low:g} to {high:g}; change it")
+                bounds = f"{low:g} or more" if high == math.inf else f"{low:g} to {high:g}"
+                raise ConfigError(f"--{name.replace('_', '-')} {value:g}: expected {bounds}; change it")
         if self.tile_size % 1:
             raise ConfigError(f"--tile-size {self.tile_size:g}: expected whole metres; change it")
         if self.block_height not in HEIGHTS:

@@ -310,7 +310,7 @@ def directions_of(crs: pyproj.CRS) -> str:
 
 def box_words(box: Sequence[float]) -> str:
     """Write a box for a message."""
-    return " ".join(f"{value:.6g}" for value in box)
+    return " ".join(f"{value:.10g}" for value in box)
 
 
 def pdal_command(cloud: Path, crs: pyproj.CRS, target: str | None) -> str:

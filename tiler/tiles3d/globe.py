@@ -78,6 +78,8 @@ class Globe:
             f"heights from {vertical_crs} to the ellipsoid"
             if vertical_crs
             else f"heights raised by {geoid_height:g} m to the ellipsoid"
+            if geoid_height
+            else "heights are those of the run: --geoid-height or --vertical-crs puts them on the ellipsoid"
         )
 
     def geographic(self, xyz: Array) -> Array:
@@ -109,9 +111,11 @@ def _open_heights(
         pass
     grids = ", ".join(find_operation(whole, world, box).missing_grids)
     what = (
-        f"it needs the grid {grids} (package proj-data, or: pyproj sync --file {grids})" if grids else "none here"
+        f"it needs the grid {grids} (package proj-data, or: pyproj sync --file {grids}), or give --geoid-height"
+        if grids
+        else "give --geoid-height"
     )
-    raise ConfigError(f"--vertical-crs {name}: PROJ has no way to the ellipsoid, {what}; or give --geoid-height")
+    raise ConfigError(f"--vertical-crs {name}: PROJ has no way from there to the ellipsoid; {what}")
 
 
 def geocentric(places: Array) -> Array:

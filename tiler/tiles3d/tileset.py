@@ -122,7 +122,7 @@ def export_tileset(
         (folder / TILESET).write_text(json.dumps(document, indent=1) + "\n")
         (folder / EXPORT_RECORD).write_text(json.dumps({"format": "3dtiles", "tiles": tree.tiles}) + "\n")
     return [
-        f"{tree.tiles} tiles on {grid.depth + 1} levels, {tree.error:.3g} m to 0 m from the run",
+        f"tiles: {tree.tiles}; levels: {grid.depth + 1}; the coarsest is {tree.error:.3g} m from the run",
         f"placed {globe.operation.describe()}; {globe.heights}",
         *(f"{number} {what}" for what, number in told.items() if number),
     ]
