@@ -64,7 +64,7 @@ def _share(value: float | None) -> str:
 
 
 def _signed(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.1%}"
+    return "-" if value is None else f"{round(value, 3) + 0.0:+.1%}"
 
 
 def json_text(document: dict[str, Any]) -> str:

@@ -25,5 +25,5 @@ class Told:
 
     def lines(self) -> list[str]:
         """Write a line for each."""
-        counted = [f"{n} {what}" for what, n in sorted(self.counts.items()) if n]
+        counted = [f"{what}: {n}" for what, n in sorted(self.counts.items()) if n]
         return [*self.said, *counted, *(say_notes(kind, n) for kind, n in sorted(self.notes.items()))]
