@@ -20,7 +20,7 @@ from tiler.config.zones import LEVELS, LOD, LOD_POINT, Zones
 from tiler.pictures.picture_data import load_city, load_levels
 from tiler.planning.lod_zones import read_zones
 from tiler.planning.region import Region
-from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD
+from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
 from tiler.store.results import StoredTerrain
 from tiler.store.run_folder import read_run_record
 from tiler.store.store import Store
@@ -149,6 +149,8 @@ def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp
     moved = text.replace(f"[{x!r},{y!r}]", f"[{WEST + 1.5 * SIZE!r},{y!r}]")
     assert "building-in-block" in prove_levels(moved, asked, tmp_path / "out", tmp_path)
     shape_city(values | {"lod_zones": [zones[0], "rest,1.2"]}, tmp_path / "none")  # no cell is at such a level
+    (path,) = (tmp_path / "none" / STORE).glob("block-cells/*")
+    assert b"no-cells-in-zones" in path.read_bytes()
     write_blocks(tmp_path / "bare.gpkg", eastern="gone")
     with pytest.raises(InputError, match="cell east has buildings, and layer lod0b nothing that stands for them"):
         shape_city(values | {"generalised": str(tmp_path / "bare.gpkg")}, tmp_path / "bare")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.citymodel import Footprints, number_ids, take_footprints
 from pipeline.data.errors import InputError
+from pipeline.data.notes import Note
 from pipeline.data.roof_forms import block_forms, no_forms
 from tiler.config.config import Config
 from tiler.config.zone_levels import find_levels
@@ -67,6 +68,9 @@ def read_cells(task: Task) -> Facts:
                 yield geometry, f"{found} {point.x!r} {point.y!r} {name}", np.nan, no_forms(1)[0]
 
     facts = put_rows(task, _pack(task, rows()), "")
+    if not facts["n"]:
+        name = place(task.parameters.generalised).name
+        task.note(Note("no-cells-in-zones", name, detail="no building is replaced: is it of another place?"))
     return facts | {"counts": {"cells replaced by blocks": facts["n"]}}
 
 

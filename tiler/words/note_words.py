@@ -273,6 +273,7 @@ WORDS: dict[str, Words] = {
     "mesh-in-parts": Words(OTHER, "the mesh falls apart: parts of it share no face"),
     "terrain-far-from-points": Words(OTHER, "terrain was interpolated over large areas without ground points"),
     "no-footprints-in-region": Words(OTHER, "no footprint of a file lies in the region"),
+    "no-cells-in-zones": Words(OTHER, "no cell of the generalised blocks lies in a zone that takes blocks"),
 }
 
 
