@@ -11,11 +11,11 @@ from tiler.footprints.plan_shapes import scan_shapes
 from tiler.georeference.crs import crs_name
 from tiler.objects.places import place
 from tiler.planning.region import Region
+from tiler.stages.blocks import LAYERS
 from tiler.vectors.layers import describe_layer
 from tiler.vectors.lengths import number_of
 
 MOST_ZONES = 1000  # every task has them
-BLOCKS = {"0C": "lod0c", "0B": "lod0b", "0A": "lod0a"}  # layers of blocks, by level
 
 
 def read_zones(config: Config, region: Region) -> Zones:
@@ -79,8 +79,8 @@ def describe_absent(zones: Zones, region: Region) -> list[str]:
 
 def check_generalised(config: Config, zones: Zones) -> None:
     """Refuse a file of blocks that has not the layers which the zones take; InputError."""
-    if config.generalised and {level for level, _, _ in zones} & BLOCKS.keys():
-        for layer in ("cells", *BLOCKS.values()):
+    if config.generalised and {level for level, _, _ in zones} & LAYERS.keys():
+        for layer in ("cells", *LAYERS.values()):
             describe_layer(place(config.generalised), layer)
 
 
