@@ -54,10 +54,12 @@ def models(out: Path) -> dict[str, tuple[bytes, ...]]:
     return rows
 
 
-def prove_levels(text: str, zones: Zones, out: Path, folder: Path) -> set[str]:
+def prove_levels(
+    text: str, zones: Zones, out: Path, folder: Path, stated: dict[str, int] | None = None
+) -> set[str]:
     """Faults of a city model in place of that of a run."""
     (folder / CITY_MODEL).write_text(text)
-    proof = check_zones(zones, folder / CITY_MODEL, out / FULL_CITY_MODEL)
+    proof = check_zones(zones, folder / CITY_MODEL, out / FULL_CITY_MODEL, stated)
     return {fault.kind for fault in proof.faults}
 
 
@@ -147,6 +149,10 @@ def test_blocks_stand_for_the_buildings_of_whole_cells(town: dict[str, Any], tmp
     assert not prove_levels(text, asked, tmp_path / "out", tmp_path)
     assert prove_levels(text, (*asked[:-1], ("0C", 6.0, "")), tmp_path / "out", tmp_path) == {"level-of-zone"}
     moved = text.replace(f"[{x!r},{y!r}]", f"[{WEST + 1.5 * SIZE!r},{y!r}]")
+    relabelled = text.replace(f'"{LOD}":"0B"', f'"{LOD}":"1.2"', 1)
+    stated = {name: sum(row[LOD] == name for row in told.values()) for name in LEVELS}
+    assert not prove_levels(text, asked, tmp_path / "out", tmp_path, stated)
+    assert "level-count" in prove_levels(relabelled, asked, tmp_path / "out", tmp_path, stated)
     assert "building-in-block" in prove_levels(moved, asked, tmp_path / "out", tmp_path)
     shape_city(values | {"lod_zones": [zones[0], "rest,1.2"]}, tmp_path / "none")  # no cell is at such a level
     (path,) = (tmp_path / "none" / STORE).glob("block-cells/*")

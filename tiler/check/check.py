@@ -138,7 +138,8 @@ def check_run(directory: Path, load_dtm: LoadDtm, *, workers: int = 0) -> CheckR
         claims, facts = _conclude(sums, len(files), record, index)
         claims += (solids,)
         if record.zones:
-            claims += (check_zones(record.zones, directory / CITY_MODEL, directory / FULL_CITY_MODEL),)
+            models = directory / CITY_MODEL, directory / FULL_CITY_MODEL
+            claims += (check_zones(record.zones, *models, record.level_counts),)
         parts = sums.count_parts()
         remarks = (report_parts(parts),) if len(parts) > 1 else ()
         return CheckReport(directory, claims, {**facts, "parts": len(parts)}, remarks)

@@ -19,6 +19,7 @@ COMMON = 0.01  # m; parts of a house share no longer wall than this where they h
 PLANES, BLOCK, TOP = LEVELS.index("2.2"), LEVELS.index("1.2"), LEVELS.index("0A")
 DETAILS = {
     "level-not-stated": f"a building has no attribute {LOD!r}, or no point {LOD_POINT!r}; run again",
+    "level-count": "run.json counts another number of building parts at a level of detail",
     "level-of-zone": "a building has another level of detail than the zone of its point asks for",
     "level-point": f"the point of a building is outside of its outline before simplification; bound: {WITHIN:g} m",
     "level-roof": "a roof slopes, where its building's level has flat ones alone",
@@ -27,7 +28,7 @@ DETAILS = {
 }
 
 
-def check_zones(zones: Zones, model: Path, full_model: Path) -> Proof:
+def check_zones(zones: Zones, model: Path, full_model: Path, stated: Mapping[str, int] | None = None) -> Proof:
     """Hold points against outlines of houses before they were simplified, and levels against zones.
 
     Parameters
@@ -38,6 +39,8 @@ def check_zones(zones: Zones, model: Path, full_model: Path) -> Proof:
         The city model that was meshed.
     full_model : Path
         The city model before it was simplified.
+    stated : mapping of str to int, optional
+        Building parts at each level by the record of the run, to hold theirs against.
 
     Raises
     ------
@@ -47,7 +50,7 @@ def check_zones(zones: Zones, model: Path, full_model: Path) -> Proof:
     found = _Found(zones)
     for name, thing, building in _iterate(model):
         found.add(name, thing, building)
-    return found.prove(full_model)
+    return found.prove(full_model, stated)
 
 
 def _iterate(path: Path) -> Iterator[tuple[str, Mapping[str, Any], BuildingRow]]:
@@ -88,7 +91,7 @@ class _Found:
         if level == "1.2" and "parents" in thing:
             self._parts.setdefault(house, []).append(building.footprint)
 
-    def prove(self, full_model: Path) -> Proof:
+    def prove(self, full_model: Path, stated: Mapping[str, int] | None) -> Proof:
         """Hold what was found against zones and the city model before it was simplified."""
         rows = np.array(self._rows, np.float64).reshape(-1, 4)
         level = rows[:, 3].astype(np.int64)
@@ -100,15 +103,17 @@ class _Found:
         single = np.flatnonzero(level <= BLOCK)
         tree = shapely.STRtree(blocks)
         covered[single[tree.query(shapely.points(rows[single, :2]), predicate="within")[0]]] = True
+        count = np.bincount(level, minlength=len(LEVELS)).tolist()
+        other = [k for k, name in enumerate(LEVELS) if stated is not None and count[k] != stated[name]]
         faults = [
             *self._told(),
+            *_fault("level-count", np.array([rows[level == k][0, :3] for k in other if count[k]]).reshape(-1, 3)),
             *_fault("level-of-zone", rows[level != found]),
             *_fault("level-point", rows[~within & (level <= BLOCK)]),
             *_fault("building-in-block", rows[covered]),
             *_fault("level-parts", np.array(self._common_walls()).reshape(-1, 3)),
         ]
-        count = np.bincount(level, minlength=len(LEVELS))
-        shown = ", ".join(f"{n} of {name}" for name, n in zip(LEVELS, count.tolist(), strict=True) if n)
+        shown = ", ".join(f"{n} of {name}" for name, n in zip(LEVELS, count, strict=True) if n)
         claim = f"{len(rows)} building parts have the level of detail of the zone of their point"
         return Proof(f"{claim}: {shown or 'none'}", tuple(faults))
 

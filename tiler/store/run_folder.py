@@ -15,7 +15,7 @@ from pipeline.data.errors import InputError
 from pipeline.data.roofs import Roofs, Weld
 from tiler.config.config import roofs_stay_flat
 from tiler.config.zone_levels import read_described
-from tiler.config.zones import Zones
+from tiler.config.zones import LEVELS, Zones
 from tiler.store.json_stream import iterate_members, read_members
 
 SCHEMA = 1  # of run.json
@@ -116,6 +116,8 @@ class RunRecord:
         Side of the columns in which that is known (m).
     zones : Zones
         Zones of detail; none where all buildings have one level.
+    level_counts : mapping of str to int
+        Building parts at each level of detail, where there are zones.
     """
 
     status: str
@@ -133,6 +135,7 @@ class RunRecord:
     leaves: bool = False
     leaf_column: float = 2.0
     zones: Zones = ()
+    level_counts: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +202,7 @@ def read_run_record(path: Path) -> RunRecord:
         zones = read_described(record.get("zones") or ())
         if not zones and (given.get("focus") or given.get("lod_zones")):
             raise InputError(f"{path}: its parameters name zones of detail, and the zones are missing; run again")
+        at_levels = {level: int(record["counts"].get(f"parts at level {level}", 0)) for level in LEVELS}
         spacing = float(given.get("dtm_spacing", 1.0))
         ground = tuple(GroundPatch(str(row["patch"]), _optional(row["z0 (m)"])) for row in found)
     except WRONG_FIELD as error:
@@ -223,6 +227,7 @@ def read_run_record(path: Path) -> RunRecord:
         leaves,
         cell,
         zones,
+        at_levels,
     )
 
 
