@@ -1,6 +1,7 @@
 """A synthetic city as arrays: hills, a pond, buildings, and the points that a flight would give."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipeline.points_terrain.synthetic_roofs import (
     flat_shapes,
     highest_places,
     shape_heights,
+    take_roofs,
 )
 
 ROOFS = ("flat", "mixed")
@@ -170,6 +172,33 @@ def make_city(
     return SyntheticCity(size, density, seed, waves, base, pond, polygons, ids, ground, roof, roofs, shapes)
 
 
+def cut_city(city: SyntheticCity, boxes: Iterable[tuple[float, float, float, float]]) -> Iterator[SyntheticCity]:
+    """Give the city around each box: the same ground, and the buildings whose envelopes meet the box.
+
+    Parameters
+    ----------
+    city : SyntheticCity
+        The city.
+    boxes : iterable of tuples of 4 floats
+        xmin, ymin, xmax, ymax in EPSG:3006 (m).
+
+    Yields
+    ------
+    SyntheticCity
+    """
+    tree = shapely.STRtree(city.polygons)
+    for box in boxes:
+        near = np.sort(tree.query(shapely.box(*box)))
+        yield replace(
+            city,
+            polygons=city.polygons[near],
+            ids=city.ids[near],
+            ground=city.ground[near],
+            roof=city.roof[near],
+            shapes=take_roofs(city.shapes, near),
+        )
+
+
 def terrain_height(city: SyntheticCity, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """Give the true height of the ground.
 
@@ -212,7 +241,7 @@ def city_points(
     xmin, ymin, xmax, ymax = bounds
     n = round(city.density * (xmax - xmin) * (ymax - ymin))
     x, y = rng.uniform(xmin, xmax, n), rng.uniform(ymin, ymax, n)
-    ground, roof = terrain_height(city, x, y), _roof_at(city, bounds, x, y)
+    ground, roof = terrain_height(city, x, y), _roof_at(next(cut_city(city, [bounds])), x, y)
     wet = np.hypot(x - city.pond[0], y - city.pond[1]) < city.pond[2]
     lot, noise = rng.random(n), rng.random(n)
     open_ground = np.isnan(roof) & ~wet
@@ -376,17 +405,11 @@ def _moved(
     return np.round(turned + centres[:, None] + ORIGIN, 3)
 
 
-def _roof_at(
-    city: SyntheticCity,
-    bounds: tuple[float, float, float, float],
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _roof_at(city: SyntheticCity, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """Give the highest roof above each point, NaN in the open."""
-    near = shapely.STRtree(city.polygons).query(shapely.box(*bounds))
     roof = np.full(len(x), -np.inf)
     xy = np.column_stack((x, y))
-    which, hits = find_inside(xy, city.polygons[near])
-    np.maximum.at(roof, hits, shape_heights(city.shapes, near[which], xy[hits]))
+    which, hits = find_inside(xy, city.polygons)
+    np.maximum.at(roof, hits, shape_heights(city.shapes, which, xy[hits]))
     roof[np.isneginf(roof)] = np.nan
     return roof

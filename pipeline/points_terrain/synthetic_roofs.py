@@ -122,6 +122,15 @@ def draw_roofs(
     return RoofShapes(kind, eaves, start, centre, axis, half, plane)
 
 
+def take_roofs(shapes: RoofShapes, houses: NDArray[np.int64]) -> RoofShapes:
+    """Give the roofs of some houses, in their order (int64, (k,))."""
+    count = np.diff(shapes.start)[houses]
+    start = np.concatenate(([0], np.cumsum(count)))
+    wing = np.arange(start[-1]) + np.repeat(shapes.start[houses] - start[:-1], count)
+    of_wings = (each[wing] for each in (shapes.centre, shapes.axis, shapes.half, shapes.plane))
+    return RoofShapes(shapes.kind[houses], shapes.eaves[houses], start, *of_wings)
+
+
 def shape_heights(shapes: RoofShapes, house: NDArray[np.int64], xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Heights of roofs at places.
 

@@ -28,24 +28,24 @@ LOOK = 0.03  # s between two looks at the memory of processes
 Measured = tuple[float, float, int]  # wall time (s), processor time (s), largest resident process (bytes)
 
 
-def measure(*words: str) -> Measured:
-    """Run a command of ours, and measure all processes that it starts."""
+def measure(*words: str, look: float = LOOK) -> Measured:
+    """Run a command of ours, and measure all processes that it starts, by a look at them every so many seconds."""
     ctypes.CDLL(None).prctl(SUBREAPER, 1, 0, 0, 0)
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     environment = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     process = subprocess.Popen([*COMMAND, *words], stdout=subprocess.DEVNULL, env=environment)
     peak, ended = [0], threading.Event()
 
-    def look() -> None:
-        while not ended.wait(LOOK):
+    def watch() -> None:
+        while not ended.wait(look):
             for child in psutil.Process().children(recursive=True):
                 try:
                     peak[0] = max(peak[0], child.memory_info().rss)
                 except psutil.Error:  # it has just ended
                     continue
 
-    looking = threading.Thread(target=look)
-    looking.start()
+    watching = threading.Thread(target=watch)
+    watching.start()
     code = process.wait()
     wall = time.perf_counter() - start
     try:
@@ -53,7 +53,7 @@ def measure(*words: str) -> Measured:
             os.wait()
     except ChildProcessError:
         ended.set()
-        looking.join()
+        watching.join()
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if code not in (0, 3):
         raise RuntimeError(f"{' '.join(words)}: exit code {code}")

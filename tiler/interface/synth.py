@@ -4,9 +4,8 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyogrio
@@ -14,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
-from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, make_city
+from pipeline.points_terrain.synthetic import ORIGIN, SyntheticCity, city_points, cut_city, make_city
 from pipeline.points_terrain.synthetic_roofs import ROOF_TYPES, wing_rings
 from tiler.executors.in_order import check_workers, map_in_order
 from tiler.formats.gpkg import fixed_time
@@ -88,12 +87,11 @@ def write_city(
 
     Notes
     -----
-    One LAZ file at a time is in memory. Each worker makes the city for itself, which is quick beside its points.
+    The city's buildings are in the memory of this process, and one LAZ file at a time in that of each worker.
     """
     check_workers(workers)
-    asked = _Asked(size, buildings, density, relief, seed, roofs)
     try:
-        city = _make(asked)
+        city = make_city(size=size, buildings=buildings, density=density, relief=relief, seed=seed, roofs=roofs)
     except ValueError as error:
         raise ConfigError(f"synth: {error}") from error
     tiles = _tiles(city, directory / "tiles")
@@ -105,36 +103,21 @@ def write_city(
         strangers = set((directory / "tiles").iterdir()) - set(tiles)
         if strangers:
             raise ConfigError(f"{min(strangers)}: is not of this city; give an empty folder or remove it")
-        for _ in map_in_order(partial(_write_cloud, asked), tiles.items(), workers):
+        parts = cut_city(city, (bounds for _, bounds in tiles.values()))
+        for _ in map_in_order(_write_cloud, zip(parts, tiles.items(), strict=True), workers):
             pass
         _write_footprints(city, files)
         files.truth.write_text(json.dumps(_truth(city, buildings, relief), indent=1) + "\n")
     return files
 
 
-class _Asked(NamedTuple):
-    """Parameters of a city."""
-
-    size: float
-    buildings: int
-    density: float
-    relief: float
-    seed: int
-    roofs: str
-
-
-@lru_cache(maxsize=1)
-def _make(asked: _Asked) -> SyntheticCity:
-    return make_city(**asked._asdict())
-
-
 Tile = tuple[tuple[int, int], tuple[float, float, float, float]]  # column and row, and its box
 
 
-def _write_cloud(asked: _Asked, item: tuple[Path, Tile]) -> None:
-    """Write the points of a part of a city, which a process makes once."""
-    path, (part, bounds) = item
-    write_laz(path, city_points(_make(asked), bounds, part), bounds, CRS)
+def _write_cloud(item: tuple[SyntheticCity, tuple[Path, Tile]]) -> None:
+    """Write the points of a part of a city."""
+    city, (path, (part, bounds)) = item
+    write_laz(path, city_points(city, bounds, part), bounds, CRS)
 
 
 def _tiles(city: SyntheticCity, folder: Path) -> dict[Path, Tile]:
