@@ -14,6 +14,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
@@ -28,12 +29,14 @@ LOOK = 0.03  # s between two looks at the memory of processes
 Measured = tuple[float, float, int]  # wall time (s), processor time (s), largest resident process (bytes)
 
 
-def measure(*words: str, look: float = LOOK) -> Measured:
-    """Run a command of ours, and measure all processes that it starts, by a look at them every so many seconds."""
+def measure(
+    *words: str, look: float = LOOK, command: Sequence[str] = COMMAND, folder: Path | None = None
+) -> Measured:
+    """Run a command of ours, and measure all processes that it starts; `look` is the time between two looks (s)."""
     ctypes.CDLL(None).prctl(SUBREAPER, 1, 0, 0, 0)
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     environment = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    process = subprocess.Popen([*COMMAND, *words], stdout=subprocess.DEVNULL, env=environment)
+    process = subprocess.Popen([*command, *words], stdout=subprocess.DEVNULL, env=environment, cwd=folder)
     peak, ended = [0], threading.Event()
 
     def watch() -> None:
