@@ -32,7 +32,7 @@ Measured = tuple[float, float, int]  # wall time (s), processor time (s), larges
 def measure(
     *words: str, look: float = LOOK, command: Sequence[str] = COMMAND, folder: Path | None = None
 ) -> Measured:
-    """Run a command of ours, and measure all processes that it starts; `look` is the time between two looks (s)."""
+    """Run a command of ours, and measure all processes that it starts, by a look at them every `look` s."""
     ctypes.CDLL(None).prctl(SUBREAPER, 1, 0, 0, 0)
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     environment = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")

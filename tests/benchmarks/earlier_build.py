@@ -1,7 +1,7 @@
 """``python -m tests.benchmarks.earlier_build PYTHON [ROUNDS]``: this build beside an earlier one, in turn.
 
 PYTHON is the interpreter of an environment that has the earlier build. Both mesh the synthetic city of 5 km with
-flat roofs, which all builds have, with two workers and with none. The table of medians goes into docs/benchmarks.md
+flat roofs, which all builds have, with two workers and with none. The medians go into docs/benchmarks.md
 between markers.
 """
 
