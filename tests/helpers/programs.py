@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-PACKAGES = "apt-get install -y openfoam gmsh python3-dolfinx cgns-convert tmux"  # Debian 12; see .ci/run
+# Debian 12; see .ci/run
+PACKAGES = "apt-get install -y openfoam gmsh python3-dolfinx cgns-convert gdal-bin libcitygml-bin tmux"
 FOAM = "/usr/share/openfoam"
 MPI = ("mpirun", "--allow-run-as-root", "--oversubscribe", "-np")
 
