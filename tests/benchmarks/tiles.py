@@ -97,11 +97,12 @@ def draw(path: Path, series: dict[str, NDArray[np.float64]]) -> None:
 def main() -> int:
     """Measure, write the report, and tell whether seams keep their promise."""
     lines = [
-        "# What seams cost",
+        "# Mesh quality at seams",
         "",
-        "Written by `make bench-tiles`; do not edit. A synthetic city of 1.2 km with 1,000 buildings at 10 m",
-        "(`citystitch synth CITY --size 1200 --buildings 1000`), as one tile and in 4, 16 and 64 tiles of 600,",
-        "300 and 150 m. In brackets: the ratio to the untiled mesh, over all cells, or those in the same places.",
+        "Cell quality of one city as one tile and in 4, 16 and 64 tiles of 600, 300 and 150 m. The city is",
+        "synthetic, of 1.2 km with 1,000 buildings, meshed at 10 m",
+        "(`citystitch synth CITY --size 1200 --buildings 1000`). In brackets: the ratio to the untiled mesh, over",
+        "all cells or over the cells in the same places. Written by `make bench-tiles`; do not edit.",
         "",
     ]
     worst = []
@@ -151,7 +152,7 @@ def main() -> int:
                 lines += ["![Cells near seams by radius ratio](tiles-quality.png)", ""]
     missed = [name for ratio, name in worst if ratio[0] < 0.5 or (ratio[1:] < 0.97).any()]
     lines += [
-        "Asked is: within 3 % at the 1st percentile and above, and a minimum not below half.",
+        "Requirement: within 3 % at the 1st percentile and above, and a minimum of at least half.",
         "Missed by: " + (", ".join(missed) or "none") + ".",
     ]
     REPORT.write_text("\n".join(lines) + "\n")
