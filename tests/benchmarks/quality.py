@@ -37,27 +37,29 @@ FIDELITY_HEAD = (
 )
 PAGE = """# Quality
 
-Written by `make quality`; do not edit. Real data is central Amsterdam in `../shared/data`; synthetic cities are
-`citystitch synth` of 1 km with 500 buildings. Every line is one run of `citystitch run` with the options that it
-names. Machine: {machine}.
+How well the city model fits the input, and how good the cells are, by mode. Written by `make quality`; do
+not edit. Real data is central Amsterdam in `../shared/data`; synthetic cities are `citystitch synth` of 1 km with
+500 buildings. Each line is one `citystitch run` with the stated options. Machine: {machine}.
 
-The published samples of city models, meshed with their own roofs: [city-models.md](city-models.md#samples), by
+For published samples of city models, meshed with their own roofs, see [city-models.md](city-models.md#samples), by
 `python -m tests.benchmarks.city_models`.
 
 ![The same block in three modes](block-modes.png)
 
 ## How well the city model fits
 
-*Outline error*: area that the built-up outline lost or gained, over that of the footprints; *a house*: each house
-against its own footprint. *Roof*: height of the model over every roof point inside its buildings. *Points off*:
-roof points of original houses where the model has none, and ground points of streets and courtyards that it built
-over. *Ground*: the DTM against its points.
+- *Outline error*: area that the built-up outline lost or gained, over that of the footprints; *a house*: the same
+  of each house and its own footprint.
+- *Roof*: height of the model minus that of the point, for every roof point inside its buildings.
+- *Points off*: roof points of original houses where the model has no building, and ground points of streets and
+  courtyards under a building of the model.
+- *Ground*: height of the DTM minus that of its points.
 FIDELITY
 
 ## How good the cells are
 
 Percentiles {percentiles} over all cells of the radius ratio (1 at best) and of the least dihedral angle
-(70.5 degrees at best); cells per second in steps 3.1 to 3.5, in one process, with whatever else ran.
+(70.5 degrees at best); cells per second in steps 3.1 to 3.5, in one process on a shared machine.
 QUALITY
 """
 PERCENTILES = ("0", "0.1", "1", "5", "50")

@@ -84,7 +84,7 @@ def faults_table(record: Any) -> list[str]:
     return [
         *cross_table(cells, "stage"),
         "",
-        f"{len(record)} runs; {missing} tiles were missing before they were mended. Seeds: {seeds}.",
+        f"{len(record)} runs; {missing} tiles were missing before the repair. Seeds: {seeds}.",
     ]
 
 

@@ -7,12 +7,12 @@ from pipeline.architecture.representations import HEIGHTS, WALLS_AT, list_repres
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "town-variants.md"
 HEAD = """# Representations of a house
 
-Written by `python -m tests.benchmarks.town_variants`; do not edit. The names are those of Random3Dcity.
-`citystitch synth DIR --style STYLE --variants all` writes them all, `--variants NAME,NAME` some: each to
-`variants/NAME.city.jsonl` (CityJSONSeq); `citystitch convert` makes CityGML of them.
-[towns.md](towns.md) says what levels show.
+`citystitch synth DIR --style STYLE --variants all` writes all representations below, `--variants NAME,NAME`
+some: each to `variants/NAME.city.jsonl` (CityJSONSeq). `citystitch convert` converts them to CityGML.
+[towns.md](towns.md) describes the levels. The names are those of Random3Dcity. Written by
+`python -m tests.benchmarks.town_variants`; do not edit.
 
-Walls: F0 where they are, F1 below the edges of the roof, Fd halfway. Blocks and roof outlines are as high as:
+Walls: F0 at their place, F1 below the edges of the roof, Fd halfway. Height of blocks and roof outlines:
 
 """
 

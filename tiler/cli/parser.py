@@ -50,12 +50,12 @@ GENERALISE_NUMBERS = (
     ("least_share", 0.3, "SHARE", "Th1: share of a cell that buildings cover, from which they become a block"),
     ("most_area", 20_000.0, "M2", "Th2: cells up to this are aggregated for LoD0A"),
     ("fragment", 400.0, "M2", "smaller cells are joined to a neighbour"),
-    ("street_width", 6.0, "M", "of streets along cells, half of which is cut from a block"),
-    ("yard_width", 0.0, "M", "a block keeps open space between buildings up to this; 0: all of the cell"),
-    ("block_gap", 6.0, "M", "without roads: buildings that are closer are of one block"),
+    ("street_width", 6.0, "M", "width of streets along cells; half of it is cut from a block"),
+    ("yard_width", 0.0, "M", "a block fills open space between buildings up to this width; 0: all of the cell"),
+    ("block_gap", 6.0, "M", "without roads: closer buildings belong to one block"),
     ("adjacent", 0.1, "M", "buildings up to this apart are adjacent"),
-    ("default_height", 6.0, "M", "of buildings whose height is not known"),
-    ("tile_size", 1000.0, "M", "side of the squares that are worked on one by one"),
+    ("default_height", 6.0, "M", "height of buildings without a known height"),
+    ("tile_size", 1000.0, "M", "side of the tiles, which are processed one by one"),
 )
 GENERALISE_OPTIONS = (*(name for name, *_ in GENERALISE_NUMBERS), "block_height")
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
@@ -89,9 +89,9 @@ TITLES = {
     "buildings": "buildings",
     "simplify": "city model",
     "mesh": "mesh: layers, grading, pad, soil",
-    "run": "where and how it runs",
-    "watch": "what it shows and writes",
-    "research": "research: other ways of the method, and their tolerances",
+    "run": "execution",
+    "watch": "display and reports",
+    "research": "research: alternative methods and their tolerances",
 }
 
 
@@ -125,13 +125,13 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
         What does each command, by its name.
     """
     common = Parser(add_help=False)
-    common.add_argument("--traceback", action="store_true", help="show where in the code an error arose")
+    common.add_argument("--traceback", action="store_true", help="show the traceback of an error")
     parser = Parser(
         prog="citystitch",
         description="LiDAR point clouds and building footprints in, one conforming tetrahedral city mesh out.",
         epilog=EXIT_CODES,
     )
-    parser.add_argument("--version", action=_Version, help="print the version and end")
+    parser.add_argument("--version", action=_Version, help="print the version and exit")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
     def add(name: str, handler: Handler, text: str) -> argparse.ArgumentParser:
@@ -145,20 +145,20 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
         return add(name, handlers[name], text)
 
     _add_run(command("run", "mesh a region from point clouds and footprints"))
-    plan = command("plan", "tell what a run would do and take, without doing it")
-    plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="write the plan as JSON too")
+    plan = command("plan", "forecast size, tasks, memory and time of a run, without running it")
+    plan.add_argument("--json", type=Path, dest="json_file", metavar="FILE", help="also write the plan as JSON")
     plan.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw tiles, files and footprints")
     _add_inputs(plan)
-    _add_check(command("check", "prove from the written files that a mesh is right"))
-    status = command("status", "tell how far a run is, whether it is alive, and how to go on")
+    _add_check(command("check", "verify a mesh from the written files"))
+    status = command("status", "show the progress of a run, whether it is alive, and how to resume it")
     status.add_argument("job", metavar="DIR|JOB", help="folder of a run, or number of its job")
-    status.add_argument("--json", action="store_true", dest="as_json", help="print all of it as JSON")
-    board = command("dashboard", "show the page of a run, at work, ended or dead, from its folder")
+    status.add_argument("--json", action="store_true", dest="as_json", help="print the status as JSON")
+    board = command("dashboard", "show the page of a running, ended or dead run, from its folder")
     board.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
-    view = command("view", "show 3D Tiles that were exported, in a browser")
+    view = command("view", "show exported 3D Tiles in a browser")
     view.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of the tiles")
     _add_address(board, view)
-    _add_report(command("report", "write report.html: what a run made, how good it is, what was left out"))
+    _add_report(command("report", "write report.html: output and quality of a run, and what was left out"))
     _add_fetch(command("fetch", "fetch the folder of a run from a bucket, and verify its checksums"))
     synth = command(
         "synth", "write a synthetic city: point cloud and footprints, or a town of houses with architecture"
@@ -170,7 +170,9 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     _add_demo(command("demo", "mesh, check and draw a synthetic city in tiles and a block of a real one"))
     _add_render(command("render", "draw a picture of a run"))
     add_job_commands(add, _add_inputs)
-    _add_edit(command("edit", "replace, remove or add buildings in a finished run, and mesh what that touches"))
+    _add_edit(
+        command("edit", "replace, remove or add buildings in a finished run, and mesh the affected tiles again")
+    )
     _add_export(command("export", "write the mesh of a run for other programs, each vertex once"))
     _add_convert(command("convert", "write city models, or that of a run, as another format of city models"))
     _add_detail(command("detail", "write city models with windows, doors and balconies by rules, at LoD3"))
@@ -178,7 +180,7 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
         command("generalise", "make blocks of buildings between streets: cells and LoD0C, LoD0B, LoD0A")
     )
     _add_wind(command("wind", "map mean wind and comfort from results of a wind case and a wind rose"))
-    command("kernels", "compile all kernels for this machine, as a first run does with what it needs")
+    command("kernels", "compile all kernels for this machine, before the first run")
     command("config", "print all parameters of a run, annotated, as a configuration file")
     return parser
 
@@ -190,14 +192,14 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         "--dashboard-address",
         default=ANYWHERE,
         metavar="HOST:PORT",
-        help="where the page of the run is shown while it is at work (default: a free port of 127.0.0.1)",
+        help="address of the page of the run (default: a free port of 127.0.0.1)",
     )
     shown.add_argument("--no-dashboard", action="store_true", help="show no page of the run")
     _add_choice(shown)
     words = shown.add_mutually_exclusive_group()
     words.add_argument("-q", "--quiet", action="store_true", help="print errors and the last line only")
-    words.add_argument("-v", "--verbose", action="store_true", help="print a line for each item too")
-    shown.add_argument("--log-json", type=Path, metavar="FILE", help="write what happens, a JSON object a line")
+    words.add_argument("-v", "--verbose", action="store_true", help="also print a line for each item")
+    shown.add_argument("--log-json", type=Path, metavar="FILE", help="write events, one JSON object a line")
     shown.add_argument(
         "--report",
         action=argparse.BooleanOptionalAction,
@@ -309,7 +311,9 @@ def _help(entry: "dataclasses.Field[Any]") -> str:
 
 def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int, roofs: str = "flat") -> None:
     parser.add_argument("--size", type=float, default=size, help=f"side of the city in m (default: {size:g})")
-    parser.add_argument("--buildings", type=int, default=buildings, help=f"their number (default: {buildings})")
+    parser.add_argument(
+        "--buildings", type=int, default=buildings, help=f"number of buildings (default: {buildings})"
+    )
     parser.add_argument("--density", type=float, default=1.5, help="points per m2 (default: 1.5)")
     parser.add_argument("--relief", type=float, default=20.0, help="height of the hills in m (default: 20)")
     parser.add_argument("--seed", type=int, default=1, help="same seed, same bytes (default: 1)")
@@ -323,9 +327,7 @@ def _add_city(parser: argparse.ArgumentParser, *, size: float, buildings: int, r
 
 def _add_choice(shown: Group) -> None:
     """Add which part of the region, or which levels, a run makes."""
-    shown.add_argument(
-        "--only", metavar="TILE", help="mesh one tile alone, in this process: to look into a failure"
-    )
+    shown.add_argument("--only", metavar="TILE", help="mesh one tile alone, in this process, to examine a failure")
     shown.add_argument(
         "--lods",
         metavar="LOD,...",
@@ -335,7 +337,7 @@ def _add_choice(shown: Group) -> None:
 
 def _add_town(synth: argparse.ArgumentParser) -> None:
     """Add what towns of houses with architecture have besides."""
-    town = synth.add_argument_group("towns of houses that are drawn by rules, with their city model")
+    town = synth.add_argument_group("towns of houses drawn by rules, with their city model")
     town.add_argument(
         "--style",
         choices=TOWN_STYLES,
@@ -343,12 +345,15 @@ def _add_town(synth: argparse.ArgumentParser) -> None:
         help="boxes: blocks, or roofs as of --roofs; others: houses with architecture (default: boxes)",
     )
     town.add_argument(
-        "--rules", type=Path, metavar="FILE", help="TOML or JSON with other rules than those of the style"
+        "--rules", type=Path, metavar="FILE", help="TOML or JSON file with rules that replace those of the style"
     )
     town.add_argument(
-        "--levels", default="1.2,2.2", metavar="LOD,...", help="of the city model: 0.0 to 3.3 (default: 1.2,2.2)"
+        "--levels",
+        default="1.2,2.2",
+        metavar="LOD,...",
+        help="levels of detail of the city model: 0.0 to 3.3 (default: 1.2,2.2)",
     )
-    town.add_argument("--walls", choices=TOWN_WALLS, default="walls", help="where walls stand (default: walls)")
+    town.add_argument("--walls", choices=TOWN_WALLS, default="walls", help="place of walls (default: walls)")
     town.add_argument(
         "--block-height",
         choices=BLOCK_HEIGHTS,
@@ -360,53 +365,57 @@ def _add_town(synth: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="N",
-        help="scan it in strips, with N pulses per m2 of a strip, instead of --density; writes truth.jsonl too",
+        help="scan in strips, with N pulses per m2 of a strip, instead of --density; also writes truth.jsonl",
     )
     town.add_argument(
         "--class-errors",
         type=float,
         metavar="SHARE",
-        help="of the points of --lidar, that have a wrong class (default: 0.01)",
+        help="share of the points of --lidar with a wrong class (default: 0.01)",
     )
     town.add_argument(
         "--trees",
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="of the corners of lots with trees (default: 0)",
+        help="share of the corners of lots with a tree (default: 0)",
     )
     town.add_argument(
-        "--water", type=float, default=0.0, metavar="SHARE", help="of the relief, that lakes fill (default: 0)"
+        "--water",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of the relief that lakes fill (default: 0)",
     )
     town.add_argument(
         "--variants",
         default="",
         metavar="NAME,...",
-        help="write each of these representations to a file of its own in variants/; all: all 392",
+        help="write each of these representations to a file in variants/; all: all 392",
     )
     town.add_argument(
         "--degrade",
         type=float,
         default=0.0,
         metavar="SIGMA",
-        help="write twins with normal noise of SIGMA m on their parameters besides, with the same ids",
+        help="also write twins with the same ids, with normal noise of SIGMA m on their parameters",
     )
     town.add_argument(
         "--broken",
         action="store_true",
-        help="write broken.city.jsonl besides: each fault of a solid once, by name",
+        help="also write broken.city.jsonl: each fault of a solid once, by name",
     )
     town.add_argument(
         "--parameters",
         type=Path,
         metavar="FILE",
-        help="make models of these: parameters.jsonl or .xml, also edited",
+        help="make models of these parameters: parameters.jsonl or .xml, also edited",
     )
     town.add_argument(
         "--footprints",
         type=Path,
         metavar="FILE",
-        help="make houses on these; rules of the style hold where attributes say nothing",
+        help="make houses on these footprints; rules of the style replace missing attributes",
     )
     town.add_argument(
         "--surfaces", action="store_true", help="surfaces with chimneys and overhangs, instead of solids without"
@@ -415,12 +424,12 @@ def _add_town(synth: argparse.ArgumentParser) -> None:
 
 def _add_report(report: argparse.ArgumentParser) -> None:
     report.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
-    words = "truth.jsonl of the synthetic town that was meshed, to hold its roofs against"
+    words = "truth.jsonl of the meshed synthetic town, to compare its roofs"
     report.add_argument("--truth", type=Path, metavar="FILE", help=words)
 
 
 def _add_fetch(fetch: argparse.ArgumentParser) -> None:
-    fetch.add_argument("source", metavar="s3://BUCKET/NAME", help="what --out of the run was")
+    fetch.add_argument("source", metavar="s3://BUCKET/NAME", help="value of --out of the run")
     fetch.add_argument("directory", type=Path, metavar="DIR", help="folder to write")
 
 
@@ -433,21 +442,20 @@ def _add_workers(parser: Any, what: str) -> None:
 def _add_check(check: argparse.ArgumentParser) -> None:
     check.add_argument("directory", type=place, metavar="DIR", help="folder of a run")
     what = check.add_mutually_exclusive_group()
-    what.add_argument(
-        "--store", action="store_true", help="instead hold every artefact of the run against its checksum"
-    )
+    what.add_argument("--store", action="store_true", help="instead verify the checksum of every file of the run")
     what.add_argument(
         "--cfd",
         action="store_true",
-        help="instead hold domain and cells against the guidelines for wind simulations of COST 732 and AIJ",
+        help="instead compare domain and cells with the guidelines for wind simulations of COST 732 and AIJ",
     )
-    _add_workers(check, "look at pieces")
+    _add_workers(check, "check pieces")
     check.add_argument(
         "--direction",
         type=float,
         action="append",
         metavar="DEGREES",
-        help="with --cfd: where the wind comes from, degrees clockwise from north (default: 270); several: repeat",
+        help="with --cfd: direction from which the wind comes, degrees clockwise from north (default: 270); "
+        "repeatable",
     )
 
 
@@ -508,16 +516,16 @@ def _add_edit(edit: argparse.ArgumentParser) -> None:
         "--replace",
         nargs=2,
         metavar=("ID", "FILE"),
-        help="put the footprint of a vector file in a building's place",
+        help="replace a building by the footprint of a vector file",
     )
-    what.add_argument("--remove", metavar="ID", help="take a building away")
+    what.add_argument("--remove", metavar="ID", help="remove a building")
     what.add_argument("--add", type=Path, metavar="FILE", help="add the footprints of a vector file")
     what.add_argument("--list", action="store_true", dest="as_list", help="print the edits so far")
     what.add_argument("--at", metavar="DATE", help="make the city of a day, YYYY-MM-DD, in --out")
     edit.add_argument("--out", type=_on_disk, metavar="DIR", help="folder for the city of a day")
-    edit.add_argument("--date", default="", help="day from which on the edit holds, YYYY-MM-DD (default: today)")
+    edit.add_argument("--date", default="", help="day from which the edit applies, YYYY-MM-DD (default: today)")
     edit.add_argument(
-        "--base", type=int, metavar="N", help="refuse the edit if one after number N is of the same building"
+        "--base", type=int, metavar="N", help="refuse the edit if an edit after number N changed the same building"
     )
     edit.add_argument("--workers", type=int, default=0, metavar="N", help="worker processes (default: this one)")
 
@@ -530,19 +538,20 @@ def _add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write")
     export.add_argument("--overwrite", action="store_true", help="replace it if it exists")
     given: dict[str, dict[str, Any]] = {
-        "parts": {"type": int, "metavar": "N", "help": "decomposed for N processes instead of whole"},
+        "parts": {"type": int, "metavar": "N", "help": "decompose the mesh for N processes"},
         "cells": {
             "choices": ("prism",),
-            "help": "prisms of a layered mesh, a third as many, instead of tetrahedra",
+            "help": "prisms of a layered mesh instead of tetrahedra, a third as many",
         },
         "case": {"choices": ("wind",), "help": "add the files of a simulation"},
         "direction": {
             "type": float,
             "action": "append",
             "metavar": "DEGREES",
-            "help": "where the wind comes from, degrees clockwise from north (default: 270); several: a case each",
+            "help": "direction from which the wind comes, degrees clockwise from north (default: 270); "
+            "repeatable, a case each",
         },
-        "wind_speed": {"type": float, "metavar": "M/S", "help": "of the undisturbed wind (default: 5)"},
+        "wind_speed": {"type": float, "metavar": "M/S", "help": "speed of the undisturbed wind (default: 5)"},
         "wind_height": {
             "type": float,
             "metavar": "M",
@@ -550,7 +559,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         },
         "wind_table": {
             "metavar": "FILE",
-            "help": "CSV of the profile by height (m): speed (m/s), and k and epsilon if it has them",
+            "help": "CSV file of the profile: height (m), speed (m/s), and optionally k and epsilon",
         },
         "roughness": {
             "type": float,
@@ -560,7 +569,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         "patch_roughness": {
             "action": "append",
             "metavar": "PATCH=M",
-            "help": "roughness length of a patch of ground, walls or roofs that differs; repeat for others",
+            "help": "roughness length of one patch of ground, walls or roofs; repeatable",
         },
         "buildings": {
             "choices": ("patches", "zones"),
@@ -568,31 +577,31 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         },
         "largest_part": {
             "action": "store_true",
-            "help": "of a mesh in parts that share no face, the one of the most cells alone",
+            "help": "of a mesh in parts that share no face, export only the one with the most cells",
         },
         "origin": {
             "metavar": "X,Y,Z|auto",
-            "help": "whole metres that coordinates count from; auto: the region's south-western corner",
+            "help": "origin of the coordinates in whole metres; auto: the region's south-western corner",
         },
         "geoid_height": {
             "type": float,
             "metavar": "M",
-            "help": "height of the geoid above the ellipsoid, which is added to all heights (default: 0)",
+            "help": "height of the geoid above the ellipsoid, added to all heights (default: 0)",
         },
         "vertical_crs": {
             "metavar": "EPSG",
-            "help": "CRS of the heights, EPSG:5709 say: PROJ adds the geoid's height at each place",
+            "help": "CRS of the heights, such as EPSG:5709; PROJ adds the height of the geoid at each place",
         },
         "slice_height": {
             "type": float,
             "action": "append",
             "metavar": "M",
-            "help": "add the cells at this height above the ground; repeat for others",
+            "help": "add the cells at this height above the ground; repeatable",
         },
         "slice_line": {
             "action": "append",
             "metavar": "X0,Y0,X1,Y1",
-            "help": "add the cells along an upright plane between two places of the CRS; repeat for others",
+            "help": "add the cells along a vertical plane between two places of the CRS; repeatable",
         },
         "scalars": {"action": "store_true", "help": "add arrays to colour by: tile, and radius ratio of cells"},
     }
@@ -605,7 +614,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
 def _add_convert(convert: argparse.ArgumentParser) -> None:
     """Add inputs, output and options of a conversion."""
     _add_models(convert)
-    convert.add_argument("--format", choices=NAMES, required=True, help="what to write")
+    convert.add_argument("--format", choices=NAMES, required=True, help="format to write")
     convert.add_argument(
         "-o",
         "--output",
@@ -625,7 +634,7 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="METRES",
-        help="write a folder with a file for each tile of this size; a building is in that of its middle",
+        help="write a folder with a file for each tile of this size; a building is in the tile of its middle",
     )
     convert.add_argument("--overwrite", action="store_true", help="replace the file or folder if it exists")
 
@@ -643,19 +652,23 @@ def _add_generalise(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace the files if they exist")
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: 0, this one)")
     source = parser.add_argument_group("buildings")
-    source.add_argument("--layer", default="", help="of --footprints (default: the only one)")
-    source.add_argument("--id-attribute", default="", metavar="ATTRIBUTE", help="with the id of a footprint")
-    source.add_argument("--height-attribute", default="", metavar="ATTRIBUTE", help="with its height (m)")
+    source.add_argument("--layer", default="", help="layer of --footprints (default: the only one)")
+    source.add_argument(
+        "--id-attribute", default="", metavar="ATTRIBUTE", help="attribute with the id of a footprint"
+    )
+    source.add_argument(
+        "--height-attribute", default="", metavar="ATTRIBUTE", help="attribute with its height (m)"
+    )
     source.add_argument("--crs", default="", metavar="EPSG", help="metric CRS (default: that of the buildings)")
     source.add_argument(
-        "--bounds", type=float, nargs=4, metavar=("XMIN", "YMIN", "XMAX", "YMAX"), help="of the region (m)"
+        "--bounds", type=float, nargs=4, metavar=("XMIN", "YMIN", "XMAX", "YMAX"), help="bounds of the region (m)"
     )
     lines = parser.add_argument_group("barriers and other objects, vector files")
     for name, text in (
         ("roads", "streets (default: the medial axis of the open space between buildings)"),
         ("railways", "further barriers"),
         ("water", "further barriers; areas are cut out of blocks"),
-        ("others", "areas that are no barriers but cut out of blocks, as parks"),
+        ("others", "areas that are no barriers but are cut out of blocks, such as parks"),
     ):
         lines.add_argument(f"--{name}", nargs="+", type=_on_disk, default=(), metavar="FILE", help=text)
     limits = parser.add_argument_group("thresholds (docs/generalisation.md)")
@@ -668,14 +681,21 @@ def _add_generalise(parser: argparse.ArgumentParser) -> None:
         "--block-height",
         choices=BLOCK_KEEPS,
         default=BLOCK_KEEPS[0],
-        help="mean height of a block: of its buildings by area, or what keeps their volume (default: area)",
+        help="height of a block: mean of its buildings by area, or the height that keeps their volume (default: "
+        "area)",
     )
-    marks = parser.add_argument_group("landmarks, which stay as they are at every level")
-    marks.add_argument("--landmark-height", type=float, default=0.0, metavar="M", help="from this height on")
-    marks.add_argument("--landmark-volume", type=float, default=0.0, metavar="M3", help="from this volume on")
-    marks.add_argument("--landmark-tag", default="", metavar="ATTRIBUTE[=VALUE]", help="with this attribute")
+    marks = parser.add_argument_group("landmarks, which stay unchanged at every level")
     marks.add_argument(
-        "--landmarks", default="", metavar="FILE|ID,...", help="of these ids; a file has one a line"
+        "--landmark-height", type=float, default=0.0, metavar="M", help="buildings from this height on"
+    )
+    marks.add_argument(
+        "--landmark-volume", type=float, default=0.0, metavar="M3", help="buildings from this volume on"
+    )
+    marks.add_argument(
+        "--landmark-tag", default="", metavar="ATTRIBUTE[=VALUE]", help="buildings with this attribute"
+    )
+    marks.add_argument(
+        "--landmarks", default="", metavar="FILE|ID,...", help="buildings with these ids; a file has one a line"
     )
 
 
@@ -690,7 +710,7 @@ def _add_models(parser: argparse.ArgumentParser) -> None:
         "--axis-order",
         choices=("xy", "yx"),
         default="",
-        help="which coordinate comes first, against what files show",
+        help="order of coordinates, instead of the detected one",
     )
 
 
@@ -705,21 +725,22 @@ def _add_detail(detail: argparse.ArgumentParser) -> None:
         "--rules", default="residential", metavar="NAME|FILE",
         help=f"{', '.join(RULES)}, or a file of rules, JSON or TOML (default: residential)",
     )  # fmt: skip
-    add("--viewpoint", default="", metavar="X,Y,Z", help="where from the city is seen; without: full detail")
+    add("--viewpoint", default="", metavar="X,Y,Z", help="viewpoint; without it: full detail")
     add(
         "--distance", default="", metavar="FULL,REDUCED",
-        help="metres from the viewpoint up to which assets are full, and from which on flat (default: 50,200)",
+        help="distances (m) from the viewpoint up to which assets are full, and from which they are flat "
+        "(default: 50,200)",
     )  # fmt: skip
     add(
         "--facing", type=float, default=None, metavar="DEGREES",
-        help="angle between façade and viewpoint from which on assets are flat; up to its half they are full",
+        help="angle between façade and viewpoint from which assets are flat; up to half of it they are full",
     )  # fmt: skip
     add(
         "--keep", default="", metavar="LABEL=PERCENT,...",
         help="least share of polygons by semantics: floor, window, door, balcony",
     )  # fmt: skip
-    add("--lod", choices=LODS, default="auto", help="level of detail that façades are put on (default: auto)")
-    add("--json", type=Path, default=None, dest="json_file", metavar="FILE", help="write the table as JSON too")
+    add("--lod", choices=LODS, default="auto", help="level of detail that gets façades (default: auto)")
+    add("--json", type=Path, default=None, dest="json_file", metavar="FILE", help="also write the table as JSON")
     add("--overwrite", action="store_true", help="replace the files if they exist")
 
 

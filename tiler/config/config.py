@@ -79,94 +79,97 @@ class Config:
     footprints: str = _parameter(
         UNSET,
         "input",
-        "SHP, GPKG, GeoJSON or GeoParquet file of building footprints; beside a city model, of the buildings that "
-        "it has not",
+        "SHP, GPKG, GeoJSON or GeoParquet file of building footprints; with a city model: buildings that it lacks",
     )
     buildings: tuple[str, ...] = _parameter(
         (), "input", "CityJSON, CityJSONSeq or CityGML files of buildings, or GeoPackages of 3DBAG, instead of "
-        "footprints, or beside them: their roof surfaces are meshed as they are",
+        "footprints or with them; their roof surfaces are meshed unchanged",
     )  # fmt: skip
     terrain: tuple[str, ...] = _parameter(
-        (), "input", "rasters with the height of the ground (GeoTIFF, COG, VRT), instead of ground points, which "
-        "count where these have none",
+        (), "input", "rasters of ground height (GeoTIFF, COG, VRT), instead of ground points; these count where "
+        "the rasters have no data",
     )  # fmt: skip
     lod: str = _parameter(
-        "auto", "input", "level of detail that is taken of each building of a city model: the best roofs that it "
-        "has, or the best level up to a number", choices=("auto", "1.2", "1.3", "2.1", "2.2"),
+        "auto", "input", "level of detail of the buildings of a city model: auto for the best roofs that it has, "
+        "or the best level up to a number", choices=("auto", "1.2", "1.3", "2.1", "2.2"),
     )  # fmt: skip
     prefer: str = _parameter(
-        "model", "input", "whose roof a house has that both a point cloud and a city model have one of",
+        "model", "input", "source of a roof that both the point cloud and the city model have",
         choices=("model", "points"),
     )  # fmt: skip
     axis_order: str = _parameter(
-        UNSET, "input", "which coordinate comes first in city models: xy for the easting, yx for the northing; "
-        "empty: what they show", choices=(UNSET, "xy", "yx"),
+        UNSET, "input", "first coordinate in city models: xy for the easting, yx for the northing; empty: "
+        "detected from the coordinates", choices=(UNSET, "xy", "yx"),
     )  # fmt: skip
     shift_z: float | str = _parameter(
-        0.0, "input", "added to all heights of city models, where they are not those of the terrain; auto: what "
-        "the rasters of terrain are above the feet of buildings in the median", unit="m", least=-1e4, most=1e4,
+        0.0, "input", "offset added to all heights of city models, if they differ from the terrain's; auto: "
+        "median height of the terrain rasters above the feet of buildings", unit="m", least=-1e4, most=1e4,
     )  # fmt: skip
     layer: str = _parameter(UNSET, "input", "layer of the footprint file; empty: its only or first one")
     id_attribute: str = _parameter(
-        UNSET, "input", "attribute that holds building ids; empty: a well-known name, else ids from geometry"
+        UNSET, "input", "attribute with building ids; empty: a well-known name, else ids from geometry"
     )
     height_attribute: str = _parameter(
         UNSET, "input", "attribute with heights above ground, for buildings without roof points", unit="m"
     )
     roof_attribute: str = _parameter(
-        UNSET, "input", "attribute with the shapes of roofs, as roof:shape of OSM has them or codes of CityGML; "
-        "empty: a well-known name; only for --roofs planes and skeleton",
+        UNSET, "input", "attribute with roof shapes, as in roof:shape of OSM or as CityGML codes; empty: a "
+        "well-known name; only for --roofs planes and skeleton",
     )  # fmt: skip
     land_cover: tuple[str, ...] = _parameter(
         (), "input", "vector files of polygons that make patches of the ground: water, street, grass and others"
     )
     land_cover_field: str = _parameter(
-        "class", "input", "attribute of land_cover with the class; of several with commas between them the first "
-        "that the table knows counts",
+        "class", "input", "attribute of land_cover with the class; of a comma-separated list the first whose "
+        "value is in the table",
     )  # fmt: skip
     land_cover_table: str = _parameter(
-        UNSET, "input", "TOML file with the patches of the ground, their roughness length and classes; empty: ours"
+        UNSET,
+        "input",
+        "TOML file with the patches of the ground, their roughness length and classes; empty: the built-in table",
     )
     water_points: bool = _parameter(
-        False, "input", "make water where points of class 9 lie: a patch of the ground at one height, beside "
-        "land_cover or alone",
+        False, "input", "make water where points of class 9 lie: a level patch of the ground, with or without "
+        "land_cover",
     )  # fmt: skip
     vegetation_classes: tuple[int, ...] = _parameter(
-        (), "input", "classes of points that are leaves, 5 or 3,4,5: cells between them are porous; empty: none",
+        (), "input", "point classes of vegetation, such as 5 or 3,4,5; cells between the leaves are porous; "
+        "empty: none",
         least=0, most=255,
     )  # fmt: skip
     trees: str = _parameter(
         UNSET,
         "input",
-        "vector file of trees: crowns, or positions, with heights or without, whose cells are porous",
+        "vector file of trees: crowns or positions, with or without heights; their cells are porous",
     )
     leaf_area_density: float = _parameter(
-        0.0, "input", "leaf area density of all trees; 0 takes what points let through, and 1 for trees whose "
-        "height the file states", unit="m2/m3", least=0, most=10,
+        0.0, "input", "leaf area density of all trees; 0: from the share of points that pass the leaves, and 1 "
+        "for trees whose height the file states", unit="m2/m3", least=0, most=10,
     )  # fmt: skip
     leaf_column: float = _parameter(
         2.0, "input", "side of the columns in which leaves are counted", unit="m", least=0.5, most=50
     )
-    crs: str = _parameter(
-        UNSET, "input", "CRS of the region, as EPSG:NNNN; empty: that of the data, where it states one"
-    )
+    crs: str = _parameter(UNSET, "input", "CRS of the region, as EPSG:NNNN; empty: the CRS that the data state")
     reproject: bool = _parameter(
-        False, "input", "reproject point clouds that are in another CRS than the region's, in degrees, or in a "
-        "projection without true lengths (Web Mercator): to crs, or to their UTM zone",
+        False, "input", "reproject point clouds in another CRS than the region's, in degrees, or in a projection "
+        "without true lengths (Web Mercator), to crs or to their UTM zone",
     )  # fmt: skip
     align: bool = _parameter(
-        False, "input", "move the footprints by the shift that fits the roofs in the point cloud best, as measured"
+        False, "input", "move the footprints by the measured shift that best fits the roofs in the point cloud"
     )
     height_unit: str = _parameter(
-        UNSET, "input", "unit of heights of the point clouds, whatever they state: m, ft, or ftUS (US survey "
-        "feet); empty: what they state, else metres, or feet where plan is in feet",
+        UNSET, "input", "unit of heights of the point clouds, instead of the stated one: m, ft, or ftUS (US "
+        "survey feet); empty: as stated, else metres, or feet where x and y are in feet",
         choices=(UNSET, "m", "ft", "ftUS"),
     )  # fmt: skip
     bounds: tuple[float, ...] = _parameter(
-        (), "input", "region as xmin ymin xmax ymax; empty: whole metres within the point clouds", unit="m"
+        (),
+        "input",
+        "region as xmin ymin xmax ymax; empty: extent of the point clouds, rounded inwards to whole metres",
+        unit="m",
     )
     building_classes: tuple[int, ...] = _parameter(
-        (BUILDING,), "input", "classes of points that mark buildings, as 6,67",
+        (BUILDING,), "input", "point classes of buildings, such as 6,67",
         source="ASPRS LAS 1.4", least=0, most=255,
     )  # fmt: skip
     skip_unreadable: bool = _parameter(
@@ -176,15 +179,15 @@ class Config:
         1.0, "terrain", "spacing of the terrain grid", unit="m", source="paper, step 1.3", least=Above(0)
     )
     ground_filter: bool = _parameter(
-        False, "terrain", "find ground points by an own filter, for clouds without ground classes"
+        False, "terrain", "classify ground points by the built-in filter, for clouds without ground classes"
     )
     min_building_area: float = _parameter(5.0, "buildings", "smaller footprints are dropped", unit="m2", least=0)
     vertex_tolerance: float = _parameter(
-        0.01, "buildings", "vertices closer than this are one; also the bound for needless ones", unit="m",
-        source="paper, step 1.4", least=Above(0), most=0.5,
+        0.01, "buildings", "vertices closer than this are merged; also the tolerance for removing redundant ones",
+        unit="m", source="paper, step 1.4", least=Above(0), most=0.5,
     )  # fmt: skip
     ground_margin: float = _parameter(
-        1.0, "buildings", "ground points lie within this distance of a footprint", unit="m",
+        1.0, "buildings", "ground points of a building lie within this distance of its footprint", unit="m",
         source="paper, step 1.5", least=Above(0),
     )  # fmt: skip
     ground_percentile: float = _parameter(
@@ -200,7 +203,7 @@ class Config:
         source="paper, step 1.6", least=0, most=100,
     )  # fmt: skip
     default_height: float = _parameter(
-        6.0, "buildings", "height above ground without roof points and attribute; 0 drops the building",
+        6.0, "buildings", "height above ground of a building without roof points and height attribute; 0 drops it",
         unit="m", least=0,
     )  # fmt: skip
     roof_clearance: float = _parameter(
@@ -245,32 +248,32 @@ class Config:
         source="paper, step 3.1", least=0.1,
     )  # fmt: skip
     open_size: float = _parameter(
-        0.0, "mesh", "target edge length far from walls, above mesh_size, which is that at walls; 0 takes "
-        "mesh_size everywhere", unit="m", least=0,
+        0.0, "mesh", "target edge length far from walls, above mesh_size (the length at walls); 0: mesh_size "
+        "everywhere", unit="m", least=0,
     )  # fmt: skip
     grading: float = _parameter(
         0.2, "mesh", "growth of the target edge length per metre away from walls, with open_size or pad",
         least=Above(0), most=1,
     )  # fmt: skip
     wall_size: float = _parameter(
-        0.0, "mesh", "target edge length at walls, in the plane alone, below mesh_size; 0 takes mesh_size",
+        0.0, "mesh", "horizontal target edge length at walls, below mesh_size; 0: mesh_size",
         unit="m", least=0,
     )  # fmt: skip
     wall_growth: float = _parameter(
-        1.2, "mesh", "with wall_size: ratio by which each edge is longer than the one before it on the way from a "
-        "wall", least=Above(1), most=2,
+        1.2, "mesh", "with wall_size: ratio of each edge length to the one before it, away from a wall",
+        least=Above(1), most=2,
     )  # fmt: skip
     refine: tuple[str, ...] = _parameter(
-        (), "mesh", "box or circle with a target edge length of its own, x0,y0,x1,y1,SIZE or x,y,RADIUS,SIZE in "
-        "coordinates of the region; may be repeated", unit="m",
+        (), "mesh", "box or circle with its own target edge length, x0,y0,x1,y1,SIZE or x,y,RADIUS,SIZE in "
+        "coordinates of the region; repeatable", unit="m",
     )  # fmt: skip
     refine_areas: str = _parameter(
-        UNSET, "mesh", "vector file of areas or lines, each with a target edge length of its own"
+        UNSET, "mesh", "vector file of areas or lines, each with its own target edge length"
     )
     refine_attribute: str = _parameter("size", "mesh", "attribute of refine_areas with that length in metres")
     refine_growth: float = _parameter(
-        1.2, "mesh", "with refine or refine_areas: ratio by which each edge is longer than the one before it on "
-        "the way from a box or an area", least=Above(1), most=2,
+        1.2, "mesh", "with refine or refine_areas: ratio of each edge length to the one before it, away from a "
+        "box or an area", least=Above(1), most=2,
     )  # fmt: skip
     focus: str = _parameter(
         UNSET, "mesh", "place of interest, x,y,RADIUS or x,y,RADIUS,SIZE: full detail and cells of SIZE (a "
@@ -278,9 +281,9 @@ class Config:
         unit="m",
     )  # fmt: skip
     lod_zones: tuple[str, ...] = _parameter(
-        (), "mesh", "zones with a level of detail (2.2, 1.3, 1.2, 0C, 0B, 0A) and a target edge length of their "
-        "own, at most mesh_size: circles x,y,RADIUS,LEVEL,SIZE, vector files of polygons with the attributes "
-        "level and size, and rest,LEVEL for all that is in none, 2.2 by default; the finest counts",
+        (), "mesh", "zones with their own level of detail (2.2, 1.3, 1.2, 0C, 0B, 0A) and target edge length, at "
+        "most mesh_size: circles x,y,RADIUS,LEVEL,SIZE, vector files of polygons with the attributes level and "
+        "size, and rest,LEVEL outside of all zones, 2.2 by default; where zones overlap, the finest counts",
     )  # fmt: skip
     generalised: str = _parameter(
         UNSET, "mesh", "GeoPackage of citystitch generalise with the blocks of zones of level 0C, 0B and 0A"
@@ -291,8 +294,8 @@ class Config:
         "tallest building; empty: none", unit="m",
     )  # fmt: skip
     min_angle: float = _parameter(
-        0.0, "mesh", "least angle of the plane mesh, but at sharp corners; 0 takes the mesher's own: 28 adaptive, "
-        "25 layered", unit="degrees", source="paper, step 3.1", least=0, most=32,
+        0.0, "mesh", "least angle of the plane mesh, except at sharp corners; 0: 28 for adaptive, 25 for layered",
+        unit="degrees", source="paper, step 3.1", least=0, most=32,
     )  # fmt: skip
     domain_height: float | str = _parameter(
         100.0, "mesh", "height of the domain above the terrain: metres, or 6H for six times the height of the "
@@ -303,14 +306,14 @@ class Config:
         "the highest terrain of the region", choices=("terrain", "flat"),
     )  # fmt: skip
     first_layer: float = _parameter(
-        0.0, "mesh", "height of the lowest cells above open ground, from which vertical spacing grows; 0 for a "
-        "spacing that is the same at all heights", unit="m", least=0,
+        0.0, "mesh", "height of the lowest cells above open ground, from which vertical spacing grows; 0: the "
+        "same spacing at all heights", unit="m", least=0,
     )  # fmt: skip
     layer_growth: float = _parameter(
-        1.2, "mesh", "with first_layer: ratio by which each layer is higher than the one below it", least=1, most=3
+        1.2, "mesh", "with first_layer: ratio of each layer height to the one below it", least=1, most=3
     )
     underground: float = _parameter(
-        0.0, "mesh", "depth of the soil that is meshed below the terrain, with the ground inside; 0 for none",
+        0.0, "mesh", "depth of the soil meshed below the terrain, with the ground as an interior surface; 0: none",
         unit="m", least=0, most=10_000,
     )  # fmt: skip
     mesher: str = _parameter(
@@ -331,7 +334,7 @@ class Config:
         1, "mesh", "rounds of moving levels at the worst cells with mesher = adaptive", least=0, most=20
     )
     layer_height: float = _parameter(
-        0.0, "mesh", "height of a layer with mesher = layered; 0 takes the mesh size", unit="m",
+        0.0, "mesh", "height of a layer with mesher = layered; 0: the mesh size", unit="m",
         source="paper, step 3.2", least=0,
     )  # fmt: skip
     smoother: str = _parameter(
@@ -352,8 +355,8 @@ class Config:
     tile_size: float = _parameter(
         0.0,
         "run",
-        "side of a tile, at least 14 mesh sizes; tiles are aligned to multiples of it in the CRS; 0 takes 1250 m, "
-        "and less for meshes finer than 10 m (660 m for 5 m, 350 m for 2.5 m), which have more cells",
+        "side of a tile, at least 14 mesh sizes; tiles are aligned to multiples of it in the CRS; 0: 1250 m, and "
+        "less for meshes finer than 10 m (660 m for 5 m, 350 m for 2.5 m), which have more cells",
         unit="m",
         least=0,
     )
@@ -361,19 +364,20 @@ class Config:
         0, "run", "worker processes on this machine; 0 runs in this process", least=0, most=1024
     )
     memory_limit: float = _parameter(
-        0.0, "run", "memory of a worker on this machine; 0 shares out nine tenths of what there is", unit="GiB",
+        0.0, "run", "memory of a worker on this machine; 0: nine tenths of the machine's memory, divided by the "
+        "workers", unit="GiB",
         least=0,
     )  # fmt: skip
     time_limit: float = _parameter(
-        3600.0, "run", "a task that takes longer in a worker of one thread is ended; 0 for no limit", unit="s",
+        3600.0, "run", "a task that takes longer in a single-threaded worker is ended; 0: no limit", unit="s",
         least=0,
     )  # fmt: skip
     retries: int = _parameter(
-        1, "run", "how often a task that fails is tried again before its tile is left out", least=0, most=100
+        1, "run", "number of times that a failed task is repeated before its tile is left out", least=0, most=100
     )
     store_patience: float = _parameter(
-        600.0, "run", "how long a run waits for the bucket of its results where that does not answer: less than "
-        "the 15 minutes for which S3 takes a signed request", unit="s", least=0, most=840,
+        600.0, "run", "time that a run waits for the bucket of its results if it does not answer: less than the "
+        "15 minutes for which S3 accepts a signed request", unit="s", least=0, most=840,
     )  # fmt: skip
     scheduler: str = _parameter(
         UNSET, "run", "address of a running Dask scheduler, whose workers see the same files; instead of workers"
@@ -383,7 +387,7 @@ class Config:
         "Dask's configuration",
     )  # fmt: skip
     tls_cert: str = _parameter(UNSET, "run", "likewise: certificate file of this client")
-    tls_key: str = _parameter(UNSET, "run", "likewise: file of its key; empty: in that of the certificate")
+    tls_key: str = _parameter(UNSET, "run", "likewise: file of its key; empty: the key is in the certificate file")
     cluster: str = _parameter(
         UNSET,
         "run",

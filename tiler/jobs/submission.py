@@ -53,14 +53,14 @@ class JobRecord:
 def add_job_commands(command: Command, add_parameters: Callable[[argparse.ArgumentParser], None]) -> None:
     """Add the commands; `add_parameters` adds point clouds and parameters of a run."""
     submit = command("submit", _submit, "submit a run to a cluster's batch system: SLURM, PBS, SGE or LSF")
-    submit.add_argument("--dry-run", action="store_true", help="print the scripts, and submit nothing")
+    submit.add_argument("--dry-run", action="store_true", help="print the scripts without submitting")
     add_parameters(submit)
-    cancel = command("cancel", _cancel, "cancel the job of a run and its workers; what is done is kept")
+    cancel = command("cancel", _cancel, "cancel the job of a run and its workers; results are kept")
     cancel.add_argument("job", metavar="JOB", help=JOB_HELP)
-    logs = command("logs", _logs, "print what the jobs of a run have printed")
+    logs = command("logs", _logs, "print the output of the jobs of a run")
     logs.add_argument("job", metavar="JOB", help=JOB_HELP)
-    logs.add_argument("--workers", action="store_true", help="those of workers too")
-    logs.add_argument("-f", "--follow", action="store_true", help="go on as long as there is more, until Ctrl-C")
+    logs.add_argument("--workers", action="store_true", help="also of the workers")
+    logs.add_argument("-f", "--follow", action="store_true", help="follow the output, until Ctrl-C")
 
 
 def find_run(job: str) -> Path:

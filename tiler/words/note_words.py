@@ -102,15 +102,17 @@ WORDS: dict[str, Words] = {
     "building-roof-raised": Words(REPAIRED, "{n} roof[s] [was|were] raised over the terrain at the walls"),
     "courtyard-filled": Words(REPAIRED, "{n} courtyard[s] smaller than --min-courtyard-area [was|were] filled"),
     "land-cover-unknown-class": Words(
-        DROPPED, "{n} file[s] of land cover [has|have] classes that the table does not know: they are ground"
+        DROPPED, "{n} file[s] of land cover [has|have] classes that are not in the table: they are ground"
     ),
     "land-cover-no-polygon": Words(DROPPED, "{n} file[s] of land cover [has|have] features that are no polygons"),
     "trees-left-out": Words(DROPPED, "{n} file[s] of trees [has|have] features that are no trees"),
-    "no-trees-in-region": Words(OTHER, "the file of trees has none in the region"),
+    "no-trees-in-region": Words(OTHER, "no tree of the file lies in the region"),
     "water-levels-differ": Words(
         OTHER, "{n} bod[y|ies] of water [has|have] several declared levels: the lowest counts"
     ),
-    "damaged-artefact": Words(REPAIRED, "{n} damaged or missing result[s] of an earlier run [was|were] made anew"),
+    "damaged-artefact": Words(
+        REPAIRED, "{n} damaged or missing result[s] of an earlier run [was|were] computed again"
+    ),
     "footprint-id-repeated": Words(REPAIRED, "{n} id[s] of several footprints [was|were] completed by geometry"),
     "footprint-on-border-clipped": Words(
         REPAIRED,
@@ -119,7 +121,7 @@ WORDS: dict[str, Words] = {
     ),
     "footprint-repaired": Words(REPAIRED, "{n} footprint[s] with an invalid ring [was|were] repaired"),
     "footprint-spike": Words(REPAIRED, "{n} footprint[s] lost a spike or slit"),
-    "footprint-split": Words(REPAIRED, "{n} footprint[s] fell into parts"),
+    "footprint-split": Words(REPAIRED, "{n} footprint[s] [was|were] split into parts"),
     "model-fault": Words(DROPPED, "{n} geometr[y|ies] of the city model cannot be read"),
     "model-in-two-files": Words(
         DROPPED, "{n} building[s] [is|are] in another city model, too, and count[s|] there"
@@ -151,9 +153,9 @@ WORDS: dict[str, Words] = {
     ),
     "solid-touching": Words(
         REPAIRED,
-        "{n} outline[s] that [touches itself|touch themselves] [was|were] parted for [its solid|their solids]",
+        "{n} outline[s] that [touches itself|touch themselves] [was|were] split for [its solid|their solids]",
     ),
-    "model-axes": Words(DEFAULTED, "the order of axes of city models was chosen by what they show"),
+    "model-axes": Words(DEFAULTED, "the order of axes of city models was detected from their coordinates"),
     "model-ground": Words(DEFAULTED, "the ground is that of the city model, as none is given"),
     "model-lower-level": Words(
         DEFAULTED, "{n} building[s] of the city model [has|have] no roof at the best level: a lower one was taken"
@@ -197,23 +199,23 @@ WORDS: dict[str, Words] = {
         DEFAULTED, "{n} footprint[s] got a hipped roof instead of the pyramidal one that [it names|they name]"
     ),
     "footprint-roof-form-lowered": Words(
-        REPAIRED, "{n} roof[s] of a given form [was|were] made lower, for the eaves to be above the ground"
+        REPAIRED, "{n} roof[s] of a given form [was|were] made lower, so that the eaves are above the ground"
     ),
     "footprint-roof-form-off": Words(
         OTHER, "{n} roof[s] of a given form [lies|lie] more than 1 m from [its|their] points"
     ),
     "footprint-roof-forms": Words(OTHER, "attributes of footprints name shapes of roofs"),
     "footprint-roof-forms-unknown": Words(
-        DEFAULTED, "attributes of footprints name shapes of roofs that are not made"
+        DEFAULTED, "attributes of footprints name shapes of roofs that are not supported"
     ),
     "footprint-roofs-by-levels": Words(DEFAULTED, "heights of roofs were taken from numbers of levels, 3 m each"),
-    "footprint-id-missing": Words(DEFAULTED, "{n} footprint[s] without an id [was|were] named by geometry"),
+    "footprint-id-missing": Words(DEFAULTED, "{n} footprint[s] without an id got one from the geometry"),
     "footprint-roof-from-attribute": Words(
         DEFAULTED, "{n} footprint[s] without roof points took the height of the attribute"
     ),
     "footprint-roof-from-default": Words(DEFAULTED, "{n} footprint[s] without roof points took --default-height"),
     "footprints-without-crs": Words(DEFAULTED, "the footprint file states no CRS: it was taken as the region's"),
-    "ground-filter": Words(DEFAULTED, "ground was found by our own filter"),
+    "ground-filter": Words(DEFAULTED, "ground points were classified by the built-in filter"),
     "no-building-class": Words(
         DEFAULTED, "point clouds without a building class: roof points were found within footprints"
     ),
@@ -222,8 +224,8 @@ WORDS: dict[str, Words] = {
     ),
     "crs-without-epsg": Words(OTHER, "the CRS has no EPSG code"),
     "crs-accuracy": Words(OTHER, "{n} reprojection[s] [is|are] less exact than the clearance"),
-    "cloud-without-crs": Words(DEFAULTED, "point clouds without a CRS were given one"),
-    "cloud-crs-overruled": Words(DEFAULTED, "--crs overruled what point clouds state"),
+    "cloud-without-crs": Words(DEFAULTED, "point clouds without a CRS got one"),
+    "cloud-crs-overruled": Words(DEFAULTED, "--crs replaced the CRS that point clouds state"),
     "cloud-crs-alike": Words(OTHER, "point clouds name one CRS in several ways"),
     "cloud-unit-of-key": Words(DEFAULTED, "the unit of point clouds is not that of their CRS"),
     "cloud-height-unit": Words(DEFAULTED, "the unit of heights was chosen"),
@@ -233,7 +235,7 @@ WORDS: dict[str, Words] = {
     "cloud-reprojected": Words(REPAIRED, "point clouds were reprojected"),
     "cloud-off-its-crs": Words(OTHER, "point clouds lie outside the area of use of the CRS"),
     "cloud-void-header-box": Words(
-        REPAIRED, "{n} point cloud[s] without a sound box in the header [was|were] read for it"
+        REPAIRED, "{n} point cloud[s] without valid bounds in the header [was|were] read to find them"
     ),
     "footprints-axes": Words(DEFAULTED, "axes of the footprints are not those of their CRS"),
     "footprints-converted": Words(REPAIRED, "coordinates of the footprints were converted to metres"),
@@ -244,7 +246,7 @@ WORDS: dict[str, Words] = {
         DEFAULTED, "{n} footprint[s] without points of the building class took smooth points of other classes"
     ),
     "footprint-curve-linearised": Words(
-        REPAIRED, "{n} footprint[s] with arcs [was|were] made of segments within 0.01 m"
+        REPAIRED, "arcs of {n} footprint[s] were replaced by segments within 0.01 m"
     ),
     "footprint-from-line": Words(
         REPAIRED, "{n} footprint[s] [is the outline of a closed line|are outlines of closed lines]"
@@ -254,23 +256,27 @@ WORDS: dict[str, Words] = {
     ),
     "footprint-heights-by-levels": Words(DEFAULTED, "heights were taken from numbers of levels, 3 m each"),
     "footprints-without-metadata": Words(DEFAULTED, "the Parquet file has no metadata of geometries"),
-    "footprints-layer-chosen": Words(OTHER, "the layer of polygons was taken of data of OpenStreetMap"),
-    "footprint-outlines-of-parts": Words(OTHER, "outlines of buildings keep what their parts do not cover"),
+    "footprints-layer-chosen": Words(OTHER, "the polygon layer of OpenStreetMap data was used"),
+    "footprint-outlines-of-parts": Words(
+        OTHER, "outlines of buildings were reduced to the area that their parts do not cover"
+    ),
     "footprint-outlines-replaced": Words(OTHER, "outlines of buildings were left out: their parts cover them"),
-    "footprint-parts": Words(OTHER, "parts of buildings (building:part) were taken one by one"),
+    "footprint-parts": Words(OTHER, "parts of buildings (building:part) became one footprint each"),
     "footprint-parts-covered": Words(OTHER, "parts of buildings below higher parts were left out"),
-    "footprint-parts-raised": Words(OTHER, "parts of buildings that begin above the ground were taken down to it"),
+    "footprint-parts-raised": Words(
+        OTHER, "parts of buildings that begin above the ground were extended down to it"
+    ),
     "footprints-not-buildings": Words(OTHER, "polygons of OpenStreetMap that are no buildings were left out"),
-    "footprints-of-osm": Words(OTHER, "tags of OpenStreetMap say which polygons are buildings, and how high"),
+    "footprints-of-osm": Words(OTHER, "tags of OpenStreetMap select the buildings and give their heights"),
     "footprints-without-geometry": Words(OTHER, "the footprints have features without a geometry"),
     "footprint-roof-like-plants": Words(
-        OTHER, "{n} footprint[s] [has|have] no roof points but points of plants as smooth as a roof, not used"
+        OTHER, "{n} footprint[s] without roof points [has|have] unused vegetation points as smooth as a roof"
     ),
     "domain-lower-than-guidelines": Words(OTHER, "the domain is lower than six times the tallest building"),
     "footprints-outside": Words(OTHER, "footprints lie beyond the region"),
     "footprints-reader-warning": Words(OTHER, "the reader of the footprints gave {n} warning[s]"),
     "footprints-reprojected": Words(OTHER, "the footprints were reprojected to the region's CRS"),
-    "mesh-in-parts": Words(OTHER, "the mesh falls apart: parts of it share no face"),
+    "mesh-in-parts": Words(OTHER, "the mesh has parts that share no face"),
     "terrain-far-from-points": Words(OTHER, "terrain was interpolated over large areas without ground points"),
     "no-footprints-in-region": Words(OTHER, "no footprint of a file lies in the region"),
     "no-cells-in-zones": Words(OTHER, "no cell of the generalised blocks lies in a zone that takes blocks"),

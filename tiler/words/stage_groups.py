@@ -30,7 +30,7 @@ STAGES: dict[str, tuple[str, str]] = {
     "members-": (SIMPLIFICATION, "clusters of tiles"),
     "shapes-": (SIMPLIFICATION, "outlines"),
     "model": (SIMPLIFICATION, "city model"),
-    "left-out": (SIMPLIFICATION, "what is left out"),
+    "left-out": (SIMPLIFICATION, "footprints left out"),
     "summits": (SEAMS, "highest ground"),
     "domain": (SEAMS, "height of the domain"),
     "rim": (SEAMS, "ground at the border of the region"),
