@@ -27,7 +27,8 @@ from tiler.engine.records import Records
 from tiler.engine.schedule import StoppedError
 from tiler.engine.task import Record
 from tiler.executors.local_cluster import local
-from tiler.monitoring.progress import RunProgress
+from tiler.monitoring.progress import ProgressFile
+from tiler.monitoring.watchers import Watchers
 from tiler.planning.own_stages import OwnStages, list_stages
 from tiler.planning.plan import Plan, make_plan
 from tiler.store.out_folder import MANIFEST_PATH, STORE
@@ -53,11 +54,11 @@ def memory() -> float:
     return int(Path("/proc/self/status").read_text().split("RssAnon:")[1].split()[0]) / 1000
 
 
-class Meter(RunProgress):
-    """The progress of a run that also looks at the memory of the driver, and ends a run when it is asked to."""
+class Meter(Watchers):
+    """The state of a run and its file; looks at the memory of the driver, and ends a run when it is asked to."""
 
-    def __init__(self, out: Path, config: Config, plan: Plan, *, stop_after: int = 0) -> None:
-        super().__init__(out, config, {s.name: len(plan.layout.boxes(s.scope)) for s in list_stages(config)})
+    def __init__(self, out: Path, config: Config, *, stop_after: int = 0) -> None:
+        super().__init__([ProgressFile(out, config)])
         self.peak, self.n_done, self.stop_after = memory(), 0, stop_after
         self.samples: list[tuple[int, float]] = []  # tasks done, and memory (MB)
         self.stop: Callable[[], None] = lambda: None
@@ -101,7 +102,7 @@ def drive(
     """Run all stages of a region and what follows them, as `tiler.workflow.run` does, but for the index files."""
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
-    meter = Meter(out, config, plan, stop_after=stop_after)
+    meter = Meter(out, config, stop_after=stop_after)
     missing, again = Missing(), 0
     begin = time.perf_counter()
     while True:

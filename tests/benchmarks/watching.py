@@ -27,7 +27,8 @@ from tiler.engine.stage import Scope
 from tiler.engine.task import Record
 from tiler.engine.watcher import RunStart, Watcher
 from tiler.interface.synth import write_city
-from tiler.monitoring.events import EventLog, begin_file
+from tiler.monitoring.event_log import EventLog
+from tiler.monitoring.events import begin_file
 from tiler.monitoring.live_view import LiveView
 from tiler.monitoring.run_log import RunLog
 from tiler.monitoring.terminal import make_view

@@ -118,7 +118,7 @@ def _done(stage: str, name: str, t: float, rng: np.random.Generator, *, reused: 
     notes = {"footprint-too-small": 1} if stage == "houses" and rng.random() < 0.2 else {}
     seconds = 0.0 if reused else round(float(rng.gamma(2.0, 1.5)), 3)
     memory = int(3e8 + 2e8 * rng.random())
-    event = {"t": round(t, 3), "event": "done", "stage": stage, "name": name, "done": 0, "seconds": seconds}
+    event = {"t": round(t, 3), "event": "done", "stage": stage, "name": name, "seconds": seconds}
     return event | {"memory": memory, "reused": reused, "notes": notes, "facts": facts}
 
 

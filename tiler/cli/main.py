@@ -1,6 +1,7 @@
 """The command line: `citystitch run | plan | check | status | report | render | export` and others."""
 
 import argparse
+import dataclasses
 import gc
 import json
 import logging
@@ -9,13 +10,13 @@ import signal
 import sys
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pipeline.data.errors import CityError, ConfigError
 from tiler.cli.negative_values import mark_values
-from tiler.cli.parser import EXPORT_OPTION, GENERALISE_OPTIONS, SYNTH_BUILDINGS, Handler, build_parser
+from tiler.cli.parser import EXPORT_OPTION, SYNTH_BUILDINGS, Handler, build_parser
 from tiler.config.config import Config, make_config
 from tiler.config.config_file import annotated_defaults, with_file
 from tiler.jobs.submission import describe_job, find_run, job_line
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from tiler.interface.synth import SynthFiles
     from tiler.towns.town_tile import Output
 
-EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+T = TypeVar("T")
+EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
 DEMO_TILES = 3  # tiles along each side of the demo's city, fewer where they would be too small
 LEAST_DEMO_TILE = 150.0  # m
 BLOCK = Path(__file__).parents[1] / "demo_block"  # real data of a few hundred kilobytes
@@ -149,7 +151,8 @@ def _run_config(
     if config.workers and not config.on_cluster and not has_record(config.out):
         start_fork_server()  # at once, as there is something to do; else with the first task
     gc.set_threshold(GARBAGE)
-    from tiler.monitoring.events import EventLog, open_log
+    from tiler.monitoring.event_log import EventLog
+    from tiler.monitoring.events import open_log
     from tiler.monitoring.terminal import make_view, print_last_line, print_summary
     from tiler.store.out_folder import refuse_result
     from tiler.workflow.run import run
@@ -194,9 +197,7 @@ def _check(options: argparse.Namespace) -> int:
         from tiler.check.cfd_guidelines import check_guidelines
         from tiler.export.wind_profile import WEST
 
-        report = check_guidelines(options.directory, options.direction or [WEST])
-        print("\n".join(map(printable, report.lines())))
-        return 0 if report.ok else EXIT_FAILED
+        return _print_proof(check_guidelines(options.directory, options.direction or [WEST]))
     if options.direction:
         raise ConfigError("--direction: is for check --cfd; give that too")
     return _check_folder(options.directory, options.workers)
@@ -206,7 +207,10 @@ def _check_folder(directory: Path, workers: int = 0) -> int:
     from tiler.check.check import check_run
     from tiler.store.results import StoredTerrain
 
-    report = check_run(directory, StoredTerrain, workers=workers)
+    return _print_proof(check_run(directory, StoredTerrain, workers=workers))
+
+
+def _print_proof(report: Any) -> int:
     print("\n".join(map(printable, report.lines())))
     return 0 if report.ok else EXIT_FAILED
 
@@ -443,60 +447,50 @@ def _export(options: argparse.Namespace) -> int:
         if name.startswith(EXPORT_OPTION)
     }
     words = {"name": options.format, "overwrite": options.overwrite, "options": given}
-    for line in export_run(options.directory, options.output, **words):
-        say(line)
-    say(str(options.output))
-    return 0
+    return _tell(export_run(options.directory, options.output, **words), options.output)
 
 
 def _convert(options: argparse.Namespace) -> int:
     from tiler.convert.convert import Asked, convert_models
 
-    words = {name: getattr(options, name) for name in ("lod", "crs", "axis_order", "tile_size", "overwrite")}
-    asked = Asked(options.format, **words)
-    for line in convert_models(options.inputs, options.output, asked):
-        say(line)
-    say(str(options.output))
-    return 0
+    asked = _from_options(Asked, options, name=options.format)
+    return _tell(convert_models(options.inputs, options.output, asked), options.output)
 
 
 def _generalise(options: argparse.Namespace) -> int:
     from tiler.generalisation.generalise import generalise
     from tiler.generalisation.options import Asked, Inputs, Landmarks, read_ids
 
-    files = ("models", "footprints", "layer", "id_attribute", "height_attribute", "crs", "roads", "railways")
-    inputs = Inputs(**{name: getattr(options, name) for name in (*files, "water", "others", "bounds")})
-    marks = ("height", "volume", "tag")
     landmarks = Landmarks(
-        **{name: getattr(options, f"landmark_{name}") for name in marks}, ids=read_ids(options.landmarks)
+        height=options.landmark_height,
+        volume=options.landmark_volume,
+        tag=options.landmark_tag,
+        ids=read_ids(options.landmarks),
     )
-    asked = Asked(**{name: getattr(options, name) for name in GENERALISE_OPTIONS}, landmarks=landmarks)
+    asked, inputs = _from_options(Asked, options, landmarks=landmarks), _from_options(Inputs, options)
     words = {"workers": options.workers, "overwrite": options.overwrite}
-    for line in generalise(inputs, options.output, asked, **words):
-        say(line)
-    say(str(options.output))
-    return 0
+    return _tell(generalise(inputs, options.output, asked, **words), options.output)
 
 
 def _detail(options: argparse.Namespace) -> int:
     from tiler.detail.detail import DetailAsked, detail_models
 
-    names = (
-        "rules",
-        "viewpoint",
-        "distance",
-        "facing",
-        "keep",
-        "lod",
-        "crs",
-        "axis_order",
-        "json_file",
-        "overwrite",
-    )
-    asked = DetailAsked(**{name: getattr(options, name) for name in names})
-    for line in detail_models(options.inputs, options.output, asked):
+    asked = _from_options(DetailAsked, options)
+    return _tell(detail_models(options.inputs, options.output, asked), options.output)
+
+
+def _from_options(kind: type[T], options: argparse.Namespace, **given: Any) -> T:
+    """Make a dataclass of the options with the names of its fields, but for those that are given."""
+    entries: Any = kind
+    names = [entry.name for entry in dataclasses.fields(entries) if entry.name not in given]
+    return kind(**{name: getattr(options, name) for name in names}, **given)
+
+
+def _tell(lines: Iterable[str], output: Path) -> int:
+    """Print what a command has to say, and at last what it wrote."""
+    for line in lines:
         say(line)
-    say(str(options.output))
+    say(str(output))
     return 0
 
 
@@ -504,10 +498,8 @@ def _wind(options: argparse.Namespace) -> int:
     from tiler.wind.study import WindMaps, assess_wind
 
     maps = WindMaps(options.rose, options.rose_height, options.resolution)
-    for line in assess_wind(options.directory, options.output, maps, overwrite=options.overwrite):
-        say(line)
-    say(str(options.output))
-    return 0
+    lines = assess_wind(options.directory, options.output, maps, overwrite=options.overwrite)
+    return _tell(lines, options.output)
 
 
 def _kernels(_: argparse.Namespace) -> int:

@@ -57,24 +57,11 @@ GENERALISE_NUMBERS = (
     ("default_height", 6.0, "M", "height of buildings without a known height"),
     ("tile_size", 1000.0, "M", "side of the tiles, which are processed one by one"),
 )
-GENERALISE_OPTIONS = (*(name for name, *_ in GENERALISE_NUMBERS), "block_height")
 EXPORT_OPTION = "option of a format: "  # begins the names of these among what was parsed
 # What a first run needs stands first in the help of a run, what is for studies of the method last.
 ESSENTIAL = (
-    *(
-        "footprints",
-        "buildings",
-        "terrain",
-        "out",
-        "crs",
-        "bounds",
-        "mesh_size",
-        "domain_height",
-        "border",
-        "tile_size",
-        "workers",
-    ),
-    "overwrite",
+    *("footprints", "buildings", "terrain", "out", "crs", "bounds", "mesh_size", "domain_height", "border"),
+    *("tile_size", "workers", "overwrite"),
 )
 RESEARCH = (
     *("vertex_tolerance", "ground_margin", "ground_percentile", "roof_height", "roof_percentile"),
@@ -527,7 +514,7 @@ def _add_edit(edit: argparse.ArgumentParser) -> None:
     edit.add_argument(
         "--base", type=int, metavar="N", help="refuse the edit if an edit after number N changed the same building"
     )
-    edit.add_argument("--workers", type=int, default=0, metavar="N", help="worker processes (default: this one)")
+    _add_workers(edit, "mesh")
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:
@@ -650,7 +637,7 @@ def _add_generalise(parser: argparse.ArgumentParser) -> None:
         help="GeoPackage of all levels; FILE.city.json and FILE.levels.json go beside it",
     )  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="replace the files if they exist")
-    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: 0, this one)")
+    _add_workers(parser, "work on squares")
     source = parser.add_argument_group("buildings")
     source.add_argument("--layer", default="", help="layer of --footprints (default: the only one)")
     source.add_argument(

@@ -3,8 +3,9 @@
 import dataclasses
 import math
 import unicodedata
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, get_args, get_origin, get_type_hints
 
 from pipeline.data.classes import BUILDING, GROUND, HIGH_NOISE, LOW_NOISE, WATER
@@ -36,10 +37,10 @@ CLEARANCE_OF_MODELS = 0.5  # m; their walls are exact: moved by more, a court co
 LEAST_FIRST_LAYER = 0.001  # mesh sizes; flatter cells are of no use to any solver
 
 
-# What may be given as a URL.
-URLS = (
-    *("pointcloud", "footprints", "buildings", "terrain", "refine_areas", "land_cover", "trees", "out"),
-    *("lod_zones", "generalised"),
+# Parameters that name inputs: files, folders, patterns or URLs; of zones not all values do.
+INPUTS = (
+    *("pointcloud", "footprints", "buildings", "terrain", "land_cover", "land_cover_table", "trees"),
+    *("refine_areas", "lod_zones", "generalised"),
 )
 
 
@@ -417,6 +418,15 @@ class Config:
         return (*self.pointcloud, *self.buildings, *self.terrain)
 
     @property
+    def inputs(self) -> list[str]:
+        """All inputs, as they were given."""
+        given: list[str] = []
+        for name in INPUTS:
+            value = self.zones_asked.files if name == "lod_zones" else getattr(self, name)
+            given += [value] if isinstance(value, str) else value
+        return list(filter(None, given))
+
+    @property
     def building_files(self) -> tuple[str, ...]:
         """Files of buildings: of a city model, and footprints."""
         return (*self.buildings, *filter(None, [self.footprints]))
@@ -451,12 +461,17 @@ class Config:
         """Whether blocks of generalised buildings may stand for those of some zones."""
         return bool(self.zoned and self.generalised)
 
-    @property
+    @cached_property
     def zones_asked(self) -> ZonesAsked:
         """What options say of zones."""
         return read_zones_asked(
             self.lod_zones, self.focus, mesh_size=self.mesh_size, blocks=bool(self.generalised)
         )
+
+    @cached_property
+    def refinements_asked(self) -> list[tuple[float, tuple[float, ...]]]:
+        """Boxes and circles with a size of their own, as `read_refinement` gives them."""
+        return [read_refinement(text, self.largest_size) for text in self.refine]
 
     @property
     def finest_size(self) -> float:
@@ -533,6 +548,7 @@ CONDITIONS = {
     "fem_tolerance": ("mesher", "layered"),
 }
 TLS = ("tls_ca", "tls_cert", "tls_key")
+NAMED = ("generalised", *TLS)  # files that a message does not repeat
 OF_FLAT_ROOFS = ("split_levels", "roof_group")
 SOIL = ("least_spacing", "most_spacing", "stagger")  # of these, those that count for soil with either mesher
 
@@ -546,49 +562,33 @@ def idle_parameters(config: Config) -> list[str]:
     ['smoother = fem has no effect: it counts with mesher = layered']
     """
     default = Config()
-    idle = [
-        f"{name} = {getattr(config, name)} has no effect: it counts with {other} = {value}"
+    others = config.refine or config.refine_areas or config.zoned
+    idle: list[tuple[tuple[str, ...], object, str]] = [
+        ((name,), getattr(config, other) == value or (config.underground and name in SOIL), f"{other} = {value}")
         for name, (other, value) in CONDITIONS.items()
-        if getattr(config, name) != getattr(default, name)
-        and getattr(config, other) != value
-        and not (config.underground and name in SOIL)
-    ]
-    if config.has_sloped_roofs:
-        idle += [
-            f"{name} = {getattr(config, name)} has no effect: it counts with roofs = flat"
-            for name in OF_FLAT_ROOFS
-            if getattr(config, name) != getattr(default, name)
-        ]
-    if config.grading != default.grading and not config.graded_size:
-        idle.append(f"grading = {config.grading:g} has no effect: it counts with open_size above 0")
-    if config.wall_growth != default.wall_growth and not config.wall_size:
-        idle.append(f"wall_growth = {config.wall_growth:g} has no effect: it counts with wall_size above 0")
-    if config.refine_growth != default.refine_growth and not (
-        config.refine or config.refine_areas or config.zoned
-    ):
-        idle.append(
-            f"refine_growth = {config.refine_growth:g} has no effect: it counts with refine, refine_areas, "
-            "focus, lod_zones"
-        )
-    if config.generalised and not config.zoned:
-        idle.append("generalised has no effect: it counts with lod_zones, focus")
-    if config.refine_attribute != default.refine_attribute and not config.refine_areas:
-        idle.append(f"refine_attribute = {config.refine_attribute} has no effect: it counts with refine_areas")
-    idle += [
-        f"{name} = {getattr(config, name)} has no effect: it counts with land_cover"
-        for name in ("land_cover_field", "land_cover_table")
-        if getattr(config, name) != getattr(default, name) and not config.covered
     ]
     idle += [
-        f"{name} = {getattr(config, name):g} has no effect: it counts with vegetation_classes, trees"
-        for name in ("leaf_area_density", "leaf_column")
-        if getattr(config, name) != getattr(default, name) and not config.has_trees
+        (OF_FLAT_ROOFS, not config.has_sloped_roofs, "roofs = flat"),
+        (("grading",), config.graded_size, "open_size above 0"),
+        (("wall_growth",), config.wall_size, "wall_size above 0"),
+        (("refine_growth",), others, "refine, refine_areas, focus, lod_zones"),
+        (("generalised",), config.zoned, "lod_zones, focus"),
+        (("refine_attribute",), config.refine_areas, "refine_areas"),
+        (("land_cover_field", "land_cover_table"), config.covered, "land_cover"),
+        (("leaf_area_density", "leaf_column"), config.has_trees, "vegetation_classes, trees"),
+        (("layer_growth",), config.first_layer, "first_layer above 0"),
+        (TLS, config.scheduler, "scheduler"),
     ]
-    if config.layer_growth != default.layer_growth and not config.first_layer:
-        idle.append(f"layer_growth = {config.layer_growth:g} has no effect: it counts with first_layer above 0")
-    if not config.scheduler:
-        idle += [f"{name} has no effect: it counts with scheduler" for name in TLS if getattr(config, name)]
-    return idle
+
+    def show(name: str) -> str:
+        return name if name in NAMED else f"{name} = {getattr(config, name)}"
+
+    return [
+        f"{show(name)} has no effect: it counts with {what}"
+        for names, counts, what in idle
+        for name in names
+        if not counts and getattr(config, name) != getattr(default, name)
+    ]
 
 
 def make_config(values: Mapping[str, Any]) -> Config:
@@ -616,18 +616,16 @@ def make_config(values: Mapping[str, Any]) -> Config:
 def with_absolute_inputs(config: Config) -> Config:
     """Name inputs such that they are found from any folder."""
     return dataclasses.replace(
-        config,
-        pointcloud=tuple(map(absolute, config.pointcloud)),
-        buildings=tuple(map(absolute, config.buildings)),
-        terrain=tuple(map(absolute, config.terrain)),
-        footprints=absolute(config.footprints) if config.footprints else "",
-        refine_areas=absolute(config.refine_areas) if config.refine_areas else "",
-        lod_zones=tuple(absolute(text) if is_file(text) else text for text in config.lod_zones),
-        generalised=absolute(config.generalised) if config.generalised else "",
-        land_cover=tuple(map(absolute, config.land_cover)),
-        land_cover_table=absolute(config.land_cover_table) if config.land_cover_table else "",
-        trees=absolute(config.trees) if config.trees else "",
+        config, **{name: change_places(name, getattr(config, name), absolute) for name in INPUTS}
     )
+
+
+def change_places(name: str, value: Any, change: Callable[[str], str]) -> Any:
+    """Change the places that the value of a parameter of `INPUTS` names; what names none stays as it is."""
+    if isinstance(value, (list, tuple)):
+        return type(value)(change_places(name, item, change) for item in value)
+    is_place = isinstance(value, str) and value and (name != "lod_zones" or is_file(value))
+    return change(value) if is_place else value
 
 
 def _convert(name: str, value: Any, wanted: Any) -> Any:
@@ -649,7 +647,7 @@ def _convert(name: str, value: Any, wanted: Any) -> Any:
         raise ConfigError(f"{name} = {_shown(value)}: {wanted.__name__} expected, not {type(value).__name__}")
     if isinstance(value, str):
         _check_text(name, value)
-        if name in URLS:
+        if name in (*INPUTS, "out"):
             check_url(value)
     return value
 
@@ -770,8 +768,7 @@ def _check_sizes(config: Config) -> None:
             f"wall_size = {config.wall_size:g} m: must be at least {LEAST_SIZE:g} m and below mesh_size = "
             f"{config.mesh_size:g} m; 0 takes mesh_size"
         )
-    for text in config.refine:
-        read_refinement(text, config.largest_size)
+    _ = config.refinements_asked
 
 
 def _check_zones(config: Config) -> None:

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import ConfigError
-from tiler.config.config import TLS, UNSET, Config
-from tiler.config.zones import is_file
+from tiler.config.config import INPUTS, TLS, UNSET, Config, change_places
 from tiler.objects.places import is_url
 from tiler.words.plain_text import shorten, suggest
 
@@ -157,23 +156,9 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _relative_to(folder: Path, name: str, value: Any) -> Any:
-    if name in ("pointcloud", "buildings", "terrain", "land_cover") and isinstance(value, (str, list)):
-        value = [value] if isinstance(value, str) else value
-        return [_below(folder, item) if isinstance(item, str) else item for item in value]
-    if name == "lod_zones" and isinstance(value, (str, list)):
-        value = [value] if isinstance(value, str) else value
-        return [_below(folder, item) if isinstance(item, str) and is_file(item) else item for item in value]
-    if (
-        name in ("footprints", "refine_areas", "generalised", "land_cover_table", "trees", "out", *TLS)
-        and isinstance(value, str)
-        and value
-    ):
-        return _below(folder, value)
-    return value
-
-
-def _below(folder: Path, text: str) -> str:
-    return text if is_url(text) else str(folder / text)
+    if name not in (*INPUTS, *TLS, "out"):
+        return value
+    return change_places(name, value, lambda text: text if is_url(text) else str(folder / text))
 
 
 def _toml(value: Any) -> str:

@@ -1,15 +1,14 @@
 """What the page asks for, as plain JSON: head, stages, series, failures, messages and the map."""
 
 import time
-from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
 from tiler.dashboard.follow import Follower
-from tiler.dashboard.items import State
 from tiler.dashboard.map_view import Question, describe_map
-from tiler.dashboard.model import SEAM, TILE, RunModel
-from tiler.monitoring.tally import StageTally, estimate_share, estimate_time
+from tiler.monitoring.items import State
+from tiler.monitoring.run_state import SEAM, TILE, RunState
+from tiler.monitoring.stage_state import add_up
 from tiler.words.note_words import say_notes
 from tiler.words.stage_groups import group_of_stage, group_stages, title_of_stage
 
@@ -59,19 +58,18 @@ def tell(follower: Follower, question: Question) -> dict[str, Any]:
     return answer
 
 
-def describe_head(model: RunModel, *, alive: bool) -> dict[str, Any]:
+def describe_head(model: RunState, *, alive: bool) -> dict[str, Any]:
     """Describe which run it is, its state, and how long it may still take (s), None where unknown."""
     status = model.standing(alive=alive)
     taken = {name: model.head.get(name) for name in ("error", "command", "bounds", "crs", "tile_size", "workers")}
     end = time.time() if status == "running" else model.last
-    stages, spent = _tally(model), end - model.first if model.first else 0.0
     return taken | {
         "status": status,
         "began": round(model.began, 1),
         "last": round(model.last, 1),
         "seconds": round(max(end - model.began, 0.0), 1) if model.began else 0.0,
-        "left": None if status != "running" else estimate_time(stages, spent),
-        "share": 1.0 if status == "done" else round(estimate_share(stages, spent), 4),
+        "left": None if status != "running" else model.time_left(end),
+        "share": 1.0 if status == "done" else round(model.share_done(end), 4),
         "memory": model.memory,
         "notes": [say_notes(kind, n) for kind, n in model.notes.most_common(20)],
         "n_notes": model.notes.total(),
@@ -79,7 +77,7 @@ def describe_head(model: RunModel, *, alive: bool) -> dict[str, Any]:
     }
 
 
-def list_values(model: RunModel) -> list[list[str]]:
+def list_values(model: RunState) -> list[list[str]]:
     """List the values that the map can be coloured by: name and title."""
     facts = {fact for items in model.items.values() for fact in items.facts}
     first = [name for name in TITLES if name in COUNTED or name in facts]
@@ -87,51 +85,36 @@ def list_values(model: RunModel) -> list[list[str]]:
     return [[name, TITLES.get(name, name.replace("_", " "))] for name in names]
 
 
-def _tally(model: RunModel) -> dict[str, StageTally]:
-    """How far each stage is, for the estimates of `tiler.monitoring.tally`."""
-    return {
-        name: StageTally(
-            max(stage.total, stage.done),
-            stage.done,
-            stage.counts[State.REUSED],
-            stage.counts[State.FAILED],
-            stage.counts[State.RUNNING],
-            stage.seconds,
-        )
-        for name, stage in model.stages.items()
-    }
-
-
-def _describe_step(model: RunModel, step: str, names: Iterable[str]) -> dict[str, Any]:
-    """Add up the stages of a step (`tiler.words.stage_groups`)."""
-    stages = [model.stages[name] for name in names]
-    counts = sum((stage.counts for stage in stages), Counter[int]())
-    reused, failed, running = (counts[state] for state in (State.REUSED, State.FAILED, State.RUNNING))
-    scopes = {stage.scope for stage in stages}
+def _describe_step(model: RunState, step: str, names: Iterable[str]) -> dict[str, Any]:
+    """Describe the stages of a step (`tiler.words.stage_groups`) together."""
+    stages = {name: model.stages[name] for name in names}
+    whole = add_up(stages)
+    total = 0
+    for one in stages.values():
+        total += max(one.total, one.done + one.counts[State.FAILED] + one.counts[State.RUNNING])
     return {
         "name": step,
-        "mapped": bool(scopes & {TILE, SEAM}),
-        "total": sum(
-            max(stage.total, stage.done + stage.counts[State.FAILED] + stage.counts[State.RUNNING])
-            for stage in stages
-        ),
-        "done": sum(stage.done for stage in stages),
-        "reused": reused,
-        "running": running,
-        "failed": failed,
-        "seconds": round(sum(stage.seconds for stage in stages), 2),
+        "mapped": any(one.scope in {TILE, SEAM} for one in stages.values()),
+        "total": total,
+        "done": whole.done,
+        "reused": whole.counts[State.REUSED],
+        "running": whole.counts[State.RUNNING],
+        "failed": whole.counts[State.FAILED],
+        "seconds": round(whole.seconds, 2),
     }
 
 
-def _describe_at_work(model: RunModel, *, alive: bool) -> list[list[Any]]:
+def _describe_at_work(model: RunState, *, alive: bool) -> list[list[Any]]:
     """List what runs, longest first."""
+    if model.ended:
+        return []
     now = time.time() if alive else model.last
     running = [(item, since) for item, since in model.at_work.items() if item not in model.queued]
     longest = sorted(running, key=lambda one: one[1])[:SHOWN_AT_WORK]
     return [[title_of_stage(stage), name, round(max(now - since, 0.0), 1)] for (stage, name), since in longest]
 
 
-def _describe_failures(model: RunModel) -> list[dict[str, Any]]:
+def _describe_failures(model: RunState) -> list[dict[str, Any]]:
     last: Iterable[Any] = list(model.failures)[-SHOWN_FAILURES:]
     return [
         {

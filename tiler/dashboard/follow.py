@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.data.errors import CityError, InputError
-from tiler.dashboard.model import RunModel
+from tiler.monitoring.events import decode
+from tiler.monitoring.run_state import RunState
 from tiler.store.folder_lock import is_held
 from tiler.store.out_folder import EVENTS, RUN_RECORD
 
@@ -30,7 +31,7 @@ class Follower:
 
     Attributes
     ----------
-    model : RunModel
+    model : RunState
         What was read so far.
     run : str
         Changes when a run starts the file anew: what was known before is void.
@@ -50,7 +51,7 @@ class Follower:
         self._start(None)
 
     def _start(self, identity: tuple[int, int] | None) -> None:
-        self.model, self._identity = RunModel(), identity
+        self.model, self._identity = RunState(), identity
         self._offset, self._rest = 0, b""
         self.share = 1.0
         self.run = f"{time.time_ns():x}"
@@ -99,7 +100,7 @@ class Follower:
             self.model.ignored += 1
         for line in lines:
             if line.strip():
-                self.model.fold(_parse(line))
+                self.model.fold(decode(line))
 
     def _from_record(self) -> None:
         """Show a run that wrote no events by its record."""
@@ -138,10 +139,3 @@ def events_of_record(record: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         yield {"event": "failed", "name": name} | told
     for kind, group in record.get("notes", {}).items():
         yield {"event": "message", "text": f"{group['count']} {str(kind).replace('-', ' ')}"}
-
-
-def _parse(line: bytes) -> object:
-    try:
-        return json.loads(line)
-    except (ValueError, RecursionError):
-        return None

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tiler.dashboard.items import Codes, Items, State, combine, tally
-from tiler.dashboard.model import SEAM, TILE, RunModel
+from tiler.monitoring.items import Codes, Items, State, combine, tally
+from tiler.monitoring.run_state import SEAM, TILE, RunState
 
 KEPT_VIEWS = 8
 MOST_SHOWN = 4096  # tiles, or cells of tiles, that a map has at most
@@ -43,12 +43,12 @@ class Question:
     key: str = ""
 
 
-def describe_map(model: RunModel, run: str, question: Question) -> dict[str, Any]:
+def describe_map(model: RunState, run: str, question: Question) -> dict[str, Any]:
     """Describe a map for the page.
 
     Parameters
     ----------
-    model : RunModel
+    model : RunState
         The run.
     run : str
         Name of the run's file, part of the key.
@@ -121,30 +121,14 @@ def _describe_seams(seams: Items, question: Question, since: int, *, whole: bool
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A part of the region, and its cells.
+    """A part of the region, and its cells; `group`, `order` and `first` only where there are cells."""
 
-    Attributes
-    ----------
-    inside : intp, (n,)
-        Its tiles.
-    level : int
-        Tiles along the side of a cell; 1 where tiles are themselves.
-    boxes : float64, (n or m, 4)
-        Boxes of tiles or cells (m).
-    group : int64, (n,)
-        Cell of each tile; this and the others only where there are cells.
-    order : intp, (n,)
-        Tiles by cell.
-    first : intp, (m,)
-        Where each cell begins in `order`.
-    """
-
-    inside: NDArray[np.intp]
-    level: int
-    boxes: NDArray[np.float64]
-    group: NDArray[np.int64]
-    order: NDArray[np.intp]
-    first: NDArray[np.intp]
+    inside: NDArray[np.intp]  # (n,) its tiles
+    level: int  # tiles along the side of a cell; 1 where tiles are themselves
+    boxes: NDArray[np.float64]  # (n or m, 4) of tiles or cells (m)
+    group: NDArray[np.int64]  # (n,) cell of each tile
+    order: NDArray[np.intp]  # (n,) tiles by cell
+    first: NDArray[np.intp]  # (m,) where each cell begins in `order`
 
 
 def _choose_part(tiles: Items, view: Box | None) -> _Part:

@@ -8,9 +8,9 @@ import numpy as np
 
 from pipeline.data.errors import CityError
 from tiler.dashboard.follow import Follower
-from tiler.dashboard.items import STATES, Items, State
 from tiler.dashboard.map_view import LOWEST
-from tiler.dashboard.model import SEAM, TILE, RunModel
+from tiler.monitoring.items import STATES, Items, State
+from tiler.monitoring.run_state import SEAM, TILE, RunState
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 RUN_STATES = ("running", "done", "failed", "stopped", "dead", "unknown")
@@ -35,12 +35,12 @@ class Family:
         return f"{self.name}_total" if self.kind == "counter" else self.name
 
 
-def families(model: RunModel, *, alive: bool, share: float = 1.0) -> list[Family]:
+def families(model: RunState, *, alive: bool, share: float = 1.0) -> list[Family]:
     """All metrics of a run.
 
     Parameters
     ----------
-    model : RunModel
+    model : RunState
         The run.
     alive : bool
         Whether it is at work.

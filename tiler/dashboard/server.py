@@ -228,17 +228,10 @@ def show_folder(folder: Path, address: str, say: Callable[[str], None]) -> None:
     follower = Follower(folder)
     with follower.lock:
         follower.advance(0.0)
-    with watched_folder(follower, address, say), suppress(KeyboardInterrupt):
-        threading.Event().wait()
-
-
-@contextmanager
-def watched_folder(follower: Follower, address: str, say: Callable[[str], None]) -> Iterator[str]:
-    """Show the page of a run by a server of its own, and tell its URL."""
-    with serve(follower, address) as url:
+    with serve(follower, address) as url, suppress(KeyboardInterrupt):
         say(f"dashboard: {url} (Ctrl-C ends it)")
         _warn_of_others(address, say)
-        yield url
+        threading.Event().wait()
 
 
 @contextmanager

@@ -28,14 +28,12 @@ from tiler.engine.task_graph import (
     Refs,
     extents,
     find_refs,
-    joined_reads,
     list_all,
     list_items,
     list_refs,
     order_stages,
     own_refs,
     readers,
-    reads_everything,
 )
 from tiler.engine.watcher import Watcher
 from tiler.store.store import Store
@@ -66,6 +64,8 @@ class Engine:
     ----------
     layout, context : Layout, object
         Of what is run next.
+    parameters : object
+        As given, and what `add_parameters` added.
     records : Records
         What came of each stage and item so far.
     set_aside : dict of (str, str) to SetAside
@@ -101,7 +101,7 @@ class Engine:
         self.policy = policy or Policy()
         self.stopped = False
         self._gaps = Gaps(layout.absent)
-        self._parameters, self.context = parameters, context
+        self.parameters, self.context = parameters, context
         self.executor, self.watcher = executor, watcher or Watcher()
         self.items: dict[str, tuple[Scope, Items]] = {}
         self._laid_out: dict[str, tuple[Layout, Any]] = {}
@@ -157,7 +157,7 @@ class Engine:
 
     def add_parameters(self, **values: Any) -> None:
         """Give values to parameters that only what was run so far decides; those of the same name are replaced."""
-        self._parameters = SimpleNamespace(**(vars(self._parameters) | values))
+        self.parameters = SimpleNamespace(**(vars(self.parameters) | values))
 
     def lay_out(self, layout: Layout, context: Any) -> None:
         """Go on over another layout: what is run from now on has its items, what was run keeps its own.
@@ -171,10 +171,6 @@ class Engine:
         """
         self.layout, self.context = layout, context
         self._gaps = Gaps(layout.absent)
-
-    def describe_layout(self) -> None:
-        """Hand the watcher the items of the layout, where they differ from those at the start of the run."""
-        self.watcher.laid_out(self.layout)
 
     def laid_out(self, stage: str) -> tuple[Layout, Any]:
         """Layout and context that a stage was run with, for `lay_out`."""
@@ -244,9 +240,9 @@ class Engine:
                 list_refs(here, source, here, dict.fromkeys(here.names, ()))
                 if source in named_by
                 else self._refs(stage, here, source, known)
-                for source, _ in joined_reads(stage)
+                for source in sorted({read.stage for read in stage.reads})
             )
-            values = declared_values(stage, self._parameters)
+            values = declared_values(stage, self.parameters)
             digest = stage_digest(stage, values, self.layout)
             plan.append(Planned(stage, here, refs, first, digest, Declared(stage.name, values), named_by))
             known[stage.name] = (stage.scope, here)
@@ -296,7 +292,7 @@ class Engine:
         by_extent = {read.by_extent for read in stage.reads if read.stage == source}
         if len(by_extent) > 1:
             raise ValueError(f"stage {stage.name} reads {source} both by box and by extent")
-        everything = reads_everything(stage.scope, scope)
+        everything = Scope.REGION in (stage.scope, scope)  # whose items read, or are read by, all
         (first, *_) = (read for read in stage.reads if read.stage == source)
         if first.own:
             if first.optional:

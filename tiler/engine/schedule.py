@@ -188,16 +188,9 @@ class Schedule:
         return a == b or (scope is Scope.SEAM and owners.get(a, a) == owners.get(b, b))
 
     def _make_part(self, ticket: int, refs: dict[str, tuple[str, ...]], before: Collection[Item]) -> Part:
-        """Make a task; what it reads counts by its content. The worker looks for an earlier result.
+        """Make a task; what it reads, from `_find_reads`, counts by its content.
 
-        Parameters
-        ----------
-        ticket : int
-            Number of the task.
-        refs : dict of str to tuple of str
-            What it reads, from `_find_reads`.
-        before : collection of (str, str)
-            Items before it in its submission, whose content is not known yet.
+        That of items `before` it in its submission is not known yet. The worker looks for an earlier result.
         """
         engine, planned = self.engine, self.plan[self.rank[ticket]]
         scope, (stage, name) = planned.stage.scope, self._item(ticket)

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tiler.engine.stage import Box, Layout, Read, Scope, Stage, check_box
+from tiler.engine.stage import Box, Layout, Read, Stage, check_box
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,11 +200,6 @@ def extents(items: Items, facts: Mapping[str, Mapping[str, Any]], stage: str) ->
     return Items(items.names, boxes)
 
 
-def reads_everything(reader: Scope, source: Scope) -> bool:
-    """Whether a stage reads all items of another one, wherever they are."""
-    return Scope.REGION in (reader, source)
-
-
 def invert(refs: Sequence[tuple[int, Refs, int]], n_tasks: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Turn refs around: which tasks wait for each task.
 
@@ -235,12 +230,6 @@ def readers(refs: Refs) -> NDArray[np.int32]:
     """Give the reading item of each ref."""
     counts = np.diff(refs.start)
     return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-
-
-def joined_reads(stage: Stage) -> list[tuple[str, list[Read]]]:
-    """Group the reads of a stage by what they read, sorted by name."""
-    names = sorted({read.stage for read in stage.reads})
-    return [(name, [read for read in stage.reads if read.stage == name]) for name in names]
 
 
 def _query(

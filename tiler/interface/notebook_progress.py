@@ -5,10 +5,10 @@ import sys
 import time
 from typing import Any
 
-from tiler.engine.submission import Item
-from tiler.engine.task import Record
 from tiler.engine.watcher import RunStart
-from tiler.monitoring.tally import Tally
+from tiler.monitoring.events import Event
+from tiler.monitoring.run_state import RunState
+from tiler.monitoring.watchers import EventWatcher
 from tiler.words.stage_groups import title_of_stage
 
 EVERY = 0.25  # s between two updates of the output
@@ -21,7 +21,7 @@ def in_notebook() -> bool:
     return shell is not None and hasattr(shell, "kernel")
 
 
-class NotebookProgress(Tally):
+class NotebookProgress(EventWatcher):
     """Shows how far a run is in the output of the cell that runs.
 
     Notes
@@ -31,49 +31,32 @@ class NotebookProgress(Tally):
     """
 
     def __init__(self) -> None:
-        super().__init__()
+        self._state, self._began = RunState(), time.perf_counter()
         self._drawn = 0.0
         self._failed: list[str] = []
         self._said: list[str] = []
         self._end = ""
         self._display: Any = None
 
+    def take(self, event: Event, state: RunState) -> None:
+        """Take note of an event; a message waits for the next update, since a signal's handler may send it."""
+        self._state = state
+        if event["event"] == "message":
+            self._said.append(event["text"])
+            return
+        if event["event"] == "failed" and "needs" not in event:
+            self._failed.append(f"{title_of_stage(event['stage'])} {event['name']}: {event['reason']}")
+        if event["event"] in {"submitted", "done", "failed"} and time.perf_counter() - self._drawn >= EVERY:
+            self._draw()
+
     def begin(self, start: RunStart) -> None:
         """Show all stages that are known."""
-        super().begin(start)
         self._draw()
-
-    def submitted(self, stage: str, name: str) -> None:
-        """Take note of an item that was given to a worker."""
-        super().submitted(stage, name)
-        self._draw_sometimes()
-
-    def done(self, stage: str, n_done: int, total: int, record: Record) -> None:
-        """Take note of an item that is done."""
-        super().done(stage, n_done, total, record)
-        self._draw_sometimes()
-
-    def failed(
-        self, stage: str, name: str, reason: str, needs: Item | None = None, *, ends_run: bool = False
-    ) -> None:
-        """Take note of an item that failed."""
-        super().failed(stage, name, reason, needs)
-        if needs is None:
-            self._failed.append(f"{title_of_stage(stage)} {name}: {reason}")
-        self._draw_sometimes()
-
-    def say(self, text: str) -> None:
-        """Keep a sentence; it is shown with the next update, since a signal's handler may be what says it."""
-        self._said.append(text)
 
     def end(self, status: str, error: str = "") -> None:
         """Show the end."""
         self._end = f"{status}: {error}" if error else status
         self._draw()
-
-    def _draw_sometimes(self) -> None:
-        if time.perf_counter() - self._drawn >= EVERY:
-            self._draw()
 
     def _draw(self) -> None:
         from IPython.display import display
@@ -89,18 +72,18 @@ class NotebookProgress(Tally):
         done, total = self._counts()
         failed = f", {len(self._failed):,} failed" if self._failed else ""
         state = f" - {self._end}" if self._end else ""
-        return f"{done:,} of {total:,} tasks, {self.elapsed:.0f} s{failed}{state}"
+        return f"{done:,} of {total:,} tasks, {time.perf_counter() - self._began:.0f} s{failed}{state}"
 
     def _counts(self) -> tuple[int, int]:
-        stages = self.stages.values()
+        stages = self._state.stages.values()
         return sum(stage.done for stage in stages), sum(stage.total for stage in stages)
 
     def _page(self) -> str:
         rows = [_bar("all tasks", *self._counts())]
         rows += [
             _bar(name, group.done, group.total)
-            for name, group in self.groups().items()
-            if group.running and not self._end
+            for name, group in self._state.groups().items()
+            if group.in_hand and not self._end
         ]
         lists = [("failed", self._failed), ("", self._said)]
         told = "".join(_list(title, lines) for title, lines in lists if lines)

@@ -12,8 +12,11 @@ from rich.live import Live
 from rich.text import Text
 
 from tiler.engine.watcher import RunStart
+from tiler.monitoring.events import Event
 from tiler.monitoring.run_log import PROGRESS, LogView
-from tiler.monitoring.tally import StageTally, Tally, format_duration
+from tiler.monitoring.run_state import RunState
+from tiler.monitoring.stage_state import StageState, format_duration
+from tiler.monitoring.watchers import EventWatcher
 from tiler.words.note_words import say_notes
 from tiler.words.plain_text import printable
 
@@ -26,7 +29,7 @@ REST = 4  # rows of the view besides them, and the cursor's
 FULL, EMPTY, PLAIN_FULL, PLAIN_EMPTY = "━", "─", "#", "-"
 
 
-class LiveView(Tally):
+class LiveView(EventWatcher):
     """Shows a run in the last rows of a terminal, and above them what it logs.
 
     Parameters
@@ -43,25 +46,25 @@ class LiveView(Tally):
     """
 
     def __init__(self, console: Console, *, verbose: bool = False) -> None:
-        super().__init__()
         self._console, self._waiting = console, SimpleQueue[logging.LogRecord]()
         handler = QueueHandler(self._waiting)
         handler.addFilter(lambda record: record.name != PROGRESS.name)  # the bars show that
         self._log = LogView(handler, logging.DEBUG if verbose else logging.INFO)
         self._live = Live(console=console, auto_refresh=False, transient=True, vertical_overflow="crop")
         self._stop = threading.Event()
+        self._state = RunState()
         self._thread = threading.Thread(target=self._draw_now_and_then, name="view", daemon=True)
+
+    def take(self, event: Event, state: RunState) -> None:
+        """Keep the state; print at once what was logged before the view begins."""
+        self._state = state
+        if not self._thread.is_alive():
+            self._print_lines()
 
     def begin(self, start: RunStart) -> None:
         """Begin to draw."""
-        super().begin(start)
         self._live.start()
         self._thread.start()
-
-    def say(self, text: str) -> None:
-        """Print at once what was logged before the view begins."""
-        if not self._thread.is_alive():
-            self._print_lines()
 
     def end(self, status: str, error: str = "") -> None:
         """Take the view away, and print what waits."""
@@ -78,7 +81,8 @@ class LiveView(Tally):
             began = time.thread_time()
             self._print_lines()
             size = self._console.size
-            self._live.update(draw(self, size.width, size.height, plain=is_plain(self._console)), refresh=True)
+            rows = draw(self._state, size.width, size.height, now=time.time(), plain=is_plain(self._console))
+            self._live.update(rows, refresh=True)
             pause = max(LEAST_EVERY, (time.thread_time() - began) / SHARE)
 
     def _print_lines(self) -> None:
@@ -93,15 +97,17 @@ def is_plain(console: Console) -> bool:
     return not console.encoding.lower().startswith("utf")
 
 
-def draw(tally: Tally, width: int, height: int, *, plain: bool = False) -> Text:
+def draw(run: RunState, width: int, height: int, *, now: float, plain: bool = False) -> Text:
     """Draw how far a run is.
 
     Parameters
     ----------
-    tally : Tally
+    run : RunState
         What is known.
     width, height : int
         Characters and rows of the terminal.
+    now : float
+        The time (s since 1970).
     plain : bool
         In ASCII alone.
 
@@ -110,23 +116,22 @@ def draw(tally: Tally, width: int, height: int, *, plain: bool = False) -> Text:
     Text
         Rows that are shorter than `width`, and fewer than `height`: a terminal must not wrap or scroll them.
     """
-    at_work = [(name, state) for name, state in tally.groups().items() if state.running and state.left]
+    at_work = [(name, state) for name, state in run.groups().items() if state.in_hand and state.left]
     room = max(min(ROWS, height - REST), 0)
     shown = at_work if len(at_work) <= room else at_work[: max(room - 1, 0)]
-    rows = [_draw_stage(tally, name, state, width, plain=plain) for name, state in shown]
+    rows = [_draw_stage(name, state, width, now=now, plain=plain) for name, state in shown]
     if len(at_work) > len(shown) and room:
         rows.append(Text(f"  and {len(at_work) - len(shown)} more steps at work"))
-    rows += [_draw_all(tally, width, plain=plain), _draw_facts(tally, width)]
+    rows += [_draw_all(run, width, now=now, plain=plain), _draw_facts(run, width, now=now)]
     for row in rows:
         row.truncate(width - 1, overflow="ellipsis" if not plain else "crop")
     return Text("\n").join(rows)
 
 
-def _draw_stage(tally: Tally, name: str, state: StageTally, width: int, *, plain: bool) -> Text:
-    words = (
-        f" {f'{state.done:,}/{state.total:,}':>13} {_format_rate(tally.rate(state)):>9} {_format_mean(state):>13}"
-    )
-    more = f"  {state.running:,} in hand" if width >= WIDE else ""
+def _draw_stage(name: str, state: StageState, width: int, *, now: float, plain: bool) -> Text:
+    rate = _format_rate(state.rate(now))
+    words = f" {f'{state.done:,}/{state.total:,}':>13} {rate:>9} {_format_mean(state):>13}"
+    more = f"  {state.in_hand:,} in hand" if width >= WIDE else ""
     more += f"  {state.failed:,} failed" if state.failed else ""
     share = state.done / state.total if state.total else 0.0
     return (
@@ -134,11 +139,11 @@ def _draw_stage(tally: Tally, name: str, state: StageTally, width: int, *, plain
     )
 
 
-def _draw_all(tally: Tally, width: int, *, plain: bool) -> Text:
-    groups = list(tally.groups().values())
+def _draw_all(run: RunState, width: int, *, now: float, plain: bool) -> Text:
+    groups = list(run.groups().values())
     finished = sum(not state.left for state in groups)
-    left, share = tally.time_left(), tally.share_done()
-    if not tally.began:
+    left, share = run.time_left(now), run.share_done(now)
+    if not run.first:
         when = "starting"
     elif finished == len(groups):
         when = "writing it down"
@@ -149,21 +154,21 @@ def _draw_all(tally: Tally, width: int, *, plain: bool) -> Text:
     return row.append(f" {share:4.0%} {when:>15}  {finished:,} of {len(groups):,} steps")
 
 
-def _draw_facts(tally: Tally, width: int) -> Text:
-    seconds = int(tally.elapsed)
-    workers = _count(tally.workers, "worker") if tally.workers else "a cluster"
+def _draw_facts(run: RunState, width: int, *, now: float) -> Text:
+    seconds = int(now - run.began)
+    workers = _count(run.workers, "worker") if run.workers else "a cluster"
     parts = [f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}", workers]
-    parts.append(f"{_count(tally.in_hand, 'task')} in hand")
-    if tally.peak_memory:
-        parts.append(f"peak {tally.peak_memory / 2**20:,.0f} MiB")
+    parts.append(f"{_count(len(run.at_work), 'task')} in hand")
+    if run.memory:
+        parts.append(f"peak {run.memory / 2**20:,.0f} MiB")
     row = Text("  " + ", ".join(parts))
-    if tally.failures:
-        row.append(f", {tally.failures:,} failed", "red")
-    number = tally.warnings.total()
+    if run.n_own:
+        row.append(f", {run.n_own:,} failed", "red")
+    number = run.notes.total()
     if number:
         row.append(f", {_count(number, 'warning')}", "yellow")
         if width >= WIDE:
-            kinds = islice(tally.warnings.most_common(), 5)
+            kinds = islice(run.notes.most_common(), 5)
             row.append(": " + ", ".join(printable(say_notes(kind, n)) for kind, n in kinds))
     return row
 
@@ -183,7 +188,7 @@ def _format_rate(rate: float) -> str:
     return f"{rate:,.1f}/s" if rate >= 1 else f"{60 * rate:.1f}/min"
 
 
-def _format_mean(state: StageTally) -> str:
+def _format_mean(state: StageState) -> str:
     ran = state.done - state.reused
     return f"{state.seconds / ran:,.2f} s each" if ran > 0 else ""
 

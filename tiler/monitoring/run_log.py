@@ -7,10 +7,11 @@ Levels: ``ERROR`` for items that failed, ``INFO`` for finished groups of stages 
 import logging
 import time
 
-from tiler.engine.submission import Item
-from tiler.engine.task import Record
 from tiler.engine.watcher import Watcher
-from tiler.monitoring.tally import StageTally, Tally, format_duration
+from tiler.monitoring.events import Event
+from tiler.monitoring.run_state import RunState
+from tiler.monitoring.stage_state import StageState, format_duration
+from tiler.monitoring.watchers import EventWatcher
 from tiler.words.note_words import say_notes
 from tiler.words.plain_text import printable
 from tiler.words.stage_groups import group_of_stage, title_of_stage
@@ -22,7 +23,7 @@ LISTED_FAILURES = 20  # that are logged as errors; the record has all
 EVERY = 60.0  # s without a line, after which one says how far a stage is
 
 
-class RunLog(Tally):
+class RunLog(EventWatcher):
     """Logs what happens in a run.
 
     Parameters
@@ -32,43 +33,44 @@ class RunLog(Tally):
     """
 
     def __init__(self, *, every: float = EVERY) -> None:
-        super().__init__()
         self._every, self._logged = every, time.monotonic()
         self._ended: set[str] = set()  # groups
 
-    def done(self, stage: str, n_done: int, total: int, record: Record) -> None:
-        """Log a finished group of stages, or each item."""
-        super().done(stage, n_done, total, record)
+    def take(self, event: Event, state: RunState) -> None:
+        """Log a finished group of stages, an item, a failure, or a sentence for the user."""
+        match event["event"]:
+            case "done":
+                self._done(event, state)
+            case "failed":
+                self._failed(event, state)
+            case "message":
+                self._log(logging.INFO, event["text"])
+
+    def _done(self, event: Event, state: RunState) -> None:
         if LOGGER.isEnabledFor(logging.DEBUG):
-            what = "was there" if record.reused else f"{record.seconds.get('all', 0.0):.2f} s"
-            notes = "".join(f", {say_notes(kind, n)}" for kind, n in record.notes.items())
-            self._log(logging.DEBUG, f"    {title_of_stage(stage)} {record.name}  {what}{notes}")
-        group = group_of_stage(stage)
-        if n_done == total:
-            state = self.groups()[group]
-            if not state.left and group not in self._ended:
+            what = "was there" if event["reused"] else f"{event['seconds']:.2f} s"
+            notes = "".join(f", {say_notes(kind, n)}" for kind, n in event["notes"].items())
+            self._log(logging.DEBUG, f"    {title_of_stage(event['stage'])} {event['name']}  {what}{notes}")
+        group = group_of_stage(event["stage"])
+        if event["done"] == event["total"]:
+            so_far = state.groups()[group]
+            if not so_far.left and group not in self._ended:
                 self._ended.add(group)
-                self._log(logging.INFO, describe_group(group, state))
+                self._log(logging.INFO, describe_group(group, so_far))
         elif PROGRESS.isEnabledFor(logging.INFO) and time.monotonic() - self._logged >= self._every:
-            left, state = self.time_left(), self.groups()[group]
+            left, so_far = state.time_left(time.time()), state.groups()[group]
             words = f", ~ {format_duration(left)} left" if left is not None else ""
-            self._log(logging.INFO, f"  {group}: {state.done:,} of {state.total:,} tasks{words}", PROGRESS)
+            self._log(logging.INFO, f"  {group}: {so_far.done:,} of {so_far.total:,} tasks{words}", PROGRESS)
 
-    def failed(
-        self, stage: str, name: str, reason: str, needs: Item | None = None, *, ends_run: bool = False
-    ) -> None:
+    def _failed(self, event: Event, state: RunState) -> None:
         """Log a failure; as an error if the run goes on and it is none of many, and for want of no other item."""
-        super().failed(stage, name, reason, needs)
-        is_error = needs is None and not ends_run and self.failures <= LISTED_FAILURES
-        self._log(
-            logging.ERROR if is_error else logging.DEBUG, f"failed: {title_of_stage(stage)} {name}: {reason}"
-        )
-        if needs is None and self.failures == LISTED_FAILURES + 1:
+        own = "needs" not in event
+        level = logging.DEBUG
+        if own and "ends_run" not in event and state.n_own <= LISTED_FAILURES:
+            level = logging.ERROR
+        self._log(level, f"failed: {title_of_stage(event['stage'])} {event['name']}: {event['reason']}")
+        if own and state.n_own == LISTED_FAILURES + 1:
             self._log(logging.ERROR, "failed: more than that; run.json will list all")
-
-    def say(self, text: str) -> None:
-        """Log a sentence for the user."""
-        self._log(logging.INFO, text)
 
     def _log(self, level: int, text: str, logger: logging.Logger = LOGGER) -> None:
         self._logged = time.monotonic()
@@ -108,14 +110,14 @@ class LogView(Watcher):
         LOGGER.setLevel(self._level_before)
 
 
-def describe_group(group: str, state: StageTally) -> str:
+def describe_group(group: str, state: StageState) -> str:
     """Write a finished group of stages, and number and time of its tasks.
 
     Examples
     --------
-    >>> describe_group("terrain", StageTally(37, done=37, seconds=1.5))
+    >>> describe_group("terrain", StageState(total=37, done=37, seconds=1.5))
     '  terrain          37 tasks      1.50 s'
-    >>> describe_group("points", StageTally(1, done=1))
+    >>> describe_group("points", StageState(total=1, done=1))
     '  points            1 task       0.00 s'
     """
     tasks = "task " if state.total == 1 else "tasks"

@@ -169,7 +169,7 @@ def remove(path: Place) -> None:
     """Remove a file, or a folder and all in it."""
     if in_bucket(path):
         delete_below(path)
-    elif path.is_dir():
+    elif path.is_dir() and not path.is_symlink():
         shutil.rmtree(str(path))
     else:
         path.unlink()

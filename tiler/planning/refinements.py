@@ -7,7 +7,7 @@ import pyproj
 import shapely
 
 from pipeline.data.errors import InputError
-from tiler.config.config import Config, check_refinement, read_refinement
+from tiler.config.config import Config, check_refinement
 from tiler.footprints.plan_shapes import scan_shapes
 from tiler.objects.places import place
 from tiler.planning.lod_zones import make_shape, read_zones
@@ -42,7 +42,7 @@ def read_refinements(config: Config, region: Region) -> Refinements:
     InputError
         If the file cannot be read, has a feature without size or geometry, or too many vertices or sizes.
     """
-    found = [read_refinement(text, config.largest_size) for text in config.refine]
+    found = list(config.refinements_asked)
     areas = {(size, shapely.to_wkb(make_shape(*place), hex=True, byte_order=1)) for size, place in found}
     if config.refine_areas:
         areas |= _read_file(place(config.refine_areas), config, region)

@@ -1,15 +1,16 @@
 """When the stages of a run worked: from the events of its tasks, or from the totals of its record."""
 
-import math
-from collections.abc import Iterator
+from array import array
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tiler.monitoring.events import read_events
+from tiler.monitoring.items import State
+from tiler.monitoring.run_state import RunState
 from tiler.words.stage_groups import group_of_stage
 
 BINS = 240  # columns of the Gantt chart
@@ -46,17 +47,8 @@ class Timeline:
     by_tile: dict[str, float]
 
 
-@dataclass
-class _Stage:
-    first: float = math.inf
-    last: float = -math.inf
-    tasks: int = 0
-    reused: int = 0
-    failed: int = 0
-
-
 def read_timeline(path: Path, tiles: frozenset[str]) -> Timeline | None:
-    """Read the events of a run twice: for its span, and for what went on in it.
+    """Read the events of a run.
 
     Parameters
     ----------
@@ -71,62 +63,42 @@ def read_timeline(path: Path, tiles: frozenset[str]) -> Timeline | None:
         None where there is no file, or no task ended. A line that is no event is passed over: the last
         one may be cut off.
     """
-    stages: dict[str, _Stage] = {}
+    run = RunState()
+    ends: defaultdict[str, array[float]] = defaultdict(lambda: array("d"))  # s since 1970, and what it took
     by_tile: dict[str, float] = {}
-    for event, stage, end, seconds in _tasks(path):
-        found = stages.setdefault(stage, _Stage())
-        found.first, found.last = min(found.first, end - seconds), max(found.last, end)
-        found.failed += event["event"] == "failed"
-        if event["event"] == "done":
-            found.tasks += 1
-            found.reused += bool(event.get("reused"))
-            if event.get("name") in tiles:
-                by_tile[event["name"]] = by_tile.get(event["name"], 0.0) + seconds
-    if not stages:
+    for event in read_events(path) if path.is_file() else ():
+        if not run.fold(event) or event["event"] not in ("done", "failed"):
+            continue
+        try:
+            end, seconds = float(event["t"]) - float(event.get("ago") or 0.0), float(event.get("seconds") or 0.0)
+        except (KeyError, TypeError, ValueError):
+            continue
+        ends[group_of_stage(event["stage"])].extend((end, seconds))
+        if event["event"] == "done" and event["name"] in tiles:
+            by_tile[event["name"]] = by_tile.get(event["name"], 0.0) + seconds
+    if not ends:
         return None
-    begin, end = min(s.first for s in stages.values()), max(s.last for s in stages.values())
-    duration = max(end - begin, 1e-3)
-    names = sorted(stages, key=lambda name: (stages[name].first, name))
-    row, busy = {name: k for k, name in enumerate(names)}, np.zeros((len(names), BINS))
-    for _, stage, last, seconds in _tasks(path):
-        _add(busy[row[stage]], (last - seconds - begin) / duration, (last - begin) / duration)
-    kept = [stages[name] for name in names]
+    spans = {}
+    for group, found in ends.items():
+        last, spent = np.array(found).reshape(-1, 2).T
+        spans[group] = last - spent, last
+    begin = min(first.min() for first, _ in spans.values())
+    duration = max(max(last.max() for _, last in spans.values()) - begin, 1e-3)
+    names = sorted(spans, key=lambda name: (spans[name][0].min(), name))
+    edges = begin + np.linspace(0.0, duration, BINS + 1)
+    worked = [  # time that tasks have worked up to each edge
+        [np.clip(edge - first, 0.0, last - first).sum() for edge in edges]
+        for first, last in (spans[name] for name in names)
+    ]
+    groups = run.groups()
     return Timeline(
         duration,
         tuple(names),
-        busy,
-        np.array([s.first - begin for s in kept]),
-        np.array([s.last - begin for s in kept]),
-        np.array([s.tasks for s in kept]),
-        np.array([s.reused for s in kept]),
-        np.array([s.failed for s in kept]),
+        np.diff(worked, axis=1) * BINS / duration,
+        np.array([spans[name][0].min() - begin for name in names]),
+        np.array([spans[name][1].max() - begin for name in names]),
+        np.array([groups[name].done for name in names]),
+        np.array([groups[name].reused for name in names]),
+        np.array([groups[name].counts[State.FAILED] for name in names]),
         by_tile,
     )
-
-
-def _tasks(path: Path) -> Iterator[tuple[dict[str, Any], str, float, float]]:
-    """Give the tasks that ended: event, stage, time of the end, and what it took (s)."""
-    if not path.is_file():
-        return
-    for event in read_events(path):
-        if event.get("event") not in ("done", "failed"):
-            continue
-        try:
-            end = float(event["t"]) - float(event.get("ago") or 0.0)
-            seconds = float(event.get("seconds") or 0.0)
-        except (KeyError, TypeError, ValueError):
-            continue
-        if math.isfinite(end) and 0 <= seconds < math.inf:
-            yield event, group_of_stage(str(event.get("stage", ""))), end, seconds
-
-
-def _add(busy: NDArray[np.float64], start: float, end: float) -> None:
-    """Add a task that is there from `start` to `end`, shares of the duration, to the slices that it touches."""
-    first, last = max(start, 0.0) * BINS, min(end, 1.0) * BINS
-    low, high = min(int(first), BINS - 1), min(int(last), BINS - 1)
-    if low == high:
-        busy[low] += last - first
-        return
-    busy[low] += low + 1 - first
-    busy[low + 1 : high] += 1
-    busy[high] += last - high

@@ -1,4 +1,7 @@
-"""One run a folder: a lock file that says who works there, and a heartbeat for file systems without locks."""
+"""One run a folder: a lock file or object that says who works there, and its heartbeat.
+
+The library filelock has no heartbeat for mounts without locks, names no owner, and knows no buckets.
+"""
 
 import errno
 import fcntl
@@ -14,7 +17,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline.data.errors import ConfigError, InputError, OutputError
+from tiler.objects.path import ObjectPath
 from tiler.objects.places import in_bucket
+from tiler.objects.requests import ChangedError
 from tiler.words.plain_text import say_nothing
 
 LOCK = ".run.lock"  # in the folder of a run, as long as the run is at work
@@ -41,13 +46,13 @@ class Owner:
 
 
 @contextmanager
-def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator[Callable[[], None]]:
+def only_run(folder: Path, say: Callable[[str], None] = say_nothing) -> Iterator[Callable[[], None]]:
     """Hold a folder for one run at a time; the hold ends with the process, however it ends.
 
     Parameters
     ----------
     folder : Path
-        An existing folder that can be written.
+        An existing folder that can be written, or the name in a bucket that results lie below.
     say : callable, optional
         Called with a sentence where the file system knows no locks, and where the folder of a dead owner is taken.
 
@@ -59,49 +64,52 @@ def only_run(folder: Path, say: Callable[[str], None] | None = None) -> Iterator
     Raises
     ------
     ConfigError
-        If another run is at work there.
+        If another run is at work there, or nothing can be put into the bucket.
     OutputError
         If the lock file cannot be written.
 
     Notes
     -----
     A lock of the system on `LOCK`, opened for writing, as NFS wants it. Some mounts keep locks to one machine, and
-    some know none: so the file also names its owner and is touched every `BEAT` seconds. An owner on this machine
-    is asked for by its process, any other is listened to for `SILENCE` seconds.
+    some know none: so the file also names its owner and is touched every `BEAT` seconds. In a bucket it is an
+    object, put if there is none (``If-None-Match``) and replaced if it is the one that was read (``If-Match``), at
+    each beat too: the store decides who is first. An owner on this machine is asked for by its process, any other
+    is listened to for `SILENCE` seconds.
     """
-    say = say or say_nothing
-    if in_bucket(folder):
-        from tiler.store.lease import only_run_in_bucket
-
-        with only_run_in_bucket(folder, say) as lease:
-            yield lease.check
-        return
     path = folder / LOCK
-    file, locked = _take(path, say)
-    stop = threading.Event()
-    beat = threading.Thread(target=_beat, args=(file, stop), daemon=True)
+    hold: _FileHold | _ObjectHold = _ObjectHold(path, say) if in_bucket(path) else _FileHold(path, say)
+    stop, lost = threading.Event(), threading.Event()
+
+    def beat() -> None:
+        while not stop.wait(BEAT):
+            with suppress(OSError, OutputError):  # a store that is not there has no other owner either
+                if not hold.beat():
+                    lost.set()
+                    return
+
+    def check() -> None:
+        if lost.is_set():
+            raise OutputError(
+                f"{folder}: another run has taken it over, as nothing was heard of this one for {SILENCE:g} s; "
+                "let one of them go on"
+            )
+
+    thread = threading.Thread(target=beat, name="heartbeat", daemon=True)
+    thread.start()
     try:
-        beat.start()
-        try:
-            yield lambda: None
-        finally:
-            stop.set()
-            beat.join()
-            owner = _read_owner(path)
-            if _is_at(path, file) and (locked or owner is None or owner.pid == os.getpid()):
-                with suppress(OSError):
-                    path.unlink()
+        yield check
     finally:
-        os.close(file)
+        stop.set()
+        thread.join()
+        hold.give_back()
 
 
 def is_held(folder: Path) -> bool:
     """Return whether a run is at work in a folder; InputError if its lock file cannot be read."""
-    if in_bucket(folder):
-        from tiler.store.lease import is_held_in_bucket
-
-        return is_held_in_bucket(folder)
     path = folder / LOCK
+    if in_bucket(path):
+        lease = _read_lease(path)
+        return lease is not None and _lives(lease[0], lambda: _read_lease(path), lease)
     try:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     except FileNotFoundError:
@@ -119,7 +127,85 @@ def is_held(folder: Path) -> bool:
         os.close(file)
 
 
-def _take(path: Path, say: Callable[[str], None]) -> tuple[int, bool]:
+class _FileHold:
+    """The lock file of a folder on a disk, held."""
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self._path = path
+        self._file, self._locked = _take_file(path, say)
+
+    def beat(self) -> bool:
+        os.utime(self._file)
+        return True
+
+    def give_back(self) -> None:
+        try:
+            owner = _read_owner(self._path)
+            ours = self._locked or owner is None or owner.pid == os.getpid()
+            if _is_at(self._path, self._file) and ours:
+                with suppress(OSError):
+                    self._path.unlink()
+        finally:
+            os.close(self._file)
+
+
+class _ObjectHold:
+    """The lock of a folder in a bucket: an object, this process, and the tag that the object has now."""
+
+    def __init__(self, path: ObjectPath, say: Callable[[str], None]) -> None:
+        self._path, self._owner, self._beats = path, this_process(), 0
+        try:
+            self._tag = self._take(say)
+        except OSError as error:
+            words = f"cannot be written ({error.strerror}); give another --out"
+            raise ConfigError(f"{path.parent}: {words}") from error
+
+    def _take(self, say: Callable[[str], None]) -> str:
+        path = self._path
+        while True:
+            found = _read_lease(path)
+            if found is not None:
+                _refuse_living(path, found[0], say, lambda: _read_lease(path), found)
+            try:
+                return path.put_if(self._text(), None if found is None else found[1])
+            except (ChangedError, FileNotFoundError) as error:
+                if isinstance(error, FileNotFoundError) and found is None:
+                    raise
+                if tag := self._find_tag():
+                    return tag
+
+    def beat(self) -> bool:
+        self._beats += 1
+        try:
+            self._tag = self._path.put_if(self._text(), self._tag)
+        except (ChangedError, FileNotFoundError):
+            self._tag = self._find_tag()
+        return bool(self._tag)
+
+    def give_back(self) -> None:
+        with suppress(OSError, OutputError):
+            if self._find_tag():
+                self._path.unlink()
+
+    def _find_tag(self) -> str:
+        """Give the tag of the object if it is ours, else nothing: a put that was repeated finds its own object."""
+        found = _read_lease(self._path)
+        return found[1] if found is not None and found[0] and found[0].token == self._owner.token else ""
+
+    def _text(self) -> bytes:
+        return json.dumps(asdict(self._owner) | {"beats": self._beats}).encode() + b"\n"
+
+
+def _read_lease(path: ObjectPath) -> tuple[Owner | None, str] | None:
+    """Read owner and tag of the lock in a bucket; None where there is none."""
+    try:
+        tag = path.stat().e_tag
+        return parse_owner(path.read_bytes()), tag
+    except FileNotFoundError:
+        return None
+
+
+def _take_file(path: Path, say: Callable[[str], None]) -> tuple[int, bool]:
     """Take the lock file: its descriptor, and whether the system has locked it."""
     while True:
         file = -1
@@ -133,8 +219,9 @@ def _take(path: Path, say: Callable[[str], None]) -> tuple[int, bool]:
                 os.close(file)
                 continue
             earlier = _read_owner(path)
-            if earlier is not None:
-                _wait_for_death(path, earlier, say, locked=state == "locked")
+            # Of an owner on this machine the system would have refused the lock.
+            if earlier is not None and (state == "none" or _is_elsewhere(earlier)):
+                _refuse_living(path, earlier, say, lambda: _look_at_file(path))
             if state == "none":
                 say(
                     f"{path.parent}: its file system has no locks; a second run is kept out by the heartbeat of "
@@ -154,7 +241,48 @@ def _take(path: Path, say: Callable[[str], None]) -> tuple[int, bool]:
             ) from error
 
 
-def _busy(path: Path, owner: Owner | None) -> ConfigError:
+def _refuse_living(
+    path: Path | ObjectPath,
+    owner: Owner | None,
+    say: Callable[[str], None],
+    look: Callable[[], object],
+    first: object = None,
+) -> None:
+    """Return when the owner that a lock names is dead; ConfigError if it lives (see `_lives`)."""
+    name = "a run" if owner is None else describe_owner(owner)
+    if owner is None or is_alive(owner) is None:
+        say(f"{path.parent}: {name} was at work there; listening for {SILENCE:g} s whether it is")
+    if _lives(owner, look, first):
+        raise _busy(path, owner)
+    say(f"{path.parent}: taken over from {name}, which is dead")
+
+
+def _lives(owner: Owner | None, look: Callable[[], object], first: object = None) -> bool:
+    """Return whether an owner lives; one elsewhere is listened to: whether `look` sees something new.
+
+    It gives None where there is no lock any more. No clocks are compared, which may differ between machines.
+    """
+    known = None if owner is None else is_alive(owner)
+    if known is not None:
+        return known
+    first, end = first or look(), time.monotonic() + SILENCE
+    while time.monotonic() < end:
+        time.sleep(min(1.0, SILENCE / 10))
+        if (found := look()) != first:
+            return found is not None
+    return False
+
+
+def _look_at_file(path: Path) -> tuple[int, Owner | None]:
+    try:  # opened: NFS asks its server then
+        with path.open("rb") as file:
+            touched = os.fstat(file.fileno()).st_mtime_ns
+    except OSError:
+        touched = -1
+    return touched, _read_owner(path)
+
+
+def _busy(path: Path | ObjectPath, owner: Owner | None) -> ConfigError:
     name = f" ({describe_owner(owner)})" if owner is not None else ""
     return ConfigError(f"{path.parent}: {BUSY}{name}; {NEXT}")
 
@@ -177,33 +305,6 @@ def _ask(file: int, lock: int) -> str:
     return "locked"
 
 
-def _wait_for_death(path: Path, owner: Owner, say: Callable[[str], None], *, locked: bool) -> None:
-    """Return when the owner that a lock file names is dead; ConfigError if it lives.
-
-    One elsewhere is listened to for a heartbeat; no clocks are compared, which may differ between machines.
-    """
-    if locked and not _is_elsewhere(owner):
-        return  # the system would have refused the lock
-    alive = is_alive(owner)
-    if alive is None:
-        say(f"{path.parent}: {describe_owner(owner)} was at work there; listening for {SILENCE:g} s whether it is")
-        first, end = _touched(path), time.monotonic() + SILENCE
-        while not alive and time.monotonic() < end:
-            time.sleep(min(1.0, SILENCE / 10))
-            alive = _touched(path) != first or _read_owner(path) != owner
-    if alive:
-        raise _busy(path, owner)
-    say(f"{path.parent}: taken over from {describe_owner(owner)}, which is dead")
-
-
-def _touched(path: Path) -> int:
-    try:  # opened: NFS asks its server then
-        with path.open("rb") as file:
-            return os.fstat(file.fileno()).st_mtime_ns
-    except OSError:
-        return -1
-
-
 def _write_owner(path: Path, file: int, *, locked: bool) -> None:
     """Write who holds the folder; without locks, make sure that nobody else did so at the same moment."""
     owner = this_process()
@@ -213,12 +314,6 @@ def _write_owner(path: Path, file: int, *, locked: bool) -> None:
         time.sleep(min(1.0, SILENCE / 10))
         if (found := _read_owner(path)) != owner:
             raise _busy(path, found)
-
-
-def _beat(file: int, stop: threading.Event) -> None:
-    while not stop.wait(BEAT):
-        with suppress(OSError):
-            os.utime(file)
 
 
 def _is_at(path: Path, file: int) -> bool:

@@ -1,8 +1,6 @@
 """The store: results by stage and name, a file each (`tiler.store.result_file`), whole or not at all."""
 
 import json
-import os
-import shutil
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +11,7 @@ from blake3 import blake3
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.data.errors import OutputError
-from tiler.objects.places import in_bucket
+from tiler.objects.places import remove
 from tiler.store.atomic import disk_errors, replacing
 from tiler.store.checksums import find_file_damage, seal_file
 from tiler.store.result_file import GROUP, ResultFile
@@ -150,7 +148,7 @@ class Store:
         """Remove a result, or all of a stage. Nothing happens if it is not there."""
         path = self.path / stage if name is None else self.file(stage, name)
         try:
-            _delete(path)
+            remove(path)
         except FileNotFoundError:
             return
         except OSError as error:
@@ -161,7 +159,7 @@ class Store:
         for path in self._list(stage):
             if path.name[0] == ".":
                 with suppress(OSError):
-                    _delete(path)
+                    remove(path)
 
     def find_strays(self) -> list[Path]:
         """List what is no result: files beside the stages, and other entries of these."""
@@ -175,7 +173,7 @@ class Store:
         """Remove what `find_strays` lists; no writer may be at work."""
         for path in self.find_strays():
             with suppress(OSError):
-                _delete(path)
+                remove(path)
 
     def find_damage(self, stage: str, name: str) -> str:
         """Describe what is wrong with the file of a result; nothing if every byte is as it was written."""
@@ -201,15 +199,3 @@ class Store:
 
 def _is_result(path: Path) -> bool:
     return path.name[0] != "." and path.name.endswith(SUFFIX) and not path.is_dir()
-
-
-def _delete(path: Path) -> None:
-    """Delete a file or a folder; OSError if that cannot be done."""
-    if in_bucket(path):
-        from tiler.objects.path import delete_below
-
-        delete_below(path)
-    elif path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        os.unlink(path)

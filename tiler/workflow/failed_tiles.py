@@ -1,6 +1,7 @@
 """What a run does about items that were set aside: which tiles go missing, and how to look into one alone."""
 
 import dataclasses
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from tiler.config.config_file import write_config
 from tiler.engine.engine import Engine
 from tiler.engine.failures import SetAside
 from tiler.engine.run_context import SHARED, tile_key, tile_name
-from tiler.engine.stage import Box, Scope
+from tiler.engine.stage import Box, Scope, Stage
 from tiler.objects.places import absolute
 from tiler.planning.plan import Plan, leave_out
 from tiler.store.atomic import replacing
@@ -48,8 +49,9 @@ class HolesError(Exception):
     """Items of the city model failed: the region must be planned again without their tiles."""
 
 
-def stop_at_holes(engine: Engine) -> None:
-    """Raise `HolesError` if anything was set aside so far."""
+def run_whole(engine: Engine, *stages: Stage, items: Mapping[str, Collection[str]] | None = None) -> None:
+    """Run stages as `Engine.run`, and raise `HolesError` if anything was set aside so far."""
+    engine.run(*stages, items=items)
     if engine.set_aside:
         raise HolesError
 

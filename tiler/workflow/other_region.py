@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pyproj
+import shapely
 
 from pipeline.data.errors import CityError, ConfigError
 from tiler.engine.stage import Box
@@ -46,7 +47,8 @@ def refuse_other_region(out: Path, region: Region, inputs: Sequence[str]) -> Non
     holds = f"{out}: holds the run of another region"
     if not _same(crs, region.crs):
         raise ConfigError(f"{holds}, in {short_crs(crs)}; this one is in {short_crs(region.crs)}; {move}")
-    share = _common_area(bounds, region.bounds) / max(_area(bounds), _area(region.bounds))
+    one, other = shapely.box(*bounds), shapely.box(*region.bounds)
+    share = one.intersection(other).area / max(one.area, other.area)
     here = {absolute(path) for path in inputs}
     if share <= 0 or (share < COMMON and here.isdisjoint(map(absolute, known))):
         how = (
@@ -82,16 +84,6 @@ def _same(one: str, other: str) -> bool:
         return same_crs(pyproj.CRS.from_user_input(one), pyproj.CRS.from_user_input(other))
     except pyproj.exceptions.CRSError:
         return False
-
-
-def _area(box: Sequence[float]) -> float:
-    return (box[2] - box[0]) * (box[3] - box[1])
-
-
-def _common_area(one: Sequence[float], other: Sequence[float]) -> float:
-    width = min(one[2], other[2]) - max(one[0], other[0])
-    height = min(one[3], other[3]) - max(one[1], other[1])
-    return max(width, 0.0) * max(height, 0.0)
 
 
 def find_missing_folders(out: Path) -> list[Path]:

@@ -207,10 +207,11 @@ def _run(
                 sync_meanwhile(out / RUN_RECORD)
             shutil.rmtree(out / TASKS, ignore_errors=True)  # of workers that were killed
         save_config(given, out)
-        progress = begin_watching(config, out, plan, own, watchers, shown=means.shown)
+        begin_watching(config, out, plan, own, watchers, shown=means.shown)
         record |= _mesh_region(config, out, plan, own, watchers, damage, means, add_up(journal))
         record |= {"edits": [edit.number for edit in journal]} if journal else {}
-        record["finished"] = progress.finished
+        stages = watchers.state.stages.items()
+        record["finished"] = {name: stage.finished for name, stage in stages if stage.finished}
         for message in record["messages"][len(plan.messages) :]:
             say(message)
         _refuse_empty(config, record)
@@ -237,15 +238,12 @@ def _run(
 def _plan(config: Config, out: Path, say: Callable[[str], None], *, fresh: bool) -> Plan:
     """Plan a run; refuse inputs among its results and, unless it begins anew, the folder of another region."""
     plan = make_plan(config, say)
-    more = [config.refine_areas, config.generalised, config.land_cover_table, config.trees]
-    zones = config.zones_asked.files if config.zoned else ()
-    files = [*config.building_files, *config.land_cover, *zones, *filter(None, more)]
     for warning in _foresee(plan, config):
         plan.messages.append(warning)
         say(warning)
-    refuse_inputs_within(out, [*(header.path for header in plan.headers), *map(place, files)])
+    refuse_inputs_within(out, [*(header.path for header in plan.headers), *map(place, config.inputs)])
     if not fresh:
-        refuse_other_region(out, plan.region, [*config.pointcloud, *files, *config.terrain])
+        refuse_other_region(out, plan.region, config.inputs)
     return plan
 
 

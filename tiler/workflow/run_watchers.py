@@ -11,8 +11,9 @@ from tiler.config.config import Config
 from tiler.engine.run_context import make_layout
 from tiler.engine.task import Record
 from tiler.engine.watcher import RunStart, Watcher
-from tiler.monitoring.events import EventLog, begin_file
-from tiler.monitoring.progress import RunProgress, command_line
+from tiler.monitoring.event_log import EventLog
+from tiler.monitoring.events import begin_file
+from tiler.monitoring.progress import ProgressFile, command_line
 from tiler.monitoring.watchers import Watchers
 from tiler.planning.own_stages import OwnStages, list_stages, stages_of_pad
 from tiler.planning.plan import Plan
@@ -82,7 +83,7 @@ def begin_watching(
     watchers: Watchers,
     *,
     shown: Path | None = None,
-) -> RunProgress:
+) -> None:
     """Begin to tell how far a run is, with all stages that are known from the start.
 
     Parameters
@@ -114,9 +115,7 @@ def begin_watching(
         if all(isinstance(width, float) for width in config.pad):  # else it is a guess, and told when it is known
             layout = padded
     command = "" if own.stages else command_line(config)  # stages of the user's own are not given by a command
-    totals = {name: total for name, (_, total) in expected.items()}
-    progress = RunProgress(out, config, totals, command=command)
-    watchers.add(progress)
+    watchers.add(ProgressFile(out, config, command=command))
     events = out / EVENTS
     if shown is not None and shown != out:
         watchers.add(CopiedEvents(events, shown))
@@ -135,4 +134,3 @@ def begin_watching(
         whole=frozenset({*NOT_ALONE, *(stage.name for stage in own.stages)}),
     )
     watchers.begin(start)
-    return progress

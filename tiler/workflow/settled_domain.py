@@ -18,7 +18,7 @@ from tiler.stages.approach import RIM, approach_stages, known_rim
 from tiler.stages.domain import domain_stages, layer_stages
 from tiler.store.out_folder import STORE
 from tiler.store.store import Store
-from tiler.workflow.failed_tiles import as_error, bounds_around, config_alone, stop_at_holes
+from tiler.workflow.failed_tiles import as_error, bounds_around, config_alone, run_whole
 
 
 def settle_domain(engine: Engine, config: Config) -> Domain:
@@ -38,8 +38,7 @@ def settle_domain(engine: Engine, config: Config) -> Domain:
     HolesError
         If an item was set aside.
     """
-    engine.run(*domain_stages(config))
-    stop_at_holes(engine)
+    run_whole(engine, *domain_stages(config))
     found = engine.records["domain", REGION_ITEM].facts
     domain = settle(config.domain_height, config.top, found)
     pad = find_pad(engine.context.grid, config, float(found["tallest"])) if config.padded else None
@@ -60,8 +59,7 @@ def take_domain(
     if pad is not None:
         lay_pad(engine, config, domain, pad, rim_store)
         return
-    engine.run(*layer_stages(config, domain))
-    stop_at_holes(engine)
+    run_whole(engine, *layer_stages(config, domain))
 
 
 def domain_of_run(config: Config) -> tuple[Domain, float]:
@@ -132,8 +130,7 @@ def lay_pad(engine: Engine, config: Config, domain: Domain, pad: Pad, rim_store:
     if engine.set_aside:
         raise as_error(engine.failed()[0])
     engine.lay_out(replace(layout, tiles=core.tiles), wider)
-    engine.run(*layer_stages(config, domain))
-    stop_at_holes(engine)
+    run_whole(engine, *layer_stages(config, domain))
     engine.lay_out(layout, wider)
 
 

@@ -31,13 +31,9 @@ from tiler.stages.mesh import mesh_stages
 from tiler.stages.pieces import fit_stage, piece_stages
 from tiler.stages.surroundings import cover_reach
 from tiler.store.edit_journal import Edits
-from tiler.store.out_folder import (
-    STORE,
-)
+from tiler.store.out_folder import STORE
 from tiler.store.store import Store
-from tiler.workflow.failed_tiles import (
-    stop_at_holes,
-)
+from tiler.workflow.failed_tiles import run_whole
 from tiler.workflow.settled_domain import settle_domain
 
 NO_EDITS = Edits()
@@ -68,7 +64,7 @@ def run_stages(engine: Engine, config: Config, edits: Edits = NO_EDITS, *, forme
         of_model = [*alignment_stages(config), *of_model]
     meshed = [*cover_stages(config), *mesh_stages(config, domain), *piece_stages(config)]
     if config.padded:
-        engine.describe_layout()
+        engine.watcher.laid_out(engine.layout)
         both = engine.layout, engine.context
         engine.lay_out(*engine.laid_out(CORE_STAGE))
         engine.run(*of_model)
@@ -116,26 +112,19 @@ def run_city_stages(
     if edited := bool(edits.boxes):
         engine.add_parameters(edits=dataclasses.asdict(edits))
         some[EDITED] = edited_tiles(engine.layout.tiles, edits)
-    engine.run(*input_stages(config, edited=edited), *files, lake_stage(), fill_stage(), items=some)
-    stop_at_holes(engine)
+    run_whole(engine, *input_stages(config, edited=edited), *files, lake_stage(), fill_stage(), items=some)
     if deep := engine.records["coarse", REGION_ITEM].facts["deep"]:
-        engine.run(lake_stage(), fill_stage(), items={"lakes": deep, "terrain": deep})
-        stop_at_holes(engine)
-    engine.run(house_stage(config))
-    stop_at_holes(engine)
-    engine.run(*first_round(config), shape_stage(0))
-    stop_at_holes(engine)
+        run_whole(engine, lake_stage(), fill_stage(), items={"lakes": deep, "terrain": deep})
+    run_whole(engine, house_stage(config))
+    run_whole(engine, *first_round(config), shape_stage(0))
     last = 0
     while True:
-        engine.run(*later_round(config, last + 1))
-        stop_at_holes(engine)
+        run_whole(engine, *later_round(config, last + 1))
         if not engine.records[f"join-{last + 1}", REGION_ITEM].facts["joined"]:
             break
         last += 1
-        engine.run(member_stage(last), shape_stage(last))
-        stop_at_holes(engine)
-    engine.run(model_stage(config, last))
-    stop_at_holes(engine)
+        run_whole(engine, member_stage(last), shape_stage(last))
+    run_whole(engine, model_stage(config, last))
     return last + 1
 
 
@@ -143,8 +132,7 @@ def _align(engine: Engine, config: Config) -> None:
     """Measure the shift between footprints and roofs before footprints are used, and take it from now on."""
     wanted = {"points", "footprints"}
     before = [stage for stage in input_stages(config) if stage.name in wanted]
-    engine.run(*before, *alignment_stages(config))
-    stop_at_holes(engine)
+    run_whole(engine, *before, *alignment_stages(config))
     engine.add_parameters(footprints_shift=shift_of(engine.records["shift", REGION_ITEM].facts))
 
 

@@ -22,7 +22,6 @@ from tiler.landcover.cover_table import describe_patches, read_table
 from tiler.mesh_files.mesh_parts import MESH_IN_PARTS, describe_parts, note_parts
 from tiler.objects.places import place
 from tiler.planning.establish_georeference import FOOTPRINTS
-from tiler.planning.lod_zones import read_zones
 from tiler.planning.own_stages import CORE_STAGE
 from tiler.planning.plan import Plan
 from tiler.report.left_out import describe_left_out, report_left_out
@@ -121,7 +120,7 @@ def summarise_run(
             for name in sorted(plan.layout.tiles.keys() - missing.tiles.keys())
         },
         **({"land_cover": _describe_cover(records, config)} if config.covered else {}),
-        **({"zones": describe_zones(read_zones(config, plan.region))} if config.zoned else {}),
+        **({"zones": describe_zones(engine.parameters.zones)} if config.zoned else {}),
         **describe_missing(missing, place(config.out)),
         "counts": counts,
         **empty,

@@ -17,6 +17,7 @@ from tiler.citymodels.building_index import index_buildings
 from tiler.cli.main import main
 from tiler.interface.city_mesh import CityMesh
 from tiler.interface.notebook_progress import NotebookProgress, in_notebook
+from tiler.monitoring.watchers import Watchers
 from tiler.pictures.render import render_run
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -284,7 +285,7 @@ def test_a_notebook_shows_how_far_it_is(tmp_path: Path, output: Display, monkeyp
 
 
 def test_what_fails_is_shown_and_escaped(output: Display) -> None:
-    progress = NotebookProgress()
+    progress = Watchers([NotebookProgress()])
     progress.submitted("points", "a")
     progress.failed("points", "<script>", "no & no")
     progress.failed("ground", "b", "needs it", ("points", "<script>"))

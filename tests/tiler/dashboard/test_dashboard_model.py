@@ -10,24 +10,24 @@ import pytest
 
 from pipeline.data.errors import InputError
 from tests.helpers.simulated_runs import simulate, write_events
-from tiler.dashboard.answer import _describe_step, tell
+from tiler.dashboard.answer import _describe_at_work, _describe_step, tell
 from tiler.dashboard.follow import Follower
-from tiler.dashboard.items import STATES, State
 from tiler.dashboard.map_view import MOST_SHOWN, Question, describe_map
 from tiler.dashboard.metrics import families, write_text
-from tiler.dashboard.model import MOST, TILE, RunModel, Series
+from tiler.monitoring.items import STATES, State
+from tiler.monitoring.run_state import MOST, TILE, RunState, Series
 from tiler.store.out_folder import EVENTS
 from tiler.words.stage_groups import group_stages
 
 
-def fold(*events: object) -> RunModel:
-    model = RunModel()
+def fold(*events: object) -> RunState:
+    model = RunState()
     for event in events:
         model.fold(event)
     return model
 
 
-def begun(*more: dict[str, Any]) -> RunModel:
+def begun(*more: dict[str, Any]) -> RunState:
     """A run of two tiles side by side and two stages, and what happened then."""
     return fold(
         {"event": "run", "t": 10.0, "status": "running", "workers": 2},
@@ -42,7 +42,7 @@ def item(event: str, stage: str, name: str, **more: Any) -> dict[str, Any]:
     return {"event": event, "t": 11.0, "stage": stage, "name": name} | more
 
 
-def states(model: RunModel, stage: str = "") -> list[str]:
+def states(model: RunState, stage: str = "") -> list[str]:
     return [STATES[code] for code in model.items[TILE].codes(stage)]
 
 
@@ -91,7 +91,7 @@ def test_a_tile_that_is_taken_again_around_a_hole_counts_once() -> None:
 def test_what_a_run_that_ends_has_in_hand_is_given_up() -> None:
     model = begun(item("submitted", "houses", "1_0"), {"event": "run", "t": 12.0, "status": "stopped"})
     assert states(model) == ["waiting", "waiting"]
-    assert not model.at_work
+    assert _describe_at_work(model, alive=False) == []
     assert model.stages["houses"].counts[State.RUNNING] == 0
 
 
@@ -244,7 +244,7 @@ def test_what_is_left_follows_from_measured_times(tmp_path: Path, monkeypatch: p
 
 def test_what_runs_is_no_more_than_workers_can_run() -> None:
     """Workers have several tasks in hand; those behind the first wait."""
-    model = RunModel()
+    model = RunState()
     model.fold({"event": "run", "t": 1.0, "status": "running", "workers": 2})
     model.fold({"event": "tiles", "tiles": [[f"{k}_0", k, 0, k + 1, 1] for k in range(4)]})
     model.fold({"event": "planned", "stage": "columns", "scope": "tile", "total": 4})

@@ -21,9 +21,9 @@ from tests.helpers.told import Listener, StageEnds
 from tiler.cli.main import main
 from tiler.config.config import make_config
 from tiler.dashboard.follow import Follower
-from tiler.dashboard.items import State
 from tiler.dashboard.server import read_address, serve
 from tiler.interface.synth import write_city
+from tiler.monitoring.items import State
 from tiler.workflow.run import run
 
 

@@ -24,7 +24,9 @@ from tiler.engine.task import Failure, Record, Task, run_task
 from tiler.engine.task_limits import Limits
 from tiler.executors.dask_executor import refuse_round, run_packed
 from tiler.executors.local_cluster import local
-from tiler.monitoring.events import EventLog, begin_file, read_events
+from tiler.monitoring.event_log import EventLog
+from tiler.monitoring.events import begin_file, read_events
+from tiler.monitoring.watchers import Watchers
 from tiler.report.timeline import read_timeline
 from tiler.store.out_folder import TASKS
 
@@ -279,7 +281,7 @@ def test_what_is_put_off_is_run_by_a_later_call(tmp_path: Path) -> None:
 
 def test_events_and_times_are_told_by_stage(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
-    log = EventLog(path, begin_file(path), every=0.0)
+    log = Watchers([EventLog(path, begin_file(path), every=0.0)])
     engine = make(tmp_path, watcher=log)
     engine.run(FIRST, replace(SECOND, function=takes_time))
     log.end("done")

@@ -21,7 +21,8 @@ from tiler.config.config_file import with_file
 from tiler.engine.stage import Facts, Scope
 from tiler.engine.task import Record
 from tiler.engine.watcher import RunStart, Watcher
-from tiler.monitoring.events import EventLog, begin_file, numbers, open_log, read_events
+from tiler.monitoring.event_log import EventLog
+from tiler.monitoring.events import begin_file, list_numbers, open_log, read_events
 from tiler.monitoring.watchers import Watchers, describe_command
 from tiler.workflow.run import run
 
@@ -31,12 +32,14 @@ KILLED = """
 import os, signal, sys, time
 from itertools import count
 from pathlib import Path
-from tiler.monitoring.events import EventLog, begin_file
+from tiler.monitoring.event_log import EventLog
+from tiler.monitoring.events import begin_file
+from tiler.monitoring.watchers import Watchers
 path = Path(sys.argv[1])
-log = EventLog(path, begin_file(path), every=0.05)
-log.say("first")
+file = begin_file(path)
+Watchers([EventLog(path, file, every=0.05)]).say("first")
 time.sleep(0.5)
-os.write(log._file, b'{"t": 1, "event": "mess')
+os.write(file, b'{"t": 1, "event": "mess')
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -55,8 +58,8 @@ def start_of(out: Path, n: int = 2, command: str = "citystitch run a.laz") -> Ru
     )
 
 
-def make_log(path: Path, every: float = 0.0) -> EventLog:
-    return EventLog(path, begin_file(path), every=every)
+def make_log(path: Path, every: float = 0.0) -> Watchers:
+    return Watchers([EventLog(path, begin_file(path), every=every)])
 
 
 def record_of(stage: str, name: str, **others: Any) -> Record:
@@ -109,7 +112,7 @@ def EXPECTED(out: Path) -> list[dict[str, Any]]:  # noqa: N802
         {"event": "failed", "stage": "columns", "name": "1_0", "reason": "it is too wet"}
         | {"command": f"citystitch run {out}/config.toml --only 1_0 --traceback"},
         {"event": "failed", "stage": "pieces", "name": "1_0", "reason": "not run: columns 1_0 is not there"}
-        | {"command": ""},
+        | {"command": "", "needs": ["columns", "1_0"]},
         {"event": "message", "text": "a 'line'\nand \udcff another"},
         {"event": "run", "status": "done", **head},
     ]
@@ -145,7 +148,7 @@ def test_the_command_shows_the_failure(tmp_path: Path, stage: str, scope: Scope,
 
 def test_numbers_are_finite_and_tell_something() -> None:
     facts: Facts = {"n": 3, "extent": [1.0, 2.0], "i0": 5, "proved": True, "bad": float("nan"), "zero": 0.0}
-    assert numbers(facts) == {"n": 3}
+    assert list_numbers(facts) == {"n": 3}
 
 
 def test_a_whole_run(town: Town) -> None:
@@ -284,7 +287,7 @@ def test_a_handler_may_say_something_in_the_middle_of_a_write(
 
 
 def test_a_full_disk_ends_the_run_where_it_can_be_told(tmp_path: Path) -> None:
-    log = EventLog(Path("/dev/full"), os.open("/dev/full", os.O_WRONLY), every=0.01)
+    log = Watchers([EventLog(Path("/dev/full"), os.open("/dev/full", os.O_WRONLY), every=0.01)])
     log.say("one")
     time.sleep(0.5)
     with pytest.raises(OutputError, match=r"/dev/full: cannot be written \(No space left on device\); free space"):
@@ -311,7 +314,7 @@ def test_a_line_after_a_cut_one_can_be_read(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_log_takes_the_place_of_nothing_but_a_log(tmp_path: Path) -> None:
     path = tmp_path / "log"
-    log = EventLog(path, open_log(path), every=0.0)
+    log = Watchers([EventLog(path, open_log(path), every=0.0)])
     log.say("one")
     log.end("done")
     os.close(open_log(path))

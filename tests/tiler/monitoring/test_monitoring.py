@@ -11,7 +11,7 @@ import pytest
 
 from tests.helpers.simulated_runs import simulate
 from tiler.dashboard.metrics import Family, families, write_text
-from tiler.dashboard.model import RunModel
+from tiler.monitoring.run_state import RunState
 
 FOLDER = Path(__file__).resolve().parents[3] / "deploy" / "monitoring"
 NAME = re.compile(r"\b(?:citystitch|dask)_[a-z_]+")
@@ -21,7 +21,7 @@ LABELS = {"job", "instance"}  # what Prometheus adds
 @pytest.fixture(scope="module")
 def metrics() -> dict[str, Family]:
     """Metrics of a run with failures and notes, by the name of their samples."""
-    model = RunModel()
+    model = RunState()
     for event in simulate(60, done=0.5, failed=2, running=2, status="running"):
         model.fold(event)
     assert model.ignored == 0

@@ -24,9 +24,14 @@ from tests.runs.test_run import hashes
 from tiler.cli.main import main, make_parser
 from tiler.config.config import make_config
 from tiler.config.config_file import with_file
+from tiler.engine.stage import Scope
 from tiler.engine.task import Record
-from tiler.monitoring.progress import RunProgress, command_line
+from tiler.engine.watcher import RunStart
+from tiler.monitoring.events import Event
+from tiler.monitoring.progress import ProgressFile, command_line
+from tiler.monitoring.run_state import RunState
 from tiler.monitoring.status import read_status
+from tiler.monitoring.watchers import Watchers
 from tiler.store.folder_lock import LOCK, is_held, only_run
 from tiler.workflow.run import run
 
@@ -35,15 +40,15 @@ KILLED = """
 import os, signal, sys
 import tiler.monitoring.progress
 from tiler.config.config import make_config
-from tiler.monitoring.progress import RunProgress
+from tiler.monitoring.progress import ProgressFile
 from tiler.workflow.run import run
 tiler.monitoring.progress.EVERY = 0.0
-done = RunProgress.done
-def stop(self, stage, n_done, total, record):
-    done(self, stage, n_done, total, record)
-    if stage == "columns" and n_done == total:
+take = ProgressFile.take
+def stop(self, event, state):
+    take(self, event, state)
+    if event.get("stage") == "columns" and event.get("done") == event.get("total", 0):
         os.kill(os.getpid(), signal.SIGKILL)
-RunProgress.done = stop
+ProgressFile.take = stop
 run(make_config(eval(sys.argv[1])))
 """
 
@@ -92,14 +97,14 @@ def test_a_run_at_work(
     out = tmp_path / "out"
     seen: dict[str, Any] = {}
 
-    done = RunProgress.done
+    take = ProgressFile.take
 
-    def look(self: RunProgress, stage: str, n_done: int, total: int, record: Record) -> None:
-        done(self, stage, n_done, total, record)
-        if stage == "seams" and n_done == total:
+    def look(self: ProgressFile, event: Event, state: RunState) -> None:
+        take(self, event, state)
+        if event.get("stage") == "seams" and event.get("done") == event.get("total", 0):
             seen["status"], seen["text"] = read_status(out), show(out, capsys)
 
-    monkeypatch.setattr(RunProgress, "done", look)
+    monkeypatch.setattr(ProgressFile, "take", look)
     run(town.config(out))
     status = seen["status"]
     assert (status["state"], status["held"], status["pid"]) == ("running", True, os.getpid())
@@ -162,16 +167,18 @@ def test_a_failed_run(town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert make_config(with_file(vars(options))) == config
 
 
-def progress_of(out: Path, **others: Any) -> RunProgress:
-    out.mkdir(exist_ok=True)
-    config = make_config({"pointcloud": ["a.laz"], "out": str(out)} | others)
-    return RunProgress(out, config, {"first": 2, "second": 3})
+def progress_of(out: Path, command: str | None = None) -> Watchers:
+    config = make_config({"pointcloud": ["a.laz"], "out": str(out)})
+    told = Watchers([ProgressFile(out, config, command=command)])
+    expected = {"first": (Scope.TILE, 2), "second": (Scope.TILE, 3)}
+    told.begin(RunStart(out, "", (0.0, 0.0, 1.0, 1.0), "EPSG:28992", 1.0, 2, {}, {}, expected))
+    return told
 
 
 def test_a_folder_that_is_held_by_a_run_of_which_nothing_is_written_yet(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    progress_of(tmp_path).write("failed", "no room")
+    progress_of(tmp_path).end("failed", "no room")
     with only_run(tmp_path):
         assert read_status(tmp_path)["state"] == "running"
         assert "a run has begun, but not with its stages" in show(tmp_path, capsys)
@@ -201,7 +208,7 @@ def test_the_command_has_all_parameters(tmp_path: Path, others: dict[str, Any]) 
 
 
 def test_stages_of_the_users_own_have_no_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    RunProgress(tmp_path, make_config({"pointcloud": ["a.laz"]}), {}, command="")
+    progress_of(tmp_path, "")
     assert "call tiler.workflow.run.run again, with the same stages" in show(tmp_path, capsys)
 
 

@@ -28,9 +28,11 @@ from tiler.cli.main import main
 from tiler.engine.stage import Scope
 from tiler.engine.watcher import RunStart
 from tiler.monitoring.events import read_events
+from tiler.monitoring.items import State
 from tiler.monitoring.live_view import LiveView, draw
 from tiler.monitoring.run_log import LISTED_FAILURES, LOGGER, LogView, RunLog
-from tiler.monitoring.tally import Tally
+from tiler.monitoring.run_state import RunState
+from tiler.monitoring.stage_state import estimate_work
 from tiler.monitoring.terminal import make_view
 from tiler.monitoring.watchers import Watchers
 from tiler.workflow.run import run
@@ -38,16 +40,6 @@ from tiler.workflow.run import run
 ROOT = Path(__file__).resolve().parents[3]
 HIDE, SHOW = "\x1b[?25l", "\x1b[?25h"
 COLOUR = re.compile(r"\x1b\[[0-9;]*[1-9][0-9;]*m")
-
-
-class Clock:
-    """A clock that is set by hand."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture(scope="module")
@@ -66,63 +58,72 @@ def do(watcher: Any, stage: str, names: range, total: int, seconds: float = 1.0,
         watcher.done(stage, k + 1, total, record_of(stage, f"{k}_0", seconds={"all": seconds}, **others))
 
 
+@pytest.fixture
+def at_100(monkeypatch: pytest.MonkeyPatch) -> float:
+    """The time at which all events happen."""
+    monkeypatch.setattr("tiler.monitoring.watchers.time.time", lambda: 100.0)
+    return 100.0
+
+
+@pytest.mark.usefixtures("at_100")
 def test_time_left_is_that_of_what_is_measured_and_typical_of_the_rest(tmp_path: Path) -> None:
-    clock = Clock()
-    tally = Tally(clock)
-    tally.begin(start_with(tmp_path, columns=10, pieces=10))
-    assert tally.time_left() is None
-    do(tally, "columns", range(5), 10, seconds=2.0)
-    clock.now += 2.0
-    assert tally.time_left() is None  # too early to tell
-    clock.now += 8.0
-    left = tally.work_left()
+    told = Watchers()
+    told.begin(start_with(tmp_path, columns=10, pieces=10))
+    state = told.state
+    assert state.time_left(100.0) is None
+    do(told, "columns", range(5), 10, seconds=2.0)
+    assert state.time_left(102.0) is None  # too early to tell
+    left = estimate_work(state.stages)
     assert left == pytest.approx({"columns": 10.0, "pieces": 20.0 * 0.10 / 0.13})
-    assert tally.time_left() == pytest.approx(10.0 + 20.0 * 0.10 / 0.13)  # 10 s of work took 10 s
-    assert tally.share_done() == pytest.approx(10.0 / (20.0 + 20.0 * 0.10 / 0.13))
-    assert tally.rate(tally.stages["columns"]) == pytest.approx(0.5)
-    do(tally, "columns", range(5, 10), 10, seconds=2.0)
-    do(tally, "pieces", range(5), 10, seconds=8.0)
-    clock.now += 20.0
-    assert tally.work_left() == pytest.approx({"pieces": 40.0})
-    assert tally.time_left() == pytest.approx(40.0 * 30.0 / 60.0)  # two workers did 60 s of work in 30 s
-    do(tally, "pieces", range(5, 10), 10)
-    assert tally.time_left() == 0.0
-    assert tally.share_done() == 1.0
+    assert state.time_left(110.0) == pytest.approx(10.0 + 20.0 * 0.10 / 0.13)  # 10 s of work took 10 s
+    assert state.share_done(110.0) == pytest.approx(10.0 / (20.0 + 20.0 * 0.10 / 0.13))
+    assert state.stages["columns"].rate(110.0) == pytest.approx(0.5)
+    do(told, "columns", range(5, 10), 10, seconds=2.0)
+    do(told, "pieces", range(5), 10, seconds=8.0)
+    assert estimate_work(state.stages) == pytest.approx({"pieces": 40.0})
+    assert state.time_left(130.0) == pytest.approx(40.0 * 30.0 / 60.0)  # two workers did 60 s of work in 30 s
+    do(told, "pieces", range(5, 10), 10)
+    assert (state.time_left(130.0), state.share_done(130.0)) == (0.0, 1.0)
 
 
-def test_the_tally_counts(tmp_path: Path) -> None:
-    tally = Tally(Clock())
-    tally.begin(start_with(tmp_path, columns=3, pieces=3))
-    do(tally, "columns", range(1), 3, notes={"odd": 2}, peak_memory=7)
-    do(tally, "columns", range(1, 2), 3, reused=True, peak_memory=5)
-    tally.submitted("columns", "2_0")
-    assert (tally.in_hand, tally.stages["columns"].left) == (1, 1)
-    tally.failed("columns", "2_0", "wet")
-    tally.failed("pieces", "2_0", "not run", ("columns", "2_0"))
-    assert (tally.in_hand, tally.failures, tally.peak_memory, tally.warnings.total()) == (0, 1, 7, 2)
-    state = tally.stages["columns"]
+def test_the_state_counts(tmp_path: Path) -> None:
+    told = Watchers()
+    told.begin(start_with(tmp_path, columns=3, pieces=3))
+    do(told, "columns", range(1), 3, notes={"odd": 2}, peak_memory=7)
+    do(told, "columns", range(1, 2), 3, reused=True, peak_memory=5)
+    told.submitted("columns", "2_0")
+    run, state = told.state, told.state.stages["columns"]
+    assert (len(run.at_work), state.in_hand, state.left) == (1, 1, 1)
+    told.failed("columns", "2_0", "wet")
+    told.failed("pieces", "2_0", "not run", ("columns", "2_0"))
+    assert (len(run.at_work), run.n_own, run.n_failures, run.memory, run.notes.total()) == (0, 1, 2, 7, 2)
     assert (state.done, state.reused, state.failed, state.left) == (2, 1, 1, 0)
-    tally.planned("columns", Scope.TILE, 2)  # without the tile that failed
-    assert (state.total, state.done, state.failed) == (2, 0, 0)
+    told.planned("columns", Scope.TILE, 2)  # without the tile that failed
+    assert (state.total, state.done, state.failed, state.counts[State.FAILED]) == (2, 0, 0, 1)
+    told.done("pieces", 1, 3, record_of("pieces", "2_0"))  # which now needs nothing that failed
+    assert (run.stages["pieces"].done, run.stages["pieces"].failed) == (1, 0)
 
 
-def busy_tally(tmp_path: Path, n: int, clock: Clock | None = None) -> Tally:
-    """A tally of many stages at work, with long names and large numbers."""
-    tally = Tally(clock or Clock())
-    tally.begin(start_with(tmp_path, **{f"stage_with_a_long_name_{k}": 3_000_000 for k in range(n)}))
+def busy_state(tmp_path: Path, n: int) -> RunState:
+    """The state of many stages at work, with long names and large numbers."""
+    told = Watchers()
+    told.begin(start_with(tmp_path, **{f"stage_with_a_long_name_{k}": 3_000_000 for k in range(n)}))
     for k in range(n):
         stage = f"stage_with_a_long_name_{k}"
-        tally.submitted(stage, "a")
-        do(tally, stage, range(1_234_566, 1_234_567), 3_000_000, notes={"building-with-a-fault": 1000})
-        tally.failed(stage, "b", "wet")
-        tally.submitted(stage, "c")
-    return tally
+        told.submitted(stage, "a")
+        do(told, stage, range(1_234_566, 1_234_567), 3_000_000, notes={"building-with-a-fault": 1000})
+        told.failed(stage, "b", "wet")
+        told.submitted(stage, "c")
+    return told.state
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (200, 50), (60, 8), (20, 3)])
 @pytest.mark.parametrize("n", [1, 40])
-def test_no_row_is_too_wide_and_the_view_is_not_too_high(tmp_path: Path, width: int, height: int, n: int) -> None:
-    view = draw(busy_tally(tmp_path, n), width, height)
+def test_no_row_is_too_wide_and_the_view_is_not_too_high(
+    tmp_path: Path, at_100: float, width: int, height: int, n: int
+) -> None:
+    state = busy_state(tmp_path, n)
+    view = draw(state, width, height, now=at_100)
     rows = view.plain.split("\n")
     assert max(map(len, rows)) < width
     assert len(rows) < height
@@ -134,20 +135,18 @@ def test_no_row_is_too_wide_and_the_view_is_not_too_high(tmp_path: Path, width: 
         assert rows[-1].startswith("  0:00:00, 2 workers, ")
         assert f"{n:,} failed" in rows[-1]
     assert ("notes: building with a fault" in rows[-1]) is (width == 200)
-    assert draw(busy_tally(tmp_path, n), width, height, plain=True).plain.isascii()
+    assert draw(state, width, height, now=at_100, plain=True).plain.isascii()
 
 
-def test_a_view_by_hand(tmp_path: Path) -> None:
-    clock = Clock()
-    tally = Tally(clock)
-    tally.begin(start_with(tmp_path, columns=10, pieces=10, report=1))
-    assert draw(tally, 80, 24).plain.split("\n")[0].rstrip() == (
+def test_a_view_by_hand(tmp_path: Path, at_100: float) -> None:
+    told = Watchers()
+    told.begin(start_with(tmp_path, columns=10, pieces=10, report=1))
+    assert draw(told.state, 80, 24, now=at_100).plain.split("\n")[0].rstrip() == (
         f"  {'all':<16} {'─' * 22}   0%        starting  0 of 2 steps"
     )
-    do(tally, "columns", range(5), 10, seconds=2.0, notes={"odd": 1}, peak_memory=300 * 2**20)
-    tally.submitted("columns", "5_0")
-    clock.now += 10.0
-    assert draw(tally, 80, 24).plain.split("\n") == [
+    do(told, "columns", range(5), 10, seconds=2.0, notes={"odd": 1}, peak_memory=300 * 2**20)
+    told.submitted("columns", "5_0")
+    assert draw(told.state, 80, 24, now=at_100 + 10.0).plain.split("\n") == [
         f"  {'mesh':<16} {'━' * 11}{'─' * 11}          5/10  30.0/min   2.00 s each",
         f"  {'all':<16} {'━' * 6}{'─' * 16}  28%     ~ 26 s left  0 of 2 steps",
         "  0:00:10, 2 workers, 1 task in hand, peak 300 MiB, 5 warnings",
@@ -158,9 +157,10 @@ def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records]
 
 
-def test_the_log_tells_stages_failures_and_what_is_said(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_log_tells_stages_failures_and_what_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "citystitch")
-    lines = RunLog()
+    lines = Watchers([RunLog()])
+    lines.begin(start_with(tmp_path, columns=3, pieces=40))
     do(lines, "columns", range(3), 3, seconds=1.5)
     lines.say("so it is")
     for k in range(LISTED_FAILURES + 5):
@@ -175,9 +175,10 @@ def test_the_log_tells_stages_failures_and_what_is_said(caplog: pytest.LogCaptur
     assert errors == [False, False] + [True] * (LISTED_FAILURES + 1)
 
 
-def test_each_item_is_told_where_it_is_asked_for(caplog: pytest.LogCaptureFixture) -> None:
+def test_each_item_is_told_where_it_is_asked_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "citystitch")
-    lines = RunLog()
+    lines = Watchers([RunLog()])
+    lines.begin(start_with(tmp_path, columns=2, pieces=2))
     do(lines, "columns", range(1), 2, seconds=1.5, notes={"odd": 2})
     do(lines, "columns", range(1, 2), 2, seconds=0.0, reused=True)
     lines.failed("pieces", "0_0", "not run: columns", ("columns", "0_0"))
@@ -192,7 +193,7 @@ def test_each_item_is_told_where_it_is_asked_for(caplog: pytest.LogCaptureFixtur
 def test_a_long_stage_says_now_and_then_how_far_it_is(capsys: pytest.CaptureFixture[str]) -> None:
     for every, expected in ((60.0, ""), (0.0, "  mesh: 1 of 10 tasks\n  mesh: 2 of 10 tasks\n")):
         view = make_view(console=Console(file=io.StringIO()))
-        do(RunLog(every=every), "columns", range(2), 10)
+        do(Watchers([RunLog(every=every)]), "columns", range(2), 10)
         view.end("done")
         assert capsys.readouterr().out == expected
 

@@ -397,7 +397,7 @@ def test_one_run_at_a_time_by_a_lease(memory: Memory, monkeypatch: pytest.Monkey
     far = {"host": "far", "place": "other", "began": "1", "token": "t", "pid": 1}
     (bucket() / folder_lock.LOCK).write_bytes(json.dumps(far).encode())
     with folder_lock.only_run(out, said.append) as check:
-        assert "taken over from (process 1 on far), which is dead" in said[-1]
+        assert "taken over from process 1 on far, which is dead" in said[-1]
         (bucket() / folder_lock.LOCK).write_bytes(json.dumps(far).encode())
         with pytest.raises(OutputError, match="another run has taken it over"):
             wait_until(lambda: bool(check()))

@@ -120,14 +120,17 @@ def test_an_owner_elsewhere_is_listened_to(tmp_path: Path, locks: bool) -> None:
     elsewhere(tmp_path)
     assert is_held(tmp_path)
     stop = threading.Event()
-    file = os.open(tmp_path / LOCK, os.O_RDWR)
-    beat = threading.Thread(target=folder_lock._beat, args=(file, stop))
+
+    def touch() -> None:
+        while not stop.wait(0.1):
+            os.utime(tmp_path / LOCK)
+
+    beat = threading.Thread(target=touch)
     beat.start()
     with pytest.raises(ConfigError, match=r"at work there \(process \d+ on far\)"), only_run(tmp_path):
         pass
     stop.set()
     beat.join()
-    os.close(file)
     said: list[str] = []
     with only_run(tmp_path, said.append):
         pass

@@ -1,5 +1,6 @@
 """What is known of the tiles or of the seams of a run: boxes, states by stage, and values to colour by."""
 
+from array import array
 from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from typing import Any
@@ -151,7 +152,7 @@ class Items:
         self.facts: dict[str, Column] = {}
         self.views: dict[Any, Any] = {}
         self._tally: NDArray[np.int16] = np.zeros((0, len(State)), np.int16)  # stages of each item in each state
-        self._boxes: list[tuple[float, float, float, float]] = []
+        self._boxes = array("d")  # four numbers an item
         self._index: dict[str, int] = {}
         self._changed = Column(np.int64, 0)
         self._known: tuple[int, NDArray[np.float64]] = (0, np.empty((0, 4)))
@@ -168,7 +169,7 @@ class Items:
             self._index[str(name)] = len(self.names)
             self._changed[len(self.names)] = version
             self.names.append(str(name))
-            self._boxes.append((xmin, ymin, xmax, ymax))
+            self._boxes.extend((xmin, ymin, xmax, ymax))
         if self.layout != len(self.names):
             self.layout = len(self.names)
             self.views.clear()
@@ -208,8 +209,8 @@ class Items:
 
     def boxes(self) -> NDArray[np.float64]:
         """Boxes (m), (n, 4)."""
-        if self._known[0] != len(self._boxes):
-            self._known = len(self._boxes), np.array(self._boxes, np.float64).reshape(-1, 4)
+        if self._known[0] != len(self):
+            self._known = len(self), np.array(self._boxes).reshape(-1, 4)
         return self._known[1]
 
     def changed(self) -> NDArray[np.int64]:

@@ -1,13 +1,18 @@
-"""The state of a run, folded from the events of its driver (`tiler.monitoring.events`) one after the other."""
+"""The state of a run: its events (`tiler.monitoring.events`), folded one after the other.
+
+Terminal, log, ``progress.json``, page, metrics and report all take their numbers from here.
+"""
 
 import math
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from tiler.dashboard.items import Items, State
+from tiler.monitoring.items import Items, State
+from tiler.monitoring.stage_state import StageState, add_up, estimate_share, estimate_time
 from tiler.words.note_words import is_drop
+from tiler.words.stage_groups import group_stages
 
 MOST = 200  # intervals; when there are more, two become one
 TILE, SEAM = "tile", "seam"
@@ -90,39 +95,6 @@ class Series:
         ]
 
 
-@dataclass
-class StageState:
-    """How far a stage is.
-
-    Attributes
-    ----------
-    scope : str
-        ``"file"``, ``"tile"``, ``"seam"`` or ``"region"``; empty if it was not told.
-    total : int
-        Its items, as planned last.
-    codes : dict of str to int
-        State of its items by name, where its scope has no boxes; those of tiles and seams are in `Items`.
-    counts : Counter
-        Number of its items in each state but `State.WAITING`.
-    seconds : float
-        Wall time of what was computed (s).
-    last : float
-        When an item was last done (s since 1970).
-    """
-
-    scope: str = ""
-    total: int = 0
-    codes: dict[str, int] = field(default_factory=dict)
-    counts: Counter[int] = field(default_factory=Counter)
-    seconds: float = 0.0
-    last: float = 0.0
-
-    @property
-    def done(self) -> int:
-        """Items done, used again or not."""
-        return self.counts[State.DONE] + self.counts[State.REUSED]
-
-
 @dataclass(frozen=True)
 class FailedItem:
     """An item that failed: its reason, and the command that reproduces it, empty if there is none."""
@@ -135,8 +107,13 @@ class FailedItem:
     version: int
 
 
-class RunModel:
+class RunState:
     """The state of a run.
+
+    Parameters
+    ----------
+    mapped : bool
+        Keep what a map shows of each tile and seam: seconds, notes and facts.
 
     Attributes
     ----------
@@ -145,15 +122,15 @@ class RunModel:
     head : dict
         What the event ``"run"`` says: command, bounds, CRS, tile size, workers, status, error.
     began, last : float
-        Time of the first and of the last event (s since 1970); 0 before any.
+        When the run began, and time of the last event (s since 1970); 0 before any.
     items : dict of str to Items
         Tiles and seams, by scope.
     stages : dict of str to StageState
         In the order in which they were told.
     failures : deque of FailedItem
-        The last `KEPT_FAILURES`; `n_failures` counts all.
+        The last `KEPT_FAILURES`; `n_failures` counts all, and `n_own` those that do not fail for want of another.
     at_work : dict of (str, str) to float
-        Stage and name of what workers have in hand, and since when (s since 1970).
+        Stage and name of what workers have in hand, or had when the run ended, and since when (s since 1970).
     queued : dict of (str, str) to None
         What of that waits at the workers' side: they have several items in hand, and run as many as they are.
     first : float
@@ -166,14 +143,15 @@ class RunModel:
         Events that were not understood.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, mapped: bool = True) -> None:
+        self._mapped = mapped
         self.version = 0
         self.head: dict[str, Any] = {}
         self.began = self.last = self.first = 0.0
         self.items = {TILE: Items(), SEAM: Items()}
         self.stages: dict[str, StageState] = {}
         self.failures: deque[FailedItem] = deque(maxlen=KEPT_FAILURES)
-        self.n_failures = 0
+        self.n_failures = self.n_own = 0
         self.messages: deque[tuple[float, str, int]] = deque(maxlen=KEPT_MESSAGES)
         self.at_work: dict[tuple[str, str], float] = {}
         self.queued: dict[tuple[str, str], None] = {}
@@ -193,8 +171,36 @@ class RunModel:
             return "running" if self.status in {"", "running"} else self.status
         return "dead" if self.status == "running" else self.status or "unknown"
 
-    def fold(self, event: object) -> None:
-        """Take note of an event; one that is not of the known form is counted in `ignored`."""
+    @property
+    def ended(self) -> bool:
+        """Whether the run has said that it is over."""
+        return self.status not in {"", "running"}
+
+    @property
+    def workers(self) -> int:
+        """Number of workers, 0 where a cluster decides."""
+        return int(self.head.get("workers") or 0)
+
+    def groups(self) -> dict[str, StageState]:
+        """How far the groups of stages are that a user sees, in their order (`tiler.words.stage_groups`)."""
+        known = dict(list(self.stages.items()))  # a thread that draws may ask while another folds
+        return {
+            group: add_up({name: known[name] for name in names}) for group, names in group_stages(known).items()
+        }
+
+    def time_left(self, now: float) -> float | None:
+        """Estimate the time to the end (s), see `estimate_time`; `now` in s since 1970."""
+        return estimate_time(dict(list(self.stages.items())), self._spent(now))
+
+    def share_done(self, now: float) -> float:
+        """How much of all work is done, see `estimate_share`."""
+        return estimate_share(dict(list(self.stages.items())), self._spent(now))
+
+    def _spent(self, now: float) -> float:
+        return now - self.first if self.first else 0.0
+
+    def fold(self, event: object) -> bool:
+        """Take note of an event; one that is not of the known form is counted in `ignored`, and gives False."""
         self.version += 1
         try:
             if not isinstance(event, dict):
@@ -208,15 +214,17 @@ class RunModel:
             fold(self, event, t)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
             self.ignored += 1
+            return False
+        return True
 
-    def _run(self, event: Mapping[str, Any], _: float) -> None:
+    def _run(self, event: Mapping[str, Any], t: float) -> None:
+        self.began = self.began if self.head else t
         self.head |= {name: value for name, value in event.items() if name not in {"t", "event"}}
-        if self.status not in {"", "running"}:
+        if self.ended:
             for stage, name in self.at_work:  # what a run that ends has in hand is given up
                 place = self._find(stage, name)
                 if self._code(place) == State.RUNNING:
                     self._set(place, State.WAITING)
-            self.at_work.clear()
             self.queued.clear()
 
     def _tiles(self, event: Mapping[str, Any], _: float) -> None:
@@ -227,49 +235,58 @@ class RunModel:
 
     def _planned(self, event: Mapping[str, Any], _: float) -> None:
         name = str(event["stage"])
-        stage = self._stage(name)
-        stage.scope, stage.total = str(event.get("scope", stage.scope)), int(event["total"])
+        stage, total = self._stage(name), int(event["total"])
+        if total < stage.total:  # planned without some, the stage begins anew
+            stage.done = 0
+            stage.lost.clear()
+        stage.scope, stage.total = str(event.get("scope", stage.scope)), total
         if stage.scope in self.items:
             self.items[stage.scope].stage(name)
 
     def _submitted(self, event: Mapping[str, Any], t: float) -> None:
         place = self._find(str(event["stage"]), str(event["name"]))
+        place.stage.in_hand += place.key not in self.at_work
+        place.stage.began = place.stage.began or t
         self.at_work[place.key] = t
         self.first = self.first or t
-        workers = int(self.head.get("workers") or 0)
-        if workers and len(self.at_work) - len(self.queued) > workers:
+        if self.workers and len(self.at_work) - len(self.queued) > self.workers:
             self.queued[place.key] = None
         elif self._code(place) not in FINISHED:
             self._set(place, State.RUNNING)
 
-    def _take_back(self, key: tuple[str, str], t: float) -> None:
+    def _take_back(self, place: "_Place", t: float) -> None:
         """Take note that workers have an item no more; the one that waits longest runs now."""
-        if self.at_work.pop(key, None) is None:
+        if self.at_work.pop(place.key, None) is None:
             return
-        if key in self.queued:
-            del self.queued[key]
+        place.stage.in_hand -= 1
+        if place.key in self.queued:
+            del self.queued[place.key]
         elif self.queued:
             following = next(iter(self.queued))
             del self.queued[following]
             self.at_work[following] = t
-            place = self._find(*following)
-            if self._code(place) not in FINISHED:
-                self._set(place, State.RUNNING)
+            next_one = self._find(*following)
+            if self._code(next_one) not in FINISHED:
+                self._set(next_one, State.RUNNING)
 
     def _done(self, event: Mapping[str, Any], t: float) -> None:
         place = self._find(str(event["stage"]), str(event["name"]))
-        self._take_back(place.key, t)
-        if self._code(place) in FINISHED:
-            return  # planned again around a hole, and taken as it was
+        stage, before = place.stage, self._code(place)
         reused, seconds, memory = bool(event.get("reused")), _number(event, "seconds"), _number(event, "memory")
         notes = {str(kind): int(n) for kind, n in (event.get("notes") or {}).items()}
+        done = int(event.get("done", stage.done + (before not in FINISHED)))
+        total = int(event.get("total", stage.total))
+        self._take_back(place, t)
+        stage.done, stage.total = done, total
+        stage.lost.discard(place.key[1])
+        if done == total:
+            stage.finished = round(t - self.began, 3)
+        if before in FINISHED:
+            return  # planned again around a hole, and taken as it was
         self._set(place, State.REUSED if reused else State.DONE)
-        stage = place.stage
-        stage.last, stage.total = t, int(event.get("total", stage.total))
         self.notes.update(notes)
         self.memory = max(self.memory, int(memory))
-        if not reused:
-            stage.seconds += seconds
+        stage.seconds += seconds
         self.series.add(
             t,
             seconds=seconds,
@@ -277,16 +294,18 @@ class RunModel:
             running=len(self.at_work) - len(self.queued),
             done=0 if reused else 1,
         )
-        if place.items is not None:
+        if place.items is not None and self._mapped:
             self._keep(place.items, place, seconds, notes, event.get("facts") or {})
 
     def _failed(self, event: Mapping[str, Any], t: float) -> None:
         place = self._find(str(event["stage"]), str(event["name"]))
-        self._take_back(place.key, t)
+        self._take_back(place, t)
         self._set(place, State.FAILED)
         reason, command = str(event.get("reason", "")), str(event.get("command", ""))
         self.failures.append(FailedItem(*place.key, reason, command, t, self.version))
         self.n_failures += 1
+        self.n_own += not event.get("needs")
+        place.stage.lost.add(place.key[1])
 
     def _message(self, event: Mapping[str, Any], t: float) -> None:
         self.messages.append((t, str(event["text"]), self.version))
@@ -345,14 +364,14 @@ class _Place(NamedTuple):
 
 
 _FOLDS = {
-    "run": RunModel._run,
-    "tiles": RunModel._tiles,
-    "seams": RunModel._seams,
-    "planned": RunModel._planned,
-    "submitted": RunModel._submitted,
-    "done": RunModel._done,
-    "failed": RunModel._failed,
-    "message": RunModel._message,
+    "run": RunState._run,
+    "tiles": RunState._tiles,
+    "seams": RunState._seams,
+    "planned": RunState._planned,
+    "submitted": RunState._submitted,
+    "done": RunState._done,
+    "failed": RunState._failed,
+    "message": RunState._message,
 }
 
 
