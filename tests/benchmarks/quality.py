@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw
 
-from tiler.citymodels.cityjson import read_city_model
+from tests.helpers.written_models import read_city_model
 from tiler.config.config import make_config
 from tiler.interface.synth import write_city
 from tiler.pictures.render import render_run

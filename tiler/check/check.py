@@ -151,8 +151,7 @@ def _look(item: tuple[Path, Path] | PieceTask) -> tuple[Proof, ...]:
         survey_piece(item)
         return ()
     path, folder = item
-    with open_vertices(folder) as vertices:
-        return (check_solids(path, vertices),)
+    return (check_solids(path, open_vertices(folder)),)
 
 
 @dataclass(eq=False)

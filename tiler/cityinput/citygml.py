@@ -33,12 +33,8 @@ BUILDING, PART, RELIEF = "Building", "BuildingPart", "TINRelief"
 POLYGONS = {"Polygon", "Triangle", "Rectangle", "PolygonPatch"}
 # Subtrees that hold no faces of a building.
 SKIPPED = {
-    "address",
-    "appearance",
-    "appearanceMember",
-    "externalReference",
-    "interiorRoom",
-    "interiorBuildingInstallation",
+    *("address", "appearance", "appearanceMember", "externalReference"),
+    *("interiorRoom", "interiorBuildingInstallation"),
 }
 GENERIC = {"intAttribute": int, "doubleAttribute": float, "measureAttribute": float}
 # Children of a building that hold no attribute of it.
@@ -57,12 +53,8 @@ class Relief:
 def scan_citygml(path: Path, height: str = "") -> Iterator[str | ModelBuilding | Relief]:
     """Give names of CRSs as they are met first, and buildings and terrain in the order of the file.
 
-    Parameters
-    ----------
-    path : Path
-        CityGML file.
-    height : str
-        Generic attribute with the height above ground (m); ``""`` for ``measuredHeight``, or ``height`` of 3.0.
+    `height` is the generic attribute with the height above ground (m); ``""`` for ``measuredHeight``, or
+    ``height`` of 3.0.
 
     Raises
     ------
@@ -191,17 +183,13 @@ def _read_object(element: Any, owner: str, reading: _Reading) -> None:
         if not tag or tag in SKIPPED:
             continue
         if found := _LOD.fullmatch(tag):
-            _read_geometry(child, owner, reading, _lod_of(found), UNKNOWN)
+            _read_geometry(child, owner, reading, found, UNKNOWN)
         elif tag in ("boundedBy", "boundary"):
             _read_boundary(child, owner, reading)
         elif tag in ("consistsOfBuildingPart", "buildingPart"):
             for part in child:
                 if _local(part) == PART:
                     _read_object(part, _name_of(part) or owner, reading)
-
-
-def _lod_of(found: re.Match[str]) -> tuple[float, str]:
-    return float(found.group(1)), found.group(2)
 
 
 def _read_boundary(element: Any, owner: str, reading: _Reading) -> None:
@@ -211,11 +199,11 @@ def _read_boundary(element: Any, owner: str, reading: _Reading) -> None:
             continue  # an envelope, or a surface of a kind that is none of a building
         for child in surface:
             if found := _LOD.fullmatch(_local(child)):
-                _read_geometry(child, owner, reading, _lod_of(found), kind)
+                _read_geometry(child, owner, reading, found, kind)
 
 
-def _read_geometry(element: Any, owner: str, reading: _Reading, lod: tuple[float, str], kind: int) -> None:
-    level, form = lod
+def _read_geometry(element: Any, owner: str, reading: _Reading, name: re.Match[str], kind: int) -> None:
+    level, form = float(name[1]), name[2]
     if form.lower() in ("footprint", "roofedge") or (level == 0 and kind == UNKNOWN):
         kind = OUTLINE
     if form in ("TerrainIntersection", "MultiCurve", "ImplicitRepresentation", "Point"):
@@ -281,12 +269,8 @@ def _collect_polygons(element: Any, found: FaceList, kind: int) -> None:
 def read_polygon(element: Any) -> list[NDArray[np.float64]]:
     """Read the rings of a polygon, the border first, float64 (k, 3) each without a repeated end.
 
-    Heights are 0 where coordinates have two numbers.
-
-    Raises
-    ------
-    ValueError
-        If coordinates are no numbers, or not so many as they should be.
+    Heights are 0 where coordinates have two numbers. ValueError if coordinates are no numbers, or not so many as
+    they should be.
     """
     rings = []
     for side in element:
@@ -303,11 +287,7 @@ def _read_ring(element: Any) -> NDArray[np.float64]:
         if tag == "posList":
             width = int(child.get("srsDimension", width))
             return _as_ring([float(word) for word in (child.text or "").split()], width)
-        if tag == "pos":
-            words = (child.text or "").split()
-            width = len(words)
-            numbers += map(float, words)
-        elif tag == "pointProperty":
+        if tag in ("pos", "pointProperty"):
             words = [word for one in child.iter() if _local(one) == "pos" for word in (one.text or "").split()]
             width = len(words)
             numbers += map(float, words)

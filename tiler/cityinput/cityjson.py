@@ -24,23 +24,9 @@ Vertices = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CityJsonHead:
-    """What the first object of a CityJSON file or sequence says.
+    """The name of a file's CRS, ``""`` for none, and how its integers become coordinates."""
 
-    Attributes
-    ----------
-    version : str
-        Version of CityJSON.
-    crs : str
-        Name of the CRS, ``""`` for none.
-    sequence : bool
-        Whether features follow in lines of their own.
-    scale, translate : tuple of 3 floats
-        How integers become coordinates.
-    """
-
-    version: str
     crs: str
-    sequence: bool
     scale: tuple[float, float, float]
     translate: tuple[float, float, float]
 
@@ -108,7 +94,7 @@ def _read_head(path: Path, document: dict[str, Any], *, sequence: bool) -> CityJ
         raise InputError(f"{path}: its transform has not three finite scales and translations; write it anew")
     metadata = document.get("metadata") or {}
     crs = metadata.get("referenceSystem") or (metadata.get("crs") or {}).get("epsg") or ""
-    return CityJsonHead(version, str(crs), sequence, scale, translate)
+    return CityJsonHead(str(crs), scale, translate)
 
 
 def _read_lines(path: Path, head: CityJsonHead) -> Iterator[tuple[Object, Vertices]]:
@@ -149,21 +135,11 @@ def _vertices_of(path: Path, document: dict[str, Any], head: CityJsonHead) -> Ve
 
 
 def read_buildings(objects: Object, vertices: Vertices, height: str = "") -> Iterator[ModelBuilding]:
-    """Give the buildings among the objects of a document, each with its parts.
+    """Give the buildings among the objects of a document, by id, each with its parts.
 
-    Parameters
-    ----------
-    objects : mapping
-        City objects by id.
-    vertices : float64, (n, 3)
-        Vertices of the document.
-    height : str
-        Attribute with the height above ground (m); ``""`` for ``measuredHeight``.
-
-    Notes
-    -----
-    A part belongs to its first parent; one whose parent is absent is a building by itself. A `Building` without
-    geometry is that of its parts.
+    `vertices`, float64 (n, 3), are those of the document; `height` is the attribute with the height above ground
+    (m), ``""`` for ``measuredHeight``. A part belongs to its first parent; one whose parent is absent is a
+    building by itself. A `Building` without geometry is that of its parts.
     """
     parts: dict[str, list[str]] = {}
     for name, thing in objects.items():
@@ -219,11 +195,10 @@ def _read_shape(owner: str, geometry: Mapping[str, Any], vertices: Vertices) -> 
             break
         faces = list(shells[0]) if shells else []
         values = lists[0] if lists else None
-    return Shape(owner, lod, DEPTH[kind] > 0, _make_faces(faces, values, kinds, (vertices, default)), several)
+    return Shape(owner, lod, DEPTH[kind] > 0, _make_faces(faces, values, kinds, vertices, default), several)
 
 
-def _make_faces(faces: list[Any], values: Any, kinds: list[int], rest: tuple[Vertices, int]) -> Faces:
-    vertices, default = rest
+def _make_faces(faces: list[Any], values: Any, kinds: list[int], vertices: Vertices, default: int) -> Faces:
     numbers = values if values is not None else [None] * len(faces)
     corners: list[int] = []  # of all rings: millions of them in a file, so a ring is added at a time
     lengths: list[int] = []

@@ -4,7 +4,8 @@ import re
 from dataclasses import dataclass
 
 import pyproj
-from pyproj.exceptions import CRSError
+
+from tiler.georeference.crs import crs_or_none
 
 # National names that no register resolves: plan, and heights where the name has them.
 PLAIN = {
@@ -35,30 +36,16 @@ ADV = "urn:adv:crs:"
 
 @dataclass(frozen=True)
 class NamedCrs:
-    """What the name of a CRS says.
+    """What the name of a CRS says."""
 
-    Attributes
-    ----------
-    crs : pyproj.CRS or None
-        The CRS; None where the name is not understood.
-    registered_axes : bool
-        Whether the form of the name means the order of axes of the register: a URN or a URL of OGC.
-    text : str
-        The name.
-    """
-
-    crs: pyproj.CRS | None
+    crs: pyproj.CRS | None  # the CRS; None where the name is not understood
+    # Whether the form of the name means the order of axes of the register: a URN or a URL of OGC.
     registered_axes: bool
     text: str
 
 
 def read_crs_name(text: str) -> NamedCrs:
-    """Find the CRS that a name of a city model stands for.
-
-    Parameters
-    ----------
-    text : str
-        As in ``srsName`` or ``referenceSystem``.
+    """Find the CRS that a name of a city model, as in ``srsName`` or ``referenceSystem``, stands for.
 
     Examples
     --------
@@ -70,24 +57,16 @@ def read_crs_name(text: str) -> NamedCrs:
     """
     name = text.strip()
     if "," in name and (codes := _COMPOUND.findall(name)):
-        return NamedCrs(_parse("EPSG:" + "+".join(codes[:2])), True, text)
-    if found := _REGISTERED.fullmatch(name):
-        return NamedCrs(_parse(f"EPSG:{found[1]}"), True, text)
-    if found := _OLD.fullmatch(name):
-        return NamedCrs(_parse(f"EPSG:{found[1]}"), False, text)
-    if found := _SHORT.fullmatch(name):
-        return NamedCrs(_parse(name.upper()), False, text)
+        return NamedCrs(crs_or_none("EPSG:" + "+".join(codes[:2])), True, text)
+    for form, registered in ((_REGISTERED, True), (_OLD, False)):
+        if found := form.fullmatch(name):
+            return NamedCrs(crs_or_none(f"EPSG:{found[1]}"), registered, text)
+    if _SHORT.fullmatch(name):
+        return NamedCrs(crs_or_none(name.upper()), False, text)
     plan, _, height = name.removeprefix(ADV).partition("*")
     key = re.sub(r"[\s/]+", "_", plan.strip()).upper()
     known = PLAIN.get(key)
     if known:
         above = HEIGHTS.get(height.strip().upper())
-        return NamedCrs(_parse(f"{known}+{above.removeprefix('EPSG:')}" if above else known), False, text)
-    return NamedCrs(_parse(name) if name else None, False, text)
-
-
-def _parse(text: str) -> pyproj.CRS | None:
-    try:
-        return pyproj.CRS.from_user_input(text)
-    except CRSError:
-        return None
+        return NamedCrs(crs_or_none(f"{known}+{above.removeprefix('EPSG:')}" if above else known), False, text)
+    return NamedCrs(crs_or_none(name) if name else None, False, text)

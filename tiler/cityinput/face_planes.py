@@ -13,25 +13,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class FacePlanes:
-    """The plane of each of ``f`` faces.
+    """The plane of each of ``f`` faces."""
 
-    Attributes
-    ----------
-    normal : float64, (f, 3)
-        Area vectors (m²): as long as the area, by the right-hand rule around the border, holes taken away.
-    centre : float64, (f, 3)
-        Mean of the vertices of the border (m).
-    low, high : float64, (f,)
-        Least and greatest height of the vertices (m).
-    residual : float64, (f,)
-        Largest vertical distance of a vertex to the plane (m); infinite for a vertical face.
-    """
-
+    # (f, 3): area vectors (m²): as long as the area, by the right-hand rule around the border, holes taken away
     normal: Array
-    centre: Array
+    centre: Array  # (f, 3): mean of the vertices of the border (m)
+    # (f,): least and greatest height of the vertices (m)
     low: Array
     high: Array
-    residual: Array
+    residual: Array  # (f,): largest vertical distance of a vertex to the plane (m); infinite for a vertical face
 
 
 def area_vectors(xyz: Array, ring_start: NDArray[np.int64]) -> Array:

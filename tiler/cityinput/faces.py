@@ -30,24 +30,13 @@ Ring = Sequence[Sequence[float]]
 
 @dataclass(frozen=True, eq=False)
 class Faces:
-    """Polygons in space, in the coordinates of their file.
+    """Polygons in space, in the coordinates of their file."""
 
-    Attributes
-    ----------
-    xyz : float64, (n, 3)
-        Vertices of all rings, none of them repeated at the end of its ring.
-    ring_start : int64, (r + 1,)
-        The vertices of ring k are the rows ``ring_start[k]`` to ``ring_start[k + 1]``.
-    face_start : int64, (f + 1,)
-        The rings of each face: the first is its border, others are holes.
-    kind : int8, (f,)
-        `UNKNOWN`, `ROOF`, `GROUND`, `WALL` or `OUTLINE`.
-    """
-
-    xyz: NDArray[np.float64]
+    xyz: NDArray[np.float64]  # (n, 3): vertices of all rings, none of them repeated at the end of its ring
+    # (r + 1,): the vertices of ring k are the rows ``ring_start[k]`` to ``ring_start[k + 1]``
     ring_start: NDArray[np.int64]
-    face_start: NDArray[np.int64]
-    kind: NDArray[np.int8]
+    face_start: NDArray[np.int64]  # (f + 1,): the rings of each face: the first is its border, others are holes
+    kind: NDArray[np.int8]  # (f,): `UNKNOWN`, `ROOF`, `GROUND`, `WALL` or `OUTLINE`
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -55,70 +44,32 @@ class Faces:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A building, or a part of it, at one level of detail.
+    """A building, or a part of it, at one level of detail."""
 
-    Attributes
-    ----------
-    owner : str
-        Id of the building or part that it belongs to.
-    lod : float
-        Level of detail; `NO_LOD` where the file states none.
-    closed : bool
-        Whether it is a solid: its faces are then oriented outwards.
-    faces : Faces
-        Its polygons.
-    several : bool
-        Whether it is several solids, one after the other.
-    """
-
-    owner: str
-    lod: float
-    closed: bool
+    owner: str  # id of the building or part that it belongs to
+    lod: float  # level of detail; `NO_LOD` where the file states none
+    closed: bool  # whether it is a solid: its faces are then oriented outwards
     faces: Faces
-    several: bool = False
+    several: bool = False  # whether it is several solids, one after the other
 
 
 @dataclass(frozen=True, eq=False)
 class ModelBuilding:
-    """A building of a city model with its parts.
+    """A building of a city model with its parts."""
 
-    Attributes
-    ----------
-    id : str
-        Its id, ``""`` where the file has none.
-    shapes : tuple of Shape
-        All that is stated of it and its parts.
-    height : float
-        Height above ground by an attribute (m), NaN where there is none.
-    faults : tuple of str
-        What could not be read.
-    attributes : mapping of str to mapping
-        Attributes of the building and of each of its parts, by id; those of a GeoPackage only where asked for.
-    installations : mapping of str to str
-        Owners that are installations: the building or part of each, by id.
-    """
-
-    id: str
-    shapes: tuple[Shape, ...]
-    height: float = float("nan")
-    faults: tuple[str, ...] = ()
+    id: str  # its id, ``""`` where the file has none
+    shapes: tuple[Shape, ...]  # all that is stated of it and its parts
+    height: float = float("nan")  # height above ground by an attribute (m), NaN where there is none
+    faults: tuple[str, ...] = ()  # what could not be read
+    # Attributes of the building and of each of its parts, by id; those of a GeoPackage only where asked for.
     attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    # Owners that are installations: the building or part of each, by id.
     installations: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
 class FaceList:
-    """Faces as they are read, one after the other.
-
-    Attributes
-    ----------
-    rings : list
-        Vertices of each ring.
-    sizes : list of int
-        Number of rings of each face.
-    kinds : list of int
-        Kind of each face.
-    """
+    """Faces as they are read: vertices of each ring, number of rings of each face, and its kind."""
 
     rings: list[Any] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
@@ -151,16 +102,13 @@ def join_faces(several: Iterable[Faces]) -> Faces:
     parts = list(several)
     if len(parts) == 1:
         return parts[0]
+    first = np.zeros(1, np.int64)
     n_xyz = np.cumsum([0, *(len(faces.xyz) for faces in parts)])
     n_rings = np.cumsum([0, *(len(faces.ring_start) - 1 for faces in parts)])
     return Faces(
         np.concatenate([np.empty((0, 3)), *(faces.xyz for faces in parts)]),
-        np.concatenate(
-            [np.zeros(1, np.int64), *(f.ring_start[1:] + n for f, n in zip(parts, n_xyz, strict=False))]
-        ),
-        np.concatenate(
-            [np.zeros(1, np.int64), *(f.face_start[1:] + n for f, n in zip(parts, n_rings, strict=False))]
-        ),
+        np.concatenate([first, *(f.ring_start[1:] + n for f, n in zip(parts, n_xyz, strict=False))]),
+        np.concatenate([first, *(f.face_start[1:] + n for f, n in zip(parts, n_rings, strict=False))]),
         np.concatenate([np.empty(0, np.int8), *(faces.kind for faces in parts)]),
     )
 

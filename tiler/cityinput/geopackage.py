@@ -2,11 +2,10 @@
 
 import re
 import sqlite3
-import struct
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,12 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from tiler.cityinput.faces import NO_LOD, OUTLINE, UNKNOWN, Faces, ModelBuilding, Shape, check_places
+from tiler.vectors.features import to_objects
+from tiler.vectors.gdal_layer import quote
 from tiler.vectors.wkb import parse_wkb
 
 SIGNATURE = b"SQLite format 3\0"
-IDS = (
-    "identificatie",
-    "gml_id",
-    "building_id",
-    "id",
-)  # columns with the id of a building, the first that is there
+IDS = ("identificatie", "gml_id", "building_id", "id")  # columns with a building's id, the first that is there
 OUTLINES = "pand"  # layer with outlines in plan
 PART = "part"  # column with the id of the part that a row is, where it is one
 BATCH = 500  # buildings whose geometries are parsed at a time
@@ -60,13 +56,12 @@ def scan_geopackage(path: Path, *, attributes: bool = False) -> Iterator[str | M
             layers = _list_layers(path, base)
             yield layers[0].crs
             rows = _list_rows(base, layers)
-            batch: list[tuple[str, list[tuple[int, int]]]] = []
-            for name, group in groupby(rows, key=lambda row: row[0]):
-                batch.append((name, [(layer, number) for _, layer, number in group]))
-                if len(batch) == BATCH:
-                    yield from _read_batch(base, layers, batch, attributes)
-                    batch = []
-            yield from _read_batch(base, layers, batch, attributes)
+            buildings = (
+                (name, [(layer, number) for _, layer, number in group])
+                for name, group in groupby(rows, key=lambda row: row[0])
+            )
+            while batch := list(islice(buildings, BATCH)):
+                yield from _read_batch(base, layers, batch, attributes)
     except sqlite3.Error as error:
         raise InputError(f"{path}: cannot be read as a GeoPackage ({error}); copy it again") from error
 
@@ -78,7 +73,7 @@ def _list_layers(path: Path, base: sqlite3.Connection) -> list[_Layer]:
         "FROM gpkg_geometry_columns g LEFT JOIN gpkg_spatial_ref_sys s ON s.srs_id = g.srs_id ORDER BY 1"
     )
     for table, column, z, organization, code in base.execute(query).fetchall():
-        columns = {row[1].lower(): row[1] for row in base.execute(f"PRAGMA table_info({_quote(table)})")}
+        columns = {row[1].lower(): row[1] for row in base.execute(f"PRAGMA table_info({quote(table)})")}
         level = _LEVEL.fullmatch(table.lower())
         name = next((columns[one] for one in IDS if one in columns), "")
         outline = table.lower() == OUTLINES
@@ -98,8 +93,8 @@ def _list_layers(path: Path, base: sqlite3.Connection) -> list[_Layer]:
 def _list_rows(base: sqlite3.Connection, layers: list[_Layer]) -> Iterator[tuple[str, int, int]]:
     """Id, layer and row of all geometries, by id; it is these that the database sorts."""
     parts = [
-        f"SELECT CAST({_quote(layer.id)} AS TEXT), {k}, rowid FROM {_quote(layer.table)} "
-        f"WHERE {_quote(layer.id)} IS NOT NULL AND {_quote(layer.geometry)} IS NOT NULL"
+        f"SELECT CAST({quote(layer.id)} AS TEXT), {k}, rowid FROM {quote(layer.table)} "
+        f"WHERE {quote(layer.id)} IS NOT NULL AND {quote(layer.geometry)} IS NOT NULL"
         for k, layer in enumerate(layers)
     ]
     yield from base.execute(" UNION ALL ".join(parts) + " ORDER BY 1, 2, 3")
@@ -117,8 +112,8 @@ def _read_batch(
     for name, rows in batch:
         for layer, number in rows:
             one = layers[layer]
-            columns = "*" if all_columns else _quote(one.geometry)
-            found = base.execute(f"SELECT {columns} FROM {_quote(one.table)} WHERE rowid = ?", (number,))
+            columns = "*" if all_columns else quote(one.geometry)
+            found = base.execute(f"SELECT {columns} FROM {quote(one.table)} WHERE rowid = ?", (number,))
             row = dict(zip((column[0] for column in found.description), found.fetchone(), strict=True))
             stripped, fault = _strip(row.pop(one.geometry))
             owners.append(str(row.pop(PART, None) or name))
@@ -128,9 +123,7 @@ def _read_batch(
                     known.setdefault(key, value)
             blobs.append(stripped)
             faults.append(fault)
-    stored = np.empty(len(blobs), object)
-    stored[:] = blobs
-    geometry, _, broken = parse_wkb(stored)
+    geometry, _, broken = parse_wkb(to_objects(blobs))
     k = 0
     for name, rows in batch:
         shapes, told = [], []
@@ -152,11 +145,8 @@ def _strip(blob: bytes) -> tuple[bytes | None, str]:
     """Take the header of a GeoPackage's geometry away; None and the reason where there is no sound one."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None, "has no header of a GeoPackage"
-    try:
-        (flags,) = struct.unpack_from("B", blob, 3)
-        return blob[8 + _ENVELOPES[flags >> 1 & 7] :], ""
-    except KeyError:
-        return None, "has a header of an unknown kind"
+    envelope = _ENVELOPES.get(blob[3] >> 1 & 7)
+    return (None, "has a header of an unknown kind") if envelope is None else (blob[8 + envelope :], "")
 
 
 def _make_faces(geometry: shapely.Geometry, kind: int) -> Faces:
@@ -176,7 +166,3 @@ def _make_faces(geometry: shapely.Geometry, kind: int) -> Faces:
         np.searchsorted(part, np.arange(len(parts) + 1)),
         np.full(len(parts), kind, np.int8),
     )
-
-
-def _quote(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"'

@@ -17,38 +17,24 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of a lattice in a box, of whatever file.
+    """Cells of a lattice in a box, of whatever file."""
 
-    Attributes
-    ----------
-    x, y : float
-        Middle of the first cell of the southernmost row (m).
-    dx, dy : float
-        Size of a cell (m).
-    z : float64, (ny, nx)
-        Heights (m), NaN where there is none.
-    """
-
+    # Middle of the first cell of the southernmost row (m).
     x: float
     y: float
+    # Size of a cell (m).
     dx: float
     dy: float
-    z: Array
+    z: Array  # (ny, nx): heights (m), NaN where there is none
 
     @classmethod
     def around(cls, box: Box, lattice: Lattice) -> "Cells":
         """Make room for the cells of a lattice in a box and two more around it; none has a height."""
-        first = [
-            math.floor((box[k] - at) / d) - 2
-            for k, at, d in ((0, lattice.x, lattice.dx), (1, lattice.y, lattice.dy))
-        ]
-        last = [
-            math.ceil((box[k] - at) / d) + 2
-            for k, at, d in ((2, lattice.x, lattice.dx), (3, lattice.y, lattice.dy))
-        ]
-        shape = last[1] - first[1] + 1, last[0] - first[0] + 1
-        x, y = lattice.x + first[0] * lattice.dx, lattice.y + first[1] * lattice.dy
-        return cls(x, y, lattice.dx, lattice.dy, np.full(shape, np.nan))
+        dx, dy = lattice.dx, lattice.dy
+        i0, j0 = math.floor((box[0] - lattice.x) / dx) - 2, math.floor((box[1] - lattice.y) / dy) - 2
+        i1, j1 = math.ceil((box[2] - lattice.x) / dx) + 2, math.ceil((box[3] - lattice.y) / dy) + 2
+        empty = np.full((j1 - j0 + 1, i1 - i0 + 1), np.nan)
+        return cls(lattice.x + i0 * dx, lattice.y + j0 * dy, dx, dy, empty)
 
     @property
     def box(self) -> Box:
@@ -66,26 +52,21 @@ class Cells:
 
 
 def interpolate_cells(cells: Cells, x: Array, y: Array, spacing: float) -> Array:
-    """Give the heights of nodes.
+    """Give the heights of nodes, float64 (ny, nx) (m), from cells around all of them.
+
+    Linear between the middles of the four cells around a node. Where some of these have no height, the others
+    count by their weights, if the nearest is among them: so a raster reaches half a cell beyond its outer middles.
+    NaN elsewhere. Cells smaller than half of the spacing are averaged first, those within half a spacing of the
+    node.
 
     Parameters
     ----------
     cells : Cells
-        Cells around all of them.
-    x : float64, (nx,)
-        Eastings of the columns of nodes (m).
-    y : float64, (ny,)
-        Northings of the rows (m).
+        The cells.
+    x, y : float64, (nx,) and (ny,)
+        Eastings of the columns of nodes, and northings of the rows (m).
     spacing : float
         Distance between nodes (m).
-
-    Returns
-    -------
-    float64, (ny, nx)
-        Heights (m): linear between the middles of the four cells around a node. Where some of these have no
-        height, the others count by their weights, if the nearest is among them: so a raster reaches half a cell
-        beyond its outer middles. NaN elsewhere. Cells smaller than half of the spacing are averaged first, those
-        within half a spacing of the node.
     """
     if max(cells.dx, cells.dy) < FINE * spacing:
         return _average(cells, x, y, spacing)

@@ -10,14 +10,9 @@ CHOICES = ("auto", "1.2", "1.3", "2.1", "2.2")
 
 
 def rank_levels(levels: Sequence[float], asked: str) -> list[float]:
-    """Order levels of detail, the one that is wanted most first.
+    """Order levels of detail, from 1 on and `NO_LOD`, the one that is wanted most first.
 
-    Parameters
-    ----------
-    levels : sequence of float
-        Levels from 1 on, and `NO_LOD`.
-    asked : str
-        One of `CHOICES`: ``"auto"`` takes the best roofs; a number the best level up to it, then the next above.
+    ``"auto"`` takes the best roofs; a number of `CHOICES` the best level up to it, then the next above.
 
     Examples
     --------
@@ -36,15 +31,10 @@ def rank_levels(levels: Sequence[float], asked: str) -> list[float]:
 
 
 def list_attempts(building: ModelBuilding, asked: str) -> list[tuple[float, Faces]]:
-    """List what may be taken for a building's faces, the best first.
+    """List what may be taken for a building's faces, the best first: the best level among the faces, and these.
 
     Each part has its best level; from one attempt to the next the best of all is left out. A building's own faces
-    count where its parts have none that is better.
-
-    Returns
-    -------
-    list of (float, Faces)
-        The best level among the faces, and these; none where the building has no level from 1 on.
+    count where its parts have none that is better. None where the building has no level from 1 on.
     """
     attempts = _choose_shapes(building, asked)
     return [(level, join_faces(shape.faces for shape in chosen)) for level, chosen in attempts]

@@ -36,77 +36,31 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is read of a city model.
+    """What is read of a city model."""
 
-    Attributes
-    ----------
-    lod : str
-        Level of detail, one of `levels.CHOICES`.
-    height : str
-        Attribute with heights above ground, ``""`` for the format's own.
-    roof_points : bool
-        Whether to make points on roofs.
-    ground_points : bool
-        Whether to make points of the ground: of the terrain, and along outlines at the foot of buildings.
-    shift : float
-        Added to all heights (m).
-    """
-
-    lod: str
-    height: str
-    roof_points: bool
+    lod: str  # level of detail, one of `levels.CHOICES`
+    height: str  # attribute with heights above ground, ``""`` for the format's own
+    roof_points: bool  # whether to make points on roofs
+    # Whether to make points of the ground: of the terrain, and along outlines at the foot of buildings.
     ground_points: bool
-    shift: float = 0.0
+    shift: float = 0.0  # added to all heights (m)
 
 
 @dataclass(frozen=True, eq=False)
 class ModelBlock:
-    """Some buildings of a file.
+    """Some buildings of a file."""
 
-    Attributes
-    ----------
-    rows : ModelRows
-        Sorted by the cell of their box's centre, then by id.
-    xyz : float64, (n, 3)
-        Points on their roofs and around them (m).
-    classification : uint8, (n,)
-        ASPRS class of each point: 6 on roofs, 2 on the ground.
-    notes : tuple of Note
-        What was not as it should be.
-    counts : Counter of str
-        Numbers by name; they add up over the blocks.
-    """
-
-    rows: ModelRows
-    xyz: Array
-    classification: NDArray[np.uint8]
-    notes: tuple[Note, ...]
-    counts: Counter[str]
+    rows: ModelRows  # sorted by the cell of their box's centre, then by id
+    xyz: Array  # (n, 3): points on their roofs and around them (m)
+    classification: NDArray[np.uint8]  # (n,): ASPRS class of each point: 6 on roofs, 2 on the ground
+    notes: tuple[Note, ...]  # what was not as it should be
+    counts: Counter[str]  # numbers by name; they add up over the blocks
 
 
 def read_model_blocks(path: Path, frame: Frame, bounds: Box, wanted: Wanted) -> Iterator[ModelBlock]:
-    """Read the buildings of a file that meet a box, and points on their faces.
+    """Read the buildings of a file that meet a box in the region's CRS (m), and points on their faces.
 
-    Parameters
-    ----------
-    path : Path
-        City model file.
-    frame : Frame
-        How its coordinates become those of the region.
-    bounds : tuple of 4 floats
-        xmin, ymin, xmax, ymax in the region's CRS (m).
-    wanted : Wanted
-        What is read.
-
-    Yields
-    ------
-    ModelBlock
-        One for each thousand buildings; at least one.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
+    Gives a block for each thousand buildings; at least one. InputError if the file cannot be read.
 
     Notes
     -----

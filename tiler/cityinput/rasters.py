@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from tiler.cityinput.sources import TERRAIN
+from tiler.georeference.crs import crs_or_none
 from tiler.georeference.frame import Frame, box_to_file, box_to_region, to_region
 from tiler.pointclouds.cells import Box, order_by_cell
 from tiler.pointclouds.clouds import CloudHeader
@@ -26,46 +26,28 @@ REACH = 2.0 * MOST_CELL  # m around a node within which its cells lie
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where the cells of a raster lie.
+    """Where the cells of a raster lie."""
 
-    Attributes
-    ----------
-    x, y : float
-        Middle of the first cell of the southernmost row (m).
-    dx, dy : float
-        Size of a cell (m).
-    nx, ny : int
-        Columns and rows.
-    """
-
+    # Middle of the first cell of the southernmost row (m).
     x: float
     y: float
+    # Size of a cell (m).
     dx: float
     dy: float
+    # Columns and rows.
     nx: int
     ny: int
 
 
 @dataclass(frozen=True, eq=False)
 class RasterBlock:
-    """Cells with a height of some rows of a raster, sorted by the cells of points.
+    """Cells with a height of some rows of a raster, sorted by the cells of points."""
 
-    Attributes
-    ----------
-    units : int32, (n, 3)
-        Column and row (from the south) of each in the lattice, and height in `HEIGHT_UNIT`.
-    cell : int64, (c, 2)
-        Cells of points.
-    start : int64, (c + 1,)
-        Where the units of each begin.
-    n_read : int
-        Number of cells that were looked at, those without a height included.
-    """
-
+    # (n, 3): column and row (from the south) of each in the lattice, and height in `HEIGHT_UNIT`
     units: NDArray[np.int32]
-    cell: NDArray[np.int64]
-    start: NDArray[np.int64]
-    n_read: int
+    cell: NDArray[np.int64]  # (c, 2): cells of points
+    start: NDArray[np.int64]  # (c + 1,): where the units of each begin
+    n_read: int  # number of cells that were looked at, those without a height included
 
 
 def read_raster_header(path: Path) -> CloudHeader:
@@ -78,14 +60,10 @@ def read_raster_header(path: Path) -> CloudHeader:
     """
     with _open(path) as source:
         _check_turn(path, source)
-        box = source.bounds
-        crs = None if source.crs is None else _parse_crs(source.crs.to_wkt())
+        crs = None if source.crs is None else crs_or_none(source.crs.to_wkt())
         unread = "" if source.crs is None or crs is not None else "its CRS is not understood"
-        low, high = sorted((box.bottom, box.top))
-        return CloudHeader(
-            path, source.width * source.height, (box.left, low, box.right, high, 0.0, 0.0), crs, unread=unread,
-            kind=TERRAIN,
-        )  # fmt: skip
+        bounds = (*_box_of(source), 0.0, 0.0)
+        return CloudHeader(path, source.width * source.height, bounds, crs, unread=unread, kind=TERRAIN)
 
 
 def list_raster_files(path: Path) -> list[Path]:
@@ -95,22 +73,10 @@ def list_raster_files(path: Path) -> list[Path]:
 
 
 def find_lattice(path: Path, frame: Frame, bounds: Box) -> Lattice:
-    """Lay the lattice of the cells of a raster in the region.
+    """Lay the lattice of the cells of a raster in the region, whose `bounds` are in metres.
 
-    Parameters
-    ----------
-    path : Path
-        The raster.
-    frame : Frame
-        How its coordinates become those of the region.
-    bounds : tuple of 4 floats
-        The region (m).
-
-    Returns
-    -------
-    Lattice
-        That of the raster, where its coordinates are those of the region but for units. A raster that is
-        reprojected has one between multiples of the length of its cells, over its part of the region.
+    It is that of the raster, where its coordinates are those of the region but for units. A raster that is
+    reprojected has one between multiples of the length of its cells, over its part of the region.
 
     Raises
     ------
@@ -121,10 +87,8 @@ def find_lattice(path: Path, frame: Frame, bounds: Box) -> Lattice:
         step = source.transform
         if not frame.source and frame.east[0] == 0:
             dx, dy = step.a * frame.east[1], -step.e * frame.north[1]
-            x, y = (
-                (step.c + step.a / 2) * frame.east[1],
-                (step.f + (source.height - 0.5) * step.e) * frame.north[1],
-            )
+            x = (step.c + step.a / 2) * frame.east[1]
+            y = (step.f + (source.height - 0.5) * step.e) * frame.north[1]
             if dx > 0 and dy > 0:
                 _check_cell(path, max(dx, dy))
                 return Lattice(x, y, dx, dy, source.width, source.height)
@@ -144,23 +108,9 @@ def find_lattice(path: Path, frame: Frame, bounds: Box) -> Lattice:
 
 
 def read_raster(path: Path, frame: Frame, lattice: Lattice, bounds: Box) -> Iterator[RasterBlock]:
-    """Read the cells of a raster in the region and `REACH` around it, some rows at a time.
+    """Read the cells of a raster in the region and `REACH` around it, some rows at a time; at least one block.
 
-    Parameters
-    ----------
-    path : Path
-        The raster.
-    frame : Frame
-        How its coordinates become those of the region.
-    lattice : Lattice
-        As from `find_lattice`.
-    bounds : tuple of 4 floats
-        The region (m).
-
-    Yields
-    ------
-    RasterBlock
-        At least one.
+    `lattice` is that of `find_lattice`, `bounds` the region (m).
 
     Notes
     -----
@@ -168,16 +118,11 @@ def read_raster(path: Path, frame: Frame, lattice: Lattice, bounds: Box) -> Iter
     offset of the band are applied. A raster in another CRS is interpolated linearly between four of its cells, all
     of which must have a height.
     """
-    i = [
-        math.floor((bounds[0] - REACH - lattice.x) / lattice.dx),
-        math.ceil((bounds[2] + REACH - lattice.x) / lattice.dx),
-    ]
-    j = [
-        math.floor((bounds[1] - REACH - lattice.y) / lattice.dy),
-        math.ceil((bounds[3] + REACH - lattice.y) / lattice.dy),
-    ]
-    i0, i1 = max(i[0], 0), min(i[1] + 1, lattice.nx)
-    j0, j1 = max(j[0], 0), min(j[1] + 1, lattice.ny)
+    x, y, dx, dy = lattice.x, lattice.y, lattice.dx, lattice.dy
+    i0 = max(math.floor((bounds[0] - REACH - x) / dx), 0)
+    j0 = max(math.floor((bounds[1] - REACH - y) / dy), 0)
+    i1 = min(math.ceil((bounds[2] + REACH - x) / dx) + 1, lattice.nx)
+    j1 = min(math.ceil((bounds[3] + REACH - y) / dy) + 1, lattice.ny)
     if i1 <= i0 or j1 <= j0:
         yield RasterBlock(np.empty((0, 3), np.int32), np.empty((0, 2), np.int64), np.zeros(1, np.int64), 0)
         return
@@ -251,9 +196,7 @@ def _resample(
     place = _to_file(frame, nodes)
     step = source.transform
     u, v = (place[:, 0] - step.c) / step.a - 0.5, (place[:, 1] - step.f) / step.e - 0.5
-    fine = (
-        np.isfinite(u) & np.isfinite(v) & (u >= 0) & (v >= 0) & (u <= source.width - 1) & (v <= source.height - 1)
-    )
+    fine = (u >= 0) & (v >= 0) & (u <= source.width - 1) & (v <= source.height - 1)  # not so for NaN
     z = np.full(len(nodes), np.nan)
     if fine.any():
         c0, r0 = int(np.floor(u[fine].min())), int(np.floor(v[fine].min()))
@@ -309,12 +252,3 @@ def _check_cell(path: Path, size: float) -> None:
 def _box_of(source: Any) -> Box:
     box = source.bounds
     return min(box.left, box.right), min(box.bottom, box.top), max(box.left, box.right), max(box.bottom, box.top)
-
-
-def _parse_crs(text: str) -> pyproj.CRS | None:
-    from pyproj.exceptions import CRSError
-
-    try:
-        return pyproj.CRS.from_wkt(text)
-    except CRSError:
-        return None

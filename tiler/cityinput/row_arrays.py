@@ -1,7 +1,6 @@
 """Rows of city models as plain arrays of a store, and those of a box found again."""
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,10 @@ from numpy.typing import NDArray
 from pipeline.data.roofs import Roofs
 from tiler.cityinput.model_blocks import ROW_CELL
 from tiler.cityinput.rows import ModelRows, join_rows
-from tiler.pointclouds.cells import order_by_cell, row_ranges
+from tiler.pointclouds.cells import boxes_of_cells, order_by_cell
+from tiler.vectors.wkb import cut_blobs, join_blobs
 
 Arrays = dict[str, NDArray[Any]]
-Box = tuple[float, float, float, float]
 Ranges = list[tuple[int, int]]
 # Reads ranges of rows of some arrays, put one after the other.
 ReadRanges = Callable[[Sequence[str], Ranges], Arrays]
@@ -43,31 +42,21 @@ class RowPacker:
             "surface_limits": rows.roofs.limits,
         }
         blobs = {
-            "model_wkb": list(shapely.to_wkb(rows.outlines, byte_order=1, output_dimension=2)),
+            "model_wkb": shapely.to_wkb(rows.outlines, byte_order=1, output_dimension=2),
             "model_id": [name.encode() for name in rows.ids.tolist()],
-            "surface_wkb": list(shapely.to_wkb(rows.surfaces, byte_order=1, output_dimension=2)),
+            "surface_wkb": shapely.to_wkb(rows.surfaces, byte_order=1, output_dimension=2),
         }
         for name, some in blobs.items():
-            ends = self._bytes[name] + np.cumsum([len(blob) for blob in some], dtype=np.int64)
-            arrays[name] = np.frombuffer(b"".join(some), np.uint8)
-            arrays[f"{name}_end"] = ends
-            self._bytes[name] = int(ends[-1]) if len(ends) else self._bytes[name]
+            arrays[name], start = join_blobs(some)
+            arrays[f"{name}_end"] = self._bytes[name] + start[1:]
+            self._bytes[name] += int(start[-1])
         box = shapely.bounds(rows.outlines).reshape(-1, 4)
-        cells = order_by_cell((box[:, :2] + box[:, 2:]) / 2, ROW_CELL)
-        first = cells.start[:-1]
-        low, high = (ufunc.reduceat(box, first) if len(first) else box for ufunc in (np.minimum, np.maximum))
-        arrays["model_cell_box"] = np.hstack((low[:, :2], high[:, 2:]))
-        arrays["model_cell_start"] = first + self.n_rows
+        start = order_by_cell((box[:, :2] + box[:, 2:]) / 2, ROW_CELL).start
+        arrays["model_cell_box"] = boxes_of_cells(box, start)
+        arrays["model_cell_start"] = start[:-1] + self.n_rows
         self.n_rows += len(rows)
         self.n_surfaces += len(rows.surfaces)
         return arrays
-
-
-def find_ranges(cell_box: NDArray[np.float64], cell_start: NDArray[np.int64], n_rows: int, box: Box) -> Ranges:
-    """Ranges of the rows of cells whose buildings may meet a box."""
-    meets = (cell_box[:, 0] <= box[2]) & (cell_box[:, 2] >= box[0])
-    meets &= (cell_box[:, 1] <= box[3]) & (cell_box[:, 3] >= box[1])
-    return row_ranges(meets, np.append(cell_start, n_rows))
 
 
 def unpack_rows(read: ReadRanges, ranges: Ranges) -> ModelRows:
@@ -111,8 +100,5 @@ def _from(ends: NDArray[np.int64], first: int) -> NDArray[np.int64]:
 
 def _blobs(read: ReadRanges, name: str, ends: NDArray[np.int64]) -> NDArray[np.object_]:
     first, last = int(ends[0]), int(ends[-1])
-    data = read((name,), [(first, last)])[name].tobytes() if last > first else b""
-    at = (ends - ends[0]).tolist()
-    found = np.empty(len(at) - 1, object)
-    found[:] = [data[a:b] for a, b in pairwise(at)]
-    return found
+    data = read((name,), [(first, last)])[name] if last > first else np.empty(0, np.uint8)
+    return cut_blobs(data, ends)

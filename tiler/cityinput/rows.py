@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import shapely
@@ -32,39 +33,23 @@ Placing = tuple[Frame, float]  # how coordinates of a file become those of the r
 
 @dataclass(frozen=True, eq=False)
 class ModelRows:
-    """Buildings of city models, one row each, and their roof surfaces.
+    """Buildings of city models, one row each, and their roof surfaces."""
 
-    Attributes
-    ----------
-    outlines : object, (n,)
-        Polygons and multipolygons in the region's CRS (m): where each building stands.
-    ids : str, (n,)
-        Ids of the buildings.
-    given_height : float64, (n,)
-        Height above ground by an attribute (m), NaN where there is none.
-    lod : float64, (n,)
-        Level of detail that the surfaces are of; NaN without any.
-    base : float64, (n,)
-        Lowest height of the building's faces (m), NaN without any.
-    start : int64, (n + 1,)
-        The surfaces of row k are ``start[k]`` to ``start[k + 1]``.
-    surfaces : object, (s,)
-        Roof surfaces in plan, shapely polygons.
-    roofs : Roofs
-        Their planes.
-    """
-
+    # (n,): polygons and multipolygons in the region's CRS (m): where each building stands
     outlines: NDArray[np.object_]
     ids: NDArray[np.str_]
-    given_height: Array
-    lod: Array
-    base: Array
-    start: Index
-    surfaces: NDArray[np.object_]
-    roofs: Roofs
+    given_height: Array  # (n,): height above ground by an attribute (m), NaN where there is none
+    lod: Array  # (n,): level of detail that the surfaces are of; NaN without any
+    base: Array  # (n,): lowest height of the building's faces (m), NaN without any
+    start: Index  # (n + 1,): the surfaces of row k are ``start[k]`` to ``start[k + 1]``
+    surfaces: NDArray[np.object_]  # (s,): roof surfaces in plan, shapely polygons
+    roofs: Roofs  # their planes
 
     def __len__(self) -> int:
         return len(self.ids)
+
+
+_COLUMNS = ("outlines", "ids", "given_height", "lod", "base")  # that have a value a building
 
 
 def no_rows() -> ModelRows:
@@ -81,38 +66,27 @@ def take_rows(rows: ModelRows, chosen: Index) -> ModelRows:
     count = np.diff(rows.start)[chosen]
     start = np.concatenate(([0], np.cumsum(count)))
     surface = np.repeat(rows.start[chosen] - start[:-1], count) + np.arange(start[-1])
-    return ModelRows(
-        rows.outlines[chosen],
-        rows.ids[chosen],
-        rows.given_height[chosen],
-        rows.lod[chosen],
-        rows.base[chosen],
-        start,
-        rows.surfaces[surface],
-        take_roofs(rows.roofs, surface),
-    )
+    columns: dict[str, Any] = {name: getattr(rows, name)[chosen] for name in _COLUMNS}
+    roofs = take_roofs(rows.roofs, surface)
+    return ModelRows(**columns, start=start, surfaces=rows.surfaces[surface], roofs=roofs)
 
 
 def join_rows(several: Sequence[ModelRows]) -> ModelRows:
     """Put rows one after the other; none gives none."""
     parts = [no_rows(), *several]
     n = np.cumsum([0, *(len(rows.surfaces) for rows in parts)])
-    return ModelRows(
-        np.concatenate([rows.outlines for rows in parts]),
-        np.concatenate([rows.ids for rows in parts]),
-        np.concatenate([rows.given_height for rows in parts]),
-        np.concatenate([rows.lod for rows in parts]),
-        np.concatenate([rows.base for rows in parts]),
-        np.concatenate([[0], *(rows.start[1:] + k for rows, k in zip(parts, n, strict=False))]).astype(np.int64),
-        np.concatenate([rows.surfaces for rows in parts]),
-        join_roofs([rows.roofs for rows in parts]),
-    )
+    start = np.concatenate([[0], *(rows.start[1:] + k for rows, k in zip(parts, n, strict=False))])
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(rows, name) for rows in parts]) for name in (*_COLUMNS, "surfaces")
+    }
+    roofs = join_roofs([rows.roofs for rows in parts])
+    return ModelRows(**joined, start=start.astype(np.int64), roofs=roofs)
 
 
 def make_rows(
     buildings: Sequence[ModelBuilding], frame: Frame, asked: str, counts: Counter[str], shift: float = 0.0
 ) -> tuple[ModelRows, list[Note]]:
-    """Make rows of buildings.
+    """Make rows of the buildings of a file that stand somewhere, in their order.
 
     Parameters
     ----------
@@ -130,12 +104,10 @@ def make_rows(
     Returns
     -------
     ModelRows
-        Those that stand somewhere, in the order of the buildings.
     list of Note
         ``model-fault`` for what could not be read, ``model-lower-level`` where a level without roofs was left for
         a lower one, ``model-no-roof`` where none has any, ``model-self-crossing``, ``model-steep-roof``,
-        ``model-not-planar``, and
-        ``model-without-place``.
+        ``model-not-planar``, and ``model-without-place``.
 
     Notes
     -----
@@ -292,11 +264,11 @@ def _assemble(
     outlines = np.empty(len(kept), object)
     outlines[:] = [done[k].outline if k in done else places[k] for k in kept]
     ids = np.array([buildings[k].id for k in kept], np.str_)
-    missing = np.flatnonzero(ids == "")
-    if len(missing):
-        made = make_ids(outlines[missing])
-        ids = ids.astype(f"<U{max(ids.itemsize // 4, 14)}")
-        ids[missing] = made
+    missing = ids == ""
+    if missing.any():
+        ids = ids.astype(object)
+        ids[missing] = make_ids(outlines[missing])
+        ids = ids.astype(np.str_)
     n_surfaces = [len(done[k].surfaces) if k in done else 0 for k in kept]
     nothing = np.empty(0, object)
     return ModelRows(

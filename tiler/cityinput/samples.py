@@ -63,7 +63,7 @@ def _find_nodes(xy: Array, ring_start: Index, face_start: Index, step: float) ->
 
 
 def grid_faces(xy: Array, ring_start: Index, face_start: Index, step: float) -> tuple[Index, Index]:
-    """Find the nodes of a grid within faces in plan.
+    """Find the nodes of a grid within faces in plan: the face of each, int64 (k,), its column i and row j, (k, 2).
 
     Parameters
     ----------
@@ -73,13 +73,6 @@ def grid_faces(xy: Array, ring_start: Index, face_start: Index, step: float) -> 
         As of `Faces`; what lies within an odd number of rings of a face is inside.
     step : float
         Side of the grid (m): nodes are at ``(i + 0.5) * step``, ``(j + 0.5) * step``.
-
-    Returns
-    -------
-    int64, (k,)
-        The face of each node.
-    int64, (k, 2)
-        Its column i and row j.
 
     Examples
     --------
@@ -102,16 +95,9 @@ def grid_polygons(polygons: NDArray[np.object_], step: float) -> tuple[Index, In
 
 
 def number_nodes(owner: Index, node: Index, low: Index, size: Index) -> Index:
-    """One number for each node of each owner, by owner, row and column, int64 (n,).
+    """One number for each node, (n, 2), of each owner, by owner, row and column, int64 (n,).
 
-    Parameters
-    ----------
-    owner : int64, (n,)
-        Owners.
-    node : int64, (n, 2)
-        Columns and rows.
-    low, size : int64, (2,)
-        Least column and row, and how many there are of each.
+    `low` and `size`, (2,), are the least column and row, and how many there are of each.
     """
     numbers: Index = (owner * size[1] + node[:, 1] - low[1]) * size[0] + node[:, 0] - low[0]
     return numbers
@@ -120,21 +106,8 @@ def number_nodes(owner: Index, node: Index, low: Index, size: Index) -> Index:
 def highest_nodes(owner: Index, node: Index, z: Array, mask: tuple[Index, Index]) -> Index:
     """Find the highest of all nodes at one place of one owner, where a mask has the place, too.
 
-    Parameters
-    ----------
-    owner : int64, (n,)
-        Owners of nodes.
-    node : int64, (n, 2)
-        Their columns and rows.
-    z : float64, (n,)
-        Their heights (m).
-    mask : (int64 (m,), int64 (m, 2))
-        Owners and nodes of places that count.
-
-    Returns
-    -------
-    int64, (k,)
-        Rows of the nodes, by owner, row and column.
+    `owner` (n,), `node` (n, 2) and `z` (n,) are owners, columns and rows, and heights (m) of nodes; `mask` has
+    owners and nodes of places that count. Gives the rows of the nodes, by owner, row and column.
     """
     if not len(owner) or not len(mask[0]):
         return np.empty(0, np.int64)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -82,14 +81,12 @@ def scan_model(
         yield from map(Relief, read_relief(objects, vertices))
 
 
-@dataclass(eq=False)
 class _Survey:
-    low: list[float] = field(default_factory=lambda: [math.inf] * 3)
-    high: list[float] = field(default_factory=lambda: [-math.inf] * 3)
-    n_buildings: int = 0
-    n_vertices: int = 0
-    right: int = 0
-    wrong: int = 0
+    """Extent of a model, numbers of its buildings and vertices, and of solids and roofs by where they look."""
+
+    def __init__(self) -> None:
+        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
+        self.n_buildings = self.n_vertices = self.right = self.wrong = 0
 
     def add(self, building: ModelBuilding) -> None:
         self.n_buildings += 1
@@ -97,36 +94,20 @@ class _Survey:
             if not len(shape.faces):
                 continue
             self.n_vertices += len(shape.faces.xyz)
-            for k, (low, high) in enumerate(
-                zip(shape.faces.xyz.min(axis=0).tolist(), shape.faces.xyz.max(axis=0).tolist(), strict=True)
-            ):
-                self.low[k], self.high[k] = min(self.low[k], low), max(self.high[k], high)
-            if self.right + self.wrong >= ENOUGH:
-                continue
-            sign = signed_volume(shape.faces) if shape.closed else upward_area(shape.faces)
-            self.right += sign > 0
-            self.wrong += sign < 0
+            self.low = np.minimum(self.low, shape.faces.xyz.min(axis=0))
+            self.high = np.maximum(self.high, shape.faces.xyz.max(axis=0))
+            if self.right + self.wrong < ENOUGH:
+                sign = signed_volume(shape.faces) if shape.closed else upward_area(shape.faces)
+                self.right += sign > 0
+                self.wrong += sign < 0
 
 
 def read_model_header(path: Path, axis_order: str = "") -> CloudHeader:
     """Read a city model once for its extent, its CRS and the order of its axes.
 
-    Parameters
-    ----------
-    path : Path
-        CityJSON, CityJSONSeq or CityGML file.
-    axis_order : str
-        ``"xy"`` for the easting first, ``"yx"`` for the northing first; ``""`` for what the file shows.
-
-    Returns
-    -------
-    CloudHeader
-        Of kind ``"model"``; its bounds have the easting first, and ``swapped`` says whether the file has not.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
+    `axis_order` is ``"xy"`` for the easting first, ``"yx"`` for the northing first; ``""`` for what the file
+    shows. The bounds of the header have the easting first, and ``swapped`` says whether the file has not.
+    InputError if the file cannot be read.
 
     Notes
     -----
@@ -140,8 +121,7 @@ def read_model_header(path: Path, axis_order: str = "") -> CloudHeader:
             name = name if name.text else read_crs_name(each)
         elif isinstance(each, ModelBuilding):
             found.add(each)
-    low, high = found.low, found.high
-    n = found.n_vertices
+    low, high, n = found.low.tolist(), found.high.tolist(), found.n_vertices
     box = (low[0], low[1], high[0], high[1]) if n else (math.nan,) * 4
     if n and not np.isfinite(box).all():
         raise InputError(f"{path}: a coordinate is not finite; mend the file")
@@ -159,7 +139,7 @@ def read_model_header(path: Path, axis_order: str = "") -> CloudHeader:
 def choose_axes(
     name: NamedCrs, box: tuple[float, float, float, float], sense: tuple[int, int], asked: str
 ) -> tuple[bool, str]:
-    """Decide whether the northing comes first in a file.
+    """Decide whether the northing comes first in a file, and say what decided.
 
     Parameters
     ----------
@@ -171,13 +151,6 @@ def choose_axes(
         Solids and roofs that look outwards and inwards with the first coordinate as the easting.
     asked : str
         ``"xy"``, ``"yx"`` or ``""``.
-
-    Returns
-    -------
-    bool
-        Whether the northing comes first.
-    str
-        What decided, ``""`` where the easting comes first and nothing contradicts.
     """
     if asked:
         return asked == "yx", "by --axis-order"

@@ -24,10 +24,8 @@ from tiler.store.run_folder import WRONG_FIELD, Buildings, broken_field
 CITYJSON = "2.0"
 MAX_NUMBER = 2**53  # of a building
 BLOCK = 1 << 14  # vertices that are read at once
-KEPT_BLOCKS = 32
 PLANE = "roof_plane"  # attribute of a sloped roof: a, b, c, x0, y0, lowest and highest height
 PLANE_VALUES = 7
-VERTEX_BYTES = 24
 VERTICES, HEAD_MEMBERS = "vertices.f64", "head.json"  # files of the vertices
 SHAPES, COLUMNS = "buildings.wkb", ("numbers", "box", "start", "size")  # files of an index
 HEAD = np.dtype([("ground", "<f8"), ("roof", "<f8"), ("plane", "<f8", PLANE_VALUES)])
@@ -51,25 +49,15 @@ class BuildingRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BuildingIndex:
-    """All buildings of a city model, by ascending number: 36 bytes of each in memory, the rest in a file.
+    """All buildings of a city model, by ascending number: 36 bytes of each in memory, the rest in a file."""
 
-    Attributes
-    ----------
-    numbers : int64, (n,)
-        Attribute ``number``.
-    box : float32, (n, 4)
-        Box of the footprint, west, south, east, north (m), rounded; NaN for an empty one.
-    start, size : int64 and int32, (n,)
-        Where the building lies in the file, and how long it is (bytes).
-    file : binary file
-        Heights, roofs and footprints.
-    """
-
-    numbers: NDArray[np.int64]
+    numbers: NDArray[np.int64]  # (n,): attribute ``number``
+    # (n, 4): box of the footprint, west, south, east, north (m), rounded; NaN for an empty one
     box: NDArray[np.float32]
+    # (n,): where the building lies in the file, and how long it is (bytes)
     start: NDArray[np.int64]
     size: NDArray[np.int32]
-    file: IO[bytes]
+    file: IO[bytes]  # heights, roofs and footprints
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -149,36 +137,28 @@ def open_index(folder: Path) -> Iterator[BuildingIndex]:
         yield BuildingIndex(numbers, box, start, size, file)
 
 
-@contextmanager
-def open_vertices(folder: Path) -> Iterator["Vertices"]:
+def open_vertices(folder: Path) -> "Vertices":
     """Open the vertices that `index_buildings` put into a folder."""
     with (folder / VERTICES).open("rb") as file:
-        n = file.seek(0, os.SEEK_END) // VERTEX_BYTES
-        yield Vertices(file, n, json.loads((folder / HEAD_MEMBERS).read_text()))
+        return Vertices(file, json.loads((folder / HEAD_MEMBERS).read_text()))
 
 
 class Vertices:
-    """The vertices of a city model in a file of float64 (n, 3), read in blocks of which the last few are kept.
+    """The vertices of a city model, mapped from a file of float64 (n, 3) that has them without the transform.
 
-    Parameters
-    ----------
-    file : binary file
-        The vertices as the city model has them, without its transform.
-    n : int
-        How many there are.
-    head : mapping
-        Members ``transform`` and, if it has any, ``metadata`` of the city model.
+    `head` has the members ``transform`` and, if it has any, ``metadata`` of the city model.
     """
 
-    def __init__(self, file: IO[bytes], n: int, head: Mapping[str, Any]) -> None:
-        self._file, self._n, self.head = file, n, head
+    def __init__(self, file: IO[bytes], head: Mapping[str, Any]) -> None:
+        self.head = head
         transform = head["transform"]
         self._scale, self._translate = (np.array(transform[name], np.float64) for name in ("scale", "translate"))
         np.zeros(3) * self._scale + self._translate  # both fit, or it is told here
-        self._blocks: dict[int, NDArray[np.float64]] = {}
+        empty = file.seek(0, os.SEEK_END) == 0
+        self._rows = np.empty((0, 3)) if empty else np.memmap(file, np.float64, "r").reshape(-1, 3)
 
     def __len__(self) -> int:
-        return self._n
+        return len(self._rows)
 
     def take(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Take vertices (k, 3) in metres."""
@@ -186,33 +166,14 @@ class Vertices:
 
     def take_raw(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Take vertices (k, 3) as the city model has them: whole numbers."""
-        found = np.empty((len(rows), 3))
-        block = rows // BLOCK
-        for number in np.unique(block).tolist():
-            there = block == number
-            found[there] = self._block(number)[rows[there] - number * BLOCK]
+        found: NDArray[np.float64] = self._rows[rows]
         return found
-
-    def _block(self, number: int) -> NDArray[np.float64]:
-        block = self._blocks.pop(number, None)
-        if block is None:
-            self._file.seek(number * BLOCK * VERTEX_BYTES)
-            block = np.frombuffer(self._file.read(BLOCK * VERTEX_BYTES)).reshape(-1, 3)
-            while len(self._blocks) >= KEPT_BLOCKS:
-                del self._blocks[next(iter(self._blocks))]
-        self._blocks[number] = block  # the youngest is the last
-        return block
 
 
 def spool_vertices(path: Path, spool: IO[bytes]) -> Vertices:
-    """Read all of a CityJSON file but its objects.
+    """Read all of a CityJSON file, in any layout, but its objects.
 
-    Parameters
-    ----------
-    path : Path
-        The file, in any layout.
-    spool : binary file
-        Empty, to be kept open as long as the vertices are used.
+    The spool is empty, and to be kept open as long as the vertices are used.
 
     Raises
     ------
@@ -227,23 +188,21 @@ def spool_vertices(path: Path, spool: IO[bytes]) -> Vertices:
             raise InputError(f"{path}: is no CityJSON {CITYJSON} file; run again")
         if large["vertices"] != "start_array" or large["CityObjects"] != "start_map":
             raise TypeError("vertices is no array, or CityObjects no object")
-        n = 0
-        for rows in _cut(iterate_elements(path, "vertices")):
-            _write(spool, _rows(rows))
-            n += len(rows)
-        return Vertices(spool, n, head)
+        elements = iterate_elements(path, "vertices")
+        while rows := list(islice(elements, BLOCK)):
+            data = _rows(rows)
+            with _writing():
+                spool.write(data.data)
+                spool.flush()
+        return Vertices(spool, head)
     except WRONG_FIELD as error:
         raise broken_field(path, error) from None
 
 
-def _cut(items: Iterator[Any]) -> Iterator[list[Any]]:
-    while batch := list(islice(items, BLOCK)):
-        yield batch
-
-
-def _write(file: IO[bytes], data: Any) -> None:
+@contextmanager
+def _writing() -> Iterator[None]:
     try:
-        file.write(data)
+        yield
     except OSError as error:
         raise OutputError(
             f"{gettempdir()}: no temporary file can be written ({error.strerror}); free space there or set TMPDIR"
@@ -266,7 +225,8 @@ def _read_objects(path: Path, vertices: Vertices, file: IO[bytes]) -> BuildingIn
             continue
         row = read_building(path, name, thing, vertices)
         data = np.array([(row.ground, row.roof, row.plane)], HEAD).tobytes() + shapely.to_wkb(row.footprint)
-        _write(file, data)
+        with _writing():
+            file.write(data)
         numbers.append(row.number)
         boxes.extend(shapely.bounds(row.footprint).tolist())
         starts.append(start)
@@ -296,13 +256,7 @@ def has_parts(path: Path, thing: Any) -> bool:
 
 
 def read_building(path: Path, name: str, thing: Mapping[str, Any], vertices: Vertices) -> BuildingRow:
-    """Take number, ground and roof height (m), roof and footprint of a building of a city model.
-
-    Raises
-    ------
-    InputError
-        If one of these is missing or wrong.
-    """
+    """Take number, heights (m), roof and footprint of a building; InputError if one is missing or wrong."""
     try:
         values = thing["attributes"]
         if not 0 <= values["number"] < MAX_NUMBER:

@@ -1,7 +1,6 @@
-"""The city model as a CityJSON 2.0 file, and back (steps 1.7 and 2.4)."""
+"""The city model as a CityJSON 2.0 file (steps 1.7 and 2.4)."""
 
 import hashlib
-import json
 import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
@@ -12,17 +11,17 @@ from typing import IO, Any, BinaryIO
 
 import numpy as np
 import pyproj
-import shapely
 from numpy.typing import NDArray
 from pyproj.exceptions import CRSError
 
 from pipeline.city_model.sloped_solids import GROUND, ROOF, WALL
 from pipeline.city_model.solids import Levels, Solids, build_solids
 from pipeline.data.citymodel import CityModel, join_models, take_model
-from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.errors import ConfigError
 from pipeline.data.notes import Note
-from pipeline.data.roofs import Roofs, choose_roofs, flat_roofs, is_flat
-from tiler.citymodels.building_index import PLANE, PLANE_VALUES
+from pipeline.data.roofs import Roofs, is_flat
+from tiler.citymodels.building_index import PLANE
+from tiler.citymodels.cityjson_text import ObjectLines, compact, reference_system
 from tiler.store.atomic import replacing
 
 # Coordinates are whole multiples of this length (m).
@@ -33,8 +32,6 @@ ATTRIBUTES = ("number", "ground_height", "roof_height", "height", "members")
 # written, else one of LoD1.2 up to the highest place of the roof.
 BLOCK_HEIGHTS = {"1.2": "lod12_height", "1.3": "lod13_height"}
 RUN = 512  # buildings that are written at once, and share their vertices
-COPY_BYTES = 1 << 20
-ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 # Semantic surfaces of every solid, by the numbers GROUND, ROOF and WALL.
 SURFACES = '[{"type":"GroundSurface"},{"type":"RoofSurface"},{"type":"WallSurface"}]'
 WITHOUT_COMMA = {bool, int, float, type(None)}  # types of values whose text has no comma
@@ -110,21 +107,9 @@ def write_city_blocks(
     Parameters
     ----------
     path, crs, bounds, title
-        As in `write_city_model`.
+        As in `write_city_model`, as are notes and errors.
     blocks : iterable of (CityModel, attributes)
-        The buildings and their further attributes, the same columns in every block.
-
-    Returns
-    -------
-    tuple of Note
-        As from `write_city_model`.
-
-    Raises
-    ------
-    ValueError
-        As from `write_city_model`; or if blocks have different columns.
-    ConfigError, OutputError
-        As from `write_city_model`.
+        The buildings and their further attributes, the same columns in every block, else ValueError.
 
     Notes
     -----
@@ -139,7 +124,7 @@ def write_city_blocks(
     origin = np.floor(np.asarray(bounds[:3], dtype=np.float64))
     head = {"type": "CityJSON", "version": "2.0", "transform": {"scale": [GRID] * 3, "translate": origin.tolist()}}
     with replacing(path) as part, part.open("wb") as file, TemporaryFile(dir=path.parent) as spool:
-        file.write(f"{_text(head)[:-1]},\n".encode("ascii"))
+        file.write(f"{compact(head)[:-1]},\n".encode("ascii"))
         writer = _Writer(file, spool, origin)
         for model, columns in _cut_runs(blocks):
             writer.add(model, columns)
@@ -152,7 +137,7 @@ def write_city_blocks(
             metadata["referenceSystem"] = system
         if title:
             metadata["title"] = title
-        file.write(f',\n"metadata":{_text(metadata)}}}\n'.encode("ascii"))
+        file.write(f',\n"metadata":{compact(metadata)}}}\n'.encode("ascii"))
     notes = tuple(writer.notes)
     if system is None:
         notes = (*notes, Note("crs-without-epsg", detail=f"{crs}: the city model names no reference system"))
@@ -160,18 +145,17 @@ def write_city_blocks(
 
 
 class _Writer:
-    """Writes objects to a file and vertices to another, and keeps what must be known at the end."""
+    """Writes objects and vertices, and keeps what must be known at the end."""
 
     def __init__(self, file: BinaryIO, spool: IO[bytes], origin: NDArray[np.float64]) -> None:
-        self.file, self.spool, self.origin = file, spool, origin
+        self.file, self.origin = file, origin
         # A version 5 identifier is this hash of a name space and a name: the name is all that we write.
         self.digest = hashlib.sha1(uuid.NAMESPACE_URL.bytes, usedforsecurity=False)
         self.box = np.empty((0, 3))
         self.notes: list[Note] = []
         self.children: dict[str, list[str]] = {}
         self.hashes: list[NDArray[np.int64]] = []
-        self.n_objects = self.n_vertices = 0
-        self._write(b'"CityObjects":{')
+        self.lines = ObjectLines(self._write, spool)
 
     def add(self, model: CityModel, extra: Attributes) -> None:
         """Write the objects of a run."""
@@ -179,21 +163,18 @@ class _Writer:
         self._check_ids(model.ids)
         levels, notes = build_solids(model, self.origin, grid=GRID, blocks=_block_heights(columns))
         self.notes += notes
-        attributes, geometry = _attribute_texts(columns, model.roofs), _geometry_texts(levels, self.n_vertices)
-        objects = []
-        for name, house, *told in zip(model.ids.tolist(), model.house.tolist(), attributes, geometry, strict=True):
-            objects.append(_object_text(name, house, *told))
+        attributes = _attribute_texts(columns, model.roofs)
+        geometry = _geometry_texts(levels, self.lines.n_vertices)
+        rows = list(zip(model.ids.tolist(), model.house.tolist(), attributes, geometry, strict=True))
+        self.lines.add_objects(_object_text(*row) for row in rows)
+        for name, house, *_ in rows:
             if house != name:
                 self.children.setdefault(house, []).append(name)
-        self._objects(objects)
         if len(levels.vertices):
             places = levels.vertices * GRID + self.origin
             self.box = np.vstack((self.box, places.min(axis=0), places.max(axis=0)))
             self.box = np.stack((self.box.min(axis=0), self.box.max(axis=0)))
-            # All at once: a call for each takes twelve times as long, the encoder of lists three times.
-            text = ",\n".join(["[%d,%d,%d]"] * len(levels.vertices)) % tuple(levels.vertices.reshape(-1).tolist())
-            self.spool.write(f"{',' if self.n_vertices else ''}\n{text}".encode("ascii"))
-            self.n_vertices += len(levels.vertices)
+            self.lines.add_vertices(levels.vertices)
 
     def finish(self) -> None:
         """Write the houses that have parts, and the vertices."""
@@ -205,13 +186,9 @@ class _Writer:
         for is_row, (house, children) in zip(mixed.tolist(), self.children.items(), strict=True):
             if is_row:
                 raise ValueError(f"building {house}: is a row and has parts, it may be one of these")
-            content = _text({"type": "Building", "children": children})
-            self._objects([f"{_text(house)}:{content}"])
-        self._write(b'\n},\n"vertices":[')
-        self.spool.seek(0)
-        while piece := self.spool.read(COPY_BYTES):
-            self._write(piece)
-        self._write(b"\n]")
+            content = compact({"type": "Building", "children": children})
+            self.lines.add_objects([f"{compact(house)}:{content}"])
+        self.lines.finish()
 
     def _check_ids(self, ids: NDArray[np.str_]) -> None:
         """Refuse two rows of one id in a run; the hashes of all, 8 bytes a building, are compared at the end."""
@@ -220,45 +197,9 @@ class _Writer:
             raise ValueError(f"building {names[times > 1][0]}: 2 buildings have this id, at most 1 may")
         self.hashes.append(_hash_names(ids.tolist()))
 
-    def _objects(self, texts: Sequence[str]) -> None:
-        """Write objects one a line."""
-        if texts:
-            before = ",\n" if self.n_objects else "\n"
-            self._write((before + ",\n".join(texts)).encode("ascii"))
-            self.n_objects += len(texts)
-
     def _write(self, data: bytes) -> None:
         self.digest.update(data)
         self.file.write(data)
-
-
-def read_city_model(path: Path) -> CityModel:
-    """Read a file of `write_city_model`.
-
-    Parameters
-    ----------
-    path : Path
-        CityJSON file.
-
-    Returns
-    -------
-    CityModel
-        The buildings in the file's order: footprints with the file's 1 mm, all else as it was given. A
-        building without geometry has an empty Polygon.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is not one of ours.
-    """
-    try:
-        return _parse(json.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check path and permissions") from error
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
-        raise InputError(
-            f"{path}: not a city model of citystitch ({type(error).__name__}: {error}); write it again"
-        ) from error
 
 
 def _hash_names(names: Collection[str]) -> NDArray[np.int64]:
@@ -300,8 +241,8 @@ def _take_rows(block: tuple[CityModel, Attributes], rows: slice) -> tuple[CityMo
 
 def _object_text(name: str, house: str, attributes: str, geometry: str) -> str:
     """Write a city object: a building, or a part of the house that the row names."""
-    kind, parents = ("Building", "") if name == house else ("BuildingPart", f',"parents":[{_text(house)}]')
-    return f'{_text(name)}:{{"type":"{kind}","attributes":{attributes},"geometry":{geometry}{parents}}}'
+    kind, parents = ("Building", "") if name == house else ("BuildingPart", f',"parents":[{compact(house)}]')
+    return f'{compact(name)}:{{"type":"{kind}","attributes":{attributes},"geometry":{geometry}{parents}}}'
 
 
 def _columns(model: CityModel, extra: Attributes) -> dict[str, Sequence[object]]:
@@ -323,11 +264,11 @@ def _attribute_texts(columns: Attributes, roofs: Roofs) -> list[str]:
     """Write the attributes of each building; those with a sloped roof have its plane besides."""
     if not len(roofs):
         return []
-    form = ",".join(f"{_text(name).replace('%', '%%')}:%s" for name in columns)
+    form = ",".join(f"{compact(name).replace('%', '%%')}:%s" for name in columns)
     texts = [_value_texts(column) for column in columns.values()]
     planes = np.column_stack((roofs.plane, roofs.origin, roofs.limits)).tolist()
     last = [
-        "" if flat else f",{_text(PLANE)}:{_text(plane)}"
+        "" if flat else f",{compact(PLANE)}:{compact(plane)}"
         for flat, plane in zip(is_flat(roofs).tolist(), planes, strict=True)
     ]
     rows = zip(*texts, strict=True)
@@ -339,17 +280,15 @@ def _value_texts(column: Sequence[object]) -> list[str]:
     plain = [value.item() if isinstance(value, np.generic) else value for value in column]
     values = [None if isinstance(value, float) and not isfinite(value) else value for value in plain]
     if set(map(type, values)) <= WITHOUT_COMMA:
-        return _text(values)[1:-1].split(",")  # all at once: a call for each takes ten times as long
-    return [_text(value) for value in values]
+        return compact(values)[1:-1].split(",")  # all at once: a call for each takes ten times as long
+    return [compact(value) for value in values]
 
 
 def _reference_system(crs: str) -> str | None:
-    """Name the CRS by its EPSG code as OGC does; None if it has no code."""
     try:
-        code = pyproj.CRS.from_user_input(crs).to_epsg()
+        return reference_system(pyproj.CRS.from_user_input(crs))
     except CRSError as error:
         raise ConfigError(f"CRS {crs!r}: unknown to pyproj; give a code such as EPSG:28992") from error
-    return None if code is None else f"https://www.opengis.net/def/crs/EPSG/0/{code}"
 
 
 def _extent(bounds: Sequence[float], points: NDArray[np.floating]) -> list[float]:
@@ -437,39 +376,3 @@ def _shell_text(lod: str, shell: str, kinds: str) -> str:
         f'{{"type":"Solid","lod":"{lod}","boundaries":[[{shell}]],'
         f'"semantics":{{"surfaces":{SURFACES},"values":[[{kinds}]]}}}}'
     )
-
-
-def _text(document: object) -> str:
-    return ENCODER.encode(document)
-
-
-def _parse(document: dict[str, Any]) -> CityModel:
-    transform = document["transform"]
-    vertices = np.array(document["vertices"], dtype=np.float64).reshape(-1, 3)[:, :2]
-    vertices = vertices * transform["scale"][:2] + transform["translate"][:2]
-    objects = {name: item for name, item in document["CityObjects"].items() if "children" not in item}
-    rows = [item["attributes"] for item in objects.values()]
-    polygons = np.empty(len(objects), dtype=np.object_)
-    polygons[:] = [_footprint(item["geometry"], vertices) for item in objects.values()]
-    stated = [row.get(PLANE) for row in rows]
-    plane = np.array([[np.nan] * PLANE_VALUES if one is None else one for one in stated], np.float64)
-    plane = plane.reshape(-1, PLANE_VALUES)
-    flat = flat_roofs(np.array([row["roof_height"] for row in rows], dtype=np.float64))
-    sloped = Roofs(plane[:, :3], plane[:, 3:5], plane[:, 5:])
-    return CityModel(
-        polygons=polygons,
-        ids=np.array(list(objects), dtype=np.str_),
-        numbers=np.array([row["number"] for row in rows], dtype=np.int64),
-        ground=np.array([row["ground_height"] for row in rows], dtype=np.float64),
-        roofs=choose_roofs(np.array([one is None for one in stated], np.bool_), flat, sloped),
-        members=tuple(tuple(row["members"]) for row in rows),
-        house=np.array([item.get("parents", [name])[0] for name, item in objects.items()], dtype=np.str_),
-    )
-
-
-def _footprint(geometry: list[dict[str, Any]], xy: NDArray[np.float64]) -> shapely.Polygon:
-    for item in geometry:
-        if item["lod"] == "0":
-            shell, *holes = (xy[ring] for ring in item["boundaries"][0])
-            return shapely.Polygon(shell, holes)
-    return shapely.Polygon()

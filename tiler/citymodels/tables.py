@@ -16,49 +16,30 @@ from pipeline.data.citymodel import CityModel, Prisms
 from pipeline.data.roofs import Roofs, join_roofs, take_roofs
 from pipeline.quality.point_fidelity import HouseFidelity
 from pipeline.roofs.house_levels import HouseParts
+from tiler.pointclouds.cells import meets_box
+from tiler.vectors.wkb import cut_blobs, join_blobs
 
 Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class Buildings:
-    """Buildings of a city model as the stages pass them on, ``n`` of them.
-
-    Attributes
-    ----------
-    model : CityModel
-        The buildings.
-    roof_source : int8, (n,)
-        Where the roof's height comes from: index into `heights.ROOF_SOURCES`.
-    measured_roof : float64, (n,)
-        Roof heights (m) before roofs were grouped and raised.
-    wall_ground : float64, (n,)
-        Highest terrain at the walls (m).
-    group : int64, (n,)
-        Buildings of one group have one roof.
-    layers : int32, (n,)
-        Layers that the layered mesher removes; 0 with the other one.
-    fidelity : HouseFidelity
-        How the roof fits its points.
-    roof_method, roof_fallback, roof_form : int8, (n,)
-        As of `City`.
-    level : int8, (n,)
-        Level of detail that the zone of its house asks for: index into `zones.LEVELS`; -1 without zones.
-    place : float64, (n, 2)
-        Representative point of the house, which decides on its zone (m); NaN without zones.
-    """
+    """Buildings of a city model as the stages pass them on, ``n`` of them."""
 
     model: CityModel
-    roof_source: NDArray[np.int8]
-    measured_roof: NDArray[np.float64]
-    wall_ground: NDArray[np.float64]
-    group: NDArray[np.int64]
-    layers: NDArray[np.int32]
-    fidelity: HouseFidelity
+    roof_source: NDArray[np.int8]  # (n,): where the roof's height comes from: index into `heights.ROOF_SOURCES`
+    measured_roof: NDArray[np.float64]  # (n,): roof heights (m) before roofs were grouped and raised
+    wall_ground: NDArray[np.float64]  # (n,): highest terrain at the walls (m)
+    group: NDArray[np.int64]  # (n,): buildings of one group have one roof
+    layers: NDArray[np.int32]  # (n,): layers that the layered mesher removes; 0 with the other one
+    fidelity: HouseFidelity  # how the roof fits its points
+    # (n,): as of `City`
     roof_method: NDArray[np.int8]
     roof_fallback: NDArray[np.int8]
     roof_form: NDArray[np.int8]
+    # (n,): level of detail that the zone of its house asks for: index into `zones.LEVELS`; -1 without zones
     level: NDArray[np.int8] = field(default_factory=lambda: np.empty(0, np.int8))
+    # (n, 2): representative point of the house, which decides on its zone (m); NaN without zones
     place: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
 
     def __post_init__(self) -> None:
@@ -73,17 +54,10 @@ class Buildings:
 
 @dataclass(frozen=True, eq=False)
 class NearBuildings:
-    """Buildings of a city model around a box, as meshing and measuring need them, ``n`` of them by ascending id.
-
-    Attributes
-    ----------
-    model : Prisms
-        The buildings.
-    wall_ground, group, layers
-        As of `Buildings`.
-    """
+    """Buildings of a city model around a box, as meshing and measuring need them, by ascending id."""
 
     model: Prisms
+    # As of `Buildings`.
     wall_ground: NDArray[np.float64]
     group: NDArray[np.int64]
     layers: NDArray[np.int32]
@@ -97,20 +71,16 @@ Rows = TypeVar("Rows", Buildings, NearBuildings)
 
 def pack_polygons(polygons: NDArray[np.object_], name: str) -> Arrays:
     """Write polygons as well-known binary: bytes one after the other, and where each starts."""
-    blobs = shapely.to_wkb(polygons, byte_order=1)
-    start = np.cumsum([0, *(len(blob) for blob in blobs)], dtype=np.int64)
-    return {name: np.frombuffer(b"".join(blobs), np.uint8), f"{name}_start": start}
+    data, start = join_blobs(shapely.to_wkb(polygons, byte_order=1))
+    return {name: data, f"{name}_start": start}
 
 
 def unpack_polygons(
     arrays: Arrays, name: str, rows: NDArray[np.integer[Any]] | None = None
 ) -> NDArray[np.object_]:
     """Read what `pack_polygons` wrote, or some rows of it."""
-    data, start = arrays[name].tobytes(), arrays[f"{name}_start"]
-    rows = np.arange(len(start) - 1) if rows is None else rows
-    blobs = np.empty(len(rows), object)
-    blobs[:] = [data[a:b] for a, b in zip(start[rows].tolist(), start[rows + 1].tolist(), strict=True)]
-    polygons: NDArray[np.object_] = shapely.from_wkb(blobs)
+    blobs = cut_blobs(arrays[name], arrays[f"{name}_start"])
+    polygons: NDArray[np.object_] = shapely.from_wkb(blobs if rows is None else blobs[rows])
     return polygons
 
 
@@ -181,20 +151,29 @@ def unpack_houses(arrays: Arrays) -> Houses:
     )
 
 
+FIDELITY_ARRAYS = {
+    "n_points": "fidelity_points",
+    **{name: f"fidelity_{name}" for name in ("rmse", "bias", "coverage", "median", "within")},
+}
+# Columns of `Buildings` that are arrays of the same name, in this order; and further ones of a run with zones.
+OWN_ARRAYS = (
+    *("roof_source", "measured_roof", "wall_ground", "group", "layers"),
+    *("roof_method", "roof_fallback", "roof_form"),
+)
+ZONE_ARRAYS = ("level", "place")
+BUILDING_ARRAYS = (
+    *("polygon", "polygon_start", "id", "number", "house", "ground", "member", "member_start"),
+    *ROOF_ARRAYS,
+    *OWN_ARRAYS,
+    *FIDELITY_ARRAYS.values(),
+)
+
+
 def make_buildings(city: City, fidelity: HouseFidelity, layers: NDArray[np.int32]) -> Buildings:
     """Take from a city what later stages need."""
-    return Buildings(
-        city.model,
-        city.roof_source,
-        city.measured_roof,
-        city.wall_ground,
-        city.group.astype(np.int64),
-        layers,
-        fidelity,
-        city.roof_method,
-        city.roof_fallback,
-        city.roof_form,
-    )
+    own: dict[str, Any] = {name: getattr(city, name) for name in OWN_ARRAYS if name != "layers"}
+    own["group"] = city.group.astype(np.int64)
+    return Buildings(model=city.model, fidelity=fidelity, layers=layers, **own)
 
 
 def pack_buildings(buildings: Buildings, prefix: str = "", *, zoned: bool = False) -> Arrays:
@@ -211,33 +190,12 @@ def pack_buildings(buildings: Buildings, prefix: str = "", *, zoned: bool = Fals
         **pack_roofs(model.roofs),
         "member": np.array(members, dtype=np.str_),
         "member_start": np.cumsum([0, *(len(names) for names in model.members)], dtype=np.int64),
-        "roof_source": buildings.roof_source,
-        "measured_roof": buildings.measured_roof,
-        "wall_ground": buildings.wall_ground,
-        "group": buildings.group,
-        "layers": buildings.layers,
-        "roof_method": buildings.roof_method,
-        "roof_fallback": buildings.roof_fallback,
-        "roof_form": buildings.roof_form,
+        **{name: getattr(buildings, name) for name in OWN_ARRAYS},
         **{name: getattr(fidelity, key) for key, name in FIDELITY_ARRAYS.items()},
     }
     if zoned:
-        arrays |= {"level": buildings.level, "place": buildings.place}
+        arrays |= {name: getattr(buildings, name) for name in ZONE_ARRAYS}
     return {prefix + name: values for name, values in arrays.items()}
-
-
-FIDELITY_ARRAYS = {
-    "n_points": "fidelity_points",
-    **{name: f"fidelity_{name}" for name in ("rmse", "bias", "coverage", "median", "within")},
-}
-BUILDING_ARRAYS = (
-    *("polygon", "polygon_start", "id", "number", "house", "ground", "member", "member_start"),
-    *ROOF_ARRAYS,
-    *("roof_source", "measured_roof", "wall_ground", "group", "layers"),
-    *("roof_method", "roof_fallback", "roof_form"),
-    *FIDELITY_ARRAYS.values(),
-)
-ZONE_ARRAYS = ("level", "place")  # further ones of a run with zones
 
 
 def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
@@ -254,19 +212,9 @@ def unpack_buildings(arrays: Arrays, prefix: str = "") -> Buildings:
         arrays["house"],
     )
     fidelity = HouseFidelity(**{key: arrays[name] for key, name in FIDELITY_ARRAYS.items()})
-    return Buildings(
-        model,
-        arrays["roof_source"],
-        arrays["measured_roof"],
-        arrays["wall_ground"],
-        arrays["group"],
-        arrays["layers"],
-        fidelity,
-        arrays["roof_method"],
-        arrays["roof_fallback"],
-        arrays["roof_form"],
-        *(arrays[name] for name in ZONE_ARRAYS if name in arrays),
-    )
+    own: dict[str, Any] = {name: arrays[name] for name in OWN_ARRAYS}
+    own |= {name: arrays[name] for name in ZONE_ARRAYS if name in arrays}
+    return Buildings(model=model, fidelity=fidelity, **own)
 
 
 NEAR_ARRAYS = (
@@ -290,29 +238,20 @@ def find_changed(old: Arrays, new: Arrays) -> list[tuple[float, float, float, fl
 
 def _rows_by_id(arrays: Arrays) -> dict[str, tuple[Any, ...]]:
     """Box, and all else as bytes, of each building by its id."""
-    data, ends = arrays["polygon"].tobytes(), arrays["polygon_start"].tolist()
+    blobs = cut_blobs(arrays["polygon"], arrays["polygon_start"])
     others = [arrays[name] for name in NEAR_ARRAYS if name not in ("polygon", "polygon_start", "id")]
     return {
-        name: (tuple(box), data[ends[k] : ends[k + 1]], *(values[k].tobytes() for values in others))
+        name: (tuple(box), blobs[k], *(values[k].tobytes() for values in others))
         for k, (name, box) in enumerate(zip(arrays["id"].tolist(), arrays["extents"].tolist(), strict=True))
     }
 
 
 def take_near(arrays: Arrays, box: shapely.Polygon, layers: NDArray[np.int32] | None = None) -> NearBuildings:
-    """Read the buildings that meet a box from `NEAR_ARRAYS` of the stage ``model``.
+    """Read the buildings that meet a box, prepared, from `NEAR_ARRAYS` of the stage ``model``.
 
-    Parameters
-    ----------
-    arrays : dict of str to array
-        The arrays.
-    box : Polygon
-        A box, prepared.
-    layers : int32, (n,), optional
-        Layers of all of them, where these were chosen later; by default those of the arrays.
+    `layers`, int32 (n,), are those of all of them where they were chosen later; by default those of the arrays.
     """
-    x0, y0, x1, y1 = box.bounds
-    west, south, east, north = arrays["extents"].T
-    rows = np.flatnonzero((west <= x1) & (east >= x0) & (south <= y1) & (north >= y0))
+    rows = np.flatnonzero(meets_box(arrays["extents"], box.bounds))
     polygons = unpack_polygons(arrays, "polygon", rows)
     meet = shapely.intersects(box, polygons)
     rows, polygons = rows[meet], polygons[meet]
@@ -351,13 +290,7 @@ def no_buildings() -> Buildings:
 
 
 def join_buildings(several: Sequence[Buildings]) -> Buildings:
-    """Put the buildings of several tiles together, by ascending id; groups stay apart.
-
-    Parameters
-    ----------
-    several : sequence of Buildings
-        Buildings of different tiles; none gives none.
-    """
+    """Put the buildings of different tiles together, by ascending id; groups stay apart. None gives none."""
     return _join_by_id([no_buildings(), *several])
 
 

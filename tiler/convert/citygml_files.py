@@ -20,6 +20,7 @@ from tiler.convert.features import (
     attribute_text,
     iter_features,
     origin_of,
+    unique_name,
 )
 from tiler.convert.inputs import ModelSource
 from tiler.georeference.crs import horizontal_crs
@@ -94,14 +95,10 @@ class CityGmlWriter:
         spaces, surfaces = self._geometries(one, places)
         if self.new:
             tall = (
-                ""
-                if not above
-                else (
-                    "<con:height><con:Height><con:highReference>highestRoofEdge</con:highReference><con:lowReference>"
-                    "lowestGroundPoint</con:lowReference><con:status>measured</con:status>"
-                    f'<con:value uom="m">{above}</con:value></con:Height></con:height>'
-                )
-            )
+                "<con:height><con:Height><con:highReference>highestRoofEdge</con:highReference><con:lowReference>"
+                "lowestGroundPoint</con:lowReference><con:status>measured</con:status>"
+                f'<con:value uom="m">{above}</con:value></con:Height></con:height>'
+            ) * bool(above)
             body = f"{text}{generic}{surfaces}{''.join(spaces.values())}{tall}{parts}"
         else:
             tall = f'<bldg:measuredHeight uom="m">{above}</bldg:measuredHeight>' if above else ""
@@ -114,12 +111,8 @@ class CityGmlWriter:
     def _id(self, text: str) -> str:
         """Give an id that XML takes and that no object before had."""
         fit = _UNFIT.sub("_", text)
-        name = first = fit if _NAME.fullmatch(fit) and not fit.startswith(OWN) else f"id{fit}"
-        number = 1
-        while hash(name) in self.ids:
-            number += 1
-            name = f"{first}_{number}"
-        self.ids.add(hash(name))
+        good = _NAME.fullmatch(fit) and not fit.startswith(OWN)
+        name = unique_name(fit if good else f"id{fit}", self.ids)
         self.told["ids that XML does not take, kept as gml:name"] += name != text
         return name
 

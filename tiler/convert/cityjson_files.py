@@ -1,16 +1,15 @@
 """CityJSON 2.0 and CityJSONSeq of features."""
 
-import json
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
 from tiler.cityinput.faces import WALL
+from tiler.citymodels.cityjson_text import ObjectLines, compact, reference_system
 from tiler.convert.features import OPENINGS, SURFACES, Feature, Geometry, iter_features, level_text, origin_of
 from tiler.convert.inputs import ModelSource
 from tiler.georeference.crs import horizontal_crs
 
-COPY_BYTES = 1 << 20
 HIGHEST = 4  # CityJSON has no level from this on
 
 
@@ -34,32 +33,22 @@ def feature_line(feature: Feature, source: ModelSource) -> bytes:
 
 def write_document(path: Path, source: ModelSource) -> None:
     """Write CityJSON, an object a line; vertices wait in a temporary file."""
-    n_vertices, before = 0, "\n"
     with path.open("wb") as file, TemporaryFile() as spool:
-        file.write(_line(_head(source))[:-2] + b',"CityObjects":{')
+        file.write(_line(_head(source))[:-2] + b",")
+        lines = ObjectLines(file.write, spool)
         for feature in iter_features(source):
-            for name, thing in _objects(feature, source, n_vertices).items():
-                file.write(f"{before}{json.dumps(name)}:".encode("ascii") + _line(thing)[:-1])
-                before = ",\n"
-            if len(feature.vertices):
-                text = ",\n".join(["[%d,%d,%d]"] * len(feature.vertices)) % tuple(
-                    feature.vertices.ravel().tolist()
-                )
-                spool.write(f"{',' if n_vertices else ''}\n{text}".encode("ascii"))
-            n_vertices += len(feature.vertices)
-        file.write(b'\n},\n"vertices":[')
-        spool.seek(0)
-        while piece := spool.read(COPY_BYTES):
-            file.write(piece)
-        file.write(b"\n]}\n")
+            objects = _objects(feature, source, lines.n_vertices)
+            lines.add_objects(f"{compact(name)}:{compact(thing)}" for name, thing in objects.items())
+            lines.add_vertices(feature.vertices)
+        lines.finish()
+        file.write(b"}\n")
 
 
 def _head(source: ModelSource) -> dict[str, Any]:
     extent = [round(float(value), 9) for value in (*source.low, *source.high)]
     metadata: dict[str, Any] = {"geographicalExtent": extent}
-    codes = [None if crs is None else crs.to_epsg() for crs in (source.crs, horizontal_crs(source.crs))]
-    if code := codes[0] or codes[1]:
-        metadata["referenceSystem"] = f"https://www.opengis.net/def/crs/EPSG/0/{code}"
+    if name := reference_system(source.crs) or reference_system(horizontal_crs(source.crs)):
+        metadata["referenceSystem"] = name
     transform = {"scale": source.step.tolist(), "translate": origin_of(source).tolist()}
     return {"type": "CityJSON", "version": "2.0", "transform": transform, "metadata": metadata}
 
@@ -75,14 +64,13 @@ def _objects(feature: Feature, source: ModelSource, first: int = 0) -> dict[str,
         kept = [item for item in one.geometries if item.lod < HIGHEST]
         source.told["geometries of level 4, which CityJSON has not"] += len(one.geometries) - len(kept)
         kind = "Building" if one is house else "BuildingInstallation" if one.parent else "BuildingPart"
-        thing: dict[str, Any] = {"type": kind} | (
-            {"parents": [one.parent or house.id]} if one is not house else {}
-        )
-        thing |= {"children": children[one.id]} if one.id in children else {}
-        found[one.id] = thing | {
-            "attributes": one.attributes,
-            "geometry": [_geometry(item, first) for item in kept],
-        }
+        thing: dict[str, Any] = {"type": kind}
+        if one is not house:
+            thing["parents"] = [one.parent or house.id]
+        if one.id in children:
+            thing["children"] = children[one.id]
+        geometry = [_geometry(item, first) for item in kept]
+        found[one.id] = thing | {"attributes": one.attributes, "geometry": geometry}
     return found
 
 
@@ -105,4 +93,4 @@ def _geometry(item: Geometry, first: int) -> dict[str, Any]:
 
 
 def _line(document: Any) -> bytes:
-    return (json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n").encode("ascii")
+    return (compact(document) + "\n").encode("ascii")

@@ -26,21 +26,12 @@ TILE = re.compile(r"-?\d+_-?\d+")  # names of files of tiles
 
 @dataclass(frozen=True)
 class Target:
-    """A format that city models are converted to.
+    """A format that city models are converted to."""
 
-    Attributes
-    ----------
-    suffixes : tuple of str
-        What the name of a file may end with.
-    write : callable
-        Writes a source to a path, at a level of detail where `one_level`.
-    one_level : bool
-        Whether it holds each building at one level: it is a surface in metres.
-    """
-
-    suffixes: tuple[str, ...]
+    suffixes: tuple[str, ...]  # what the name of a file may end with
+    # Writes a source to a path, at a level of detail where `one_level`.
     write: Callable[[Path, ModelSource, str], None]
-    one_level: bool = False
+    one_level: bool = False  # whether it holds each building at one level: it is a surface in metres
 
 
 TARGETS: Mapping[str, Target] = {
@@ -67,7 +58,7 @@ class Asked:
 
 
 def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[str]:
-    """Write city models as another format.
+    """Write city models as another format, and give what must be known of the file, a line each.
 
     Parameters
     ----------
@@ -77,11 +68,6 @@ def convert_models(inputs: Sequence[Path], output: Path, asked: Asked) -> list[s
         The file, or with a size of tiles the folder of their files ``i_j``; it appears whole or not at all.
     asked : Asked
         What is asked.
-
-    Returns
-    -------
-    list of str
-        What must be known of the file, a line each.
 
     Raises
     ------

@@ -63,7 +63,9 @@ def iter_features(source: ModelSource) -> Iterator[Feature]:
     seen: set[int] = set()
     origin, step = origin_of(source), source.step
     for building in source.buildings():
-        names = {owner: _unique(owner, seen, source.told) for owner in owners_of(building)}
+        names = {owner: unique_name(owner or "building", seen) for owner in owners_of(building)}
+        again = sum(name != (owner or "building") for owner, name in names.items())
+        source.told["ids that were there before, or missing, with a number behind them"] += again
         units = [np.round((shape.faces.xyz - origin) / step).astype(np.int64) for shape in building.shapes]
         rows, number = np.unique(np.concatenate([np.empty((0, 3), np.int64), *units]), axis=0, return_inverse=True)
         ends = np.cumsum([0, *map(len, units)])
@@ -89,16 +91,14 @@ def owners_of(building: ModelBuilding) -> list[str]:
     return list(dict.fromkeys([building.id, *building.attributes, *(shape.owner for shape in building.shapes)]))
 
 
-def _unique(name: str, seen: set[int], told: Counter[str]) -> str:
-    """Give an id that no other object has; 8 bytes of each are kept."""
-    first = name = name or "building"
-    number = 1
-    while hash(name) in seen:
+def unique_name(name: str, seen: set[int]) -> str:
+    """Give a name that was not given before, with a number behind it where it was; 8 bytes of each are kept."""
+    found, number = name, 1
+    while hash(found) in seen:
         number += 1
-        name = f"{first}_{number}"
-    seen.add(hash(name))
-    told["ids that were there before, or missing, with a number behind them"] += number > 1 or not first
-    return name
+        found = f"{name}_{number}"
+    seen.add(hash(found))
+    return found
 
 
 def _make_geometry(shape: Shape, number: list[int], told: Counter[str]) -> Geometry | None:

@@ -15,7 +15,7 @@ from pipeline.data.errors import ConfigError, InputError
 from tiler.cityinput.faces import Faces, ModelBuilding
 from tiler.cityinput.sources import MODEL, kind_of, read_model_header, scan_model
 from tiler.formats.cityjsonseq import write_cityjsonseq
-from tiler.georeference.crs import box_words, crs_name, crs_text, horizontal_crs, parse_crs, same_crs
+from tiler.georeference.crs import box_around, box_words, crs_name, crs_text, horizontal_crs, parse_crs, same_crs
 from tiler.georeference.frame import Frame, box_to_region, to_region
 from tiler.mesh_files.run_files import RUN_RECORD
 from tiler.pointclouds.clouds import CloudHeader
@@ -28,28 +28,15 @@ HEIGHT_STEP = 0.001  # m
 
 @dataclass(frozen=True, eq=False)
 class ModelSource:
-    """City models that are read as often as a writer needs.
+    """City models that are read as often as a writer needs."""
 
-    Attributes
-    ----------
-    files : tuple of (Path, Frame)
-        The files, and how the coordinates of each become those of the output.
-    crs : pyproj.CRS or None
-        CRS of the output, with heights where one names them; None where none is known.
-    low, high : float64, (3,)
-        Box around all vertices, easting first.
-    notes : tuple of str
-        What must be known of the files.
-    told : Counter of str
-        What was left out or changed, by what it is; each reading counts anew.
-    """
-
-    files: tuple[tuple[Path, Frame], ...]
-    crs: pyproj.CRS | None
+    files: tuple[tuple[Path, Frame], ...]  # the files, and how the coordinates of each become those of the output
+    crs: pyproj.CRS | None  # CRS of the output, with heights where one names them; None where none is known
+    # (3,): box around all vertices, easting first
     low: NDArray[np.float64]
     high: NDArray[np.float64]
-    notes: tuple[str, ...]
-    told: Counter[str]
+    notes: tuple[str, ...]  # what must be known of the files
+    told: Counter[str]  # what was left out or changed, by what it is; each reading counts anew
 
     @property
     def in_degrees(self) -> bool:
@@ -110,17 +97,15 @@ def open_source(paths: Sequence[Path], *, crs: str = "", axis_order: str = "") -
                     f"{other.path}: {names[1]}; {headers[0].path}: {names[0]}; convert them one by one, with --crs"
                 )
         frames = [_frame_of(header, crs) for header in headers]
-        boxes, heights = [], []
-        for header, frame in zip(headers, frames, strict=True):
-            # The box of a header has the easting first already.
-            boxes.append(box_to_region(Frame(source=frame.source, target=frame.target), header.bounds[:4]))
-            heights.append(header.bounds[4:])
-        box, z = np.array(boxes), np.array(heights)
+        # The box of a header has the easting first already.
+        straight = [Frame(source=frame.source, target=frame.target) for frame in frames]
+        boxes = [box_to_region(one, header.bounds[:4]) for one, header in zip(straight, headers, strict=True)]
+        xmin, ymin, xmax, ymax = box_around(boxes)
         yield ModelSource(
             tuple((header.path, frame) for header, frame in zip(headers, frames, strict=True)),
             parse_crs(crs) if crs else own,
-            np.array([*box[:, :2].min(axis=0), z[:, 0].min()]),
-            np.array([*box[:, 2:].max(axis=0), z[:, 1].max()]),
+            np.array([xmin, ymin, min(header.bounds[4] for header in headers)]),
+            np.array([xmax, ymax, max(header.bounds[5] for header in headers)]),
             tuple(f"{one.path}: {note}" for one in headers for note in (one.unread, _axes_note(one)) if note),
             Counter(),
         )

@@ -14,23 +14,9 @@ HELD_BYTES = 64 * 2**20  # of features that wait in memory, of all tiles togethe
 def split_source(source: ModelSource, size: float, folder: Path) -> list[Path]:
     """Write CityJSONSeq by tile: a building is in that of the middle of its box, whole.
 
-    Parameters
-    ----------
-    source : ModelSource
-        City models.
-    size : float
-        Side of a tile (m). Tiles begin at multiples of it in the CRS.
-    folder : Path
-        An empty folder.
-
-    Returns
-    -------
-    list of Path
-        Files ``i_j.jsonl`` of tiles with buildings; i and j are whole numbers, eastwards and northwards.
-
-    Notes
-    -----
-    Memory is `HELD_BYTES` and what an id takes (`features.iter_features`), whatever the number of buildings.
+    Tiles of `size` (m) begin at multiples of it in the CRS. Files ``i_j.jsonl`` are given for tiles with
+    buildings, in an empty folder; i and j are whole numbers, eastwards and northwards. Memory is `HELD_BYTES` and
+    what an id takes (`features.iter_features`), whatever the number of buildings.
     """
     origin, step = origin_of(source)[:2], source.step[:2]
     waiting: dict[Path, list[bytes]] = {}

@@ -17,27 +17,14 @@ from tiler.convert.inputs import ModelSource
 
 @dataclass(frozen=True, eq=False)
 class SolidBuilding:
-    """A building as triangles.
-
-    Attributes
-    ----------
-    id : str
-        Its id.
-    attributes : dict
-        Its own, then those of its parts that it has not itself.
-    xyz : float64, (n, 3)
-        Vertices.
-    triangles : int64, (t, 3)
-        Their corners, counter-clockwise seen from the side that the faces look to.
-    kind : int8, (t,)
-        Kind of the face that each is of.
-    """
+    """A building as triangles."""
 
     id: str
-    attributes: dict[str, Any]
-    xyz: NDArray[np.float64]
+    attributes: dict[str, Any]  # its own, then those of its parts that it has not itself
+    xyz: NDArray[np.float64]  # (n, 3): vertices
+    # (t, 3): their corners, counter-clockwise seen from the side that the faces look to
     triangles: NDArray[np.int64]
-    kind: NDArray[np.int8]
+    kind: NDArray[np.int8]  # (t,): kind of the face that each is of
 
 
 def iter_triangles(source: ModelSource, lod: str) -> Iterator[SolidBuilding]:
@@ -63,25 +50,11 @@ def iter_triangles(source: ModelSource, lod: str) -> Iterator[SolidBuilding]:
 def triangulate(
     faces: Faces, xyz: NDArray[np.float64], number: list[int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int8], int]:
-    """Cut faces into triangles.
+    """Cut faces, polygons with holes, into triangles.
 
-    Parameters
-    ----------
-    faces : Faces
-        Polygons with holes.
-    xyz : float64, (n, 3)
-        Places, each there once.
-    number : list of int
-        Which of them each vertex of the faces is at.
-
-    Returns
-    -------
-    int64, (t, 3)
-        Corners of triangles, as rows of `xyz`.
-    int8, (t,)
-        Kinds of their faces.
-    int
-        How many faces are no polygons in their plane: triangles meet in their first corner.
+    `xyz`, float64 (n, 3), are places, each there once, and `number` says which of them each vertex of the faces is
+    at. Gives corners of triangles as rows of `xyz`, int64 (t, 3), kinds of their faces, int8 (t,), and how many
+    faces are no polygons in their plane: triangles meet in their first corner.
     """
     found: list[list[int]] = []
     kinds: list[int] = []

@@ -39,7 +39,9 @@ class DetailAsked:
 
 
 def detail_models(inputs: Sequence[Path], output: Path, asked: DetailAsked) -> list[str]:
-    """Write city models with façades by rules, at level of detail 3.
+    """Write city models with façades by rules, at level of detail 3, a building and a façade at a time.
+
+    Gives what must be known of the file, and the table of polygons, a line each.
 
     Parameters
     ----------
@@ -50,11 +52,6 @@ def detail_models(inputs: Sequence[Path], output: Path, asked: DetailAsked) -> l
     asked : DetailAsked
         What is asked.
 
-    Returns
-    -------
-    list of str
-        What must be known of the file, and the table of polygons, a line each.
-
     Raises
     ------
     ConfigError
@@ -63,10 +60,6 @@ def detail_models(inputs: Sequence[Path], output: Path, asked: DetailAsked) -> l
         If an input cannot be read.
     OutputError
         If a file cannot be written.
-
-    Notes
-    -----
-    Buildings are read and written one at a time, each a façade at a time.
     """
     if output.suffix not in SUFFIXES:
         raise ConfigError(f"{output}: ends with none of {', '.join(SUFFIXES)}; rename --output")
@@ -102,10 +95,7 @@ def _write(path: Path, suffix: str, source: DetailedSource) -> None:
 def make_criteria(asked: DetailAsked) -> dict[str, Criteria]:
     """Make the criteria of the table by name: all kept, those asked for together, and each of several alone.
 
-    Raises
-    ------
-    ConfigError
-        If an option is no number or out of range, or needs another one.
+    ConfigError if an option is no number or out of range, or needs another one.
     """
     seen = _numbers("viewpoint", asked.viewpoint, 3)
     far = _numbers("distance", asked.distance, 2)

@@ -60,24 +60,14 @@ class Facade:
 
 @dataclass(frozen=True, eq=False)
 class DetailedSource(ModelSource):
-    """City models whose walls have façades by rules.
+    """City models whose walls have façades by rules."""
 
-    Attributes
-    ----------
-    graph : Graph
-        Rewritten rules.
-    criteria : tuple of Criteria
-        The first keeps everything, the second is what is made; others are counted alone.
-    lod : str
-        Which level buildings are taken at: see `tiler.cityinput.levels.CHOICES`.
-    counts : Counter of str
-        Buildings, façades, assets, and polygons by criterion (``"polygons 0"`` and so on), ``"low assets"``,
-        ``"low facades"``; each reading counts anew.
-    """
-
-    graph: Graph
+    graph: Graph  # rewritten rules
+    # The first keeps everything, the second is what is made; others are counted alone.
     criteria: tuple[Criteria, ...]
-    lod: str = "auto"
+    lod: str = "auto"  # which level buildings are taken at: see `tiler.cityinput.levels.CHOICES`
+    # Buildings, façades, assets, and polygons by criterion (``"polygons 0"`` and so on), ``"low assets"``, ``"low
+    # facades"``; each reading counts anew.
     counts: Counter[str] = field(default_factory=Counter)
 
     @property

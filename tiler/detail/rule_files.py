@@ -21,12 +21,7 @@ def rule_schema() -> dict[str, Any]:
 
 
 def load_graph(rules: str) -> Graph:
-    """Read rules, and rewrite their graph for levels of detail.
-
-    Parameters
-    ----------
-    rules : str
-        One of `RULES`, or the path of a file.
+    """Read rules, one of `RULES` or a file, and rewrite their graph for levels of detail.
 
     Raises
     ------

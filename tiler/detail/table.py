@@ -7,11 +7,8 @@ from typing import Any
 def make_table(counts: Mapping[str, int], names: Sequence[str]) -> dict[str, Any]:
     """Make the table from the counts of a `DetailedSource` and the names of its criteria.
 
-    Returns
-    -------
-    dict
-        ``buildings``, ``facades``, ``assets`` of what was made by how they are, and ``polygons``: a row for each
-        model with ``model``, ``polygons`` and ``remaining`` (per cent of the full model).
+    ``buildings``, ``facades``, ``assets`` of what was made by how they are, and ``polygons``: a row for each model
+    with ``model``, ``polygons`` and ``remaining`` (per cent of the full model).
     """
     rows = [(name, counts[f"polygons {k}"]) for k, name in enumerate(names)]
     rows += [("low-asset level", counts["low assets"]), ("low-façade level", counts["low facades"])]

@@ -11,6 +11,7 @@ from pipeline.data.citymodel import Footprints
 from pipeline.data.errors import InputError
 from tiler.config.config import Config
 from tiler.footprints.footprint_index import FootprintRows, join_footprints, scan_footprints
+from tiler.footprints.footprint_source import open_source
 from tiler.objects.places import is_missing
 from tiler.store.edit_journal import Box, Outline
 from tiler.vectors.layers import describe_layer
@@ -51,16 +52,15 @@ def read_upload(path: Path, config: Config, *, crs: str, bounds: Box) -> Footpri
     layer = describe_layer(path)
     # An upload may say less than the file of the city: what has no height takes that of the points.
     names = {name: name if name in layer.fields else "" for name in (config.height_attribute, config.id_attribute)}
-    found = list(
-        scan_footprints(
-            path,
-            crs=pyproj.CRS.from_user_input(crs),
-            bounds=bounds,
-            id_attribute=names[config.id_attribute],
-            height_attribute=names[config.height_attribute],
-            roof_attribute=config.roof_attribute if config.roof_attribute in layer.fields else "",
-        )
+    source = open_source(
+        path,
+        crs=pyproj.CRS.from_user_input(crs),
+        bounds=bounds,
+        id_attribute=names[config.id_attribute],
+        height_attribute=names[config.height_attribute],
+        roof_attribute=config.roof_attribute if config.roof_attribute in layer.fields else "",
     )
+    found = list(scan_footprints(source))
     for note in (note for block in found for note in block.notes):
         if note.kind in REFUSED:
             raise InputError(f"{path}: {note.subject} {note.detail} ({note.kind}); mend the file")

@@ -5,7 +5,6 @@ every place has one footprint: that of the highest part over it, else that of th
 """
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import shapely
@@ -13,10 +12,10 @@ from numpy.typing import NDArray
 
 from tiler.footprints.footprint_attributes import height_columns, read_heights
 from tiler.footprints.plan_outlines import outline_all
-from tiler.georeference.frame import Frame, box_to_file, to_region
+from tiler.georeference.frame import Frame, box_to_file, shapes_to_region
 from tiler.vectors.features import Box
 from tiler.vectors.layers import BATCH, Layer, scan_layer
-from tiler.vectors.osm_tags import find_osm_tags, is_part
+from tiler.vectors.osm_tags import is_part
 
 REACH = 500.0  # m beyond the region within which parts are looked for: of buildings that stand on its border
 OWN_SHARE = 0.5  # share of a part that lies within the outline of its building
@@ -27,81 +26,50 @@ Rank = tuple[float, float, bytes]
 
 @dataclass(frozen=True, eq=False)
 class BuildingParts:
-    """The parts of buildings in a file.
+    """The parts of buildings in a file."""
 
-    Attributes
-    ----------
-    polygons : object, (n,)
-        Valid Polygons and MultiPolygons in the region's CRS (m).
-    area : float64, (n,)
-        Their areas (m²).
-    ranks : list of Rank
-        The lower rank is seen from above where two parts overlap: that of the greater height, then, without a
-        height or of the same, of the smaller area.
-    tree : STRtree
-        Of the polygons.
-    """
-
-    polygons: NDArray[np.object_]
-    area: NDArray[np.float64]
+    polygons: NDArray[np.object_]  # (n,): valid Polygons and MultiPolygons in the region's CRS (m)
+    area: NDArray[np.float64]  # (n,): their areas (m²)
+    # The lower rank is seen from above where two parts overlap: that of the greater height, then, without a height
+    # or of the same, of the smaller area.
     ranks: list[Rank]
-    tree: shapely.STRtree
+    tree: shapely.STRtree  # of the polygons
 
 
 @dataclass(frozen=True, eq=False)
 class Shares:
-    """What footprints keep beside the parts of buildings over them.
+    """What footprints keep beside the parts of buildings over them."""
 
-    Attributes
-    ----------
-    geometry : object, (k,)
-        Polygons and MultiPolygons; empty where nothing is left.
-    share : float64, (k,)
-        Share of the area that is left; 1 where nothing was taken.
-    """
-
-    geometry: NDArray[np.object_]
-    share: NDArray[np.float64]
+    geometry: NDArray[np.object_]  # (k,): polygons and MultiPolygons; empty where nothing is left
+    share: NDArray[np.float64]  # (k,): share of the area that is left; 1 where nothing was taken
 
 
 def find_building_parts(
     layer: Layer, frame: Frame, bounds: Box, *, height_name: str, batch: int = BATCH
 ) -> BuildingParts | None:
-    """Read the parts of buildings in and around a region.
+    """Read the parts of buildings in and around a region; None where there is none, or data are not of OSM.
 
     Parameters
     ----------
-    layer : Layer
-        From `describe_layer`.
+    layer, batch
+        As of `scan_layer`.
     frame : Frame
         How coordinates of the file become those of the region.
     bounds : tuple of 4 floats
         The region (m), in its own CRS.
     height_name : str
         Attribute with heights, as of `read_heights`.
-    batch : int
-        Features in memory at once.
-
-    Returns
-    -------
-    BuildingParts or None
-        None for data that are not of OSM, and where there is no part.
-
-    Raises
-    ------
-    InputError
-        If the file is damaged.
 
     Notes
     -----
     A pass through the region of its own, as a part may stand in the file before or after its outline. Memory holds
     all parts of the region.
     """
-    tags = find_osm_tags(layer.fields)
+    tags = layer.tags
     if tags is None or not (tags.more or "building:part" in tags.column):
         return None
     near = bounds[0] - REACH, bounds[1] - REACH, bounds[2] + REACH, bounds[3] + REACH
-    box = box_to_file(frame, near) if frame.changes_plan else near
+    box = box_to_file(frame, near)
     shapes, heights = [np.empty(0, np.object_)], [np.empty(0)]
     for features in scan_layer(layer, height_columns(layer, height_name), box, batch=batch):
         hits = np.flatnonzero(is_part(tags, features.columns))
@@ -109,15 +77,13 @@ def find_building_parts(
         outlines = outline_all(features.wkb[hits], metre=layer.metre, curved=curved)
         geometry = outlines.geometry
         finite = np.isfinite(shapely.bounds(geometry).reshape(-1, 4)).all(axis=1)
-        if frame.changes_plan:
-            geometry = shapely.transform(geometry, partial(to_region, frame))
-        shapes.append(mend_polygons(geometry[finite]))
+        shapes.append(mend_polygons(shapes_to_region(frame, geometry)[finite]))
         heights.append(read_heights(layer, height_name, features)[0][hits[outlines.rows[finite]]])
     polygons = np.concatenate(shapes)
     if not len(polygons):
         return None
-    area = shapely.area(polygons)
-    return BuildingParts(polygons, area, _rank(polygons, np.concatenate(heights)), shapely.STRtree(polygons))
+    ranks = _rank(polygons, np.concatenate(heights))
+    return BuildingParts(polygons, shapely.area(polygons), ranks, shapely.STRtree(polygons))
 
 
 def share_places(

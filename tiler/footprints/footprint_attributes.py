@@ -1,17 +1,17 @@
 """Ids and heights of footprints by the attributes of a file (step 1.2)."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
-from tiler.vectors.features import Features
+from tiler.vectors.features import Features, text_of
 from tiler.vectors.gdal_layer import list_some
 from tiler.vectors.layers import Layer
 from tiler.vectors.lengths import metres_of, number_of
-from tiler.vectors.osm_tags import STOREY, OsmTags, find_osm_tags, osm_heights, osm_ids, values_of
+from tiler.vectors.osm_tags import STOREY, OsmTags, osm_heights, osm_ids, values_of
 from tiler.vectors.shapefile import find_wide_columns, is_shapefile
 from tiler.words.plain_text import ID_LENGTH, printable, shorten
 
@@ -26,26 +26,14 @@ _WHOLE_FLOATS = 2.0**53  # below it each whole number is a float
 
 
 def find_attribute(info: Layer, asked: str) -> str:
-    """Check that an attribute exists; a GeoJSON file without features has none, and needs none.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such attribute, nor a tag of OSM of that name.
-    """
-    tags = find_osm_tags(info.fields)
+    """Check that an attribute, or a tag of OSM of that name, exists, as `known_attribute`."""
+    tags = info.tags
     known = {*info.fields, info.fid_name} | ({"height", "building:levels"} if tags else set())
     return known_attribute(info, asked, known)
 
 
 def known_attribute(info: Layer, asked: str, known: Collection[str]) -> str:
-    """Give the attribute that is asked for if it is a known one, ``""`` for a layer without features.
-
-    Raises
-    ------
-    ConfigError
-        If it is none of these.
-    """
+    """Give the attribute asked for; ``""`` for a layer without features; ConfigError if it is no known one."""
     if asked and asked not in known:
         if info.n_features == 0:
             return ""
@@ -76,7 +64,7 @@ def read_ids(layer: Layer, id_name: str, features: Features) -> list[str]:
 
 def height_columns(layer: Layer, height_name: str) -> list[str]:
     """List the attributes that heights are read from."""
-    tags = find_osm_tags(layer.fields)
+    tags = layer.tags
     own = [height_name] if height_name in layer.fields or height_name == layer.fid_name else []
     return list(dict.fromkeys([*own, *(tags.fields if tags else ())])) if height_name or tags else []
 
@@ -84,7 +72,7 @@ def height_columns(layer: Layer, height_name: str) -> list[str]:
 def read_heights(
     layer: Layer, height_name: str, features: Features
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[str]]:
-    """Give the heights of features above ground.
+    """Give the heights of features above ground, by an attribute, or by the tags of OSM data.
 
     Parameters
     ----------
@@ -105,17 +93,15 @@ def read_heights(
         What is wrong with each, ``""`` where nothing is: where an attribute is asked for, a height that is missing
         is wrong too.
     """
-    tags = find_osm_tags(layer.fields)
+    tags = layer.tags
     n = len(features.wkb)
     if not height_name and tags is None:
         return np.full(n, np.nan), np.zeros(n, np.bool_), [""] * n
     if tags is not None and height_name in ("", "height", tags.column.get("height", "")):
         height, by_levels, unread = osm_heights(tags, features.columns)
-        told = [
-            value is not None or (height_name and np.isnan(h)) for value, h in zip(unread, height, strict=True)
-        ]
-        wrong = [_not_a_height(value) if is_told else "" for value, is_told in zip(unread, told, strict=True)]
-        return height, by_levels, wrong
+        told = np.array([value is not None for value in unread.tolist()], np.bool_)
+        told |= bool(height_name) & np.isnan(height)
+        return height, by_levels, _not_heights(unread, told)
     if tags is not None and height_name in ("building:levels", tags.column.get("building:levels", "")):
         values = values_of(tags, "building:levels", features.columns)
         height = STOREY * np.array([number_of(value) for value in values], np.float64)
@@ -126,22 +112,11 @@ def read_heights(
         by_levels = np.zeros(n, np.bool_)
     bad = ~(np.isfinite(height) & (height > 0))
     height[bad] = np.nan
-    wrong = [_not_a_height(value) if is_bad else "" for value, is_bad in zip(values, bad, strict=True)]
-    return height, by_levels & ~bad, wrong
+    return height, by_levels & ~bad, _not_heights(values, bad)
 
 
 def explain_repeated(layer: Layer, id_name: str, name: str) -> str:
-    """Say how an id that several footprints carry is made unique, and where the format is to blame for it.
-
-    Parameters
-    ----------
-    layer : Layer
-        Where they come from.
-    id_name : str
-        Attribute of the ids.
-    name : str
-        The id as text.
-    """
+    """Say how an id that several footprints carry is made unique, and where the format is to blame for it."""
     plain = "completed by its geometry"
     if layer.gdal is None or layer.gdal.dtype_of(id_name) != "float64" or metres_of(name) < _WHOLE_FLOATS:
         return plain
@@ -158,40 +133,27 @@ def explain_repeated(layer: Layer, id_name: str, name: str) -> str:
 
 
 def id_text(value: Any) -> str:
-    """Write an id as text, whole floats as integers (a column with nulls may be read as float).
+    """Write an id as text, whole floats as integers (a column with nulls may be read as float), ``""`` for none.
 
-    Parameters
-    ----------
-    value : Any
-        As the file has it.
-
-    Returns
-    -------
-    str
-        ``""`` where there is none. Control characters are escaped, and what is longer than `ID_LENGTH` ends in a
-        hash: an id becomes a key of files and part of messages.
+    Control characters are escaped, and what is longer than `ID_LENGTH` ends in a hash: an id becomes a key of
+    files and part of messages.
 
     Examples
     --------
     >>> id_text(12.0), id_text(" a1 "), id_text(None), id_text(float("nan"))
     ('12', 'a1', '', '')
     """
-    return shorten(printable(_plain_id(value)), ID_LENGTH)
+    return shorten(printable(text_of(value)), ID_LENGTH)
 
 
 def _pair_of_ids(layer: Layer, id_name: str) -> OsmTags | None:
     """Give the tags of a layer whose ids are those of relations and of ways, where one of these is asked for."""
-    tags = find_osm_tags(layer.fields)
+    tags = layer.tags
     return tags if tags is not None and tags.way_id and id_name in (tags.relation_id, tags.way_id) else None
 
 
-def _plain_id(value: Any) -> str:
-    if isinstance(value, str):
-        return value.strip()
-    if isinstance(value, float | np.floating):
-        return f"{value:.17g}" if np.isfinite(value) else ""
-    return "" if value is None else str(value).strip()
-
-
-def _not_a_height(value: Any) -> str:
-    return f"{shorten(repr(value), ID_LENGTH)} is no height above 0 m"
+def _not_heights(values: Iterable[Any], bad: NDArray[np.bool_]) -> list[str]:
+    return [
+        f"{shorten(repr(value), ID_LENGTH)} is no height above 0 m" if wrong else ""
+        for value, wrong in zip(values, bad, strict=True)
+    ]

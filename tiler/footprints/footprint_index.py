@@ -3,10 +3,8 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import pyproj
 import shapely
 from numpy.typing import NDArray
 
@@ -14,13 +12,12 @@ from pipeline.data.citymodel import Footprints
 from pipeline.data.notes import Note
 from pipeline.data.roof_forms import no_forms
 from tiler.footprints.building_parts import find_building_parts
-from tiler.footprints.footprint_source import FootprintSource, count_notes_of, make_footprints, open_source
+from tiler.footprints.footprint_source import FootprintSource, count_notes_of, make_footprints
 from tiler.footprints.repeated_ids import find_repeated_ids
-from tiler.georeference.frame import Frame
-from tiler.objects.places import as_place
-from tiler.pointclouds.cells import order_by_cell, row_ranges
+from tiler.pointclouds.cells import boxes_of_cells, meets_box, order_by_cell
 from tiler.vectors.features import Box, Features
 from tiler.vectors.layers import BATCH, scan_layer
+from tiler.vectors.wkb import cut_blobs, join_blobs
 
 # Side of the cells that footprints are sorted by (m).
 FOOTPRINT_CELL = 1000.0
@@ -28,31 +25,16 @@ FOOTPRINT_CELL = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class FootprintRows:
-    """Footprints as plain arrays, for a store.
+    """Footprints as plain arrays, for a store."""
 
-    Attributes
-    ----------
-    wkb : uint8, (k,)
-        Well-known binary of all polygons, one behind the other.
-    wkb_start : int64, (n + 1,)
-        Polygon r is ``wkb[wkb_start[r] - wkb_start[0]:wkb_start[r + 1] - wkb_start[0]]``: a range of rows may
-        keep the numbers that it has in the whole.
-    ids : str, (n,)
-        Building ids.
-    given_height : float64, (n,)
-        Height above ground (m), NaN where there is none.
-    forms : float64, (n, 6)
-        What attributes say of their roofs, by the columns of `roof_forms`.
-    box : float64, (n, 4)
-        xmin, ymin, xmax, ymax of each polygon in the region's CRS (m).
-    """
-
-    wkb: NDArray[np.uint8]
+    wkb: NDArray[np.uint8]  # (k,): well-known binary of all polygons, one behind the other
+    # (n + 1,): Polygon r is ``wkb[wkb_start[r] - wkb_start[0]:wkb_start[r + 1] - wkb_start[0]]``: a range of rows
+    # may keep the numbers that it has in the whole
     wkb_start: NDArray[np.int64]
     ids: NDArray[np.str_]
-    given_height: NDArray[np.float64]
-    forms: NDArray[np.float64]
-    box: NDArray[np.float64]
+    given_height: NDArray[np.float64]  # (n,): height above ground (m), NaN where there is none
+    forms: NDArray[np.float64]  # (n, 6): what attributes say of their roofs, by the columns of `roof_forms`
+    box: NDArray[np.float64]  # (n, 4): xmin, ymin, xmax, ymax of each polygon in the region's CRS (m)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -60,65 +42,24 @@ class FootprintRows:
 
 @dataclass(frozen=True, eq=False)
 class FootprintBlock:
-    """Footprints of a part of a file.
+    """Footprints of a part of a file."""
 
-    Attributes
-    ----------
-    rows : FootprintRows
-        Sorted by the cell of the box's centre (j, then i), then by id.
-    cell : int64, (c, 2)
-        Cells (i, j) of the grid of `FOOTPRINT_CELL` that have rows, in that order.
-    start : int64, (c + 1,)
-        The footprints of cell k are the rows ``start[k]`` to ``start[k + 1]``.
-    cell_box : float64, (c, 4)
-        The box around the boxes of each cell's footprints (m).
-    notes : tuple of Note
-        What was converted, left out, assumed or renamed; they add up over the blocks of a file. One a footprint
-        for what `outline_all` tells, ``footprint-not-finite``, ``footprint-id-missing``,
-        ``footprint-id-repeated``, ``footprint-height-missing`` and ``footprint-roof-unread``; one a file for what
-        `count_notes_of` counts, ``footprints-without-crs``, ``footprints-reprojected``, ``footprints-outside`` and
-        ``footprints-reader-warning``.
-    """
-
-    rows: FootprintRows
-    cell: NDArray[np.int64]
-    start: NDArray[np.int64]
-    cell_box: NDArray[np.float64]
+    rows: FootprintRows  # sorted by the cell of the box's centre (j, then i), then by id
+    cell: NDArray[np.int64]  # (c, 2): cells (i, j) of the grid of `FOOTPRINT_CELL` that have rows, in that order
+    start: NDArray[np.int64]  # (c + 1,): the footprints of cell k are the rows ``start[k]`` to ``start[k + 1]``
+    cell_box: NDArray[np.float64]  # (c, 4): the box around the boxes of each cell's footprints (m)
+    # What was converted, left out, assumed or renamed; they add up over the blocks of a file. One a footprint for
+    # what `outline_all` tells, ``footprint-not-finite``, ``footprint-id-missing``, ``footprint-id-repeated``,
+    # ``footprint-height-missing`` and ``footprint-roof-unread``; one a file for what `count_notes_of` counts,
+    # ``footprints-without-crs``, ``footprints-reprojected``, ``footprints-outside`` and
+    # ``footprints-reader-warning``.
     notes: tuple[Note, ...]
 
 
-def scan_footprints(
-    path: str | Path,
-    *,
-    crs: pyproj.CRS,
-    bounds: Box,
-    layer: str = "",
-    id_attribute: str = "",
-    height_attribute: str = "",
-    roof_attribute: str = "",
-    frame: Frame | None = None,
-    batch: int = BATCH,
-) -> Iterator[FootprintBlock]:
-    """Read the footprints that meet a box, once and by batches (step 1.2).
+def scan_footprints(source: FootprintSource, *, batch: int = BATCH) -> Iterator[FootprintBlock]:
+    """Read the footprints of a source that meet its region, once and by batches (step 1.2).
 
-    Parameters
-    ----------
-    path, crs, bounds, layer, id_attribute, height_attribute, roof_attribute, frame
-        As `open_source` has them.
-    batch : int
-        Features in memory at once.
-
-    Yields
-    ------
-    FootprintBlock
-        One a batch; at least one a file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or its coordinates do not fit its CRS.
-    ConfigError
-        If the layer or an attribute does not exist.
+    Gives a block for each `batch` of features in memory, at least one a file. InputError if the file is damaged.
 
     Notes
     -----
@@ -126,21 +67,12 @@ def scan_footprints(
     that, see `find_repeated_ids`: an id is the same whatever box is asked for. So are parts of buildings of OSM
     data, see `find_building_parts`.
     """
-    source = open_source(
-        as_place(path),
-        crs=crs,
-        bounds=bounds,
-        layer=layer,
-        id_attribute=id_attribute,
-        height_attribute=height_attribute,
-        roof_attribute=roof_attribute,
-        frame=frame,
-    )
-    repeated = find_repeated_ids(source.layer, source.id_name, batch=batch)
-    parts = find_building_parts(source.layer, source.frame, bounds, height_name=source.height_name, batch=batch)
-    n_found, notes, warned = 0, [*source.layer.notes, *source.notes], set[str]()
+    layer, height = source.layer, source.height_name
+    repeated = find_repeated_ids(layer, source.id_name, batch=batch)
+    parts = find_building_parts(layer, source.frame, source.bounds, height_name=height, batch=batch)
+    n_found, notes, warned = 0, [*layer.notes, *source.notes], set[str]()
     counts: Counter[str] = Counter()
-    for features in scan_layer(source.layer, source.columns, source.box, batch=batch):
+    for features in scan_layer(layer, source.columns, source.box, batch=batch):
         footprints, found = make_footprints(source, features, repeated, counts, parts)
         notes += [*_warnings(source, features, warned), *found]
         n_found += len(footprints.ids)
@@ -151,56 +83,19 @@ def scan_footprints(
     if n_found == 0:
         notes += _outside(source)
     if n_found == 0 or notes:
-        yield block_footprints(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), notes)
-
-
-def select_footprints(cell_box: NDArray[np.float64], start: NDArray[np.int64], box: Box) -> list[tuple[int, int]]:
-    """Give the ranges of rows of the cells whose footprints may meet a box.
-
-    Parameters
-    ----------
-    cell_box : float64, (c, 4)
-        Boxes around the footprints of each cell.
-    start : int64, (c + 1,)
-        First row of each cell, and the number of rows.
-    box : tuple of 4 floats
-        xmin, ymin, xmax, ymax (m); the borders belong to the box.
-
-    Returns
-    -------
-    list of (row_start, row_stop)
-        Ascending, apart from each other: all that meet the box are in them, and others are too.
-
-    Examples
-    --------
-    >>> cell_box = np.array([[0.0, 0, 1010, 900], [1005, 0, 2000, 900], [3000, 0, 3100, 50]])
-    >>> select_footprints(cell_box, np.array([0, 4, 5, 9]), (1006.0, 10.0, 1007.0, 20.0))
-    [(0, 5)]
-    """
-    return row_ranges(_meets(cell_box, box), start)
+        yield no_footprints(notes)
 
 
 def join_footprints(parts: Sequence[FootprintRows], box: Box) -> Footprints:
-    """Join rows of any blocks, and keep the footprints that meet a box.
+    """Join rows of any blocks, and keep the footprints that meet a box (m); its borders belong to it.
 
-    Parameters
-    ----------
-    parts : sequence of FootprintRows
-        No row twice.
-    box : tuple of 4 floats
-        xmin, ymin, xmax, ymax (m); the borders belong to the box.
-
-    Returns
-    -------
-    Footprints
-        By ascending id, those of one id by their geometry as stored, then by height and form: the same whatever
-        the order of the parts and of their rows.
+    By ascending id, those of one id by their geometry as stored, then by height and form: the same whatever
+    the order of the parts and of their rows.
     """
     blobs, ids, heights, roofs = [], [np.empty(0, np.str_)], [np.empty(0)], [no_forms(0)]
     for part in parts:
-        near = np.flatnonzero(_meets(part.box, box))
-        stored, start = part.wkb.tobytes(), part.wkb_start - part.wkb_start[0]
-        blobs += [stored[start[row] : start[row + 1]] for row in near]
+        near = np.flatnonzero(meets_box(part.box, box))
+        blobs += cut_blobs(part.wkb, part.wkb_start)[near].tolist()
         ids.append(part.ids[near])
         heights.append(part.given_height[near])
         roofs.append(part.forms[near])
@@ -212,31 +107,25 @@ def join_footprints(parts: Sequence[FootprintRows], box: Box) -> Footprints:
     return Footprints(geometry[kept], names[order[kept]], given[order[kept]], forms[order[kept]])
 
 
-def _meets(boxes: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
-    xmin, ymin, xmax, ymax = boxes.T
-    meets: NDArray[np.bool_] = (xmin <= box[2]) & (xmax >= box[0]) & (ymin <= box[3]) & (ymax >= box[1])
-    return meets
-
-
 def block_footprints(footprints: Footprints, notes: Sequence[Note]) -> FootprintBlock:
     """Put footprints into blocks of rows sorted by place, with some notes."""
     box = shapely.bounds(footprints.polygons).reshape(-1, 4)
     by_id = np.argsort(footprints.ids, kind="stable")
     cells = order_by_cell((box[by_id, :2] + box[by_id, 2:]) / 2, FOOTPRINT_CELL)
     order = by_id[cells.order]
-    blobs = shapely.to_wkb(footprints.polygons[order], output_dimension=2, byte_order=1)
-    length = np.fromiter(map(len, blobs), np.int64, len(blobs))
     rows = FootprintRows(
-        np.frombuffer(b"".join(blobs), np.uint8),
-        np.concatenate([np.zeros(1, np.int64), np.cumsum(length)]),
+        *join_blobs(shapely.to_wkb(footprints.polygons[order], output_dimension=2, byte_order=1)),
         footprints.ids[order],
         footprints.given_height[order],
         footprints.forms[order],
         box[order],
     )
-    first = cells.start[:-1]
-    low, high = (ufunc.reduceat(rows.box, first) if len(first) else rows.box for ufunc in (np.minimum, np.maximum))
-    return FootprintBlock(rows, cells.cell, cells.start, np.hstack((low[:, :2], high[:, 2:])), tuple(notes))
+    return FootprintBlock(rows, cells.cell, cells.start, boxes_of_cells(rows.box, cells.start), tuple(notes))
+
+
+def no_footprints(notes: Sequence[Note] = ()) -> FootprintBlock:
+    """Give a block of notes alone."""
+    return block_footprints(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), notes)
 
 
 def _warnings(source: FootprintSource, features: Features, warned: set[str]) -> list[Note]:

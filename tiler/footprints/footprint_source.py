@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Set
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,11 +28,11 @@ from tiler.footprints.plan_outlines import Finding, outline_all
 from tiler.footprints.roof_attributes import RoofAttributes, find_roof_attributes, read_roofs, roof_columns
 from tiler.georeference.crs import crs_name, horizontal_crs
 from tiler.georeference.footprints import footprint_frame
-from tiler.georeference.frame import Frame, box_to_file, to_region
+from tiler.georeference.frame import Frame, box_to_file, shapes_to_region, to_region
 from tiler.pointclouds.las_header import COORDINATE_LIMIT
 from tiler.vectors.features import Box, Features
 from tiler.vectors.layers import Layer, describe_layer
-from tiler.vectors.osm_tags import STOREY, OsmTags, find_osm_tags, is_building, is_part, is_raised
+from tiler.vectors.osm_tags import STOREY, OsmTags, is_building, is_part, is_raised
 
 # Kinds of the notes of forms, before the shape: that of each is counted.
 GIVEN_FORMS, UNKNOWN_FORMS = "footprint-roof-forms:", "footprint-roof-forms-unknown:"
@@ -44,33 +43,17 @@ _NOWHERE = (float("nan"),) * 4
 
 @dataclass(frozen=True, eq=False)
 class FootprintSource:
-    """How footprints are read from one layer.
-
-    Attributes
-    ----------
-    layer : Layer
-        The layer.
-    id_name, height_name, roof_name : str
-        Attributes with the id, the height above ground and the shape of the roof, ``""`` for none that is asked
-        for.
-    frame : Frame
-        How coordinates of the file become those of the region.
-    bounds : tuple of 4 floats
-        The region (m), in its own CRS.
-    box : tuple of 4 floats
-        The region in the file's CRS.
-    notes : tuple of Note
-        What was assumed about the CRS.
-    """
+    """How footprints are read from one layer."""
 
     layer: Layer
+    # Attributes with the id, the height above ground and the shape of the roof, ``""`` for none that is asked for.
     id_name: str
     height_name: str
     roof_name: str
-    frame: Frame
-    bounds: Box
-    box: Box
-    notes: tuple[Note, ...]
+    frame: Frame  # how coordinates of the file become those of the region
+    bounds: Box  # the region (m), in its own CRS
+    box: Box  # the region in the file's CRS
+    notes: tuple[Note, ...]  # what was assumed about the CRS
 
     @property
     def columns(self) -> list[str]:
@@ -85,9 +68,9 @@ def open_source(
     *,
     crs: pyproj.CRS,
     bounds: Box,
-    layer: str,
-    id_attribute: str,
-    height_attribute: str,
+    layer: str = "",
+    id_attribute: str = "",
+    height_attribute: str = "",
     roof_attribute: str = "",
     frame: Frame | None = None,
 ) -> FootprintSource:
@@ -112,10 +95,6 @@ def open_source(
     frame : Frame, optional
         How coordinates of the file become those of the region; by default as the CRSs have it.
 
-    Returns
-    -------
-    FootprintSource
-
     Raises
     ------
     InputError
@@ -130,7 +109,7 @@ def open_source(
     _check_extent(info, own or crs)
     if frame is None:
         frame = Frame() if own is None else footprint_frame(own, crs, bounds)[0]
-    box = box_to_file(frame, bounds) if frame.changes_plan else bounds
+    box = box_to_file(frame, bounds)
     return FootprintSource(
         info, id_name, height_name, roof_attribute, frame, bounds, box, tuple(_crs_notes(info, own, crs, frame))
     )
@@ -165,23 +144,26 @@ def make_footprints(
     list of Note
         As a `FootprintBlock` has them.
     """
-    tags = find_osm_tags(source.layer.fields)
+    tags = source.layer.tags
     wanted = np.ones(len(features.wkb), np.bool_) if tags is None else is_building(tags, features.columns)
     outlines = outline_all(features.wkb, metre=source.layer.metre, curved=features.curved)
     counts["footprints-without-geometry"] += sum(blob is None for blob in features.wkb) - len(features.broken)
     names = read_ids(source.layer, source.id_name, features) if source.id_name else [""] * len(features.wkb)
-    notes = _unreadable(features, names)
+    notes = [
+        Note("footprint-unreadable", names[row], detail=f"feature {features.fids[row]}: {reason}")
+        for row, reason in sorted(features.broken.items())
+    ]
     geometry, rows = outlines.geometry, outlines.rows
-    if source.frame.changes_plan:
-        geometry = shapely.transform(geometry, partial(to_region, source.frame))
-    keep, wrong = _finite_within(geometry, source.bounds)
+    geometry = shapes_to_region(source.frame, geometry)
+    keep = is_finite(geometry)
+    wrong = np.flatnonzero(~keep)
+    keep[keep] = shapely.intersects(geometry[keep], shapely.box(*source.bounds))
     counts["footprints-not-buildings"] += int((keep & ~wanted[rows]).sum())
     keep &= wanted[rows]
-    found = [finding for finding in outlines.findings if wanted[finding.row] and _is_near(finding, source.box)]
-    notes += _tell(found, source, features, names)
-    notes += _tell(
-        [finding for finding in _not_finite(rows[wrong]) if wanted[finding.row]], source, features, names
-    )
+    detail = f"a coordinate is NaN, infinite, or beyond ±{COORDINATE_LIMIT:g} m"
+    lost = [Finding("footprint-not-finite", row, detail, _NOWHERE) for row in rows[wrong].tolist()]
+    found = [one for one in outlines.findings if _is_near(one, source.box)] + lost
+    notes += _tell([one for one in found if wanted[one.row]], source, features, names)
     geometry, rows = geometry[keep], rows[keep]
     height, by_levels, bad = read_heights(source.layer, source.height_name, features)
     if tags is not None and parts is not None:
@@ -194,7 +176,7 @@ def make_footprints(
     ids, told = _ids(source, geometry, np.array([names[row] for row in rows], np.str_), repeated)
     notes += told
     counts["footprint-heights-by-levels"] += int(by_levels[rows].sum())
-    none = np.array([bool(bad[row]) for row in rows], np.bool_)
+    none = np.array(list(map(bool, bad)), np.bool_)[rows]
     notes += _notes("footprint-height-missing", geometry[none], [bad[row] for row in rows[none]], ids[none])
     roofs = read_roofs(source.layer, source.roof_name, features)
     roofs.forms[by_levels & np.isfinite(roofs.forms[:, SHAPE]), TO_EAVES] = 1.0
@@ -257,7 +239,7 @@ def _tell_roofs(
     shape = roofs.forms[rows, SHAPE]
     counts.update(GIVEN_FORMS + ROOF_SHAPES[int(each)] for each in shape[np.isfinite(shape)].tolist())
     counts.update(UNKNOWN_FORMS + roofs.unknown[row] for row in rows.tolist() if roofs.unknown[row])
-    bad = np.array([bool(roofs.wrong[row]) for row in rows.tolist()], np.bool_)
+    bad = np.array(list(map(bool, roofs.wrong)), np.bool_)[rows]
     return _notes("footprint-roof-unread", geometry[bad], [roofs.wrong[row] for row in rows[bad]], ids[bad])
 
 
@@ -282,19 +264,12 @@ def _check_extent(info: Layer, crs: pyproj.CRS) -> None:
         )
 
 
-def _finite_within(geometry: NDArray[np.object_], bounds: Box) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Tell the geometries that meet a box, and list those that are not finite."""
+def is_finite(geometry: NDArray[np.object_]) -> NDArray[np.bool_]:
+    """Tell the geometries, (n,), whose coordinates are all within `COORDINATE_LIMIT`, and none of them NaN."""
     coordinates, owner = shapely.get_coordinates(geometry, return_index=True)
-    finite = np.ones(len(geometry), bool)
-    finite[owner[~(np.abs(coordinates) <= COORDINATE_LIMIT).all(axis=1)]] = False  # NaN too
-    keep = finite.copy()
-    keep[finite] = shapely.intersects(geometry[finite], shapely.box(*bounds))
-    return keep, np.flatnonzero(~finite)
-
-
-def _not_finite(rows: NDArray[np.int64]) -> list[Finding]:
-    detail = f"a coordinate is NaN, infinite, or beyond ±{COORDINATE_LIMIT:g} m"
-    return [Finding("footprint-not-finite", row, detail, _NOWHERE) for row in rows.tolist()]
+    finite = np.ones(len(geometry), np.bool_)
+    finite[owner[~(np.abs(coordinates) <= COORDINATE_LIMIT).all(axis=1)]] = False
+    return finite
 
 
 def _is_near(finding: Finding, box: Box) -> bool:
@@ -315,19 +290,12 @@ def _tell(findings: list[Finding], source: FootprintSource, features: Features, 
     return notes
 
 
-def _unreadable(features: Features, names: list[str]) -> list[Note]:
-    return [
-        Note("footprint-unreadable", names[row], detail=f"feature {features.fids[row]}: {reason}")
-        for row, reason in sorted(features.broken.items())
-    ]
-
-
 def _ids(
     source: FootprintSource, geometry: NDArray[np.object_], given: NDArray[np.str_], repeated: Set[str]
 ) -> tuple[NDArray[np.str_], list[Note]]:
     """Give each footprint its id: its own, completed by its geometry where that is repeated, or the geometry's."""
     missing = given == ""
-    again = np.fromiter((name in repeated for name in given.tolist()), bool, len(given)) & ~missing
+    again = np.isin(given, sorted(repeated)) & ~missing
     made = np.full(len(given), "", dtype="<U14")
     made[missing | again] = make_ids(geometry[missing | again])
     ids = np.where(missing, made, given)
@@ -338,8 +306,7 @@ def _ids(
         "footprint-id-missing", geometry[missing], ["named by its geometry"] * int(missing.sum()), made[missing]
     )
     reasons = [explain_repeated(source.layer, source.id_name, name) for name in given[again].tolist()]
-    notes += _notes("footprint-id-repeated", geometry[again], reasons, ids[again])
-    return ids, notes
+    return ids, notes + _notes("footprint-id-repeated", geometry[again], reasons, ids[again])
 
 
 def _notes(kind: str, geometry: NDArray[np.object_], details: list[str], subjects: NDArray[np.str_]) -> list[Note]:

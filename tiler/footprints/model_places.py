@@ -16,31 +16,17 @@ DROP_SHARE = 0.5  # of a footprint, from which on the buildings of the model ove
 
 @dataclass(frozen=True, eq=False)
 class ModelPlaces:
-    """Where buildings of city models stand.
+    """Where buildings of city models stand."""
 
-    Attributes
-    ----------
-    polygons : object, (n,)
-        Their outlines, all that meet the footprints (m).
-    numbers : int64, (m,)
-        Numbers of the ids of all buildings of the region, ascending: see `number_ids`.
-    """
-
-    polygons: NDArray[np.object_]
+    polygons: NDArray[np.object_]  # (n,): their outlines, all that meet the footprints (m)
+    # (m,): numbers of the ids of all buildings of the region, ascending: see `number_ids`
     numbers: NDArray[np.int64]
 
 
 def give_way(footprints: Footprints, places: ModelPlaces, bounds: Box) -> tuple[Footprints, list[Note]]:
     """Take from footprints what buildings of city models stand on: each place belongs to one house.
 
-    Parameters
-    ----------
-    footprints : Footprints
-        All that meet some box; what becomes of each depends on the buildings over it alone.
-    places : ModelPlaces
-        The buildings.
-    bounds : tuple of 4 floats
-        xmin, ymin, xmax, ymax of the region (m), in which places of notes lie.
+    What becomes of each depends on the buildings over it alone. Places of notes lie in `bounds`, the region (m).
 
     Returns
     -------

@@ -7,8 +7,6 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tiler.footprints.closed_lines import outline_lines
-from tiler.footprints.surfaces import is_surface, outline_faces
 from tiler.pointclouds.las_header import COORDINATE_LIMIT
 from tiler.vectors.features import Box
 from tiler.vectors.wkb import parse_wkb
@@ -16,49 +14,31 @@ from tiler.vectors.wkb import parse_wkb
 # Vertices of one footprint: the largest of a national register have some thousands. Up to this many take less than
 # a minute however they lie, beyond it the time of geometric predicates grows with the square.
 MAX_VERTICES = 100_000
+CLOSED = 0.01  # m; a line whose ends are this close is closed, as in drawings of CAD
+GRID = 0.001  # m; faces that meet within this are joined
+GAP = 0.01  # m; gaps between faces up to twice this wide are closed
+STEEP = 0.002  # a face whose plan area is a smaller share of its area is vertical
 _POLYGONAL = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)
 _LINEAR = (shapely.GeometryType.LINESTRING, shapely.GeometryType.LINEARRING)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What was done to a geometry, or why it is left out: one of a `pipeline.data.notes.Note` in the making.
+    """What was done to a geometry, or why it is left out: one of a `pipeline.data.notes.Note` in the making."""
 
-    Attributes
-    ----------
-    kind : str
-        As a note has it.
-    row : int
-        Row of the geometry.
-    detail : str
-        What was seen.
-    box : tuple of 4 floats
-        Its bounding box in the file's CRS; NaN where there is none.
-    """
-
-    kind: str
-    row: int
+    kind: str  # as a note has it
+    row: int  # row of the geometry
     detail: str
-    box: Box
+    box: Box  # its bounding box in the file's CRS; NaN where there is none
 
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """Plan outlines.
+    """Plan outlines."""
 
-    Attributes
-    ----------
-    geometry : object, (m,)
-        Polygons and multipolygons without Z, valid or not, not empty.
-    rows : int64, (m,)
-        The row of each among what was given, ascending.
-    findings : list of Finding
-        What was converted, and what is left out.
-    """
-
-    geometry: NDArray[np.object_]
-    rows: NDArray[np.int64]
-    findings: list[Finding] = field(default_factory=list)
+    geometry: NDArray[np.object_]  # (m,): polygons and multipolygons without Z, valid or not, not empty
+    rows: NDArray[np.int64]  # (m,): the row of each among what was given, ascending
+    findings: list[Finding] = field(default_factory=list)  # what was converted, and what is left out
 
 
 def outline_all(wkb: NDArray[np.object_], *, metre: float = 1.0, curved: Set[int] = frozenset()) -> Outlines:
@@ -80,10 +60,6 @@ def outline_all(wkb: NDArray[np.object_], *, metre: float = 1.0, curved: Set[int
         space and collections of polygons the outline of their faces (``footprint-outline-of-surface``); what
         closed lines enclose (``footprint-from-line``). Left out: ``footprint-not-polygon``,
         ``footprint-not-finite``, ``footprint-unreadable``, ``footprint-too-many-vertices``.
-
-    Notes
-    -----
-    Polygons alone are parsed and tested all at once; each of the others takes some 0.1 ms.
     """
     geometry, surfaces, broken = parse_wkb(wkb)
     found = {row: [("footprint-unreadable", reason)] for row, reason in broken.items()}
@@ -171,3 +147,109 @@ def _flatten(shape: shapely.Geometry) -> NDArray[np.object_]:
         parts = np.concatenate([shapely.get_parts(part) for part in parts])
     kept: NDArray[np.object_] = parts[~shapely.is_empty(parts)]
     return kept
+
+
+def outline_lines(geometry: shapely.Geometry, *, metre: float = 1.0) -> shapely.Geometry | str:
+    """Give the area that lines enclose, closed ones within others as holes; or why there is none.
+
+    Lines close each by itself within `CLOSED`, or all of them together from end to end. `metre` is the length of a
+    metre in units of the coordinates.
+
+    Examples
+    --------
+    >>> outline_lines(shapely.LineString([(0, 0), (4, 0), (4, 3), (0, 3), (0, 0)])).wkt
+    'POLYGON ((0 0, 4 0, 4 3, 0 3, 0 0))'
+    >>> outline_lines(shapely.LineString([(0, 0), (4, 0), (4, 3)]))
+    'is an open line: its ends are 5 m apart'
+    """
+    lines = [line for line in shapely.get_parts(shapely.force_2d(geometry)) if not line.is_empty]
+    gaps = [_gap(line) / metre for line in lines]
+    if not all(np.isfinite(gaps)) or not lines:
+        return "is a line without finite vertices"
+    rings = [line for line, gap in zip(lines, gaps, strict=True) if gap <= CLOSED and len(line.coords) > 3]
+    if len(rings) == len(lines):
+        polygons = [shapely.Polygon(line) for line in rings]
+        return polygons[0] if len(polygons) == 1 else _nest(polygons)
+    if len(lines) == 1:
+        return f"is an open line: its ends are {gaps[0]:.3g} m apart"
+    faces, cuts, dangles, invalid = shapely.polygonize_full(lines)
+    if faces.is_empty or not (cuts.is_empty and dangles.is_empty and invalid.is_empty):
+        return f"is {len(lines)} lines that do not close together"
+    return _nest(list(faces.geoms))
+
+
+def _gap(line: shapely.LineString) -> float:
+    ends = shapely.get_coordinates(line)[[0, -1]]
+    return float(np.hypot(*(ends[1] - ends[0])))
+
+
+def _nest(polygons: list[shapely.Polygon]) -> shapely.Geometry:
+    """Join polygons so that each ring within another changes from house to courtyard and back."""
+    shells = [shapely.make_valid(shapely.Polygon(polygon.exterior), method="structure") for polygon in polygons]
+    shells.sort(key=lambda shell: (-shell.area, shapely.to_wkb(shell)))
+    outline = shells[0]
+    for shell in shells[1:]:
+        outline = shapely.symmetric_difference(outline, shell)
+    return outline
+
+
+def outline_faces(faces: NDArray[np.object_], *, metre: float = 1.0) -> shapely.Geometry:
+    """Give the outline of faces, polygons (n,) with Z or without, in plan: polygon or multipolygon.
+
+    It is the union of the faces that are not vertical, on a grid of `GRID`, with gaps up to twice `GAP` closed;
+    an empty polygon if all are vertical. `metre` is the length of a metre in units of the coordinates.
+
+    Examples
+    --------
+    >>> roof = shapely.Polygon([(0, 0, 3), (2, 0, 5), (2, 4, 5), (0, 4, 3)])
+    >>> wall = shapely.Polygon([(2, 0, 5), (2, 4, 5), (2, 4, 0), (2, 0, 0)])
+    >>> outline_faces(np.array([roof, wall])).normalize().wkt
+    'POLYGON ((0 0, 0 4, 2 4, 2 0, 0 0))'
+    """
+    seen = faces[_is_seen(faces)]
+    if not len(seen):
+        return shapely.Polygon()
+    flat = shapely.make_valid(shapely.force_2d(seen), method="structure", keep_collapsed=False)
+    outline = _polygonal(shapely.union_all(flat, grid_size=GRID * metre))
+    if _count_rings(outline) > 1:
+        gap = {"join_style": "mitre", "mitre_limit": 5.0}
+        closed = _polygonal(outline.buffer(GAP * metre, **gap).buffer(-GAP * metre, **gap))
+        if not closed.is_empty and _count_rings(closed) < _count_rings(outline):
+            return closed
+    return outline
+
+
+def is_surface(geometry: NDArray[np.object_]) -> NDArray[np.bool_]:
+    """Tell the multipolygons (n,) with Z that are faces of a body rather than parts of an outline: bool (n,).
+
+    Several faces have Z and are, seen from above, no valid multipolygon: they are vertical, lie over one another,
+    or meet along edges.
+    """
+    several = shapely.has_z(geometry) & (shapely.get_num_geometries(geometry) > 1)
+    found = np.zeros(len(geometry), np.bool_)
+    with np.errstate(invalid="ignore"):
+        found[several] = ~shapely.is_valid(shapely.force_2d(geometry[several]))
+    return found
+
+
+def _is_seen(faces: NDArray[np.object_]) -> NDArray[np.bool_]:
+    """Compare the plan area of each face with its area, by the normals of Newell."""
+    xyz, face = shapely.get_coordinates(shapely.get_exterior_ring(faces), include_z=True, return_index=True)
+    first = np.unique(face, return_index=True)[1]
+    low = np.zeros((len(faces), 3))
+    low[face[first]] = xyz[first]
+    arm = np.where(np.isnan(xyz), 0.0, xyz - low[face])
+    same = face[1:] == face[:-1]
+    cross = np.cross(arm[:-1][same], arm[1:][same])
+    normal = np.stack([np.bincount(face[1:][same], side, minlength=len(faces)) for side in cross.T], axis=1)
+    seen: NDArray[np.bool_] = np.abs(normal[:, 2]) > STEEP * np.linalg.norm(normal, axis=1)
+    return seen
+
+
+def _polygonal(geometry: shapely.Geometry) -> shapely.Geometry:
+    parts = [part for part in shapely.get_parts(geometry) if part.geom_type == "Polygon" and not part.is_empty]
+    return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)
+
+
+def _count_rings(geometry: shapely.Geometry) -> int:
+    return len(shapely.get_rings(shapely.get_parts(geometry)))

@@ -1,7 +1,6 @@
 """Geometries of a vector layer in plan, in a region's CRS, with some attributes."""
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from pipeline.data.errors import InputError
 from tiler.footprints.footprint_attributes import known_attribute
 from tiler.georeference.crs import horizontal_crs
 from tiler.georeference.footprints import footprint_frame
-from tiler.georeference.frame import Frame, to_region
+from tiler.georeference.frame import Frame, shapes_to_region
 from tiler.objects.places import is_missing
 from tiler.vectors.features import Box
 from tiler.vectors.layers import describe_layer, scan_layer
@@ -32,21 +31,16 @@ def scan_shapes(
         Attributes.
     option : str
         Name of the option that names the file, for messages.
-    crs : pyproj.CRS
-        CRS of the region.
-    bounds : tuple of 4 floats
-        The region (m).
+    crs, bounds
+        CRS of the region, and its box (m).
     layer : str
         Name of the layer; by default the only one.
 
     Yields
     ------
-    str
-        What to call the feature in a message.
-    Geometry
-        Without Z, in the region's CRS, wherever it lies.
-    list
-        Its values of the attributes.
+    tuple of str, Geometry, list
+        What to call the feature in a message; without Z, in the region's CRS, wherever it lies; its values of the
+        attributes.
 
     Raises
     ------
@@ -67,9 +61,7 @@ def scan_shapes(
             subject = f"{path}: feature {fid}" + (f" of layer {layer}" if layer else "")
             if blob is None:
                 raise InputError(f"{subject}: has no geometry; mend or remove it")
-            geometry = shapely.force_2d(shapely.from_wkb(blob, on_invalid="fix"))
-            if frame.changes_plan:
-                geometry = shapely.transform(geometry, partial(to_region, frame))
+            geometry = shapes_to_region(frame, shapely.force_2d(shapely.from_wkb(blob, on_invalid="fix")))
             if not np.isfinite(shapely.get_coordinates(geometry)).all() or shapely.is_empty(geometry):
                 raise InputError(f"{subject}: has no place in the region's CRS; mend or remove it")
             yield subject, geometry, list(row)

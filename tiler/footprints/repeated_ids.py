@@ -11,26 +11,9 @@ from tiler.vectors.layers import BATCH, Layer, scan_layer
 
 
 def find_repeated_ids(layer: Layer, id_name: str, *, batch: int = BATCH) -> set[str]:
-    """Find the ids that at least two different polygons of a layer carry.
+    """Find the ids that at least two different polygons of a layer carry; none where `id_name` is ``""``.
 
-    Parameters
-    ----------
-    layer : Layer
-        From `describe_layer`.
-    id_name : str
-        Attribute with the ids; ``""`` for none.
-    batch : int
-        Features in memory at once.
-
-    Returns
-    -------
-    set of str
-        Empty if there is no attribute. Polygons that are equal whatever their start vertex are one.
-
-    Raises
-    ------
-    InputError
-        If the file is damaged.
+    Polygons that are equal whatever their start vertex are one. InputError if the file is damaged.
 
     Notes
     -----

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pipeline.data.roof_forms import ACROSS, DIRECTION, HEIGHT, ROOF_SHAPES, SHAPE, SLOPE, no_forms
 from tiler.footprints.footprint_attributes import known_attribute
-from tiler.vectors.features import Features
+from tiler.vectors.features import Features, text_of
 from tiler.vectors.layers import Layer
 from tiler.vectors.lengths import metres_of, number_of
-from tiler.vectors.osm_tags import STOREY, find_osm_tags, tags_of
+from tiler.vectors.osm_tags import STOREY, tags_of
 from tiler.vectors.roof_words import (
     LEAST_ANGLE,
     LEAST_HEIGHT,
@@ -25,7 +25,6 @@ from tiler.vectors.roof_words import (
     degrees_of,
     direction_of,
     shape_of,
-    word_of,
 )
 from tiler.words.plain_text import ID_LENGTH, printable, shorten
 
@@ -37,46 +36,22 @@ _SHP_NAME = 10  # letters of a name in a Shapefile
 
 @dataclass(frozen=True, eq=False)
 class RoofAttributes:
-    """What attributes of ``n`` features say of their roofs.
+    """What attributes of ``n`` features say of their roofs."""
 
-    Attributes
-    ----------
-    forms : float64, (n, 6)
-        By the columns of `roof_forms`, but for that of the eaves.
-    by_levels : bool, (n,)
-        True where the height of the roof is its number of levels, of `STOREY` each.
-    unknown : list of str
-        The shape that is none of ours, ``""`` elsewhere.
-    wrong : list of str
-        What cannot be read, or is out of bounds, of a feature with a shape; ``""`` where nothing is.
-    """
-
-    forms: NDArray[np.float64]
+    forms: NDArray[np.float64]  # (n, 6): by the columns of `roof_forms`, but for that of the eaves
+    # (n,): True where the height of the roof is its number of levels, of `STOREY` each
     by_levels: NDArray[np.bool_]
-    unknown: list[str]
+    unknown: list[str]  # the shape that is none of ours, ``""`` elsewhere
+    # What cannot be read, or is out of bounds, of a feature with a shape; ``""`` where nothing is.
     wrong: list[str]
 
 
 def find_roof_attributes(layer: Layer, asked: str) -> dict[str, str]:
-    """Find the attributes of a layer that tell of roofs; tags of OSM data without a column are left out.
+    """Find the attribute of each of `ROOF_KEYS` that a layer has one of; none without one of the shape.
 
-    Parameters
-    ----------
-    layer : Layer
-        Where features come from.
-    asked : str
-        Attribute of the shape; ``""`` for ``roof:shape``, ``roof_shape`` and the like, else `CODE_ATTRIBUTES`.
-
-    Returns
-    -------
-    dict of str to str
-        Attribute of each of `ROOF_KEYS` that there is one of; none without one of the shape. An attribute of codes
-        is alone: other columns beside it do not mean what those of OpenStreetMap do.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such attribute.
+    That of the shape is the one asked for, else ``roof:shape``, ``roof_shape`` and the like, else one of
+    `CODE_ATTRIBUTES`: that is alone, as other columns beside it do not mean what those of OpenStreetMap do. Tags
+    of OSM data without a column are left out. ConfigError if there is no such attribute.
     """
     asked = known_attribute(layer, asked, layer.fields)
     plain = {_plain(field): field for field in reversed(layer.fields)}
@@ -93,29 +68,17 @@ def find_roof_attributes(layer: Layer, asked: str) -> dict[str, str]:
 
 def roof_columns(layer: Layer, asked: str) -> list[str]:
     """List the attributes that forms of roofs are read from."""
-    tags = find_osm_tags(layer.fields)
+    tags = layer.tags
     more = [tags.more] if tags is not None and tags.more else []
     return list(dict.fromkeys([*find_roof_attributes(layer, asked).values(), *more]))
 
 
 def read_roofs(layer: Layer, asked: str, features: Features) -> RoofAttributes:
-    """Read the forms of roofs.
+    """Read the forms of roofs of features that have the attributes which `roof_columns` names.
 
-    Parameters
-    ----------
-    layer : Layer
-        Where features come from.
-    asked : str
-        Attribute of the shape, ``""`` for a well-known one.
-    features : Features
-        With the attributes that `roof_columns` names.
-
-    Returns
-    -------
-    RoofAttributes
-        A shape that is not ours, or none, is no form, whatever else is said; of a flat one nothing else is read.
-        What is out of bounds counts as not said. The height is that of ``roof:height``; without it and without
-        ``roof:angle`` that of ``roof:levels``, if these are more than 0.
+    A shape that is not ours, or none, is no form, whatever else is said; of a flat one nothing else is read.
+    What is out of bounds counts as not said. The height is that of ``roof:height``; without it and without
+    ``roof:angle`` that of ``roof:levels``, if these are more than 0.
     """
     n = len(features.wkb)
     values = _read_values(layer, asked, features)
@@ -129,7 +92,7 @@ def read_roofs(layer: Layer, asked: str, features: Features) -> RoofAttributes:
                 forms[row], by_levels[row], wrong[row] = _read_form(tags)
             forms[row, SHAPE] = shape
         elif shape == NO_SHAPE:
-            unknown[row] = printable(shorten(word_of(value), ID_LENGTH))
+            unknown[row] = printable(shorten(text_of(value), ID_LENGTH))
     return RoofAttributes(forms, by_levels, unknown, wrong)
 
 
@@ -137,13 +100,13 @@ def _read_values(layer: Layer, asked: str, features: Features) -> Mapping[str, S
     """Give the values of each of `ROOF_KEYS` that may have any: of their own attributes, else of further tags."""
     names = find_roof_attributes(layer, asked)
     values: dict[str, Sequence[Any]] = {key: list(features.columns[name]) for key, name in names.items()}
-    tags = find_osm_tags(layer.fields)
+    tags = layer.tags
     if tags is None or not tags.more:
         return values
     others = tags_of(features.columns[tags.more], ROOF_KEYS)
     for key, of in others.items():
         own = values.get(key, [None] * len(of))
-        values[key] = [value if word_of(value) else other for value, other in zip(own, of, strict=True)]
+        values[key] = [value if text_of(value) else other for value, other in zip(own, of, strict=True)]
     return values
 
 
@@ -152,7 +115,7 @@ def _read_form(tags: Mapping[str, Any]) -> tuple[NDArray[np.float64], bool, str]
     form, wrong = no_forms(1)[0], list[str]()
 
     def read(key: str, convert: Callable[[Any], float], low: float, high: float, bounds: str) -> float:
-        if not word_of(tags.get(key)):
+        if not text_of(tags.get(key)):
             return math.nan
         value = convert(tags[key])
         if low <= value <= high:

@@ -1,7 +1,6 @@
 """Roads, railways, water and other objects of vector files, by batches in the region's CRS."""
 
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,12 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, InputError
-from tiler.generalisation.told import Told
+from tiler.footprints.footprint_source import is_finite
+from tiler.generalisation.summary import Told
 from tiler.georeference.crs import horizontal_crs
 from tiler.georeference.footprints import footprint_frame
-from tiler.georeference.frame import box_to_file, to_region
+from tiler.georeference.frame import Frame, box_to_file, shapes_to_region
 from tiler.objects.places import is_missing
-from tiler.pointclouds.las_header import COORDINATE_LIMIT
 from tiler.vectors.features import Box
 from tiler.vectors.layers import Layer, describe_layer, scan_layer
 from tiler.vectors.wkb import parse_wkb
@@ -31,25 +30,18 @@ HINT = (
 def scan_geometries(
     path: Path, *, crs: pyproj.CRS, around: Box, bounds: Box | None, told: Told
 ) -> Iterator[NDArray[np.object_]]:
-    """Read lines and polygons of a vector file.
+    """Read lines and polygons of a vector file with one layer, without Z, in metres: object (n,) each time.
 
     Parameters
     ----------
-    path : Path
-        The file, with one layer.
-    crs : pyproj.CRS
-        The region's.
+    path, crs
+        The file, and the CRS of the region.
     around : tuple of 4 floats
         Where the buildings are (m): it tells which reprojection is best.
     bounds : tuple of 4 floats, optional
         Lines and polygons are cut at this box (m).
     told : Told
         What is left out or assumed is counted here.
-
-    Yields
-    ------
-    object, (n,)
-        Without Z, in metres.
 
     Raises
     ------
@@ -69,21 +61,17 @@ def scan_geometries(
     own = horizontal_crs(layer.crs)
     if own is None:
         told.say(f"{path.name}: states no CRS, taken in that of the buildings")
-    frame = None if own is None else footprint_frame(own, crs, bounds or around)[0]
-    box = None if bounds is None else bounds if frame is None else box_to_file(frame, bounds)
+    frame = Frame() if own is None else footprint_frame(own, crs, bounds or around)[0]
+    box = None if bounds is None else box_to_file(frame, bounds)
     for features in scan_layer(layer, [], box, batch=BATCH):
         geometry, _, broken = parse_wkb(features.wkb)
         told.counts[f"features of {path.name} that cannot be read"] += len(broken | features.broken)
         geometry = shapely.force_2d(geometry[~shapely.is_missing(geometry)])
-        if frame is not None and frame.changes_plan:
-            geometry = shapely.transform(geometry, partial(to_region, frame))
-        limits = shapely.bounds(geometry).reshape(-1, 4)
-        finite = (np.abs(limits) <= COORDINATE_LIMIT).all(axis=1)  # not so for NaN, too
-        lines = shapely.get_dimensions(geometry) > 0
-        told.counts[f"points and features without a place in {path.name}, left out: lines or areas are taken"] += (
-            int((~(finite & lines)).sum())
-        )
-        geometry = geometry[finite & lines]
+        geometry = shapes_to_region(frame, geometry)
+        taken = is_finite(geometry) & ~shapely.is_empty(geometry) & (shapely.get_dimensions(geometry) > 0)
+        left = f"points and features without a place in {path.name}, left out: lines or areas are taken"
+        told.counts[left] += int((~taken).sum())
+        geometry = geometry[taken]
         if bounds is not None:
             wrong = ~shapely.is_valid(geometry)
             geometry[wrong] = shapely.make_valid(geometry[wrong])

@@ -4,8 +4,8 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from itertools import islice, pairwise
+from dataclasses import dataclass, fields, replace
+from itertools import islice
 
 import numpy as np
 import pyproj
@@ -16,18 +16,21 @@ from pipeline.data.errors import ConfigError
 from pipeline.data.notes import Note
 from tiler.cityinput.faces import ModelBuilding
 from tiler.cityinput.rows import ModelRows, make_rows
+from tiler.convert.features import unique_name
 from tiler.convert.inputs import open_source
+from tiler.footprints.building_parts import mend_polygons
 from tiler.footprints.footprint_attributes import find_attribute, find_id_attribute, id_columns, read_ids
 from tiler.footprints.footprint_index import scan_footprints
+from tiler.footprints.footprint_source import open_source as open_footprints
 from tiler.generalisation.barrier_files import extent_of
 from tiler.generalisation.options import Asked, Inputs, Landmarks
-from tiler.generalisation.told import Told
+from tiler.generalisation.summary import Told
 from tiler.georeference.crs import crs_name, horizontal_crs, parse_crs, utm_crs
 from tiler.georeference.footprints import footprint_frame
 from tiler.georeference.frame import Frame, box_to_region
 from tiler.vectors.features import to_objects
 from tiler.vectors.layers import Layer, describe_layer, scan_layer
-from tiler.vectors.osm_tags import find_osm_tags
+from tiler.vectors.wkb import cut_blobs
 
 BATCH = 2000  # buildings of a model in memory at once
 HEIGHTS = ("height", "measuredheight", "h", "hoogte")  # attributes that are taken where none is named
@@ -37,43 +40,27 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Buildings:
-    """Some buildings, a row each.
+    """Some buildings, a row each."""
 
-    Attributes
-    ----------
-    outlines : object, (n,)
-        Valid polygons and multipolygons (m).
-    ids : object, (n,)
-        Text, each once in the region.
-    height : float64, (n,)
-        Mean height of the roof above ground (m).
-    ground : float64, (n,)
-        Absolute height of the ground (m), NaN where unknown.
-    landmark : bool, (n,)
-        Whether it stays as it is at every level.
-    """
-
-    outlines: NDArray[np.object_]
-    ids: NDArray[np.object_]
-    height: Array
-    ground: Array
-    landmark: NDArray[np.bool_]
+    outlines: NDArray[np.object_]  # (n,): valid polygons and multipolygons (m)
+    ids: NDArray[np.object_]  # (n,): text, each once in the region
+    height: Array  # (n,): mean height of the roof above ground (m)
+    ground: Array  # (n,): absolute height of the ground (m), NaN where unknown
+    landmark: NDArray[np.bool_]  # (n,): whether it stays as it is at every level
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def take(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> "Buildings":
         """Take some, in the order of the rows."""
-        return Buildings(
-            self.outlines[rows], self.ids[rows], self.height[rows], self.ground[rows], self.landmark[rows]
-        )
+        return Buildings(*(getattr(self, one.name)[rows] for one in fields(self)))
 
 
 def join_buildings(parts: list[Buildings]) -> Buildings:
     """Put buildings one after the other; none gives none."""
     none = Buildings(np.empty(0, object), np.empty(0, object), np.empty(0), np.empty(0), np.empty(0, np.bool_))
-    names = ("outlines", "ids", "height", "ground", "landmark")
-    return Buildings(*(np.concatenate([getattr(part, name) for part in [none, *parts]]) for name in names))
+    columns = ([getattr(part, one.name) for part in (none, *parts)] for one in fields(none))
+    return Buildings(*map(np.concatenate, columns))
 
 
 @dataclass(frozen=True)
@@ -116,13 +103,8 @@ def _scan_models(buildings: Iterator[ModelBuilding], landmarks: Landmarks, told:
         rows, notes = make_rows(batch, Frame(), "auto", Counter())
         _tell(notes, "", told)
         tagged = {one.id for one in batch if _has_tag(one, landmarks.tag)}
-        yield Buildings(
-            rows.outlines,
-            rows.ids.astype(object),
-            mean_roofs(rows),
-            rows.base,
-            np.array([name in tagged for name in rows.ids.tolist()], np.bool_),
-        )
+        landmark = np.array([name in tagged for name in rows.ids.tolist()], np.bool_)
+        yield Buildings(rows.outlines, rows.ids.astype(object), mean_roofs(rows), rows.base, landmark)
 
 
 def _tell(notes: Sequence[Note], file: str, told: Told) -> None:
@@ -180,12 +162,14 @@ def _open_footprints(inputs: Inputs, asked: Asked, told: Told) -> tuple[pyproj.C
         bounds = box_to_region(frame, extent)
     lower = {field.lower(): field for field in layer.fields}
     height = inputs.height_attribute
-    if not height and find_osm_tags(layer.fields) is None:  # of OSM data, levels count where there is no height
+    if not height and layer.tags is None:  # of OSM data, levels count where there is no height
         height = next((lower[name] for name in HEIGHTS if name in lower), "")
     tagged = _find_tagged(inputs, layer, asked.landmarks.tag)
     blocks = scan_footprints(
-        path, crs=crs, bounds=bounds, layer=inputs.layer, id_attribute=inputs.id_attribute,
-        height_attribute=height,
+        open_footprints(
+            path, crs=crs, bounds=bounds, layer=inputs.layer, id_attribute=inputs.id_attribute,
+            height_attribute=height,
+        )
     )  # fmt: skip
     if height:
         told.say(f"{path.name}: heights are of attribute {height}")
@@ -194,10 +178,7 @@ def _open_footprints(inputs: Inputs, asked: Asked, told: Told) -> tuple[pyproj.C
         for block in blocks:
             _tell(block.notes, path.name, told)
             rows = block.rows
-            data = rows.wkb.tobytes()
-            ends = (rows.wkb_start - rows.wkb_start[0]).tolist()
-            blobs = [data[a:b] for a, b in pairwise(ends)]
-            outlines = np.asarray(shapely.from_wkb(blobs, on_invalid="fix"), object)
+            outlines = shapely.from_wkb(cut_blobs(rows.wkb, rows.wkb_start), on_invalid="fix")
             landmark = np.array([name.split("-g")[0] in tagged for name in rows.ids.tolist()], np.bool_)
             none = np.full(len(rows), np.nan)
             yield Buildings(outlines, rows.ids.astype(object), rows.given_height, none, landmark)
@@ -231,10 +212,9 @@ def _finish(batches: Iterator[Buildings], inputs: Inputs, asked: Asked, told: To
     """Mend outlines, give missing heights, make ids unique, and tell landmarks; 8 bytes of each id are kept."""
     seen: set[int] = set()
     for given in batches:
-        outlines = shapely.force_2d(given.outlines)
-        wrong = ~shapely.is_valid(outlines)
-        outlines[wrong] = shapely.make_valid(outlines[wrong], method="structure", keep_collapsed=False)
-        told.counts["outlines made valid"] += int(wrong.sum())
+        flat = shapely.force_2d(given.outlines)
+        outlines = mend_polygons(flat)
+        told.counts["outlines made valid"] += int((~shapely.is_valid(flat)).sum())
         kept = shapely.area(outlines) > 0
         told.counts["buildings without area, left out"] += int((~kept).sum())
         if inputs.bounds is not None:
@@ -245,7 +225,9 @@ def _finish(batches: Iterator[Buildings], inputs: Inputs, asked: Asked, told: To
         unknown = ~(np.isfinite(batch.height) & (batch.height > 0))
         told.counts[f"buildings without a height, taken as {asked.default_height:g} m high"] += int(unknown.sum())
         height = np.where(unknown, asked.default_height, batch.height)
-        ids = [_unique(str(name), seen, told) for name in batch.ids.tolist()]
+        ids = [unique_name(str(name), seen) for name in batch.ids.tolist()]
+        again = int((batch.ids.astype(str) != np.array(ids, np.str_)).sum())
+        told.counts["ids that were there before, with a number behind them"] += again
         marks = asked.landmarks
         landmark = batch.landmark | np.array([name in marks.ids for name in ids], np.bool_)
         if marks.height:
@@ -253,14 +235,3 @@ def _finish(batches: Iterator[Buildings], inputs: Inputs, asked: Asked, told: To
         if marks.volume:
             landmark |= height * shapely.area(batch.outlines) >= marks.volume
         yield Buildings(batch.outlines, to_objects(ids), height, batch.ground, landmark)
-
-
-def _unique(name: str, seen: set[int], told: Told) -> str:
-    """Give an id that no other building has."""
-    first, number = name, 1
-    while hash(name) in seen:
-        number += 1
-        name = f"{first}_{number}"
-    seen.add(hash(name))
-    told.counts["ids that were there before, with a number behind them"] += number > 1
-    return name

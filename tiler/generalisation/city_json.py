@@ -1,9 +1,7 @@
 """CityJSON 2.0 of all levels in one hierarchy: groups of LoD0A, cells, objects of LoD0C, buildings."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from shutil import copyfileobj
 from typing import IO, Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.city_model.solids import Levels, build_solids
 from pipeline.data.citymodel import CityModel
 from pipeline.data.roofs import flat_roofs
+from tiler.citymodels.cityjson_text import ObjectLines, compact, reference_system
 from tiler.generalisation.rows import LEVELS, Rows, level_word
 
 STEP = 0.001  # m; coordinates are whole multiples of it
@@ -26,24 +25,23 @@ class HierarchyWriter:
 
     def __init__(self, file: IO[bytes], spool: IO[bytes], crs: pyproj.CRS, origin: Sequence[float]) -> None:
         self.origin = np.array([*origin, 0.0])
-        self.file, self.spool = file, spool
-        self.n_vertices, self.before = 0, b"\n"
-        self.without_solid = 0
+        self.file, self.without_solid = file, 0
         head: dict[str, Any] = {
             "type": "CityJSON",
             "version": "2.0",
             "transform": {"scale": [STEP] * 3, "translate": self.origin.tolist()},
         }
-        if code := crs.to_epsg():
-            head["metadata"] = {"referenceSystem": f"https://www.opengis.net/def/crs/EPSG/0/{code}"}
-        self.file.write(_text(head)[:-1] + b',"CityObjects":{')
+        if name := reference_system(crs):
+            head["metadata"] = {"referenceSystem": name}
+        file.write(f"{compact(head)[:-1]},".encode("ascii"))
+        self.lines = ObjectLines(file.write, spool)
 
     def add(self, rows: Mapping[str, Rows], children: Mapping[str, Sequence[str]]) -> None:
         """Add what a tile has; `children` are the cells of each object of LoD0A.
 
         An object that stands unchanged at several levels is written once, at the lowest of them.
         """
-        below = {**{name: list(cells) for name, cells in children.items()}}
+        below = {name: list(cells) for name, cells in children.items()}
         for level in ("lod0c", "lod1"):
             for name, parent in zip(rows[level].id.tolist(), rows[level].parent.tolist(), strict=True):
                 if name != parent:
@@ -61,10 +59,8 @@ class HierarchyWriter:
 
     def finish(self) -> None:
         """Write the vertices."""
-        self.file.write(b'\n},\n"vertices":[')
-        self.spool.seek(0)
-        copyfileobj(self.spool, self.file)
-        self.file.write(b"\n]}\n")
+        self.lines.finish()
+        self.file.write(b"}\n")
 
     def _add(self, level: str, rows: Rows, below: Mapping[str, Sequence[str]]) -> None:
         if not len(rows):
@@ -87,11 +83,8 @@ class HierarchyWriter:
                 thing["attributes"]["ground_height"] = float(rows.ground_height[k])
             thing["geometry"] = [_geometry(solids[k], LODS[level])] if solids[k] else []
             self.without_solid += not solids[k]
-            self.file.write(self.before + _text(name) + b":" + _text(thing))
-            self.before = b",\n"
-        text = ",\n".join(["[%d,%d,%d]"] * len(vertices)) % tuple(vertices.ravel().tolist())
-        self.spool.write(f"{',' if self.n_vertices else ''}\n{text}".encode("ascii"))
-        self.n_vertices += len(vertices)
+            self.lines.add_objects([f"{compact(name)}:{compact(thing)}"])
+        self.lines.add_vertices(vertices)
 
     def _solids(self, rows: Rows) -> tuple[list[list[Any]], NDArray[np.int64]]:
         """Give the solids of each object, as shells of faces by kind, and the vertices that they count."""
@@ -104,7 +97,7 @@ class HierarchyWriter:
         )  # fmt: skip
         levels, _ = build_solids(model, self.origin, grid=STEP)
         solids: list[list[Any]] = [[] for _ in range(len(rows))]
-        for of, faces in zip(owner.tolist(), _faces(levels, self.n_vertices), strict=True):
+        for of, faces in zip(owner.tolist(), _faces(levels, self.lines.n_vertices), strict=True):
             if faces:
                 solids[of].append(faces)
         return solids, levels.vertices
@@ -134,7 +127,3 @@ def _geometry(solids: list[Any], lod: str) -> dict[str, Any]:
         "boundaries": shells[0] if one else shells,
         "semantics": {"surfaces": SURFACES, "values": values[0] if one else values},
     }
-
-
-def _text(value: Any) -> bytes:
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode("ascii")

@@ -1,7 +1,8 @@
 """`citystitch generalise`: buildings and barriers in, cells and levels out, tile by tile."""
 
+import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
@@ -18,6 +19,7 @@ from pipeline.generalisation.cell_graph import join_small
 from pipeline.geometry.components import join_pairs
 from tiler.convert.convert import refuse_output
 from tiler.executors.in_order import map_in_order
+from tiler.footprints.building_parts import mend_polygons
 from tiler.formats.gpkg import fixed_time
 from tiler.generalisation.barrier_files import scan_geometries
 from tiler.generalisation.buildings import open_buildings
@@ -27,10 +29,9 @@ from tiler.generalisation.options import Asked, Inputs
 from tiler.generalisation.region_cells import Cells, join_cells
 from tiler.generalisation.rows import LEVELS
 from tiler.generalisation.shards import Shards, Tile, by_tile
-from tiler.generalisation.summary import LevelSum, describe_levels, json_text, table_lines
-from tiler.generalisation.tile_cells import Work, at_tile, count_buildings, pair_buildings, part_tile
+from tiler.generalisation.summary import LevelSum, Told, describe_levels, table_lines
+from tiler.generalisation.tile_cells import Work, count_buildings, pair_buildings, part_tile
 from tiler.generalisation.tile_levels import CellList, CellRecord, GroupList, make_cells, make_levels
-from tiler.generalisation.told import Told
 from tiler.georeference.crs import box_words, crs_text
 from tiler.store.atomic import replacing
 from tiler.vectors.features import to_objects
@@ -73,25 +74,18 @@ class Outputs:
 def generalise(
     inputs: Inputs, output: Path, asked: Asked, *, workers: int = 0, overwrite: bool = False
 ) -> list[str]:
-    """Make cells, LoD0C, LoD0B and LoD0A of buildings.
+    """Make cells, LoD0C, LoD0B and LoD0A of buildings; gives the table of levels and what must be known.
 
     Parameters
     ----------
-    inputs : Inputs
-        Buildings, barriers and other objects.
+    inputs, asked
+        Buildings, barriers and other objects; options.
     output : Path
         GeoPackage to write; CityJSON and numbers go beside it. Each file appears whole or not at all.
-    asked : Asked
-        Options.
     workers : int
         Processes; 0 for this one. The bytes are the same.
     overwrite : bool
         Whether files that exist are replaced.
-
-    Returns
-    -------
-    list of str
-        The table of levels, and what must be known, a line each.
 
     Raises
     ------
@@ -127,7 +121,7 @@ def generalise(
             told.say("no roads: streets are the medial axis of the open space between buildings")
 
         def each(step: Callable[[Work], Result], tiles: Sequence[Tile], /) -> Iterator[Result]:
-            return map_in_order(step, (at_tile(work, tile) for tile in tiles), workers)
+            return map_in_order(step, (replace(work, tile=tile) for tile in tiles), workers)
 
         if (n := shards.count(rim.bounds)) > MOST_TILES:
             raise InputError(
@@ -140,7 +134,8 @@ def generalise(
         told.counts["fragments joined to a neighbour"] = cells.fragments
         levels = _write(files, owners, shards, crs, told)
     with replacing(files.numbers) as part:
-        part.write_text(json_text({"levels": levels, "counts": told.known(), "notes": told.said}))
+        numbers = {"levels": levels, "counts": told.known(), "notes": told.said}
+        part.write_text(json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")
     return [*table_lines(levels), *told.lines()]
 
 
@@ -200,14 +195,11 @@ def _deal_others(geometry: NDArray[np.object_], shards: Shards) -> None:
     """Deal areas out to the tiles that they touch, cut at their borders."""
     parts = shapely.get_parts(shapely.get_parts(geometry))
     parts = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
-    wrong = ~shapely.is_valid(parts)
-    parts[wrong] = shapely.make_valid(parts[wrong], method="structure", keep_collapsed=False)
-    boxes = np.floor(shapely.bounds(parts).reshape(-1, 4) / shards.size).astype(np.int64)
-    for k in np.flatnonzero(shapely.area(parts) > 0).tolist():
-        low_i, low_j, high_i, high_j = boxes[k].tolist()
-        for tile in ((i, j) for i in range(low_i, high_i + 1) for j in range(low_j, high_j + 1)):
-            whole = (low_i, low_j) == (high_i, high_j)
-            own = parts[k] if whole else shapely.intersection(parts[k], shapely.box(*shards.box(tile)))
+    parts = mend_polygons(parts)
+    for part in parts[shapely.area(parts) > 0]:
+        tiles = list(shards.covered(part.bounds))
+        for tile in tiles:
+            own = part if len(tiles) == 1 else shapely.intersection(part, shapely.box(*shards.box(tile)))
             own = shapely.set_precision(own, GRID)
             if own.area > 0:
                 shards.append("others", tile, to_objects([own]))

@@ -13,22 +13,13 @@ LEAST_TILE = 100.0  # m
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Which buildings stay as they are at every level.
+    """Which buildings stay as they are at every level."""
 
-    Attributes
-    ----------
-    height, volume : float
-        From which height (m) and volume (m3) on; 0 for none.
-    tag : str
-        ``ATTRIBUTE`` that is set, or ``ATTRIBUTE=VALUE``; ``""`` for none.
-    ids : frozenset of str
-        Ids of buildings.
-    """
-
+    # From which height (m) and volume (m3) on; 0 for none.
     height: float = 0.0
     volume: float = 0.0
-    tag: str = ""
-    ids: frozenset[str] = frozenset()
+    tag: str = ""  # ``ATTRIBUTE`` that is set, or ``ATTRIBUTE=VALUE``; ``""`` for none
+    ids: frozenset[str] = frozenset()  # ids of buildings
 
 
 def read_ids(text: str) -> frozenset[str]:
@@ -46,45 +37,21 @@ def read_ids(text: str) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Asked:
-    """Options of a generalisation; lengths in metres, areas in square metres.
+    """Options of a generalisation; lengths in metres, areas in square metres."""
 
-    Attributes
-    ----------
-    least_share : float
-        Th1: share of a cell without other objects that buildings must cover for the land use Building.
-    most_area : float
-        Th2: cells up to this are aggregated for LoD0A.
-    fragment : float
-        Cells below this are joined to the neighbour with the longest border.
-    street_width : float
-        Of the streets along cells, half of which is cut from each block.
-    yard_width : float
-        A block keeps open space between its buildings up to this; 0 for all of the cell, as the paper has it.
-    block_gap : float
-        Without roads: buildings that are closer are of one block.
-    adjacent : float
-        Buildings up to this apart are adjacent.
-    block_height : str
-        What the mean height of a block keeps, one of `HEIGHTS`.
-    default_height : float
-        Height of buildings of which none is known.
-    landmarks : Landmarks
-        What is left out of generalisation.
-    tile_size : float
-        Side of the squares that are worked on one by one.
-    """
-
+    # Th1: share of a cell without other objects that buildings must cover for the land use Building.
     least_share: float = 0.3
-    most_area: float = 20_000.0
-    fragment: float = 400.0
-    street_width: float = 6.0
+    most_area: float = 20_000.0  # Th2: cells up to this are aggregated for LoD0A
+    fragment: float = 400.0  # cells below this are joined to the neighbour with the longest border
+    street_width: float = 6.0  # of the streets along cells, half of which is cut from each block
+    # A block keeps open space between its buildings up to this; 0 for all of the cell, as the paper has it.
     yard_width: float = 0.0
-    block_gap: float = 6.0
-    adjacent: float = 0.1
-    block_height: str = HEIGHTS[0]
-    default_height: float = 6.0
-    landmarks: Landmarks = field(default_factory=Landmarks)
-    tile_size: float = 1000.0
+    block_gap: float = 6.0  # without roads: buildings that are closer are of one block
+    adjacent: float = 0.1  # buildings up to this apart are adjacent
+    block_height: str = HEIGHTS[0]  # what the mean height of a block keeps, one of `HEIGHTS`
+    default_height: float = 6.0  # height of buildings of which none is known
+    landmarks: Landmarks = field(default_factory=Landmarks)  # what is left out of generalisation
+    tile_size: float = 1000.0  # side of the squares that are worked on one by one
 
     def __post_init__(self) -> None:
         """Refuse what is out of range, with a ConfigError."""
@@ -114,31 +81,18 @@ class Asked:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Files of a generalisation.
+    """Files of a generalisation."""
 
-    Attributes
-    ----------
-    models : sequence of Path
-        City models, or the folder of a run; none with `footprints`.
-    footprints : Path, optional
-        Vector file of buildings.
-    layer, id_attribute, height_attribute : str
-        Of `footprints`, ``""`` for what is found.
-    crs : str
-        CRS of the output, ``""`` for that of the buildings, or the UTM zone where these are in degrees.
-    bounds : tuple of 4 floats, optional
-        Region (m); by default all there is.
-    roads, railways, water, others : sequence of Path
-        Barriers, and other objects that are none.
-    """
-
-    models: Sequence[Path] = ()
-    footprints: Path | None = None
+    models: Sequence[Path] = ()  # city models, or the folder of a run; none with `footprints`
+    footprints: Path | None = None  # vector file of buildings
+    # Of `footprints`, ``""`` for what is found.
     layer: str = ""
     id_attribute: str = ""
     height_attribute: str = ""
+    # CRS of the output, ``""`` for that of the buildings, or the UTM zone where these are in degrees.
     crs: str = ""
-    bounds: tuple[float, float, float, float] | None = None
+    bounds: tuple[float, float, float, float] | None = None  # region (m); by default all there is
+    # Barriers, and other objects that are none.
     roads: Sequence[Path] = ()
     railways: Sequence[Path] = ()
     water: Sequence[Path] = ()

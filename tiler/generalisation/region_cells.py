@@ -18,48 +18,22 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of a region as numbers, without geometry.
+    """Cells of a region as numbers, without geometry."""
 
-    Attributes
-    ----------
-    tile : int64, (p, 2)
-        Tile of each piece, in order.
-    piece : int64, (p,)
-        Its row within the tile.
-    cell : int64, (p,)
-        The cell that it belongs to, 0 to n - 1.
-    area : float64, (n,)
-        Of each cell (m2).
-    pairs : int64, (k, 2)
-        Cells that share a border.
-    length : float64, (k,)
-        Of that border (m).
-    fragments : int
-        Cells that were joined to a neighbour.
-    """
-
-    tile: Index
-    piece: Index
-    cell: Index
-    area: Array
-    pairs: Index
-    length: Array
-    fragments: int
+    tile: Index  # (p, 2): tile of each piece, in order
+    piece: Index  # (p,): its row within the tile
+    cell: Index  # (p,): the cell that it belongs to, 0 to n - 1
+    area: Array  # (n,): of each cell (m2)
+    pairs: Index  # (k, 2): cells that share a border
+    length: Array  # (k,): of that border (m)
+    fragments: int  # cells that were joined to a neighbour
 
 
 def join_cells(pieces: Mapping[Tile, Pieces], fragment: float) -> Cells:
-    """Join pieces across the sides of tiles where no barrier is, then fragments to neighbours.
+    """Join the pieces of tiles across their sides where no barrier is, then fragments to neighbours.
 
-    Parameters
-    ----------
-    pieces : mapping
-        Pieces of each tile.
-    fragment : float
-        Cells below this area (m2) are joined to the neighbour with the longest border.
-
-    Notes
-    -----
-    Memory holds some 200 bytes a piece, and the borders of cells.
+    Cells below `fragment` (m2) are joined to the neighbour with the longest border. Memory holds some 200 bytes a
+    piece, and the borders of cells.
     """
     tiles = sorted(pieces)
     count = [len(pieces[tile].block) for tile in tiles]

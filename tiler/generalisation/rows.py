@@ -15,30 +15,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Objects of one level.
+    """Objects of one level."""
 
-    Attributes
-    ----------
-    outlines : object, (n,)
-        Polygons and multipolygons (m).
-    id, parent, cell : object, (n,)
-        Text: of the object, of what stands for it one level up (``""`` for none), and of its cell.
-    height, ground_height : float64, (n,)
-        Above ground, and of the ground (m; NaN where unknown).
-    members : int64, (n,)
-        Buildings that it stands for.
-    landmark : int64, (n,)
-        1 for a building that is left out of generalisation.
-    """
-
-    outlines: NDArray[np.object_]
+    outlines: NDArray[np.object_]  # (n,): polygons and multipolygons (m)
+    # (n,): text: of the object, of what stands for it one level up (``""`` for none), and of its cell
     id: NDArray[np.object_]
     parent: NDArray[np.object_]
     cell: NDArray[np.object_]
+    # (n,): above ground, and of the ground (m; NaN where unknown)
     height: Array
     ground_height: Array
-    members: NDArray[np.int64]
-    landmark: NDArray[np.int64]
+    members: NDArray[np.int64]  # (n,): buildings that it stands for
+    landmark: NDArray[np.int64]  # (n,): 1 for a building that is left out of generalisation
 
     def __len__(self) -> int:
         return len(self.id)
@@ -56,28 +44,16 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class CellRows:
-    """Cells: what the layer of cells holds.
+    """Cells: what the layer of cells holds."""
 
-    Attributes
-    ----------
-    outlines : object, (n,)
-        Polygons (m).
-    id, parent : object, (n,)
-        Text: of the cell, and of its object of LoD0A, ``""`` where its land use is Other.
-    use : bool, (n,)
-        Whether its land use is Building.
-    free, built : float64, (n,)
-        A - A_other and A_bldg of equation (1) (m2).
-    members : int64, (n,)
-        Buildings that are registered to it.
-    """
-
-    outlines: NDArray[np.object_]
+    outlines: NDArray[np.object_]  # (n,): polygons (m)
+    # (n,): text: of the cell, and of its object of LoD0A, ``""`` where its land use is Other
     id: NDArray[np.object_]
-    use: NDArray[np.bool_]
+    use: NDArray[np.bool_]  # (n,): whether its land use is Building
+    # (n,): A - A_other and A_bldg of equation (1) (m2)
     free: Array
     built: Array
-    members: NDArray[np.int64]
+    members: NDArray[np.int64]  # (n,): buildings that are registered to it
     parent: NDArray[np.object_]
 
 

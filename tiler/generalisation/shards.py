@@ -3,6 +3,7 @@
 import pickle
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -51,13 +52,16 @@ class Shards:
 
     def covered(self, box: Iterable[float]) -> Iterator[Tile]:
         """Give the tiles that a box touches."""
-        low_x, low_y, high_x, high_y = (int(np.floor(value / self.size)) for value in box)
-        yield from ((i, j) for i in range(low_x, high_x + 1) for j in range(low_y, high_y + 1))
+        yield from product(*self._ranges(box))
 
     def count(self, box: Iterable[float]) -> int:
         """Count the tiles that a box touches."""
+        columns, rows = self._ranges(box)
+        return len(columns) * len(rows)
+
+    def _ranges(self, box: Iterable[float]) -> tuple[range, range]:
         low_x, low_y, high_x, high_y = (int(np.floor(value / self.size)) for value in box)
-        return (high_x - low_x + 1) * (high_y - low_y + 1)
+        return range(low_x, high_x + 1), range(low_y, high_y + 1)
 
     def _path(self, kind: str, tile: Tile) -> Path:
         return self.folder / kind / f"{tile[0]}_{tile[1]}.pkl"

@@ -1,13 +1,37 @@
-"""Table of levels: objects, polygons, area and volume, and how far they are from the buildings."""
+"""What a generalisation tells: statements and counts, and the table of its levels."""
 
-import json
-from dataclasses import asdict, dataclass
+from collections import Counter
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from pipeline.generalisation.measures import compare, count_faces
 from tiler.generalisation.rows import LEVELS, Rows, level_word
+from tiler.words.note_words import say_notes
+
+
+@dataclass(eq=False)
+class Told:
+    """Statements in their order, each once, counts by what they are of, and notes on buildings by their kind."""
+
+    said: list[str] = field(default_factory=list)
+    counts: Counter[str] = field(default_factory=Counter)
+    notes: Counter[str] = field(default_factory=Counter)
+
+    def say(self, text: str) -> None:
+        """Add a statement."""
+        if text not in self.said:
+            self.said.append(text)
+
+    def known(self) -> dict[str, int]:
+        """Give the counts that are not 0, by name, those of notes by their kind."""
+        return {what: n for what, n in sorted((self.counts + self.notes).items()) if n}
+
+    def lines(self) -> list[str]:
+        """Write a line for each."""
+        counted = [f"{what}: {n}" for what, n in sorted(self.counts.items()) if n]
+        return [*self.said, *counted, *(say_notes(kind, n) for kind, n in sorted(self.notes.items()))]
 
 
 @dataclass
@@ -65,8 +89,3 @@ def _share(value: float | None) -> str:
 
 def _signed(value: float | None) -> str:
     return "-" if value is None else f"{round(value, 3) + 0.0:+.1%}"
-
-
-def json_text(document: dict[str, Any]) -> str:
-    """Write a document as JSON."""
-    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"

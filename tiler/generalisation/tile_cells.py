@@ -1,6 +1,6 @@
 """Pieces of cells of a tile: blocks of buildings where there are no roads, barriers, borders, registration."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -104,8 +104,3 @@ def _read_near(work: Work, box: tuple[float, float, float, float]) -> tuple[NDAr
 
 def _grow(box: tuple[float, float, float, float], by: float) -> tuple[float, float, float, float]:
     return box[0] - by, box[1] - by, box[2] + by, box[3] + by
-
-
-def at_tile(work: Work, tile: Tile) -> Work:
-    """The same work for another tile."""
-    return replace(work, tile=tile)

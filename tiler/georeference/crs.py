@@ -1,7 +1,7 @@
 """Coordinate reference systems: read, named, compared, and where on Earth they have a place (steps 1.1, 1.2)."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -18,17 +18,7 @@ Box = tuple[float, float, float, float]
 
 
 def parse_crs(text: str) -> pyproj.CRS:
-    """Parse the CRS that a user asked for.
-
-    Parameters
-    ----------
-    text : str
-        What pyproj understands: ``"EPSG:28992"``, WKT, PROJJSON, a PROJ string.
-
-    Returns
-    -------
-    pyproj.CRS
-        As asked, compound CRSs included.
+    """Parse the CRS that a user asked for: anything that pyproj understands, compound ones included.
 
     Raises
     ------
@@ -41,19 +31,19 @@ def parse_crs(text: str) -> pyproj.CRS:
         raise ConfigError(f"--crs {text!r} is no CRS that PROJ knows; give for example EPSG:28992") from error
 
 
+def crs_or_none(text: str) -> pyproj.CRS | None:
+    """Parse the CRS that a file names; None where PROJ does not understand it."""
+    try:
+        return pyproj.CRS.from_user_input(text)
+    except pyproj.exceptions.CRSError:
+        return None
+
+
 def horizontal_crs(crs: pyproj.CRS | None) -> pyproj.CRS | None:
-    """Give the two-dimensional horizontal part of a CRS.
+    """Give the two-dimensional horizontal part of a CRS, the entry of the EPSG register where it is one.
 
-    Parameters
-    ----------
-    crs : pyproj.CRS or None
-        Any CRS: compound (horizontal and height), bound (with a datum shift), three-dimensional.
-
-    Returns
-    -------
-    pyproj.CRS or None
-        The entry of the EPSG register where it is one. None for None, and for an engineering CRS such as
-        the "undefined" one of GeoPackage, which says nothing about the place on Earth.
+    None for None, and for an engineering CRS such as the "undefined" one of GeoPackage, which says nothing about
+    the place on Earth.
 
     Examples
     --------
@@ -110,19 +100,7 @@ def same_crs(one: pyproj.CRS, other: pyproj.CRS) -> bool:
 
 
 def utm_crs(bounds: Sequence[float], crs: pyproj.CRS) -> str | None:
-    """Name the UTM zone (WGS 84) in which the middle of a box lies.
-
-    Parameters
-    ----------
-    bounds : sequence of at least 4 floats
-        xmin, ymin, xmax, ymax in `crs`, x before y.
-    crs : pyproj.CRS
-        CRS of the bounds.
-
-    Returns
-    -------
-    str or None
-        None if the box is not on Earth.
+    """Name the UTM zone (WGS 84) of the middle of a box, x before y in `crs`; None if it is not on Earth.
 
     Examples
     --------
@@ -161,20 +139,10 @@ def geographic_box(bounds: Sequence[float], crs: pyproj.CRS) -> tuple[float, flo
 
 
 def scale_of(bounds: Sequence[float], crs: pyproj.CRS) -> float:
-    """Give how long a metre on the ground is in a projected, metric CRS, at the middle of a box.
+    """Give how long a metre on the ground is in a projected, metric CRS, at the middle of a box (m).
 
-    Parameters
-    ----------
-    bounds : sequence of at least 4 floats
-        xmin, ymin, xmax, ymax, easting first (m).
-    crs : pyproj.CRS
-        Projected.
-
-    Returns
-    -------
-    float
-        Of the directions along both axes that which is farther from 1; NaN if the box is not on Earth, or PROJ has
-        no transformation of the CRS.
+    Of the directions along both axes that which is farther from 1; NaN if the box is not on Earth, or PROJ has no
+    transformation of the CRS.
 
     Examples
     --------
@@ -205,17 +173,8 @@ def scale_of(bounds: Sequence[float], crs: pyproj.CRS) -> float:
 def move_between(one: pyproj.CRS, other: pyproj.CRS, bounds: Sequence[float]) -> float:
     """Give how far coordinates move where those of one CRS become those of another (units of the CRSs).
 
-    Parameters
-    ----------
-    one, other : pyproj.CRS
-        Projected, or both geographic.
-    bounds : sequence of at least 4 floats
-        xmin, ymin, xmax, ymax, easting first: the corners and the middle are tried.
-
-    Returns
-    -------
-    float
-        The farthest; infinite where a place is lost, or the CRSs are of different kinds.
+    Corners and middle of a box, easting first, are tried, of CRSs that are both projected or both geographic;
+    infinite where a place is lost, or the CRSs are of different kinds.
 
     Examples
     --------
@@ -326,3 +285,9 @@ def pdal_command(cloud: Path, crs: pyproj.CRS, target: str | None) -> str:
 def boxes_meet(one: Sequence[float], other: Sequence[float]) -> bool:
     """Whether two boxes have a place in common."""
     return one[0] <= other[2] and one[2] >= other[0] and one[1] <= other[3] and one[3] >= other[1]
+
+
+def box_around(boxes: Iterable[Sequence[float]]) -> Box:
+    """Give the box around boxes, of which the first four numbers count."""
+    xmin, ymin, xmax, ymax, *_ = zip(*boxes, strict=True)
+    return min(xmin), min(ymin), max(xmax), max(ymax)

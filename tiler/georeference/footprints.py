@@ -7,11 +7,9 @@ import pyproj
 
 from pipeline.data.errors import InputError
 from tiler.georeference.crs import boxes_meet, crs_name, crs_text, directions_of, is_one
-from tiler.georeference.frame import Frame, box_to_region
+from tiler.georeference.frame import Box, Frame, box_to_region
 from tiler.georeference.metric import MetricCrs, find_metric
 from tiler.georeference.operation import Operation, find_operation
-
-Box = tuple[float, float, float, float]
 
 
 def footprint_frame(
@@ -21,10 +19,8 @@ def footprint_frame(
 
     Parameters
     ----------
-    stated : pyproj.CRS
-        CRS of the footprints, horizontal.
-    crs : pyproj.CRS
-        The region's.
+    stated, crs : pyproj.CRS
+        CRS of the footprints, horizontal, and that of the region.
     box : tuple of 4 floats
         The region (m).
     say : callable, optional
@@ -44,18 +40,14 @@ def footprint_frame(
     metric = MetricCrs(stated, (0, 1.0), (1, 1.0)) if stated.is_geographic else find_metric(stated)
     if metric is None:
         raise InputError(
-            f"the footprints: {crs_name(stated)} has axes to the {directions_of(stated)}, and no register has "
-            "it with "
-            f"axes east and north; reproject them: ogr2ogr -t_srs {crs_name(crs)} metric.gpkg <footprints>"
+            f"the footprints: {crs_name(stated)} has axes to the {directions_of(stated)}, and no register has it "
+            f"with axes east and north; reproject them: ogr2ogr -t_srs {crs_name(crs)} metric.gpkg <footprints>"
         )
     plain = Frame(metric.east, metric.north)
     if not stated.is_geographic and is_one(metric.crs, crs, box):
         if say is not None and plain.changes_plan:
-            say(
-                "footprints-converted",
-                "footprints",
-                f"the footprints: {crs_name(stated)} converted to {crs_name(crs)}",
-            )
+            text = f"the footprints: {crs_name(stated)} converted to {crs_name(crs)}"
+            say("footprints-converted", "footprints", text)
         return plain, None
     frame = replace(plain, source=crs_text(metric.crs), target=crs_text(crs))
     operation = find_operation(metric.crs, crs, box)
@@ -71,10 +63,8 @@ def find_shown_axes(
 
     Parameters
     ----------
-    stated : pyproj.CRS
-        CRS of the footprints, horizontal.
-    crs : pyproj.CRS
-        The region's.
+    stated, crs : pyproj.CRS
+        CRS of the footprints, horizontal, and that of the region.
     extent : tuple of 4 floats, or None
         Of the footprints, in their own coordinates.
     box : tuple of 4 floats

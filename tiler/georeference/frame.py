@@ -2,10 +2,11 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
@@ -24,22 +25,14 @@ MARGIN = 0.01  # share of its size by which such a box is then grown
 
 @dataclass(frozen=True)
 class Frame:
-    """How coordinates of a file become those of the region.
+    """How coordinates of a file become those of the region."""
 
-    Attributes
-    ----------
-    east, north : tuple of int and float
-        Which coordinate of the file it is, and the metres of its unit, negative where it grows westwards or
-        southwards.
-    height : float
-        Metres of a unit of height.
-    source, target : str
-        CRSs from and to which these coordinates are then reprojected, as EPSG:NNNN or WKT; ``""`` for none.
-    """
-
+    # Which coordinate of the file it is, and the metres of its unit, negative where it grows westwards or
+    # southwards.
     east: Axis = (0, 1.0)
     north: Axis = (1, 1.0)
-    height: float = 1.0
+    height: float = 1.0  # metres of a unit of height
+    # CRSs from and to which these coordinates are then reprojected, as EPSG:NNNN or WKT; ``""`` for none.
     source: str = ""
     target: str = ""
 
@@ -53,19 +46,7 @@ AS_IT_IS = Frame()
 
 
 def to_region(frame: Frame, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Give places of the file in the region's CRS.
-
-    Parameters
-    ----------
-    frame : Frame
-        Of the file.
-    xy : float64, (n, 2)
-        As the file has them.
-
-    Returns
-    -------
-    float64, (n, 2)
-        Metres; infinite where a place has none in the region's CRS.
+    """Give places of the file in the region's CRS, float64 (n, 2): metres; infinite where a place has none there.
 
     Examples
     --------
@@ -76,6 +57,11 @@ def to_region(frame: Frame, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     if not frame.source:
         return plan
     return np.column_stack(_transformer(frame.source, frame.target).transform(plan[:, 0], plan[:, 1]))
+
+
+def shapes_to_region(frame: Frame, shapes: Any) -> Any:
+    """Give geometries of the file, one or an array of them, in the region's CRS."""
+    return shapely.transform(shapes, partial(to_region, frame)) if frame.changes_plan else shapes
 
 
 def box_to_region(frame: Frame, box: Box) -> Box:

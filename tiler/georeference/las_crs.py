@@ -23,37 +23,19 @@ _DAMAGE = (pyproj.exceptions.CRSError, ValueError, TypeError, LookupError, Overf
 
 @dataclass(frozen=True)
 class LasCrs:
-    """What a LAS header states of its coordinates.
+    """What a LAS header states of its coordinates."""
 
-    Attributes
-    ----------
-    crs : pyproj.CRS or None
-        The CRS of the WKT record, else of the GeoTIFF keys; None if neither states one that is understood.
-    plan_unit : float or None
-        Metres of a unit in plan, where a key states it beside the CRS; None where none does.
-    height_unit : float or None
-        Metres of a unit of height, by a key or by the vertical part of the CRS; None where nothing states it.
-    unread : str
-        What a record holds that is not understood, ``""`` if nothing.
-    """
-
+    # The CRS of the WKT record, else of the GeoTIFF keys; None if neither states one that is understood.
     crs: pyproj.CRS | None = None
+    # Metres of a unit in plan, where a key states it beside the CRS; None where none does.
     plan_unit: float | None = None
+    # Metres of a unit of height, by a key or by the vertical part of the CRS; None where nothing states it.
     height_unit: float | None = None
-    unread: str = ""
+    unread: str = ""  # what a record holds that is not understood, ``""`` if nothing
 
 
 def read_las_crs(header: laspy.LasHeader) -> LasCrs:
-    """Read the CRS and the units that a header states.
-
-    Parameters
-    ----------
-    header : laspy.LasHeader
-        With its records, also those behind the points.
-
-    Returns
-    -------
-    LasCrs
+    """Read the CRS and the units that a header states, with its records, also those behind the points.
 
     Notes
     -----
@@ -98,11 +80,9 @@ def _height_unit(crs: pyproj.CRS | None, keys: dict[int, float]) -> float | None
     if unit is not None:
         return unit
     vertical = _from_epsg(int(keys.get(VERTICAL_CRS, 0)))
-    return (
-        None
-        if vertical is None or not vertical.is_vertical
-        else exact_unit(vertical.axis_info[0].unit_conversion_factor)
-    )
+    if vertical is None or not vertical.is_vertical:
+        return None
+    return exact_unit(vertical.axis_info[0].unit_conversion_factor)
 
 
 def _keys(records: list[object]) -> dict[int, float]:
@@ -131,17 +111,15 @@ def _unit(keys: dict[int, float], key: int, size: int | None = None) -> float | 
 
 
 def _crs_of_keys(keys: dict[int, float]) -> tuple[pyproj.CRS | None, str]:
-    code, model = int(keys.get(PROJECTED_CRS, 0)), int(keys.get(MODEL_TYPE, 0))
+    key, code = PROJECTED_CRS, int(keys.get(PROJECTED_CRS, 0))
     if code == USER_DEFINED:
         return None, f"GeoTIFF key {PROJECTED_CRS} = {USER_DEFINED}, a user-defined projection"
-    if code:
-        crs = _from_epsg(code)
-        return crs, "" if crs is not None else f"GeoTIFF key {PROJECTED_CRS} = {code}, no CRS of the EPSG register"
-    code = int(keys.get(GEODETIC_CRS, 0))
-    if code and code != USER_DEFINED and model in (0, GEOGRAPHIC_MODEL):
-        crs = _from_epsg(code)
-        return crs, "" if crs is not None else f"GeoTIFF key {GEODETIC_CRS} = {code}, no CRS of the EPSG register"
-    return None, ""
+    if not code and int(keys.get(MODEL_TYPE, 0)) in (0, GEOGRAPHIC_MODEL):
+        key, code = GEODETIC_CRS, int(keys.get(GEODETIC_CRS, 0))
+    if code in (0, USER_DEFINED):
+        return None, ""
+    crs = _from_epsg(code)
+    return crs, "" if crs is not None else f"GeoTIFF key {key} = {code}, no CRS of the EPSG register"
 
 
 def _parse_wkt(text: str) -> tuple[pyproj.CRS | None, str]:

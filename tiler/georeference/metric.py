@@ -26,35 +26,20 @@ _FALSE_EASTING, _FALSE_NORTHING = 8806, 8807  # codes of their parameters
 
 @dataclass(frozen=True)
 class MetricCrs:
-    """A metric CRS with axes east and north, and where a file has its coordinates.
+    """A metric CRS with axes east and north, and where a file has its coordinates."""
 
-    Attributes
-    ----------
-    crs : pyproj.CRS
-        Projected, in metres; that of the EPSG or Esri register where one has it.
-    east, north : tuple of int and float
-        Which coordinate of the file it is, and the metres of its unit; negative where it grows westwards or
-        southwards.
-    """
-
-    crs: pyproj.CRS
+    crs: pyproj.CRS  # projected, in metres; that of the EPSG or Esri register where one has it
+    # Which coordinate of the file it is, and the metres of its unit; negative where it grows westwards or
+    # southwards.
     east: Axis
     north: Axis
 
 
 @lru_cache(maxsize=64)
 def find_metric(crs: pyproj.CRS) -> MetricCrs | None:
-    """Find the metric CRS with axes east and north that differs from a projected one by units and axes alone.
+    """Find the metric CRS with axes east and north that a projected one stands for, by units and axes alone.
 
-    Parameters
-    ----------
-    crs : pyproj.CRS
-        Projected, horizontal.
-
-    Returns
-    -------
-    MetricCrs or None
-        None if the axes point elsewhere than east and north, and no register has the CRS with those.
+    None if the axes point elsewhere than east and north, and no register has the CRS with those.
 
     Notes
     -----

@@ -7,31 +7,19 @@ from dataclasses import dataclass
 import pyproj
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-from tiler.georeference.crs import crs_name, geographic_box
-
-Box = tuple[float, float, float, float]
+from tiler.georeference.crs import Box, crs_name, geographic_box
 
 
 @dataclass(frozen=True)
 class Operation:
-    """A coordinate operation as it was used.
+    """A coordinate operation as it was used."""
 
-    Attributes
-    ----------
-    source, target : str
-        Names of the CRSs.
-    description : str
-        What PROJ calls it.
-    accuracy : float or None
-        Accuracy that the register states (m); None if it is unknown.
-    missing_grids : tuple of str
-        Grids that a more exact operation at this place needs and that are not installed.
-    """
-
+    # Names of the CRSs.
     source: str
     target: str
-    description: str
-    accuracy: float | None
+    description: str  # what PROJ calls it
+    accuracy: float | None  # accuracy that the register states (m); None if it is unknown
+    # Grids that a more exact operation at this place needs and that are not installed.
     missing_grids: tuple[str, ...] = ()
 
     @property
@@ -53,18 +41,7 @@ class Operation:
 
 
 def find_operation(source: pyproj.CRS, target: pyproj.CRS, box: Box) -> Operation:
-    """Find the operation that PROJ uses between two CRSs at the middle of a box.
-
-    Parameters
-    ----------
-    source, target : pyproj.CRS
-        From and to, horizontal.
-    box : tuple of 4 floats
-        xmin, ymin, xmax, ymax in the target, easting first.
-
-    Returns
-    -------
-    Operation
+    """Find the operation that PROJ uses between two horizontal CRSs at the middle of a box of the target.
 
     Notes
     -----

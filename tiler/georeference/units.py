@@ -1,13 +1,7 @@
 """Units of length that clouds and CRSs have."""
 
-METRES = {
-    9001: 1.0,
-    9002: 0.3048,
-    9003: 1200 / 3937,
-    9005: 0.3047972654,
-    9036: 1000.0,
-    9096: 0.9144,
-}  # by EPSG code
+# By EPSG code.
+METRES = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937, 9005: 0.3047972654, 9036: 1000.0, 9096: 0.9144}
 UNITS = {"m": 1.0, "ft": 0.3048, "ftUS": 1200 / 3937}  # that --height-unit takes
 _NAMES = {1.0: "metres", 0.3048: "feet", 1200 / 3937: "US survey feet"}
 _SAME = 1e-9  # relative; what registers and files write of one unit differs by less

@@ -71,30 +71,17 @@ def lay_canopy(task: Task) -> Facts:
             kept |= under
         leaves.append(cloud.xyz[kept])
         ground.append(cloud.xyz[np.isin(cloud.classification, (GROUND, WATER))])
-    shape = (window.ny, window.nx)
     canopy = find_canopy(
-        np.concatenate(leaves),
-        np.concatenate(ground),
-        (window.i0, window.j0),
-        shape,
-        size=size,
+        np.concatenate(leaves), np.concatenate(ground), (window.i0, window.j0), (window.ny, window.nx), size=size,
         density=given.leaf_area_density,
-    )
+    )  # fmt: skip
     if crowns is not None and tall.any():
         x, y = (np.arange(n) + first + 0.5 for n, first in ((window.nx, window.i0), (window.ny, window.j0)))
         centre = np.stack(np.meshgrid(x * size, y * size), axis=-1).reshape(-1, 2)
-        foot = np.where(
-            np.isnan(crowns.forms[:, BASE_COLUMN]), FOOT * crowns.given_height, crowns.forms[:, BASE_COLUMN]
-        )
-        _plant(
-            canopy,
-            centre,
-            sample_dtm(terrain, centre),
-            crowns.polygons[tall],
-            crowns.given_height[tall],
-            foot[tall],
-            given.leaf_area_density or DENSITY,
-        )
+        foot = crowns.forms[:, BASE_COLUMN]
+        foot = np.where(np.isnan(foot), FOOT * crowns.given_height, foot)
+        ground_at, density = sample_dtm(terrain, centre), given.leaf_area_density or DENSITY
+        _plant(canopy, centre, ground_at, crowns.polygons[tall], crowns.given_height[tall], foot[tall], density)
     task.put_rasters(base=canopy.base, top=canopy.top, density=canopy.density)
     n = int((canopy.density > 0).sum())
     return {"i0": window.i0, "j0": window.j0, "nx": window.nx, "ny": window.ny, "counts": {"columns of leaves": n}}

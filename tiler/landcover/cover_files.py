@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +13,12 @@ from pipeline.data.citymodel import Footprints, make_ids
 from pipeline.data.errors import InputError
 from pipeline.data.notes import Note
 from tiler.footprints.footprint_attributes import known_attribute
-from tiler.footprints.footprint_index import FootprintBlock, block_footprints
-from tiler.footprints.footprint_source import FootprintSource, open_source
+from tiler.footprints.footprint_index import FootprintBlock, block_footprints, no_footprints
+from tiler.footprints.footprint_source import FootprintSource, is_finite, open_source
 from tiler.footprints.plan_outlines import outline_all
-from tiler.georeference.frame import to_region
+from tiler.georeference.frame import shapes_to_region
 from tiler.landcover.cover_table import class_word
 from tiler.objects.places import is_missing
-from tiler.pointclouds.las_header import COORDINATE_LIMIT
 from tiler.vectors.features import Box, Features
 from tiler.vectors.layers import scan_layer
 from tiler.vectors.lengths import number_of
@@ -32,16 +30,12 @@ MOST_WORDS = 10  # unknown classes that a note names
 def scan_cover(
     path: Path, *, crs: pyproj.CRS, bounds: Box, field: str, rows: Mapping[str, int], tolerance: float
 ) -> Iterator[FootprintBlock]:
-    """Read the polygons of a file that meet a box, by batches.
+    """Read the polygons of a vector file that meet a box, by batches.
 
     Parameters
     ----------
-    path : Path
-        Any vector file.
-    crs : pyproj.CRS
-        The region's.
-    bounds : tuple of 4 floats
-        The region (m).
+    path, crs, bounds
+        The file; CRS of the region, and its box (m).
     field : str
         Attributes with the class, with commas between them.
     rows : mapping of str to int
@@ -77,26 +71,21 @@ def scan_cover(
         of_feature = _find_rows(features, names, rows, unknown)
         outlines = outline_all(features.wkb, metre=source.layer.metre, curved=features.curved)
         counts["land-cover-no-polygon"] += len(features.wkb) - len(outlines.rows)
-        geometry = outlines.geometry
-        if source.frame.changes_plan:
-            geometry = shapely.transform(geometry, partial(to_region, source.frame))
-        finite = np.array(
-            [bool((np.abs(shapely.get_coordinates(g)) <= COORDINATE_LIMIT).all()) for g in geometry], np.bool_
-        )
+        geometry = shapes_to_region(source.frame, outlines.geometry)
+        finite = is_finite(geometry)
         counts["land-cover-no-polygon"] += int((~finite).sum())
         kept = finite & (of_feature[outlines.rows] > 0)
         levels = np.full(len(features.wkb), np.nan)
         if level:
             levels = np.array([number_of(value) for value in features.columns[LEVEL]], np.float64)
-        yield _block(
-            geometry[kept], of_feature[outlines.rows[kept]], levels[outlines.rows[kept]], bounds, tolerance
-        )
+        rows_kept = outlines.rows[kept]
+        yield _block(geometry[kept], of_feature[rows_kept], levels[rows_kept], bounds, tolerance)
     notes = [Note(kind, path.name, detail=f"{n} features") for kind, n in counts.items() if n]
     if unknown:
         words = ", ".join(f"{word} ({n})" for word, n in unknown.most_common(MOST_WORDS))
         detail = f"{sum(unknown.values())} polygons of {len(unknown)} classes: {words}"
         notes.append(Note("land-cover-unknown-class", path.name, detail=detail))
-    yield block_footprints(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), notes)
+    yield no_footprints(notes)
 
 
 def open_file(path: Path, parameter: str, hint: str, *, crs: pyproj.CRS, bounds: Box) -> FootprintSource:
@@ -106,7 +95,7 @@ def open_file(path: Path, parameter: str, hint: str, *, crs: pyproj.CRS, bounds:
     """
     if is_missing(path):
         raise InputError(f"{path}: no such file; check the path of {parameter}")
-    source = open_source(path, crs=crs, bounds=bounds, layer="", id_attribute="", height_attribute="")
+    source = open_source(path, crs=crs, bounds=bounds)
     if source.layer.gdal is not None and source.layer.gdal.driver == "OSM":
         raise InputError(
             f"{path}: of an extract of OpenStreetMap tags of buildings alone are read; make a file of its {hint}"

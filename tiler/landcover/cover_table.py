@@ -20,24 +20,12 @@ ROUGHNESS = (0.0, 5.0)  # m; what is taken, the first left out
 
 @dataclass(frozen=True)
 class CoverRow:
-    """A patch of the ground.
+    """A patch of the ground."""
 
-    Attributes
-    ----------
-    patch : str
-        Its name, ``water``; in files it is ``ground_water``.
-    roughness : float
-        Roughness length z0 (m).
-    level : bool
-        Whether each body of it is at one height.
-    classes : tuple of str
-        Words that files have for it, in small letters.
-    """
-
-    patch: str
-    roughness: float
-    level: bool
-    classes: tuple[str, ...]
+    patch: str  # its name, ``water``; in files it is ``ground_water``
+    roughness: float  # roughness length z0 (m)
+    level: bool  # whether each body of it is at one height
+    classes: tuple[str, ...]  # words that files have for it, in small letters
 
 
 # In the order in which they count where polygons overlap. Roughness lengths are of Wieringa's classification (J.
@@ -65,10 +53,7 @@ TABLE = tuple(
 def read_table(config: Config) -> tuple[CoverRow, ...]:
     """Read the patches of a run: those of its file, or ours; none where it has no land cover.
 
-    Raises
-    ------
-    ConfigError
-        If the file is no table of patches.
+    ConfigError if the file is no table of patches.
     """
     if not config.covered:
         return ()

@@ -21,15 +21,25 @@ from tiler.store.store import Store
 AROUND = 9  # canopies of tiles that stay in memory
 
 
+class _Around:
+    """Results of a stage by tile, and which of these lie around a box; parameters as of `StoredCover`."""
+
+    def __init__(self, path: Path, stage: str, tiles: Mapping[str, Box]) -> None:
+        self.store = Store(path)
+        known = set(self.store.names(stage))
+        self._names = [name for name in tiles if name in known]
+        self._boxes = shapely.STRtree([shapely.box(*tiles[name]) for name in self._names])
+
+    def find(self, box: shapely.Polygon) -> list[str]:
+        """List the tiles whose boxes meet a box, in their order."""
+        return [self._names[k] for k in np.sort(self._boxes.query(box)).tolist()]
+
+
 class StoredCanopy:
     """Leaf area density at places, by the canopies of all tiles around them; parameters as of `StoredCover`."""
 
     def __init__(self, path: Path, tiles: Mapping[str, Box], size: float) -> None:
-        self._store = Store(path)
-        known = set(self._store.names(CANOPY))
-        self._names = [name for name in tiles if name in known]
-        self._boxes = shapely.STRtree([shapely.box(*tiles[name]) for name in self._names])
-        self._size = size
+        self._tiles, self._size = _Around(path, CANOPY, tiles), size
         self._take = lru_cache(maxsize=AROUND)(self._read)
 
     def __call__(self, places: NDArray[np.float64], /) -> NDArray[np.float32]:
@@ -37,10 +47,10 @@ class StoredCanopy:
         if len(places) == 0:
             return np.empty(0, np.float32)
         box = shapely.box(*places[:, :2].min(axis=0) - self._size, *places[:, :2].max(axis=0) + self._size)
-        return densities_at([self._take(k) for k in np.sort(self._boxes.query(box)).tolist()], places)
+        return densities_at([self._take(name) for name in self._tiles.find(box)], places)
 
-    def _read(self, k: int) -> Canopy:
-        arrays, attributes = self._store.read(CANOPY, self._names[k])
+    def _read(self, name: str) -> Canopy:
+        arrays, attributes = self._tiles.store.read(CANOPY, name)
         return make_canopy(arrays, attributes["facts"], self._size)
 
 
@@ -60,13 +70,8 @@ class StoredCover:
     """
 
     def __init__(self, path: Path, tiles: Mapping[str, Box], core: Box | None, pad: int) -> None:
-        self._store = Store(path)
-        known = set(self._store.names(COVERED))
-        self._names = [name for name in tiles if name in known]
-        boxes = [shapely.box(*tiles[name]) for name in self._names]
-        self._boxes = shapely.STRtree(boxes)
-        self._core, self._pad = core, pad
-        levels = self._store.read(LEVELS, REGION_ITEM)[0]
+        self._tiles, self._core, self._pad = _Around(path, COVERED, tiles), core, pad
+        levels = self._tiles.store.read(LEVELS, REGION_ITEM)[0]
         self._levels = dict(zip(levels["ids"].tolist(), levels["level"].tolist(), strict=True))
 
     def __call__(self, xy: NDArray[np.float64], /) -> NDArray[np.int8]:
@@ -96,8 +101,8 @@ class StoredCover:
 
     def _around(self, xy: NDArray[np.float64]) -> tuple[NDArray[np.str_], NDArray[np.object_]]:
         """Polygons of the tiles around places, each once."""
-        around = np.sort(self._boxes.query(shapely.box(*xy.min(axis=0), *xy.max(axis=0))))
-        found = [self._store.read(COVERED, self._names[k])[0] for k in around.tolist()]
+        around = self._tiles.find(shapely.box(*xy.min(axis=0), *xy.max(axis=0)))
+        found = [self._tiles.store.read(COVERED, name)[0] for name in around]
         ids, kept = rows_of_cover(np.concatenate([np.empty(0, "<U20"), *(arrays["ids"] for arrays in found)]))
         outlines = [np.empty(0, np.object_), *(unpack_polygons(arrays, "outline") for arrays in found)]
         return ids, np.concatenate(outlines)[kept]

@@ -1,7 +1,6 @@
 """Trees of vector files: crowns, or positions with a width, as rows for the store."""
 
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,9 @@ from numpy.typing import NDArray
 from pipeline.data.citymodel import Footprints, make_ids
 from pipeline.data.notes import Note
 from pipeline.data.roof_forms import no_forms
-from tiler.footprints.footprint_index import FootprintBlock, block_footprints
-from tiler.georeference.frame import to_region
+from tiler.footprints.footprint_index import FootprintBlock, block_footprints, no_footprints
+from tiler.footprints.footprint_source import is_finite
+from tiler.georeference.frame import shapes_to_region
 from tiler.landcover.cover_files import open_file
 from tiler.vectors.features import Box, Features
 from tiler.vectors.layers import scan_layer
@@ -26,27 +26,10 @@ AREAS = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)
 
 
 def scan_trees(path: Path, *, crs: pyproj.CRS, bounds: Box) -> Iterator[FootprintBlock]:
-    """Read the trees of a file that meet a box, by batches.
+    """Read the trees of a vector file of polygons or points that meet a box of the region (m), by batches.
 
-    Parameters
-    ----------
-    path : Path
-        Any vector file of polygons or points.
-    crs : pyproj.CRS
-        The region's.
-    bounds : tuple of 4 floats
-        The region (m).
-
-    Yields
-    ------
-    FootprintBlock
-        Crowns; heights are those of the tops above ground (m), NaN where the file states none, and the first
-        column of forms has the feet of the crowns.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
+    Gives crowns; heights are those of the tops above ground (m), NaN where the file states none, and the first
+    column of forms has the feet of the crowns. InputError if the file cannot be read.
     """
     hint = f'trees: ogr2ogr -where "other_tags like \'%natural"=>"tree%\'" trees.gpkg {path.name} points'
     source = open_file(path, "trees", hint, crs=crs, bounds=bounds)
@@ -55,15 +38,13 @@ def scan_trees(path: Path, *, crs: pyproj.CRS, bounds: Box) -> Iterator[Footprin
     for features in scan_layer(source.layer, names, source.box):
         there = np.flatnonzero([blob is not None for blob in features.wkb])
         shapes = shapely.force_2d(shapely.from_wkb(features.wkb[there], on_invalid="fix"))
-        if source.frame.changes_plan:
-            shapes = shapely.transform(shapes, partial(to_region, source.frame))
+        shapes = shapes_to_region(source.frame, shapes)
         height, base, width = (_lengths(features, name)[there] for name in (HEIGHT, BASE, WIDTH))
         kind = shapely.get_type_id(shapes)
         points = kind == shapely.GeometryType.POINT
         radius = np.where(np.isfinite(width) & (width > 0), width, CROWN)[points] / 2
         shapes[points] = shapely.buffer(shapes[points], radius, quad_segs=4)
-        finite = np.array([bool(np.isfinite(shapely.get_coordinates(one)).all()) for one in shapes], np.bool_)
-        usable = finite & (points | np.isin(kind, AREAS)) & ~(height <= 0)
+        usable = is_finite(shapes) & (points | np.isin(kind, AREAS)) & ~(height <= 0)
         left += len(features.wkb) - int(usable.sum())
         shapes[~usable] = None
         kept = usable & shapely.intersects(shapes, shapely.box(*bounds))
@@ -73,7 +54,7 @@ def scan_trees(path: Path, *, crs: pyproj.CRS, bounds: Box) -> Iterator[Footprin
         yield block_footprints(Footprints(parts, make_ids(parts), height[kept][owner], forms), [])
     if left:
         note = Note("trees-left-out", path.name, detail=f"{left} features are no area or point, or have no height")
-        yield block_footprints(Footprints(np.empty(0, np.object_), np.empty(0, np.str_), np.empty(0)), [note])
+        yield no_footprints([note])
 
 
 def _lengths(features: Features, name: str) -> NDArray[np.float64]:

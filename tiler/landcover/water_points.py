@@ -13,6 +13,7 @@ from tiler.engine.stage import Facts, Read, Scope, Stage
 from tiler.engine.task import Task
 from tiler.stages.inputs import halo_of_points, own_window
 from tiler.stages.readers import read_bands
+from tiler.vectors.features import to_objects
 
 WET = "wet"
 CELLS = 16  # a side of a square, in which water is a polygon of its own
@@ -75,28 +76,16 @@ def find_wet(task: Task) -> Facts:
             size,
         )
     ]
-    array = np.empty(len(polygons), np.object_)
-    array[:] = polygons
+    array = to_objects(polygons)
     task.put(**pack_polygons(array, "outline"), names=make_ids(array))
     return {"n": len(polygons)}
 
 
 def outline_wet(wet: NDArray[np.bool_], first: tuple[int, int], size: float) -> list[shapely.Polygon]:
-    """Outline the water between the centres of cells.
+    """Outline the water between the centres of cells, bool (ny, nx), of a side (m).
 
-    Parameters
-    ----------
-    wet : bool, (ny, nx)
-        Which cells are water.
-    first : (i, j)
-        Index of the first one, counted in `size` from the CRS's origin.
-    size : float
-        Side of a cell (m).
-
-    Returns
-    -------
-    list of Polygon
-        Shores go through the middles between centres, so squares beside each other fit.
+    `first` is the index (i, j) of the first cell, counted in `size` from the CRS's origin. Shores go through the
+    middles between centres, so squares beside each other fit.
 
     Examples
     --------

@@ -11,6 +11,8 @@ from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
 from tiler.config.config import Config
 from tiler.georeference.crs import (
+    Box,
+    box_around,
     box_words,
     crs_name,
     directions_of,
@@ -28,8 +30,6 @@ from tiler.georeference.las_crs import height_unit_of
 from tiler.georeference.metric import MetricCrs, find_metric
 from tiler.georeference.units import UNITS, same_unit, unit_name
 from tiler.pointclouds.clouds import CloudHeader
-
-Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,10 @@ class CloudGroup:
         kind = "point clouds" if self.first.kind == "cloud" else "files"
         return self.first.path.name if n == 1 else f"{n} {kind} ({self.first.path.name} and others)"
 
+    @property
+    def state(self) -> str:
+        return "states" if len(self.clouds) == 1 else "state"
+
 
 @dataclass(frozen=True)
 class PlanCrs:
@@ -65,12 +69,18 @@ class PlanCrs:
 
 @dataclass(frozen=True)
 class Findings:
+    """What the user must know, as messages and as notes."""
+
     messages: list[str]
     notes: list[Note]
 
     def say(self, kind: str, subject: str, text: str) -> None:
         self.messages.append(text)
         self.notes.append(Note(kind, subject, detail=text))
+
+    def say_of(self, group: CloudGroup, kind: str, text: str) -> None:
+        """Say what is so of a group; the record names its first file."""
+        self.say(kind, group.first.path.name, text)
 
 
 def group_clouds(clouds: Sequence[CloudHeader]) -> list[CloudGroup]:
@@ -99,9 +109,8 @@ def read_wish(asked: Config, groups: Sequence[CloudGroup]) -> tuple[pyproj.CRS, 
     metric = find_metric(flat)
     if metric is None:
         raise InputError(
-            f"--crs {crs_name(flat)} has axes to the {directions_of(flat)}, and no register has it with axes "
-            "east and "
-            "north; give such a CRS, a UTM zone for example, with --reproject"
+            f"--crs {crs_name(flat)} has axes to the {directions_of(flat)}, and no register has it with axes east "
+            "and north; give such a CRS, a UTM zone for example, with --reproject"
         )
     return flat, metric
 
@@ -117,28 +126,23 @@ def choose_plan(
         unread = f": {group.first.unread}" if group.first.unread else ""
         if wish is None:
             return None
-        findings.say(
-            "cloud-without-crs",
-            group.first.path.name,
-            f"{group.label} {states_of(group)} no CRS that is understood{unread}; taken as {crs_name(wish[0])} "
-            "of --crs",
-        )
+        text = f"no CRS that is understood{unread}; taken as {crs_name(wish[0])} of --crs"
+        findings.say_of(group, "cloud-without-crs", f"{group.label} {group.state} {text}")
         return PlanCrs(wish[0], _with_unit(group, wish[0], wish[1], findings))
     if stated.is_geographic:
         return _choose_for_degrees(group, stated, wish, asked, findings)
     if not stated.is_projected:
         raise InputError(
             f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}; reproject the cloud to a "
-            "projected "
-            f"CRS: {pdal_command(group.first.path, stated, None)}"
+            f"projected CRS: {pdal_command(group.first.path, stated, None)}"
         )
     metric = find_metric(stated)
     if metric is None:
         zone = utm_crs(group.box, stated) or "EPSG:<a projected CRS in metres>"
         raise InputError(
             f"{group.first.path}: its CRS, {crs_name(stated)}, has axes to the {directions_of(stated)}, and no "
-            "register "
-            f"has it with axes east and north; reproject the cloud: {pdal_command(group.first.path, stated, zone)}"
+            "register has it with axes east and north; reproject the cloud: "
+            f"{pdal_command(group.first.path, stated, zone)}"
         )
     if wish is None or asked.reproject or is_one(metric.crs, wish[1].crs, metric_box(group, metric)):
         return PlanCrs(stated, _with_unit(group, stated, metric, findings))
@@ -153,16 +157,13 @@ def _overrule(
     if not is_on_its_place(metric_box(group, metric), metric.crs):
         raise InputError(
             f"{group.first.path}: states {crs_name(stated)}, but --crs asks for {crs_name(flat)}, where "
-            "coordinates "
-            f"such as ({group.box[0]:.10g}, {group.box[1]:.10g}) have no place; add --reproject to reproject "
-            "the cloud, "
-            f"or leave out --crs"
+            f"coordinates such as ({group.box[0]:.10g}, {group.box[1]:.10g}) have no place; add --reproject to "
+            "reproject the cloud, or leave out --crs"
         )
-    findings.say(
+    findings.say_of(
+        group,
         "cloud-crs-overruled",
-        group.first.path.name,
-        f"{group.label} {states_of(group)} {crs_name(stated)}; taken as {crs_name(flat)} of --crs (--reproject "
-        "would "
+        f"{group.label} {group.state} {crs_name(stated)}; taken as {crs_name(flat)} of --crs (--reproject would "
         "reproject instead)",
     )
     return PlanCrs(flat, metric)
@@ -187,8 +188,7 @@ def _choose_for_degrees(
     target = crs_name(wish[0]) if wish is not None else utm_crs(group.box, stated)
     raise InputError(
         f"{group.first.path}: its CRS, {crs_name(stated)}, {fault_of(stated)}, and cells need metres; give "
-        "--reproject"
-        f"{f' --crs {target}' if target else ''}, or reproject this and every cloud like it: "
+        f"--reproject{f' --crs {target}' if target else ''}, or reproject this and every cloud like it: "
         f"{pdal_command(group.first.path, stated, target)}"
     )
 
@@ -205,9 +205,9 @@ def _with_unit(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, findings: 
         )
         by_key, by_crs = (is_on_its_place(metric_box(group, one), one.crs) for one in (keyed, metric))
         taken = keyed if by_key or not by_crs else metric
-        findings.say(
+        findings.say_of(
+            group,
             "cloud-unit-of-key",
-            group.first.path.name,
             f"{group.label}: {crs_name(crs)} is in {unit_name(sizes[0])}, but GeoTIFF key 3076 says "
             f"{unit_name(unit)}; coordinates are taken in {unit_name(unit if taken is keyed else sizes[0])}",
         )
@@ -230,9 +230,7 @@ def _with_axes(group: CloudGroup, crs: pyproj.CRS, metric: MetricCrs, findings: 
     }
     for words, other in others.items():
         if other != metric and is_on_its_place(metric_box(group, other), other.crs):
-            findings.say(
-                "cloud-axes", group.first.path.name, f"{group.label}: {words}; taken as {crs_name(metric.crs)}"
-            )
+            findings.say_of(group, "cloud-axes", f"{group.label}: {words}; taken as {crs_name(metric.crs)}")
             return other
     return metric
 
@@ -252,14 +250,13 @@ def choose_fallback(
     unread = next((f" ({group.first.unread})" for group in silent if group.first.unread), "")
     if known:
         group, plan = known[0]
-        findings.say(
+        findings.say_of(
+            silent[0],
             "cloud-without-crs",
-            silent[0].first.path.name,
             f"{n_silent} of {n_all} point clouds state no CRS{unread}; taken as {crs_name(plan.source)} of "
             f"{group.first.path.name}",
         )
         return plan
-    first = silent[0]
     flat = horizontal_crs(footprints)
     if flat is None:
         raise InputError(
@@ -271,12 +268,12 @@ def choose_fallback(
             f"the point clouds state no CRS{unread}, and that of the footprints, {crs_name(flat)}, "
             f"{fault_of(flat) or f'has axes to the {directions_of(flat)}'}; give the CRS of the clouds with --crs"
         )
-    findings.say(
+    findings.say_of(
+        silent[0],
         "cloud-without-crs",
-        first.first.path.name,
         f"the point cloud states no CRS{unread}; using {crs_name(flat)} of the footprints",
     )
-    return PlanCrs(flat, _with_unit(first, flat, metric, findings))
+    return PlanCrs(flat, _with_unit(silent[0], flat, metric, findings))
 
 
 def _assume_degrees(
@@ -284,11 +281,11 @@ def _assume_degrees(
 ) -> PlanCrs:
     """Take coordinates that look like degrees for those of WGS 84, where they may be reprojected."""
     wgs84 = pyproj.CRS("EPSG:4326")
-    states = f"{states_of(group)} {'no CRS' if group.stated is None else crs_name(group.stated)}"
+    states = f"{group.state} {'no CRS' if group.stated is None else crs_name(group.stated)}"
     if asked.reproject:
-        findings.say(
+        findings.say_of(
+            group,
             "cloud-without-crs",
-            group.first.path.name,
             f"{group.label} {states}, and the coordinates look like degrees; taken as EPSG:4326 (WGS 84)",
         )
         return PlanCrs(wgs84, MetricCrs(wgs84, (0, 1.0), (1, 1.0)), degrees=True)
@@ -302,16 +299,11 @@ def _assume_degrees(
 
 def choose_height_unit(group: CloudGroup, plan: PlanCrs, asked: Config, findings: Findings) -> float:
     """Metres of a unit of height: asked for, stated, or that of plan."""
-    stated, name = group.first.height_unit, group.first.path.name
+    stated, text = group.first.height_unit, ""
     if asked.height_unit:
         unit = UNITS[asked.height_unit]
         if stated is not None and not same_unit(stated, unit):
-            findings.say(
-                "cloud-height-unit",
-                name,
-                f"{group.label}: states heights in {unit_name(stated)}; taken in {unit_name(unit)} by "
-                "--height-unit",
-            )
+            text = f"states heights in {unit_name(stated)}; taken in {unit_name(unit)} by --height-unit"
     elif stated is not None:
         unit = stated
     elif asked.crs and (by_crs := height_unit_of(parse_crs(asked.crs))) is not None:
@@ -319,16 +311,13 @@ def choose_height_unit(group: CloudGroup, plan: PlanCrs, asked: Config, findings
     else:
         unit = 1.0 if plan.degrees else abs(plan.metric.east[1])
         if unit != 1.0:
-            findings.say(
-                "cloud-height-unit",
-                name,
-                f"{group.label}: no record states the unit of heights; taken in {unit_name(unit)} as plan is, "
-                "--height-unit m says otherwise",
-            )
+            text = f"no record states the unit of heights; taken in {unit_name(unit)} as plan is, "
+            text += "--height-unit m says otherwise"
+    if text:
+        findings.say_of(group, "cloud-height-unit", f"{group.label}: {text}")
     if unit != 1.0:
-        findings.say(
-            "cloud-height-converted", name, f"{group.label}: heights in {unit_name(unit)} converted to metres"
-        )
+        text = f"{group.label}: heights in {unit_name(unit)} converted to metres"
+        findings.say_of(group, "cloud-height-converted", text)
     return unit
 
 
@@ -339,16 +328,3 @@ def metric_box(group: CloudGroup, metric: MetricCrs) -> Box:
 def group_box(group: CloudGroup, plan: PlanCrs) -> Box:
     """Give the box of a group in its metric CRS, or in degrees."""
     return group.box if plan.degrees else metric_box(group, plan.metric)
-
-
-def box_around(boxes: Sequence[Sequence[float]]) -> Box:
-    return (
-        min(box[0] for box in boxes),
-        min(box[1] for box in boxes),
-        max(box[2] for box in boxes),
-        max(box[3] for box in boxes),
-    )
-
-
-def states_of(group: CloudGroup) -> str:
-    return "states" if len(group.clouds) == 1 else "state"

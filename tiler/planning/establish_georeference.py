@@ -12,6 +12,8 @@ from pipeline.data.notes import Note
 from tiler.config.config import Config
 from tiler.georeference.crs import (
     SAME_PLACE,
+    Box,
+    box_around,
     boxes_meet,
     crs_name,
     crs_text,
@@ -31,7 +33,6 @@ from tiler.planning.cloud_crs import (
     CloudGroup,
     Findings,
     PlanCrs,
-    box_around,
     choose_fallback,
     choose_height_unit,
     choose_plan,
@@ -44,38 +45,18 @@ from tiler.pointclouds.clouds import CloudHeader
 FOOTPRINTS = "the footprints"  # subject of their operation
 LARGEST_SCALE = 0.004  # how far the scale of a projection may be from 1: 4 m in a kilometre
 
-Box = tuple[float, float, float, float]
-
 
 @dataclass(frozen=True)
 class Georeference:
-    """Where a region lies, and how its input gets there.
+    """Where a region lies, and how its input gets there."""
 
-    Attributes
-    ----------
-    crs : pyproj.CRS
-        Projected, horizontal, in metres, axes east and north.
-    clouds : list of CloudHeader
-        All clouds, with their boxes in that CRS, and their frames.
-    footprints : Frame
-        How coordinates of the footprints become those of the region.
-    operations : dict of str to Operation
-        Those that reproject, by what they reproject.
-    messages : list of str
-        Messages for the user.
-    notes : list of Note
-        The same for the record, by kind.
-    record : dict
-        All of it in plain values.
-    """
-
-    crs: pyproj.CRS
-    clouds: list[CloudHeader]
-    footprints: Frame
-    operations: dict[str, Operation]
-    messages: list[str]
-    notes: list[Note]
-    record: dict[str, Any]
+    crs: pyproj.CRS  # projected, horizontal, in metres, axes east and north
+    clouds: list[CloudHeader]  # all clouds, with their boxes in that CRS, and their frames
+    footprints: Frame  # how coordinates of the footprints become those of the region
+    operations: dict[str, Operation]  # those that reproject, by what they reproject
+    messages: list[str]  # messages for the user
+    notes: list[Note]  # the same for the record, by kind
+    record: dict[str, Any]  # all of it in plain values
 
 
 def establish_georeference(
@@ -93,10 +74,6 @@ def establish_georeference(
         CRS that the footprints state.
     extent : tuple of 4 floats, or None
         xmin, ymin, xmax, ymax of the footprints in their own coordinates, where it is known.
-
-    Returns
-    -------
-    Georeference
 
     Raises
     ------
@@ -136,16 +113,10 @@ def establish_georeference(
     frame, operation = _place_footprints(footprints, extent, crs, region, plans, groups, placed, findings)
     operations |= {} if operation is None else {FOOTPRINTS: operation}
     _describe_stray(list(placed.values()), crs, findings)
-    record = {
-        "crs": crs_name(crs),
-        "scale of the projection": round(scale, 6),
-        "clouds": described,
-    }
+    record = {"crs": crs_name(crs), "scale of the projection": round(scale, 6), "clouds": described}
     if footprints is not None or extent is not None:
-        record["footprints"] = {
-            "crs": None if footprints is None else crs_name(footprints),
-            **_describe_frame(frame, operation),
-        }
+        name = None if footprints is None else crs_name(footprints)
+        record["footprints"] = {"crs": name, **_describe_frame(frame, operation)}
     everything = [placed.get(id(cloud), cloud) for cloud in clouds]
     return Georeference(crs, everything, frame, operations, findings.messages, findings.notes, record)
 
@@ -190,12 +161,8 @@ def _registered(
         for match in crs.list_authority(auth_name="EPSG", min_confidence=LIKELY)
     ]
     for other in others:
-        if (
-            other.is_projected
-            and other.to_epsg() is not None
-            and is_on_its_place(box, other)
-            and is_one(crs, other, box)
-        ):
+        registered = other.is_projected and other.to_epsg() is not None
+        if registered and is_on_its_place(box, other) and is_one(crs, other, box):
             metric = find_metric(other)
             if metric is not None and metric.crs == other:
                 return other
@@ -210,20 +177,18 @@ def _frame(
     height = choose_height_unit(group, plan, asked, findings)
     plain = Frame(metric.east, metric.north, height)
     box = group_box(group, plan)
-    name = group.first.path.name
     if is_one(metric.crs, crs, box):
         if not same_crs(metric.crs, crs):
-            findings.say(
+            findings.say_of(
+                group,
                 "cloud-crs-alike",
-                name,
-                f"{group.label}: {crs_name(metric.crs)} is taken as {crs_name(crs)}, as the region moves by "
-                "less than "
-                f"{SAME_PLACE:g} m between them",
+                f"{group.label}: {crs_name(metric.crs)} is taken as {crs_name(crs)}, as the region moves by less "
+                f"than {SAME_PLACE:g} m between them",
             )
         if plain.changes_plan:
-            findings.say(
+            findings.say_of(
+                group,
                 "cloud-converted",
-                name,
                 f"{group.label}: {crs_name(plan.source)} in {unit_name(abs(metric.east[1]))}"
                 f"{axes_words(metric)} converted to {crs_name(crs)} in metres",
             )
@@ -231,12 +196,11 @@ def _frame(
     if not asked.reproject:
         raise InputError(
             f"{group.first.path}: states {crs_name(plan.source)}, others {crs_name(crs)}; add --reproject to "
-            "reproject "
-            "it, or leave it out"
+            "reproject it, or leave it out"
         )
     frame = replace(plain, source=crs_text(metric.crs), target=crs_text(crs))
     operation = find_operation(metric.crs, crs, box_to_region(frame, group.box))
-    findings.say("cloud-reprojected", name, f"{group.label}: reprojected {operation.describe()}")
+    findings.say_of(group, "cloud-reprojected", f"{group.label}: reprojected {operation.describe()}")
     return frame, operation
 
 
@@ -288,8 +252,7 @@ def _place_footprints(
                 "footprints-without-crs",
                 "footprints",
                 f"the footprints state no CRS; taken as {crs_name(plans[0].source)}, as their coordinates are "
-                "those of "
-                f"{groups[0].first.path.name}",
+                f"those of {groups[0].first.path.name}",
             )
             return replace(like, height=1.0), None
         return Frame(), None
@@ -315,14 +278,13 @@ def _describe_stray(clouds: Sequence[CloudHeader], crs: pyproj.CRS, findings: Fi
 def _describe_clouds(
     group: CloudGroup, plan: PlanCrs, frame: Frame, operation: Operation | None
 ) -> dict[str, Any]:
-    stated = group.first.height_unit is not None
     return {
         "files": len(group.clouds),
         "first": group.first.path.name,
         "stated": None if group.stated is None else crs_name(group.stated),
         "taken as": crs_name(plan.source),
         "unit of heights (m)": frame.height,
-        "unit of heights stated": stated,
+        "unit of heights stated": group.first.height_unit is not None,
         **_describe_frame(frame, operation),
     }
 

@@ -1,7 +1,7 @@
 """A look at the footprints before a run: how many there are, where, and how finely they are drawn."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,34 +27,17 @@ CHAIN_TOLERANCE = 0.2  # m; what a run takes from outlines before anything else
 
 @dataclass(frozen=True, eq=False)
 class FootprintSample:
-    """Footprints of a region, or the first ones of very many.
+    """Footprints of a region, or the first ones of very many."""
 
-    Attributes
-    ----------
-    total : int
-        How many the region has; an estimate unless the sample is complete.
-    complete : bool
-        Whether the sample has all of them.
-    polygons : object, (n,)
-        Polygons and multipolygons of the sample, in the region's CRS.
-    box : float64, (n, 4)
-        xmin, ymin, xmax, ymax of each (m).
-    area : float64, (n,)
-        Their areas (m2).
-    detail : float64, (n,)
-        How much finer than the mesh their walls are: the sum of 1/e - 1/h over walls, with e the length of the
-        wall, but at least the clearance and at most the mesh size h (1/m).
-    octaves : float64, (n,)
-        The same as the sum of log2(h/e).
-    """
-
-    total: int
-    complete: bool
-    polygons: NDArray[np.object_]
-    box: NDArray[np.float64]
-    area: NDArray[np.float64]
+    total: int  # how many the region has; an estimate unless the sample is complete
+    complete: bool  # whether the sample has all of them
+    polygons: NDArray[np.object_]  # (n,): polygons and multipolygons of the sample, in the region's CRS
+    box: NDArray[np.float64]  # (n, 4): xmin, ymin, xmax, ymax of each (m)
+    area: NDArray[np.float64]  # (n,): their areas (m2)
+    # (n,): how much finer than the mesh their walls are: the sum of 1/e - 1/h over walls, with e the length of the
+    # wall, but at least the clearance and at most the mesh size h (1/m)
     detail: NDArray[np.float64]
-    octaves: NDArray[np.float64]
+    octaves: NDArray[np.float64]  # (n,): the same as the sum of log2(h/e)
 
     def __len__(self) -> int:
         return len(self.polygons)
@@ -68,25 +51,18 @@ def sample_footprints(
     models: Sequence[CloudHeader] = (),
     limit: int = SAMPLE_FEATURES,
 ) -> FootprintSample | None:
-    """Read the footprints of a region, or enough of them to know the rest.
+    """Read the footprints of a region, or enough of them to know the rest; None if no buildings are configured.
 
     Parameters
     ----------
-    config : Config
-        Parameters of the run.
-    region : Region
-        The region.
+    config, region
+        Parameters of the run; the region.
     frame : Frame, optional
         How coordinates of the footprints become those of the region; by default as the CRSs have it.
     models : sequence of CloudHeader
         City models of the region, where buildings are theirs.
     limit : int
         Reading stops after this many footprints.
-
-    Returns
-    -------
-    FootprintSample or None
-        None if no buildings are configured.
 
     Raises
     ------
@@ -139,16 +115,11 @@ def _read_file(config: Config, region: Region, frame: Frame | None, limit: int) 
         height_attribute=config.height_attribute,
         roof_attribute=config.roof_attribute,
     )
-    parts, n_read, complete = [np.empty(0, np.object_)], 0, True
-    for features in scan_layer(source.layer, source.columns, source.box, batch=min(BATCH, limit)):
-        if n_read >= limit:
-            complete = False
-            break
-        parts.append(make_footprints(source, features, frozenset(), Counter())[0].polygons)
-        n_read += len(parts[-1])
-    polygons = np.concatenate(parts)
-    total = len(polygons) if complete else max(len(polygons), _number_within(source, region, crs))
-    return _Outlines(polygons, total, complete)
+    parts = (
+        make_footprints(source, features, frozenset(), Counter())[0].polygons
+        for features in scan_layer(source.layer, source.columns, source.box, batch=min(BATCH, limit))
+    )
+    return _take_some(parts, limit, lambda: _number_within(source, region, crs))
 
 
 def _read_models(config: Config, region: Region, models: Sequence[CloudHeader], limit: int) -> _Outlines:
@@ -160,16 +131,18 @@ def _read_models(config: Config, region: Region, models: Sequence[CloudHeader], 
         if header.kind == MODEL
         for block in read_model_blocks(header.path, header.frame, region.bounds, wanted)
     )
-    parts, n_read, complete = [np.empty(0, np.object_)], 0, True
-    for outlines in blocks:
+    return _take_some(blocks, limit, lambda: sum(header.n_buildings for header in models))
+
+
+def _take_some(parts: Iterable[NDArray[np.object_]], limit: int, estimate: Callable[[], int]) -> _Outlines:
+    """Take parts until there are as many as the limit; of more, `estimate` says how many there are in all."""
+    taken, n_read = [np.empty(0, np.object_)], 0
+    for part in parts:
         if n_read >= limit:
-            complete = False
-            break
-        parts.append(outlines)
-        n_read += len(outlines)
-    polygons = np.concatenate(parts)
-    total = len(polygons) if complete else max(len(polygons), sum(header.n_buildings for header in models))
-    return _Outlines(polygons, total, complete)
+            return _Outlines(np.concatenate(taken), max(n_read, estimate()), complete=False)
+        taken.append(part)
+        n_read += len(part)
+    return _Outlines(np.concatenate(taken), n_read, complete=True)
 
 
 def _make_sample(config: Config, polygons: NDArray[np.object_], total: int, *, complete: bool) -> FootprintSample:
@@ -183,12 +156,7 @@ def _make_sample(config: Config, polygons: NDArray[np.object_], total: int, *, c
 def measure_detail(
     polygons: NDArray[np.object_], *, clearance: float, mesh_size: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Measure how much finer than the mesh the walls of each polygon are.
-
-    Returns
-    -------
-    detail, octaves : float64, (n,)
-        See `FootprintSample`.
+    """Measure how much finer than the mesh the walls of each polygon are: detail and octaves of `FootprintSample`.
 
     Examples
     --------
@@ -212,8 +180,7 @@ def _number_within(source: FootprintSource, region: Region, crs: pyproj.CRS) -> 
     extent, n = source.layer.extent, source.layer.n_features
     if extent is None or n < 0:
         return 0
-    if source.frame.changes_plan:
-        extent = box_to_region(source.frame, extent)
+    extent = box_to_region(source.frame, extent)
     sides = [max(0.0, min(extent[k + 2], region.bounds[k + 2]) - max(extent[k], region.bounds[k])) for k in (0, 1)]
     area = (extent[2] - extent[0]) * (extent[3] - extent[1])
     return round(n * sides[0] * sides[1] / area) if area > 0 else n

@@ -66,20 +66,11 @@ class Tasks:
 
 @dataclass(frozen=True, eq=False)
 class TileLoads:
-    """What each tile that is present has, column by column.
+    """What each tile that is present has, column by column."""
 
-    Attributes
-    ----------
-    index : int64, (n, 2)
-        Column and row in the CRS.
-    area : float64, (n,)
-        Area (m2).
-    lidar_points, footprints, cells : float64, (n,)
-        Their numbers.
-    """
-
-    index: NDArray[np.int64]
-    area: NDArray[np.float64]
+    index: NDArray[np.int64]  # (n, 2): column and row in the CRS
+    area: NDArray[np.float64]  # (n,): area (m2)
+    # (n,): their numbers
     lidar_points: NDArray[np.float64]
     footprints: NDArray[np.float64]
     cells: NDArray[np.float64]
@@ -90,35 +81,17 @@ class TileLoads:
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What a run will take.
-
-    Attributes
-    ----------
-    loads : TileLoads
-        The tiles.
-    tasks : list of Tasks
-        In the order of the stages; one later round of simplification is counted, and there may be more.
-    disk : float
-        Of the output folder (bytes).
-    tile_memory : float64, (n,)
-        Peak of a worker that does a tile (bytes).
-    work : float
-        Seconds of one core for all tasks.
-    driver : float
-        Seconds that no number of workers shortens.
-    warnings : list of str
-        What may go wrong, and the next move.
-    cells_by_level : dict of str to float
-        Cells by level of detail of the zone that they lie in; empty without zones.
-    """
+    """What a run will take."""
 
     loads: TileLoads
+    # In the order of the stages; one later round of simplification is counted, and there may be more.
     tasks: list[Tasks]
-    disk: float
-    tile_memory: NDArray[np.float64]
-    work: float
-    driver: float
-    warnings: list[str]
+    disk: float  # of the output folder (bytes)
+    tile_memory: NDArray[np.float64]  # (n,): peak of a worker that does a tile (bytes)
+    work: float  # seconds of one core for all tasks
+    driver: float  # seconds that no number of workers shortens
+    warnings: list[str]  # what may go wrong, and the next move
+    # Cells by level of detail of the zone that they lie in; empty without zones.
     cells_by_level: dict[str, float] = field(default_factory=dict)
 
     def seconds(self, workers: int) -> float:
@@ -129,18 +102,9 @@ class Forecast:
 def forecast_run(
     survey: Survey, sample: FootprintSample | None, config: Config, *, memory: float | None = None
 ) -> Forecast:
-    """Estimate what a run will take.
+    """Estimate what a run will take, from a survey of its headers and a sample of its footprints, if any.
 
-    Parameters
-    ----------
-    survey : Survey
-        What headers tell.
-    sample : FootprintSample or None
-        The footprints, None without any.
-    config : Config
-        Parameters of the run.
-    memory : float, optional
-        Memory of the machine (bytes), shared by the workers; without it nothing is said of it.
+    `memory` is that of the machine (bytes), shared by the workers; without it nothing is said of it.
 
     Notes
     -----
@@ -189,14 +153,9 @@ def _count_items(grid: TileGrid, n_files: int) -> dict[Scope, int]:
 
 
 def spread_points(grid: TileGrid, clouds: Sequence[CloudHeader], core: Bounds) -> NDArray[np.float64]:
-    """Deal the LiDAR points of files out to tiles, as if they lay evenly in the box of their header.
+    """Deal the LiDAR points of files out to tiles, (nx, ny), as if they lay evenly in the box of their header.
 
     Points beyond the region without its pad, `core`, are not counted.
-
-    Returns
-    -------
-    float64, (nx, ny)
-        By column and row, those of absent tiles included.
     """
     x, y = grid.lines
     points = np.zeros((len(x) - 1, len(y) - 1))
@@ -260,15 +219,10 @@ def _thinning(survey: Survey, sample: FootprintSample | None, config: Config) ->
 def _look_up(
     survey: Survey, sample: FootprintSample | None, config: Config
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Look sizes up in some places of each tile.
+    """Look sizes up in some places of each tile; None where they are the same everywhere.
 
-    Returns
-    -------
-    xy : float64, (nx, side, ny, side, 2)
-        The places (m).
-    share : float64, (nx, side, ny, side)
-        How many cells open ground has there, of those without graded or finer sizes. Footprints that are not known
-        are taken to be everywhere. None where sizes are the same everywhere.
+    Gives the places (m), (nx, side, ny, side, 2), and how many cells open ground has there, (nx, side, ny, side),
+    of those without graded or finer sizes. Footprints that are not known are taken to be everywhere.
     """
     x, y = survey.meshed.lines
     shape = len(x) - 1, len(y) - 1
@@ -362,8 +316,6 @@ def _memory_warnings(
 def warn_of_memory(survey: Survey, config: Config, *, memory: float) -> list[str]:
     """Warn before a run which tiles may not fit into memory, from headers alone; see `forecast_run`.
 
-    Notes
-    -----
     Footprints are not looked at: what is refined at walls comes on top.
     """
     loads = _loads(survey, None, config)

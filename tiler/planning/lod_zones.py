@@ -19,19 +19,9 @@ MOST_ZONES = 1000  # every task has them
 
 
 def read_zones(config: Config, region: Region) -> Zones:
-    """Read the zones of a run, and the level of the rest; none without zones.
+    """Read the zones of a run, in the region's CRS, and the level of the rest; none without zones.
 
-    Parameters
-    ----------
-    config : Config
-        Parameters of the run.
-    region : Region
-        The region, in whose CRS places are given.
-
-    Returns
-    -------
-    Zones
-        The finest level first, the rest last; places as they are, wherever they lie.
+    The finest level first, the rest last; places as they are, wherever they lie.
 
     Raises
     ------

@@ -1,7 +1,8 @@
 """City models and rasters of terrain in a plan: their headers, and the region that they make."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from pipeline.data.errors import InputError
@@ -9,6 +10,7 @@ from pipeline.data.notes import Note
 from tiler.cityinput.rasters import list_raster_files, read_raster_header
 from tiler.cityinput.sources import CLOUD, MODEL, TERRAIN, kind_of, read_model_header
 from tiler.config.config import Config
+from tiler.georeference.crs import box_around
 from tiler.georeference.frame import Frame
 from tiler.objects.places import identify, is_url
 from tiler.pointclouds.clouds import CloudHeader, each_once, list_files
@@ -23,38 +25,41 @@ OPTIONS = {MODEL: "--buildings", TERRAIN: "--terrain"}
 
 
 def read_other_headers(config: Config) -> tuple[list[CloudHeader], dict[str, str]]:
-    """Read the headers of all city models and rasters.
-
-    Returns
-    -------
-    list of CloudHeader
-        Those that can be read.
-    dict of str to str
-        Why others cannot, where these are skipped.
+    """Read the headers of all city models and rasters, and say why others cannot be read, where these are skipped.
 
     Raises
     ------
     InputError
         If one is missing, of another kind, or cannot be read.
     """
-    read: dict[str, Callable[[Path], CloudHeader]] = {
-        MODEL: lambda path: read_model_header(path, config.axis_order),
-        TERRAIN: read_raster_header,
-    }
-    headers, unreadable = [], {}
+    headers, unreadable = list[CloudHeader](), dict[str, str]()
     for kind, sources in ((MODEL, config.buildings), (TERRAIN, config.terrain)):
-        for path in find_files(sources, kind):
-            try:
-                if (found := kind_of(path)) != kind:
-                    raise InputError(
-                        f"{path}: is {_describe(found)}, no {WORDS[kind]}; {OPTIONS[kind]} takes these"
-                    )
-                headers.append(read[kind](path))
-            except InputError as error:
-                if not config.skip_unreadable:
-                    raise
-                unreadable[str(path)] = str(error)
+        read = partial(_read_other, kind, config.axis_order)
+        found, others = read_headers(find_files(sources, kind), read, skip=config.skip_unreadable)
+        headers += found
+        unreadable |= others
     return headers, unreadable
+
+
+def read_headers(
+    paths: Iterable[Path], read: Callable[[Path], CloudHeader], *, skip: bool
+) -> tuple[list[CloudHeader], dict[str, str]]:
+    """Read the headers of files, and why some cannot be read; with `skip` these do not end it."""
+    headers, unreadable = list[CloudHeader](), dict[str, str]()
+    for path in paths:
+        try:
+            headers.append(read(path))
+        except InputError as error:
+            if not skip:
+                raise
+            unreadable[str(path)] = str(error)
+    return headers, unreadable
+
+
+def _read_other(kind: str, axis_order: str, path: Path) -> CloudHeader:
+    if (found := kind_of(path)) != kind:
+        raise InputError(f"{path}: is {_describe(found)}, no {WORDS[kind]}; {OPTIONS[kind]} takes these")
+    return read_model_header(path, axis_order) if kind == MODEL else read_raster_header(path)
 
 
 def _describe(kind: str) -> str:
@@ -64,10 +69,7 @@ def _describe(kind: str) -> str:
 def find_files(sources: Sequence[str], kind: str) -> list[Path]:
     """Find the files that files, globs and folders stand for, sorted, each once.
 
-    Raises
-    ------
-    InputError
-        If one is missing, stands for no file, or is a URL.
+    InputError if one is missing, stands for no file, or is a URL.
     """
     found: list[Path] = []
     for source in sources:
@@ -103,16 +105,14 @@ def headers_of_region(headers: Sequence[CloudHeader]) -> list[CloudHeader]:
     Buildings are given `MARGIN` around them, within the extent of the rasters where there are some. Without both,
     it is that of the rasters.
     """
-    kinds = {
-        kind: [one for one in headers if one.kind == kind and one.n_points] for kind in (CLOUD, MODEL, TERRAIN)
-    }
+    known = [one for one in headers if one.n_points]
+    kinds = {kind: [one for one in known if one.kind == kind] for kind in (CLOUD, MODEL, TERRAIN)}
     if kinds[CLOUD] or not kinds[MODEL]:
         return kinds[CLOUD] or kinds[TERRAIN]
     grown = [_grow(one) for one in kinds[MODEL]]
     if not kinds[TERRAIN]:
         return grown
-    boxes = [one.bounds for one in kinds[TERRAIN]]
-    most = (*(min(box[k] for box in boxes) for k in (0, 1)), *(max(box[k] for box in boxes) for k in (2, 3)))
+    most = box_around(one.bounds for one in kinds[TERRAIN])
     cut = [_cut(one, most) for one in grown]
     kept = [one for one in cut if one.bounds[0] < one.bounds[2] and one.bounds[1] < one.bounds[3]]
     if not kept:

@@ -25,28 +25,10 @@ ROUNDING = 1  # decimals of the shift (m)
 
 
 def settle_shift(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[Config, Plan]:
-    """Measure the shift of the city models where it is asked for.
+    """Measure the shift of the city models where it is asked for, and say what was found.
 
-    Parameters
-    ----------
-    config : Config
-        Of the run.
-    plan : Plan
-        Its plan.
-    say : callable
-        Called with what was found.
-
-    Returns
-    -------
-    Config
-        With the shift in metres.
-    Plan
-        With a note of kind ``model-shifted``.
-
-    Raises
-    ------
-    InputError
-        If no building of a model stands on a raster.
+    Gives parameters with the shift in metres, and a plan with a note of kind ``model-shifted``. InputError if no
+    building of a model stands on a raster.
 
     Notes
     -----

@@ -27,17 +27,10 @@ CORE_STAGE = "model"  # one that has the items of the region without its pad
 
 @dataclass(frozen=True)
 class OwnStages:
-    """Stages and parameters that a run has besides ours.
+    """Stages and parameters that a run has besides ours."""
 
-    Attributes
-    ----------
-    stages : tuple of Stage
-        Run after ours.
-    parameters : mapping
-        What they may declare besides the parameters of the run.
-    """
-
-    stages: tuple[Stage, ...] = ()
+    stages: tuple[Stage, ...] = ()  # run after ours
+    # What they may declare besides the parameters of the run.
     parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -66,13 +59,7 @@ def stages_of_pad(config: Config) -> set[str]:
 
 
 def check_own(config: Config, stages: Sequence[Stage], parameters: Mapping[str, Any] | None) -> OwnStages:
-    """Take stages and parameters of the user's own.
-
-    Raises
-    ------
-    ValueError
-        If a stage has the name of one of ours, or a parameter that of one of the run.
-    """
+    """Take stages and parameters of the user's own; ValueError if one has the name of one of ours."""
     own = OwnStages(tuple(stages), dict(parameters or {}))
     # Rounds of simplification are numbered: near-0, near-1, and so on.
     names = {stage.name.rstrip("0123456789") for stage in [*list_stages(config), lake_stage()]} | {EDITED}

@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
-from pathlib import Path
 
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.notes import Note
@@ -27,6 +26,7 @@ from tiler.planning.model_inputs import (
     headers_of_tiles,
     identify_file,
     order_headers,
+    read_headers,
     read_other_headers,
     turn_frames,
 )
@@ -46,36 +46,17 @@ from tiler.vectors.layers import describe_layer
 
 @dataclass(frozen=True)
 class Survey:
-    """What headers alone tell of a run, before anything is listed by name.
+    """What headers alone tell of a run, before anything is listed by name."""
 
-    Attributes
-    ----------
-    region : Region
-        What is meshed.
-    headers : list of CloudHeader
-        All point-cloud files that can be read.
-    clouds : list of CloudHeader
-        Those of them that have points and meet the region.
-    messages : list of str
-        Sentences that the user should read.
-    unreadable : dict
-        Files left out, with the reason.
-    grid : TileGrid
-        Tiles, those without any point cloud left out.
-    georeference : Georeference
-        Where the region lies, and how coordinates of its input get there.
-    meshed : TileGrid
-        The same, and those of the pad where there is one; where its width follows from the tallest building, that
-        of an expected one counts.
-    """
-
-    region: Region
-    headers: list[CloudHeader]
-    clouds: list[CloudHeader]
-    messages: list[str]
-    unreadable: dict[str, str]
-    grid: TileGrid
-    georeference: Georeference
+    region: Region  # what is meshed
+    headers: list[CloudHeader]  # all point-cloud files that can be read
+    clouds: list[CloudHeader]  # those of them that have points and meet the region
+    messages: list[str]  # sentences that the user should read
+    unreadable: dict[str, str]  # files left out, with the reason
+    grid: TileGrid  # tiles, those without any point cloud left out
+    georeference: Georeference  # where the region lies, and how coordinates of its input get there
+    # The same, and those of the pad where there is one; where its width follows from the tallest building, that of
+    # an expected one counts.
     meshed: TileGrid
 
 
@@ -105,14 +86,7 @@ def _refuse_missing(config: Config) -> None:
 
 
 def make_plan(config: Config, say: Callable[[str], None]) -> Plan:
-    """Find out what a run has to do, from headers alone.
-
-    Parameters
-    ----------
-    config : Config
-        Parameters of the run.
-    say : callable
-        Called with sentences that the user should read.
+    """Find out what a run has to do, from headers alone; `say` is called with sentences that the user should read.
 
     Raises
     ------
@@ -149,7 +123,7 @@ def survey_inputs(config: Config, say: Callable[[str], None]) -> Survey:
     check_sources(config)
     _refuse_missing(config)
     paths = find_clouds(config.pointcloud) if config.pointcloud else []
-    headers, unreadable = _read_headers(paths, skip=config.skip_unreadable)
+    headers, unreadable = read_headers(paths, read_header, skip=config.skip_unreadable)
     others, unread = read_other_headers(config)
     unreadable |= unread
     found = find_georeference(config, order_headers([*headers, *others]))
@@ -203,12 +177,8 @@ def find_georeference(config: Config, headers: Sequence[CloudHeader]) -> Georefe
         if header.box_of_points
     ]
     if void:
-        have = (
-            "1 point cloud has no sound box in its"
-            if len(void) == 1
-            else f"{len(void)} point clouds have no sound box in their"
-        )
-        words.append(f"{have} header; the points were read for it")
+        who, its = ("1 point cloud has", "its") if len(void) == 1 else (f"{len(void)} point clouds have", "their")
+        words.append(f"{who} no sound box in {its} header; the points were read for it")
     others, told = describe_others(found.clouds, config)
     notes = [*found.notes, *void, *inexact, *told]
     messages = [*found.messages, *words, *others]
@@ -229,16 +199,3 @@ def file_items(clouds: Sequence[CloudHeader]) -> dict[str, FileItem]:
         name = next(name for k in count(1) if (name := f"{stem}-{k}" if k > 1 else stem) not in items)
         items[name] = FileItem(str(header.path), header.bounds[:4], identify_file(header), header.frame)
     return items
-
-
-def _read_headers(paths: Sequence[Path], *, skip: bool) -> tuple[list[CloudHeader], dict[str, str]]:
-    headers: list[CloudHeader] = []
-    unreadable: dict[str, str] = {}
-    for path in paths:
-        try:
-            headers.append(read_header(path))
-        except InputError as error:
-            if not skip:
-                raise
-            unreadable[str(path)] = str(error)
-    return headers, unreadable

@@ -23,17 +23,7 @@ Refinements = tuple[tuple[float, str], ...]
 def read_refinements(config: Config, region: Region) -> Refinements:
     """Read what is to be finer: size (m) and geometry, as well-known binary in hexadecimal digits, of each.
 
-    Parameters
-    ----------
-    config : Config
-        Parameters of the run.
-    region : Region
-        The region, in whose CRS geometries are given.
-
-    Returns
-    -------
-    tuple of (float, str)
-        Sorted, none twice. Areas and lines of the file as they are, wherever they lie.
+    Sorted, none twice. Areas and lines of the file as they are, in the region's CRS, wherever they lie.
 
     Raises
     ------

@@ -16,6 +16,7 @@ from tiler.config.config import Config
 from tiler.config.domain_height import EXPECTED_TALLEST, check_widths, widths_in_metres
 from tiler.config.step_options import expected_levels
 from tiler.engine.run_context import SHARED
+from tiler.georeference.crs import box_around
 from tiler.pointclouds.clouds import CloudHeader
 
 ASTRAY_TILES = 20  # a file longer than this many tiles is likely to have astray points ...
@@ -31,13 +32,6 @@ SPARSEST = 100.0  # m2; ... where it has fewer points than one in this area
 class Pad:
     """A region within its pad, a margin of bare ground.
 
-    Attributes
-    ----------
-    core : (xmin, ymin, xmax, ymax)
-        The region that was asked for, with its buildings and points (m).
-    grid : TileGrid
-        Tiles of core and pad.
-
     Notes
     -----
     Guidelines keep the sides of the domain away from buildings: five times the height of the tallest one towards
@@ -45,8 +39,8 @@ class Pad:
     AIJ, 2008); both are cited in full in `tiler.config.domain_height`.
     """
 
-    core: Bounds
-    grid: TileGrid
+    core: Bounds  # the region that was asked for, with its buildings and points (m)
+    grid: TileGrid  # tiles of core and pad
 
 
 def pad_bounds(core: Bounds, widths: Sequence[float]) -> Bounds:
@@ -62,26 +56,10 @@ def pad_bounds(core: Bounds, widths: Sequence[float]) -> Bounds:
 
 
 def pad_grid(core: TileGrid, bounds: Bounds, *, mesh_size: float, open_size: float) -> TileGrid:
-    """Lay tiles over a region and its pad.
+    """Lay tiles over a region and its pad, `bounds` (m), between multiples of the tile size, as any.
 
-    Parameters
-    ----------
-    core : TileGrid
-        Tiles of the region.
-    bounds : (xmin, ymin, xmax, ymax)
-        Region and pad (m).
-    mesh_size, open_size : float
-        As in `make_grid`.
-
-    Returns
-    -------
-    TileGrid
-        Tiles between multiples of the tile size, as any. One that shares area with an absent tile of the region is
-        absent too; all others are there.
-
-    Notes
-    -----
-    Every line within the region is a line of the larger grid: no tile of this has parts of two of the region's.
+    One that shares area with an absent tile of the region is absent too; all others are there. Every line within
+    the region is a line of the larger grid: no tile of this has parts of two of the region's.
     """
     whole = make_grid(bounds, tile_size=core.tile_size, mesh_size=mesh_size, open_size=open_size)
     column, row = (_tiles_below(outer, inner) for outer, inner in zip(whole.lines, core.lines, strict=True))
@@ -100,21 +78,11 @@ def _tiles_below(outer: NDArray[np.float64], inner: NDArray[np.float64]) -> NDAr
 
 @dataclass(frozen=True)
 class Region:
-    """A box in a metric CRS.
+    """A box in a metric CRS."""
 
-    Attributes
-    ----------
-    bounds : (xmin, ymin, xmax, ymax)
-        The box (m).
-    crs : str
-        The CRS as ``EPSG:NNNN`` where it has a code, else as WKT.
-    tile_size : float
-        Side of a tile (m); tiles are aligned to multiples of it in the CRS.
-    """
-
-    bounds: Bounds
-    crs: str
-    tile_size: float
+    bounds: Bounds  # the box (m)
+    crs: str  # the CRS as ``EPSG:NNNN`` where it has a code, else as WKT
+    tile_size: float  # side of a tile (m); tiles are aligned to multiples of it in the CRS
 
 
 def check_points(clouds: Sequence[CloudHeader]) -> None:
@@ -133,15 +101,10 @@ def check_points(clouds: Sequence[CloudHeader]) -> None:
 def choose_bounds(asked: Sequence[float], clouds: Sequence[CloudHeader]) -> Bounds:
     """Take the bounds asked for, else the whole metres inside the extent of all clouds with points.
 
-    Raises
-    ------
-    InputError
-        If no cloud has a point, or none meets the bounds.
+    InputError if no cloud has a point, or none meets the bounds.
     """
-    extents = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
     check_points(clouds)
-    xmin, ymin = min(e[0] for e in extents), min(e[1] for e in extents)
-    xmax, ymax = max(e[2] for e in extents), max(e[3] for e in extents)
+    xmin, ymin, xmax, ymax = box_around([cloud.bounds for cloud in clouds if cloud.n_points > 0])
     if not asked:
         return float(math.ceil(xmin)), float(math.ceil(ymin)), float(math.floor(xmax)), float(math.floor(ymax))
     kind = clouds[0].kind
@@ -170,13 +133,9 @@ def describe_pad(core: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
 
 def describe_overhang(bounds: Bounds, clouds: Sequence[CloudHeader]) -> list[str]:
     """State by how much the region reaches beyond the point clouds; nothing where it does not."""
-    extents = [cloud.bounds for cloud in clouds if cloud.n_points > 0]
-    beyond = {
-        "west": min(extent[0] for extent in extents) - bounds[0],
-        "south": min(extent[1] for extent in extents) - bounds[1],
-        "east": bounds[2] - max(extent[2] for extent in extents),
-        "north": bounds[3] - max(extent[3] for extent in extents),
-    }
+    xmin, ymin, xmax, ymax = box_around([cloud.bounds for cloud in clouds if cloud.n_points > 0])
+    beyond = {"west": xmin - bounds[0], "south": ymin - bounds[1]}
+    beyond |= {"east": bounds[2] - xmax, "north": bounds[3] - ymax}
     sides = ", ".join(f"{by:.1f} m {side}" for side, by in beyond.items() if by > 0)
     what = INPUTS[min((cloud.kind for cloud in clouds), key=list(INPUTS).index)] if sides else ""
     return [f"the region reaches beyond the {what} ({sides}); terrain is carried on there"] if sides else []
@@ -274,10 +233,7 @@ def check_region(region: Region, mesh_size: float, clouds: Sequence[CloudHeader]
 def find_pad(core: TileGrid, config: Config, tallest: float) -> Pad:
     """Lay the pad around a region, given the height of its tallest building (m).
 
-    Raises
-    ------
-    ConfigError
-        If the pad needs buildings and there are none, or it makes the region too large.
+    ConfigError if the pad needs buildings and there are none, or it makes the region too large.
     """
     widths = widths_in_metres(config.pad, tallest)
     check_widths(widths, mesh_size=config.mesh_size, dtm_spacing=config.dtm_spacing)

@@ -28,18 +28,10 @@ def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.boo
     among : bool, (n,), optional
         Rows to order; all by default.
 
-    Returns
-    -------
-    CellOrder
-
     Raises
     ------
     ValueError
         If the size is not positive.
-
-    Notes
-    -----
-    Cell (i, j) holds i = floor(x / size), j = floor(y / size): it depends on the coordinates alone.
 
     Examples
     --------
@@ -68,23 +60,9 @@ def order_by_cell(xy: NDArray[np.float64], size: float, *, among: NDArray[np.boo
 def select_cells(
     cell: NDArray[np.int64], start: NDArray[np.int64], box: Box, *, size: float
 ) -> list[tuple[int, int]]:
-    """Give the ranges of rows whose cells meet a box.
+    """Give the ranges of rows whose cells, as of `CellOrder` and of side `size` (m), meet a box, borders included.
 
-    Parameters
-    ----------
-    cell : int64, (c, 2)
-        Cells (i, j), as `CellOrder` has them.
-    start : int64, (c + 1,)
-        First row of each cell, and the number of rows.
-    box : tuple of 4 floats
-        xmin, ymin, xmax, ymax (m); the borders belong to the box.
-    size : float
-        Side of a cell (m), the one that the cells were made with.
-
-    Returns
-    -------
-    list of (row_start, row_stop)
-        Ascending, apart from each other: every row in the box is in one of them, and others near it are too.
+    Ascending, apart from each other: every row in the box is in one of them, and others near it are too.
 
     Examples
     --------
@@ -95,6 +73,33 @@ def select_cells(
     low, high = (np.floor(np.array(corner) / size) for corner in (box[:2], box[2:]))
     i, j = cell.T
     return row_ranges((i >= low[0]) & (i <= high[0]) & (j >= low[1]) & (j <= high[1]), start)
+
+
+def meets_box(boxes: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
+    """Whether boxes, (n, 4), have a place in common with a box; the borders belong to it."""
+    xmin, ymin, xmax, ymax = boxes.T
+    meets: NDArray[np.bool_] = (xmin <= box[2]) & (xmax >= box[0]) & (ymin <= box[3]) & (ymax >= box[1])
+    return meets
+
+
+def boxes_of_cells(boxes: NDArray[np.float64], start: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Box around the boxes of the rows of each cell, (n, 4) to (c, 4)."""
+    if len(start) < 2:
+        return boxes
+    low, high = (ufunc.reduceat(boxes, start[:-1]) for ufunc in (np.minimum, np.maximum))
+    return np.hstack((low[:, :2], high[:, 2:]))
+
+
+def ranges_near(cell_box: NDArray[np.float64], start: NDArray[np.int64], box: Box) -> list[tuple[int, int]]:
+    """Give the ranges of rows of the cells whose boxes, as of `boxes_of_cells`, meet a box.
+
+    Examples
+    --------
+    >>> cell_box = np.array([[0.0, 0, 1010, 900], [1005, 0, 2000, 900], [3000, 0, 3100, 50]])
+    >>> ranges_near(cell_box, np.array([0, 4, 5, 9]), (1006.0, 10.0, 1007.0, 20.0))
+    [(0, 5)]
+    """
+    return row_ranges(meets_box(cell_box, box), start)
 
 
 def row_ranges(wanted: NDArray[np.bool_], start: NDArray[np.int64]) -> list[tuple[int, int]]:

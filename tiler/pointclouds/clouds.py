@@ -24,66 +24,38 @@ logging.getLogger("laspy").addHandler(logging.NullHandler())
 
 @dataclass(frozen=True)
 class CloudHeader:
-    """What one point cloud file says about itself.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    n_points : int
-        Number of points.
-    bounds : tuple of 6 floats
-        xmin, ymin, xmax, ymax, zmin, zmax in the file's CRS, or in the region's where that is established; all NaN
-        if there are no points.
-    crs : pyproj.CRS or None
-        As stated, compound CRSs included; None if the file states none or one that nobody can parse.
-    plan_unit, height_unit : float or None
-        Metres of a unit in plan and of height, where a record states them beside the CRS (see `LasCrs`).
-    unread : str
-        What a record of the CRS holds that is not understood.
-    box_of_points : bool
-        Whether the box in the header is void, and the points were read for `bounds`.
-    frame : Frame
-        How coordinates of the file become those of the region.
-    kind : str
-        ``"cloud"``; other files that give points or ground are ``"model"``, a city model, and ``"terrain"``, a
-        raster.
-    swapped : bool
-        Whether the northing comes first in the file; `bounds` have the easting first all the same.
-    axes : str
-        What decided on that order, where it is not the usual one.
-    n_buildings : int
-        Number of buildings of a city model.
-    """
+    """What one point cloud file says about itself."""
 
     path: Path
     n_points: int
+    # xmin, ymin, xmax, ymax, zmin, zmax in the file's CRS, or in the region's where that is established; all NaN
+    # if there are no points.
     bounds: tuple[float, float, float, float, float, float]
+    # As stated, compound CRSs included; None if the file states none or one that nobody can parse.
     crs: pyproj.CRS | None
+    # Metres of a unit in plan and of height, where a record states them beside the CRS (see `LasCrs`).
     plan_unit: float | None = None
     height_unit: float | None = None
-    unread: str = ""
-    box_of_points: bool = False
-    frame: Frame = AS_IT_IS
+    unread: str = ""  # what a record of the CRS holds that is not understood
+    box_of_points: bool = False  # whether the box in the header is void, and the points were read for `bounds`
+    frame: Frame = AS_IT_IS  # how coordinates of the file become those of the region
+    # ``"cloud"``; other files that give points or ground are ``"model"``, a city model, and ``"terrain"``, a
+    # raster.
     kind: str = "cloud"
+    # Whether the northing comes first in the file; `bounds` have the easting first all the same.
     swapped: bool = False
-    axes: str = ""
+    axes: str = ""  # what decided on that order, where it is not the usual one
     n_buildings: int = 0
 
 
 def find_clouds(sources: Sequence[str | Path]) -> list[Path]:
-    """Find the point cloud files that files, globs and folders stand for.
+    """Find the point cloud files that files, globs and folders stand for: sorted, each file once.
 
     Parameters
     ----------
     sources : sequence of str or Path
         Files of any name, glob patterns (``**`` included), and folders, whose ``.las`` and ``.laz`` files
         are taken in any case, without their subfolders. URLs of files, and ``s3://`` ones of what lies below.
-
-    Returns
-    -------
-    list of Path
-        Sorted, each file once.
 
     Raises
     ------
@@ -100,13 +72,8 @@ def find_clouds(sources: Sequence[str | Path]) -> list[Path]:
 def list_files(source: Path, suffixes: Collection[str]) -> list[Path]:
     """List the files that a file, a pattern or a folder stands for; none where nothing is there.
 
-    Parameters
-    ----------
-    source : Path
-        Of a folder the files with one of the suffixes, in any case; hidden ones are not meant, such as the
-        ``._x.laz`` of macOS archives.
-    suffixes : collection of str
-        As ``.laz``, in lower case.
+    Of a folder those with one of the suffixes, given in lower case, in any case; hidden ones are not meant, such
+    as the ``._x.laz`` of macOS archives.
 
     Raises
     ------
@@ -136,15 +103,8 @@ def each_once(files: Iterable[Path]) -> list[Path]:
 
 
 def read_header(path: str | Path) -> CloudHeader:
-    """Read the header of a LAS, LAZ or COPC file.
+    """Read the header of a LAS, LAZ or COPC file; errors as of `read_las_header`.
 
-    Raises
-    ------
-    InputError
-        As `read_las_header`.
-
-    Notes
-    -----
     A CRS that cannot be parsed counts as none, and a message asks the user to state it. Where the box in the
     header is void, all points are read once for their box.
     """

@@ -29,36 +29,22 @@ MOST_POINTS = 40_960_000
 
 @dataclass(frozen=True, eq=False)
 class PointBlock:
-    """Usable points of a part of a file, sorted by cell.
+    """Usable points of a part of a file, sorted by cell."""
 
-    Attributes
-    ----------
-    units : int32, (n, 3)
-        Coordinates in the region's CRS in units of the file, by ascending cell (j, then i); in a cell in the
-        order of the file.
-    scale, offset : tuple of 3 floats
-        Size of a unit along each axis, and place of unit 0 (m).
-    classification : uint8, (n,)
-        ASPRS class of each point.
-    cell : int64, (c, 2)
-        Cells (i, j) that have points, ascending by j, then i.
-    start : int64, (c + 1,)
-        The points of cell k are the rows ``start[k]`` to ``start[k + 1]``.
-    classes : uint8, (k,)
-        Classes that occur among all points that were looked at, inside the box or not, usable or not.
-    counts : dict of str to int
-        ``read`` = ``outside`` + ``withheld`` + ``noise`` + ``absurd`` + ``kept``; each point counts once. Where
-        there are any, ``key points`` are those of ``read`` with the class of model key points: ground. Counts add
-        up over the blocks of a file.
-    """
-
+    # (n, 3): coordinates in the region's CRS in units of the file, by ascending cell (j, then i); in a cell in the
+    # order of the file
     units: NDArray[np.int32]
+    # Size of a unit along each axis, and place of unit 0 (m).
     scale: Triple
     offset: Triple
-    classification: NDArray[np.uint8]
-    cell: NDArray[np.int64]
-    start: NDArray[np.int64]
+    classification: NDArray[np.uint8]  # (n,): ASPRS class of each point
+    cell: NDArray[np.int64]  # (c, 2): cells (i, j) that have points, ascending by j, then i
+    start: NDArray[np.int64]  # (c + 1,): the points of cell k are the rows ``start[k]`` to ``start[k + 1]``
+    # (k,): classes that occur among all points that were looked at, inside the box or not, usable or not
     classes: NDArray[np.uint8]
+    # ``read`` = ``outside`` + ``withheld`` + ``noise`` + ``absurd`` + ``kept``; each point counts once. Where
+    # there are any, ``key points`` are those of ``read`` with the class of model key points: ground. Counts add up
+    # over the blocks of a file.
     counts: dict[str, int]
 
 
@@ -88,8 +74,6 @@ def read_cells(
     InputError
         If the file cannot be read or is damaged, see `read_las_header` and `read_chunks`, and if a cell has more
         than `MOST_POINTS`.
-    ValueError
-        If the size is not positive.
 
     Notes
     -----

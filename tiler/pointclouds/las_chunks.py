@@ -45,30 +45,18 @@ Record = tuple[laspy.ScaleAwarePointRecord, NDArray[np.float64] | None]  # point
 
 @dataclass(frozen=True, eq=False)
 class PointChunk:
-    """Some points of a file.
+    """Some points of a file."""
 
-    Attributes
-    ----------
-    x, y, z : int32, (n,)
-        Coordinates in whole units.
-    scale, offset : tuple of 3 floats
-        Size of a unit along each axis, and place of unit 0, in the file's CRS or the region's.
-    classification : uint8, (n,)
-        ASPRS class of each point; model key points count as ground.
-    withheld : bool, (n,)
-        Whether the file says not to use a point.
-    n_key_points : int
-        How many points had the class of model key points.
-    """
-
+    # (n,): coordinates in whole units
     x: NDArray[np.int32]
     y: NDArray[np.int32]
     z: NDArray[np.int32]
+    # Size of a unit along each axis, and place of unit 0, in the file's CRS or the region's.
     scale: Triple
     offset: Triple
-    classification: NDArray[np.uint8]
-    withheld: NDArray[np.bool_]
-    n_key_points: int = 0
+    classification: NDArray[np.uint8]  # (n,): ASPRS class of each point; model key points count as ground
+    withheld: NDArray[np.bool_]  # (n,): whether the file says not to use a point
+    n_key_points: int = 0  # how many points had the class of model key points
 
     def __len__(self) -> int:
         return len(self.x)
@@ -147,23 +135,16 @@ def read_octree(path: Path, header: laspy.LasHeader) -> Nodes | None:
 def read_chunks(
     path: Path, header: laspy.LasHeader, nodes: Nodes | None = None, frame: Frame = AS_IT_IS
 ) -> Iterator[PointChunk]:
-    """Read points of a file by chunks.
+    """Read points of a file by chunks of some million in the region's CRS, in the order of the file; at least one.
 
     Parameters
     ----------
-    path : Path
-        LAS, LAZ or COPC file.
-    header : laspy.LasHeader
-        Of `read_las_header`.
+    path, header
+        LAS, LAZ or COPC file, and its header by `read_las_header`.
     nodes : Nodes, optional
         Which nodes of a COPC file, from `nodes_near`; all points by default.
     frame : Frame
         How coordinates of the file become those of the region.
-
-    Yields
-    ------
-    PointChunk
-        Some million points in the region's CRS, in the order of the file; one without points where there are none.
 
     Raises
     ------

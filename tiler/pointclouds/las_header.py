@@ -35,16 +35,7 @@ _EMPTY_LAZ = 1000  # what follows the header of a LAZ file without points is sho
 def read_las_header(path: Path, *, evlrs: bool = False) -> laspy.LasHeader:
     """Read the header of a LAS, LAZ or COPC file, and refuse what the file cannot hold.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    evlrs : bool
-        Whether to read the records behind the points too, where they have no more than `RECORD_BYTES`.
-
-    Returns
-    -------
-    laspy.LasHeader
+    `evlrs`: the records behind the points are read too, where they have no more than `RECORD_BYTES`.
 
     Raises
     ------

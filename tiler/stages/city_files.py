@@ -18,12 +18,13 @@ from pipeline.roofs.roof_surfaces import RoofSurfaces, no_surfaces
 from tiler.cityinput.lattices import Cells, interpolate_cells
 from tiler.cityinput.model_blocks import UNIT, Wanted, pack_points, read_model_blocks
 from tiler.cityinput.rasters import HEIGHT_UNIT, Lattice, find_lattice, read_raster
-from tiler.cityinput.row_arrays import OF_CELL, RowPacker, find_ranges, unpack_rows
+from tiler.cityinput.row_arrays import OF_CELL, RowPacker, unpack_rows
 from tiler.cityinput.rows import ModelRows, join_rows
 from tiler.cityinput.sources import MODEL, TERRAIN
 from tiler.engine.stage import Box, Facts
 from tiler.engine.task import Task
 from tiler.georeference.frame import origin_of
+from tiler.pointclouds.cells import ranges_near
 from tiler.stages.readers import extent_of, read_units_of
 
 # Parameters of a run that decide what is read of a city model.
@@ -237,7 +238,7 @@ def _rows_near(task: Task, name: str, facts: Facts, box: Box) -> ModelRows:
     if not facts["n"]:
         return join_rows([])
     arrays, _ = task.store.read("points", name, names=OF_CELL)
-    ranges = find_ranges(arrays["model_cell_box"], arrays["model_cell_start"], facts["n"], box)
+    ranges = ranges_near(arrays["model_cell_box"], np.append(arrays["model_cell_start"], facts["n"]), box)
     return unpack_rows(partial(_read, task, name), ranges)
 
 

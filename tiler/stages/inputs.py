@@ -40,6 +40,7 @@ from tiler.engine.run_context import tile_key
 from tiler.engine.stage import Box, Facts, Read, Scope, Stage, boxes_touch
 from tiler.engine.task import Task
 from tiler.footprints.footprint_index import FootprintBlock, block_footprints, scan_footprints
+from tiler.footprints.footprint_source import open_source
 from tiler.footprints.model_places import ModelPlaces, give_way
 from tiler.georeference.frame import Frame
 from tiler.objects.places import is_url, place
@@ -231,18 +232,19 @@ def read_footprint_file(task: Task) -> Facts:
     given = task.parameters
     if not given.footprints:
         return {"n": 0, "part_like": []}
+    source = open_source(
+        place(given.footprints),
+        crs=pyproj.CRS.from_user_input(task.context.crs),
+        bounds=grow(task.context.bounds, REACH) if given.align else task.context.bounds,
+        frame=Frame(*given.footprints_frame),
+        layer=given.layer,
+        id_attribute=given.id_attribute,
+        height_attribute=given.height_attribute,
+        roof_attribute=given.roof_attribute,
+    )
     return put_rows(
         task,
-        scan_footprints(
-            place(given.footprints),
-            crs=pyproj.CRS.from_user_input(task.context.crs),
-            bounds=grow(task.context.bounds, REACH) if given.align else task.context.bounds,
-            frame=Frame(*given.footprints_frame),
-            layer=given.layer,
-            id_attribute=given.id_attribute,
-            height_attribute=given.height_attribute,
-            roof_attribute=given.roof_attribute,
-        ),
+        scan_footprints(source),
         given.footprints,
         *(["houses are those of the city model"] if given.get("buildings_given", False) else []),
     )

@@ -29,8 +29,8 @@ from tiler.citymodels.tables import NEAR_ARRAYS, NearBuildings, join_near, take_
 from tiler.engine.run_context import find_owned
 from tiler.engine.stage import Box, Facts
 from tiler.engine.task import Task
-from tiler.footprints.footprint_index import FootprintBlock, FootprintRows, join_footprints, select_footprints
-from tiler.pointclouds.cells import select_cells
+from tiler.footprints.footprint_index import FootprintBlock, FootprintRows, join_footprints
+from tiler.pointclouds.cells import ranges_near, select_cells
 from tiler.pointclouds.ingest import CELL
 from tiler.store.result_file import CHUNK_BYTES
 
@@ -248,7 +248,7 @@ def read_rows(task: Task, box: Box, *, stage: str = "footprints") -> Footprints:
     if found.facts["n"] == 0:
         return join_footprints([], box)
     arrays, _ = task.store.read(stage, found.name, names=("cell_box", "cell_start", "end"))
-    ranges = select_footprints(arrays["cell_box"], np.append(arrays["cell_start"], arrays["end"]), box)
+    ranges = ranges_near(arrays["cell_box"], np.append(arrays["cell_start"], arrays["end"]), box)
 
     def read(ranges: Ranges, *names: str) -> dict[str, NDArray[Any]]:
         return task.read_ranges(stage, found.name, names, ranges)

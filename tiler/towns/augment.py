@@ -18,7 +18,7 @@ from pipeline.architecture.lots import Lot, lot_random
 from pipeline.architecture.parameters import House
 from pipeline.architecture.rules import Distribution
 from pipeline.data.errors import InputError
-from tiler.formats.gpkg import fixed_time
+from tiler.formats.gpkg import Column, fixed_time, write_rows
 from tiler.towns.synthetic_files import DAY
 
 # Attributes that win over rules, by what they give: the first that a file has.
@@ -40,40 +40,21 @@ _BESIDE = 0.15  # m from a wall: what lies there shares it
 
 @dataclass(frozen=True, eq=False)
 class Augmented:
-    """Footprints with what rules and attributes say of them.
+    """Footprints with what rules and attributes say of them."""
 
-    Attributes
-    ----------
-    outlines : object, (n,)
-        Polygons and multipolygons of the file.
-    columns : mapping of str to array
-        ``id``, ``height`` (m, to the ridge), ``building:levels``, ``roof:shape`` and ``roof:height`` of each.
-    houses : sequence of House
-        Those of rectangular outlines.
-    crs : str
-        Of the file.
-    counts : Counter of str
-        How many attributes were taken, how many outlines are no houses, and what could not be read.
-    """
-
-    outlines: NDArray[np.object_]
+    outlines: NDArray[np.object_]  # (n,): polygons and multipolygons of the file
+    # ``id``, ``height`` (m, to the ridge), ``building:levels``, ``roof:shape`` and ``roof:height`` of each.
     columns: Mapping[str, NDArray[Any]]
-    houses: Sequence[House]
-    crs: str
+    houses: Sequence[House]  # those of rectangular outlines
+    crs: str  # of the file
+    # How many attributes were taken, how many outlines are no houses, and what could not be read.
     counts: Counter[str]
 
 
 def augment(path: Path, rules: Mapping[str, Distribution], *, seed: int) -> Augmented:
-    """Draw what the attributes of footprints do not say.
+    """Draw what the attributes of footprints, polygons of a file in a metric CRS, do not say; all are in memory.
 
-    Parameters
-    ----------
-    path : Path
-        A vector file of polygons in a metric CRS; all of them are in memory.
-    rules : mapping of str to Distribution
-        As from `make_rules`.
-    seed : int
-        Not negative; what is drawn depends on it, the rules, the attributes and the place of a footprint alone.
+    What is drawn depends on `seed`, not negative, the rules, the attributes and the place of a footprint alone.
 
     Raises
     ------
@@ -121,17 +102,12 @@ def augment(path: Path, rules: Mapping[str, Distribution], *, seed: int) -> Augm
 def write_augmented(path: Path, found: Augmented) -> None:
     """Write footprints with their attributes as a GeoPackage that `citystitch run` takes roofs from."""
     path.unlink(missing_ok=True)
+    single = bool((shapely.get_type_id(found.outlines) == shapely.GeometryType.POLYGON).all())
+    kind = "Polygon" if single else "Unknown"
+    columns: dict[str, Column] = {name: (values, None) for name, values in found.columns.items()}
     with fixed_time(DAY):
-        single = bool((shapely.get_type_id(found.outlines) == shapely.GeometryType.POLYGON).all())
-        pyogrio.raw.write(
-            path,
-            shapely.to_wkb(found.outlines),
-            list(found.columns.values()),
-            list(found.columns),
-            geometry_type="Polygon" if single else "Unknown",
-            crs=found.crs,
-            layer="footprints",
-        )
+        wkb = shapely.to_wkb(found.outlines)
+        write_rows(path, wkb, columns, layer="footprints", crs=found.crs, kind=kind)
 
 
 @dataclass(frozen=True)

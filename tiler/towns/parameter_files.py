@@ -1,7 +1,7 @@
 """Parameters of houses as files: JSON, a house a line, and the XML of Random3Dcity (paper, Figure 6)."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -14,12 +14,8 @@ from pipeline.data.errors import InputError
 
 # What the paper's XML calls them; all others are named as here.
 _NAMES = {
-    "length": "xSize",
-    "width": "ySize",
-    "height": "zSize",
-    "storeys": "floors",
-    "shape": "roofType",
-    "rise": "h",
+    **{"length": "xSize", "width": "ySize", "height": "zSize"},
+    **{"storeys": "floors", "shape": "roofType", "rise": "h"},
 }
 XML_HEAD, XML_END = '<?xml version="1.0" encoding="UTF-8"?>\n<buildings>\n', "</buildings>\n"
 _FIELDS = {name: field for field, name in _NAMES.items()}
@@ -32,25 +28,13 @@ _LISTS = {
 }
 
 
-def write_json(houses: Iterable[House], path: Path) -> None:
-    """Write a house a line."""
-    with path.open("w", encoding="ascii", newline="\n") as file:
-        file.writelines(map(house_json, houses))
-
-
 def house_json(house: House) -> str:
     """Give the line of a house."""
     return json.dumps(_values_of(house), separators=(",", ":"), allow_nan=False) + "\n"
 
 
 def read_json(path: Path) -> Iterator[House]:
-    """Read what `write_json` wrote, or what was edited in it.
-
-    Raises
-    ------
-    InputError
-        If a line is no house: names file and line.
-    """
+    """Read lines of `house_json`, or what was edited in them; InputError with file and line if one is no house."""
     with path.open(encoding="utf-8") as file:
         for number, line in enumerate(file, 1):
             if line.strip():
@@ -60,22 +44,8 @@ def read_json(path: Path) -> Iterator[House]:
                     raise InputError(f"{path}, line {number}: is no house ({error})") from error
 
 
-def write_xml(houses: Iterable[House], path: Path) -> None:
-    """Write an element a house."""
-    with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(XML_HEAD)
-        file.writelines(map(house_xml, houses))
-        file.write(XML_END)
-
-
 def read_xml(path: Path) -> Iterator[House]:
-    """Read what `write_xml` wrote.
-
-    Raises
-    ------
-    InputError
-        If it is no such file: names the house.
-    """
+    """Read elements of `house_xml` in a file; InputError that names the house if it is no such file."""
     last = "the start"
     try:
         with path.open("rb") as file:

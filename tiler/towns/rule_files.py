@@ -12,12 +12,9 @@ LARGEST = 1 << 20  # bytes of a file of rules
 
 
 def read_rules(path: Path) -> dict[str, Any]:
-    """Read a file of rules, a table by the name of each rule: see `pipeline.architecture.rules.make_rules`.
+    """Read a file of rules, a table by the name of each rule; ConfigError if it cannot be read, or holds no table.
 
-    Raises
-    ------
-    ConfigError
-        If it cannot be read, or holds no table.
+    See `pipeline.architecture.rules.make_rules`.
     """
     try:
         if path.stat().st_size > LARGEST:

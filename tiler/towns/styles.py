@@ -23,21 +23,11 @@ _WAVES = ((1100.0, 700.0, 0.5), (310.0, -450.0, 0.3), (-170.0, 230.0, 0.2))  # l
 
 @dataclass(frozen=True)
 class Style:
-    """How a town is laid out.
+    """How a town is laid out."""
 
-    Attributes
-    ----------
-    preset : str
-        One of `pipeline.architecture.rules.PRESETS`.
-    placement : str
-        One of `pipeline.architecture.lots.PLACEMENTS`.
-    lot : float
-        Size of a lot (m).
-    """
-
-    preset: str
-    placement: str
-    lot: float
+    preset: str  # one of `pipeline.architecture.rules.PRESETS`
+    placement: str  # one of `pipeline.architecture.lots.PLACEMENTS`
+    lot: float  # size of a lot (m)
 
 
 STYLES = {
@@ -52,33 +42,15 @@ STYLES = {
 
 @dataclass(frozen=True, eq=False)
 class Town:
-    """A town, as little as all of it follows from.
+    """A town, as little as all of it follows from."""
 
-    Attributes
-    ----------
-    bounds : tuple of 4 floats
-        West, south, east, north (m).
-    style : Style
-        Its layout.
-    rules : mapping of str to Distribution
-        What its houses are drawn by.
-    seed : int
-        Not negative.
-    relief : float
-        Highest minus lowest ground, about (m).
-    trees : float
-        Share of the corners of lots that have a tree.
-    water : float
-        Share of the relief that lakes fill; no house stands in them.
-    """
-
-    bounds: Box
-    style: Style
-    rules: Mapping[str, Distribution]
-    seed: int
-    relief: float
-    trees: float = 0.0
-    water: float = 0.0
+    bounds: Box  # west, south, east, north (m)
+    style: Style  # its layout
+    rules: Mapping[str, Distribution]  # what its houses are drawn by
+    seed: int  # not negative
+    relief: float  # highest minus lowest ground, about (m)
+    trees: float = 0.0  # share of the corners of lots that have a tree
+    water: float = 0.0  # share of the relief that lakes fill; no house stands in them
 
     def lots(self, box: Box) -> Iterator[Lot]:
         """List the lots whose centre lies in a box (m), and in the town."""

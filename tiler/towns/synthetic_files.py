@@ -17,19 +17,7 @@ DAY = date(2022, 1, 1)  # in all files, so that the same seed gives the same byt
 
 
 def write_laz(path: Path, cloud: PointCloud, bounds: tuple[float, float, float, float], crs: str) -> None:
-    """Write a point cloud.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    cloud : PointCloud
-        The points, each the only return of its pulse.
-    bounds : tuple of 4 floats
-        Its box: offsets are whole metres of the lower left corner.
-    crs : str
-        Its CRS, as ``EPSG:3006``.
-    """
+    """Write a point cloud, each point the only return of its pulse, with offsets of whole metres."""
     las = laspy.LasData(_make_header(bounds, crs))
     las.x, las.y, las.z = cloud.xyz.T
     las.classification = cloud.classification

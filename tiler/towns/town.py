@@ -10,7 +10,6 @@ from shutil import copyfileobj, rmtree
 from typing import IO
 
 import numpy as np
-import pyogrio
 import pyproj
 import shapely
 
@@ -21,7 +20,7 @@ from pipeline.architecture.representations import list_representations
 from pipeline.data.errors import ConfigError, OutputError
 from pipeline.points_terrain.synthetic import ORIGIN
 from tiler.executors.in_order import check_workers, map_in_order
-from tiler.formats.gpkg import fixed_time
+from tiler.formats.gpkg import Column, fixed_time, write_rows
 from tiler.towns.parameter_files import XML_END, XML_HEAD
 from tiler.towns.rule_files import read_rules
 from tiler.towns.styles import Box, Town, make_town
@@ -39,13 +38,12 @@ MOST_NOISE = 10.0  # m
 
 @dataclass(frozen=True)
 class TownFiles:
-    """What `write_town` wrote: LAZ files, footprints, city model, parameters as JSON and XML, truth; houses."""
+    """What `write_town` wrote: LAZ files, footprints, city model, parameters, truth; houses."""
 
     clouds: list[Path]
     footprints: Path
     models: Path
     parameters: Path
-    parameters_xml: Path
     truth: Path
     houses: int
 
@@ -70,12 +68,8 @@ def open_town(
         One of `tiler.towns.styles.STYLES`.
     rules : Path, optional
         File with other rules than those of the style.
-    seed : int
-        Not negative; the same seed gives the same town.
-    relief : float
-        Highest minus lowest ground, about (m).
-    trees, water : float
-        Share of the corners of lots with a tree, and of the relief that lakes fill.
+    seed, relief, trees, water
+        As of `Town`.
 
     Raises
     ------
@@ -178,17 +172,8 @@ def make_output(
 ) -> Output:
     """Choose the files of houses.
 
-    Parameters
-    ----------
-    models : ModelOptions
-        Of the city model.
-    variants : sequence of str
-        Names of representations, each of which is written to a file of its own: see `list_representations`;
-        ``"all"`` for all.
-    degrade : float
-        Standard deviation of the noise of degraded twins (m); 0 for none.
-    truth, seed
-        As of `Output`.
+    `variants` are names of representations, each of which is written to a file of its own, ``"all"`` for all: see
+    `list_representations`. All else is as of `Output`.
 
     Raises
     ------
@@ -216,8 +201,18 @@ class _OpenTown:
     houses: int = 0
 
     def append_footprints(self, rows: Sequence[tuple[str, float, list[list[float]]]]) -> None:
-        """Append outlines with id and height."""
-        _append_footprints(rows, self.footprints, self.crs)
+        """Append outlines with id and height; a file without any is written, too."""
+        there = self.footprints.exists()
+        if not rows and there:
+            return
+        polygons = np.array([shapely.Polygon(ring) for *_, ring in rows], object)
+        columns: dict[str, Column] = {
+            "id": (np.array([name for name, *_ in rows], object), None),
+            "height": (np.array([height for _, height, _ in rows], np.float64), None),
+        }
+        with fixed_time(DAY):
+            wkb = shapely.to_wkb(polygons)
+            write_rows(self.footprints, wkb, columns, layer="footprints", crs=self.crs, append=there)
 
 
 @contextmanager
@@ -242,7 +237,7 @@ def _open_town(directory: Path, output: Output, crs: str, *, clouds: Sequence[Pa
             opened["xml"].write(XML_HEAD.encode())
             yield _OpenTown(opened, footprints, crs)
             opened["xml"].write(XML_END.encode())
-    except (OSError, pyogrio.errors.DataSourceError) as error:
+    except OSError as error:
         raise OutputError(f"{directory}: cannot be written ({error}); give a folder that can") from error
 
 
@@ -252,7 +247,6 @@ def _list_files(directory: Path, clouds: list[Path], houses: int) -> TownFiles:
         directory / "footprints.gpkg",
         directory / "town.city.jsonl",
         directory / "parameters.jsonl",
-        directory / "parameters.xml",
         directory / "truth.jsonl",
         houses,
     )
@@ -274,31 +268,3 @@ def list_tiles(bounds: Box) -> Iterator[tuple[Box, tuple[int, int]]]:
     for i, j in product(columns, rows):
         box = max(west, i * TILE), max(south, j * TILE), min(east, (i + 1) * TILE), min(north, (j + 1) * TILE)
         yield box, (i, j)
-
-
-def list_houses(town: Town) -> Iterator[House]:
-    """Draw the houses of a town, tile by tile."""
-    for box, _ in list_tiles(town.bounds):
-        yield from town.houses(box)
-
-
-def _append_footprints(rows: Sequence[tuple[str, float, list[list[float]]]], path: Path, crs: str) -> None:
-    """Append outlines with id and height; a file without any is written, too."""
-    if not rows and path.exists():
-        return
-    polygons = np.array([shapely.Polygon(ring) for *_, ring in rows], object)
-    fields = {
-        "id": np.array([name for name, *_ in rows], object),
-        "height": np.array([height for _, height, _ in rows], np.float64),
-    }
-    with fixed_time(DAY):
-        pyogrio.raw.write(
-            path,
-            shapely.to_wkb(polygons),
-            list(fields.values()),
-            list(fields),
-            geometry_type="Polygon",
-            crs=crs,
-            layer="footprints",
-            append=path.exists(),
-        )

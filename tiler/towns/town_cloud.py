@@ -18,26 +18,10 @@ GROUND_SIGMA, ROOF_SIGMA = 0.03, 0.05  # m
 def scan_town(
     town: Town, box: Box, houses: Sequence[House], part: tuple[int, int], *, density: float
 ) -> PointCloud:
-    """Draw the points of one file of a flight.
+    """Draw the points of one file of a flight, given its box (m), numbers `part` and points per square metre.
 
-    Parameters
-    ----------
-    town : Town
-        The town.
-    box : tuple of 4 floats
-        The file's box (m).
-    houses : sequence of House
-        All that reach into it.
-    part : tuple of 2 ints
-        Numbers of the file, which its points are drawn from.
-    density : float
-        Points per square metre.
-
-    Returns
-    -------
-    PointCloud
-        From right above: the highest of roof, overhang, dormer, chimney and ground at each place, with normal
-        noise of 3 cm on the ground and 5 cm on houses. Classes are without errors.
+    From right above: the highest of roof, overhang, dormer, chimney and ground at each place, of all houses that
+    reach into the box, with normal noise of 3 cm on the ground and 5 cm on houses. Classes are without errors.
     """
     west, south, east, north = box
     rng = np.random.default_rng([town.seed, 5, part[0] % 2**32, part[1] % 2**32])

@@ -1,9 +1,7 @@
 """City models of towns: CityJSONSeq, all levels of detail of a house in one object."""
 
-import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,71 +15,36 @@ from pipeline.architecture.plants import Tree, crown_rings
 from pipeline.architecture.representations import Representation, make_representation
 from pipeline.architecture.roof_sides import Point
 from pipeline.data.errors import ConfigError
+from tiler.citymodels.cityjson_text import compact, reference_system
 
-_ROOF_TYPES = {
-    "flat": "1000",
-    "shed": "1010",
-    "gabled": "1030",
-    "hipped": "1040",
-    "pyramidal": "1070",
-}  # CityGML codes
-
-
-def write_models(
-    houses: Iterable[House],
-    path: Path,
-    *,
-    crs: pyproj.CRS,
-    levels: Sequence[str],
-    footprint: Footprint = "walls",
-    top: str = "half",
-    solid: bool = True,
-) -> int:
-    """Write CityJSONSeq 2.0, a house a line, and give their number.
-
-    Parameters
-    ----------
-    houses : iterable of House
-        One at a time is in memory.
-    path : Path
-        The file.
-    crs : CRS
-        Of the town.
-    levels, footprint, top, solid
-        As of `make_level`; all levels stand side by side.
-    """
-    number = 0
-    with path.open("w", encoding="ascii", newline="\n") as file:
-        file.write(model_head(crs))
-        for house in houses:
-            file.write(house_feature(house, levels=levels, footprint=footprint, top=top, solid=solid))
-            number += 1
-    return number
+# CityGML codes.
+_ROOF_TYPES = {"flat": "1000", "shed": "1010", "gabled": "1030", "hipped": "1040", "pyramidal": "1070"}
 
 
 def model_head(crs: pyproj.CRS) -> str:
     """Give the first line of CityJSONSeq: coordinates are whole millimetres."""
-    code = crs.to_epsg()
-    if code is None:
+    name = reference_system(crs)
+    if name is None:
         raise ConfigError(f"{crs.name}: has no EPSG code, which CityJSON names it by")
-    return _text(
+    head = compact(
         {
             "type": "CityJSON",
             "version": "2.0",
             "transform": {"scale": [0.001] * 3, "translate": [0.0] * 3},
-            "metadata": {"referenceSystem": f"https://www.opengis.net/def/crs/EPSG/0/{code}"},
+            "metadata": {"referenceSystem": name},
             "CityObjects": {},
             "vertices": [],
         }
     )
+    return head + "\n"
 
 
 def house_feature(
     house: House, *, levels: Sequence[str], footprint: Footprint = "walls", top: str = "half", solid: bool = True
 ) -> str:
-    """Give the line of a house in CityJSONSeq; see `write_models`."""
+    """Give the line of a house in CityJSONSeq: all levels side by side, parameters as of `make_level`."""
     made = {level: make_level(house, level, footprint=footprint, top=top, solid=solid) for level in levels}
-    return _text(_feature(house, made))
+    return _house_line(house, made)
 
 
 def variant_feature(house: House, asked: Representation) -> str:
@@ -89,7 +52,7 @@ def variant_feature(house: House, asked: Representation) -> str:
     semantics = asked.kind != "surfaces"
     if not asked.interior:
         made = {asked.level: make_representation(house, asked)}
-        return _text(_feature(house, made, semantics=semantics))
+        return _house_line(house, made, semantics=semantics)
     vertices = _Vertices()
     objects: dict[str, Any] = {house.id: {"type": "Building", "attributes": describe_house(house), "geometry": []}}
     rooms = make_interior(house, asked.level)
@@ -106,7 +69,7 @@ def variant_feature(house: House, asked: Representation) -> str:
             "attributes": {"storey": room.storey},
             "geometry": geometry,
         }
-    return _text({"type": "CityJSONFeature", "id": house.id, "CityObjects": objects, "vertices": vertices.rows()})
+    return _feature_line(house.id, objects, vertices)
 
 
 def fault_feature(name: str, faces: Sequence[Sequence[Sequence[Point]]], corner: Point) -> str:
@@ -124,8 +87,7 @@ def fault_feature(name: str, faces: Sequence[Sequence[Sequence[Point]]], corner:
         "attributes": {"fault": name},
         "geometry": [{"type": "Solid", "lod": "1.2", "boundaries": [shell]}],
     }
-    rows = vertices.rows()
-    return _text({"type": "CityJSONFeature", "id": name, "CityObjects": {name: thing}, "vertices": rows})
+    return _feature_line(name, {name: thing}, vertices)
 
 
 def lot_feature(lot: Lot, ground: Callable[[float, float], float]) -> str:
@@ -142,8 +104,7 @@ def lot_feature(lot: Lot, ground: Callable[[float, float], float]) -> str:
     if street:
         geometry["semantics"] = {"surfaces": [{"type": "TrafficArea"}], "values": [0, 0]}
     thing = {"type": "Road" if street else "PlantCover", "geometry": [geometry]}
-    rows = vertices.rows()
-    return _text({"type": "CityJSONFeature", "id": name, "CityObjects": {name: thing}, "vertices": rows})
+    return _feature_line(name, {name: thing}, vertices)
 
 
 def tree_feature(tree: Tree) -> str:
@@ -163,8 +124,7 @@ def tree_feature(tree: Tree) -> str:
         "attributes": {"height": tree.height, "crownDiameter": round(2 * tree.radius, 3)},
         "geometry": [{"type": "MultiSurface", "lod": "2.0", "boundaries": faces}],
     }
-    rows = vertices.rows()
-    return _text({"type": "CityJSONFeature", "id": name, "CityObjects": {name: thing}, "vertices": rows})
+    return _feature_line(name, {name: thing}, vertices)
 
 
 def describe_house(house: House) -> dict[str, Any]:
@@ -196,7 +156,7 @@ class _Vertices:
         return rows
 
 
-def _feature(house: House, made: dict[str, list[Volume]], *, semantics: bool = True) -> dict[str, Any]:
+def _house_line(house: House, made: dict[str, list[Volume]], *, semantics: bool = True) -> str:
     names = [f"{house.id}-{part.kind}-{k + 1}" for k, part in enumerate(house.parts)]
     vertices = _Vertices()
     geometry: dict[str, list[dict[str, Any]]] = {name: [] for name in (house.id, *names)}
@@ -216,7 +176,12 @@ def _feature(house: House, made: dict[str, list[Volume]], *, semantics: bool = T
             "attributes": {"function": part.kind, "measuredHeight": part.height},
             "geometry": geometry[name],
         }
-    return {"type": "CityJSONFeature", "id": house.id, "CityObjects": objects, "vertices": vertices.rows()}
+    return _feature_line(house.id, objects, vertices)
+
+
+def _feature_line(name: str, objects: dict[str, Any], vertices: _Vertices) -> str:
+    told = {"type": "CityJSONFeature", "id": name, "CityObjects": objects, "vertices": vertices.rows()}
+    return compact(told) + "\n"
 
 
 def _geometry(level: str, volume: Volume, vertices: _Vertices, *, semantics: bool) -> dict[str, Any]:
@@ -225,15 +190,10 @@ def _geometry(level: str, volume: Volume, vertices: _Vertices, *, semantics: boo
     told["boundaries"] = [faces] if volume.closed else faces
     if not semantics:
         return told
-    values = [surface.kind for surface in volume.surfaces]
-    kinds = list(dict.fromkeys(values))
-    rows = [kinds.index(kind) for kind in values]
+    kinds = list(dict.fromkeys(surface.kind for surface in volume.surfaces))
+    rows = [kinds.index(surface.kind) for surface in volume.surfaces]
     told["semantics"] = {
         "surfaces": [{"type": kind} for kind in kinds],
         "values": [rows] if volume.closed else rows,
     }
     return told
-
-
-def _text(document: Any) -> str:
-    return json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n"

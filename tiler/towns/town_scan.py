@@ -52,13 +52,7 @@ class Scan(NamedTuple):
 
 
 def check_flight(town: Town) -> None:
-    """Refuse a town that this flight cannot scan.
-
-    Raises
-    ------
-    ConfigError
-        If a building is too high, or the ground too steep.
-    """
+    """Raise ConfigError for a town that this flight cannot scan: too high a building, or too steep ground."""
     if town.top - LOWEST > FLIGHT / 2:
         raise ConfigError(
             f"--lidar: roofs up to {town.top - LOWEST:.0f} m above the lowest ground, expected at most "

@@ -32,27 +32,13 @@ class ModelOptions(NamedTuple):
 
 
 class Output(NamedTuple):
-    """Which files of houses are written.
+    """Which files of houses are written."""
 
-    Attributes
-    ----------
-    models : ModelOptions
-        Of the city model.
-    variants : tuple of Representation
-        Each of which has a file of its own.
-    degrade : float
-        Standard deviation of the noise of degraded twins (m); 0 for none.
-    truth : bool
-        Whether the truth is written.
-    seed : int
-        What noise is drawn from.
-    """
-
-    models: ModelOptions = ModelOptions()
-    variants: tuple[Representation, ...] = ()
-    degrade: float = 0.0
-    truth: bool = False
-    seed: int = 1
+    models: ModelOptions = ModelOptions()  # of the city model
+    variants: tuple[Representation, ...] = ()  # each of which has a file of its own
+    degrade: float = 0.0  # standard deviation of the noise of degraded twins (m); 0 for none
+    truth: bool = False  # whether the truth is written
+    seed: int = 1  # what noise is drawn from
 
     def paths(self, directory: Path) -> dict[str, Path]:
         """Give the files by their kinds, as of `house_lines`."""
@@ -81,24 +67,13 @@ class Output(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TownTile:
-    """A tile of a town: what `write_tile` makes its files of.
+    """A tile of a town: what `write_tile` makes its files of."""
 
-    Attributes
-    ----------
-    directory : Path
-        Folder of the town.
-    town, density, lidar, class_errors, output
-        As of `write_town`.
-    box : tuple of 4 floats
-        Of the tile (m).
-    numbers : tuple of 2 ints
-        Of the tile.
-    """
-
-    directory: Path
+    directory: Path  # folder of the town
+    # As of `write_town`.
     town: Town
-    box: Box
-    numbers: tuple[int, int]
+    box: Box  # of the tile (m)
+    numbers: tuple[int, int]  # of the tile
     density: float
     lidar: float
     class_errors: float

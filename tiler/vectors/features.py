@@ -11,58 +11,40 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Features of a layer as they are stored.
+    """Features of a layer as they are stored."""
 
-    Attributes
-    ----------
-    wkb : object, (n,)
-        Geometries as well-known binary (bytes); None where there is none.
-    columns : dict of str to (n,) arrays
-        Values of the attributes that were asked for.
-    warned : tuple of str
-        What the reader warned of, each once.
-    fids : int64, (n,)
-        The numbers that the file, or its reader, gives them: rows of a Shapefile and of Parquet count from 0.
-    broken : dict of int to str
-        Why a geometry that is None cannot be read, by row; None in another row means that the file has none.
-    curved : frozenset of int
-        Rows whose arcs GDAL made segments of 4 degrees.
-    """
-
-    wkb: NDArray[np.object_]
-    columns: dict[str, NDArray[Any]]
-    warned: tuple[str, ...]
+    wkb: NDArray[np.object_]  # (n,): geometries as well-known binary (bytes); None where there is none
+    columns: dict[str, NDArray[Any]]  # values of the attributes that were asked for
+    warned: tuple[str, ...]  # what the reader warned of, each once
+    # (n,): the numbers that the file, or its reader, gives them: rows of a Shapefile and of Parquet count from 0
     fids: NDArray[np.int64]
+    # Why a geometry that is None cannot be read, by row; None in another row means that the file has none.
     broken: dict[int, str]
-    curved: frozenset[int] = frozenset()
+    curved: frozenset[int] = frozenset()  # rows whose arcs GDAL made segments of 4 degrees
 
 
 def to_objects(items: list[Any]) -> NDArray[np.object_]:
-    """Put values into an array of objects, each as it is.
-
-    Parameters
-    ----------
-    items : list
-        Anything, lists and None included.
-
-    Returns
-    -------
-    object, (n,)
-    """
+    """Put values, lists and None included, into an array of objects (n,), each as it is."""
     array = np.empty(len(items), dtype=np.object_)
     array[:] = items
     return array
 
 
-def decode_text(data: bytes | None, warned: list[str]) -> str | None:
-    """Decode text of a file that states no encoding, or a wrong one: UTF-8, else Windows-1252.
+def text_of(value: Any) -> str:
+    """Write a value as text without spaces around it; whole floats as integers, ``""`` for none, as NaN is.
 
-    Parameters
-    ----------
-    data : bytes or None
-        As stored.
-    warned : list of str
-        Gets a line for a text that is no UTF-8.
+    Examples
+    --------
+    >>> text_of(" Flat "), text_of(1030.0), text_of(None), text_of(float("nan"))
+    ('Flat', '1030', '', '')
+    """
+    if isinstance(value, float | np.floating):
+        return f"{value:.17g}" if np.isfinite(value) else ""
+    return "" if value is None else str(value).strip()
+
+
+def decode_text(data: bytes | None, warned: list[str]) -> str | None:
+    """Decode text of a file that states no encoding, or a wrong one: UTF-8, else Windows-1252, which is told.
 
     Examples
     --------

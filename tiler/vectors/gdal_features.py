@@ -24,24 +24,9 @@ _UNREADABLE = "its geometry cannot be parsed"
 def scan_features(
     layer: GdalLayer, columns: Sequence[str], box: Box | None, *, geometry: bool, batch: int
 ) -> Iterator[Features]:
-    """Read the features of a layer by batches, which GDAL streams by Arrow.
+    """Read the features of a layer by batches, which GDAL streams by Arrow; parameters as of `layers.scan_layer`.
 
-    Parameters
-    ----------
-    layer : GdalLayer
-        From `open_layer`.
-    columns : sequence of str
-        Attributes to read.
-    box : tuple of 4 floats, or None
-        Features away from it may be left out; those whose place is unknown are not. None for all features.
-    geometry : bool
-        False leaves the geometries out: None in every row.
-    batch : int
-        Features in memory at once.
-
-    Yields
-    ------
-    Features
+    Features whose place is unknown are among those of a box.
 
     Raises
     ------

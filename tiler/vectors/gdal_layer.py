@@ -29,33 +29,15 @@ _OSM_POLYGONS = "multipolygons"
 
 @dataclass(frozen=True)
 class GdalLayer:
-    """How GDAL reads a layer, and what it says about it.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    source : Path or bytes
-        What is opened: the file, or a VRT that points to it.
-    name : str
-        Name of the layer.
-    options : dict of str to str
-        Open options of the driver.
-    info : dict
-        As `pyogrio.read_info` gives it.
-    driver : str
-        Name of GDAL's driver for the file, ``""`` where that is not known.
-    chosen : bool
-        Whether the layer was chosen among several.
-    """
+    """How GDAL reads a layer, and what it says about it."""
 
     path: Path
-    source: Path | bytes
+    source: Path | bytes  # what is opened: the file, or a VRT that points to it
     name: str
-    options: dict[str, str]
-    info: dict[str, Any]
-    driver: str
-    chosen: bool
+    options: dict[str, str]  # open options of the driver
+    info: dict[str, Any]  # as `pyogrio.read_info` gives it
+    driver: str  # name of GDAL's driver for the file, ``""`` where that is not known
+    chosen: bool  # whether the layer was chosen among several
 
     @property
     def fid_name(self) -> str:
@@ -87,18 +69,9 @@ class GdalLayer:
 
 
 def open_layer(path: Path, layer: str) -> GdalLayer:
-    """Find a layer and describe it without reading its features.
+    """Find a layer of a file on a disk, and describe it without reading its features.
 
-    Parameters
-    ----------
-    path : Path
-        A file on a disk.
-    layer : str
-        Name of the layer; ``""`` for the only one that has geometries, or that of the polygons in OSM data.
-
-    Returns
-    -------
-    GdalLayer
+    `layer` is its name; ``""`` for the only one that has geometries, or that of the polygons in OSM data.
 
     Raises
     ------

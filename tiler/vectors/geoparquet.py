@@ -35,12 +35,7 @@ def is_parquet(path: Path) -> bool:
 
 
 def describe(path: Path) -> tuple[GeometryColumn, tuple[str, ...], int, Box | None]:
-    """Read the metadata of a Parquet file with geometries.
-
-    Returns
-    -------
-    tuple
-        The column with the geometries, names of the attributes, number of features, and extent as stated or None.
+    """Read from a Parquet file its column of geometries, attributes, number of features, and extent or None.
 
     Raises
     ------
@@ -59,35 +54,10 @@ def describe(path: Path) -> tuple[GeometryColumn, tuple[str, ...], int, Box | No
 
 
 def scan(path: Path, columns: Sequence[str], box: Box | None, *, geometry: bool, batch: int) -> Iterator[Features]:
-    """Read the features of the groups of rows that may meet a box, by batches.
+    """Read the features of the groups of rows that may meet a box, by batches, as `layers.scan_layer`.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    columns : sequence of str
-        Attributes to read.
-    box : tuple of 4 floats, or None
-        xmin, ymin, xmax, ymax in the file's CRS; None for all features.
-    geometry : bool
-        False leaves the geometries out: None in every row.
-    batch : int
-        Features in memory at once, beside those that are kept.
-
-    Yields
-    ------
-    Features
-        Numbered by their rows in the file, from 0.
-
-    Raises
-    ------
-    InputError
-        As `describe`.
-
-    Notes
-    -----
-    Row groups are left out where the file has a bounding box column, and its statistics say that the group
-    is away from the box.
+    Features are numbered by their rows in the file, from 0. Row groups are left out where the file has a bounding
+    box column, and its statistics say that the group is away from the box.
     """
     with _arrow_as_input_error(path):
         table, column = _open(path, columns)

@@ -4,6 +4,7 @@ import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import pyproj
@@ -16,7 +17,7 @@ from tiler.vectors import geoparquet
 from tiler.vectors.features import Box, Features, to_objects
 from tiler.vectors.gdal_features import check_readable, scan_features
 from tiler.vectors.gdal_layer import GdalLayer, has_whole_ids, open_layer
-from tiler.vectors.osm_tags import STOREY, find_osm_tags
+from tiler.vectors.osm_tags import STOREY, OsmTags, find_osm_tags
 from tiler.vectors.vector_forms import read_head
 
 BATCH = 50_000  # features in memory at once
@@ -26,40 +27,24 @@ _DEGREE = 111_320.0  # m, of latitude
 
 @dataclass(frozen=True)
 class Layer:
-    """What one layer of a vector file says about itself.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    name : str
-        Name of the layer; ``""`` for Parquet, which has one.
-    crs : pyproj.CRS or None
-        As stated, None if not.
-    fields : tuple of str
-        Names of the attributes.
-    n_features : int
-        Number of features; -1 if the driver would have to read them all to know.
-    extent : tuple of 4 floats, or None
-        xmin, ymin, xmax, ymax in the file's CRS; None if unknown or if there are no features.
-    fid_name : str
-        What stands for the numbers of the features where it is asked for as an attribute: of a GeoJSON with whole
-        numbers as ids ``"id"``, which is among `fields` then; the column of a GeoPackage, which is not.
-    notes : tuple of Note
-        What was assumed about the file.
-    gdal : GdalLayer or None
-        How GDAL reads it; None for Parquet.
-    """
+    """What one layer of a vector file says about itself."""
 
     path: Path
-    name: str
-    crs: pyproj.CRS | None
+    name: str  # name of the layer; ``""`` for Parquet, which has one
+    crs: pyproj.CRS | None  # as stated, None if not
     fields: tuple[str, ...]
-    n_features: int
-    extent: Box | None
+    n_features: int  # number of features; -1 if the driver would have to read them all to know
+    extent: Box | None  # xmin, ymin, xmax, ymax in the file's CRS; None if unknown or if there are no features
+    # What stands for the numbers of the features where it is asked for as an attribute: of a GeoJSON with whole
+    # numbers as ids ``"id"``, which is among `fields` then; the column of a GeoPackage, which is not.
     fid_name: str = ""
-    notes: tuple[Note, ...] = ()
-    gdal: GdalLayer | None = None
+    notes: tuple[Note, ...] = ()  # what was assumed about the file
+    gdal: GdalLayer | None = None  # how GDAL reads it; None for Parquet
+
+    @cached_property
+    def tags(self) -> OsmTags | None:
+        """Tags of OSM data; None for other data."""
+        return find_osm_tags(self.fields)
 
     @property
     def metre(self) -> float:
@@ -81,10 +66,6 @@ def describe_layer(path: Path, layer: str = "") -> Layer:
         ranges; all others are fetched first.
     layer : str
         Name of the layer; ``""`` for the only one that has geometries.
-
-    Returns
-    -------
-    Layer
 
     Raises
     ------
@@ -148,15 +129,12 @@ def scan_layer(
     ------
     InputError
         If the file is damaged.
-
-    Notes
-    -----
-    A file with a spatial index is read by query, another from end to end: see `scan_features`.
     """
     if layer.gdal is None:
         yield from geoparquet.scan(layer.path, columns, box, geometry=geometry, batch=batch)
         return
-    if box is not None and layer.extent is not None and _holds(box, layer.extent):
+    at = layer.extent
+    if box and at and box[0] <= at[0] and box[1] <= at[1] and box[2] >= at[2] and box[3] >= at[3]:
         box = None  # all features: then their number is known, and can be checked
     n_read = 0
     own = [name for name in columns if name != layer.fid_name or name in layer.gdal.fields]
@@ -181,11 +159,6 @@ def _notes(gdal: GdalLayer) -> Iterator[Note]:
     if gdal.chosen and gdal.driver != "OSM":
         detail = f"{gdal.name}; building:part in the layer lines is not read: give the extract itself for it"
         yield Note("footprints-layer-chosen", name, detail=detail)
-
-
-def _holds(box: Box, extent: Box) -> bool:
-    low = box[0] <= extent[0] and box[1] <= extent[1]
-    return low and box[2] >= extent[2] and box[3] >= extent[3]
 
 
 def _stored_crs(path: Path, text: str) -> pyproj.CRS | None:

@@ -25,18 +25,10 @@ _SIGNS = str.maketrans(
 
 
 def metres_of(value: Any) -> float:
-    """Read a length.
+    """Read a length (m).
 
-    Parameters
-    ----------
-    value : Any
-        A number (m), or text: a number with a point or a comma before its decimals and metres, centimetres,
-        feet, inches or feet and inches behind it.
-
-    Returns
-    -------
-    float
-        Length (m); NaN where it cannot be read, as text with thousands marks, ranges or other units.
+    A number, or text with a point or comma before its decimals and a unit, or feet and inches, behind it; NaN
+    where it cannot be read, as text with thousands marks, ranges or other units.
 
     Examples
     --------

@@ -12,32 +12,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tiler.vectors.features import text_of, to_objects
 from tiler.vectors.lengths import metres_of, number_of
 
 STOREY = 3.0  # m; height of a level where a building has only their number
-# Attributes that only OSM data have, in lower case.
-_MARKS = ("osm_id", "osm_way_id", "@id", "full_id", "osmid")
-_TAGS = ("other_tags", "all_tags")  # all further tags in one text: hstore, or JSON from GDAL 3.7 on
+# Attributes that only OSM data have, in lower case, with colons for underscores.
+_MARKS = ("osm:id", "osm:way:id", "@id", "full:id", "osmid")
+_TAGS = ("other:tags", "all:tags")  # all further tags in one text: hstore, or JSON from GDAL 3.7 on
 _PAIR = re.compile(r'"((?:[^"\\]|\\.)*)"\s*(?:=>|:)\s*"((?:[^"\\]|\\.)*)"')
 _KEYS = ("building", "building:part", "height", "building:levels", "min_height", "building:min_level")
 
 
 @dataclass(frozen=True)
 class OsmTags:
-    """Where a layer of OSM data keeps what a run needs.
+    """Where a layer of OSM data keeps what a run needs."""
 
-    Attributes
-    ----------
-    column : mapping of str to str
-        Attribute of each tag that has one of its own.
-    more : str
-        Attribute with all further tags as text, ``""`` for none.
-    relation_id, way_id : str
-        Attributes with the ids of relations and of ways, ``""`` where the layer has not both.
-    """
-
-    column: Mapping[str, str]
-    more: str
+    column: Mapping[str, str]  # attribute of each tag that has one of its own
+    more: str  # attribute with all further tags as text, ``""`` for none
+    # Attributes with the ids of relations and of ways, ``""`` where the layer has not both.
     relation_id: str
     way_id: str
 
@@ -51,10 +43,7 @@ class OsmTags:
 def find_osm_tags(fields: Sequence[str]) -> OsmTags | None:
     """Find the tags of OSM data among the attributes of a layer.
 
-    Returns
-    -------
-    OsmTags or None
-        None for other data: without an id of OSM, or without the tag ``building``.
+    None for other data: without an id of OSM, or without the tag ``building``.
 
     Examples
     --------
@@ -63,10 +52,10 @@ def find_osm_tags(fields: Sequence[str]) -> OsmTags | None:
     >>> find_osm_tags(["id", "building"]) is None
     True
     """
-    lower = {field.lower().replace("_", ":") if field[:1] != "@" else field: field for field in reversed(fields)}
-    column = {key: lower[key.replace("_", ":")] for key in _KEYS if key.replace("_", ":") in lower}
-    more = next((lower[name.replace("_", ":")] for name in _TAGS if name.replace("_", ":") in lower), "")
-    if not any(mark.replace("_", ":") in lower for mark in _MARKS) or not (more or "building" in column):
+    lower = {_plain(field): field for field in reversed(fields)}
+    column = {key: lower[_plain(key)] for key in _KEYS if _plain(key) in lower}
+    more = next((lower[name] for name in _TAGS if name in lower), "")
+    if not any(mark in lower for mark in _MARKS) or not (more or "building" in column):
         return None
     both = "osm:id" in lower and "osm:way:id" in lower
     ids = (lower["osm:id"], lower["osm:way:id"]) if both else ("", "")
@@ -74,18 +63,9 @@ def find_osm_tags(fields: Sequence[str]) -> OsmTags | None:
 
 
 def is_building(tags: OsmTags, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Tell the features with ``building=*`` or ``building:part=*``, whose value is not ``no``.
+    """Tell the features with ``building=*`` or ``building:part=*``, whose value is not ``no``: bool (n,).
 
-    Parameters
-    ----------
-    tags : OsmTags
-        Of the layer.
-    columns : mapping of str to (n,) arrays
-        The attributes that `OsmTags.fields` names.
-
-    Returns
-    -------
-    bool, (n,)
+    `columns` has the attributes that `OsmTags.fields` names.
     """
     house, part = (values_of(tags, key, columns) for key in ("building", "building:part"))
     return np.array([_is_set(a) or _is_set(b) for a, b in zip(house, part, strict=True)], np.bool_)
@@ -103,16 +83,10 @@ def is_raised(tags: OsmTags, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.
 
 
 def osm_ids(tags: OsmTags, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.object_]:
-    """Give the ids of ways and relations, which are numbered apart, as ``way/123`` and ``relation/7``.
-
-    Returns
-    -------
-    object, (n,)
-        None where there is neither.
-    """
+    """Give the ids of ways and relations as ``way/123`` and ``relation/7``; None where there is neither."""
     pairs = zip(columns[tags.relation_id], columns[tags.way_id], strict=True)
-    ids = [_prefixed("relation", relation) or _prefixed("way", way) for relation, way in pairs]
-    return np.array([*ids, None], np.object_)[:-1]
+    ids = [_prefixed("relation", relation) or _prefixed("way", way) or None for relation, way in pairs]
+    return to_objects(ids)
 
 
 def osm_heights(
@@ -132,10 +106,7 @@ def osm_heights(
     given, levels = (values_of(tags, key, columns) for key in ("height", "building:levels"))
     height = np.array([metres_of(value) for value in given], np.float64)
     bad = ~(np.isfinite(height) & (height > 0))
-    unread = np.array(
-        [value if wrong and _text(value) else None for value, wrong in zip(given, bad, strict=True)] + [None],
-        np.object_,
-    )[:-1]
+    unread = to_objects([v if wrong and text_of(v) else None for v, wrong in zip(given, bad, strict=True)])
     by_levels = STOREY * np.array([number_of(value) for value in levels], np.float64)
     by_levels[~(np.isfinite(by_levels) & (by_levels > 0))] = np.nan
     return np.where(bad, by_levels, height), bad & np.isfinite(by_levels), unread
@@ -148,7 +119,7 @@ def values_of(tags: OsmTags, key: str, columns: Mapping[str, NDArray[Any]]) -> l
     if not tags.more:
         return list(own)
     texts = columns[tags.more]
-    return [value if _text(value) else _parse(text).get(key) for value, text in zip(own, texts, strict=True)]
+    return [value if text_of(value) else _parse(text).get(key) for value, text in zip(own, texts, strict=True)]
 
 
 def tags_of(texts: NDArray[Any], keys: Sequence[str]) -> dict[str, list[str | None]]:
@@ -163,6 +134,10 @@ def tags_of(texts: NDArray[Any], keys: Sequence[str]) -> dict[str, list[str | No
     return {key: [tags.get(key) for tags in parsed] for key in keys}
 
 
+def _plain(field: str) -> str:
+    return field.lower().replace("_", ":")
+
+
 def _parse(text: Any) -> dict[str, str]:
     if not isinstance(text, str):
         return {}
@@ -174,19 +149,9 @@ def _unescape(text: str) -> str:
 
 
 def _is_set(value: Any) -> bool:
-    text = _text(value).lower()
-    return text not in ("", "no", "false")
+    return text_of(value).lower() not in ("", "no", "false")
 
 
-def _prefixed(kind: str, value: Any) -> str | None:
-    text = _text(value)
-    if not text:
-        return None
-    return text if "/" in text else f"{kind}/{text}"
-
-
-def _text(value: Any) -> str:
-    """Write a value as text, whole floats as integers; ``""`` for none, as a column with nulls has NaN."""
-    if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
-        return ""
-    return f"{value:.17g}" if isinstance(value, float | np.floating) else str(value).strip()
+def _prefixed(kind: str, value: Any) -> str:
+    text = text_of(value)
+    return text if not text or "/" in text else f"{kind}/{text}"

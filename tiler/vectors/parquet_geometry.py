@@ -34,45 +34,19 @@ _NESTED = {
 
 @dataclass(frozen=True)
 class GeometryColumn:
-    """The column with the geometries.
-
-    Attributes
-    ----------
-    name : str
-        Its name.
-    encoding : str
-        ``"WKB"``, or one of GeoArrow: ``"polygon"`` and the like.
-    crs : pyproj.CRS or None
-        None where the file says that it is unknown, or where it says nothing and coordinates are no degrees.
-    bbox : list of float, or None
-        Extent, as GeoParquet has it.
-    covering : dict or None
-        Columns with the bounding box of each feature, as GeoParquet has them.
-    notes : tuple of Note
-        What was assumed.
-    """
+    """The column with the geometries."""
 
     name: str
-    encoding: str
+    encoding: str  # ``"WKB"``, or one of GeoArrow: ``"polygon"`` and the like
+    # None where the file says that it is unknown, or where it says nothing and coordinates are no degrees.
     crs: pyproj.CRS | None
-    bbox: list[float] | None = None
-    covering: dict[str, Any] | None = None
-    notes: tuple[Note, ...] = ()
+    bbox: list[float] | None = None  # extent, as GeoParquet has it
+    covering: dict[str, Any] | None = None  # columns with the bounding box of each feature, as GeoParquet has them
+    notes: tuple[Note, ...] = ()  # what was assumed
 
 
 def find_geometry(path: Path, table: Any) -> GeometryColumn:
-    """Find the column with the geometries.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    table : pyarrow.parquet.ParquetFile
-        The file opened.
-
-    Returns
-    -------
-    GeometryColumn
+    """Find the column with the geometries of a `pyarrow.parquet.ParquetFile`.
 
     Raises
     ------
@@ -107,19 +81,7 @@ def find_geometry(path: Path, table: Any) -> GeometryColumn:
 
 
 def read_geometry(column: Any, encoding: str) -> list[bytes | None]:
-    """Give the geometries of a batch as well-known binary.
-
-    Parameters
-    ----------
-    column : pyarrow.Array
-        Of any encoding.
-    encoding : str
-        Of `GeometryColumn`.
-
-    Returns
-    -------
-    list of bytes or None
-    """
+    """Give the geometries of a batch, a `pyarrow.Array` of some encoding, as well-known binary."""
     if encoding == "WKB":
         blobs: list[bytes | None] = column.to_pylist()
         return blobs

@@ -3,9 +3,8 @@
 import re
 from typing import Any
 
-import numpy as np
-
 from pipeline.data.roof_forms import ROOF_SHAPES
+from tiler.vectors.features import text_of
 from tiler.vectors.lengths import metres_of
 
 LEAST_ANGLE, MOST_ANGLE = 1.0, 80.0  # degrees, of a roof that is not flat
@@ -31,18 +30,9 @@ _DEGREES = re.compile(r"([+-]?\d+(?:[.,]\d+)?)\s*(?:°|deg|degs|degree|degrees)?
 
 
 def shape_of(value: Any) -> int:
-    """Read the shape of a roof.
+    """Read the shape of a roof: a word of ``roof:shape``, also with ``roof`` behind it, or a code of CityGML.
 
-    Parameters
-    ----------
-    value : Any
-        A word of ``roof:shape`` of OpenStreetMap, with or without ``roof`` behind it, or a code of CityGML, as
-        text or number.
-
-    Returns
-    -------
-    int
-        Index into `ROOF_SHAPES`; `NOTHING` where the value is missing, `NO_SHAPE` for any other.
+    Gives the index into `ROOF_SHAPES`; `NOTHING` where the value is missing, `NO_SHAPE` for any other.
 
     Examples
     --------
@@ -51,7 +41,7 @@ def shape_of(value: Any) -> int:
     >>> shape_of("onion") == shape_of(1020) == NO_SHAPE, shape_of(None) == shape_of(" ") == NOTHING
     (True, True)
     """
-    text = word_of(value)
+    text = text_of(value)
     if not text:
         return NOTHING
     number = metres_of(text)
@@ -60,19 +50,6 @@ def shape_of(value: Any) -> int:
     words = re.sub(r"[\s_-]+", " ", text.lower()).removesuffix(" roof")
     name = _SAME_SHAPE.get(words, words)
     return ROOF_SHAPES.index(name) if name in ROOF_SHAPES else NO_SHAPE
-
-
-def word_of(value: Any) -> str:
-    """Write a value as text without spaces around it; whole floats as integers, ``""`` for none.
-
-    Examples
-    --------
-    >>> word_of(" Flat "), word_of(1030.0), word_of(None), word_of(float("nan"))
-    ('Flat', '1030', '', '')
-    """
-    if isinstance(value, float | np.floating):
-        return f"{value:.17g}" if np.isfinite(value) else ""
-    return "" if value is None else str(value).strip()
 
 
 def degrees_of(value: Any) -> float:
@@ -108,4 +85,4 @@ def direction_of(value: Any) -> float:
 
 def across_of(value: Any) -> float:
     """Read an orientation: 1 for ``across`` (a ridge along the shorter side), 0 for ``along``, NaN for others."""
-    return {"across": 1.0, "along": 0.0}.get(word_of(value).lower(), float("nan"))
+    return {"across": 1.0, "along": 0.0}.get(text_of(value).lower(), float("nan"))

@@ -62,17 +62,7 @@ def find_wide_columns(path: Path) -> dict[str, int]:
 def is_null_shape(path: Path, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Tell the shapes that say themselves that they are null from those that cannot be read.
 
-    Parameters
-    ----------
-    path : Path
-        The .shp, with its index beside it.
-    rows : int64, (n,)
-        Rows without a geometry.
-
-    Returns
-    -------
-    bool, (n,)
-        False too where the index or the file ends before.
+    Of rows without a geometry, int64 (n,), to bool (n,); False too where the index or the file ends before.
     """
     index = _beside(path, ".shx")
     found = np.zeros(len(rows), np.bool_)

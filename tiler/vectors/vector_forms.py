@@ -32,11 +32,8 @@ _OSM_XML = re.compile(rb"(<\?xml[^>]*\?>)?\s*(<!--(?:[^-]|-(?!->))*-->\s*)*<osm[
 def check_form(path: Path) -> None:
     """Refuse a vector file that GDAL should not open.
 
-    Parameters
-    ----------
-    path : Path
-        Shapefile, GeoPackage, GeoJSON (also as a sequence, TopoJSON and Esri JSON), FlatGeobuf or an extract of
-        OpenStreetMap, told by its content; or a folder, such as an Esri geodatabase.
+    Taken are Shapefile, GeoPackage, GeoJSON (also as a sequence, TopoJSON and Esri JSON), FlatGeobuf and extracts
+    of OpenStreetMap, told by their content; and folders, such as an Esri geodatabase.
 
     Raises
     ------

@@ -1,10 +1,14 @@
 """Well-known binary from files, parsed only where its sizes and its nesting can do no harm (step 1.2)."""
 
 import struct
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+
+from tiler.vectors.features import to_objects
 
 # GEOS descends into nested geometries by recursion and ends the process where the stack ends: 10,000 levels do.
 DEEPEST = 8  # levels of collections; polygons of a multipolygon are two
@@ -57,6 +61,17 @@ def parse_wkb(wkb: NDArray[np.object_]) -> tuple[NDArray[np.object_], set[int], 
         if wkb[row] is not None:
             broken.setdefault(row, "its geometry cannot be parsed")
     return geometry, surfaces, broken
+
+
+def join_blobs(blobs: Sequence[bytes]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Put bytes one behind the other: uint8 (k,), and where each begins and the last ends, int64 (n + 1,)."""
+    return np.frombuffer(b"".join(blobs), np.uint8), np.cumsum([0, *map(len, blobs)], dtype=np.int64)
+
+
+def cut_blobs(data: NDArray[np.uint8], start: NDArray[np.int64]) -> NDArray[np.object_]:
+    """Give the bytes that `join_blobs` joined, or of a range of them: the first start is that of the data."""
+    whole, ends = data.tobytes(), (start - start[0]).tolist()
+    return to_objects([whole[first:last] for first, last in pairwise(ends)])
 
 
 def is_curve(blob: bytes | None) -> bool:

@@ -14,9 +14,10 @@ from pipeline.city_model.roof_areas import block_heights
 from pipeline.data.citymodel import CityModel
 from pipeline.data.roofs import Roofs
 from tests.helpers import iso19107
+from tests.helpers.written_models import read_city_model
 from tiler.check.solid_proofs import check_solids
 from tiler.citymodels.building_index import spool_vertices
-from tiler.citymodels.cityjson import read_city_model, write_city_model
+from tiler.citymodels.cityjson import write_city_model
 
 Json = dict[str, Any]
 

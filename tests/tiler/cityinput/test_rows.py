@@ -24,11 +24,12 @@ from tests.tiler.cityinput.models import (
 from tiler.cityinput.faces import ModelBuilding
 from tiler.cityinput.levels import list_attempts, rank_levels
 from tiler.cityinput.model_blocks import ModelBlock, Wanted, read_model_blocks
-from tiler.cityinput.row_arrays import RowPacker, find_ranges, unpack_rows
+from tiler.cityinput.row_arrays import RowPacker, unpack_rows
 from tiler.cityinput.rows import ModelRows, make_rows
 from tiler.cityinput.samples import grid_faces, grid_polygons
 from tiler.cityinput.sources import scan_model
 from tiler.georeference.frame import AS_IT_IS, Frame
+from tiler.pointclouds.cells import ranges_near
 
 EVERYWHERE = (0.0, 0.0, 1e7, 1e7)
 ALL = Wanted("auto", "", roof_points=True, ground_points=True)
@@ -315,5 +316,5 @@ def test_rows_come_back_from_their_arrays(tmp_path: Path) -> None:
         assert found.roofs.plane.tolist() == rows.roofs.plane[surfaces].tolist()
         assert shapely.equals(found.surfaces, rows.surfaces[surfaces]).all()
     box = (*rows.outlines[0].bounds,)
-    near = find_ranges(whole["model_cell_box"], whole["model_cell_start"], 12, box)
+    near = ranges_near(whole["model_cell_box"], np.append(whole["model_cell_start"], 12), box)
     assert any(first <= 0 < last for first, last in near)

@@ -17,14 +17,15 @@ from shapely.affinity import rotate, translate
 
 from pipeline.city_model.solids import build_solids
 from pipeline.data.citymodel import CityModel, number_ids, take_model
-from pipeline.data.errors import ConfigError, InputError, OutputError
+from pipeline.data.errors import ConfigError, OutputError
 from pipeline.data.notes import Note
 from pipeline.data.roofs import flat_roofs
 from tests.helpers.campaigns import examples
 from tests.helpers.cityjson_rules import area_vector, broken, file_faults, solid_faults, volume
 from tests.helpers.iso19107 import check_solids
+from tests.helpers.written_models import read_city_model
 from tiler.citymodels import cityjson
-from tiler.citymodels.cityjson import read_city_model, write_city_blocks, write_city_model
+from tiler.citymodels.cityjson import write_city_blocks, write_city_model
 
 BOUNDS = (120999.5, 486999.5, -2.5, 121200.0, 487200.0, 100.0)
 HOUSE = shapely.box(121000, 487000, 121010, 487008)
@@ -354,18 +355,6 @@ def test_a_folder_in_the_way_leaves_nothing_behind(target: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
         write(target, make_model(HOUSE))
     assert list(target.parent.iterdir()) == [target]
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"CityObjects": 3}', "\udcff"])
-def test_a_foreign_file_is_refused(target: Path, text: str) -> None:
-    target.write_bytes(text.encode("utf-8", "surrogateescape"))
-    with pytest.raises(InputError, match=r"citymodel.city.json: not a city model of citystitch"):
-        read_city_model(target)
-
-
-def test_a_missing_file_is_named(target: Path) -> None:
-    with pytest.raises(InputError, match=r"citymodel.city.json: cannot be read \(No such file"):
-        read_city_model(target)
 
 
 SOLID = ["CityObjects", "b1", "geometry", 1]

@@ -15,7 +15,8 @@ from pipeline.data.citymodel import CityModel
 from pipeline.data.errors import CityError, InputError, OutputError
 from pipeline.data.roofs import flat_roofs
 from tests.helpers.cityjson_rules import file_faults, solid_faults
-from tiler.citymodels.cityjson import read_city_model, write_city_model
+from tests.helpers.written_models import read_city_model
+from tiler.citymodels.cityjson import write_city_model
 from tiler.cli.main import main
 from tiler.export.export import export_run
 from tiler.formats import gpkg

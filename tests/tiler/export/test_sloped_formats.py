@@ -16,6 +16,7 @@ from pipeline.data.citymodel import CityModel
 from pipeline.data.mesh import Marker
 from pipeline.data.roofs import ROOF_METHODS, is_flat, roof_heights
 from tests.helpers.foam_reader import read_poly_mesh
+from tests.helpers.written_models import read_city_model
 from tests.tiler.export.test_formats_buildings import READERS as BY_BUILDING
 from tests.tiler.export.test_formats_buildings import sorted_rows
 from tests.tiler.export.test_formats_cgns import corners_of
@@ -23,7 +24,6 @@ from tests.tiler.export.test_formats_glb import read_document, turned
 from tests.tiler.export.test_formats_openfoam import MESH, assert_in_order, volumes_of
 from tests.tiler.export.test_formats_surfaces import READERS as SURFACES
 from tests.tiler.export.test_formats_surfaces import Facets, facets_of, open_edges, volume
-from tiler.citymodels.cityjson import read_city_model
 from tiler.export.export import export_run, list_formats, load_format
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.store.out_folder import CITY_MODEL

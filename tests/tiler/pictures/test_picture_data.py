@@ -17,7 +17,7 @@ from pipeline.data.roofs import roof_heights
 from pipeline.quality.quality import measure_cells
 from tests.helpers.scene import PIECES, write_scene
 from tests.helpers.vtk_writers import write_vtp
-from tiler.citymodels.cityjson import read_city_model
+from tests.helpers.written_models import read_city_model
 from tiler.mesh_files.facet_quality import measure_facets
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp
 from tiler.pictures.city_model_data import DEEP, load_blocks

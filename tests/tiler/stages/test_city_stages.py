@@ -16,8 +16,8 @@ from pipeline.data.roof_forms import NO_FORM
 from pipeline.data.roofs import NOT_FITTED, flat_roofs
 from pipeline.quality.point_fidelity import HouseFidelity
 from tests.helpers.cityjson_rules import file_faults, solid_faults
+from tests.helpers.written_models import read_city_model
 from tiler.citymodels import cityjson
-from tiler.citymodels.cityjson import read_city_model
 from tiler.citymodels.tables import Buildings, no_buildings, pack_buildings, take_buildings
 from tiler.config.config import Config
 from tiler.engine.engine import Engine

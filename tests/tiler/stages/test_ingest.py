@@ -34,12 +34,12 @@ from tiler.footprints.footprint_index import (
     FootprintRows,
     join_footprints,
     scan_footprints,
-    select_footprints,
 )
+from tiler.footprints.footprint_source import open_source
 from tiler.footprints.repeated_ids import find_repeated_ids
 from tiler.georeference.frame import AS_IT_IS, Frame
 from tiler.pointclouds import las_chunks
-from tiler.pointclouds.cells import Box, select_cells
+from tiler.pointclouds.cells import Box, ranges_near, select_cells
 from tiler.pointclouds.clouds import find_clouds
 from tiler.pointclouds.ingest import CELL, PointBlock, read_cells
 from tiler.pointclouds.las_chunks import nodes_near, read_chunks, read_octree
@@ -379,12 +379,12 @@ def write_any(path: Path, shapes: list[shapely.Polygon], fields: dict[str, np.nd
 
 def scan(path: Path, bounds: Box = REGION, *, batch: int = 1000) -> list[FootprintBlock]:
     height = "h" if "h" in describe_layer(path).fields else ""
-    return list(scan_footprints(path, crs=RD, bounds=bounds, height_attribute=height, batch=batch))
+    return list(scan_footprints(open_source(path, crs=RD, bounds=bounds, height_attribute=height), batch=batch))
 
 
 def in_box(blocks: list[FootprintBlock], box: Box) -> Footprints:
     """Read a box back as a reader of the store does: ranges of rows, then the join."""
-    ranges = [(block, select_footprints(block.cell_box, block.start, box)) for block in blocks]
+    ranges = [(block, ranges_near(block.cell_box, block.start, box)) for block in blocks]
     return join_footprints([take_rows(block.rows, *pair) for block, pairs in ranges for pair in pairs], box)
 
 

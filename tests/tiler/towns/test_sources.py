@@ -16,7 +16,7 @@ from tests.tiler.convert.test_convert import validate_gml
 from tests.tiler.towns.test_towns import read_document
 from tiler.cli.main import main
 from tiler.cli.parser import BLOCK_HEIGHTS, TOWN_STYLES, TOWN_WALLS
-from tiler.towns.parameter_files import read_json, write_json
+from tiler.towns.parameter_files import house_json, read_json
 from tiler.towns.styles import STYLES
 
 RING = shapely.Polygon([(0, 0), (12, 0), (12, 6), (6, 6), (6, 12), (0, 12)])
@@ -73,7 +73,7 @@ def test_attributes_win_over_rules(tmp_path: Path, capsys: pytest.CaptureFixture
     assert (tmp_path / "u/town.city.jsonl").read_bytes() == (tmp_path / "t/town.city.jsonl").read_bytes()
     row = json.loads((tmp_path / "t/parameters.jsonl").read_text().splitlines()[1])
     assert row["id"] == "b"
-    write_json([b], tmp_path / "edited.jsonl")
+    (tmp_path / "edited.jsonl").write_text(house_json(b))
     again = ["--parameters", str(tmp_path / "edited.jsonl")]
     assert main(["synth", str(tmp_path / "v"), *style, *again]) == 0
     assert list(read_document(tmp_path / "v/town.city.jsonl")["CityObjects"]) == ["b"]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,23 +16,37 @@ import pytest
 import shapely
 
 from pipeline.architecture.heights import house_heights
-from pipeline.architecture.levels import LEVELS
+from pipeline.architecture.levels import LEVELS, Footprint
 from pipeline.architecture.parameters import House
 from pipeline.architecture.rules import PRESETS
 from pipeline.data.errors import ConfigError, InputError
 from tests.helpers.iso19107 import check_solids
 from tiler.cityinput.cityjson import read_buildings, read_objects
 from tiler.cli.main import main
-from tiler.towns.parameter_files import read_json, read_xml, write_json, write_xml
+from tiler.towns.parameter_files import XML_END, XML_HEAD, house_json, house_xml, read_json, read_xml
 from tiler.towns.rule_files import read_rules, rule_schema
 from tiler.towns.styles import STYLES
-from tiler.towns.town import list_houses, open_town, write_town
-from tiler.towns.town_models import write_models
+from tiler.towns.town import open_town, write_town
+from tiler.towns.town_models import house_feature, model_head
 from tiler.towns.town_tile import ModelOptions
 
 
 def houses_of(style: str, size: float) -> list[House]:
-    return list(list_houses(open_town(size, style, rules=None, seed=4, relief=10)))
+    town = open_town(size, style, rules=None, seed=4, relief=10)
+    return list(town.houses(town.bounds))
+
+
+def write_json(houses: Sequence[House], path: Path) -> None:
+    path.write_text("".join(map(house_json, houses)))
+
+
+def write_xml(houses: Sequence[House], path: Path) -> None:
+    path.write_text(XML_HEAD + "".join(map(house_xml, houses)) + XML_END)
+
+
+def write_models(houses: Sequence[House], path: Path, levels: Sequence[str], walls: Footprint = "walls") -> None:
+    lines = (house_feature(house, levels=levels, footprint=walls) for house in houses)
+    path.write_text(model_head(pyproj.CRS(3006)) + "".join(lines))
 
 
 def read_document(path: Path) -> dict[str, Any]:
@@ -57,7 +72,8 @@ def _shift(numbers: Any, by: int) -> Any:
 def test_all_solids_are_valid(tmp_path: Path, style: str, size: float, walls: Any) -> None:
     houses = houses_of(style, size)[: 2 if walls == "walls" else 1]
     path = tmp_path / "town.city.jsonl"
-    assert write_models(houses, path, crs=pyproj.CRS(3006), levels=LEVELS, footprint=walls) == len(houses) > 0
+    assert houses
+    write_models(houses, path, LEVELS, walls)
     document = read_document(path)
     found = check_solids(document, LEVELS)
     assert len(found) >= 12 * len(houses)
@@ -70,7 +86,7 @@ def test_all_solids_are_valid(tmp_path: Path, style: str, size: float, walls: An
 def test_the_model_is_read_as_the_houses_are(tmp_path: Path) -> None:
     houses = houses_of("detached", 80.0)
     path = tmp_path / "town.city.jsonl"
-    write_models(houses, path, crs=pyproj.CRS(3006), levels=("1.2", "2.2"))
+    write_models(houses, path, ("1.2", "2.2"))
     _, objects = read_objects(path)
     buildings = [
         building for thing, vertices in objects for building in read_buildings(thing, vertices, "measuredHeight")
@@ -134,7 +150,7 @@ def test_a_town_has_the_same_bytes_and_its_points_lie_on_houses_and_ground(tmp_p
         strict=True,
     ):
         assert first.read_bytes() == second.read_bytes()
-    houses = list(list_houses(town))
+    houses = list(town.houses(town.bounds))
     las = laspy.read(one.clouds[0])
     xyz, built = np.column_stack((las.x, las.y, las.z)), np.asarray(las.classification) == 6
     assert len(xyz) == round(5.0 * 150 * 150)
@@ -194,7 +210,7 @@ def test_rules_are_files_with_a_schema(tmp_path: Path) -> None:
     )
     assert read_rules(tmp_path / "rules.toml") == read_rules(tmp_path / "rules.json")
     town = open_town(100, "grid", rules=tmp_path / "rules.toml", seed=1, relief=0)
-    assert {house.roof.shape for house in list_houses(town)} <= {"hipped", "pyramidal"}
+    assert {house.roof.shape for house in town.houses(town.bounds)} <= {"hipped", "pyramidal"}
 
 
 @pytest.mark.parametrize(
@@ -228,5 +244,5 @@ def test_edited_parameters_are_a_house_like_others(tmp_path: Path) -> None:
     house = replace(houses_of("detached", 60.0)[0], storeys=1, height=3.0, dormers=(), openings=())
     write_json([house], tmp_path / "houses.jsonl")
     (read,) = read_json(tmp_path / "houses.jsonl")
-    write_models([read], tmp_path / "m.city.jsonl", crs=pyproj.CRS(3006), levels=("3.3",))
+    write_models([read], tmp_path / "m.city.jsonl", ("3.3",))
     assert not any(check_solids(read_document(tmp_path / "m.city.jsonl"), ["3.3"]).values())
