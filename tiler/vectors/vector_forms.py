@@ -26,6 +26,10 @@ _BEGINNINGS = {
 # The first block of an OSM extract in protocol buffers, behind its length; and the first element of one in XML,
 # with nothing but the declaration and comments before: no entities, which may expand without end.
 _OSM_BLOCK, _OSM_BLOCK_PLACE = b"\x0a\x09OSMHeader", 4
+_CITY_MODELS = {
+    "CityJSON": re.compile(rb'"type"\s*:\s*"CityJSON(Feature)?"'),
+    "CityGML": re.compile(rb"<(\w+:)?CityModel[\s>]"),
+}
 _OSM_XML = re.compile(rb"(<\?xml[^>]*\?>)?\s*(<!--(?:[^-]|-(?!->))*-->\s*)*<osm[\s>]")
 
 
@@ -38,11 +42,14 @@ def check_form(path: Path) -> None:
     Raises
     ------
     InputError
-        If it is of another form, points elsewhere, is no regular file, or cannot be read.
+        If it is a city model or of another form, points elsewhere, is no regular file, or cannot be read.
     """
     if path.is_dir():
         return
     head = read_head(path)
+    for name, mark in _CITY_MODELS.items():
+        if mark.search(head):
+            raise InputError(f"{path}: is a city model ({name}), no vector file; give it as --buildings")
     pointer = next((mark for mark in _POINTERS if mark in head.lower()), None)
     start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     known = any(start.startswith(mark) for mark in _BEGINNINGS) or is_osm(head)

@@ -516,6 +516,21 @@ def test_other_xml_is_refused(tmp_path: Path, text: str) -> None:
         read(path)
 
 
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ('{"type": "CityJSON", "version": "2.0"}', "CityJSON"),
+        ('{"type":"CityJSONFeature"}', "CityJSON"),
+        ("<?xml version='1.0'?><core:CityModel xmlns:core='http://www.opengis.net/citygml/2.0'/>", "CityGML"),
+    ],
+)
+def test_a_city_model_is_told_from_footprints(tmp_path: Path, text: str, name: str) -> None:
+    path = tmp_path / "city.model"
+    path.write_text(text)
+    with pytest.raises(InputError, match=rf"is a city model \({name}\), no vector file; give it as --buildings"):
+        read(path)
+
+
 # Features that cannot be read
 
 GOOD, NEXT, FOURTH = (shapely.to_wkb(square(x, 5, 9)) for x in (0, 10, 30))  # where the index has them
