@@ -1,14 +1,18 @@
 """Fixtures that all tests share."""
 
+import fcntl
 import os
+import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+Once = Callable[[str, Callable[[Path], object]], Path]
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "data"
 
@@ -53,66 +57,60 @@ def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Finished run of a synthetic city on four tiles, not to be changed."""
-    from tiler.config.config import make_config
-    from tiler.interface.synth import write_city
-    from tiler.workflow.run import run
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """Fill a folder, in the first of pytest's processes that asks for it; nothing in it is to be changed."""
+    home = tmp_path_factory.getbasetemp()
+    home = home.parent if "PYTEST_XDIST_WORKER" in os.environ else home
 
-    folder = tmp_path_factory.mktemp("small")
-    files = write_city(folder / "city", size=300, buildings=15, density=1.0)
-    given = {
-        "pointcloud": [str(path) for path in files.clouds],
-        "footprints": str(files.footprints),
-        "out": str(folder / "out"),
-        "tile_size": 150.0,
-        "domain_height": 60.0,
-    }
-    run(make_config(given))
-    return folder / "out"
+    def fill(name: str, make: Callable[[Path], object]) -> Path:
+        folder = home / name
+        with (home / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (folder / "filled").exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                (folder / "filled").touch()
+        return folder
 
-
-@pytest.fixture(scope="session")
-def sloped_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Finished run of a synthetic city with roofs of all types on four tiles, not to be changed."""
-    from tiler.config.config import make_config
-    from tiler.interface.synth import write_city
-    from tiler.workflow.run import run
-
-    folder = tmp_path_factory.mktemp("sloped")
-    files = write_city(folder / "city", size=280, buildings=24, density=3.0, relief=6, seed=5, roofs="mixed")
-    given = {
-        "pointcloud": [str(path) for path in files.clouds],
-        "footprints": str(files.footprints),
-        "out": str(folder / "out"),
-        "roofs": "planes",
-        "tile_size": 150.0,
-        "domain_height": 60.0,
-    }
-    run(make_config(given))
-    return folder / "out"
+    return fill
 
 
 @pytest.fixture(scope="session")
-def amsterdam_run(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Finished run of central Amsterdam on four tiles, not to be changed."""
-    return run_amsterdam(shared_data, tmp_path_factory.mktemp("amsterdam") / "out", tile_size=300.0)
+def small_run(once: Once) -> Path:
+    """Finished run of a synthetic city on four tiles."""
+    from tests.helpers.synthetic import run_city
+
+    return once("small", run_city) / "out"
 
 
 @pytest.fixture(scope="session")
-def amsterdam_blocks_run(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Finished run of some blocks of Amsterdam on four tiles, for solvers; not to be changed."""
-    bounds = [120_750.0, 486_000.0, 121_050.0, 486_300.0]
-    return run_amsterdam(shared_data, tmp_path_factory.mktemp("blocks") / "out", tile_size=150.0, bounds=bounds)
+def sloped_run(once: Once) -> Path:
+    """Finished run of a synthetic city with roofs of all types on four tiles."""
+    from tests.helpers.synthetic import run_city
+
+    city = {"size": 280, "buildings": 24, "density": 3.0, "relief": 6, "seed": 5, "roofs": "mixed"}
+    return once("sloped", lambda folder: run_city(folder, city, roofs="planes")) / "out"
 
 
-def run_amsterdam(shared_data: Path, out: Path, **given: Any) -> Path:
-    """Mesh central Amsterdam; gives the folder of the run."""
+@pytest.fixture(scope="session")
+def amsterdam_run(shared_data: Path, once: Once) -> Path:
+    """Finished run of central Amsterdam on four tiles."""
+    return once("amsterdam", lambda folder: run_amsterdam(shared_data, folder / "out", tile_size=300.0)) / "out"
+
+
+@pytest.fixture(scope="session")
+def amsterdam_blocks_run(shared_data: Path, once: Once) -> Path:
+    """Finished run of some blocks of Amsterdam on four tiles, for solvers."""
+    given: dict[str, Any] = {"tile_size": 150.0, "bounds": [120_750.0, 486_000.0, 121_050.0, 486_300.0]}
+    return once("blocks", lambda folder: run_amsterdam(shared_data, folder / "out", **given)) / "out"
+
+
+def run_amsterdam(shared_data: Path, out: Path, **given: Any) -> None:
+    """Mesh central Amsterdam."""
     from tiler.config.config import make_config
     from tiler.workflow.run import run
 
     data = shared_data / "amsterdam"
     clouds = [str(path) for path in sorted((data / "tiles").iterdir())]
-    inputs = {"pointcloud": clouds, "footprints": str(data / "footprints.gpkg"), "out": str(out)}
-    run(make_config(inputs | given))
-    return out
+    run(make_config({"pointcloud": clouds, "footprints": str(data / "footprints.gpkg"), "out": str(out)} | given))

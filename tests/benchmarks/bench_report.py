@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from tests.benchmarks.log_plot import draw_log_plot
+from matplotlib.figure import Figure
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 REPORT = DOCS / "benchmarks.md"
@@ -68,6 +67,22 @@ def fit_exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float | No
     if use.sum() < 2:
         return None
     return float(np.polyfit(np.log(n[use]), np.log(t[use]), 1)[0])
+
+
+def draw_log_plot(
+    path: Path, sizes: Sequence[float], series: Mapping[str, Sequence[float]], *, x: str, y: str
+) -> None:
+    """Draw lines over one axis, the last one thick, with a dashed line of slope one through its first value."""
+    figure = Figure(figsize=(10, 5.6))
+    axes = figure.subplots()
+    *_, (last, whole) = series.items()
+    for name, line in series.items():
+        places = [value if value > 0 else float("nan") for value in line]
+        axes.loglog(sizes, places, marker="o", label=name, linewidth=4 if name == last else 2)
+    axes.loglog(sizes, [whole[0] * size / sizes[0] for size in sizes], "--", color="#999999")
+    axes.set(xlabel=x, ylabel=y)
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.savefig(path, bbox_inches="tight")
 
 
 def write_report(kept: Mapping[str, Any]) -> None:

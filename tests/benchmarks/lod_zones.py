@@ -23,10 +23,10 @@ from skfem.helpers import dot, grad
 
 from pipeline.data.mesh import TetMesh
 from pipeline.quality.quality import measure_cells
+from tests.helpers.synthetic import city_files
 from tiler.config.config import make_config
 from tiler.config.zones import LOD, LOD_POINT
 from tiler.export.export import export_run
-from tiler.interface.synth import write_city
 from tiler.store.out_folder import CITY_MODEL
 from tiler.workflow.run import run
 
@@ -123,13 +123,8 @@ def main() -> None:
     parser.add_argument("--radius", type=float, default=80.0, help="of the focus (m)")
     given = parser.parse_args()
     n = round(480 * given.size**2 / 1e6)
-    city = write_city(given.folder / "city", size=given.size, buildings=n, density=2.0, roofs="mixed", seed=3)
-    whole = {
-        "pointcloud": [str(path) for path in city.clouds],
-        "footprints": str(city.footprints),
-        "tile_size": given.size / 2,
-        "overwrite": True,
-    }
+    whole = city_files(given.folder / "city", size=given.size, buildings=n, density=2.0, roofs="mixed", seed=3)
+    whole |= {"tile_size": given.size / 2, "overwrite": True}
     west, south, east, north = 318000.0, 6399000.0, 318000.0 + given.size, 6399000.0 + given.size
     middle = ((west + east) / 2, (south + north) / 2)
     focus = f"{middle[0]:g},{middle[1]:g},{given.radius:g},{given.mesh:g}"

@@ -11,9 +11,9 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw
 
+from tests.helpers.synthetic import city_files
 from tests.helpers.written_models import read_city_model
 from tiler.config.config import make_config
-from tiler.interface.synth import write_city
 from tiler.pictures.render import render_run
 from tiler.workflow.run import run
 
@@ -82,9 +82,8 @@ def amsterdam(name: str, out: Path, **options: Any) -> dict[str, Any]:
 def synthetic(folder: Path, out: Path, *, seed: int, relief: float = 20.0, **options: Any) -> dict[str, Any]:
     """Mesh a synthetic square kilometre with 500 buildings."""
     city = folder / f"city-{seed}-{relief:g}"
-    files = write_city(city, size=1000, buildings=500, relief=relief, seed=seed)
-    values = {"pointcloud": [str(p) for p in files.clouds], "footprints": str(files.footprints), "out": str(out)}
-    return run(make_config(values | {"overwrite": True, "roofs": "flat"} | options))
+    values = city_files(city, size=1000, buildings=500, relief=relief, seed=seed)
+    return run(make_config(values | {"out": str(out), "overwrite": True, "roofs": "flat"} | options))
 
 
 def union_error(out: Path) -> float:

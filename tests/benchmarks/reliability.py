@@ -20,7 +20,10 @@ ROOT = Path(__file__).resolve().parents[2]
 REPORT = ROOT / "docs" / "reliability.md"
 CODES = ("0", "1", "2", "3")
 # Tests of drawn cities and properties that have more rounds too, but no table.
-WITHOUT_TABLE = ("tests/pipeline", "tests/stitch", "tests/runs/test_sloped_runs.py", "tests/tiler/citymodels")
+WITHOUT_TABLE = (
+    *("tests/pipeline", "tests/stitch", "tests/tiler/citymodels"),
+    *("tests/runs/test_sloped_runs.py", "tests/runs/test_disk_faults.py"),
+)
 
 
 def fuzz_table(record: Any) -> list[str]:

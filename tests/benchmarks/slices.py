@@ -12,8 +12,8 @@ from typing import Any
 import pyvista as pv
 from PIL import Image
 
+from tests.helpers.synthetic import city_files
 from tiler.config.config import make_config
-from tiler.interface.synth import write_city
 from tiler.workflow.run import run
 
 SIZE, TILE, HEIGHT = 300.0, 150.0, 60.0  # m
@@ -57,9 +57,8 @@ def main() -> None:
     shape = (len(RUNS), 1)
     plotter = pv.Plotter(shape=shape, window_size=(WIDTH, len(RUNS) * DEPTH), border=False, off_screen=True)
     with tempfile.TemporaryDirectory() as folder:
-        city = write_city(Path(folder) / "city", size=SIZE, buildings=45, density=1.0, relief=20, seed=4)
-        given: dict[str, Any] = {"tile_size": TILE, "domain_height": HEIGHT}
-        given |= {"pointcloud": [str(path) for path in city.clouds], "footprints": str(city.footprints)}
+        given = city_files(Path(folder) / "city", size=SIZE, buildings=45, density=1.0, relief=20, seed=4)
+        given |= {"tile_size": TILE, "domain_height": HEIGHT}
         for k, (title, options) in enumerate(RUNS.items()):
             out = Path(folder) / str(k)
             start = time.perf_counter()

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipeline.columns.columns import expand_cells
@@ -24,7 +25,7 @@ TILES = {"1": 1200.0, "4": 600.0, "16": 300.0, "64": 150.0}
 NEAR = 20.0  # m from a seam
 PERCENTILES = (0, 1, 5, 50)
 MESHERS = {"adaptive": (), "layered": ("--mesher", "layered", "--layer-height", "5")}
-MEASURES = {"radius_ratio": "radius ratio", "min_dihedral": "least dihedral angle in degrees"}
+MEASURES = {"radius_ratio": "radius ratio", "min_dihedral": "least dihedral angle, degrees"}
 HEAD = ("| mesh | cells | 0 % | 1 % | 5 % | 50 % |", "|---|---|---|---|---|---|")
 REPORT = Path(__file__).resolve().parents[2] / "docs" / "tiles.md"
 
@@ -67,31 +68,14 @@ def row(title: str, values: NDArray[np.float64], base: NDArray[np.float64]) -> t
 
 def draw(path: Path, series: dict[str, NDArray[np.float64]]) -> None:
     """Draw the shares of cells by radius ratio, one line a number of tiles."""
-    from PIL import Image, ImageDraw
-
-    width, height, margin = 900, 420, 50
-    image = Image.new("RGB", (width, height), "white")
-    pen = ImageDraw.Draw(image)
-    colours = ("#000000", "#0072b2", "#d55e00", "#009e73")
-    shares = {name: np.histogram(values, 100, (0, 1))[0] / len(values) for name, values in series.items()}
-    top = max(float(share.max()) for share in shares.values())
-    pen.line([(margin, margin), (margin, height - margin), (width - margin, height - margin)], fill="black")
-    for tick in range(11):
-        x = margin + tick / 10 * (width - 2 * margin)
-        pen.line([(x, height - margin), (x, height - margin + 5)], fill="black")
-        pen.text((x - 8, height - margin + 8), f"{tick / 10:g}", fill="black")
-    pen.text((margin + 10, 15), "cells within 20 m of seams, by radius ratio (share of each mesh)", fill="black")
-    for k, (name, share) in enumerate(shares.items()):
-        line = [
-            (
-                margin + (i + 0.5) / 100 * (width - 2 * margin),
-                height - margin - value / top * (height - 2 * margin),
-            )
-            for i, value in enumerate(share)
-        ]
-        pen.line(line, fill=colours[k], width=2)
-        pen.text((margin + 20, 45 + 16 * k), name, fill=colours[k])
-    image.save(path, optimize=True)
+    figure = Figure(figsize=(9, 4.2))
+    axes = figure.subplots()
+    for name, values in series.items():
+        counts, edges = np.histogram(values, 100, (0, 1))
+        axes.stairs(counts / len(values), edges, label=name)
+    axes.set_title("cells within 20 m of seams, by radius ratio (share of each mesh)")
+    axes.legend()
+    figure.savefig(path)
 
 
 def main() -> int:
@@ -118,16 +102,8 @@ def main() -> int:
                 found[tiles] = cells_of(out)
             whole, places = found["1"]
             series: dict[str, NDArray[np.float64]] = {}
-            for measure, title in (
-                ("radius_ratio", "radius ratio"),
-                ("min_dihedral", "least dihedral angle, degrees"),
-            ):
-                lines += [
-                    f"## {mesher}: {title}",
-                    "",
-                    "| mesh | cells | 0 % | 1 % | 5 % | 50 % |",
-                    "|---|---|---|---|---|---|",
-                ]
+            for measure, title in MEASURES.items():
+                lines += [f"## {mesher}: {title}", "", *HEAD]
                 base = getattr(whole, measure)
                 lines.append(row("1 tile, all cells", base, base)[0])
                 for tiles, (quality, centre) in list(found.items())[1:]:

@@ -61,16 +61,25 @@ def find_house() -> House:
     return next(house for house in houses if len(house.dormers) == len(house.parts) == 2 and house.roof_windows)
 
 
+def show(plotter: pv.Plotter, surfaces: list[Surface], shift: np.ndarray, opacity: float = 1.0) -> None:
+    """Add surfaces and their edges."""
+    for surface in surfaces:
+        plotter.add_mesh(triangulate(surface).translate(shift), color=COLOURS[surface.kind], opacity=opacity)
+        for ring in (surface.border, *surface.holes):
+            plotter.add_mesh(pv.lines_from_points(np.array([*ring, ring[0]]) + shift), color="#444444")
+
+
+def show_house(plotter: pv.Plotter, house: House, level: str, shift: np.ndarray) -> None:
+    """Add a house with all that it has."""
+    for volume in make_level(house, level, solid=level < "2.3"):
+        show(plotter, volume.surfaces, shift)
+
+
 def draw(path: Path) -> None:
     """Draw the levels in rows of four."""
     house, plotter = find_house(), pv.Plotter(off_screen=True, window_size=(1400, 1120))
     for number, level in enumerate(LEVELS):
-        shift = np.array([24 * (number % 4), 0, -22 * (number // 4)])
-        for volume in make_level(house, level, solid=level < "2.3"):
-            for surface in volume.surfaces:
-                plotter.add_mesh(triangulate(surface).translate(shift), color=COLOURS[surface.kind])
-                for ring in (surface.border, *surface.holes):
-                    plotter.add_mesh(pv.lines_from_points(np.array([*ring, ring[0]]) + shift), color="#444444")
+        show_house(plotter, house, level, np.array([24 * (number % 4), 0, -22 * (number // 4)]))
     plotter.set_background("white")
     plotter.enable_parallel_projection()
     plotter.camera_position = [(85, -125, 48), (38, 0, -33), (0, 0, 1)]

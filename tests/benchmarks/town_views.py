@@ -11,28 +11,13 @@ import pyvista as pv
 
 from pipeline.architecture.interiors import INTERIORS, make_interior
 from pipeline.architecture.levels import make_level
-from pipeline.architecture.parameters import ROOF_SHAPES, House
-from pipeline.architecture.surfaces import Surface
-from tests.benchmarks.town_levels import COLOURS, find_house, triangulate
+from pipeline.architecture.parameters import ROOF_SHAPES
+from tests.benchmarks.town_levels import find_house, show, show_house
 from tiler.cli.main import main as citystitch
 from tiler.towns.parameter_files import read_json
 
 CLASSES = {1: "#999999", 2: "#b08d57", 5: "#4f8f3a", 6: "#b5533c"}
 TOWN = ("--style", "blocks", "--size", "110", "--lidar", "8", "--trees", "0.8", "--relief", "8", "--seed", "3")
-
-
-def show(plotter: pv.Plotter, surfaces: list[Surface], shift: np.ndarray, opacity: float = 1.0) -> None:
-    """Add surfaces and their edges."""
-    for surface in surfaces:
-        plotter.add_mesh(triangulate(surface).translate(shift), color=COLOURS[surface.kind], opacity=opacity)
-        for ring in (surface.border, *surface.holes):
-            plotter.add_mesh(pv.lines_from_points(np.array([*ring, ring[0]]) + shift), color="#444444")
-
-
-def show_house(plotter: pv.Plotter, house: House, level: str, shift: np.ndarray) -> None:
-    """Add a house with all that it has."""
-    for volume in make_level(house, level, solid=level < "2.3"):
-        show(plotter, volume.surfaces, shift)
 
 
 def look(plotter: pv.Plotter, title: str, way: tuple[float, float, float]) -> None:

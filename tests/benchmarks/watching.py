@@ -22,11 +22,11 @@ from unittest.mock import patch
 
 from rich.console import Console
 
+from tests.helpers.synthetic import city_files
 from tiler.config.config import Config, make_config
 from tiler.engine.stage import Scope
 from tiler.engine.task import Record
 from tiler.engine.watcher import RunStart, Watcher
-from tiler.interface.synth import write_city
 from tiler.monitoring.event_log import EventLog
 from tiler.monitoring.events import begin_file
 from tiler.monitoring.live_view import LiveView
@@ -100,11 +100,7 @@ def measure_pairs(pairs: int, folder: Path) -> tuple[list[tuple[float, float]], 
     ours, theirs = pty.openpty()
     threading.Thread(target=drain, args=(ours,), daemon=True).start()
     terminal = os.fdopen(theirs, "w")
-    files = write_city(folder / "city", size=SIZE, buildings=BUILDINGS, density=1.0, relief=10.0, seed=1)
-    values: dict[str, Any] = {
-        "pointcloud": [str(path) for path in files.clouds],
-        "footprints": str(files.shapefile),
-    }
+    values = city_files(folder / "city", size=SIZE, buildings=BUILDINGS, density=1.0, relief=10.0, seed=1)
     values |= {"out": str(folder / "out"), "tile_size": TILE, "overwrite": True}
     config = make_config(values)
     run(config)  # compiled code is in its place

@@ -13,7 +13,6 @@ import os
 import re
 import statistics
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -21,6 +20,8 @@ import urllib.parse
 import urllib.request
 from collections.abc import Sequence
 from pathlib import Path
+
+from tests.benchmarks.runs import COMMAND, citystitch
 
 SCRAPE = 15  # s between two scrapes; the page asks every second
 
@@ -53,7 +54,7 @@ def run_once(words: Sequence[str], *, watched: bool) -> tuple[float, int]:
 
 def cost_of_answer(out: Path, asked: int = 300) -> float:
     """Processor time (s) that the server of a run's folder takes to answer a page that is open."""
-    words = [sys.executable, "-m", "tiler.cli.main", "dashboard", str(out)]
+    words = [*COMMAND, "dashboard", str(out)]
     place = os.environ | {"PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=place) as job:
         assert job.stdout is not None
@@ -114,15 +115,11 @@ def main() -> None:
     parser.add_argument("--buildings", type=int, default=500)
     parser.add_argument("--tile-size", type=float, default=250.0)
     given = parser.parse_args()
-    python = [sys.executable, "-m", "tiler.cli.main"]
     with tempfile.TemporaryDirectory() as folder:
         city, out = Path(folder, "city"), Path(folder, "out")
-        size = ["--size", str(given.size), "--buildings", str(given.buildings)]
-        subprocess.run([*python, "synth", str(city), *size], check=True, stdout=subprocess.DEVNULL)
-        (clouds,) = {path.parent for path in city.rglob("*.laz")}
-        (footprints,) = city.rglob("*.gpkg")
-        words = [*python, "run", str(clouds), "--footprints", str(footprints), "--out", str(out), "--overwrite"]
-        words += ["--tile-size", str(given.tile_size)]
+        citystitch("synth", str(city), "--size", str(given.size), "--buildings", str(given.buildings))
+        words = [*COMMAND, "run", str(city / "tiles"), "--footprints", str(city / "footprints.gpkg")]
+        words += ["--out", str(out), "--overwrite", "--tile-size", str(given.tile_size)]
         print("| workers | pairs | CPU without a page (s) | with one (s) | difference | asked |")
         print("|---|---|---|---|---|---|")
         for workers in given.workers:

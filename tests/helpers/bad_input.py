@@ -56,14 +56,16 @@ def write_cloud(path: Path, xyz: NDArray[np.float64], classes: Any) -> Path:
     return path
 
 
-def write_houses(path: Path, polygons: list[Any], *, ids: list[Any] | None = None, crs: str = "EPSG:3006") -> Path:
-    """Write footprints in the format of the path's suffix."""
+def write_houses(
+    path: Path, polygons: list[Any], *, ids: list[Any] | None = None, crs: str = "EPSG:3006", **fields: list[Any]
+) -> Path:
+    """Write footprints, with further fields, in the format of the path's suffix."""
     names = np.array([f"b{k}" for k in range(len(polygons))] if ids is None else ids)
     pyogrio.raw.write(
         path,
         geometry=shapely.to_wkb(np.array(polygons, object)),
-        field_data=[names],
-        fields=["id"],
+        field_data=[names, *map(np.array, fields.values())],
+        fields=["id", *fields],
         geometry_type="Unknown" if path.suffix == ".gpkg" else "Polygon",
         crs=crs,
     )

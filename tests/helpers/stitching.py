@@ -32,7 +32,17 @@ from stitch.seams.seam_columns import fill_corner, fill_seam, tile_columns
 from stitch.seams.seams import Seam, trace_seam
 from stitch.seams.tiles import mesh_tile, sizes_halo, tile_halo
 from stitch.tiling.corners import Corner, place_corner
-from stitch.tiling.grid import Key, SeamKey, TileGrid, ends_of_seam, seams_of_tile, tile_keys
+from stitch.tiling.grid import (
+    Key,
+    SeamKey,
+    TileGrid,
+    ends_of_seam,
+    is_border,
+    make_grid,
+    seam_keys,
+    seams_of_tile,
+    tile_keys,
+)
 from stitch.tiling.patches import mesh_patch
 from stitch.tiling.walls import cut_walls
 from tests.helpers.cities import CITY_OPTIONS, Bounds, city_of, crowded_blocks, hilly_dtm
@@ -50,6 +60,9 @@ LAYERED = LayeredOptions(
 )
 
 Options = AdaptiveOptions | LayeredOptions
+BOTH = {"adaptive": OPTIONS, "layered": LAYERED}
+SQUARE: Bounds = (0.0, 0.0, 420.0, 420.0)
+NINE = make_grid(SQUARE, tile_size=140.0, mesh_size=10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,6 +291,30 @@ def glue(meshes: Sequence[ColumnMesh]) -> TetMesh:
     points, index = np.unique(np.concatenate([part.points for part in parts]), axis=0, return_inverse=True)
     cells = np.concatenate([part.cells + offset for part, offset in zip(parts, first[:-1], strict=True)])
     return TetMesh(points, index.reshape(-1)[cells].astype(np.int32))
+
+
+def prove_tiles(
+    scene: Scene,
+    grid: TileGrid,
+    options: Options = OPTIONS,
+    *,
+    level: bool = False,
+    rule: SizeRule | None = None,
+    finer: Sequence[Finer] = (),
+) -> dict[Key, Tile]:
+    """Mesh every tile alone, and prove that glued they are one mesh, which on level ground fills the box."""
+    tiles = mesh_all(scene, grid, options, rule=rule, finer=finer)
+    assert prove_seams(tiles) == sum(not is_border(grid, key) for key in seam_keys(grid))
+    prove_glued(glue([tile.mesh for tile in tiles.values()]), scene, grid.bounds, options)
+    if level:
+        prove_volume(tiles, scene, grid.bounds, options)
+    return tiles
+
+
+def same_houses(mesh: ColumnMesh, rows: NDArray[np.integer]) -> bytes:
+    """All of a mesh as bytes, its houses by their rows elsewhere."""
+    building = np.append(rows, -1).astype(np.int32)[mesh.plane.building]
+    return mesh_bytes(replace(mesh, plane=replace(mesh.plane, building=building)))
 
 
 def prove_glued(mesh: TetMesh, scene: Scene, bounds: Bounds, options: Options = OPTIONS) -> None:

@@ -20,6 +20,7 @@ from shapely import affinity
 from pipeline.data.classes import BUILDING, GROUND
 from pipeline.points_terrain.synthetic_roofs import RoofShapes, draw_roofs, shape_heights
 from stitch.tiling.grid import Bounds
+from tiler.check.check import CheckReport, check_run
 from tiler.config.config import Config, make_config
 from tiler.config.step_options import derived_parameters
 from tiler.engine.engine import Engine
@@ -31,13 +32,32 @@ from tiler.planning.lod_zones import read_zones
 from tiler.planning.plan import Plan, make_plan
 from tiler.stages.citymodel import city_model_stages
 from tiler.stages.mesh import mesh_stages
+from tiler.store.results import StoredTerrain
 from tiler.workflow.run import run
 from tiler.workflow.settled_domain import settle_domain
 from tiler.workflow.stage_sequence import run_city_stages
 
 CRS = "EPSG:3006"
+X, Y = 318_000.0, 6_399_000.0
+SIZE = 140.0  # m; least tile for cells of 10 m
 ROOF_SIGMA = 0.05  # m, of the points on sloped roofs
 ROAD = 14.0  # m between two terraces, back to back ones are closer
+
+
+def box(width: float, height: float, *, west: float = X, south: float = Y) -> Bounds:
+    return west, south, west + width, south + height
+
+
+def around(tile: tuple[int, int], by: float, *, size: float = SIZE) -> Bounds:
+    """The box of a tile, grown by some tiles."""
+    (i, j), far = tile, by * size
+    return i * size - far, j * size - far, (i + 1) * size + far, (j + 1) * size + far
+
+
+def put_beside(polygons: list[shapely.Polygon], *others: shapely.Polygon) -> list[shapely.Polygon]:
+    """Take others in, and all that is farther from them than 2 m."""
+    place = shapely.buffer(shapely.union_all([shapely.envelope(other) for other in others]), 2.0)
+    return [polygon for polygon in polygons if not polygon.intersects(place)] + list(others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,6 +255,24 @@ def column_arrays(values: dict[str, Any], out: Path, tile: str) -> tuple[dict[st
         engine.run(columns, items={"columns": [tile]})
         arrays, attributes = engine.store.read("columns", tile)
         return arrays, attributes["facts"]
+
+
+def prove(out: Path) -> CheckReport:
+    report = check_run(out, StoredTerrain)
+    assert report.ok, "\n".join(report.lines())
+    return report
+
+
+def prove_local(values: dict[str, Any], tile: tuple[int, int], folder: Path, *bounds: Bounds) -> None:
+    """Prove that a tile has the same arrays and facts in several regions."""
+    first: tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]] | None = None
+    for k, region in enumerate(bounds):
+        arrays, facts = column_arrays(values | {"bounds": region}, folder / str(k), f"{tile[0]}_{tile[1]}")
+        first = first or (arrays, facts)
+        assert arrays.keys() == first[0].keys()
+        for name, array in arrays.items():
+            assert array.tobytes() == first[0][name].tobytes(), f"{name} of region {k}"
+        assert facts == first[1]
 
 
 def shape_city(values: dict[str, Any], out: Path) -> tuple[list[int], int]:

@@ -14,7 +14,7 @@ import pytest
 from pipeline.data.errors import CityError, ConfigError
 from pipeline.data.mesh import Marker
 from tests.helpers.faults import Faults, injected, raises, segfaults
-from tests.runs.test_resume import Town
+from tests.helpers.towns import Town, make_town
 from tests.runs.test_run import hashes
 from tiler.check.check import check_run
 from tiler.cli.main import main
@@ -26,18 +26,12 @@ from tiler.store.results import StoredTerrain
 from tiler.workflow.run import run
 from tiler.workflow.single_tile import run_alone
 
-SIZE, TILE = 420.0, 140.0  # m: 9 tiles
+SIZE = 420.0  # m: 9 tiles
 
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
-    folder = tmp_path_factory.mktemp("town")
-    write_city(folder / "city", size=SIZE, buildings=40, density=0.5, relief=5, seed=3)
-    start = Town(folder / "city", folder / "out", {})
-    record = run(start.config(start.out))
-    assert record["counts"]["tiles"] == 9
-    assert record["exit_code"] == 0
-    return Town(start.folder, start.out, record)
+    return make_town(tmp_path_factory.mktemp("town"), size=SIZE, buildings=40)
 
 
 def named(town: Town, i: int, j: int) -> str:
@@ -117,7 +111,7 @@ def test_a_tile_that_fails_before_there_is_a_city_model_is_as_absent(
 
 def test_what_a_hole_does_not_touch_has_its_result(tmp_path: Path) -> None:
     write_city(tmp_path / "city", size=SIZE, buildings=40, density=0.5, relief=5, seed=3)
-    strip = Town(tmp_path / "city", tmp_path / "out", {})
+    strip = Town(tmp_path / "city", tmp_path / "out")
     west, south, _, _ = pyogrio.read_info(tmp_path / "city" / "footprints.gpkg")["total_bounds"]
     small = {"tile_size": 70.0, "mesh_size": 5.0, "bounds": [west, south, west + 400, south + 100]}
     whole = run(strip.config(strip.out, **small))
@@ -146,7 +140,7 @@ def test_what_a_hole_does_not_touch_has_its_result(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_file_that_cannot_be_read_takes_the_tiles_below_it(tmp_path: Path) -> None:
     write_city(tmp_path / "city", size=1000.0, buildings=20, density=0.3, relief=5, seed=3)
-    town = Town(tmp_path / "city", tmp_path / "whole", {})
+    town = Town(tmp_path / "city", tmp_path / "whole")
     values = {"tile_size": 500.0, "mesh_size": 30.0}
     whole = run(town.config(town.out, **values))
     clouds = sorted((town.folder / "tiles").iterdir())

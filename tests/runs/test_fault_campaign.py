@@ -42,7 +42,7 @@ EARLY = ("ground", "houses", "shapes-0")  # a tile each, before there is a city 
 LATE = ("columns", "pieces", "fit", "own")  # a tile each, afterwards; seams come to these
 ASIDE = ("fit", "own")  # what takes no tile with it
 OTHER = {"early": "late", "late": "early"}
-# Each kind before there is a city model, or after it.
+# Each kind before there is a city model, or after it; in CI the late ones are in one run from the start.
 PAIRS = list(zip(KINDS, ("early", "late") * 3, strict=True))
 REGION = ("coarse", "join-0", "citymodel", "report")
 # One worker a core; a task that hangs is ended soon, one that allocates is refused.
@@ -126,7 +126,9 @@ def prove(city: SparseCity, out: Path, items: dict[str, str], kinds: dict[str, s
 
 @pytest.mark.long
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(("kind", "when"), rounds(PAIRS, [(kind, OTHER[when]) for kind, when in PAIRS]))
+@pytest.mark.parametrize(
+    ("kind", "when"), rounds(PAIRS[::2], [*PAIRS[1::2], *((kind, OTHER[when]) for kind, when in PAIRS)])
+)
 def test_each_kind_of_fault_at_each_stage(city: SparseCity, tmp_path: Path, kind: str, when: str) -> None:
     early = when == "early"
     seed = 2 * list(KINDS).index(kind) + early
@@ -141,9 +143,9 @@ def test_each_kind_of_fault_at_each_stage(city: SparseCity, tmp_path: Path, kind
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("seed", rounds([100], [101]))
 def test_all_kinds_in_one_run_from_the_start(city: SparseCity, tmp_path: Path, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    items = draw(city, rng, early=False)
-    kinds = dict(zip(items, map(str, rng.permutation(list(KINDS))), strict=False))
+    items = draw(city, np.random.default_rng(seed), early=False)
+    late_first = sorted(KINDS, key=lambda kind: (kind, "early") in PAIRS)
+    kinds = dict(zip(items, late_first[seed - 100 :], strict=False))
     keep_outcome("faults", seed=seed, **prove(city, tmp_path / "out", items, kinds))
 
 

@@ -28,7 +28,7 @@ from tests.tiler.stages.test_ingest import write_copc
 from tiler.config.config import Config
 
 LIMIT = 100.0  # s a call may take on a busy machine that compiles kernels first; most take half a second
-FEW, MANY = 10, 60 if ALL_ROUNDS else 12  # cases of a family in the everyday tests and in the campaign
+FEW, MANY = 10, 60 if ALL_ROUNDS else 8  # cases of a family in the everyday tests and in the campaign
 Rng = np.random.Generator
 
 # Fixed fields of a LAS header: place and form.
@@ -260,10 +260,9 @@ def listing(case: Path) -> dict[str, tuple[int, int]]:
     return {str(path): (path.lstat().st_size, path.lstat().st_mtime_ns) for path in found if not path.is_dir()}
 
 
-@pytest.fixture
-def worker(tmp_path: Path) -> Iterator[Worker]:
-    (tmp_path / "empty").mkdir()
-    with Worker(tmp_path / "empty", limit=LIMIT) as running:
+@pytest.fixture(scope="module")
+def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Worker]:
+    with Worker(tmp_path_factory.mktemp("empty"), limit=LIMIT) as running:
         yield running
 
 

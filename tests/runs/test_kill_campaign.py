@@ -1,8 +1,8 @@
 """Kills at random moments: workers, the driver, all, the scheduler; every run ends with the same bytes.
 
 The moments are numbers of committed results, drawn from seeds, spread evenly over a run and its stages. The same
-run is killed and gone on with several times before it may end. `make reliability` kills twelve runs, CI one for
-each kind; what was killed when is kept as ``kills.json`` (`tests.helpers.campaigns`).
+run is killed and gone on with several times before it may end. `make reliability` kills twelve runs, CI two; what
+was killed when is kept as ``kills.json`` (`tests.helpers.campaigns`).
 """
 
 import json
@@ -39,8 +39,14 @@ END = 240.0  # s that a run, or what is left of a killed one, may take
 LOST = "the connection to the Dask scheduler is lost; all that was done is kept"
 CLUSTER = "scheduler"
 KINDS = ("worker", "driver", "group", "mixed", CLUSTER)
+# Of workers, drivers and groups one each is killed in the small city below, and any of them in a mixed round.
 ROUNDS = rounds(
-    [(kind, 0) for kind in KINDS], [*((kind, 1) for kind in KINDS), *((kind, 2) for kind in ("driver", "group"))]
+    [("mixed", 0), (CLUSTER, 0)],
+    [
+        *((kind, 0) for kind in KINDS[:3]),
+        *((kind, 1) for kind in KINDS),
+        *((kind, 2) for kind in ("driver", "group")),
+    ],
 )
 
 

@@ -11,8 +11,17 @@ import shapely
 
 from pipeline.data.citymodel import Prisms
 from pipeline.data.errors import ConfigError, InputError
-from tests.helpers.tiles import CRS, hash_files, make_town, put_roofs, run_of, shape_city, terraces, write_town
-from tiler.check.check import check_run
+from tests.helpers.tiles import (
+    CRS,
+    hash_files,
+    make_town,
+    prove,
+    put_roofs,
+    run_of,
+    shape_city,
+    terraces,
+    write_town,
+)
 from tiler.check.zone_proofs import check_zones
 from tiler.citymodels.tables import unpack_buildings
 from tiler.config.config import make_config
@@ -21,7 +30,6 @@ from tiler.pictures.picture_data import load_city, load_levels
 from tiler.planning.lod_zones import read_zones
 from tiler.planning.region import Region
 from tiler.store.out_folder import CITY_MODEL, FULL_CITY_MODEL, RUN_RECORD, STORE
-from tiler.store.results import StoredTerrain
 from tiler.store.run_folder import read_run_record
 from tiler.store.store import Store
 
@@ -66,8 +74,7 @@ def prove_levels(
 def test_zones_of_detail_are_one_mesh_and_proved(town: dict[str, Any], tmp_path: Path) -> None:
     out = tmp_path / "zones"
     record = run_of(town, out, **ZONES)
-    report = check_run(out, StoredTerrain)
-    assert report.ok, "\n".join(report.lines())
+    prove(out)
     assert {f"parts at level {level}" for level in LEVELS[:3]} <= record["counts"].keys()
     shape_city(town, tmp_path / "full")
     mine, full = models(out), models(tmp_path / "full")

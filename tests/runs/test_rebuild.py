@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,9 @@ from pipeline.data.errors import ConfigError
 from stitch.tiling.grid import tiles_of_seam
 from tests.helpers.campaigns import keep_outcome
 from tests.helpers.told import StageEnds
+from tests.helpers.towns import TILE, Town
 from tests.runs.test_run import hashes
 from tiler.check.check import check_run
-from tiler.config.config import Config, make_config
 from tiler.engine.run_context import seam_key, tile_key
 from tiler.interface.synth import write_city
 from tiler.store.folder_lock import only_run
@@ -33,7 +32,6 @@ from tiler.workflow import run as run_module
 from tiler.workflow.run import run
 from tiler.workflow.summary import describe_tasks
 
-TILE = 140.0  # m
 CORNER = "2271_45707"  # the first tile
 FILE = 100.0  # m
 LAKE = 100.0  # m; side of the square without ground in the last tile: deep enough for the coarse level
@@ -45,24 +43,14 @@ TASKS = {"tasks", "ran", "reused"}
 Items = set[tuple[str, str]]
 
 
-@dataclass(frozen=True)
-class Town:
-    """A synthetic city as files, with the folder of its finished run."""
+def copy(town: Town, path: Path) -> Town:
+    """Copy the results."""
+    return Town(town.folder, town.copy(path / "out"))
 
-    folder: Path
-    out: Path
 
-    def config(self, out: Path, **others: Any) -> Config:
-        values = {"pointcloud": [str(self.folder / "tiles")], "footprints": str(self.folder / "footprints.gpkg")}
-        return make_config(values | {"out": str(out), "tile_size": TILE, "domain_height": 70.0} | others)
-
-    def copy(self, path: Path) -> "Town":
-        """Copy the results."""
-        return Town(self.folder, shutil.copytree(self.out, path / "out"))
-
-    def copy_all(self, path: Path) -> "Town":
-        """Copy inputs too, with the times of their last change."""
-        return Town(shutil.copytree(self.folder, path / "city"), self.copy(path).out)
+def copy_all(town: Town, path: Path) -> Town:
+    """Copy inputs too, with the times of their last change."""
+    return Town(shutil.copytree(town.folder, path / "city"), copy(town, path).out)
 
 
 def make_town(folder: Path, n: int) -> Town:
@@ -215,7 +203,7 @@ GROUND = {"points", "ground", "flooded", "coarse", "lakes", "terrain"}
 
 
 def test_nothing_changed_runs_nothing(nine: Town, tmp_path: Path) -> None:
-    town = nine.copy(tmp_path)
+    town = copy(nine, tmp_path)
     record, ran = update(town)
     assert ran == set()
     assert describe_tasks(record["tasks"]).startswith("0 of ")
@@ -225,7 +213,7 @@ def test_nothing_changed_runs_nothing(nine: Town, tmp_path: Path) -> None:
 
 
 def test_workers_folder_and_names_of_inputs_are_nothing_that_results_depend_on(nine: Town, tmp_path: Path) -> None:
-    town = Town(nine.folder, nine.copy(tmp_path).out.rename(tmp_path / "elsewhere"))
+    town = Town(nine.folder, copy(nine, tmp_path).out.rename(tmp_path / "elsewhere"))
     clouds = shutil.copytree(nine.folder / "tiles", tmp_path / "clouds")
     _, ran = update(town, workers=1, pointcloud=[str(clouds)])
     assert ran == set()
@@ -233,7 +221,7 @@ def test_workers_folder_and_names_of_inputs_are_nothing_that_results_depend_on(n
 
 
 def test_files_touched_but_the_same_are_read_and_no_more(nine: Town, tmp_path: Path) -> None:
-    town = nine.copy_all(tmp_path)
+    town = copy_all(nine, tmp_path)
     update(town)
     for path in (sorted((town.folder / "tiles").iterdir())[4], town.folder / "footprints.gpkg"):
         os.utime(path, ns=(1, 1))
@@ -247,7 +235,7 @@ def test_files_touched_but_the_same_are_read_and_no_more(nine: Town, tmp_path: P
 def test_a_changed_footprint_reaches_the_tiles_around_it(
     nine: Town, tmp_path: Path, change: Callable[[Town, tuple[int, int]], None]
 ) -> None:
-    town = nine.copy_all(tmp_path)
+    town = copy_all(nine, tmp_path)
     change(town, (0, 0))
     _, ran = update(town)
     assert stages(ran).isdisjoint(GROUND)
@@ -264,7 +252,7 @@ def test_a_changed_footprint_reaches_the_tiles_around_it(
 
 def test_another_cloud_in_place_of_one_reaches_the_tiles_under_it(nine: Town, tmp_path: Path) -> None:
     """A file at the lake: the coarse level is another one, and matters to the tile of the lake alone."""
-    town = nine.copy_all(tmp_path)
+    town = copy_all(nine, tmp_path)
     coarse = Store(town.out / "store.zarr").describe("coarse", "region")[1]
     i, j = np.floor((lake_middle(3) - LAKE / 2 - 5) / FILE).astype(int).tolist()
     (shore,) = (town.folder / "tiles").glob(f"{i}-{j}-*.laz")
@@ -300,7 +288,7 @@ def test_rings_and_coarse_nodes_are_kept_only_where_a_lake_is_deep(nine: Town) -
 def test_a_parameter_of_the_mesh_does_not_touch_the_city_model(
     nine: Town, tmp_path: Path, change: dict[str, Any], first: set[str]
 ) -> None:
-    town = nine.copy(tmp_path)
+    town = copy(nine, tmp_path)
     _, ran = update(town, **change)
     assert stages(ran) <= first
     assert {"seams", "columns", "pieces"} <= stages(ran)
@@ -311,7 +299,7 @@ def test_a_parameter_of_the_mesh_does_not_touch_the_city_model(
 
 
 def test_an_update_that_is_cut_off_states_no_finished_mesh_and_goes_on(nine: Town, tmp_path: Path) -> None:
-    town = nine.copy(tmp_path)
+    town = copy(nine, tmp_path)
     seen: list[tuple[str, bool]] = []
 
     def look(stage: str) -> None:
@@ -337,7 +325,7 @@ def test_an_update_that_is_cut_off_states_no_finished_mesh_and_goes_on(nine: Tow
 def test_the_record_says_that_a_run_is_at_work_before_anything_goes(
     nine: Town, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    town = nine.copy(tmp_path)
+    town = copy(nine, tmp_path)
 
     def stop(*_: Any, **__: Any) -> None:
         assert json.loads((town.out / "run.json").read_text())["status"] == "running"
@@ -351,7 +339,7 @@ def test_the_record_says_that_a_run_is_at_work_before_anything_goes(
 
 
 def test_a_folder_whose_record_is_not_ours_is_refused_and_so_is_one_at_work(nine: Town, tmp_path: Path) -> None:
-    town = nine.copy(tmp_path)
+    town = copy(nine, tmp_path)
     with only_run(town.out), pytest.raises(ConfigError, match="another run is at work there"):
         run(town.config(town.out))
     # Without these a folder is known by its record alone.
@@ -375,7 +363,7 @@ def test_a_folder_whose_record_is_not_ours_is_refused_and_so_is_one_at_work(nine
 @pytest.mark.long
 @pytest.mark.timeout(900)
 def test_in_a_larger_city_what_is_far_does_not_run(many: Town, tmp_path: Path) -> None:
-    town = many.copy_all(tmp_path)
+    town = copy_all(many, tmp_path)
     move(town, (1, 1))
     record, ran = update(town)
     print("moved footprint:", record["ran"])

@@ -12,71 +12,37 @@ from shapely import affinity
 
 from pipeline.data.mesh import Marker
 from stitch.seams.tiles import tile_halo
-from stitch.tiling.grid import Bounds
 from tests.helpers.campaigns import keep_outcome, rounds
 from tests.helpers.cities import crowded_blocks
 from tests.helpers.tiles import (
+    SIZE,
     Town,
-    column_arrays,
+    X,
+    Y,
+    around,
+    box,
     comb,
     hash_files,
     make_town,
+    prove,
+    prove_local,
+    put_beside,
     run_of,
     shape_city,
     shuffle_inputs,
     terraces,
     write_town,
 )
-from tiler.check.check import CheckReport, check_run
 from tiler.config.config import make_config
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.vtk_files import read_vtp
 from tiler.stages.surroundings import terrain_halo
-from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
 
-X, Y = 318_000.0, 6_399_000.0
-SIZE = 140.0  # least tile for cells of 10 m
 TILE = (2272, 45708)
 WEST, SOUTH = TILE[0] * SIZE, TILE[1] * SIZE  # its corner, close to (X, Y)
+# The first and the last are held as close as they reach, the others in a region that is much larger.
 WAYS = [("adaptive", "clearance"), ("layered", "clearance"), ("adaptive", "paper"), ("layered", "paper")]
-
-
-def box(width: float, height: float, *, west: float = X, south: float = Y) -> Bounds:
-    return west, south, west + width, south + height
-
-
-def around(tile: tuple[int, int], by: float, *, size: float = SIZE) -> Bounds:
-    """The box of a tile, grown by some tiles."""
-    (i, j), far = tile, by * size
-    return i * size - far, j * size - far, (i + 1) * size + far, (j + 1) * size + far
-
-
-def put_beside(polygons: list[shapely.Polygon], *others: shapely.Polygon) -> list[shapely.Polygon]:
-    """Take others in, and all that is farther from them than 2 m."""
-    place = shapely.buffer(shapely.union_all([shapely.envelope(other) for other in others]), 2.0)
-    return [polygon for polygon in polygons if not polygon.intersects(place)] + list(others)
-
-
-def prove(out: Path) -> CheckReport:
-    report = check_run(out, StoredTerrain)
-    assert report.ok, "\n".join(report.lines())
-    return report
-
-
-# A tile and its surroundings.
-
-
-def prove_local(values: dict[str, Any], tile: tuple[int, int], folder: Path, *bounds: Bounds) -> None:
-    """Prove that a tile has the same arrays and facts in several regions."""
-    first: tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]] | None = None
-    for k, region in enumerate(bounds):
-        arrays, facts = column_arrays(values | {"bounds": region}, folder / str(k), f"{tile[0]}_{tile[1]}")
-        first = first or (arrays, facts)
-        assert arrays.keys() == first[0].keys()
-        for name, array in arrays.items():
-            assert array.tobytes() == first[0][name].tobytes(), f"{name} of region {k}"
-        assert facts == first[1]
 
 
 def reach_of(values: dict[str, Any]) -> float:
@@ -98,7 +64,7 @@ def test_a_tile_depends_on_its_surroundings_alone(mesher: str, simplify: str, tm
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("mesher", "simplify"), WAYS)
+@pytest.mark.parametrize(("mesher", "simplify"), WAYS[1:3])
 def test_a_tile_in_a_large_region_is_that_in_a_small_one(mesher: str, simplify: str, tmp_path: Path) -> None:
     region = around(TILE, 3)
     town = make_town(region, crowded_blocks(region, 700, seed=6), relief=30)
@@ -511,7 +477,7 @@ def test_the_model_of_real_blocks_knows_no_tiles_and_no_workers(
         "crs": "EPSG:28992",
         "simplify": simplify,
     }
-    prove_same_model(values, tmp_path, [5000.0, 500.0, 200.0])
+    prove_same_model(values, tmp_path, [5000.0, 200.0])
     run_of(values, tmp_path / "two", tile_size=300.0, workers=2)
     for name in ("citymodel.city.json", "citymodel-full.city.json"):
         assert (tmp_path / "two" / name).read_bytes() == (tmp_path / "200" / name).read_bytes()
@@ -521,7 +487,7 @@ def test_the_model_of_real_blocks_knows_no_tiles_and_no_workers(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", rounds(range(3), range(3, 50)))
+@pytest.mark.parametrize("seed", rounds(range(2), range(2, 50)))
 def test_random_tiled_cities_are_meshed_and_proved(tmp_path: Path, seed: int) -> None:
     """Cities of any density, size of blocks and relief in 9 to 25 tiles, from files to files."""
     rng = np.random.default_rng(seed)

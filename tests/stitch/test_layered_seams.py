@@ -1,7 +1,6 @@
 """Seams of layers: tiles meshed alone are one mesh when glued, and depend on terrain in reach and layers alone."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,14 +9,10 @@ from numpy.typing import NDArray
 from shapely import affinity
 
 from pipeline.city_model.groups import adjacent_houses
-from pipeline.city_model.heights import highest_wall_ground
-from pipeline.columns.columns import expand_cells
 from pipeline.columns.layered import LayeredOptions, choose_layers, fill_layers, mesh_layers, terrain_reach
 from pipeline.columns.nodes import SeamColumns, take_columns
-from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.points_terrain.terrain import Dtm
-from pipeline.quality.quality import measure_cells
 from pipeline.smoothing.ground_smoothing import (
     SlabShape,
     _find_levels,
@@ -29,113 +24,29 @@ from pipeline.smoothing.ground_smoothing import (
 from stitch.seams.layered_seams import fill_corner_layers
 from stitch.seams.seams import find_vertices
 from stitch.tiling.corners import place_corner
-from stitch.tiling.grid import Key, SeamKey, is_border, make_grid, seam_keys
+from stitch.tiling.grid import Key, SeamKey
 from stitch.tiling.patches import mesh_patch
 from stitch.tiling.walls import cut_walls
 from tests.helpers.cities import Bounds, city_of, hilly_dtm, tilted_dtm
 from tests.helpers.stitching import (
     LAYERED,
+    NINE,
+    SQUARE,
     Scene,
-    Tile,
-    amsterdam_scene,
-    glue,
     layers_of,
-    mesh_all,
     mesh_alone,
-    mesh_bytes,
-    prove_glued,
-    prove_seams,
-    prove_volume,
+    prove_tiles,
     random_scene,
     scene_of,
     select_houses,
 )
-from tests.helpers.terraces import terrace_town
-from tests.stitch.test_seams import CITIES, NINE, SQUARE
-
-# A domain so low that tiles in the middle of a small region are out of reach of its border.
-LOW = LayeredOptions(
-    mesh_size=10.0, layer_height=5.0, domain_height=30.0, smoother="columns", tolerance=0.003, fem_tolerance=1e-8
-)
-
-
-def prove_one_mesh(
-    tiles: dict[Key, Tile], scene: Scene, bounds: Bounds, options: LayeredOptions = LAYERED, *, seams: int
-) -> None:
-    assert prove_seams(tiles) == seams
-    prove_glued(glue([tile.mesh for tile in tiles.values()]), scene, bounds, options)
-
-
-@pytest.mark.parametrize("seed", [3])
-def test_random_cities_are_one_mesh(seed: int) -> None:
-    scene = random_scene(SQUARE, 60 + 25 * seed, seed=seed, relief=25.0 * (seed % 3))
-    tiles = mesh_all(scene, NINE, LAYERED)
-    prove_one_mesh(tiles, scene, SQUARE, seams=12)
-    if seed % 3 == 0:
-        prove_volume(tiles, scene, SQUARE, LAYERED)
-
-
-@pytest.mark.parametrize("name", ["a courtyard around a tile", "towers on the corners"])
-def test_houses_on_seams_and_corners(name: str) -> None:
-    houses = CITIES[name]
-    scene = scene_of(houses, [8.0 + 3 * k for k in range(len(houses))], tilted_dtm(SQUARE, height=2.0))
-    tiles = mesh_all(scene, NINE, LAYERED)
-    prove_one_mesh(tiles, scene, SQUARE, seams=12)
-    prove_volume(tiles, scene, SQUARE, LAYERED)
-
-
-@pytest.mark.parametrize("layer_height", [2.5, 6.0])
-def test_terraces_keep_their_party_walls_across_seams(layer_height: float) -> None:
-    town = terrace_town()
-    dtm = hilly_dtm(town.bounds, relief=1.0, length=20.0)
-    options = replace(LAYERED, mesh_size=3.5, layer_height=layer_height)
-    grid = make_grid(town.bounds, tile_size=49.0, mesh_size=3.5)
-    scene = Scene(town.model, town.group, dtm)
-    tiles = mesh_all(scene, grid, options)
-    assert any(len(seam.wall_nodes) for tile in tiles.values() for seam in tile.seams.values())
-    prove_one_mesh(tiles, scene, town.bounds, options, seams=4)
-
-
-@pytest.mark.parametrize("bounds", [(70.0, 70.0, 420.0, 210.0), (0.0, 0.0, 600.0, 30.0)])
-def test_narrow_outer_tiles_and_single_rows(bounds: Bounds) -> None:
-    area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
-    scene = random_scene(bounds, int(area * 5e-4), seed=1, relief=10.0)
-    grid = make_grid(bounds, tile_size=140.0, mesh_size=10.0)
-    seams = sum(not is_border(grid, key) for key in seam_keys(grid))
-    prove_one_mesh(mesh_all(scene, grid, LAYERED), scene, bounds, seams=seams)
 
 
 def test_steep_terrain_is_repaired_on_seams_too() -> None:
     dtm = hilly_dtm(SQUARE, relief=80.0, length=20.0)
     houses = random_scene(SQUARE, 60, seed=4).model.polygons
     scene = scene_of(list(houses), [6.0] * len(houses), dtm)
-    options = replace(LAYERED, domain_height=150.0)
-    prove_one_mesh(mesh_all(scene, NINE, options), scene, SQUARE, options, seams=12)
-
-
-def test_a_tile_is_the_same_alone_and_in_a_larger_region() -> None:
-    bounds, inner = (0.0, 0.0, 700.0, 700.0), (140.0, 140.0, 560.0, 560.0)
-    scene = random_scene(bounds, 300, seed=3, relief=15.0)
-    scene = replace(scene, model=replace(scene.model, roofs=flat_roofs(np.minimum(scene.model.roof, 14.0))))
-    crossing = shapely.intersects(scene.model.polygons, shapely.box(*inner).exterior)
-    scene = select_houses(scene, np.flatnonzero(~crossing))
-    within = np.flatnonzero(shapely.within(scene.model.polygons, shapely.box(*inner)))
-    assert len(within) < len(scene.model)
-    large, small = (make_grid(box, tile_size=140.0, mesh_size=10.0) for box in (bounds, inner))
-    alone = mesh_alone(scene, large, Key(2, 2), LOW).mesh
-    assert mesh_bytes(mesh_alone(scene, large, Key(2, 2), LOW, clip=False).mesh) == mesh_bytes(alone)
-    in_small = mesh_alone(select_houses(scene, within), small, Key(2, 2), LOW).mesh
-    rows = np.append(within, -1).astype(np.int32)[in_small.plane.building]
-    assert mesh_bytes(replace(in_small, plane=replace(in_small.plane, building=rows))) == mesh_bytes(alone)
-
-
-def test_a_tile_does_not_depend_on_the_order_of_houses() -> None:
-    scene = random_scene(SQUARE, 110, seed=5, relief=10.0)
-    order = np.random.default_rng(0).permutation(len(scene.model))
-    one = mesh_alone(scene, NINE, Key(1, 1), LAYERED).mesh
-    two = mesh_alone(select_houses(scene, order), NINE, Key(1, 1), LAYERED).mesh
-    rows = np.append(order, -1).astype(np.int32)[two.plane.building]
-    assert mesh_bytes(replace(two, plane=replace(two.plane, building=rows))) == mesh_bytes(one)
+    prove_tiles(scene, NINE, replace(LAYERED, domain_height=150.0))
 
 
 def rows_of_terraces(bounds: Bounds) -> Scene:
@@ -154,7 +65,7 @@ def choose(scene: Scene, dtm: Dtm, bounds: Bounds) -> NDArray[np.int32]:
     return layers_of(replace(scene, dtm=dtm), bounds, LOW_TOWN)
 
 
-LOW_TOWN = replace(LOW, domain_height=60.0, layer_height=3.0)
+LOW_TOWN = replace(LAYERED, layer_height=3.0)
 
 
 def test_layers_are_those_of_the_cluster_and_the_terrain_in_reach_alone() -> None:
@@ -312,36 +223,6 @@ def test_a_seam_keeps_the_triangles_around_it() -> None:
     assert 18 < distance.max() <= 20
     rings = {xy.tobytes() for xy in seam.ring.xy[seam.ring.triangles]}
     assert rings < {xy.tobytes() for xy in plane.xy[plane.triangles]}
-
-
-def test_seams_cost_little_quality() -> None:
-    bounds = SQUARE
-    scene = random_scene(bounds, 130, seed=8, relief=20.0)
-    grid = NINE
-    tiles = mesh_all(scene, grid, LAYERED)
-    tiled = measure_cells(glue([tile.mesh for tile in tiles.values()])).radius_ratio
-    plane, _ = mesh_plane(bounds, scene.model.polygons, mesh_size=10.0, min_angle=28, refinements=1, passes=4)
-    wall_ground = highest_wall_ground(scene.model.polygons, scene.dtm)
-    whole, _ = mesh_layers(plane, scene.dtm, scene.model, wall_ground, bounds, LAYERED)
-    untiled = measure_cells(expand_cells(whole)).radius_ratio
-    ratio = np.percentile(tiled, (0, 0.1, 1, 5, 50)) / np.percentile(untiled, (0, 0.1, 1, 5, 50))
-    assert ratio[0] > 0.5
-    assert ratio[1] > 0.85
-    assert (ratio[2:] > 0.95).all()
-    assert len(tiled) < 1.04 * len(untiled)
-
-
-@pytest.mark.long
-@pytest.mark.shared
-def test_amsterdam_in_four_tiles_is_one_mesh(shared_data: Path) -> None:
-    bounds = (120900.0, 486150.0, 121200.0, 486450.0)
-    scene = amsterdam_scene(shared_data / "amsterdam", bounds, "clearance")
-    grid = make_grid(bounds, tile_size=150.0, mesh_size=10.0)
-    options = replace(LAYERED, domain_height=100.0)
-    tiles = mesh_all(scene, grid, options)
-    prove_one_mesh(tiles, scene, bounds, options, seams=4)
-    alone = mesh_alone(scene, grid, Key(807, 3242), options, clip=False).mesh
-    assert mesh_bytes(alone) == mesh_bytes(tiles[Key(807, 3242)].mesh)
 
 
 def test_wrong_seams_and_layers_are_refused() -> None:

@@ -1,22 +1,18 @@
-"""Pieces of a tiled mesh: boundaries and numbers that fit together, and the files that are made of them."""
+"""Pieces of a tiled mesh: boundaries and numbers that fit together."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
-import meshio
 import numpy as np
 import pytest
-import pyvista
 import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
-from pipeline.columns.adaptive import mesh_adaptive
+from pipeline.columns.adaptive import AdaptiveOptions, mesh_adaptive
 from pipeline.columns.columns import expand_cells, extract_boundary, find_used_points, split_boundary
-from pipeline.data.errors import GeometryError, InputError, OutputError
-from pipeline.data.mesh import Boundary, Marker, SeamEdges, TetMesh
+from pipeline.data.errors import GeometryError
+from pipeline.data.mesh import Boundary, ColumnMesh, Marker, SeamEdges
 from pipeline.plane_mesh.plane import mesh_plane
 from stitch.pieces.conformity import match_facets, pair_cell_faces, pair_edges, pair_faces
 from stitch.pieces.frontier import find_edges_below
@@ -25,38 +21,98 @@ from stitch.pieces.numbering import (
     MOST_TILES,
     collect_ids,
     corner_part,
+    count_all_points,
+    count_by_part,
     first_id,
     number_columns,
     number_without_gaps,
+    seam_ids,
     seam_part,
     tile_part,
 )
-from stitch.seams.facets import label_beyond
-from stitch.tiling.grid import Key, SeamKey, corner_keys, make_grid, seam_keys, tile_keys
-from tests.helpers.cities import Bounds, hilly_dtm, tilted_dtm
-from tests.helpers.stitching import OPTIONS, Scene, glue, random_scene, scene_of
-from tests.helpers.terraces import terrace_town
-from tests.helpers.tiled_runs import (
-    City,
-    Pieces,
-    SampledDtm,
-    Split,
-    count_city,
-    cut_city,
-    mesh_city,
-    number_city,
-    seam_edges,
-    split_all,
-    write_numbered,
-    write_tiled_run,
+from stitch.seams.facets import Side, find_seam_edges, label_beyond
+from stitch.seams.seam_columns import tile_columns
+from stitch.seams.seams import find_vertices
+from stitch.tiling.grid import Key, SeamKey, TileGrid, corner_keys, make_grid, seam_keys, seams_of_tile, tile_keys
+from tests.helpers.cities import tilted_dtm
+from tests.helpers.stitching import (
+    OPTIONS,
+    SQUARE,
+    Scene,
+    Tile,
+    clip_scene,
+    glue,
+    mesh_all,
+    random_scene,
+    scene_of,
 )
-from tests.helpers.vtk_writers import write_vtu
-from tiler.check.check import CheckReport, check_run
-from tiler.mesh_files.merged import VERTEX_ID, write_merged_boundary, write_merged_volume
-from tiler.mesh_files.vtk_files import read_vtp, read_vtu
+from tests.helpers.terraces import terrace_town
 from tiler.stages.pieces import prove_seams
 
-SQUARE: Bounds = (0.0, 0.0, 420.0, 420.0)
+Split = tuple[ColumnMesh, Boundary, NDArray[np.int32]]
+
+
+@dataclass(frozen=True, eq=False)
+class City:
+    """A scene meshed in tiles, with all that these were made from."""
+
+    scene: Scene
+    grid: TileGrid
+    options: AdaptiveOptions
+    tiles: dict[Key, Tile]
+
+
+def mesh_city(scene: Scene, grid: TileGrid, options: AdaptiveOptions = OPTIONS) -> City:
+    """Mesh all tiles."""
+    return City(scene, grid, options, mesh_all(scene, grid, options))
+
+
+def seam_edges(city: City, key: Key, missing: Collection[SeamKey] = ()) -> SeamEdges:
+    """What a tile knows of its neighbours: its own seams, labelled with the houses of its halo."""
+    tile, near = city.tiles[key], clip_scene(city.scene, city.grid, key, city.options).model
+    south, east, _, _ = seams_of_tile(key)
+    inner = [seam for seam in seams_of_tile(key) if seam in tile.columns]
+    sides = [Side(tile.seams[seam], seam in (south, east), seam in missing) for seam in inner]
+    columns = tile_columns(tile.mesh.plane, [(tile.seams[seam], tile.columns[seam]) for seam in inner])
+    return find_seam_edges(tile.mesh.plane, sides, columns, near.numbers)
+
+
+def split_all(city: City, gone: Collection[Key] = ()) -> dict[Key, Split]:
+    """Split the boundaries of all tiles but those that are gone."""
+    numbers, bounds = city.scene.model.numbers, city.grid.bounds
+    lost = {seam for key in gone for seam in seams_of_tile(key)}
+    return {
+        key: (tile.mesh, *split_boundary(tile.mesh, numbers, bounds, seam_edges(city, key, lost)))
+        for key, tile in city.tiles.items()
+        if key not in gone
+    }
+
+
+def number_city(city: City) -> dict[Key, NDArray[np.int64]]:
+    """Give the points of all tiles their ids."""
+    ids = {}
+    for key, tile in city.tiles.items():
+        start = tile.mesh.z_start
+        column = number_columns(tile.mesh, *_number_seams(tile), first_id(tile_part(key)))
+        ids[key] = np.repeat(column - start[:-1], np.diff(start)) + np.arange(start[-1])
+    return ids
+
+
+def count_city(city: City) -> int:
+    """Count the points of all parts, as a run does."""
+    counts = []
+    for tile in city.tiles.values():
+        shared, lowest = _number_seams(tile)
+        counts.append(count_by_part(tile.mesh, find_used_points(tile.mesh), shared, lowest))
+    return count_all_points(counts)
+
+
+def _number_seams(tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    shared = [find_vertices(tile.mesh.plane.xy, tile.seams[seam].xy) for seam in tile.columns]
+    lowest = [seam_ids(seam, levels) for seam, levels in tile.columns.items()]
+    return np.concatenate(shared), np.concatenate(lowest)
+
+
 FOUR = make_grid(SQUARE, tile_size=210.0, mesh_size=10.0)
 SIDES = (Marker.WEST, Marker.EAST, Marker.SOUTH, Marker.NORTH)
 
@@ -214,45 +270,23 @@ def test_seams_that_do_not_fit_the_mesh_are_refused(crowded: City) -> None:
         label_beyond(cut, left=True)
 
 
-WIDE: Bounds = (0.0, 0.0, 840.0, 840.0)
-COARSE = replace(OPTIONS, mesh_size=20.0)
-CENTRE = Key(1, 1)
+def test_a_point_has_one_id_in_all_tiles_and_none_is_left_out(crowded: City) -> None:
+    ids, total = number_city(crowded), count_city(crowded)
+    kept = {key: find_used_points(tile.mesh) for key, tile in crowded.tiles.items()}
+    used = [ids[key][kept[key]] for key in crowded.tiles]
+    flat = np.concatenate(used)
+    points = np.concatenate([expand_cells(crowded.tiles[key].mesh).points[used] for key, used in kept.items()])
+    assert flat.min() >= 0
+    assert len(np.unique(flat)) == len(np.unique(points, axis=0)) == total
+    assert len(np.unique(np.column_stack((flat, points)), axis=0)) == total
+    table = collect_ids(used)
+    assert np.unique(number_without_gaps(table, flat)).tolist() == list(range(table.n_points))
+    assert table.n_points == total
+    # Every part is one run: there is no id of a level that no tile uses.
+    assert len(table.start) == len(np.unique(flat >> LOCAL_BITS))
 
 
-@pytest.fixture(scope="module")
-def nine() -> City:
-    houses = [shapely.box(x, y, x + 25, y + 25) for x in range(210, 410, 25) for y in range(210, 410, 25)]
-    houses += [affinity.rotate(shapely.box(520, 500, 600, 620), 20.0), shapely.Point(280, 560).buffer(30)]
-    scene = scene_of(houses, [12.0 + 4 * (k % 5) for k in range(len(houses))], hilly_dtm(WIDE, relief=15.0))
-    return mesh_city(scene, make_grid(WIDE, tile_size=280.0, mesh_size=20.0), COARSE)
-
-
-@pytest.fixture(scope="module")
-def pieces(nine: City) -> Pieces:
-    return cut_city(nine)
-
-
-# --- numbers ---------------------------------------------------------------------------------------
-
-
-def test_a_point_has_one_id_in_all_tiles_and_none_is_left_out(crowded: City, nine: City) -> None:
-    for city in (crowded, nine):
-        ids, total = number_city(city), count_city(city)
-        kept = {key: find_used_points(tile.mesh) for key, tile in city.tiles.items()}
-        used = [ids[key][kept[key]] for key in city.tiles]
-        flat = np.concatenate(used)
-        points = np.concatenate([expand_cells(city.tiles[key].mesh).points[used] for key, used in kept.items()])
-        assert flat.min() >= 0
-        assert len(np.unique(flat)) == len(np.unique(points, axis=0)) == total
-        assert len(np.unique(np.column_stack((flat, points)), axis=0)) == total
-        table = collect_ids(used)
-        assert np.unique(number_without_gaps(table, flat)).tolist() == list(range(table.n_points))
-        assert table.n_points == total
-        # Every part is one run: there is no id of a level that no tile uses.
-        assert len(table.start) == len(np.unique(flat >> LOCAL_BITS))
-
-
-def test_ids_say_nothing_of_the_region(nine: City) -> None:
+def test_ids_say_nothing_of_the_region() -> None:
     """Of a larger region with the same houses, the tiles in the middle have the same ids."""
     houses = CITIES["towers on the corners"]
     roofs = [9.0, 12.0, 15.0, 18.0]
@@ -306,198 +340,6 @@ def test_corners_with_two_ids_are_refused(crowded: City) -> None:
     mesh = crowded.tiles[Key(0, 0)].mesh
     with pytest.raises(ValueError, match="number a corner differently"):
         number_columns(mesh, np.array([0, 1, 0], np.int32), np.array([0, 40, 7]), 100)
-
-
-# --- one file of all pieces ------------------------------------------------------------------------
-
-
-def test_one_file_has_all_pieces_and_each_vertex_once(tmp_path: Path, nine: City, pieces: Pieces) -> None:
-    volumes, boundaries = write_numbered(tmp_path, nine)
-    before = sorted(tmp_path.iterdir())
-    write_merged_volume(tmp_path / "all.vtu", volumes)
-    write_merged_boundary(tmp_path / "all.vtp", boundaries, volumes)
-    assert sorted(tmp_path.iterdir()) == sorted([*before, tmp_path / "all.vtu", tmp_path / "all.vtp"])
-    mesh = meshio.vtu.read(str(tmp_path / "all.vtu"))
-    cells = mesh.cells[0].data
-    corners = np.concatenate([piece.points[piece.cells] for piece, _ in pieces.values()])
-    assert mesh.points[cells].tobytes() == corners.tobytes()
-    assert len(np.unique(mesh.points, axis=0)) == len(mesh.points)
-    tiles = np.repeat([10 * key.i + key.j for key in pieces], [len(piece.cells) for piece, _ in pieces.values()])
-    assert (mesh.cell_data["tile"][0] == tiles).all()
-    assert len(pair_edges(pair_cell_faces(cells.astype(np.int32), len(mesh.points)).exterior).open) == 0
-    merged = read_vtp(tmp_path / "all.vtp")
-    facets = np.concatenate([piece.points[boundary.facets] for piece, boundary in pieces.values()])
-    assert merged.points[merged.boundary.facets].tobytes() == facets.tobytes()
-    assert (mesh.points[merged.vertex] == merged.points).all()
-    assert (merged.boundary.marker == np.concatenate([part.marker for _, part in pieces.values()])).all()
-    surface = pyvista.read(tmp_path / "all.vtp")
-    assert (surface.points == merged.points).all()
-    assert (surface.regular_faces == merged.boundary.facets).all()
-    assert (surface.cell_data["building"] == merged.boundary.building).all()
-
-
-def test_pieces_that_cannot_be_merged_leave_no_file(tmp_path: Path, nine: City, pieces: Pieces) -> None:
-    volumes, _ = write_numbered(tmp_path, nine)
-    target = tmp_path / "all.vtu"
-    mesh, ids = pieces[CENTRE][0], read_vtu(tmp_path / "1_1.vtu").point_data[VERTEX_ID]
-    tile = np.zeros(len(mesh.cells), np.int32)
-    lists: list[tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]], str]] = [
-        ({}, {"tile": tile}, "has no point array vertex_id"),
-        ({VERTEX_ID: ids[::-1].copy()}, {"tile": tile}, "stands for two places"),
-        ({VERTEX_ID: ids}, {"tile": tile.astype(np.float64)}, "has no array 'tile' like the first piece's"),
-    ]
-    for point_data, cell_data, message in lists:
-        write_vtu(tmp_path / "1_1.vtu", mesh, point_data=point_data, cell_data=cell_data)
-        with pytest.raises(InputError, match=message):
-            write_merged_volume(target, volumes)
-    with pytest.raises(OutputError, match="cannot be written"):
-        write_merged_volume(tmp_path / "none" / "all.vtu", volumes)
-    with pytest.raises(ValueError, match="at least one piece"):
-        write_merged_volume(target, [])
-    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".vtp"] * 9 + [".vtu"] * 9
-    assert not target.exists()
-
-
-# --- many pieces, checked --------------------------------------------------------------------------
-
-
-def check(folder: Path, city: City) -> CheckReport:
-    return check_run(folder, lambda path: SampledDtm(city.scene.dtm))
-
-
-def kinds(report: CheckReport) -> set[str]:
-    return {fault.kind for fault in report.faults}
-
-
-def test_many_pieces_are_proved_in_any_order(tmp_path: Path, nine: City, pieces: Pieces) -> None:
-    write_tiled_run(tmp_path / "a", nine, pieces)
-    report = check(tmp_path / "a", nine)
-    assert report.ok, report.lines()
-    n_shared = sum(len(shared) for _, _, shared in split_all(nine).values())
-    assert (
-        report.lines()[1]
-        == f"ok    {n_shared // 2} faces on 12 seams of 9 pieces are bitwise equal from both sides"
-    )
-    keys = np.random.default_rng(1).permutation(list(pieces))
-    write_tiled_run(tmp_path / "b", nine, {Key(i, j): pieces[Key(i, j)] for i, j in keys.tolist()})
-    again = check(tmp_path / "b", nine)
-    assert again.ok, again.lines()
-    assert {name: round(value, 3) for name, value in again.facts.items()} == {
-        name: round(value, 3) for name, value in report.facts.items()
-    }
-
-
-def seam_face(pieces: Pieces, key: Key) -> NDArray[np.int32]:
-    """An exterior face of a piece that is not in its boundary."""
-    mesh, boundary = pieces[key]
-    exterior = pair_cell_faces(mesh.cells, len(mesh.points)).exterior
-    face: NDArray[np.int32] = exterior[match_facets(exterior, boundary.facets).missing[0]]
-    return face
-
-
-def with_facet(pieces: Pieces, key: Key, face: NDArray[np.int32], marker: Marker, building: int) -> Pieces:
-    mesh, old = pieces[key]
-    boundary = Boundary(
-        np.concatenate((old.facets, face[None])),
-        np.append(old.marker, np.int32(marker)),
-        np.append(old.building, np.int64(building)),
-    )
-    return {**pieces, key: (mesh, boundary)}
-
-
-def twin_of(pieces: Pieces, key: Key, face: NDArray[np.int32], other: Key) -> NDArray[np.int32]:
-    """The same face in another piece, turned over."""
-    corners, points = pieces[key][0].points[face], pieces[other][0].points
-    found = [np.flatnonzero((points == corner).all(axis=1)) for corner in corners]
-    return np.array([int(row[0]) for row in found[::-1]], np.int32)
-
-
-def shift_vertex(pieces: Pieces, nine: City) -> Pieces:
-    mesh, boundary = pieces[CENTRE]
-    points = mesh.points.copy()
-    points[seam_face(pieces, CENTRE)[0], 0] += 1e-9
-    return {**pieces, CENTRE: (TetMesh(points, mesh.cells), boundary)}
-
-
-def lift_vertex(pieces: Pieces, nine: City) -> Pieces:
-    mesh, boundary = pieces[CENTRE]
-    free = np.setdiff1d(seam_face(pieces, CENTRE), boundary.facets)
-    points = mesh.points.copy()
-    points[free[0], 2] = np.nextafter(points[free[0], 2], np.inf)
-    return {**pieces, CENTRE: (TetMesh(points, mesh.cells), boundary)}
-
-
-def drop_piece(pieces: Pieces, nine: City) -> Pieces:
-    return {key: piece for key, piece in pieces.items() if key != CENTRE}
-
-
-def stray_facet(pieces: Pieces, nine: City) -> Pieces:
-    mesh, _ = pieces[CENTRE]
-    faces = mesh.cells[:, [0, 2, 1]]
-    exterior = np.unique(pair_cell_faces(mesh.cells, len(mesh.points)).exterior)
-    inner = faces[~np.isin(faces, exterior).any(axis=1)][0]
-    return with_facet(pieces, CENTRE, inner, Marker.WALL, int(nine.scene.model.numbers[0]))
-
-
-def seam_as_wall(pieces: Pieces, nine: City) -> Pieces:
-    """A face of a seam, written as a wall by both of its pieces: each boundary alone is as good as before."""
-    number = int(nine.scene.model.numbers[0])
-    face = seam_face(pieces, Key(0, 0))
-    corners = pieces[Key(0, 0)][0].points[face]
-    others = [
-        key
-        for key in (Key(0, 1), Key(1, 0))
-        if all((pieces[key][0].points == corner).all(axis=1).any() for corner in corners)
-    ]
-    twin = twin_of(pieces, Key(0, 0), face, others[0])
-    once = with_facet(pieces, Key(0, 0), face, Marker.WALL, number)
-    return with_facet(once, others[0], twin, Marker.WALL, number)
-
-
-def seam_wall_left_out(pieces: Pieces, nine: City) -> Pieces:
-    """A wall over a seam that its piece leaves to the neighbour, who has no such face."""
-    mesh, old = pieces[CENTRE]
-    edges = nine.tiles[CENTRE].mesh.plane.xy[seam_edges(nine, CENTRE).vertices]
-    over = find_edges_below(mesh.points[old.facets], edges) >= 0
-    row = int(np.flatnonzero(over & (old.marker == Marker.WALL))[0])
-    kept = np.arange(len(old.facets)) != row
-    return {**pieces, CENTRE: (mesh, Boundary(old.facets[kept], old.marker[kept], old.building[kept]))}
-
-
-def seam_as_missing(pieces: Pieces, nine: City) -> Pieces:
-    return with_facet(pieces, CENTRE, seam_face(pieces, CENTRE), Marker.MISSING, -1)
-
-
-FAULTS: dict[str, tuple[Callable[[Pieces, City], Pieces], set[str]]] = {
-    "seam vertex shifted": (shift_vertex, {"seam-open"}),
-    "seam vertex lifted by a bit": (lift_vertex, {"seam-open"}),
-    "piece dropped": (drop_piece, {"seam-open", "plan-area", "boundary-open", "roof-area"}),
-    "stray facet": (stray_facet, {"facet-extra", "boundary-open", "wall-off-outline"}),
-    "seam as wall on both sides": (seam_as_wall, {"facet-extra", "wall-off-outline"}),
-    "wall over a seam left out": (seam_wall_left_out, {"seam-open", "boundary-open"}),
-    "seam as missing on one side": (seam_as_missing, {"facet-extra", "boundary-open"}),
-}
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_faults_of_many_pieces_are_found(tmp_path: Path, nine: City, pieces: Pieces, name: str) -> None:
-    tamper, expected = FAULTS[name]
-    write_tiled_run(tmp_path, nine, tamper(pieces, nine))
-    found = check(tmp_path, nine)
-    assert kinds(found) >= expected, found.lines()
-    for fault in found.faults:
-        assert fault.places or fault.kind in ("plan-area", "volume", "counts")
-
-
-def test_missing_pieces_are_told_and_the_rest_is_proved(tmp_path: Path, nine: City) -> None:
-    gone = (Key(1, 1), Key(0, 2), Key(1, 0))
-    write_tiled_run(tmp_path, nine, cut_city(nine, gone))
-    report = check(tmp_path, nine)
-    assert report.ok, report.lines()
-    assert report.facts["missing_facets"] > 0
-    assert any(
-        f"{report.facts['missing_facets']} facets bound pieces that are missing" in line for line in report.lines()
-    )
 
 
 def test_seams_that_differ_are_an_error() -> None:

@@ -10,89 +10,92 @@ import shapely
 from numpy.typing import NDArray
 from shapely import affinity
 
+from pipeline.city_model.heights import highest_wall_ground
 from pipeline.columns.adaptive import mesh_adaptive
 from pipeline.columns.columns import expand_cells
+from pipeline.columns.layered import LayeredOptions, mesh_layers
 from pipeline.data.errors import GeometryError
+from pipeline.data.roofs import flat_roofs
 from pipeline.plane_mesh.plane import mesh_plane
 from pipeline.quality.quality import measure_cells
 from stitch.seams.seams import find_vertices, trace_seam
 from stitch.seams.tiles import areas_within
 from stitch.tiling import paths
 from stitch.tiling.corners import place_corner
-from stitch.tiling.grid import Key, SeamKey, is_border, make_grid, seam_keys, tile_keys
+from stitch.tiling.grid import Key, SeamKey, has_tile, is_border, make_grid, seam_keys, tile_keys
 from stitch.tiling.strips import CORRIDOR, Strip, improve_around, mesh_strip
 from stitch.tiling.walls import cut_walls, split_walls
 from tests.helpers.campaigns import rounds
-from tests.helpers.cities import Bounds, crowded_blocks, tilted_dtm
+from tests.helpers.cities import Bounds, crowded_blocks, hilly_dtm, tilted_dtm
 from tests.helpers.stitching import (
+    BOTH,
+    LAYERED,
+    NINE,
     OPTIONS,
+    SQUARE,
+    Options,
     Scene,
     amsterdam_scene,
     glue,
     mesh_all,
     mesh_alone,
     mesh_bytes,
-    prove_glued,
-    prove_seams,
-    prove_volume,
+    prove_tiles,
     random_scene,
+    same_houses,
     scene_of,
     select_houses,
 )
 from tests.helpers.terraces import terrace_town
 
-SQUARE: Bounds = (0.0, 0.0, 420.0, 420.0)
-NINE = make_grid(SQUARE, tile_size=140.0, mesh_size=10.0)
+# A domain so low that tiles in the middle of a small region are out of reach of its border.
+LOW = replace(LAYERED, domain_height=30.0)
+RANDOM: list[tuple[Options, int, int, float]] = [
+    *((OPTIONS, 40 + 20 * seed, seed, 20.0 * (seed % 3)) for seed in rounds([0, 7], [1, 2, 3, 4, 5, 6])),
+    (LAYERED, 135, 3, 0.0),
+]
 
 
 def test_open_ground_is_cut_straight_and_glued() -> None:
-    scene = scene_of([], [], tilted_dtm(SQUARE, height=5.0))
     grid = make_grid(SQUARE, tile_size=210.0, mesh_size=10.0)
-    tiles = mesh_all(scene, grid)
-    assert prove_seams(tiles) == 4
-    prove_glued(glue([tile.mesh for tile in tiles.values()]), scene, SQUARE)
-    prove_volume(tiles, scene, SQUARE)
+    prove_tiles(scene_of([], [], tilted_dtm(SQUARE, height=5.0)), grid, level=True)
 
 
-@pytest.mark.parametrize("seed", rounds([0, 7], [1, 2, 3, 4, 5, 6]))
-def test_random_cities_are_one_mesh(seed: int) -> None:
-    scene = random_scene(SQUARE, 40 + 20 * seed, seed=seed, relief=20.0 * (seed % 3))
-    tiles = mesh_all(scene, NINE)
-    assert prove_seams(tiles) == 12
-    prove_glued(glue([tile.mesh for tile in tiles.values()]), scene, SQUARE)
-    if seed % 3 == 0:
-        prove_volume(tiles, scene, SQUARE)
+@pytest.mark.parametrize(("options", "n", "seed", "relief"), RANDOM)
+def test_random_cities_are_one_mesh(options: Options, n: int, seed: int, relief: float) -> None:
+    prove_tiles(random_scene(SQUARE, n, seed=seed, relief=relief), NINE, options, level=not relief)
 
 
-def test_a_tile_is_the_same_alone_and_in_a_larger_region() -> None:
-    bounds, inner = (0.0, 0.0, 560.0, 560.0), (70.0, 70.0, 490.0, 490.0)
-    scene = random_scene(bounds, 220, seed=3, relief=15.0)
+@pytest.mark.parametrize(
+    ("options", "side", "margin", "n", "keys"),
+    [(OPTIONS, 560.0, 70.0, 220, [Key(1, 1), Key(2, 2)]), (LOW, 700.0, 140.0, 300, [Key(2, 2)])],
+    ids=BOTH,
+)
+def test_a_tile_is_the_same_alone_and_in_a_larger_region(
+    options: Options, side: float, margin: float, n: int, keys: list[Key]
+) -> None:
+    """The small region's outer tiles may be half as wide; those within touch its border nowhere."""
+    bounds, inner = (0.0, 0.0, side, side), (margin, margin, side - margin, side - margin)
+    scene = random_scene(bounds, n, seed=3, relief=15.0)
+    if options is LOW:
+        scene = replace(scene, model=replace(scene.model, roofs=flat_roofs(np.minimum(scene.model.roof, 14.0))))
     crossing = shapely.intersects(scene.model.polygons, shapely.box(*inner).exterior)
     scene = select_houses(scene, np.flatnonzero(~crossing))
-    within = select_houses(scene, np.flatnonzero(shapely.within(scene.model.polygons, shapely.box(*inner))))
-    assert len(within.model) < len(scene.model)
+    within = np.flatnonzero(shapely.within(scene.model.polygons, shapely.box(*inner)))
+    assert len(within) < len(scene.model)
     large, small = (make_grid(box, tile_size=140.0, mesh_size=10.0) for box in (bounds, inner))
-    # The small region's outer tiles are half as wide; the two by two within touch its border nowhere.
-    for tile in (Key(1, 1), Key(2, 2)):
-        alone = mesh_bytes(mesh_alone(scene, large, tile).mesh)
-        assert mesh_bytes(mesh_alone(scene, large, tile, clip=False).mesh) == alone
-        in_small = mesh_alone(within, small, tile)
-        names = np.append(within.model.ids, "")
-        mesh = in_small.mesh
-        rows = np.searchsorted(scene.model.numbers, np.append(within.model.numbers, -1)).astype(np.int32)
-        rows[-1] = -1
-        assert (np.append(scene.model.ids, "")[rows] == names).all()
-        plane = replace(mesh.plane, building=rows[mesh.plane.building])
-        assert mesh_bytes(replace(mesh, plane=plane)) == alone
+    for tile in keys:
+        alone = mesh_bytes(mesh_alone(scene, large, tile, options).mesh)
+        assert mesh_bytes(mesh_alone(scene, large, tile, options, clip=False).mesh) == alone
+        assert same_houses(mesh_alone(select_houses(scene, within), small, tile, options).mesh, within) == alone
 
 
-def test_a_tile_does_not_depend_on_the_order_of_houses() -> None:
+@pytest.mark.parametrize("options", BOTH.values(), ids=BOTH)
+def test_a_tile_does_not_depend_on_the_order_of_houses(options: Options) -> None:
     scene = random_scene(SQUARE, 110, seed=5, relief=10.0)
-    shuffled = select_houses(scene, np.random.default_rng(0).permutation(len(scene.model)))
-    one, two = (mesh_alone(city, NINE, Key(1, 1)).mesh for city in (scene, shuffled))
-    assert mesh_bytes(replace(one, plane=replace(one.plane, building=two.plane.building))) == mesh_bytes(two)
-    names = [np.append(city.model.ids, "")[mesh.plane.building] for city, mesh in ((scene, one), (shuffled, two))]
-    assert (names[0] == names[1]).all()
+    order = np.random.default_rng(0).permutation(len(scene.model))
+    one, two = (mesh_alone(city, NINE, Key(1, 1), options).mesh for city in (scene, select_houses(scene, order)))
+    assert same_houses(two, order) == mesh_bytes(one)
 
 
 COURT = shapely.box(60, 60, 360, 360).difference(shapely.box(75, 75, 345, 345))
@@ -104,73 +107,88 @@ CITIES = {
     "walls along the lines": [shapely.box(3, 138, 417, 142), shapely.box(3, 278, 417, 281)],
     "rows across all seams": [shapely.box(3, 110 + 6 * k, 417, 112 + 6 * k) for k in range(10)],
 }
+ON_SEAMS: list[tuple[Options, str]] = [(OPTIONS, name) for name in CITIES]
+ON_SEAMS += [(LAYERED, "a courtyard around a tile"), (LAYERED, "towers on the corners")]
 
 
-@pytest.mark.parametrize("name", CITIES)
-def test_houses_on_seams_and_corners(name: str) -> None:
-    houses = CITIES[name]
-    scene = scene_of(houses, [8.0 + 3 * k for k in range(len(houses))], tilted_dtm(SQUARE, height=2.0))
-    tiles = mesh_all(scene, NINE)
-    assert prove_seams(tiles) == 12
-    prove_glued(glue([tile.mesh for tile in tiles.values()]), scene, SQUARE)
-    prove_volume(tiles, scene, SQUARE)
+@pytest.mark.parametrize(("options", "name"), ON_SEAMS)
+def test_houses_on_seams_and_corners(options: Options, name: str) -> None:
+    roofs = [8.0 + 3 * k for k in range(len(CITIES[name]))]
+    prove_tiles(scene_of(CITIES[name], roofs, tilted_dtm(SQUARE, height=2.0)), NINE, options, level=True)
 
 
 @pytest.mark.parametrize(
-    "bounds", [(70.0, 70.0, 490.0, 350.0), (0.0, 0.0, 600.0, 30.0), (-300.0, -600.0, -180.0, -300.0)]
+    ("options", "bounds"),
+    [
+        (OPTIONS, (70.0, 70.0, 490.0, 350.0)),
+        (OPTIONS, (0.0, 0.0, 600.0, 30.0)),
+        (OPTIONS, (-300.0, -600.0, -180.0, -300.0)),
+        (LAYERED, (70.0, 70.0, 420.0, 210.0)),
+        (LAYERED, (0.0, 0.0, 600.0, 30.0)),
+    ],
 )
-def test_narrow_outer_tiles_single_rows_and_negative_coordinates(bounds: Bounds) -> None:
+def test_narrow_outer_tiles_single_rows_and_negative_coordinates(options: Options, bounds: Bounds) -> None:
     area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
-    scene = random_scene(bounds, int(area * 5e-4), seed=1, relief=10.0)
     grid = make_grid(bounds, tile_size=140.0, mesh_size=10.0)
-    tiles = mesh_all(scene, grid)
-    assert prove_seams(tiles) == sum(not is_border(grid, key) for key in seam_keys(grid)) > 0
-    prove_glued(glue([tile.mesh for tile in tiles.values()]), scene, bounds)
+    tiles = prove_tiles(random_scene(bounds, int(area * 5e-4), seed=1, relief=10.0), grid, options)
+    assert len(tiles) > 1
 
 
-def test_terraces_keep_their_party_walls_across_seams() -> None:
+@pytest.mark.parametrize(
+    ("options", "relief"),
+    [(OPTIONS, 0.0), (replace(LAYERED, layer_height=2.5), 1.0), (replace(LAYERED, layer_height=6.0), 1.0)],
+)
+def test_terraces_keep_their_party_walls_across_seams(options: Options, relief: float) -> None:
     town = terrace_town()
-    dtm = tilted_dtm(town.bounds)
-    options = replace(OPTIONS, mesh_size=3.5)
     grid = make_grid(town.bounds, tile_size=49.0, mesh_size=3.5)
-    scene = Scene(town.model, town.group, dtm)
-    tiles = mesh_all(scene, grid, options)
+    scene = Scene(town.model, town.group, hilly_dtm(town.bounds, relief=relief, length=20.0))
+    tiles = prove_tiles(scene, grid, replace(options, mesh_size=3.5), level=not relief)
     assert len(tiles) == 4
     assert any(len(seam.wall_nodes) for tile in tiles.values() for seam in tile.seams.values())
-    prove_seams(tiles)
-    prove_glued(glue([tile.mesh for tile in tiles.values()]), scene, town.bounds, options)
-    prove_volume(tiles, scene, town.bounds, options)
 
 
-def test_seams_cost_little_quality() -> None:
-    bounds = (0.0, 0.0, 600.0, 600.0)
-    scene = random_scene(bounds, 270, seed=8, relief=20.0)
+@pytest.mark.parametrize(
+    ("options", "side", "n", "bounds_of_ratio"),
+    [(OPTIONS, 600.0, 270, (0.5, 0.93, 0.97, 1.03)), (LAYERED, 420.0, 130, (0.5, 0.85, 0.95, 1.04))],
+    ids=BOTH,
+)
+def test_seams_cost_little_quality(
+    options: Options, side: float, n: int, bounds_of_ratio: tuple[float, ...]
+) -> None:
+    bounds = (0.0, 0.0, side, side)
+    scene = random_scene(bounds, n, seed=8, relief=20.0)
+    grid = make_grid(bounds, tile_size=side / 3, mesh_size=10.0)
+    tiled = measure_cells(glue([tile.mesh for tile in mesh_all(scene, grid, options).values()])).radius_ratio
     model = scene.model
-    grid = make_grid(bounds, tile_size=200.0, mesh_size=10.0)
-    tiled = measure_cells(glue([tile.mesh for tile in mesh_all(scene, grid).values()])).radius_ratio
     plane, _ = mesh_plane(bounds, model.polygons, mesh_size=10.0, min_angle=28, refinements=1, passes=4)
-    whole = expand_cells(mesh_adaptive(plane, scene.dtm, model.roofs, model.ids, OPTIONS)[0])
-    untiled = measure_cells(whole).radius_ratio
+    if isinstance(options, LayeredOptions):
+        wall_ground = highest_wall_ground(model.polygons, scene.dtm)
+        whole = mesh_layers(plane, scene.dtm, model, wall_ground, bounds, options)[0]
+    else:
+        whole = mesh_adaptive(plane, scene.dtm, model.roofs, model.ids, options)[0]
+    untiled = measure_cells(expand_cells(whole)).radius_ratio
     ratio = np.percentile(tiled, (0, 0.1, 1, 5, 50)) / np.percentile(untiled, (0, 0.1, 1, 5, 50))
-    assert ratio[0] > 0.5
-    assert ratio[1] > 0.93
-    assert (ratio[2:] > 0.97).all()
-    assert len(tiled) < 1.03 * len(untiled)
+    worst, few, most, cells = bounds_of_ratio
+    assert ratio[0] > worst
+    assert ratio[1] > few
+    assert (ratio[2:] > most).all()
+    assert len(tiled) < cells * len(untiled)
 
 
 @pytest.mark.long
 @pytest.mark.shared
-@pytest.mark.parametrize("simplify", ["clearance", "paper"])
-def test_amsterdam_in_four_tiles_is_one_mesh(simplify: Literal["clearance", "paper"], shared_data: Path) -> None:
-    bounds = (120900.0, 486150.0, 121200.0, 486450.0)
+@pytest.mark.parametrize(
+    ("options", "simplify"), [(OPTIONS, "clearance"), (OPTIONS, "paper"), (LAYERED, "clearance")]
+)
+def test_amsterdam_in_four_tiles_is_one_mesh(
+    options: Options, simplify: Literal["clearance", "paper"], shared_data: Path
+) -> None:
+    bounds, key = (120900.0, 486150.0, 121200.0, 486450.0), Key(807, 3242)
     scene = amsterdam_scene(shared_data / "amsterdam", bounds, simplify)
     grid = make_grid(bounds, tile_size=150.0, mesh_size=10.0)
-    options = replace(OPTIONS, domain_height=100.0)
-    tiles = mesh_all(scene, grid, options)
-    assert prove_seams(tiles) == 4
-    prove_glued(glue([tile.mesh for tile in tiles.values()]), scene, bounds, options)
-    alone = mesh_alone(scene, grid, Key(807, 3242), options, clip=False).mesh
-    assert mesh_bytes(alone) == mesh_bytes(tiles[Key(807, 3242)].mesh)
+    options = replace(options, domain_height=100.0)
+    tiles = prove_tiles(scene, grid, options)
+    assert mesh_bytes(mesh_alone(scene, grid, key, options, clip=False).mesh) == mesh_bytes(tiles[key].mesh)
 
 
 def test_the_clearest_place_is_the_middle_of_the_street() -> None:
@@ -237,6 +255,21 @@ def test_lines_are_multiples_of_the_tile_size_and_stay_clear_of_the_sides() -> N
         make_grid(SQUARE, tile_size=130.0, mesh_size=10.0)
     with pytest.raises(ValueError, match="empty"):
         make_grid((0.0, 0.0, 0.0, 9.0), tile_size=140.0, mesh_size=10.0)
+
+
+def test_what_the_grid_says_of_absent_tiles() -> None:
+    """Runs of regions with absent tiles are proved in `tests.runs.test_tiled_runs`."""
+    present = np.ones((3, 3), np.bool_)
+    present[2, 2] = False
+    grid = replace(NINE, present=present)
+    assert not has_tile(grid, Key(2, 2))
+    assert not has_tile(grid, Key(-1, 0))
+    assert not has_tile(grid, Key(3, 0))
+    assert len(tile_keys(grid)) == 8
+    assert is_border(grid, SeamKey(1, 2, 2))
+    assert not is_border(grid, SeamKey(1, 2, 1))
+    assert SeamKey(1, 3, 2) not in seam_keys(grid)
+    assert len(seam_keys(grid)) == 24 - 2
 
 
 def test_a_seam_goes_round_houses_where_it_can_and_never_leaves_its_wedges() -> None:

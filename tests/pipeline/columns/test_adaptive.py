@@ -37,7 +37,6 @@ from pipeline.plane_mesh.improve_plane import improve_plane
 from pipeline.plane_mesh.plane import mesh_plane, signed_areas
 from pipeline.points_terrain.terrain import HEIGHT_UNIT, Dtm, sample_dtm
 from pipeline.quality.quality import measure_cells, quality_percentiles
-from stitch.pieces.conformity import pair_cell_faces, pair_edges
 from tests.helpers.cities import Bounds, city_of, crowded_blocks, hilly_dtm, tilted_dtm
 from tests.helpers.terraces import prove_conforming, prove_volume, prove_walls, terrace_town
 
@@ -170,15 +169,6 @@ def test_quality_is_as_stated(seed: int) -> None:
     assert report.worst_ratio[1] >= report.worst_ratio[0]
 
 
-def test_same_input_same_bytes() -> None:
-    town = terrace_town()
-    dtm = hilly_dtm(town.bounds, relief=2.0)
-    one, two = (mesh_of(town.model, dtm, town.bounds)[0] for _ in range(2))
-    assert one.z.tobytes() == two.z.tobytes()
-    assert one.plane.xy.tobytes() == two.plane.xy.tobytes()
-    assert one.bottom.tobytes() == two.bottom.tobytes()
-
-
 def halves(plane: PlaneMesh, x: float) -> list[tuple[PlaneMesh, NDArray[np.int64]]]:
     """Cut a plane mesh along its edges: each half with the vertices of the whole that it has."""
     left = plane.xy[plane.triangles][..., 0].mean(axis=1) < x
@@ -188,46 +178,6 @@ def halves(plane: PlaneMesh, x: float) -> list[tuple[PlaneMesh, NDArray[np.int64
         part = PlaneMesh(plane.xy[used], triangles.reshape(-1, 3).astype(np.int32), plane.building[side])
         result.append((part, used))
     return result
-
-
-def test_two_halves_with_a_given_seam_are_one_mesh() -> None:
-    town = terrace_town(ground=6.0)
-    dtm = hilly_dtm(town.bounds, relief=4.0)
-    city = town.model
-    plane, _ = mesh_plane(town.bounds, city.polygons, mesh_size=10.0, min_angle=28, passes=4)
-    whole, _ = fill_columns(plane, dtm, city.roofs, city.ids, OPTIONS)
-    parts = halves(plane, 50.0)  # cuts houses and party walls
-    common = np.intersect1d(parts[0][1], parts[1][1]).astype(np.int32)
-    given = take_columns(whole, common)
-    points: list[NDArray[np.float64]] = []
-    cells: list[NDArray[np.int32]] = []
-    for part, used in parts:
-        seam = SeamColumns(np.searchsorted(used, common).astype(np.int32), given)
-        mesh, _ = mesh_adaptive(part, dtm, city.roofs, city.ids, OPTIONS, seam=seam)
-        for k, vertex in enumerate(seam.vertex):
-            column = mesh.z[mesh.z_start[vertex] : mesh.z_start[vertex + 1]]
-            assert column.tobytes() == given.z[given.start[k] : given.start[k + 1]].tobytes()
-        explicit = expand_cells(mesh)
-        cells.append(explicit.cells + np.int32(sum(map(len, points))))
-        points.append(explicit.points)
-    unique, index = np.unique(np.concatenate(points), axis=0, return_inverse=True)
-    glued = index.reshape(-1)[np.concatenate(cells)].astype(np.int32)
-    prove_glued(unique, glued, plane, city)
-
-
-def prove_glued(points: NDArray[np.float64], cells: NDArray[np.int32], plane: PlaneMesh, city: CityModel) -> None:
-    """Prove that no face inside the region is open but those on walls, roofs and ground."""
-    faces = pair_cell_faces(cells, len(points))
-    assert (len(faces.same_side), len(faces.shared)) == (0, 0)
-    assert len(pair_edges(faces.exterior).open) == 0
-    corners = points[faces.exterior]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    upright = np.abs(normal[:, 2]) < 1e-9 * np.linalg.norm(normal, axis=1)
-    middle = corners[upright].mean(axis=1)[:, :2]
-    low, high = plane.xy.min(axis=0), plane.xy.max(axis=0)
-    inner = ((middle > low + 1e-9) & (middle < high - 1e-9)).all(axis=1)
-    walls = shapely.union_all(shapely.boundary(city.polygons))
-    assert shapely.distance(walls, shapely.points(middle[inner])).max() < 1e-9
 
 
 def test_a_column_depends_on_its_neighbourhood_alone() -> None:

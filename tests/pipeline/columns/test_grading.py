@@ -20,8 +20,7 @@ from stitch.tiling.grid import Key, TileGrid, make_grid
 from stitch.tiling.walls import cut_walls
 from tests.helpers.cities import Bounds, city_of, crowded_blocks, hilly_dtm
 from tests.helpers.stitching import (
-    LAYERED,
-    OPTIONS,
+    BOTH,
     Options,
     Scene,
     Tile,
@@ -31,12 +30,11 @@ from tests.helpers.stitching import (
     mesh_bytes,
     prove_glued,
     prove_seams,
-    prove_volume,
+    prove_tiles,
     scene_of,
     select_houses,
 )
-from tests.helpers.tiles import column_arrays, hash_files, make_town, run_of, write_town
-from tiler.check.check import check_run
+from tests.helpers.tiles import column_arrays, make_town, prove, run_of, write_town
 from tiler.config.config import Config, idle_parameters, make_config
 from tiler.pictures.picture_data import City
 from tiler.pictures.picture_parts import plan_edges
@@ -45,7 +43,6 @@ from tiler.planning.footprint_sample import sample_footprints
 from tiler.planning.forecast import forecast_run
 from tiler.planning.plan import survey_inputs
 from tiler.stages.mesh import mesh_stages
-from tiler.store.results import StoredTerrain
 
 RULE = SizeRule(mesh_size=10.0, open_size=25.0, grading=0.2)
 SIZE = 350.0  # m; side of a tile, 14 open sizes
@@ -148,18 +145,14 @@ def test_nine_tiles_are_one_mesh_of_fewer_cells_as_good_in_the_same_places(
     assert (np.array(ratios[0]) > 0.95 * np.array(ratios[1])).all()
 
 
-@pytest.mark.parametrize("options", [OPTIONS, LAYERED], ids=["adaptive", "layered"])
+@pytest.mark.parametrize("options", BOTH.values(), ids=BOTH)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_four_tiles_are_one_mesh(options: Options, seed: int) -> None:
     bounds = (0.0, 0.0, 2 * SIZE, 2 * SIZE)
     # The first stands on corner and seams, the second in a corner of the region.
     built = ((220.0, 250.0, 520.0, 500.0), (0.0, 0.0, 250.0, 200.0))[seed]
     scene = town_scene(bounds, built, 30, seed=seed, relief=15.0 * (1 - seed))
-    tiles = mesh_all(scene, grid_of(bounds), options, rule=RULE)
-    assert prove_seams(tiles) == 4
-    prove_glued(glue([tile.mesh for tile in tiles.values()]), scene, bounds, options)
-    if seed:
-        prove_volume(tiles, scene, bounds, options)
+    prove_tiles(scene, grid_of(bounds), options, level=seed > 0, rule=RULE)
 
 
 def test_a_tile_is_the_same_alone_and_in_a_larger_region() -> None:
@@ -215,8 +208,7 @@ def town_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TownRun]:
 
 @pytest.mark.parametrize("mesher", ["adaptive", "layered"])
 def test_a_graded_run_is_proved(town_runs: dict[str, TownRun], mesher: str) -> None:
-    report = check_run(town_runs[mesher][1], StoredTerrain)
-    assert report.ok, "\n".join(report.lines())
+    prove(town_runs[mesher][1])
 
 
 def test_a_tile_of_a_graded_run_is_the_same_in_a_smaller_region(tmp_path: Path) -> None:
@@ -229,12 +221,6 @@ def test_a_tile_of_a_graded_run_is_the_same_in_a_smaller_region(tmp_path: Path) 
         column_arrays(values | {"bounds": box}, tmp_path / str(k), "2_1") for k, box in enumerate((region, narrow))
     ]
     assert all(found[0][0][name].tobytes() == array.tobytes() for name, array in found[1][0].items())
-
-
-def test_workers_leave_the_same_files(town_runs: dict[str, TownRun], tmp_path: Path) -> None:
-    values, out, _ = town_runs["adaptive"]
-    run_of(values, tmp_path, workers=2)
-    assert hash_files(tmp_path) == hash_files(out)
 
 
 def test_tiles_that_are_too_small_for_the_open_size_are_refused(tmp_path: Path) -> None:

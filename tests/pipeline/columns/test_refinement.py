@@ -20,19 +20,16 @@ from stitch.tiling.grid import Key, make_grid
 from stitch.tiling.walls import LONGEST_PIECE, cut_walls
 from tests.helpers.cities import city_of, crowded_blocks
 from tests.helpers.stitching import (
-    LAYERED,
-    OPTIONS,
+    BOTH,
     Options,
     glue,
     mesh_all,
     mesh_alone,
     mesh_bytes,
-    prove_glued,
-    prove_seams,
+    prove_tiles,
     random_scene,
 )
-from tests.helpers.tiles import CRS, hash_files, make_town, run_of, write_town
-from tiler.check.check import check_run
+from tests.helpers.tiles import CRS, hash_files, make_town, prove, run_of, write_town
 from tiler.cli.negative_values import mark_values
 from tiler.cli.parser import build_parser
 from tiler.config.config import Config, idle_parameters, make_config, read_refinement
@@ -42,7 +39,6 @@ from tiler.planning.plan import survey_inputs
 from tiler.planning.refinements import MOST_PLACES, read_refinements
 from tiler.planning.region import Region
 from tiler.stages.mesh import mesh_stages
-from tiler.store.results import StoredTerrain
 
 SIDE = 160.0  # m; of a tile
 BOUNDS = (0.0, 0.0, 2 * SIDE, 2 * SIDE)
@@ -92,19 +88,18 @@ def test_triangles_are_thin_at_walls_and_cells_as_high_as_without() -> None:
     assert column_spacing(plane, finer, limits, mesh_size=10.0)[on_wall].max() <= 0.8 * 3.0
 
 
-@pytest.mark.parametrize("options", [OPTIONS, LAYERED], ids=["adaptive", "layered"])
+@pytest.mark.parametrize("options", BOTH.values(), ids=BOTH)
 @pytest.mark.parametrize("what", ["walls", "box"])
 def test_four_tiles_are_one_mesh(options: Options, what: str) -> None:
     scene = random_scene((90.0, 90.0, 240.0, 230.0), 12, seed=3)
     grid = make_grid(BOUNDS, tile_size=SIDE, mesh_size=10.0)
     rule, finer = (WALLS, []) if what == "walls" else (EVEN, finer_box())
     scene = type(scene)(scene.model, scene.group, random_scene(BOUNDS, 1, seed=0, relief=8.0).dtm)
-    tiles = mesh_all(scene, grid, options, rule=rule, finer=finer)
-    assert prove_seams(tiles) == 4
-    mesh = glue([tile.mesh for tile in tiles.values()])
-    prove_glued(mesh, scene, BOUNDS, options)
+    tiles = prove_tiles(scene, grid, options, rule=rule, finer=finer)
     even = mesh_all(scene, grid, options)
-    assert len(mesh.cells) > 1.3 * sum(len(tile.mesh.plane.triangles) for tile in even.values())
+    assert len(glue([tile.mesh for tile in tiles.values()]).cells) > 1.3 * sum(
+        len(tile.mesh.plane.triangles) for tile in even.values()
+    )
     alone = mesh_alone(scene, grid, Key(0, 0), options, clip=False, rule=rule, finer=finer)
     assert mesh_bytes(alone.mesh) == mesh_bytes(tiles[Key(0, 0)].mesh)
 
@@ -131,8 +126,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
 def test_a_refined_run_is_proved_and_foreseen(town: Town, mesher: str, tmp_path: Path) -> None:
     values = town(mesher=mesher, wall_size=4.0)
     record = run_of(values, tmp_path / "out")
-    report = check_run(tmp_path / "out", StoredTerrain)
-    assert report.ok, "\n".join(report.lines())
+    prove(tmp_path / "out")
     config = make_config(values)
     survey = survey_inputs(config, lambda _: None)
     cells = forecast_run(survey, sample_footprints(config, survey.region), config).loads.cells.sum()

@@ -9,7 +9,7 @@ import shapely
 
 from pipeline.city_model.city import City, CityOptions
 from pipeline.city_model.city_steps import build_city
-from pipeline.columns.columns import expand_cells, lowest_gap
+from pipeline.columns.columns import lowest_gap
 from pipeline.columns.layered import LayeredOptions
 from pipeline.data.citymodel import Footprints, make_ids, number_ids
 from pipeline.data.errors import InputError
@@ -96,7 +96,7 @@ def test_a_footprint_as_large_as_the_region_is_no_harm(border: Literal["drop", "
     city = city_over(footprints_of(whole), [(whole, 15.0)], dataclasses.replace(OPTIONS, border=border))
     assert len(city.model) == (0 if border == "drop" else 1)
     mesh = mesh_city(city, tilted_dtm(BOUNDS), BOUNDS, LAYERS, min_angle=25.0)
-    assert lowest_gap(mesh.columns)[1] == 0
+    assert lowest_gap(mesh)[1] == 0
 
 
 def test_a_roof_below_the_terrain_uphill_is_raised_and_told() -> None:
@@ -105,13 +105,6 @@ def test_a_roof_below_the_terrain_uphill_is_raised_and_told() -> None:
     assert city.model.roof.tolist() == [19.5]
     (note,) = [note for note in city.notes if note.kind == "building-roof-raised"]
     assert "6.00 m raised to 19.50 m" in note.detail
-
-
-def test_terrain_alone_is_a_mesh() -> None:
-    city = city_over(footprints_of(), [])
-    mesh = mesh_city(city, tilted_dtm(BOUNDS), BOUNDS, LAYERS, min_angle=25.0)
-    corners = expand_cells(mesh.columns).points[expand_cells(mesh.columns).cells]
-    assert np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6 == pytest.approx(100 * 100 * 100)
 
 
 def test_the_city_does_not_depend_on_the_order_of_footprints_and_points() -> None:

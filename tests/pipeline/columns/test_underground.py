@@ -40,10 +40,19 @@ from pipeline.columns.underground import (
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
 from stitch.pieces.conformity import compute_cell_volumes, pair_cell_faces
-from tests.helpers.cities import Bounds, crowded_blocks
-from tests.helpers.tiles import hash_files, make_town, run_of, write_town
+from tests.helpers.cities import crowded_blocks
+from tests.helpers.tiles import (
+    SIZE,
+    around,
+    hash_files,
+    make_town,
+    prove,
+    prove_local,
+    put_beside,
+    run_of,
+    write_town,
+)
 from tests.helpers.vtk_writers import write_vtp, write_vtu
-from tests.runs.test_tiled_runs import prove_local, put_beside
 from tiler.check.check import CheckReport, check_run
 from tiler.config.config import Config, idle_parameters, make_config
 from tiler.export.export import export_run
@@ -51,19 +60,14 @@ from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, rea
 from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
 
-SIZE = 140.0  # m: side of a tile
 DEPTH = 25.0
 LIMITS = SpacingLimits(least=0.1, most=0.8)
 OPTIONS = SoilOptions(depth=20.0, mesh_size=10.0, limits=LIMITS, stagger=0.8)
 
 
-def box(width: float, height: float) -> Bounds:
-    return (0.0, 0.0, width, height)
-
-
 def write_blocks(folder: Path, size: float, *, seed: int = 1) -> dict[str, Any]:
     """Crowded blocks on hills, across the lines between tiles, and a hall that no seam of 140 m can go around."""
-    region = box(size, size)
+    region = (0.0, 0.0, size, size)
     blocks = crowded_blocks(region, round(45 * (size / 280) ** 2), seed=seed)
     town = make_town(region, put_beside(blocks, shapely.box(90, 30, 190, 105)), relief=15)
     return write_town(folder, town) | {"domain_height": 50.0, "bounds": region}
@@ -263,8 +267,7 @@ def test_soil_is_proved(tiles: int, mesher: str, tmp_path: Path) -> None:
     size = SIZE * max(tiles, 2)
     values = write_blocks(tmp_path / "city", size, seed=tiles) | {"tile_size": size / tiles, "mesher": mesher}
     record = run_of(values, tmp_path / "out", underground=DEPTH)
-    report = check(tmp_path / "out")
-    assert report.ok, "\n".join(report.lines())
+    report = prove(tmp_path / "out")
     assert record["counts"]["tiles"] == tiles**2
     np.testing.assert_allclose(report.facts["soil_volume"], size**2 * DEPTH, rtol=1e-9)
     assert report.facts["cells"] == record["counts"]["cells"]
@@ -272,8 +275,7 @@ def test_soil_is_proved(tiles: int, mesher: str, tmp_path: Path) -> None:
 
 def test_four_tiles_with_houses_on_seams_are_proved(four: tuple[dict[str, Any], Path]) -> None:
     _, out = four
-    report = check(out)
-    assert report.ok, "\n".join(report.lines())
+    prove(out)
     store = Store(out / "store.zarr")
     seams = [store.read("seams", name)[0] for name in store.names("seams")]
     air = [levels_of(s["level_start"], s["level_z"], s["level_kind"]) for s in seams if "level_z" in s]
@@ -306,15 +308,12 @@ def test_soil_leaves_the_air_of_a_run_that_goes_on_with_it(
 
 @pytest.mark.parametrize("mesher", ["adaptive", pytest.param("layered", marks=pytest.mark.long)])
 def test_soil_depends_on_the_surroundings_of_its_tile_alone(mesher: str, tmp_path: Path) -> None:
-    def around(by: float) -> Bounds:
-        return (-by * SIZE, -by * SIZE, (1 + by) * SIZE, (1 + by) * SIZE)
-
-    far = around(2)
+    far = around((0, 0), 2)
     town = make_town(far, crowded_blocks(far, 100, seed=5), relief=10)
     values = write_town(tmp_path / "city", town, files=(2, 2)) | {"mesher": mesher, "tile_size": SIZE}
     values |= {"domain_height": 50.0 if mesher == "adaptive" else 38.0, "underground": DEPTH}
     least = 1.0 if mesher == "adaptive" else 1.5
-    prove_local(values, (0, 0), tmp_path, around(least + 0.1), around(least))
+    prove_local(values, (0, 0), tmp_path, around((0, 0), least + 0.1), around((0, 0), least))
 
 
 @pytest.mark.parametrize(
@@ -327,13 +326,12 @@ def test_soil_depends_on_the_surroundings_of_its_tile_alone(mesher: str, tmp_pat
 )
 def test_soil_ends_at_tiles_that_are_absent(mesher: str, gone: list[tuple[int, int]], tmp_path: Path) -> None:
     """Tiles that meet in a corner alone share its column of soil too."""
-    region = box(420.0, 420.0)
+    region = (0.0, 0.0, 420.0, 420.0)
     town = make_town(region, crowded_blocks(region, 90, seed=4), relief=10)
     values = write_town(tmp_path / "city", town, files=(3, 3), without=gone)
     values |= {"tile_size": SIZE, "domain_height": 50.0, "mesher": mesher, "underground": DEPTH}
     record = run_of(values, tmp_path / "out")
-    report = check(tmp_path / "out")
-    assert report.ok, "\n".join(report.lines())
+    report = prove(tmp_path / "out")
     assert record["counts"]["tiles"] == 9 - len(gone)
     assert report.facts["missing_facets"] > 0
 

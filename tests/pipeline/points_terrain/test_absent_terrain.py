@@ -13,11 +13,10 @@ from pipeline.points_terrain.raster import Dtm, NodeWindow
 from pipeline.points_terrain.terrain import cut_terrain
 from pipeline.smoothing.ground_smoothing import lift_places
 from stitch.tiling.grid import Bounds, Key, ends_of_seam
+from tests.helpers.campaigns import rounds
 from tests.helpers.cities import crowded_blocks, hilly_dtm
-from tests.helpers.tiles import make_town, run_of, write_town
-from tiler.check.check import check_run
+from tests.helpers.tiles import make_town, prove, run_of, write_town
 from tiler.engine.run_context import seam_key
-from tiler.store.results import StoredTerrain
 from tiler.store.store import Store
 
 WEST, SOUTH, SIZE = 318_000.0, 6_399_000.0, 560.0  # m
@@ -51,8 +50,7 @@ def prove_sparse(values: dict[str, Any], out: Path, **others: Any) -> tuple[int,
     record = run_of(values, out, domain_height=100.0, **others)
     corners = corner_columns(out)
     assert [tuple(key) for key, columns in corners.items() if len(set(columns)) > 1] == []
-    report = check_run(out, StoredTerrain)
-    assert report.ok, "\n".join(report.lines())
+    prove(out)
     return len(record["region"]["absent"]), sum(len(columns) > 1 for columns in corners.values())
 
 
@@ -61,17 +59,6 @@ def test_seams_beside_absent_tiles_find_the_same_corners(tmp_path: Path) -> None
     absent, corners = prove_sparse(values, tmp_path / "out", tile_size=157.5, mesher="layered")
     assert absent > 0
     assert corners > 4
-
-
-@pytest.mark.parametrize("mesher", ["adaptive", pytest.param("layered", marks=pytest.mark.long)])
-def test_tiles_that_meet_in_corners_alone_are_proved(mesher: str, tmp_path: Path) -> None:
-    region: Bounds = (318_080.0, 6_399_120.0, 318_500.0, 6_399_540.0)  # three tiles each way
-    town = make_town(region, crowded_blocks(region, 90, seed=4), relief=10)
-    values = write_town(tmp_path / "town", town, files=(3, 3), without=[(0, 2), (1, 1), (2, 0)])
-    record = run_of(values, tmp_path / "out", tile_size=140.0, domain_height=50.0, mesher=mesher)
-    report = check_run(tmp_path / "out", StoredTerrain)
-    assert report.ok, "\n".join(report.lines())
-    assert record["counts"]["tiles"] == 6
 
 
 def test_a_place_beside_absent_tiles_depends_on_its_own_window_alone() -> None:
@@ -96,7 +83,9 @@ def test_a_window_without_any_tile_is_an_error() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("seed", "mesher"), [(0, "adaptive"), (1, "layered"), (2, "adaptive"), (3, "layered")])
+@pytest.mark.parametrize(
+    ("seed", "mesher"), rounds([(0, "adaptive"), (1, "layered")], [(2, "adaptive"), (3, "layered")])
+)
 def test_any_tiles_may_be_absent(seed: int, mesher: str, tmp_path: Path) -> None:
     """Tile sizes and sets of absent files: four in a square and three others, off most tiles' lines."""
     rng = np.random.default_rng([seed, 5])

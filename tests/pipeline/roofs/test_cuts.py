@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import shapely
 from numpy.typing import NDArray
+from shapely import Polygon, box
 
 from pipeline.geometry.outlines import open_outline
 from pipeline.geometry.segments import distances_to_segments
@@ -31,74 +32,64 @@ def cut(
     return np.sort(shapely.area(pieces)).round(9).tolist(), set(map(tuple, corners.round(9).tolist()))
 
 
-def test_a_line_far_from_all_corners_cuts_straight() -> None:
-    assert cut(shapely.box(0, 0, 10, 20), 12) == ([80, 120], {(0, 12), (10, 12)})
+BENT = Polygon([(0, 0), (10, 0), (10, 20), (-4, 20), (-4, 12.3), (0, 12.3)])
+# Bent up to (0, 10.4), the wall would pass (2, 10.6), at the tip of a courtyard, at 0.28 m.
+CLOSE = Polygon([(0, 0), (10, 0), (10, 20), (-3, 20), (-3, 10.4), (0, 10.4)], [[(2, 10.6), (3, 14), (1, 14)]])
+COURT = Polygon(box(0, 0, 40, 40).exterior, [box(10, 10, 30, 30).exterior])
+COMB = Polygon([(0, 0), (15, 0), (15, 20), (10, 20), (10, 8), (5, 8), (5, 20), (0, 20)])
+NOTCH = Polygon([(0, 0), (15, 0), (15, 10), (11, 10), (10, 6), (9, 10), (5, 10), (5, 20), (0, 20)])
+# A body that hangs from a strip of 0.3 m: the wall between them would run 0.3 m below the strip's edge.
+STRIP = Polygon([(0, 0), (10, 0), (10, -10), (20, -10), (20, 0), (30, 0), (30, 0.3), (0, 0.3)])
+WAIST = Polygon(
+    [
+        (0, 0),
+        (10, 0),
+        (10, 10),
+        (5.2, 10),
+        (5.2, 14),
+        (10, 14),
+        (10, 24),
+        (0, 24),
+        (0, 14),
+        (4.8, 14),
+        (4.8, 10),
+        (0, 10),
+    ]
+)
+# House, height of the line in the plan, clearance; areas of the pieces or their number, and ends of the walls.
+CUTS: dict[str, tuple[Polygon, float, float, list[float] | int, set[tuple[float, ...]] | None]] = {
+    "straight far from all corners": (box(0, 0, 10, 20), 12, 0.5, [80, 120], {(0, 12), (10, 12)}),
+    "bent through a corner within the clearance": (BENT, 12, 0.5, 2, {(0, 12.3), (10, 12)}),
+    "straight at the clearance": (BENT, 11.5, 0.5, 2, {(0, 11.5), (10, 11.5)}),
+    "to the end of a slanting wall that is close": (
+        Polygon([(0, 0), (10, 0), (12, 10), (10, 20), (0, 20)]), 9.8, 0.5, 2, {(0, 9.8), (12, 10)},
+    ),
+    "from a corner, and along no wall": (
+        Polygon([(0, 0), (20, 0), (20, 8), (8, 8), (8, 20), (0, 20)]), 8, 0.5, [96, 160], {(8, 8), (0, 8)},
+    ),
+    "not close to another corner": (CLOSE, 10, 0.5, [CLOSE.area], None),
+    "where that corner is none": (Polygon(CLOSE.exterior), 10, 0.5, 2, None),
+    "not at 18 degrees to a wall": (Polygon([(0, 0), (30, 0), (0, 10)]), 5, 0.5, [150], None),
+    "at 45 degrees to a wall": (Polygon([(0, 0), (30, 0), (0, 30)]), 15, 0.5, [112.5, 337.5], None),
+    "on both sides of a courtyard": (COURT, 20, 0.5, [600, 600], {(0, 20), (10, 20), (30, 20), (40, 20)}),
+    "along the side of a courtyard": (COURT, 10, 0.5, [400, 800], None),
+    "not beside the house": (box(0, 0, 10, 20), 20.3, 0.5, [200], None),
+    "not far from the house": (box(0, 0, 10, 20), 50, 0.5, [200], set()),
+    "each tooth of a comb": (COMB, 14, 0.5, [30, 30, COMB.area - 60], None),
+    "not across a notch outside the house": (NOTCH, 10, 0.5, [50, NOTCH.area - 50], {(0, 10), (5, 10)}),
+    "not along another wall within the clearance": (STRIP, 0.1, 0.5, [STRIP.area], None),
+    "along another wall beyond the clearance": (STRIP, 0.1, 0.2, 2, None),
+    "with no wall shorter than the clearance": (WAIST, 12, 0.5, [WAIST.area], None),
+    "with a wall longer than the clearance": (WAIST, 12, 0.3, 2, None),
+}  # fmt: skip
 
 
-def test_a_line_within_the_clearance_bends_through_the_corner() -> None:
-    house = shapely.Polygon([(0, 0), (10, 0), (10, 20), (-4, 20), (-4, 12.3), (0, 12.3)])
-    assert cut(house, 12)[1] == {(0, 12.3), (10, 12)}
-    assert cut(house, 11.5)[1] == {(0, 11.5), (10, 11.5)}
-
-
-def test_a_line_that_meets_a_slanting_wall_close_to_its_end_takes_the_end() -> None:
-    house = shapely.Polygon([(0, 0), (10, 0), (12, 10), (10, 20), (0, 20)])
-    assert cut(house, 9.8)[1] == {(0, 9.8), (12, 10)}
-
-
-def test_a_line_through_a_corner_may_follow_a_wall_no_farther() -> None:
-    corner = shapely.Polygon([(0, 0), (20, 0), (20, 8), (8, 8), (8, 20), (0, 20)])
-    assert cut(corner, 8) == ([96, 160], {(8, 8), (0, 8)})
-
-
-def test_a_wall_too_close_to_another_corner_is_given_up() -> None:
-    # Bent up to (0, 10.4), the wall would pass (2, 10.6), at the tip of a courtyard, at 0.28 m.
-    hole = [(2, 10.6), (3, 14), (1, 14)]
-    house = shapely.Polygon([(0, 0), (10, 0), (10, 20), (-3, 20), (-3, 10.4), (0, 10.4)], [hole])
-    assert cut(house, 10)[0] == [house.area]
-    assert len(cut(shapely.Polygon(house.exterior), 10)[0]) == 2
-
-
-def test_a_wall_at_a_sharp_angle_to_another_is_given_up() -> None:
-    wedge = shapely.Polygon([(0, 0), (30, 0), (0, 10)])  # 18 degrees
-    assert cut(wedge, 5)[0] == [150]
-    blunt = shapely.Polygon([(0, 0), (30, 0), (0, 30)])  # 45 degrees
-    assert cut(blunt, 15)[0] == [112.5, 337.5]
-
-
-def test_walls_on_both_sides_of_a_courtyard_cut_together() -> None:
-    court = shapely.Polygon(shapely.box(0, 0, 40, 40).exterior, [shapely.box(10, 10, 30, 30).exterior])
-    assert cut(court, 20) == ([600, 600], {(0, 20), (10, 20), (30, 20), (40, 20)})
-    assert cut(court, 10)[0] == [400, 800]
-
-
-def test_a_line_beside_the_house_cuts_nothing() -> None:
-    assert cut(shapely.box(0, 0, 10, 20), 20.3)[0] == [200]
-    assert cut(shapely.box(0, 0, 10, 20), 50) == ([200], set())
-
-
-def test_the_teeth_of_a_comb_fall_off_one_by_one() -> None:
-    comb = shapely.Polygon([(0, 0), (15, 0), (15, 20), (10, 20), (10, 8), (5, 8), (5, 20), (0, 20)])
-    assert cut(comb, 14)[0] == [30, 30, comb.area - 60]
-
-
-def test_no_wall_crosses_a_notch_outside_the_house() -> None:
-    house = shapely.Polygon([(0, 0), (15, 0), (15, 10), (11, 10), (10, 6), (9, 10), (5, 10), (5, 20), (0, 20)])
-    assert cut(house, 10) == ([50, house.area - 50], {(0, 10), (5, 10)})
-
-
-def test_a_wall_along_another_within_the_clearance_is_given_up() -> None:
-    # A body that hangs from a strip of 0.3 m: the wall between them would run 0.3 m below the strip's edge.
-    house = shapely.Polygon([(0, 0), (10, 0), (10, -10), (20, -10), (20, 0), (30, 0), (30, 0.3), (0, 0.3)])
-    assert cut(house, 0.1)[0] == [house.area]
-    assert len(cut(house, 0.1, clearance=0.2)[0]) == 2
-
-
-def test_no_wall_is_shorter_than_the_clearance() -> None:
-    waist = [(0, 0), (10, 0), (10, 10), (5.2, 10), (5.2, 14), (10, 14), (10, 24), (0, 24), (0, 14), (4.8, 14)]
-    house = shapely.Polygon([*waist, (4.8, 10), (0, 10)])
-    assert cut(house, 12)[0] == [pytest.approx(house.area)]
-    assert len(cut(house, 12, clearance=0.3)[0]) == 2
+@pytest.mark.parametrize("way", CUTS)
+def test_a_house_is_cut(way: str) -> None:
+    house, y, clearance, wanted, ends = CUTS[way]
+    areas, found = cut(house, y, clearance=clearance)
+    assert len(areas) == wanted if isinstance(wanted, int) else areas == pytest.approx(wanted, rel=1e-9)
+    assert ends is None or found == ends
 
 
 def test_points_choose_the_line() -> None:

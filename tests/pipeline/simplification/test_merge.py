@@ -76,88 +76,72 @@ def blobs(polygons: NDArray[np.object_]) -> list[bytes]:
     return sorted(shapely.to_wkb(polygons).tolist())
 
 
-def test_two_squares_half_a_metre_apart_are_patched() -> None:
-    merged = merge(box(0, 0, 4, 4), box(4.5, 0, 9, 4))
-    assert merged.polygons[0].equals(box(0, 0, 9, 4))
-    assert (members(merged), merged.method, used(merged)) == ([[0, 1]], ("patch",), {"patch": 1})
-
-
-def test_a_patch_grows_until_no_step_is_shorter_than_the_clearance() -> None:
-    merged = merge(box(0, 0, 4, 4), box(4.5, 1, 9, 6))
+YARD = box(0, 0, 20, 20).difference(box(5, 5, 15, 15))
+NORTH = Polygon([(0, 10), (5, 10), (5, 15), (15, 15), (15, 10), (20, 10), (20, 20), (0, 20)])
+SOUTH = Polygon([(0, 0), (20, 0), (20, 10), (15, 10), (15, 5), (5, 5), (5, 10), (0, 10)])
+HOLES = box(2, 2, 5, 5).union(box(2, 10, 38, 10.9)).union(box(10, 2, 14, 6))
+CHAIN = [box(5 * k, 0, 5 * k + 4.5, 4) for k in range(6)]
+# Footprints; what becomes of the first, or its area; rows of each; how each was made, and how often.
+BY_HAND: dict[str, tuple[list[Polygon], Polygon | float, list[list[int]], tuple[str, ...], dict[str, int]]] = {
+    "squares half a metre apart are patched": (
+        [box(0, 0, 4, 4), box(4.5, 0, 9, 4)], box(0, 0, 9, 4), [[0, 1]], ("patch",), {"patch": 1},
+    ),
     # Within 1 m there are two points, a line; within 2 m the patch ends at (4.5, 4), 0.5 m from (4, 4);
     # within 4 m it is the trapezoid between the facing walls, 4 and 5 m long.
-    assert merged.method == ("patch",)
-    assert merged.polygons[0].area == pytest.approx(16 + 22.5 + 0.5 * (4 + 5) / 2)
-
-
-def test_overlapping_squares_are_united() -> None:
-    merged = merge(box(0, 0, 4, 4), box(2, 2, 6, 6))
-    assert merged.polygons[0].area == pytest.approx(28)
-    assert (merged.method, used(merged)) == (("union",), {"union": 1})
-
-
-def test_houses_that_share_a_wall_lose_it() -> None:
-    merged = merge(box(0, 0, 4, 4), box(4, 0, 8, 4), box(8, 0, 12, 4))
-    assert merged.polygons[0].equals(box(0, 0, 12, 4))
-    assert shapely.get_num_coordinates(merged.polygons[0]) == 5
-    assert (members(merged), used(merged)) == ([[0, 1, 2]], {"union": 2})
-
-
-def test_squares_that_touch_in_a_corner_become_one_polygon() -> None:
-    merged = merge(box(0, 0, 4, 4), box(4, 4, 8, 8))
+    "a patch grows until no step is shorter than the clearance": (
+        [box(0, 0, 4, 4), box(4.5, 1, 9, 6)], 16 + 22.5 + 0.5 * (4 + 5) / 2, [[0, 1]], ("patch",), {"patch": 1},
+    ),
+    "overlapping squares are united": (
+        [box(0, 0, 4, 4), box(2, 2, 6, 6)], 28.0, [[0, 1]], ("union",), {"union": 1},
+    ),
+    "houses that share a wall lose it": (
+        [box(0, 0, 4, 4), box(4, 0, 8, 4), box(8, 0, 12, 4)],
+        box(0, 0, 12, 4), [[0, 1, 2]], ("union",), {"union": 2},
+    ),
     # Nothing of one projects beyond the common corner within 1 or 2 m; at 4 m the patch is the point still.
-    assert (merged.method, used(merged)) == (("hull",), {"hull": 1})
-    assert merged.polygons[0].area == pytest.approx(64 - 16)
-
-
-def test_a_gap_of_the_clearance_stays() -> None:
-    merged = merge(box(0, 0, 4, 4), box(5, 0, 9, 4), box(9.999, 0, 13, 4))
-    assert members(merged) == [[0], [1, 2]]
-    assert merged.method == ("single", "patch")
-
-
-def test_a_chain_is_merged_through_its_links() -> None:
-    chain = [box(5 * k, 0, 5 * k + 4.5, 4) for k in range(6)]
-    merged = merge(*chain[::-1], box(90, 0, 95, 4))
-    assert members(merged) == [[0, 1, 2, 3, 4, 5], [6]]
-    assert merged.polygons[0].equals(box(0, 0, 29.5, 4))
-
-
-def test_a_building_in_a_courtyard_stays_if_it_is_far_from_its_walls() -> None:
-    yard = box(0, 0, 20, 20).difference(box(5, 5, 15, 15))
-    merged = merge(box(8, 8, 12, 12), yard)
-    assert members(merged) == [[1], [0]]
-    assert len(merged.polygons[0].interiors) == 1
-
-
-def test_a_building_close_to_the_wall_of_its_courtyard_merges_and_the_courtyard_stays() -> None:
-    yard = box(0, 0, 20, 20).difference(box(5, 5, 15, 15))
-    merged = merge(yard, box(5.5, 7, 9, 12))
+    "squares that touch in a corner become one polygon": (
+        [box(0, 0, 4, 4), box(4, 4, 8, 8)], 64.0 - 16, [[0, 1]], ("hull",), {"hull": 1},
+    ),
+    "a gap of the clearance stays": (
+        [box(0, 0, 4, 4), box(5, 0, 9, 4), box(9.999, 0, 13, 4)],
+        box(0, 0, 4, 4), [[0], [1, 2]], ("single", "patch"), {"patch": 1},
+    ),
+    "a chain is merged through its links": (
+        [*CHAIN[::-1], box(90, 0, 95, 4)],
+        box(0, 0, 29.5, 4), [[0, 1, 2, 3, 4, 5], [6]], ("patch", "single"), {"patch": 5},
+    ),
+    "a building far from the walls of its courtyard stays": (
+        [box(8, 8, 12, 12), YARD], YARD, [[1], [0]], ("single", "single"), {},
+    ),
     # Only the patch within 4 m has area. It reaches the walls north and south; two corners left are filled.
-    assert merged.method == ("patch",)
-    assert merged.polygons[0].equals(box(0, 0, 20, 20).difference(box(9, 5, 15, 15)))
+    "a building close to the wall of its courtyard merges and the courtyard stays": (
+        [YARD, box(5.5, 7, 9, 12)],
+        box(0, 0, 20, 20).difference(box(9, 5, 15, 15)), [[0, 1]], ("patch",), {"patch": 1},
+    ),
+    "a courtyard too small or thin for the mesh is filled": (
+        [box(0, 0, 40, 20).difference(HOLES)],
+        box(0, 0, 40, 20).difference(box(10, 2, 14, 6)), [[0]], ("single",), {"hole-filled": 2},
+    ),
+    "a footprint in another vanishes in it": (
+        [box(0, 0, 20, 20), box(5, 5, 9, 9), box(0, 0, 20, 20)],
+        box(0, 0, 20, 20), [[0, 1, 2]], ("union",), {"union": 2},
+    ),
+    "a union that encloses a courtyard keeps it": ([NORTH, SOUTH], YARD, [[0, 1]], ("union",), {"union": 1}),
+    "needless vertices go also where nothing is merged": (
+        [Polygon([(0, 0), (2, 0.005), (4, 0), (4, 4), (0, 4)])], box(0, 0, 4, 4), [[0]], ("single",), {},
+    ),
+}  # fmt: skip
 
 
-def test_a_courtyard_too_small_or_thin_for_the_mesh_is_filled() -> None:
-    big = box(0, 0, 40, 20)
-    holes = box(2, 2, 5, 5).union(box(2, 10, 38, 10.9)).union(box(10, 2, 14, 6))
-    merged = merge(big.difference(holes))
-    assert [ring.bounds for ring in merged.polygons[0].interiors] == [(10, 2, 14, 6)]
-    assert (merged.method, used(merged)) == (("single",), {"hole-filled": 2})
-
-
-def test_a_footprint_in_another_vanishes_in_it() -> None:
-    merged = merge(box(0, 0, 20, 20), box(5, 5, 9, 9), box(0, 0, 20, 20))
-    assert merged.polygons[0].equals(box(0, 0, 20, 20))
-    assert (members(merged), used(merged)) == ([[0, 1, 2]], {"union": 2})
-
-
-def test_a_union_that_encloses_a_courtyard_keeps_it() -> None:
-    north = Polygon([(0, 10), (5, 10), (5, 15), (15, 15), (15, 10), (20, 10), (20, 20), (0, 20)])
-    south = Polygon([(0, 0), (20, 0), (20, 10), (15, 10), (15, 5), (5, 5), (5, 10), (0, 10)])
-    merged = merge(north, south)
-    assert merged.method == ("union",)
-    assert merged.polygons[0].equals(box(0, 0, 20, 20).difference(box(5, 5, 15, 15)))
+@pytest.mark.parametrize("name", BY_HAND)
+def test_merges_by_hand(name: str) -> None:
+    footprints, first, rows, method, counts = BY_HAND[name]
+    merged = merge(*footprints)
+    assert (members(merged), merged.method, used(merged)) == (rows, method, counts)
+    if isinstance(first, float):
+        assert merged.polygons[0].area == pytest.approx(first)
+    else:
+        assert merged.polygons[0].normalize().equals_exact(first.normalize(), 1e-9)
 
 
 def test_hulls_are_taken_where_no_patch_helps() -> None:
@@ -288,12 +272,6 @@ def test_a_courtyard_that_a_repair_closes_is_filled_if_too_small() -> None:
         merged = merge(box(0, 0, 10, 10).difference(court).difference(gate))
         assert used(merged) == {"repaired-buffer": 1}
         assert len(merged.polygons[0].interiors) == holes
-
-
-def test_needless_vertices_go_also_where_nothing_is_merged() -> None:
-    merged = merge(Polygon([(0, 0), (2, 0.005), (4, 0), (4, 4), (0, 4)]))
-    assert merged.polygons[0].equals(box(0, 0, 4, 4))
-    assert merged.method == ("single",)
 
 
 def test_a_ring_that_touches_another_has_no_clearance() -> None:

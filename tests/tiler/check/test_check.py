@@ -16,7 +16,7 @@ from pipeline.data.citymodel import take_model
 from pipeline.data.errors import InputError
 from pipeline.data.mesh import Boundary, Marker, TetMesh
 from pipeline.data.roofs import flat_roofs
-from stitch.pieces.conformity import pair_cell_faces
+from stitch.pieces.conformity import match_facets, pair_cell_faces
 from stitch.pieces.frontier import Settled
 from tests.helpers.meshes import (
     CORNER,
@@ -64,9 +64,11 @@ def kinds(report: CheckReport) -> set[str]:
 # --- sound folders ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n_pieces", [1, 2])
-def test_a_sound_folder_is_proved(tmp_path: Path, city: TinyCity, n_pieces: int) -> None:
-    write_run(tmp_path, city, pieces=split_city(city, 50.0) if n_pieces == 2 else None)
+@pytest.mark.parametrize("names", ["", "0_0 1_0", "1_0 0_0"])
+def test_a_sound_folder_is_proved(tmp_path: Path, city: TinyCity, names: str) -> None:
+    """In one piece, or in two in any order."""
+    halves = split_city(city, 50.0)
+    write_run(tmp_path, city, pieces={name: halves[name] for name in names.split()})
 
     report = check(tmp_path)
 
@@ -76,6 +78,7 @@ def test_a_sound_folder_is_proved(tmp_path: Path, city: TinyCity, n_pieces: int)
     assert report.facts["points"] == len(city.mesh.points)
     assert report.facts["facets"] == len(city.boundary.facets)
     assert report.facts["building parts"] == len(HOUSES)
+    assert bool(names) == any("seams of 2 pieces are bitwise equal from both sides" in s for s in report.lines())
     # The two houses that touch in a corner, up to the lower roof: two levels of it.
     assert report.facts["non_manifold_edges"] == 2
     assert any("touch in a corner only: (" in line for line in report.lines())
@@ -681,26 +684,76 @@ def test_a_seam_that_differs_in_the_last_bit_is_a_fault(tmp_path: Path, city: Ti
     assert check_run(tmp_path, load_plane, workers=2).lines() == report.lines()
 
 
-def test_a_seam_facet_in_the_boundary_file_is_a_fault(tmp_path: Path, city: TinyCity) -> None:
-    pieces = split_city(city, 50.0)
+Pieces = dict[str, tuple[TetMesh, Boundary]]
+
+
+def add_facet(pieces: Pieces, name: str, face: NDArray[np.int32], marker: Marker, building: int = -1) -> None:
+    mesh, old = pieces[name]
+    facets, marks = np.concatenate((old.facets, face[None])), np.append(old.marker, np.int32(marker))
+    pieces[name] = mesh, Boundary(facets, marks, np.append(old.building, np.int64(building)))
+
+
+def seam_face(pieces: Pieces) -> NDArray[np.int32]:
+    """An exterior face of the western piece that is not in its boundary."""
+    mesh, boundary = pieces["0_0"]
+    exterior = pair_cell_faces(mesh.cells, len(mesh.points)).exterior
+    face: NDArray[np.int32] = exterior[match_facets(exterior, boundary.facets).missing[0]]
+    return face
+
+
+def seam_as_wall(pieces: Pieces, city: TinyCity) -> None:
+    """A face of the seam, written as a wall by both pieces: each boundary alone is as good as before."""
+    face, number = seam_face(pieces), int(city.model.numbers[0])
+    corners, points = pieces["0_0"][0].points[face], pieces["1_0"][0].points
+    twin = np.array([np.flatnonzero((points == corner).all(axis=1))[0] for corner in corners[::-1]], np.int32)
+    add_facet(pieces, "0_0", face, Marker.WALL, number)
+    add_facet(pieces, "1_0", twin, Marker.WALL, number)
+
+
+def seam_as_missing(pieces: Pieces, city: TinyCity) -> None:
+    add_facet(pieces, "0_0", seam_face(pieces), Marker.MISSING)
+
+
+def seam_as_side(pieces: Pieces, city: TinyCity) -> None:
+    add_facet(pieces, "0_0", seam_face(pieces), Marker.EAST)
+
+
+def leave_out_seam_wall(pieces: Pieces, city: TinyCity) -> None:
+    """A wall over the seam that its piece leaves to the neighbour, who has no such face."""
     mesh, old = pieces["0_0"]
-    seam = pair_cell_faces(mesh.cells, len(mesh.points)).exterior
-    known = {tuple(sorted(facet)) for facet in old.facets.tolist()}
-    face = next(facet for facet in seam.tolist() if tuple(sorted(facet)) not in known)
-    facets = np.concatenate([old.facets, np.array([face], np.int32)])
-    marker = np.append(old.marker, np.int32(Marker.EAST))
-    boundary = Boundary(facets, marker, np.append(old.building, np.int64(-1)))
-    pieces["0_0"] = (mesh, boundary)
-    write_run(tmp_path, city, pieces=pieces)
-
-    assert kinds(check(tmp_path)) == {"facet-extra", "boundary-open", "side-off-box", "counts"}
+    over = (mesh.points[old.facets][..., 0] == CORNER[0] + 50).all(axis=1)
+    kept = np.arange(len(old.facets)) != np.flatnonzero(over & (old.marker == Marker.WALL))[0]
+    pieces["0_0"] = mesh, Boundary(old.facets[kept], old.marker[kept], old.building[kept])
 
 
-def test_a_piece_under_two_names_is_a_fault(tmp_path: Path, city: TinyCity) -> None:
+def drop_piece(pieces: Pieces, city: TinyCity) -> None:
+    del pieces["1_0"]
+
+
+def repeat_piece(pieces: Pieces, city: TinyCity) -> None:
+    """A piece under two names."""
+    pieces["2_0"] = pieces["1_0"]
+
+
+SEAMS: dict[str, tuple[Callable[[Pieces, TinyCity], None], set[str]]] = {
+    "seam as wall on both sides": (seam_as_wall, {"facet-extra", "wall-off-outline"}),
+    "seam as missing on one side": (seam_as_missing, {"facet-extra", "boundary-open"}),
+    "seam as a side": (seam_as_side, {"facet-extra", "boundary-open", "side-off-box", "counts"}),
+    "wall over the seam left out": (leave_out_seam_wall, {"seam-open", "boundary-open", "counts"}),
+    "piece dropped": (drop_piece, {"seam-open", "boundary-open", "plan-area", "counts"}),
+    "piece twice": (repeat_piece, {"seam-open", "boundary-open", "plan-area", "roof-area", "counts"}),
+}
+
+
+@pytest.mark.parametrize("name", SEAMS)
+def test_tampering_with_a_seam(tmp_path: Path, city: TinyCity, name: str) -> None:
+    tamper, expected = SEAMS[name]
     pieces = split_city(city, 50.0)
-    write_run(tmp_path, city, pieces={**pieces, "2_0": pieces["1_0"]})
-    found = kinds(check(tmp_path))
-    assert found >= {"seam-open", "boundary-open", "plan-area", "roof-area", "counts"}
+    tamper(pieces, city)
+    write_run(tmp_path, city, pieces=pieces)
+    found = check(tmp_path)
+    assert kinds(found) >= expected, found.lines()
+    assert all(fault.places or fault.kind in ("plan-area", "volume", "counts") for fault in found.faults)
 
 
 def test_all_houses_that_are_missing_are_counted(tmp_path: Path, city: TinyCity) -> None:

@@ -17,6 +17,7 @@ import tiler
 from pipeline.data.errors import CityError, ConfigError, InputError
 from tests.conftest import SHARED
 from tests.helpers.iso19107 import check_solids
+from tests.helpers.patch_readers import read_document
 from tests.tiler.cityinput.models import (
     CORNERS,
     PLACE,
@@ -28,7 +29,6 @@ from tests.tiler.cityinput.models import (
     write_json,
     write_sequence,
 )
-from tests.tiler.export.test_formats_glb import read_document
 from tiler.cityinput.face_planes import signed_volume
 from tiler.cityinput.faces import ModelBuilding
 from tiler.cityinput.sources import read_model_header, scan_model

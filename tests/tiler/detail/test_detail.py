@@ -9,8 +9,8 @@ import pytest
 
 from tests.conftest import SHARED
 from tests.helpers.iso19107 import check_solids
+from tests.helpers.patch_readers import read_document
 from tests.tiler.cityinput.models import house_json, write_json
-from tests.tiler.export.test_formats_glb import read_document
 from tiler.cli.main import main
 
 SCHEMA = SHARED / "schemas/cityjson/2.0/cityjson.min.schema.json"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runs.test_resume import Town
+from tests.helpers.towns import Town
 from tests.runs.test_run import hashes
 from tiler.interface.synth import write_city
 from tiler.workflow.run import run

@@ -4,67 +4,32 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.data.errors import OutputError
+from pipeline.data.errors import InputError, OutputError
+from tests.helpers.vtk_readers import read_xml
+from tests.helpers.vtk_writers import write_vtu
+from tests.tiler.export.conftest import Exported
 from tiler.cli.main import main
-from tiler.config.config import make_config
 from tiler.export.export import export_run, list_formats, load_format
-from tiler.interface.synth import write_city
+from tiler.mesh_files.merged import VERTEX_ID, write_merged_volume
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu
-from tiler.workflow.run import run
-
-
-@pytest.fixture(scope="module")
-def tiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run of a synthetic city on four tiles."""
-    folder = tmp_path_factory.mktemp("export")
-    files = write_city(folder / "city", size=300, buildings=15, density=1.0)
-    run(
-        make_config(
-            {
-                "pointcloud": [str(path) for path in files.clouds],
-                "footprints": str(files.footprints),
-                "out": str(folder / "out"),
-                "tile_size": 150.0,
-                "domain_height": 60.0,
-            }
-        )
-    )
-    return folder / "out"
 
 
 @pytest.fixture
-def copy(tiled: Path, tmp_path: Path) -> Path:
+def copy(small_run: Path, tmp_path: Path) -> Path:
     """The run without its store, to be damaged."""
-    return shutil.copytree(tiled, tmp_path / "run", ignore=shutil.ignore_patterns("store.zarr"))
+    return shutil.copytree(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("store.zarr"))
 
 
-def read_with_vtk(path: Path) -> Any:
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
-
-    reader = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkXMLUnstructuredGridReader()
-    errors: list[str] = []
-    reader.AddObserver("ErrorEvent", lambda *_: errors.append("error"))
-    reader.SetFileName(str(path))
-    reader.Update()
-    assert not errors
-    return reader.GetOutput()
-
-
-def test_one_file_has_the_counts_of_the_record(tiled: Path, tmp_path: Path) -> None:
+def test_one_file_has_the_counts_of_the_record(small_run: Path, exported: Exported) -> None:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    record = json.loads((tiled / "run.json").read_text())
+    record = json.loads((small_run / "run.json").read_text())
     assert len(record["tiles"]) == 4
-    for name in ("vtu", "vtp"):
-        command = ["export", str(tiled), "--format", name, "-o", str(tmp_path / f"all.{name}")]
-        assert main(command) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["all.vtp", "all.vtu"]
-    volume, surface = (read_with_vtk(tmp_path / name) for name in ("all.vtu", "all.vtp"))
+    volume, surface = (read_xml(exported(small_run, name)) for name in ("vtu", "vtp"))
     counts = record["counts"]
     assert (volume.GetNumberOfPoints(), volume.GetNumberOfCells()) == (counts["points"], counts["cells"])
     assert surface.GetNumberOfCells() == counts["facets"]
@@ -76,14 +41,12 @@ def test_one_file_has_the_counts_of_the_record(tiled: Path, tmp_path: Path) -> N
     )
 
 
-def test_cells_and_marks_are_those_of_the_pieces(tiled: Path, tmp_path: Path) -> None:
-    for name in ("vtu", "vtp"):
-        export_run(tiled, tmp_path / f"all.{name}", name=name)
-    volume, surface = read_vtu(tmp_path / "all.vtu").mesh, read_vtp(tmp_path / "all.vtp")
-    pieces = [read_vtu(path).mesh for path in sorted((tiled / "mesh").iterdir())]
+def test_cells_and_marks_are_those_of_the_pieces(small_run: Path, exported: Exported) -> None:
+    volume, surface = read_vtu(exported(small_run, "vtu")).mesh, read_vtp(exported(small_run, "vtp"))
+    pieces = [read_vtu(path).mesh for path in sorted((small_run / "mesh").iterdir())]
     corners = np.concatenate([piece.points[piece.cells] for piece in pieces])
     assert volume.points[volume.cells].tobytes() == corners.tobytes()
-    parts = [read_vtp(path) for path in sorted((tiled / "boundary").iterdir())]
+    parts = [read_vtp(path) for path in sorted((small_run / "boundary").iterdir())]
     corners = np.concatenate([part.points[part.boundary.facets] for part in parts])
     assert surface.points[surface.boundary.facets].tobytes() == corners.tobytes()
     for mark in ("marker", "building"):
@@ -91,22 +54,18 @@ def test_cells_and_marks_are_those_of_the_pieces(tiled: Path, tmp_path: Path) ->
         assert np.array_equal(getattr(surface.boundary, mark), expected)
 
 
-def test_scalars_to_colour_by_are_added_on_request(tiled: Path, tmp_path: Path) -> None:
+def test_scalars_to_colour_by_are_added_on_request(small_run: Path, exported: Exported) -> None:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    for name in ("vtu", "vtp"):
-        command = ["export", str(tiled), "--format", name, "-o", str(tmp_path / f"plain.{name}")]
-        assert main(command) == 0
-        assert main([*command[:-1], str(tmp_path / f"all.{name}"), "--scalars"]) == 0
-    plain = [read_with_vtk(tmp_path / f"plain.{name}") for name in ("vtu", "vtp")]
-    volume, surface = (read_with_vtk(tmp_path / f"all.{name}") for name in ("vtu", "vtp"))
+    plain = [read_xml(exported(small_run, name)) for name in ("vtu", "vtp")]
+    volume, surface = (read_xml(exported(small_run, name, "--scalars")) for name in ("vtu", "vtp"))
     for grid, without in zip((volume, surface), plain, strict=True):
         names, few = (
             {g.GetCellData().GetArrayName(i) for i in range(g.GetCellData().GetNumberOfArrays())}
             for g in (grid, without)
         )
         assert names - few == ({"tile", "radius_ratio"} if grid is volume else {"tile"})
-    folders = [sorted((tiled / folder).iterdir()) for folder in ("mesh", "boundary")]
+    folders = [sorted((small_run / folder).iterdir()) for folder in ("mesh", "boundary")]
     cells = [len(read_vtu(path).mesh.cells) for path in folders[0]]
     facets = [len(read_vtp(path).boundary.facets) for path in folders[1]]
     for grid, sizes in ((volume, cells), (surface, facets)):
@@ -123,6 +82,37 @@ def test_scalars_to_colour_by_are_added_on_request(tiled: Path, tmp_path: Path) 
     assert np.allclose(found, 3 / heights.sum(axis=1) / outer, rtol=1e-4)
 
 
+AGAIN: list[tuple[str, tuple[str, ...]]] = [(name, ()) for name in list_formats()] + [
+    (name, ("--buildings", "patches")) for name in ("stl", "obj", "glb", "msh", "msh2", "cgns")
+]
+AGAIN.append(("openfoam", ("--case", "wind", "--parts", "3")))
+
+
+@pytest.mark.parametrize(("name", "words"), AGAIN)
+def test_a_format_is_the_same_bytes_again_and_whole_or_not_at_all(
+    small_run: Path, exported: Exported, tmp_path: Path, name: str, words: tuple[str, ...]
+) -> None:
+    path = exported(small_run, name, *words)
+    main(["export", str(small_run), "--format", name, "-o", str(tmp_path / path.name), *words])
+    one, two = (
+        {str(file.relative_to(home)): file.read_bytes() for file in sorted(home.rglob("*")) if file.is_file()}
+        for home in (path.parent, tmp_path)
+    )
+    assert one == two
+    assert {file.split("/")[0] for file in one} == {path.name} | ({"city.h5"} if name == "xdmf" else set())
+    with pytest.raises(OutputError, match="cannot be written"):
+        export_run(small_run, tmp_path / "none" / path.name, name=name)
+
+
+@pytest.mark.parametrize("name", [name for name in list_formats() if load_format(name).suffix])
+def test_other_suffixes_are_refused(
+    small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    assert main(["export", str(small_run), "--format", name, "-o", str(tmp_path / "x.vtu")]) == 2
+    suffix = load_format(name).suffix
+    assert f"x.vtu: a file of format {name} ends with {suffix}; give another --output" in capsys.readouterr().err
+
+
 def test_help_has_a_line_a_format(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         main(["export", "--help"])
@@ -133,16 +123,16 @@ def test_help_has_a_line_a_format(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_file_is_replaced_on_request_alone(
-    tiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "all.vtp"
     target.write_text("mine")
-    command = ["export", str(tiled), "--format", "vtp", "-o", str(target)]
+    command = ["export", str(small_run), "--format", "vtp", "-o", str(target)]
     assert main(command) == 2
     assert "all.vtp: exists; give another --output, or --overwrite" in capsys.readouterr().err
     assert target.read_text() == "mine"
     assert main([*command, "--overwrite"]) == 0
-    assert read_with_vtk(target).GetNumberOfCells() > 0
+    assert read_xml(target).GetNumberOfCells() > 0
     assert list(tmp_path.iterdir()) == [target]
 
 
@@ -209,12 +199,28 @@ def test_what_is_no_finished_run_is_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_wrong_arguments_and_places(tiled: Path, tmp_path: Path) -> None:
+def test_pieces_that_cannot_be_merged_leave_no_file(copy: Path, tmp_path: Path) -> None:
+    first, second, *_ = volumes = sorted((copy / "mesh").iterdir())
+    one, other = read_vtu(first), read_vtu(second)
+    ids, mark = other.point_data[VERTEX_ID], {"q": np.zeros(len(one.mesh.cells), np.int32)}
+    for point_data, cell_data, message in (
+        ({}, {}, "has no point array vertex_id"),
+        ({VERTEX_ID: ids[::-1].copy()}, {}, "stands for two places"),
+        ({VERTEX_ID: ids}, mark, "has no array 'q' like the first piece's"),
+    ):
+        write_vtu(first, one.mesh, point_data=one.point_data, cell_data=cell_data)
+        write_vtu(second, other.mesh, point_data=point_data)
+        with pytest.raises(InputError, match=message):
+            write_merged_volume(tmp_path / "all.vtu", volumes)
+    with pytest.raises(ValueError, match="at least one piece"):
+        write_merged_volume(tmp_path / "all.vtu", [])
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_wrong_arguments_and_places(small_run: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="format 'nope' must be one of 3dtiles, cgns, cityjsonseq"):
-        export_run(tiled, tmp_path / "all.obj", name="nope")
-    with pytest.raises(OutputError, match=r"all.vtu: cannot be written \(No such file or directory\)"):
-        export_run(tiled, tmp_path / "none" / "all.vtu", name="vtu")
+        export_run(small_run, tmp_path / "all.obj", name="nope")
     (tmp_path / "all.vtu").mkdir()
     with pytest.raises(OutputError, match=r"all.vtu: cannot be written"):
-        export_run(tiled, tmp_path / "all.vtu", name="vtu", overwrite=True)
+        export_run(small_run, tmp_path / "all.vtu", name="vtu", overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["all.vtu"]

@@ -12,12 +12,12 @@ import pytest
 import shapely
 
 from pipeline.data.citymodel import CityModel
-from pipeline.data.errors import CityError, InputError, OutputError
+from pipeline.data.errors import CityError, InputError
 from pipeline.data.roofs import flat_roofs
 from tests.helpers.cityjson_rules import file_faults, solid_faults
 from tests.helpers.written_models import read_city_model
+from tests.tiler.export.conftest import Exported
 from tiler.citymodels.cityjson import write_city_model
-from tiler.cli.main import main
 from tiler.export.export import export_run
 from tiler.formats import gpkg
 from tiler.formats.cityjsonseq import write_cityjsonseq
@@ -25,16 +25,6 @@ from tiler.formats.gpkg import write_gpkg
 from tiler.store.out_folder import CITY_MODEL
 
 SUFFIX = {"cityjsonseq": "jsonl", "gpkg": "gpkg"}
-
-
-@pytest.fixture(scope="module")
-def exported(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The small city's model in all formats."""
-    folder = tmp_path_factory.mktemp("city")
-    files = {name: folder / f"city.{suffix}" for name, suffix in SUFFIX.items()}
-    for name, path in files.items():
-        assert main(["export", str(small_run), "--format", name, "-o", str(path)]) == 0
-    return files
 
 
 def write_parts(path: Path) -> CityModel:
@@ -89,8 +79,8 @@ def placed(document: dict[str, Any]) -> dict[str, Any]:
     return dict(objects)
 
 
-def test_features_are_the_buildings_of_the_city_model(small_run: Path, exported: dict[str, Path]) -> None:
-    document, found = json.loads((small_run / CITY_MODEL).read_text()), merged(exported["cityjsonseq"])
+def test_features_are_the_buildings_of_the_city_model(small_run: Path, exported: Exported) -> None:
+    document, found = json.loads((small_run / CITY_MODEL).read_text()), merged(exported(small_run, "cityjsonseq"))
     assert found["CityObjects"] == placed(document)
     assert len(found["CityObjects"]) >= 10
     assert (found["metadata"], found["transform"]) == (document["metadata"], document["transform"])
@@ -110,11 +100,9 @@ def test_parts_are_in_the_feature_of_their_building(tmp_path: Path) -> None:
     assert merged(tmp_path / "x.jsonl")["CityObjects"] == placed(json.loads((tmp_path / "model.json").read_text()))
 
 
-def test_rows_are_the_buildings_of_the_city_model(
-    small_run: Path, exported: dict[str, Path], tmp_path: Path
-) -> None:
+def test_rows_are_the_buildings_of_the_city_model(small_run: Path, exported: Exported) -> None:
     model = read_city_model(small_run / CITY_MODEL)
-    meta, _, wkb, columns = pyogrio.raw.read(exported["gpkg"], layer="buildings")
+    meta, _, wkb, columns = pyogrio.raw.read(exported(small_run, "gpkg"), layer="buildings")
     table = dict(zip(meta["fields"], columns, strict=True))
     assert meta["crs"] == json.loads((small_run / "run.json").read_text())["region"]["crs"]
     assert table["id"].tolist() == model.ids.tolist()
@@ -160,18 +148,6 @@ def test_a_city_without_buildings(tmp_path: Path) -> None:
     assert len((tmp_path / "x.jsonl").read_text().splitlines()) == 1
     write_gpkg(tmp_path / "x.gpkg", tmp_path / "model.json", crs="EPSG:28992")
     assert pyogrio.read_info(tmp_path / "x.gpkg")["features"] == 0
-
-
-@pytest.mark.parametrize("name", list(SUFFIX))
-def test_export_is_the_same_bytes_again(
-    small_run: Path, exported: dict[str, Path], tmp_path: Path, name: str
-) -> None:
-    path = tmp_path / f"again.{SUFFIX[name]}"
-    export_run(small_run, path, name=name)
-    assert path.read_bytes() == exported[name].read_bytes()
-    assert list(tmp_path.iterdir()) == [path]
-    with pytest.raises(OutputError, match="cannot be written"):
-        export_run(small_run, tmp_path / "none" / path.name, name=name)
 
 
 @pytest.mark.parametrize(

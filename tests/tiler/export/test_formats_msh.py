@@ -12,24 +12,15 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.data.mesh import Marker
+from tests.helpers.patch_readers import expected_of
 from tests.helpers.programs import mesh_is_ok, read_check, run_foam, run_program
-from tiler.cli.main import main
+from tests.tiler.export.conftest import Exported
 from tiler.export.export import export_run
 from tiler.export.foam_patches import PATCHES
 from tiler.formats.msh import AIR
 from tiler.mesh_files.mesh_pieces import open_pieces
 
 FORMATS = ["msh", "msh2"]
-
-
-@pytest.fixture(scope="module")
-def exported(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The small city in both formats."""
-    folder = tmp_path_factory.mktemp("msh")
-    files = {name: folder / f"{name}.msh" for name in FORMATS}
-    for name, path in files.items():
-        assert main(["export", str(small_run), "--format", name, "-o", str(path)]) == 0
-    return files
 
 
 def groups_of(mesh: Any, kind: str) -> dict[int, NDArray[np.int64]]:
@@ -43,8 +34,8 @@ def groups_of(mesh: Any, kind: str) -> dict[int, NDArray[np.int64]]:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_meshio_reads_points_cells_and_groups(small_run: Path, exported: dict[str, Path], name: str) -> None:
-    mesh = meshio.read(exported[name])
+def test_meshio_reads_points_cells_and_groups(small_run: Path, exported: Exported, name: str) -> None:
+    mesh = meshio.read(exported(small_run, name))
     pieces = open_pieces(small_run)
     parts = [pieces.read(k) for k in range(len(pieces.names))]
     assert len(mesh.points) == pieces.n_points
@@ -63,21 +54,6 @@ def test_meshio_reads_points_cells_and_groups(small_run: Path, exported: dict[st
     assert names == {**{PATCHES[Marker(m)]: (m, 2) for m in markers}, "air": (AIR, 3)}
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_export_is_the_same_bytes_again(
-    small_run: Path, exported: dict[str, Path], tmp_path: Path, name: str
-) -> None:
-    path = tmp_path / "again.msh"
-    export_run(small_run, path, name=name)
-    assert path.read_bytes() == exported[name].read_bytes()
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_other_suffixes_are_refused(small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(small_run), "--format", "msh", "-o", str(tmp_path / "x.vtu")]) == 2
-    assert "x.vtu: a file of format msh ends with .msh; give another --output" in capsys.readouterr().err
-
-
 def check_with_gmsh(path: Path) -> dict[str, int]:
     """What Gmsh says of a file, complaints included; it ends with 0 either way."""
     text = run_program(["gmsh", "-check", str(path)], path.parent)
@@ -89,15 +65,19 @@ def check_with_gmsh(path: Path) -> dict[str, int]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", FORMATS)
-def test_gmsh_has_no_complaints(small_run: Path, exported: dict[str, Path], name: str) -> None:
+def test_gmsh_has_no_complaints(small_run: Path, exported: Exported, name: str) -> None:
     counts = json.loads((small_run / "run.json").read_text())["counts"]
     elements = counts["cells"] + counts["facets"]
-    assert check_with_gmsh(exported[name]) == {"nodes": counts["points"], "elements": elements, "complaints": 0}
+    assert check_with_gmsh(exported(small_run, name)) == {
+        "nodes": counts["points"],
+        "elements": elements,
+        "complaints": 0,
+    }
 
 
 @pytest.mark.long
-def test_gmsh_complains_of_a_broken_file(exported: dict[str, Path], tmp_path: Path) -> None:
-    lines = exported["msh2"].read_text().splitlines()
+def test_gmsh_complains_of_a_broken_file(small_run: Path, exported: Exported, tmp_path: Path) -> None:
+    lines = exported(small_run, "msh2").read_text().splitlines()
     at = lines.index("$Nodes") + 2
     # Two nodes at one place.
     lines[at] = " ".join([lines[at].split()[0], *lines[at + 1].split()[1:]])
@@ -113,15 +93,14 @@ def assert_gmsh_to_foam(run: Path, path: Path, case: Path) -> None:
     assert mesh_is_ok(text), text[-3000:]
     found, counts = read_check(text), json.loads((run / "run.json").read_text())["counts"]
     assert (found["cells"], found["points"], found["regions"]) == (counts["cells"], counts["points"], 1)
-    marker = np.concatenate([piece.marker for piece in map(open_pieces(run).read, range(4))])
-    expected = {PATCHES[Marker(m)]: int((marker == m).sum()) for m in np.unique(marker)}
+    expected = {patch: len(corners) for patch, corners in expected_of(open_pieces(run), path, "msh2").items()}
     assert {name[6:]: n for name, n in found.items() if name.startswith("patch ")} == expected
 
 
 @pytest.mark.long
 @pytest.mark.timeout(1200)
-def test_gmsh_to_foam_makes_the_same_patches(small_run: Path, exported: dict[str, Path], tmp_path: Path) -> None:
-    assert_gmsh_to_foam(small_run, exported["msh2"], tmp_path / "case")
+def test_gmsh_to_foam_makes_the_same_patches(small_run: Path, exported: Exported, tmp_path: Path) -> None:
+    assert_gmsh_to_foam(small_run, exported(small_run, "msh2"), tmp_path / "case")
 
 
 @pytest.mark.long

@@ -12,12 +12,15 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, InputError, OutputError
-from pipeline.data.mesh import Marker
 from stitch.pieces import face_mates
 from stitch.pieces.cell_faces import find_cell_faces
+from tests.conftest import Once
 from tests.helpers.foam_reader import PolyMesh, read_field, read_header, read_labels, read_poly_mesh, read_zones
 from tests.helpers.hand_pieces import HandPieces, box_pieces
+from tests.helpers.patch_readers import INTERNAL, corners_of, expected_of, volume_of_cells
 from tests.helpers.programs import mesh_is_ok, read_check, run_foam
+from tests.helpers.synthetic import run_city
+from tests.helpers.vtk_readers import read_vtk
 from tiler.cli.main import main
 from tiler.export import region_faces
 from tiler.export.export import export_run
@@ -25,7 +28,7 @@ from tiler.export.foam_patches import PATCHES
 from tiler.export.pieces import Pieces
 from tiler.formats import openfoam
 from tiler.formats.openfoam import write_openfoam
-from tiler.mesh_files.vtk_files import read_vtp, read_vtu
+from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.store.atomic import replacing_folder
 
 MESH = "constant/polyMesh"
@@ -322,14 +325,12 @@ def read_with_vtk(case: Path) -> dict[str, Any]:
     from vtkmodules.vtkIOGeometry import vtkOpenFOAMReader
 
     reader = vtkOpenFOAMReader()
-    errors: list[str] = []
-    reader.AddObserver("ErrorEvent", lambda *_: errors.append("error"))
-    reader.SetFileName(str(case / "case.foam"))
-    reader.UpdateInformation()
-    reader.EnableAllPatchArrays()
-    reader.Update()
-    assert not errors
-    output = reader.GetOutput()
+
+    def take_all() -> None:
+        reader.UpdateInformation()
+        reader.EnableAllPatchArrays()
+
+    output = read_vtk(reader, case / "case.foam", take_all).GetOutput()
     blocks = {"cells": output.GetBlock(0)}
     boundary = output.GetBlock(1)
     for i in range(boundary.GetNumberOfBlocks()):
@@ -338,17 +339,11 @@ def read_with_vtk(case: Path) -> dict[str, Any]:
 
 
 def counts_by_patch(run: Path) -> dict[str, int]:
-    marker = np.concatenate([read_vtp(path).boundary.marker for path in sorted((run / "boundary").iterdir())])
-    return {PATCHES[Marker(m)]: int((marker == m).sum()) for m in np.unique(marker)}
+    return {name: len(corners) for name, corners in expected_of(open_pieces(run), run, "openfoam").items()}
 
 
 def volume_of(run: Path) -> float:
-    total = 0.0
-    for path in sorted((run / "mesh").iterdir()):
-        mesh = read_vtu(path).mesh
-        a, b, c, d = (mesh.points[mesh.cells[:, k]] for k in range(4))
-        total += float(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a).sum() / 6)
-    return total
+    return volume_of_cells(corners_of(open_pieces(run), lambda *_: "")[INTERNAL])
 
 
 def test_export_of_a_run_is_read_by_vtk(small_run: Path, tmp_path: Path) -> None:
@@ -373,14 +368,6 @@ def test_export_of_a_run_is_read_by_vtk(small_run: Path, tmp_path: Path) -> None
     ground = next(line for line in (case / "constant" / "wind").read_text().splitlines() if "zGround" in line)
     west = mesh.points[mesh.faces[mesh.patch_of("west")]]
     assert float(ground.split()[2].rstrip(";")) == pytest.approx(west[..., 2].min())
-
-
-def test_export_is_the_same_bytes_again(small_run: Path, tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        export_run(small_run, tmp_path / name, name="openfoam", options={"parts": 3, "case": "wind"})
-    one, two = (sorted(path for path in (tmp_path / name).rglob("*") if path.is_file()) for name in ("one", "two"))
-    assert len(one) > 40
-    assert [path.read_bytes() for path in one] == [path.read_bytes() for path in two]
 
 
 def test_options_and_targets_that_cannot_be(
@@ -550,17 +537,10 @@ def assert_reconstructed(one: Path, two: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def one_tile_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def one_tile_run(once: Once) -> Path:
     """Finished run of a synthetic city on one tile."""
-    from tiler.config.config import make_config
-    from tiler.interface.synth import write_city
-    from tiler.workflow.run import run
-
-    folder = tmp_path_factory.mktemp("one_tile")
-    files = write_city(folder / "city", size=200, buildings=8, density=1.0)
-    given = {"pointcloud": [str(path) for path in files.clouds], "footprints": str(files.footprints)}
-    run(make_config(given | {"out": str(folder / "out"), "tile_size": 200.0, "domain_height": 60.0}))
-    return folder / "out"
+    city = {"size": 200, "buildings": 8, "density": 1.0}
+    return once("one_tile", lambda folder: run_city(folder, city, tile_size=200.0)) / "out"
 
 
 def test_one_tile_is_divided_evenly_and_interfaces_are_counted(one_tile_run: Path, tmp_path: Path) -> None:

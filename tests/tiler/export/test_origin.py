@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
 from tests.helpers.foam_reader import read_poly_mesh
+from tests.tiler.export.conftest import Exported
 from tiler.cli.main import main
 from tiler.cli.negative_values import mark_values
 from tiler.export.export import export_run, list_formats, load_format
@@ -55,19 +56,21 @@ def read_ply(path: Path) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("name", sorted(set(list_formats()) - WITHOUT))
-def test_points_are_those_of_the_crs_less_the_origin(small_run: Path, tmp_path: Path, name: str) -> None:
-    suffix = load_format(name).suffix or (f".{name}" if name != "openfoam" else "")
-    export_run(small_run, tmp_path / f"plain{suffix}", name=name)
-    said = export_run(small_run, tmp_path / f"local{suffix}", name=name, options={"origin": TEXT})
-    plain, local = (points_of(tmp_path / f"{word}{suffix}", name) for word in ("plain", "local"))
+def test_points_are_those_of_the_crs_less_the_origin(
+    small_run: Path, exported: Exported, tmp_path: Path, name: str
+) -> None:
+    whole = exported(small_run, name)
+    part = tmp_path / whole.name
+    said = export_run(small_run, part, name=name, options={"origin": TEXT})
+    plain, local = (points_of(path, name) for path in (whole, part))
     assert plain.shape == local.shape
     assert (plain - ORIGIN == local).all()
     assert said[0].startswith("coordinates count from 317990 6399000 -5 m, in EPSG:")
     if name in ("xdmf", "cgns", "msh", "msh2", "vtkhdf"):
-        content = (tmp_path / f"local{suffix}").read_bytes()
+        content = part.read_bytes()
         wanted = np.array(ORIGIN).tobytes() if name == "vtkhdf" else b"317990 6399000 -5"
         assert wanted in content
-        assert wanted not in (tmp_path / f"plain{suffix}").read_bytes()
+        assert wanted not in whole.read_bytes()
 
 
 def test_a_wind_case_knows_its_place(small_run: Path, tmp_path: Path) -> None:

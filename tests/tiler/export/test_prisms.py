@@ -14,28 +14,23 @@ import pyvista
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.mesh import Marker
 from stitch.pieces.conformity import compute_cell_volumes
+from tests.conftest import Once
 from tests.helpers.programs import mesh_is_ok, read_check, run_foam, run_program
-from tiler.cli.main import main
+from tests.helpers.synthetic import run_city
+from tests.helpers.vtk_readers import read_vtk
+from tests.tiler.export.conftest import Exported
 from tiler.export.export import export_run
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.prisms import NO_CORNER, PrismMesh, combine_cells, read_prisms
 
+PRISMS = ("--cells", "prism")
 UPRIGHT = {Marker.WALL, Marker.WEST, Marker.EAST, Marker.SOUTH, Marker.NORTH}
 
 
 @pytest.fixture(scope="module")
-def layered_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def layered_run(once: Once) -> Path:
     """Finished run of a synthetic city on four tiles in layers that grow."""
-    from tiler.config.config import make_config
-    from tiler.interface.synth import write_city
-    from tiler.workflow.run import run
-
-    folder = tmp_path_factory.mktemp("layered")
-    files = write_city(folder / "city", size=300, buildings=15, density=1.0)
-    given = {"pointcloud": [str(path) for path in files.clouds], "footprints": str(files.footprints)}
-    mesh = {"mesher": "layered", "first_layer": 2.0, "tile_size": 150.0, "domain_height": 60.0}
-    run(make_config(given | mesh | {"out": str(folder / "out")}))
-    return folder / "out"
+    return once("layered", lambda folder: run_city(folder, mesher="layered", first_layer=2.0)) / "out"
 
 
 @pytest.fixture(scope="module")
@@ -112,40 +107,33 @@ def test_faces_are_in_order_and_those_of_the_boundary_have_their_markers(
     assert (np.cross(west[:, 1] - west[:, 0], west[:, 2] - west[:, 0])[:, 0] < 0).all()
 
 
-def test_readers_find_prisms_and_quadrilaterals(layered_run: Path, prisms: PrismMesh, tmp_path: Path) -> None:
-    for name in ("vtu", "msh", "xdmf", "cgns"):
-        words = ["--format", name, "--cells", "prism", "-o", f"{tmp_path}/a.{name}"]
-        assert main(["export", str(layered_run), *words]) == 0
-    grid = pyvista.read(tmp_path / "a.vtu")
+def test_readers_find_prisms_and_quadrilaterals(layered_run: Path, prisms: PrismMesh, exported: Exported) -> None:
+    grid = pyvista.read(exported(layered_run, "vtu", *PRISMS))
     assert set(grid.celltypes.tolist()) == {pyvista.CellType.WEDGE}
     volume = grid.compute_cell_sizes(length=False, area=False)["Volume"]
     assert volume.min() > 0
-    mesh = meshio.read(tmp_path / "a.msh")
+    mesh = meshio.read(exported(layered_run, "msh", *PRISMS))
     assert (mesh.cells_dict["wedge"] == prisms.cells).all()
     for kind, width in (("triangle", 3), ("quad", 4)):
         corners, marker, _ = prisms.facets(width)
         order = np.argsort(marker, kind="stable")
         assert (mesh.cells_dict[kind] == corners[order]).all()
         assert (mesh.cell_data_dict["gmsh:physical"][kind] == marker[order]).all()
-    with h5py.File(tmp_path / "a.h5") as file:
+    with h5py.File(exported(layered_run, "xdmf", *PRISMS).with_suffix(".h5")) as file:
         assert (file["cells"][:] == prisms.cells).all()
         assert (file["sides"][:] == prisms.facets(4)[0]).all()
         assert (file["side_marker"][:] == prisms.facets(4)[1]).all()
-    with h5py.File(tmp_path / "a.cgns") as file:
+    with h5py.File(exported(layered_run, "cgns", *PRISMS)) as file:
         zone = file["city/air"]
         assert zone["cells/ data"][0] == 14
         assert (zone["cells/ElementConnectivity/ data"][:].reshape(-1, 6) == prisms.cells + 1).all()
         assert zone["walls_quadrilaterals/ data"][0] == 7
 
 
-def test_xdmf_has_three_grids_that_vtk_reads(layered_run: Path, prisms: PrismMesh, tmp_path: Path) -> None:
+def test_xdmf_has_three_grids_that_vtk_reads(layered_run: Path, prisms: PrismMesh, exported: Exported) -> None:
     from vtkmodules.vtkIOXdmf2 import vtkXdmfReader
 
-    export_run(layered_run, tmp_path / "a.xdmf", name="xdmf", options={"cells": "prism"})
-    reader = vtkXdmfReader()
-    reader.SetFileName(str(tmp_path / "a.xdmf"))
-    reader.Update()
-    blocks = reader.GetOutputDataObject(0)
+    blocks = read_vtk(vtkXdmfReader(), exported(layered_run, "xdmf", *PRISMS)).GetOutputDataObject(0)
     grids = [blocks.GetBlock(k) for k in range(blocks.GetNumberOfBlocks())]
     found = [(grid.GetCellType(0), grid.GetNumberOfCells()) for grid in grids]
     expected = [(13, len(prisms.cells)), (5, len(prisms.facets(3)[0])), (9, len(prisms.facets(4)[0]))]
@@ -154,14 +142,14 @@ def test_xdmf_has_three_grids_that_vtk_reads(layered_run: Path, prisms: PrismMes
 
 
 def test_openfoam_has_faces_of_three_and_of_four_corners(
-    layered_run: Path, prisms: PrismMesh, tmp_path: Path
+    layered_run: Path, prisms: PrismMesh, exported: Exported
 ) -> None:
-    export_run(layered_run, tmp_path / "case", name="openfoam", options={"cells": "prism"})
-    reader = pyvista.POpenFOAMReader(str(tmp_path / "case" / "case.foam"))
+    case = exported(layered_run, "openfoam", *PRISMS)
+    reader = pyvista.POpenFOAMReader(str(case / "case.foam"))
     grid = reader.read()["internalMesh"]
     assert set(grid.celltypes.tolist()) == {pyvista.CellType.WEDGE}
     assert grid.n_cells == len(prisms.cells)
-    record = json.loads((tmp_path / "case" / "export.json").read_text())["meshes"][0]
+    record = json.loads((case / "export.json").read_text())["meshes"][0]
     assert record["faces"] == len(prisms.inner) + len(prisms.outer)
     assert record["patches"]["ground"] == (prisms.marker == Marker.GROUND).sum()
     quads = (prisms.outer[:, 3] != NO_CORNER) & (prisms.marker == Marker.WALL)

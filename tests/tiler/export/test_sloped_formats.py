@@ -16,15 +16,11 @@ from pipeline.data.citymodel import CityModel
 from pipeline.data.mesh import Marker
 from pipeline.data.roofs import ROOF_METHODS, is_flat, roof_heights
 from tests.helpers.foam_reader import read_poly_mesh
+from tests.helpers.patch_readers import corners_of, patch_of, sorted_rows, surface_of, volume
 from tests.helpers.written_models import read_city_model
-from tests.tiler.export.test_formats_buildings import READERS as BY_BUILDING
-from tests.tiler.export.test_formats_buildings import sorted_rows
-from tests.tiler.export.test_formats_cgns import corners_of
-from tests.tiler.export.test_formats_glb import read_document, turned
+from tests.tiler.export.conftest import Exported
 from tests.tiler.export.test_formats_openfoam import MESH, assert_in_order, volumes_of
-from tests.tiler.export.test_formats_surfaces import READERS as SURFACES
-from tests.tiler.export.test_formats_surfaces import Facets, facets_of, open_edges, volume
-from tiler.export.export import export_run, list_formats, load_format
+from tiler.export.export import list_formats
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.store.out_folder import CITY_MODEL
 
@@ -34,10 +30,10 @@ HOUSE_FIELDS = ("roof_method", "roof_fallback", "roof_form", "roof_parts", "roof
 
 def roof_facets(run: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Corners of all roof facets, (k, 3, 3), and their buildings."""
-    found = facets_of(open_pieces(run))
-    roof = found.marker == Marker.ROOF
-    assert found.building is not None
-    return found.corners[roof], found.building[roof]
+    pieces = open_pieces(run)
+    parts = [(part, part.marker == Marker.ROOF) for part in map(pieces.read, range(len(pieces.names)))]
+    corners = np.concatenate([part.points[part.facets[roof]] for part, roof in parts])
+    return corners, np.concatenate([part.building[roof] for part, roof in parts])
 
 
 def assert_roofs(corners: NDArray[np.float64], building: NDArray[np.int64], model: CityModel) -> None:
@@ -61,38 +57,8 @@ def test_roofs_of_the_mesh_lie_on_the_planes_of_the_city_model(sloped_run: Path)
     assert_roofs(*roof_facets(sloped_run), read_city_model(sloped_run / CITY_MODEL))
 
 
-@pytest.mark.parametrize("name", sorted(SURFACES))
-def test_surfaces_are_closed(sloped_run: Path, tmp_path: Path, name: str) -> None:
-    export_run(sloped_run, tmp_path / f"a.{name}", name=name)
-    found, expected = SURFACES[name](tmp_path / f"a.{name}"), facets_of(open_pieces(sloped_run))
-    assert sorted_rows(found.corners) == sorted_rows(expected.corners)
-    assert open_edges(found) == 0
-    assert volume(found) == pytest.approx(volume(expected), rel=1e-9)
-    if found.building is not None:
-        roof = found.marker == Marker.ROOF
-        assert_roofs(found.corners[roof], found.building[roof], read_city_model(sloped_run / CITY_MODEL))
-
-
-@pytest.mark.parametrize("name", sorted(BY_BUILDING))
-def test_each_building_has_its_walls_and_its_sloped_roof(sloped_run: Path, tmp_path: Path, name: str) -> None:
-    path = tmp_path / f"a{load_format(name).suffix}"
-    export_run(sloped_run, path, name=name, options={"buildings": "patches"})
-    found, expected = BY_BUILDING[name](path), corners_of(open_pieces(sloped_run), by_building=True)
-    if name != "cgns":
-        del expected["Internal"]
-    if name == "glb":
-        origin = read_document(path)[0]["asset"]["extras"]["origin"]
-        expected = {patch: turned(corners, origin) for patch, corners in expected.items()}
-    assert sorted(found) == sorted(expected)
-    for patch, corners in expected.items():
-        assert sorted_rows(found[patch]) == sorted_rows(corners), patch
-    if name != "cgns":
-        assert open_edges(Facets(np.concatenate(list(found.values())), np.empty(0, np.int64))) == 0
-
-
-def test_vtp_has_the_building_of_each_facet(sloped_run: Path, tmp_path: Path) -> None:
-    export_run(sloped_run, tmp_path / "a.vtp", name="vtp")
-    data = pyvista.read(tmp_path / "a.vtp")
+def test_vtp_has_the_building_of_each_facet(sloped_run: Path, exported: Exported) -> None:
+    data = pyvista.read(exported(sloped_run, "vtp"))
     assert isinstance(data, pyvista.PolyData)
     facets = data.regular_faces
     roof = data.cell_data["marker"] == Marker.ROOF
@@ -100,19 +66,18 @@ def test_vtp_has_the_building_of_each_facet(sloped_run: Path, tmp_path: Path) ->
     assert_roofs(corners, building, read_city_model(sloped_run / CITY_MODEL))
 
 
-def test_xdmf_has_every_cell(sloped_run: Path, tmp_path: Path) -> None:
-    export_run(sloped_run, tmp_path / "a.xdmf", name="xdmf")
-    with h5py.File(tmp_path / "a.h5") as file:
+def test_xdmf_has_every_cell(sloped_run: Path, exported: Exported) -> None:
+    with h5py.File(exported(sloped_run, "xdmf").with_suffix(".h5")) as file:
         points, cells = file["points"][()], file["cells"][()]
     edges = np.diff(points[cells], axis=1)
     volumes = np.einsum("ij,ij->i", np.cross(edges[:, 0], edges[:, 1]), edges[:, 2]) / 6
     assert (volumes > 0).all()
-    assert volumes.sum() == pytest.approx(volume(facets_of(open_pieces(sloped_run))), rel=1e-9)
+    surface = surface_of(corners_of(open_pieces(sloped_run), patch_of))
+    assert volumes.sum() == pytest.approx(volume(surface), rel=1e-9)
 
 
-def test_openfoam_has_a_patch_of_sloped_roofs(sloped_run: Path, tmp_path: Path) -> None:
-    export_run(sloped_run, tmp_path / "case", name="openfoam")
-    mesh = read_poly_mesh(tmp_path / "case" / MESH)
+def test_openfoam_has_a_patch_of_sloped_roofs(sloped_run: Path, exported: Exported) -> None:
+    mesh = read_poly_mesh(exported(sloped_run, "openfoam") / MESH)
     assert_in_order(mesh)
     assert (volumes_of(mesh) > 0).all()
     roofs = mesh.patches["roofs"]
@@ -120,9 +85,8 @@ def test_openfoam_has_a_patch_of_sloped_roofs(sloped_run: Path, tmp_path: Path) 
     assert sorted_rows(np.sort(faces, axis=1)) == sorted_rows(np.sort(roof_facets(sloped_run)[0], axis=1))
 
 
-def test_geopackage_has_what_is_known_of_each_roof(sloped_run: Path, tmp_path: Path) -> None:
-    export_run(sloped_run, tmp_path / "a.gpkg", name="gpkg")
-    meta, _, _, columns = pyogrio.raw.read(tmp_path / "a.gpkg")
+def test_geopackage_has_what_is_known_of_each_roof(sloped_run: Path, exported: Exported) -> None:
+    meta, _, _, columns = pyogrio.raw.read(exported(sloped_run, "gpkg"))
     table = dict(zip(meta["fields"], columns, strict=True))
     document = json.loads((sloped_run / CITY_MODEL).read_text())
     things = {name: thing["attributes"] for name, thing in document["CityObjects"].items() if "geometry" in thing}
@@ -161,7 +125,5 @@ def same(one: Any, other: Any) -> bool:
 
 
 @pytest.mark.parametrize("name", sorted(list_formats()))
-def test_every_format_takes_a_mesh_with_sloped_roofs(sloped_run: Path, tmp_path: Path, name: str) -> None:
-    target = tmp_path / f"a{load_format(name).suffix}"
-    export_run(sloped_run, target, name=name)
-    assert target.exists()
+def test_every_format_takes_a_mesh_with_sloped_roofs(sloped_run: Path, exported: Exported, name: str) -> None:
+    assert exported(sloped_run, name).exists()

@@ -15,35 +15,31 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, InputError
 from pipeline.data.mesh import Marker, Region
-from stitch.pieces.conformity import compute_cell_volumes, pair_edges
+from stitch.pieces.conformity import compute_cell_volumes
+from tests.conftest import Once
 from tests.helpers.foam_reader import PolyMesh, read_poly_mesh, read_zones
 from tests.helpers.hand_pieces import HandPieces
+from tests.helpers.patch_readers import open_edges, read_obj, surface_of
 from tests.helpers.programs import mesh_is_ok, read_check, run_foam, run_program
+from tests.helpers.synthetic import run_city
 from tests.helpers.vtk_writers import write_vtu
+from tests.tiler.export.conftest import Exported
+from tests.tiler.export.test_formats_msh import check_with_gmsh
 from tests.tiler.export.test_formats_openfoam import MESH, assert_in_order, volumes_of
 from tiler.cli.main import main
-from tiler.config.config import make_config
-from tiler.export.export import export_run, list_formats, load_format
+from tiler.export.export import export_run, list_formats
 from tiler.export.foam_patches import PATCHES
 from tiler.formats.openfoam import write_openfoam
-from tiler.interface.synth import write_city
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
 from tiler.mesh_files.vtk_files import read_vtu
-from tiler.workflow.run import run
 
 DEPTH = 20.0
 
 
 @pytest.fixture(scope="module")
-def soil_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def soil_run(once: Once) -> Path:
     """Finished run of a synthetic city with soil on four tiles, not to be changed."""
-    folder = tmp_path_factory.mktemp("soil")
-    files = write_city(folder / "city", size=300, buildings=15, density=1.0)
-    given: dict[str, Any] = {"pointcloud": [str(path) for path in files.clouds]}
-    given |= {"footprints": str(files.footprints)}
-    given |= {"out": str(folder / "out"), "tile_size": 150.0, "domain_height": 60.0, "underground": DEPTH}
-    run(make_config(given))
-    return folder / "out"
+    return once("soil", lambda folder: run_city(folder, underground=DEPTH)) / "out"
 
 
 def parts_of(folder: Path) -> list[MeshPiece]:
@@ -109,9 +105,8 @@ def assert_zones(folder: Path, mesh: PolyMesh) -> int:
     return len(ground)
 
 
-def test_openfoam_has_the_ground_inside_and_a_zone_a_region(soil_run: Path, tmp_path: Path) -> None:
-    export_run(soil_run, tmp_path / "case", name="openfoam")
-    folder, parts = tmp_path / "case" / MESH, parts_of(soil_run)
+def test_openfoam_has_the_ground_inside_and_a_zone_a_region(soil_run: Path, exported: Exported) -> None:
+    folder, parts = exported(soil_run, "openfoam") / MESH, parts_of(soil_run)
     mesh = read_poly_mesh(folder)
     assert_in_order(mesh)
     volume = volumes_of(mesh)
@@ -193,9 +188,8 @@ def test_check_mesh_is_content_with_two_regions(soil_run: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", ["msh", "msh2"])
-def test_meshio_reads_two_volumes(soil_run: Path, tmp_path: Path, name: str) -> None:
-    export_run(soil_run, tmp_path / "a.msh", name=name)
-    mesh, parts = meshio.read(tmp_path / "a.msh"), parts_of(soil_run)
+def test_meshio_reads_two_volumes(soil_run: Path, exported: Exported, name: str) -> None:
+    mesh, parts = meshio.read(exported(soil_run, name)), parts_of(soil_run)
     assert {mesh.field_data[volume][0]: mesh.field_data[volume][1] for volume in ("air", "soil")} == {10: 3, 20: 3}
     assert tuple(mesh.field_data["bottom"]) == (Marker.BOTTOM, 2)
     assert tuple(mesh.field_data["foundations"]) == (Marker.FOUNDATION, 2)
@@ -211,19 +205,15 @@ def test_meshio_reads_two_volumes(soil_run: Path, tmp_path: Path, name: str) -> 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["msh", "msh2"])
-def test_gmsh_has_no_complaints_of_soil(soil_run: Path, tmp_path: Path, name: str) -> None:
-    export_run(soil_run, tmp_path / "a.msh", name=name)
-    text = run_program(["gmsh", "-check", str(tmp_path / "a.msh")], tmp_path)
-    assert "Done checking mesh coherence" in text
-    assert not re.findall(r"^(?:Warning|Error)", text, re.MULTILINE)
+def test_gmsh_has_no_complaints_of_soil(soil_run: Path, exported: Exported, name: str) -> None:
+    assert check_with_gmsh(exported(soil_run, name))["complaints"] == 0
 
 
 @pytest.mark.long
-def test_gmsh_to_foam_makes_the_zones(soil_run: Path, tmp_path: Path) -> None:
+def test_gmsh_to_foam_makes_the_zones(soil_run: Path, exported: Exported, tmp_path: Path) -> None:
     export_run(soil_run, tmp_path / "case", name="openfoam")
-    export_run(soil_run, tmp_path / "b.msh", name="msh2")
     expected = read_check(run_foam("checkMesh", tmp_path / "case"))
-    run_foam("gmshToFoam", tmp_path / "case", str(tmp_path / "b.msh"))
+    run_foam("gmshToFoam", tmp_path / "case", str(exported(soil_run, "msh2")))
     text = run_foam("checkMesh", tmp_path / "case")
     assert mesh_is_ok(text)
     found = read_check(text)
@@ -232,14 +222,14 @@ def test_gmsh_to_foam_makes_the_zones(soil_run: Path, tmp_path: Path) -> None:
     assert re.search(r"^    ground +\d+", text, re.MULTILINE)
 
 
-def test_xdmf_has_the_region_of_each_cell(soil_run: Path, tmp_path: Path) -> None:
-    export_run(soil_run, tmp_path / "a.xdmf", name="xdmf")
-    with h5py.File(tmp_path / "a.h5") as file:
+def test_xdmf_has_the_region_of_each_cell(soil_run: Path, exported: Exported) -> None:
+    path = exported(soil_run, "xdmf")
+    with h5py.File(path.with_suffix(".h5")) as file:
         region, cells = file["region"][()], file["cells"][()]
     parts = parts_of(soil_run)
     assert np.array_equal(region, np.concatenate([part.region for part in parts if part.region is not None]))
     assert np.array_equal(cells, np.concatenate([part.ids[part.cells] for part in parts]))
-    text = (tmp_path / "a.xdmf").read_text()
+    text = path.read_text()
     assert text.count('<Attribute Name="region" AttributeType="Scalar" Center="Cell">') == 1
 
 
@@ -264,27 +254,18 @@ print(json.dumps([tags.dim, int((tags.values == 0).sum()), int((tags.values == 1
 # Surfaces, and all formats.
 
 
-def test_a_surface_without_its_ground_is_closed(soil_run: Path, tmp_path: Path) -> None:
-    export_run(soil_run, tmp_path / "a.obj", name="obj")
-    groups: dict[str, list[list[int]]] = {}
-    name = ""
-    for line in (tmp_path / "a.obj").read_text().splitlines():
-        kind, *words = line.split()
-        if kind == "g":
-            name = words[0]
-        elif kind == "f":
-            groups.setdefault(name, []).append([int(word) for word in words])
-    assert {name: len(rows) for name, rows in groups.items() if name != "ground"} == marked(parts_of(soil_run))
-    outer = np.array([row for name, rows in groups.items() if name != "ground" for row in rows], np.int32)
-    assert len(pair_edges(outer).open) == 0
-    assert len(pair_edges(np.concatenate((outer, np.array(groups["ground"], np.int32)))).open) > 0
+def test_a_surface_without_its_ground_is_closed(soil_run: Path, exported: Exported) -> None:
+    patches = read_obj(exported(soil_run, "obj"))
+    whole, ground = surface_of(patches), patches.pop("ground")
+    assert {name: len(rows) for name, rows in patches.items()} == marked(parts_of(soil_run))
+    assert len(ground) > 0
+    assert open_edges(surface_of(patches)) == 0
+    assert open_edges(whole) > 0
 
 
 @pytest.mark.parametrize("name", sorted({*list_formats()} - {"cgns"}))
-def test_every_other_format_takes_a_mesh_with_soil(soil_run: Path, tmp_path: Path, name: str) -> None:
-    target = tmp_path / f"a{load_format(name).suffix}"
-    export_run(soil_run, target, name=name)
-    assert target.exists()
+def test_every_other_format_takes_a_mesh_with_soil(soil_run: Path, exported: Exported, name: str) -> None:
+    assert exported(soil_run, name).exists()
 
 
 def test_a_piece_without_its_regions_is_refused(soil_run: Path, tmp_path: Path) -> None:

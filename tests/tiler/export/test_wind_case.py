@@ -12,8 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
+from tests.conftest import Once
 from tests.helpers.foam_reader import PolyMesh, read_field, read_labels, read_patch, read_poly_mesh
 from tests.helpers.programs import mesh_is_ok, run_foam
+from tests.helpers.synthetic import run_city
+from tests.tiler.export.conftest import Exported
 from tiler.cli.main import main
 from tiler.export.export import export_run
 from tiler.export.foam_part import DISTANCES, count_distances
@@ -24,29 +27,20 @@ Floats = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
-def flat_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def flat_run(once: Once) -> Path:
     """Finished run of 240 x 80 m of bare level ground, 60 m high, with thin cells at the ground."""
-    from tiler.config.config import make_config
-    from tiler.interface.synth import write_city
-    from tiler.workflow.run import run
-
-    folder = tmp_path_factory.mktemp("flat")
-    files = write_city(folder / "city", size=300, buildings=1, density=0.5, relief=0.0)
+    city = {"size": 300, "buildings": 1, "density": 0.5, "relief": 0.0}
     west, south = 318000.0, 6399000.0
-    given = {"pointcloud": [str(path) for path in files.clouds], "out": str(folder / "out")}
-    mesh = {"mesh_size": 8.0, "first_layer": 1.0, "domain_height": 60.0, "top": "flat", "tile_size": 1000.0}
-    run(make_config(given | mesh | {"bounds": [west + 30, south + 30, west + 270, south + 110]}))
-    return folder / "out"
+    given: dict[str, Any] = {"bounds": [west + 30, south + 30, west + 270, south + 110], "footprints": ""}
+    given |= {"mesh_size": 8.0, "first_layer": 1.0, "top": "flat", "tile_size": 1000.0}
+    return once("flat", lambda folder: run_city(folder, city, **given)) / "out"
 
 
 @pytest.fixture(scope="module")
-def small_wind(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_wind(small_run: Path, exported: Exported) -> Path:
     """Export of three directions for two processes."""
-    case = tmp_path_factory.mktemp("wind") / "case"
-    words = ["--direction", "240", "--direction", "0", "--direction", "22.5", "--parts", "2"]
-    command = ["export", str(small_run), "--format", "openfoam", "-o", str(case), "--case", "wind", *words]
-    assert main(command) == 0
-    return case
+    words = ("--direction", "240", "--direction", "0", "--direction", "22.5", "--parts", "2")
+    return exported(small_run, "openfoam", "--case", "wind", *words)
 
 
 def conditions(path: Path) -> dict[str, str]:

@@ -12,33 +12,19 @@ from pipeline.data.errors import InputError
 from pipeline.data.mesh import Marker
 from stitch.pieces.conformity import pair_cell_faces
 from tests.helpers.vtk_writers import write_vtu
-from tiler.config.config import make_config
-from tiler.interface.synth import write_city
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu
-from tiler.workflow.run import run
-
-
-@pytest.fixture(scope="module")
-def tiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run of a synthetic city on four tiles, without its store."""
-    folder = tmp_path_factory.mktemp("pieces")
-    files = write_city(folder / "city", size=300, buildings=15, density=0.5)
-    values = {"pointcloud": [str(path) for path in files.clouds], "footprints": str(files.footprints)}
-    run(make_config(values | {"out": str(folder / "out"), "tile_size": 150.0, "domain_height": 60.0}))
-    shutil.rmtree(folder / "out" / "store.zarr")
-    return folder / "out"
 
 
 @pytest.fixture
-def copy(tiled: Path, tmp_path: Path) -> Path:
+def copy(small_run: Path, tmp_path: Path) -> Path:
     """The run, to be damaged."""
-    return shutil.copytree(tiled, tmp_path / "run")
+    return shutil.copytree(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("store.zarr"))
 
 
-def test_pieces_glued_by_their_numbers_are_the_whole_mesh(tiled: Path) -> None:
-    counts = json.loads((tiled / "run.json").read_text())["counts"]
-    pieces = open_pieces(tiled)
+def test_pieces_glued_by_their_numbers_are_the_whole_mesh(small_run: Path) -> None:
+    counts = json.loads((small_run / "run.json").read_text())["counts"]
+    pieces = open_pieces(small_run)
     xyz = np.full((pieces.n_points, 3), np.nan)
     cells, facets = [], []
     for k, name in enumerate(pieces.names):
@@ -62,13 +48,13 @@ def test_pieces_glued_by_their_numbers_are_the_whole_mesh(tiled: Path) -> None:
     assert np.array_equal(np.unique(np.sort(exterior), axis=0), np.unique(np.sort(boundary), axis=0))
 
 
-def test_cells_facets_and_marks_are_those_of_the_files(tiled: Path) -> None:
-    pieces = open_pieces(tiled)
+def test_cells_facets_and_marks_are_those_of_the_files(small_run: Path) -> None:
+    pieces = open_pieces(small_run)
     for k, name in enumerate(pieces.names):
-        piece, mesh = pieces.read(k), read_vtu(tiled / "mesh" / f"{name}.vtu").mesh
+        piece, mesh = pieces.read(k), read_vtu(small_run / "mesh" / f"{name}.vtu").mesh
         assert piece.points.tobytes() == mesh.points.tobytes()
         assert piece.cells.tobytes() == mesh.cells.tobytes()
-        side = read_vtp(tiled / "boundary" / f"{name}.vtp")
+        side = read_vtp(small_run / "boundary" / f"{name}.vtp")
         assert piece.points[piece.facets].tobytes() == side.points[side.boundary.facets].tobytes()
         assert np.array_equal(piece.marker, side.boundary.marker)
         assert np.array_equal(piece.building, side.boundary.building)

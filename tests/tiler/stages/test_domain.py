@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError, InputError
 from stitch.tiling.grid import Bounds
 from tests.helpers.cities import crowded_blocks
-from tests.helpers.tiles import Town, hash_files, make_town, write_town
-from tests.runs.test_tiled_runs import SIZE, TILE, around, prove, prove_local
+from tests.helpers.tiles import SIZE, Town, around, hash_files, make_town, prove, prove_local, write_town
+from tests.runs.test_tiled_runs import TILE
 from tiler.cli.main import main
 from tiler.config.config import Config, idle_parameters, make_config
 from tiler.config.config_file import load_config
@@ -125,7 +125,6 @@ def test_real_blocks_have_a_flat_top_above_grown_layers(shared_data: Path, meshe
     ("mesher", "options"),
     [
         ("adaptive", CFD | {"domain_height": "1.5H"}),
-        pytest.param("layered", {"first_layer": 1.0, "domain_height": 38.0}, marks=pytest.mark.long),
         pytest.param("layered", CFD | {"domain_height": "1.3H"}, marks=pytest.mark.long),
     ],
 )

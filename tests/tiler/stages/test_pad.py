@@ -19,7 +19,7 @@ from stitch.tiling.grid import Key, has_tile, make_grid, tile_box, tile_keys
 from tests.helpers.cities import crowded_blocks
 from tests.helpers.faults import injected, raises
 from tests.helpers.programs import mesh_is_ok, read_check, run_foam
-from tests.helpers.tiles import hash_files, make_town, run_of, write_footprints, write_town
+from tests.helpers.tiles import hash_files, make_town, prove, run_of, write_footprints, write_town
 from tiler.check.check import check_run
 from tiler.cli.main import main
 from tiler.config.config import Config, check_height, make_config
@@ -73,11 +73,6 @@ def bare(core: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> tupl
     """The same without a pad."""
     out = tmp_path_factory.mktemp("bare") / "out"
     return run_of(core, out), out
-
-
-def prove(out: Path) -> None:
-    report = check_run(out, StoredTerrain)
-    assert report.ok, "\n".join(report.lines())
 
 
 def test_the_pad_is_meshed_and_proved(padded: tuple[dict[str, Any], Path]) -> None:
