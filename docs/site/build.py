@@ -23,7 +23,7 @@ from sphinx.cmd.build import build_main
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 # In this order; the other guides follow by name.
-FIRST_GUIDES = ("python", "stages", "formats", "plan", "meshing", "grading", "underground", "wind")
+FIRST_GUIDES = ("python", "stages", "formats", "plan", "meshing", "grading", "underground", "solids", "wind")
 LAST_GUIDES = ("architecture", "reliability", "quality", "tiles", "benchmarks")
 FIRST_NOTEBOOKS = ("first_mesh", "own_data", "own_stage", "cluster", "seams")
 LINK = re.compile(r"(?<!!)\[([^]]*)]\(([^)#:\s]+)(#[^)\s]*)?\)")

@@ -21,6 +21,7 @@ from pipeline.columns.nodes import (
     NodeMoves,
     Nodes,
     SeamColumns,
+    add_floors,
     collect_surfaces,
     no_seam,
     place_nodes,
@@ -62,6 +63,8 @@ class AdaptiveOptions:
         Absolute height of the domain's top (m) if it is flat; None: it follows the smoothed terrain.
     weld : Weld or None
         How roofs that meet at a vertex are joined and parted; None: only roofs of one height are joined.
+    solids : bool
+        Whether columns go on below roofs, down to the terrain, for cells of buildings.
     """
 
     mesh_size: float
@@ -72,6 +75,7 @@ class AdaptiveOptions:
     growth: Growth | None = None
     top: float | None = None
     weld: Weld | None = None
+    solids: bool = False
 
 
 @dataclass(frozen=True)
@@ -171,7 +175,8 @@ def mesh_adaptive(
     n_shared, home = _count_shared(levels), levels.z
     del levels  # its kinds are of no use any more
     # Level tops of walls are never passed by: without sloped roofs there is nothing to see to.
-    gates = np.empty((0, 2, 2), np.int64) if options.weld is None else wall_gates(mesh)
+    keyed = options.weld is not None or options.solids
+    gates = wall_gates(mesh, floors=options.solids) if keyed else np.empty((0, 2, 2), np.int64)
 
     def key_anew(mesh: ColumnMesh) -> ColumnMesh:
         return _key_columns(replace(mesh, key=None), seam, given, gates)[0]
@@ -258,6 +263,9 @@ def _fill_columns(
     least_gap = np.full(len(plane.xy), limits.least * size)
     ground = sample_dtm(dtm, plane.xy)
     nodes, moves = place_nodes(plane, roofs, ground, seam, spacing=spacing, least_gap=least_gap, weld=options.weld)
+    if options.solids:
+        given = np.isin(np.arange(len(plane.xy)), seam.vertex)
+        nodes = add_floors(nodes, ground, given, least_gap)
     _check_top(plane, nodes, top, least_gap, options.domain_height)
     levels, bottom = fill_levels(nodes, top, spacing, shift, seam, ground=ground, growth=options.growth)
     return levels, bottom, moves

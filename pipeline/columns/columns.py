@@ -124,7 +124,7 @@ def extract_boundary(mesh: ColumnMesh, numbers: NDArray[np.int64]) -> Boundary:
 
 
 def split_boundary(
-    mesh: ColumnMesh, numbers: NDArray[np.int64], bounds: Bounds, seams: SeamEdges
+    mesh: ColumnMesh, numbers: NDArray[np.int64], bounds: Bounds, seams: SeamEdges, *, strict: bool = True
 ) -> tuple[Boundary, NDArray[np.int32]]:
     """Extract the boundary of one tile of a region (step 3.6), without the faces that it shares with others.
 
@@ -138,6 +138,8 @@ def split_boundary(
         The region (m).
     seams : SeamEdges
         All outer edges of the tile that are not on the region's border.
+    strict : bool
+        Refuse other outer edges; else facets over them have the marker 0.
 
     Returns
     -------
@@ -159,7 +161,7 @@ def split_boundary(
     A wall on a seam is found like any other: from the levels at which the two sides begin. Both tiles have the
     same columns there, so what one leaves out the other does not have.
     """
-    return _extract_boundary(mesh, numbers, bounds, seams, strict=True)
+    return _extract_boundary(mesh, numbers, bounds, seams, strict=strict)
 
 
 def _oriented(facets: NDArray[np.int32], swap: NDArray[np.bool_]) -> NDArray[np.int32]:

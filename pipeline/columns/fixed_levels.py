@@ -125,6 +125,44 @@ def take_used_levels(
     return Levels(start, z[used], kind[used], z[used], collect_surfaces(plane, bottom.astype(np.int32)))
 
 
+def stand_on_floors(
+    given: GivenLevels, z: NDArray[np.float64], heights: NDArray[np.float64], *, min_gap: float
+) -> tuple[GivenLevels, NDArray[np.float64]]:
+    """Let columns that begin at a roof go on below it, for cells of buildings: down to the terrain.
+
+    Parameters
+    ----------
+    given : GivenLevels
+        What was given.
+    z : float64, (n, l)
+        Heights of all levels (m): the lowest at the terrain, those from `GivenLevels.kept` on as they stay.
+    heights : float64, (l,)
+        Heights of the levels over flat ground (m): levels below a roof keep the ratios of their distances.
+    min_gap : float
+        Least distance of two levels (m): where terrain inside a building comes too close to its roof, the floor
+        is as far below that as its levels need.
+
+    Returns
+    -------
+    GivenLevels
+        The same, with all levels kept.
+    float64, (n, l)
+        Heights of all levels (m).
+    """
+    bare = np.flatnonzero(given.kept)
+    kept = given.kept[bare]
+    roof = z[bare, kept]
+    floor = np.minimum(z[bare, 0], roof - min_gap * heights[kept] / heights[1])
+    kind, z = given.kind.copy(), z.copy()
+    kind[bare, 0] = GROUND_LEVEL
+    z[bare] = np.where(
+        np.arange(z.shape[1]) < kept[:, None],
+        floor[:, None] + (roof - floor)[:, None] * (heights / heights[kept, None]),
+        z[bare],
+    )
+    return GivenLevels(np.zeros_like(given.kept), kind, given.stays, given.z), z
+
+
 def _check_seam(plane: PlaneMesh, first: NDArray[np.int32], seam: SeamColumns, n_layers: int) -> None:
     """Refuse a triangle at a seam whose cells begin at a level that does not stand for its surface there."""
     row = np.full(len(plane.xy), -1, np.int64)

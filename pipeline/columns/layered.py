@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.city_model.groups import adjacent_houses
 from pipeline.columns.columns import expand_cells
-from pipeline.columns.fixed_levels import GivenLevels, find_given_levels, take_used_levels
+from pipeline.columns.fixed_levels import GivenLevels, find_given_levels, stand_on_floors, take_used_levels
 from pipeline.columns.growth import Growth, full_height, layer_levels
 from pipeline.columns.neighbours import check_groups, join_equal_roofs, part_neighbours
 from pipeline.columns.nodes import Levels, SeamColumns, no_seam
@@ -59,6 +59,8 @@ class LayeredOptions:
         How layers grow from the ground up to `layer_height`; None: all have the same height.
     top : float or None
         Absolute height of the domain's top (m) if it is flat; None: it follows the smoothed terrain.
+    solids : bool
+        Whether columns go on below roofs, down to the terrain, for cells of buildings.
     """
 
     mesh_size: float
@@ -69,6 +71,7 @@ class LayeredOptions:
     fem_tolerance: float
     growth: Growth | None = None
     top: float | None = None
+    solids: bool = False
 
 
 @dataclass(frozen=True)
@@ -340,6 +343,9 @@ def _settle(
         u, iterations, residual = relax_columns(plane, first, z, fixed, guess, tolerance=options.tolerance)
     z = np.where(given.stays, given.z, z + u)
     z, moved_roofs = repair_columns(z, given.kept, given.stays, min_gap=min_gap)
+    if options.solids:
+        heights = np.arange(n_layers + 1.0) if shape is None else shape.levels
+        given, z = stand_on_floors(given, z, heights, min_gap=min_gap)
     return z, given, LayeredReport(n_layers, 0, moved_terrain, moved_roofs, iterations, residual)
 
 

@@ -305,6 +305,37 @@ def place_nodes(
     return nodes, NodeMoves(node_z[node_of] - wanted, joined, len(crossed))
 
 
+def add_floors(
+    nodes: Nodes, ground: NDArray[np.float64], given: NDArray[np.bool_], gap: NDArray[np.float64]
+) -> Nodes:
+    """Give each column that begins at a roof a node below it, at the terrain: the floor of the building there.
+
+    Parameters
+    ----------
+    nodes : Nodes
+        Nodes of ``n`` columns.
+    ground : float64, (n,)
+        Terrain at each vertex (m).
+    given : bool, (n,)
+        Columns that are given: they have their floors.
+    gap : float64, (n,)
+        Least distance of two nodes (m): where terrain inside a building comes closer to its roof, the floor is
+        that much below it.
+    """
+    first = nodes.start[:-1]
+    bare = (nodes.kind[first] != GROUND_LEVEL) & ~given
+    floor = np.minimum(ground, nodes.z[first] - gap)[bare]
+    at, before = first[bare], np.cumsum(bare)
+    column = np.repeat(np.arange(len(bare)), np.diff(nodes.start))
+    return Nodes(
+        nodes.start + np.concatenate(([0], before)),
+        np.insert(nodes.z, at, floor),
+        np.insert(nodes.kind, at, GROUND_LEVEL),
+        np.insert(nodes.level, at, -1),
+        nodes.of_corner + before[column[nodes.of_corner]],
+    )
+
+
 def _surface_keys(plane: PlaneMesh) -> NDArray[np.int64]:
     """Vertex and building of every corner of every triangle as one number, (3 m,)."""
     width = int(plane.building.max(initial=-1)) + 2

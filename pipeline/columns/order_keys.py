@@ -23,19 +23,23 @@ SWEEPS = 400
 LEAST_STEP = 0.02  # m between keys of a column, and by which one middle must be above another
 
 
-def wall_gates(mesh: ColumnMesh) -> NDArray[np.int64]:
+def wall_gates(mesh: ColumnMesh, *, floors: bool = False) -> NDArray[np.int64]:
     """Find the edges over which the two sides begin at different levels, within the mesh.
 
     Parameters
     ----------
     mesh : ColumnMesh
         The mesh.
+    floors : bool
+        Whether buildings have cells, which begin at the lowest level of each column: then those of the higher one
+        must make the same faces as those of a lower one beside it, up to the lower roof.
 
     Returns
     -------
     int64, (g, 2, 2)
         For each such edge, at each of its ends, the level of `ColumnMesh.z` where the lower side begins and that
-        where the upper side does. Edges along which the sides change order are left out.
+        where the upper side does. Edges along which the sides change order are left out. With floors, rows follow
+        for edges between two buildings: the floor, and the lower roof.
     """
     edges, of_triangle = plane_edges(mesh.plane.triangles)
     corners = np.array([[0, 1], [0, 2], [1, 2]])  # of a triangle, at the ends of each of its edges
@@ -49,6 +53,11 @@ def wall_gates(mesh: ColumnMesh) -> NDArray[np.int64]:
     gates = (rise != 0).any(axis=1) & ~((rise > 0).any(axis=1) & (rise < 0).any(axis=1))
     ends = np.stack((levels.min(axis=1), levels.max(axis=1)), axis=2)
     result: NDArray[np.int64] = ends[gates]
+    if floors:
+        lower = result[:, :, 0]
+        floor = mesh.z_start[np.searchsorted(mesh.z_start, lower, side="right") - 1]
+        party = (lower > floor).all(axis=1)
+        result = np.concatenate((result, np.stack((floor, lower), axis=2)[party]))
     return result
 
 

@@ -1,18 +1,20 @@
-"""Soil: columns below the ground over the same plane mesh, for volumes below ground (beyond the paper).
+"""Soil and buildings: columns go on below ground and roofs, over the same plane mesh (beyond the paper).
 
 A column of soil ends in the ground node of the air above it, or, where there is none since houses stand all
 around, in a node of its own at the terrain. From there it goes down to a given depth. Columns of soil and air are
 kept as one, numbered from below, so that all that is said of points goes for both; the soil is merged into cells
-by the air's rule, so its faces match without exchange too.
+by the air's rule, so its faces match without exchange too. Cells of a building are merged of the same levels, from
+where the soil ends, or the column begins, up to its roof: in the air's order, so that walls match.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.columns.cell_blocks import CellBlocks
-from pipeline.columns.columns import Bounds, find_used_points, split_boundary
+from pipeline.columns.columns import Bounds, count_cells, find_used_points, split_boundary
 from pipeline.columns.levels import stagger_columns
 from pipeline.columns.nodes import (
     GROUND_LEVEL,
@@ -51,19 +53,27 @@ class SoilOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class SoilMesh:
-    """Columns of air with the soil below them.
+class RegionMesh:
+    """Columns of air with soil below them, or buildings, or both.
 
     Attributes
     ----------
     columns : ColumnMesh
         The air's mesh; its columns begin at the soil's bottom, and `ColumnMesh.bottom` counts from there.
     top : int32, (n,)
-        Level of each column in which its soil ends.
+        Level of each column in which its soil ends: 0 without soil.
+    solids : bool
+        Whether buildings have cells.
     """
 
     columns: ColumnMesh
     top: NDArray[np.int32]
+    solids: bool = False
+
+    @property
+    def has_soil(self) -> bool:
+        """Whether there is soil."""
+        return bool(self.top.any())
 
 
 def soil_tops(
@@ -187,7 +197,8 @@ def add_soil(
     options: SoilOptions,
     *,
     sizes: SizeField | None = None,
-) -> tuple[SoilMesh, NDArray[np.int32], NDArray[np.int64]]:
+    solids: bool = False,
+) -> tuple[RegionMesh, NDArray[np.int32], NDArray[np.int64]]:
     """Put the columns of a tile's air on columns of soil.
 
     Parameters
@@ -202,10 +213,12 @@ def add_soil(
         Parameters.
     sizes : SizeField, optional
         Sizes in the plane, where they are graded.
+    solids : bool
+        Whether buildings have cells: then columns begin at the terrain everywhere.
 
     Returns
     -------
-    SoilMesh
+    RegionMesh
         Both.
     int32, (n,)
         By how much each level of the air's columns moved up in them.
@@ -213,7 +226,7 @@ def add_soil(
         Vertices inside houses where the terrain reaches the roof, and was lowered.
     """
     plane, n = mesh.plane, len(mesh.plane.xy)
-    grounded = np.zeros(n, np.bool_)
+    grounded = np.full(n, solids)
     grounded[plane.triangles[plane.building < 0]] = True
     grounded[air.vertex] = is_grounded(air.levels)
     top, lowered = soil_tops(mesh.z[mesh.z_start[:-1]], grounded, terrain, options)
@@ -233,91 +246,182 @@ def add_soil(
         moved[np.arange(len(mesh.z)) + beyond] = mesh.moved
     bottom = mesh.bottom + raised[plane.triangles]
     columns = ColumnMesh(plane, whole.start, whole.z, bottom, mesh.order, key, moved)
-    return SoilMesh(columns, (np.diff(levels.start) - 1).astype(np.int32)), raised, np.flatnonzero(lowered)
+    mesh_of_all = RegionMesh(columns, (np.diff(levels.start) - 1).astype(np.int32), solids)
+    return mesh_of_all, raised, np.flatnonzero(lowered)
 
 
-def count_soil_cells(mesh: SoilMesh) -> int:
-    """Count the tetrahedra of the soil."""
-    return int(mesh.top[mesh.columns.plane.triangles].sum())
+def count_regions(mesh: RegionMesh) -> dict[Region, int]:
+    """Count the tetrahedra of each region that there may be."""
+    inside = mesh.columns.plane.building >= 0
+    below = mesh.top[mesh.columns.plane.triangles]
+    counts = {Region.AIR: count_cells(mesh.columns)}
+    if mesh.has_soil:
+        counts[Region.SOIL] = int(below.sum())
+    if mesh.solids:
+        counts[Region.BUILDING] = int((mesh.columns.bottom - below)[inside].sum())
+    return counts
 
 
-def expand_regions(mesh: SoilMesh) -> tuple[CellBlocks, NDArray[np.int8]]:
-    """Tell the tetrahedra of positive volume that air and soil stand for.
+def expand_regions(mesh: RegionMesh) -> tuple[CellBlocks, NDArray[np.int8]]:
+    """Tell the tetrahedra of positive volume that air, soil and buildings stand for.
 
     Parameters
     ----------
-    mesh : SoilMesh
+    mesh : RegionMesh
         The tile's mesh.
 
     Returns
     -------
     CellBlocks
-        The air's cells, then the soil's, each triangle by triangle; corners are levels of `SoilMesh.columns`.
+        The air's cells, then the soil's, then those of buildings, each triangle by triangle; corners are levels of
+        `RegionMesh.columns`.
     int8, (m,)
         `Region` of each cell.
     """
-    soil, rows = _take_soil(mesh)
-    cells, n_soil = CellBlocks([(mesh.columns, None), (soil, rows)]), count_soil_cells(mesh)
-    region = np.repeat(np.array([Region.AIR, Region.SOIL], np.int8), [cells.n_cells - n_soil, n_soil])
-    return cells, region
+    parts: list[tuple[ColumnMesh, NDArray[np.int32] | None]] = [(mesh.columns, None)]
+    if mesh.has_soil:
+        parts.append(_take_soil(mesh))
+    if mesh.solids:
+        parts.append(_take_buildings(mesh)[:2])
+    counts = count_regions(mesh)
+    return CellBlocks(parts), np.repeat(np.array([*counts], np.int8), [*counts.values()])
 
 
-def find_used(mesh: SoilMesh) -> NDArray[np.bool_]:
-    """Tell which levels of a mesh with soil belong to a cell, bool (n_levels,)."""
+def find_used(mesh: RegionMesh) -> NDArray[np.bool_]:
+    """Tell which levels of a mesh with soil or buildings belong to a cell, bool (n_levels,)."""
     used = find_used_points(mesh.columns)
-    used[_take_soil(mesh)[1]] = True
+    if mesh.has_soil:
+        used[_take_soil(mesh)[1]] = True
+    if mesh.solids:
+        used[_take_buildings(mesh)[1]] = True
     return used
 
 
 def split_regions(
-    mesh: SoilMesh, numbers: NDArray[np.int64], bounds: Bounds, seams: SeamEdges
+    mesh: RegionMesh, numbers: NDArray[np.int64], bounds: Bounds, seams: SeamEdges
 ) -> tuple[Boundary, NDArray[np.int32]]:
-    """Extract the boundary of one tile's air and soil, and the ground between them.
+    """Extract the boundary of one tile's air, soil and buildings, and what is between them.
 
     Parameters
     ----------
-    mesh : SoilMesh
+    mesh : RegionMesh
         The tile's mesh.
     numbers, bounds, seams
-        As in `split_boundary`; levels are those of `SoilMesh.columns`.
+        As in `split_boundary`; levels are those of `RegionMesh.columns`.
 
     Returns
     -------
     Boundary
-        That of the air, then that of the soil: bottom, foundations and sides. The ground is there once, and points
-        out of the air; all else is the boundary of both.
+        That of the air, then that of the soil: bottom, foundations and sides, then that of buildings: without soil
+        their floors, and sides. What two regions share is there once, and points out of the air, foundations out
+        of the soil: ground above soil, walls and roofs of buildings with cells, foundations between both. All else
+        is the boundary of all.
     int32, (s, 3)
-        The other facets over seams, as from `split_boundary`.
+        The other facets over seams, as from `split_boundary`; with cells in buildings also the walls there.
     """
     boundary, shared = split_boundary(mesh.columns, numbers, bounds, seams)
-    soil, rows = _take_soil(mesh)
-    k = len(seams.vertices)
-    at_bottom = SeamEdges(seams.vertices, np.zeros((k, 2), np.int32), np.full(k, -1), seams.missing)
-    below, shared_below = split_boundary(soil, np.empty(0, np.int64), bounds, at_bottom)
-    building = mesh.columns.plane.building
-    ceiling = np.flatnonzero(below.marker == Marker.TOP)
-    marker, owner = below.marker.copy(), below.building.copy()
-    marker[marker == Marker.GROUND] = Marker.BOTTOM
-    marker[ceiling] = Marker.FOUNDATION
-    owner[ceiling] = np.where(building >= 0, np.append(numbers, -1)[building], -1)
-    kept = np.ones(len(marker), np.bool_)
-    kept[ceiling[building < 0]] = False
+    parts, over = [boundary], [shared]
+    if mesh.has_soil:
+        soil, rows = _take_soil(mesh)
+        k = len(seams.vertices)
+        at_bottom = SeamEdges(seams.vertices, np.zeros((k, 2), np.int32), np.full(k, -1), seams.missing)
+        below, shared_below = split_boundary(soil, np.empty(0, np.int64), bounds, at_bottom)
+        building = mesh.columns.plane.building
+        ceiling = np.flatnonzero(below.marker == Marker.TOP)
+        marker, owner = below.marker.copy(), below.building.copy()
+        marker[marker == Marker.GROUND] = Marker.BOTTOM
+        marker[ceiling] = Marker.FOUNDATION
+        owner[ceiling] = np.where(building >= 0, np.append(numbers, -1)[building], -1)
+        kept = np.ones(len(marker), np.bool_)
+        kept[ceiling[building < 0]] = False
+        parts.append(Boundary(rows[below.facets[kept]], marker[kept], owner[kept]))
+        over.append(rows[shared_below])
+    if mesh.solids:
+        houses, rows, vertex = _take_buildings(mesh)
+        inside, shared_inside = split_boundary(
+            houses, np.empty(0, np.int64), bounds, _seams_of_buildings(mesh, houses, vertex, seams), strict=False
+        )
+        marker, owner = inside.marker.copy(), inside.building.copy()
+        floor = np.flatnonzero(marker == Marker.GROUND)
+        owner[floor] = numbers[mesh.columns.plane.building[mesh.columns.plane.building >= 0]]
+        marker[floor] = 0 if mesh.has_soil else Marker.FOUNDATION
+        kept = (marker != 0) & (marker != Marker.TOP)
+        parts.append(Boundary(rows[inside.facets[kept]], marker[kept], owner[kept]))
+        over += [rows[shared_inside], _walls_over(mesh.columns, boundary, seams)]
     return (
         Boundary(
-            np.concatenate((boundary.facets, rows[below.facets[kept]])),
-            np.concatenate((boundary.marker, marker[kept])),
-            np.concatenate((boundary.building, owner[kept])),
+            np.concatenate([part.facets for part in parts]),
+            np.concatenate([part.marker for part in parts]),
+            np.concatenate([part.building for part in parts]),
         ),
-        np.concatenate((shared, rows[shared_below])),
+        np.concatenate(over),
     )
 
 
-def _take_soil(mesh: SoilMesh) -> tuple[ColumnMesh, NDArray[np.int32]]:
+def _take_soil(mesh: RegionMesh) -> tuple[ColumnMesh, NDArray[np.int32]]:
     """Take the soil alone, as a mesh on open ground; also the row of each of its points in the whole."""
     columns, plane = mesh.columns, mesh.columns.plane
-    count = mesh.top.astype(np.int64) + 1
-    start = np.concatenate(([0], np.cumsum(count))).astype(np.int64)
-    rows = np.arange(start[-1]) + np.repeat(columns.z_start[:-1] - start[:-1], count)
-    ground = PlaneMesh(plane.xy, plane.triangles, np.full(len(plane.triangles), -1, np.int32))
+    start, rows = _take_levels(columns, np.arange(len(plane.xy)), np.zeros(len(plane.xy), np.int64), mesh.top)
     bottom = np.zeros(plane.triangles.shape, np.int32)
-    return ColumnMesh(ground, start, columns.z[rows], bottom, "heights"), rows.astype(np.int32)
+    ground = PlaneMesh(plane.xy, plane.triangles, np.full(len(plane.triangles), -1, np.int32))
+    return ColumnMesh(ground, start, columns.z[rows], bottom, "heights"), rows
+
+
+def _take_buildings(mesh: RegionMesh) -> tuple[ColumnMesh, NDArray[np.int32], NDArray[np.int64]]:
+    """Take the buildings alone, as a mesh on open ground with a column for each building at each vertex.
+
+    Also the row of each of its points in the whole, and the vertex of each of its columns.
+    """
+    columns, plane = mesh.columns, mesh.columns.plane
+    inside = plane.building >= 0
+    width = int(plane.building.max(initial=-1)) + 1
+    name = plane.triangles[inside].astype(np.int64) * width + plane.building[inside, None]
+    found, first, index = np.unique(name, return_index=True, return_inverse=True)
+    vertex: NDArray[np.int64] = found // max(width, 1)
+    start, rows = _take_levels(columns, vertex, mesh.top[vertex], columns.bottom[inside].ravel()[first])
+    triangles = index.reshape(-1, 3).astype(np.int32)
+    houses = PlaneMesh(plane.xy[vertex], triangles, np.full(len(triangles), -1, np.int32))
+    key = None if columns.key is None else columns.key[rows]
+    bottom = np.zeros(triangles.shape, np.int32)
+    return ColumnMesh(houses, start, columns.z[rows], bottom, columns.order, key), rows, vertex
+
+
+def _take_levels(
+    columns: ColumnMesh, vertex: NDArray[np.integer[Any]], low: NDArray[np.integer[Any]], high: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Take the levels from `low` to `high` of some columns: where each begins, and their rows in the whole."""
+    count = high.astype(np.int64) - low + 1
+    start = np.concatenate(([0], np.cumsum(count))).astype(np.int64)
+    rows = np.arange(start[-1]) + np.repeat(columns.z_start[vertex] + low - start[:-1], count)
+    return start, rows.astype(np.int32)
+
+
+def _seams_of_buildings(
+    mesh: RegionMesh, houses: ColumnMesh, vertex: NDArray[np.int64], seams: SeamEdges
+) -> SeamEdges:
+    """Find the seams among the edges of buildings: the other side has all facets that these have there."""
+    edges, _ = plane_edges(houses.plane.triangles)
+    row = _find_pairs(vertex[edges], seams.vertices, len(mesh.columns.plane.xy))
+    found = row >= 0
+    k = int(found.sum())
+    return SeamEdges(edges[found], np.zeros((k, 2), np.int32), np.full(k, -1), seams.missing[row[found]])
+
+
+def _walls_over(mesh: ColumnMesh, boundary: Boundary, seams: SeamEdges) -> NDArray[np.int32]:
+    """Find the walls over seams, (w, 3)."""
+    walls = boundary.facets[boundary.marker == Marker.WALL]
+    column = np.searchsorted(mesh.z_start, walls, side="right") - 1
+    pairs = np.stack((column.min(axis=1), column.max(axis=1)), axis=1)
+    over: NDArray[np.int32] = walls[_find_pairs(pairs, seams.vertices[~seams.missing], len(mesh.plane.xy)) >= 0]
+    return over
+
+
+def _find_pairs(pairs: NDArray[np.int64], among: NDArray[np.int32], n: int) -> NDArray[np.int64]:
+    """Find pairs of vertices, ascending, among others: rows of these, -1 where there is none."""
+    if not len(among):
+        return np.full(len(pairs), -1)
+    key, wanted = (some[:, 0].astype(np.int64) * n + some[:, 1] for some in (among, pairs))
+    order = np.argsort(key)
+    row = order[np.searchsorted(key, wanted, sorter=order).clip(max=len(key) - 1)]
+    found: NDArray[np.int64] = np.where(key[row] == wanted, row, -1)
+    return found

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Marker(IntEnum):
-    """What a facet bounds; with soil below, the ground has cells on both sides."""
+    """What a facet bounds; ground with soil below, and walls and roofs of solids, have cells on both sides."""
 
     GROUND = 1
     WALL = 2
@@ -21,7 +21,7 @@ class Marker(IntEnum):
     NORTH = 8
     MISSING = 9  # a seam whose other tile is not there
     BOTTOM = 11  # what the soil ends at; 10 is the number of the air in Gmsh's files
-    FOUNDATION = 12  # the soil's top under a building
+    FOUNDATION = 12  # the soil's top under a building, or without soil the floor of a solid
 
 
 # Markers from here on are ground, too: that of the patches of land cover, by number from 1.
@@ -39,6 +39,29 @@ class Region(IntEnum):
 
     AIR = 0
     SOIL = 1
+    BUILDING = 2
+
+
+Regions = tuple[Region, ...]
+# Markers of the facets between two regions, where a mesh has both: they point out of the first.
+INTERFACES = {
+    (Region.AIR, Region.SOIL): (Marker.GROUND,),
+    (Region.AIR, Region.BUILDING): (Marker.WALL, Marker.ROOF),
+    (Region.SOIL, Region.BUILDING): (Marker.FOUNDATION,),
+}
+
+
+def find_inside(marker: NDArray[np.int32], regions: Regions) -> NDArray[np.bool_]:
+    """Tell which facets (f,) have cells on both sides in a mesh of some regions.
+
+    Examples
+    --------
+    >>> find_inside(np.array([Marker.GROUND, Marker.WALL], np.int32), (Region.AIR, Region.SOIL)).tolist()
+    [True, False]
+    """
+    found = [mark for pair, marks in INTERFACES.items() if {*pair} <= {*regions} for mark in marks]
+    inside: NDArray[np.bool_] = np.isin(marker, found)
+    return inside | is_ground(marker) if Marker.GROUND in found else inside
 
 
 @dataclass(frozen=True, eq=False)

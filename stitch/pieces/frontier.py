@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data.mesh import Region
 from stitch.pieces.conformity import group_rows
 
+MARKED = 8  # added to the region of a face, see `Rim`
 Bounds = tuple[float, float, float, float]
 Vertices = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -33,6 +35,9 @@ class Rim:
         Whether the piece says that a face is the boundary of the whole mesh.
     part : int64, (f,)
         Number of the part of the mesh that the cell behind a face belongs to, no two pieces have one in common.
+    side : int8, (f,)
+        `pipeline.data.mesh.Region` of that cell; `MARKED` more where the piece says that the face is what air and
+        a building share.
     lines : float64, (l, 2, 3)
         Edges of boundary facets, from start to end, each as often as it occurs, with both ends over the rim.
     points : float64, (p, 4)
@@ -43,6 +48,7 @@ class Rim:
     faces: Vertices
     is_boundary: Mask
     part: NDArray[np.int64]
+    side: NDArray[np.int8]
     lines: Vertices
     points: Vertices
 
@@ -63,9 +69,14 @@ class Settled:
         Faces that a piece says are on the boundary although another piece has them too.
     same_side, shared : float64, (t, 3, 3)
         Faces of two pieces in the same orientation, and of more than two.
+    mixed : float64, (m, 3, 3)
+        Faces of cells that are not of one region, or are air and building, but not marked as such, or are marked
+        and something else.
     open_lines, crowded_lines : float64, (l, 2, 3)
         Boundary edges that facets do not use equally often in both directions, and others of more than two
         facets; each once.
+    n_walls : int
+        How many of the matched faces are walls between air and a building with cells.
     """
 
     n_matched: int
@@ -75,8 +86,10 @@ class Settled:
     extra: Vertices
     same_side: Vertices
     shared: Vertices
+    mixed: Vertices
     open_lines: Vertices
     crowded_lines: Vertices
+    n_walls: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +106,9 @@ class Frontier:
 def start_frontier() -> Frontier:
     """Return the frontier before the first piece."""
     none = np.empty(0, np.bool_)
-    number = np.empty(0, np.int64)
-    rim = Rim(np.empty((0, 2, 2)), np.empty((0, 3, 3)), none, number, np.empty((0, 2, 3)), np.empty((0, 4)))
+    number, side = np.empty(0, np.int64), np.empty(0, np.int8)
+    faces, lines = np.empty((0, 3, 3)), np.empty((0, 2, 3))
+    rim = Rim(np.empty((0, 2, 2)), faces, none, number, side, lines, np.empty((0, 4)))
     return Frontier(rim, number)
 
 
@@ -226,25 +240,25 @@ def add_rim(frontier: Frontier, rim: Rim, piece: int) -> tuple[Frontier, Settled
     faces = np.concatenate((old.faces, rim.faces))
     is_boundary = np.concatenate((old.is_boundary, rim.is_boundary))
     pieces = np.concatenate((frontier.piece, np.full(len(rim.faces), piece)))
-    part = np.concatenate((old.part, rim.part))
+    part, side = np.concatenate((old.part, rim.part)), np.concatenate((old.side, rim.side))
     face_done = is_done(old.faces, rim.faces)
     lines = np.concatenate((old.lines, rim.lines))
     line_done = is_done(old.lines, rim.lines)
     fresh = _find_fresh(old.points, rim.points, low, high)
     points = np.concatenate((old.points, rim.points[fresh]))
     point_done = is_done(old.points[:, None], rim.points[fresh][:, None])
-    settled = _settle(
-        faces[face_done], is_boundary[face_done], pieces[face_done], part[face_done], lines[line_done]
+    left, of_done = ~face_done, (pieces[face_done], part[face_done], side[face_done])
+    settled = _settle(faces[face_done], is_boundary[face_done], *of_done, lines[line_done])
+    waiting = Rim(
+        edges, faces[left], is_boundary[left], part[left], side[left], lines[~line_done], points[~point_done]
     )
-    left = ~face_done
-    waiting = Rim(edges, faces[left], is_boundary[left], part[left], lines[~line_done], points[~point_done])
     return Frontier(waiting, pieces[left]), settled, fresh
 
 
 def close_frontier(frontier: Frontier) -> Settled:
     """Settle what still waits after the last piece."""
     rim = frontier.rim
-    return _settle(rim.faces, rim.is_boundary, frontier.piece, rim.part, rim.lines)
+    return _settle(rim.faces, rim.is_boundary, frontier.piece, rim.part, rim.side, rim.lines)
 
 
 def _pair_edges(edges: Vertices) -> Vertices:
@@ -269,7 +283,12 @@ def _find_fresh(old: Vertices, new: Vertices, low: Vertices, high: Vertices) -> 
 
 
 def _settle(
-    faces: Vertices, is_boundary: Mask, piece: NDArray[np.int64], part: NDArray[np.int64], lines: Vertices
+    faces: Vertices,
+    is_boundary: Mask,
+    piece: NDArray[np.int64],
+    part: NDArray[np.int64],
+    side: NDArray[np.int8],
+    lines: Vertices,
 ) -> Settled:
     corner, _ = group_rows(faces.reshape(-1, 3))
     order = np.argsort(corner.reshape(-1, 3), axis=1)
@@ -282,6 +301,9 @@ def _settle(
     # Rows of one face stand together, so its two pieces are neighbours in this order.
     rows = np.flatnonzero(matched)
     two = rows[np.argsort(group[rows], kind="stable")].reshape(-1, 2)
+    low, high = np.sort(side[two], axis=1).T
+    same = (low == high) & (high < MARKED)
+    wall = (low == Region.BUILDING) & (high == Region.AIR + MARKED)
     open_lines, crowded_lines = _settle_lines(lines)
     return Settled(
         n_matched=len(two),
@@ -291,8 +313,10 @@ def _settle(
         extra=faces[opposite & is_boundary],
         same_side=faces[(count == 2) & ~opposite],
         shared=faces[count > 2],
+        mixed=faces[two[~(same | wall), 0]],
         open_lines=open_lines,
         crowded_lines=crowded_lines,
+        n_walls=int(wall.sum()),
     )
 
 

@@ -82,17 +82,17 @@ def fill_seam(
     which move their own columns alone.
     """
     levels, bottom = fill_columns(seam.ring, dtm, roofs, ids, options, sizes=sizes)
-    if options.weld is not None:
-        levels = _key_along(seam, levels, bottom)
+    if options.weld is not None or options.solids:
+        levels = _key_along(seam, levels, bottom, floors=options.solids)
     return join_levels([ends[0], take_columns(levels, seam.vertex[1:-1]), ends[1]])
 
 
-def _key_along(seam: Seam, levels: Levels, bottom: NDArray[np.int32]) -> Levels:
+def _key_along(seam: Seam, levels: Levels, bottom: NDArray[np.int32], *, floors: bool) -> Levels:
     """Set the order keys of a seam's columns, but for those of its corners, for the edges along it."""
     mesh = ColumnMesh(seam.ring, levels.start, levels.z, bottom, "heights")
     given = np.ones(len(seam.ring.xy), np.bool_)
     given[seam.vertex[1:-1]] = False
-    gates = wall_gates(mesh)
+    gates = wall_gates(mesh, floors=floors)
     column = np.searchsorted(levels.start, gates[:, :, 0], side="right") - 1
     along = np.full(len(seam.ring.xy), -1)
     along[seam.vertex] = np.arange(len(seam.vertex))

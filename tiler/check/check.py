@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
+from pipeline.data.mesh import INTERFACES
 from pipeline.geometry.components import join_pairs
 from stitch.pieces.frontier import Settled, add_rim, close_frontier, start_frontier
 from tiler.check import city_proofs, cover_proofs, pad_proofs, proofs, soil_proofs, wall_proofs
@@ -166,7 +167,7 @@ class _Sums:
     crowded: Vertices  # (c, 2): where edges have more than two facets
     seams: NDArray[np.int64]  # (s, 2): pairs of pieces that share faces
     part_cells: NDArray[np.int64]  # (p,): cells of each part of a piece
-    part_soil: NDArray[np.bool_]  # (p,): whether it is soil
+    part_air: NDArray[np.bool_]  # (p,): whether it is air
     joined: NDArray[np.int64]  # (j, 2): pairs of parts that share faces
     rim_walls: wall_proofs.Walls  # over the rims of pieces
 
@@ -191,7 +192,7 @@ class _Sums:
         self.faults = proofs.merge_faults((*self.faults, *survey.faults))
         self._add_crowded(survey.crowded)
         self.part_cells = np.concatenate((self.part_cells, survey.part_cells))
-        self.part_soil = np.concatenate((self.part_soil, survey.part_soil))
+        self.part_air = np.concatenate((self.part_air, survey.part_air))
 
     def add_fresh(self, survey: Survey, fresh: NDArray[np.bool_], record: RunRecord) -> None:
         """Add the points over the rim of a piece that no earlier piece had."""
@@ -221,7 +222,7 @@ class _Sums:
 
     def count_parts(self) -> list[int]:
         """Cells of the parts of the air that share no face, the largest first."""
-        air, name = ~self.part_soil, join_pairs(len(self.part_cells), self.joined)
+        air, name = self.part_air, join_pairs(len(self.part_cells), self.joined)
         cells = np.bincount(name[air], self.part_cells[air]).astype(np.int64)
         return sorted(cells[cells > 0].tolist(), reverse=True)
 
@@ -271,14 +272,19 @@ def _conclude(
         )
     if record.leaves:
         claims += (cover_proofs.prove_leaves(found["leaves"]),)
+    for sides in INTERFACES:
+        if (name := f"between {soil_proofs.name_interface(sides)}") in found:
+            claims += (soil_proofs.prove_between(found[name], sides),)
     if record.depth:
-        claims += (
-            soil_proofs.prove_between(found["between"]),
-            soil_proofs.prove_bottom(found["bottom"], record.depth),
-            soil_proofs.prove_foundations(found["foundations"]),
-            soil_proofs.prove_soil_sizes(found["soil"], found["sizes"]),
-        )
+        claims += (soil_proofs.prove_bottom(found["bottom"], record.depth),)
+    if "foundations" in found:
+        claims += (soil_proofs.prove_foundations(found["foundations"]),)
+    if record.depth:
+        claims += (soil_proofs.prove_soil_sizes(found["soil"], found["sizes"]),)
         facts |= {"soil_volume": found["soil"].sums["cells"]}
+    if record.solids:
+        claims += (soil_proofs.prove_building_cells(found["houses"]),)
+        facts |= {"building_volume": found["houses"].sums["cells"]}
     return claims, facts
 
 

@@ -1,5 +1,6 @@
 """One piece of a run folder, read for `citystitch check`: its boundary, its rim, and what its cells say."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -7,13 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import Boundary, Marker, Region, TetMesh
+from pipeline.data.mesh import INTERFACES, Boundary, Marker, Region, Regions, TetMesh, find_inside
 from stitch.pieces import conformity
-from stitch.pieces.frontier import Rim, find_border, find_edges_below, find_outline, find_points_over
+from stitch.pieces.frontier import (
+    MARKED,
+    Rim,
+    as_places,
+    find_border,
+    find_edges_below,
+    find_outline,
+    find_points_over,
+)
 from tiler.check import proofs
 from tiler.check.cover_proofs import DensityAt, check_leaves
 from tiler.check.proofs import Bounds, Fault, Finding, Mask, Surface, Vertices
-from tiler.check.soil_proofs import check_between
+from tiler.check.soil_proofs import check_between, name_interface
 from tiler.mesh_files.mesh_pieces import read_leaves, read_regions
 from tiler.mesh_files.vtk_files import BoundaryPiece, read_vtp, read_vtu
 from tiler.mesh_files.vtk_xml import damaged
@@ -31,20 +40,26 @@ class Piece:
     ----------
     n_cells, n_points : int
         Cells, and points that are not over the rim.
-    air, soil, smallest : float
-        Volume of all cells of air, of all cells of soil, and of the smallest (m³).
+    volumes : mapping of str to float
+        Volume of all cells of each region, ``air`` and so on (m³).
+    smallest : float
+        Volume of the smallest cell (m³).
     surface : Surface
         Its boundary file, on the distinct vertices of this and of the exterior faces.
-    part_cells, part_soil : int64, bool, (p,)
-        Cells of each part, air or soil, that hang together by faces, and whether it is soil.
+    part_cells, part_air : int64, bool, (p,)
+        Cells of each part of a region that hang together by faces, and whether it is air.
     outline : float64, (k, 2, 2)
         Edges of its plan.
     rim : Rim
         What it has over those of them that are not on the region's border.
     on_rim : bool, (n,)
         Which of the surface's points are over the rim.
-    same_boundary, ground, closed : Finding
-        What the piece alone says of these claims; of the ground only with soil below it.
+    same_boundary, closed : Finding
+        What the piece alone says of these claims.
+    between : mapping of str to Finding
+        What it says of each interface of regions, by name.
+    houses : float64, (h, 3)
+        A place of a cell of a building over each triangle of the plan that has one (m).
     crowded : float64, (c, 2, 3)
         Boundary edges of more than two facets, paired, not over the rim.
     leaves : Finding
@@ -57,18 +72,18 @@ class Piece:
 
     n_cells: int
     n_points: int
-    air: float
-    soil: float
+    volumes: Mapping[str, float]
     smallest: float
     surface: Surface
     part_cells: NDArray[np.int64]
-    part_soil: Mask
+    part_air: Mask
     outline: Vertices
     rim: Rim
     on_rim: Mask
     same_boundary: Finding
-    ground: Finding
     closed: Finding
+    between: Mapping[str, Finding]
+    houses: Vertices
     crowded: Vertices
     leaves: Finding
     faults: tuple[Fault, ...]
@@ -85,17 +100,17 @@ class _Cells:
         How many they are.
     points : float64, (n, 3)
         Points of the volume (m).
-    air, soil, smallest : float
+    volumes, smallest, houses
         As of `Piece`.
     exterior : int32, (k, 3)
         Faces of one cell, as rows of the points.
-    between : int32, (g, 3)
-        Faces between air and soil, as the air has them.
-    of_soil : bool, (k,)
-        Which exterior faces are the soil's.
+    between : mapping of str to int32 (g, 3)
+        Faces of each interface of regions, pointing out of its first.
+    side : int8, (k,)
+        Region of the cell behind each exterior face.
     part : int64, (k,)
         Part of the mesh behind each exterior face.
-    part_cells, part_soil
+    part_cells, part_air
         As of `Piece`.
     leaves : Finding
         What was found of leaves.
@@ -105,15 +120,15 @@ class _Cells:
 
     n_cells: int
     points: Vertices
-    air: float
-    soil: float
+    volumes: Mapping[str, float]
     smallest: float
+    houses: Vertices
     exterior: NDArray[np.int32]
-    between: NDArray[np.int32]
-    of_soil: Mask
+    between: Mapping[str, NDArray[np.int32]]
+    side: NDArray[np.int8]
     part: NDArray[np.int64]
     part_cells: NDArray[np.int64]
-    part_soil: Mask
+    part_air: Mask
     leaves: Finding
     faults: tuple[Fault, ...]
 
@@ -123,7 +138,7 @@ def read_piece(
     boundary_path: Path,
     bounds: Bounds,
     *,
-    soil: bool = False,
+    regions: Regions = (Region.AIR,),
     density_at: DensityAt | None = None,
 ) -> Piece:
     """Read the two files of a piece of the region with these bounds (m), each once.
@@ -134,8 +149,8 @@ def read_piece(
         The files.
     bounds : (west, south, east, north)
         Bounds of the region (m).
-    soil : bool
-        Whether the mesh has soil.
+    regions : tuple of Region
+        What the mesh has.
     density_at : callable, optional
         Gives the leaf area density of places, where the mesh has trees.
 
@@ -144,48 +159,47 @@ def read_piece(
     InputError
         If one is missing or damaged.
     """
-    cells = _survey_cells(volume_path, soil=soil, density_at=density_at)
+    cells = _survey_cells(volume_path, regions, density_at=density_at)
     file = read_vtp(boundary_path)
-    surface, rows = _join(cells.points, np.concatenate((cells.exterior, cells.between)), file)
-    faces, between = rows[: len(cells.exterior)], rows[len(cells.exterior) :]
+    surface, rows = _join(cells.points, np.concatenate((cells.exterior, *cells.between.values())), file)
+    counts = [len(cells.exterior), *(len(some) for some in cells.between.values())]
+    faces, *between = np.split(rows, np.cumsum(counts)[:-1])
     # Faces of cells whose vertices are there twice meet where coordinates are equal.
     joined = conformity.pair_faces(faces)
     exterior = joined.exterior
-    # With soil below it, the ground is no boundary.
-    inside = surface.marked(Marker.GROUND) & soil
-    facets, ground = surface.boundary.facets[~inside], surface.boundary.facets[inside]
+    inside = find_inside(surface.boundary.marker, regions)
+    facets = surface.boundary.facets[~inside]
     match = conformity.match_facets(exterior, facets)
     known = np.ones(len(exterior), np.bool_)
     known[match.missing] = False
-    of_air = known.copy()
-    if soil:
-        of_soil = np.ones(len(exterior), np.bool_)
-        of_soil[conformity.match_facets(faces[cells.of_soil], exterior).extra] = False
-        of_air &= ~of_soil
+    side = cells.side[joined.row]
+    of_air = known & (side == Region.AIR)
     outline = find_outline(surface.points, _facing_up(surface.points, exterior[of_air]))
     edges = outline[~find_border(outline, bounds, tolerance=proofs.SIDE_TOLERANCE)]
     on_rim = find_points_over(surface.points, edges)
     over = np.all(on_rim[exterior], axis=1)
     over[over] = find_edges_below(surface.points[exterior[over]], edges) >= 0
     behind = (exterior[over], cells.part[joined.row[over]])
-    rim = _find_rim(surface, facets, edges, behind, known=known[over], faces=faces, on_rim=on_rim)
+    found, on_seam = _check_interfaces(surface, dict(zip(cells.between, between, strict=True)), exterior, over)
+    side[on_seam] += MARKED
+    rim = _find_rim(surface, facets, edges, (*behind, side[over]), known=known[over], faces=faces, on_rim=on_rim)
     open_edges, crowded = _pair_edges(surface.points, facets, on_rim)
     inner = len(cells.points) - int(conformity.find_used_points(cells.exterior, len(cells.points)).sum())
     return Piece(
         n_cells=cells.n_cells,
         n_points=inner + int((conformity.find_used_points(faces, len(on_rim)) & ~on_rim).sum()),
-        air=cells.air,
-        soil=cells.soil,
+        volumes=cells.volumes,
         smallest=cells.smallest,
         surface=surface,
         part_cells=cells.part_cells,
-        part_soil=cells.part_soil,
+        part_air=cells.part_air,
         outline=outline,
         rim=rim,
         on_rim=on_rim,
         same_boundary=proofs.check_same_boundary(surface.points, facets, exterior, match, over),
-        ground=check_between(surface.points, ground, between) if soil else Finding(),
         closed=proofs.check_closed(open_edges, crowded),
+        between=found,
+        houses=cells.houses,
         crowded=crowded,
         leaves=cells.leaves,
         faults=proofs.merge_faults(
@@ -199,33 +213,59 @@ def read_piece(
     )
 
 
-def _survey_cells(path: Path, *, soil: bool, density_at: DensityAt | None) -> _Cells:
+def _check_interfaces(
+    surface: Surface,
+    between: Mapping[str, NDArray[np.int32]],
+    exterior: NDArray[np.int32],
+    over: Mask,
+) -> tuple[dict[str, Finding], NDArray[np.int64]]:
+    """Hold the faces between regions against the facets that are marked as such.
+
+    Also gives the rows of exterior faces over the rim, `over`, that are marked so: what lies beyond is the other
+    piece's.
+    """
+    found: dict[str, Finding] = {}
+    on_seam = [np.empty(0, np.int64)]
+    for sides, markers in INTERFACES.items():
+        if (name := name_interface(sides)) in between:
+            marked = surface.boundary.facets[surface.marked(*markers)]
+            match = conformity.match_facets(marked, exterior)
+            rows = np.setdiff1d(np.flatnonzero(over), np.append(match.extra, match.flipped))
+            match = conformity.match_facets(exterior[rows], marked)
+            marked = marked[np.union1d(match.extra, match.duplicate)]
+            found[name] = check_between(surface.points, marked, between[name], sides)
+            on_seam.append(rows)
+    return found, np.concatenate(on_seam)
+
+
+def _survey_cells(path: Path, regions: Regions, *, density_at: DensityAt | None) -> _Cells:
     """Read the volume, and let its cells go."""
     volume = read_vtu(path)
     mesh = volume.mesh
     if not np.isfinite(mesh.points).all():
         raise damaged(path, "a coordinate is not finite")
-    region = read_regions(path, volume) if soil else np.full(len(mesh.cells), Region.AIR, np.int8)
+    region = np.full(len(mesh.cells), Region.AIR, np.int8)
+    if len(regions) > 1:
+        region = read_regions(path, volume, regions)
     leaves = Finding()
     if density_at is not None:
         leaves = check_leaves(mesh.points, mesh.cells, read_leaves(path, volume), density_at)
     del volume
     sizes = proofs.check_cells(mesh, region)
     pairs = conformity.pair_cell_faces(mesh.cells, len(mesh.points))
-    between, of_soil = _part_regions(mesh, region, pairs.exterior) if soil else _no_regions(pairs.exterior)
-    label = _label_parts(mesh, region, pairs.part) if soil else pairs.part
+    label = _label_parts(mesh, region, pairs.part) if len(regions) > 1 else pairs.part
     return _Cells(
         n_cells=len(mesh.cells),
         points=mesh.points,
-        air=sizes.sums["air"],
-        soil=sizes.sums["soil"],
+        volumes=sizes.sums,
         smallest=-sizes.largest["-smallest"],
+        houses=_find_houses(mesh, region),
         exterior=pairs.exterior,
-        between=between,
-        of_soil=of_soil,
+        between=_find_between(mesh, region, regions, pairs.exterior),
+        side=region[pairs.row],
         part=label[pairs.row].astype(np.int64),
         part_cells=_count_parts(label),
-        part_soil=_count_parts(label[region == Region.SOIL], int(label.max(initial=-1)) + 1) > 0,
+        part_air=_count_parts(label[region == Region.AIR], int(label.max(initial=-1)) + 1) > 0,
         leaves=leaves,
         faults=proofs.merge_faults([*proofs.find_face_faults(mesh.points, pairs), *sizes.faults]),
     )
@@ -250,23 +290,33 @@ def _count_parts(label: NDArray[Any], n: int = 0) -> NDArray[np.int64]:
     return total
 
 
-def _no_regions(exterior: NDArray[np.int32]) -> tuple[NDArray[np.int32], Mask]:
-    return np.empty((0, 3), np.int32), np.zeros(len(exterior), np.bool_)
+def _find_between(
+    mesh: TetMesh, region: NDArray[np.int8], regions: Regions, exterior: NDArray[np.int32]
+) -> dict[str, NDArray[np.int32]]:
+    """Find the faces of each interface of regions (g, 3), pointing out of its first, by name."""
+    if len(regions) == 1:
+        return {}
+    inner = {}
+    for kind in regions:
+        own = conformity.pair_cell_faces(mesh.cells[region == kind], len(mesh.points)).exterior
+        inner[kind] = own[conformity.match_facets(exterior, own).extra]
+    return {
+        name_interface((one, two)): inner[one][conformity.match_facets(inner[two], inner[one]).flipped]
+        for one, two in INTERFACES
+        if one in regions and two in regions
+    }
 
 
-def _part_regions(
-    mesh: TetMesh, region: NDArray[np.int8], exterior: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], Mask]:
-    """Find the faces between air and soil (g, 3), as the air has them, and which exterior faces are the soil's."""
-    air = conformity.pair_cell_faces(mesh.cells[region == Region.AIR], len(mesh.points)).exterior
-    match = conformity.match_facets(exterior, air)
-    of_soil = np.zeros(len(exterior), np.bool_)
-    of_soil[match.missing] = True
-    return air[match.extra], of_soil
+def _find_houses(mesh: TetMesh, region: NDArray[np.int8]) -> Vertices:
+    """Find the cells of buildings: a place (h, 3) over each triangle of the plan that has one."""
+    corners = mesh.points[mesh.cells[region == Region.BUILDING, :3]]
+    plan, row = np.unique(np.sort(as_places(corners), axis=1), axis=0, return_index=True)
+    middle = plan.mean(axis=1)
+    return np.column_stack((middle.real, middle.imag, corners[row, 0, 2]))
 
 
 def _label_parts(mesh: TetMesh, region: NDArray[np.int8], part: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Number the parts of the air and those of the soil; `part` is that of each cell without regions."""
+    """Number the parts of each region; `part` is that of each cell without regions."""
     label = part.astype(np.int64)
     first = 0
     for kind in np.unique(region).tolist() if len(np.unique(region)) > 1 else ():
@@ -304,13 +354,13 @@ def _find_rim(
     surface: Surface,
     facets: NDArray[np.int32],
     edges: Vertices,
-    over: tuple[NDArray[np.int32], NDArray[np.int64]],
+    over: tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int8]],
     *,
     known: Mask,
     faces: NDArray[np.int32],
     on_rim: Mask,
 ) -> Rim:
-    """Gather what stands over the rim's edges: exterior faces `over` them with their parts, some `known`.
+    """Gather what stands over the rim's edges: exterior faces `over` them with their parts and sides.
 
     Those `known` are in the boundary file; of that, `facets` are those that bound the cells.
     """
@@ -325,6 +375,7 @@ def _find_rim(
         faces=points[over[0]],
         is_boundary=known,
         part=over[1],
+        side=over[2],
         lines=points[np.stack((start[both], end[both]), axis=1)],
         points=np.column_stack((points[rows], np.repeat((ANY, GROUND, TOP), [len(row) for row in chosen]))),
     )

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import Marker
+from pipeline.data.mesh import Marker, Region, Regions
 from pipeline.data.roofs import roof_heights
 from stitch.pieces.conformity import group_rows
 from stitch.pieces.frontier import group_places
@@ -32,18 +32,17 @@ from tiler.citymodels.building_index import BuildingIndex
 from tiler.store.run_folder import FLAT_ROOFS, Buildings, RoofRules
 
 LOADED = 4096  # footprints that are measured at once
-BELOW = (Marker.BOTTOM, Marker.FOUNDATION)  # markers that only a run with soil has
 
 
-def check_marks(surface: Surface, buildings: Buildings, *, soil: bool = False) -> Finding:
+def check_marks(surface: Surface, buildings: Buildings, *, regions: Regions = (Region.AIR,)) -> Finding:
     """Every facet has one marker, and walls, roofs and foundations alone have a building, a known one."""
     marker, owner = surface.boundary.marker, surface.boundary.building
-    known = [mark for mark in Marker if soil or mark not in BELOW]
-    unmarked = ~surface.marked(*known)
+    below = [Marker.BOTTOM] * (Region.SOIL in regions) + [Marker.FOUNDATION] * (len(regions) > 1)
+    unmarked = ~surface.marked(*(mark for mark in Marker if mark <= Marker.MISSING or mark in below))
     built = surface.marked(Marker.WALL, Marker.ROOF, Marker.FOUNDATION)
     unknown = built & (_rows_of(owner, buildings) < 0)
     astray = ~built & (owner != -1)
-    bound = "1 to 9, 11 or 12" if soil else "1 to 9"
+    bound = " or ".join(["1 to 9", *(f"{mark:d}" for mark in below)])
     centres = surface.corners.mean(axis=1)
     faults = [
         *find_faults("marker-unknown", centres[unmarked], f"marker {_first(marker[unmarked])}; bound: {bound}"),
@@ -65,7 +64,7 @@ def check_marks(surface: Surface, buildings: Buildings, *, soil: bool = False) -
 def prove_marks(found: Finding) -> Proof:
     """Tell how many facets have which marker."""
     names = [mark.name.lower() for mark in Marker]
-    rare = [mark.name.lower() for mark in (Marker.MISSING, *BELOW)]
+    rare = [mark.name.lower() for mark in (Marker.MISSING, Marker.BOTTOM, Marker.FOUNDATION)]
     counts = ", ".join(f"{found.sums[name]} {name}" for name in names if name not in rare or found.sums[name])
     return Proof(f"every facet has one marker: {counts}", found.faults)
 

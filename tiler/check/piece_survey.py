@@ -73,7 +73,7 @@ class Survey:
         Of its cells.
     crowded : float64, (c, 2, 3)
         Boundary edges of more than two facets, paired, not over the rim.
-    part_cells, part_soil, rim
+    part_cells, part_air, rim
         As of `Piece`.
     terrain, level : float64, (p,)
         Height of the terrain at each point of the rim that is ground, and level of the water there, if any (m).
@@ -91,7 +91,7 @@ class Survey:
     faults: tuple[Fault, ...]
     crowded: Vertices
     part_cells: NDArray[np.int64]
-    part_soil: Mask
+    part_air: Mask
     rim: Rim
     terrain: NDArray[np.float64]
     level: NDArray[np.float64]
@@ -112,7 +112,7 @@ def survey_piece(task: PieceTask) -> None:
         task.directory / task.volume,
         task.directory / task.boundary,
         record.bounds,
-        soil=record.depth > 0,
+        regions=record.regions,
         density_at=run.canopy,
     )
     with open_index(task.shared) as index:
@@ -172,25 +172,30 @@ def _survey(piece: Piece, run: Run, index: BuildingIndex) -> Survey:
     found: dict[str, Finding] = {
         "same": piece.same_boundary,
         "closed": piece.closed,
-        "marks": city_proofs.check_marks(surface, buildings, soil=record.depth > 0),
+        "marks": city_proofs.check_marks(surface, buildings, regions=record.regions),
         "box": proofs.check_box(surface, record.bounds, piece.rim.edges),
         "top": proofs.check_top(take_vertices(piece, Marker.TOP), record.top),
         "ground": proofs.check_ground(ground, terrain[: len(ground)]),
         "roofs": city_proofs.check_roofs(surface, buildings, dtm, record.roofs),
         "walls": city_proofs.check_walls(surface, buildings, dtm, record.roofs),
         "overlap": wall_proofs.check_overlap(within),
-        "sizes": proofs.check_sizes(surface, piece.outline, piece.air),
+        "sizes": proofs.check_sizes(surface, piece.outline, piece.volumes["air"]),
+        **{f"between {name}": finding for name, finding in piece.between.items()},
     }
     if record.core is not None:
         level_pad = pad_proofs.check_level(ground, record.bounds, record.core, record.rim)
         found["pad"] = proofs.join_findings(level_pad, pad_proofs.check_houses(surface, record.core))
     if record.depth:
         found |= {
-            "between": piece.ground,
             "bottom": soil_proofs.check_bottom(surface, record.depth),
-            "foundations": soil_proofs.check_foundations(surface, dtm),
-            "soil": soil_proofs.check_soil_sizes(surface, piece.soil),
+            "soil": soil_proofs.check_soil_sizes(surface, piece.volumes["soil"]),
         }
+    if len(record.regions) > 1:
+        found["foundations"] = soil_proofs.check_foundations(surface, dtm, up=record.depth > 0)
+    if record.solids:
+        found["houses"] = soil_proofs.check_building_cells(
+            surface, piece.volumes["building"], piece.houses, buildings
+        )
     if run.cover is not None:
         found["cover"] = cover_proofs.check_cover(surface, piece.patch, record.ground, run.cover)
         levels = run.find_levels(np.concatenate((ground, edge[:, :3])))
@@ -208,7 +213,7 @@ def _survey(piece: Piece, run: Run, index: BuildingIndex) -> Survey:
         faults=piece.faults,
         crowded=piece.crowded,
         part_cells=piece.part_cells,
-        part_soil=piece.part_soil,
+        part_air=piece.part_air,
         rim=piece.rim,
         terrain=_spread(piece, terrain[len(ground) :]),
         level=_spread(piece, level),

@@ -173,9 +173,10 @@ def check_cells(mesh: TetMesh, region: NDArray[np.int8]) -> Finding:
     Returns
     -------
     Finding
-        Volumes of ``air`` and ``soil`` add up (m³); ``-smallest`` is that of the smallest cell with a minus sign.
+        Volumes of each region, ``air`` and so on, add up (m³); ``-smallest`` is that of the smallest cell with a
+        minus sign.
     """
-    found = Finding(sums={"air": 0.0, "soil": 0.0}, largest={"-smallest": -np.inf})
+    found = Finding(sums={kind.name.lower(): 0.0 for kind in Region}, largest={"-smallest": -np.inf})
     for start in range(0, len(mesh.cells), CELLS_AT_ONCE):
         rows = slice(start, start + CELLS_AT_ONCE)
         found = join_findings(found, _measure_cells(mesh.points, mesh.cells[rows], region[rows]))
@@ -198,7 +199,7 @@ def _measure_cells(points: Vertices, cells: NDArray[np.int32], region: NDArray[n
         *find_faults("cell-inverted", centres[inverted], bound),
         *find_faults("cell-flat", centres[~inverted], bound),
     ]
-    sums = {kind.name.lower(): float(volumes[region == kind].sum()) for kind in (Region.AIR, Region.SOIL)}
+    sums = {kind.name.lower(): float(volumes[region == kind].sum()) for kind in Region}
     return Finding(tuple(faults), sums, {"-smallest": -least})
 
 
@@ -224,7 +225,7 @@ def check_same_boundary(
     points : float64, (n, 3)
         Points of a piece's surface (m).
     facets : int32, (f, 3)
-        What its boundary file has: all facets but ground with soil below it.
+        What its boundary file has: all facets but those with cells on both sides.
     exterior : int32, (k, 3)
         Exterior faces of its cells.
     match : Matched
@@ -289,15 +290,18 @@ def check_seams(settled: Settled) -> Finding:
         ("facet-extra", settled.extra, EXTRA),
         ("face-same-side", settled.same_side, SAME_SIDE),
         ("face-shared", settled.shared, SHARED),
+        ("seam-mixed", settled.mixed, "cells of two regions, and no wall is marked between them; or one is"),
     ]
     faults = [fault for kind, faces, why in lists for fault in find_faults(kind, faces.mean(axis=1), why)]
-    return Finding(merge_faults(faults), {"faces": settled.n_matched})
+    return Finding(merge_faults(faults), {"faces": settled.n_matched, "walls": settled.n_walls})
 
 
 def prove_seams(found: Finding, n_seams: int, n_pieces: int) -> Proof:
     """Tell whether the pieces fit together."""
     count = int(found.sums["faces"])
     claim = f"{count} faces on {n_seams} seams of {n_pieces} pieces are bitwise equal from both sides"
+    if walls := int(found.sums["walls"]):
+        claim += f", {walls} of them walls with air on one and a building on the other"
     return Proof(claim, found.faults)
 
 

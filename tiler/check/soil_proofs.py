@@ -1,9 +1,10 @@
-"""The proofs of `citystitch check` below ground: the ground inside, bottom, foundations, volume of the soil."""
+"""The proofs of `citystitch check` of soil and buildings: what is between regions, bottom, foundations, cells."""
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import Marker
+from pipeline.data.mesh import INTERFACES, Marker, Region
 from stitch.pieces import conformity
 from stitch.pieces.frontier import as_places
 from tiler.check.proofs import (
@@ -22,38 +23,57 @@ from tiler.check.proofs import (
     merge_faults,
     unless_equal,
 )
+from tiler.check.roof_proofs import OUTLINE_TOLERANCE
+from tiler.store.run_folder import Buildings
 
 
-def check_between(points: Vertices, ground: NDArray[np.int32], between: NDArray[np.int32]) -> Finding:
-    """The ground is what cells of air and of soil share.
+def name_interface(sides: tuple[Region, Region]) -> str:
+    """Name the facets between two regions.
+
+    Examples
+    --------
+    >>> name_interface((Region.AIR, Region.BUILDING))
+    'wall or roof'
+    """
+    return " or ".join(marker.name.lower() for marker in INTERFACES[sides])
+
+
+def check_between(
+    points: Vertices, marked: NDArray[np.int32], between: NDArray[np.int32], sides: tuple[Region, Region]
+) -> Finding:
+    """The facets between two regions are what cells of both share.
 
     Parameters
     ----------
     points : float64, (n, 3)
         Points of a piece's surface (m).
-    ground : int32, (g, 3)
-        Facets marked as ground in the boundary file.
+    marked : int32, (g, 3)
+        Facets with the markers of `INTERFACES` in the boundary file.
     between : int32, (k, 3)
-        Faces that a cell of air and one of soil have, pointing out of the air.
+        Faces that a cell of either region has, pointing out of the first.
+    sides : (Region, Region)
+        The regions.
     """
-    match = conformity.match_facets(between, ground)
+    match = conformity.match_facets(between, marked)
+    name, (one, two) = name_interface(sides), (side.name.lower() for side in sides)
     lists = [
-        ("ground-missing", between[match.missing], "a face between air and soil that is not marked as ground"),
-        ("ground-one-sided", ground[match.extra], "a ground facet without air on one side and soil on the other"),
-        ("ground-flipped", ground[match.flipped], "a ground facet that points out of the soil"),
-        ("ground-duplicate", ground[match.duplicate], "a ground facet is there twice"),
+        ("missing", between[match.missing], f"a face between {one} and {two} that is not marked as {name}"),
+        ("one-sided", marked[match.extra], f"a {name} facet without {one} on one side and {two} on the other"),
+        ("flipped", marked[match.flipped], f"a {name} facet that points out of the {two}"),
+        ("duplicate", marked[match.duplicate], f"a {name} facet is there twice"),
     ]
-    faults = [fault for kind, rows, why in lists for fault in find_faults(kind, centres_of(points, rows), why)]
-    return Finding(merge_faults(faults), {"ground": len(ground), "between": len(between)})
+    kind = name.replace(" ", "-")
+    faults = [f for word, rows, why in lists for f in find_faults(f"{kind}-{word}", centres_of(points, rows), why)]
+    return Finding(merge_faults(faults), {"marked": len(marked), "between": len(between)})
 
 
-def prove_between(found: Finding) -> Proof:
-    """Tell whether air and soil meet in the ground alone."""
-    ground, between = int(found.sums["ground"]), int(found.sums["between"])
-    claim = (
-        f"the {ground} ground facets are the {between} faces between air and soil, air above, soil below, bitwise"
-    )
-    return Proof(claim, found.faults)
+def prove_between(found: Finding, sides: tuple[Region, Region]) -> Proof:
+    """Tell whether two regions meet in the facets between them alone."""
+    marked, between = int(found.sums["marked"]), int(found.sums["between"])
+    one, two = (side.name.lower() for side in sides)
+    way = ", air above, soil below" if two == "soil" else f", out of the {one}"
+    claim = f"the {marked} {name_interface(sides)} facets are the {between} faces between {one} and {two}{way}"
+    return Proof(f"{claim}, bitwise", found.faults)
 
 
 def check_bottom(surface: Surface, depth: float) -> Finding:
@@ -85,8 +105,8 @@ def prove_bottom(found: Finding, depth: float) -> Proof:
     return Proof(f"{claim}; {at_most(HEIGHT_TOLERANCE)}", found.faults)
 
 
-def check_foundations(surface: Surface, dtm: Dtm) -> Finding:
-    """Foundations lie under the roofs of their buildings, on the terrain or below it."""
+def check_foundations(surface: Surface, dtm: Dtm, *, up: bool = True) -> Finding:
+    """Foundations lie under the roofs of their buildings, on the terrain or below it; they face up, or down."""
     chosen = surface.marked(Marker.FOUNDATION)
     points = surface.points[np.unique(surface.boundary.facets[chosen])]
     over = points[:, 2] - dtm.sample(points[:, :2])
@@ -109,7 +129,8 @@ def check_foundations(surface: Surface, dtm: Dtm) -> Finding:
     if uneven.any() and not len(middle):
         roofs = surface.corners.mean(axis=1)[np.isin(row, np.flatnonzero(uneven))]
         faults += find_faults("foundation-area", roofs[:1], "a building with a roof, but without a foundation")
-    faults += _find_turned(surface, chosen & ~(surface.area > 0), "foundation", "up")
+    wrong = ~(surface.area > 0) if up else ~(surface.area < 0)
+    faults += _find_turned(surface, chosen & wrong, "foundation", "up" if up else "down")
     lowered = int((over < -HEIGHT_TOLERANCE).sum())
     return Finding(tuple(faults), {"facets": int(chosen.sum()), "area": float(area.sum()), "lowered": lowered})
 
@@ -153,6 +174,39 @@ def prove_soil_sizes(found: Finding, air: Finding) -> Proof:
         *unless_equal("soil-volume", claim, soil, cells),
     )
     return Proof(claim, faults)
+
+
+def check_building_cells(surface: Surface, cells: float, places: Vertices, buildings: Buildings) -> Finding:
+    """Measure the volume under roofs, and find cells of buildings beyond all footprints.
+
+    Parameters
+    ----------
+    surface : Surface
+        Boundary of a piece.
+    cells : float
+        Volume of its cells of buildings (m³).
+    places : float64, (k, 3)
+        Where these are: one place in the plan for all that stand over one triangle of it (m).
+    buildings : Buildings
+        The city model's buildings around the piece.
+    """
+    height = np.sign(surface.area) * surface.volume
+    under = height[surface.marked(Marker.ROOF)].sum() - height[surface.marked(Marker.FOUNDATION)].sum()
+    within = np.zeros(len(places), np.bool_)
+    points = shapely.points(places[:, :2])
+    within[buildings.tree.query(points, predicate="dwithin", distance=OUTLINE_TOLERANCE)[0]] = True
+    faults = find_faults("building-cell-astray", places[~within], "a cell of a building beyond all footprints")
+    return Finding(tuple(faults), {"cells": cells, "under": float(under), "places": len(places)})
+
+
+def prove_building_cells(found: Finding) -> Proof:
+    """The cells of buildings fill what is between roofs and foundations, within footprints."""
+    cells, under = found.sums["cells"], found.sums["under"]
+    claim = (
+        f"buildings: cells over {int(found.sums['places'])} triangles of the plan, all in footprints; volumes: "
+        f"cells {cells:.6f}, under roofs and above foundations {under:.6f} m³"
+    )
+    return Proof(claim, (*found.faults, *unless_equal("building-volume", claim, under, cells)))
 
 
 def _find_turned(surface: Surface, wrong: Mask, name: str, way: str) -> list[Fault]:

@@ -317,6 +317,9 @@ class Config:
         0.0, "mesh", "depth of the soil meshed below the terrain, with the ground as an interior surface; 0: none",
         unit="m", least=0, most=10_000,
     )  # fmt: skip
+    solids: bool = _parameter(
+        False, "mesh", "fill buildings with cells too, from the terrain up to their roofs, conforming with the air"
+    )
     mesher: str = _parameter(
         "adaptive", "mesh", "how columns are filled: each by its own levels, or by the paper's layers",
         source="paper, steps 3.2-3.5", choices=("adaptive", "layered"),

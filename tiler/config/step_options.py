@@ -96,7 +96,8 @@ def layer_parameters(config: Config) -> tuple[str, ...]:
     """Parameters of the columns: those of features only where these are used, so that keys stay without them."""
     growth = ("first_layer", "layer_growth") if config.first_layer else ()
     roofs = ("roofs_or_flat", "roof_clearance_or_spacing") if config.has_sloped_roofs else ()
-    return (*LAYER_PARAMETERS, *growth, *roofs, *(("top_elevation",) if config.top == "flat" else ()))
+    top = ("top_elevation",) if config.top == "flat" else ()
+    return (*LAYER_PARAMETERS, *growth, *roofs, *top, *(("solids",) if config.solids else ()))
 
 
 def expected_levels(config: Config, spacing: float) -> float:
@@ -149,6 +150,7 @@ def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | A
             growth=growth,
             top=domain.top,
             weld=Weld(clearance=given.roof_clearance_or_spacing) if sloped else None,
+            solids=_optional(given, "solids", False),
         )
     return LayeredOptions(
         mesh_size=given.mesh_size,
@@ -159,6 +161,7 @@ def mesh_options(given: Any, domain: Domain | None = None) -> LayeredOptions | A
         fem_tolerance=given.fem_tolerance,
         growth=growth,
         top=domain.top,
+        solids=_optional(given, "solids", False),
     )
 
 

@@ -34,6 +34,7 @@ from tiler.export.region_faces import (
     RegionFaces,
     faces_of_piece,
     find_ground,
+    find_inner_ground,
     find_outer,
     lowest_first,
     own_faces,
@@ -342,7 +343,7 @@ class _PartWriter:
         if piece.region is None:
             return
         rows = np.concatenate(ground)
-        if self._places is None and len(rows) != int((~find_outer(piece)).sum()):
+        if self._places is None and len(rows) != int(find_inner_ground(piece).sum()):
             raise wrong_ground(piece)
         if self._zones is not None and len(rows):
             self._zones.write(k, np.full(len(rows), GROUND_ZONE), rows)

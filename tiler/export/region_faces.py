@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from pipeline.data.kernel import kernel
-from pipeline.data.mesh import Region, is_ground
+from pipeline.data.mesh import Region, find_inside, is_ground
 from stitch.pieces.cell_faces import CellFaces, find_cell_faces
 from stitch.pieces.conformity import group_rows
 from tiler.export.pieces import Pieces
@@ -212,11 +212,16 @@ def faces_of_piece(piece: MeshPiece) -> CellFaces:
 
 
 def find_outer(piece: MeshPiece) -> NDArray[np.bool_]:
-    """Return which facets of a piece bound its cells, bool (f,): all, but for the ground with soil below it."""
-    if piece.region is None:
+    """Return which facets of a piece bound its cells, bool (f,): all, but for those with cells on both sides."""
+    if len(piece.regions) == 1:
         return np.ones(len(piece.facets), np.bool_)
-    outer: NDArray[np.bool_] = ~is_ground(piece.marker)
+    outer: NDArray[np.bool_] = ~find_inside(piece.marker, piece.regions)
     return outer
+
+
+def find_inner_ground(piece: MeshPiece) -> NDArray[np.bool_]:
+    """Return which facets of a piece are ground with soil below it, bool (f,)."""
+    return is_ground(piece.marker) & ~find_outer(piece)
 
 
 def own_faces(

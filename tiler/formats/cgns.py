@@ -75,7 +75,7 @@ def export_cgns(
     Raises
     ------
     ConfigError
-        If the mesh has soil.
+        If the mesh has soil, or cells in buildings.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
@@ -159,7 +159,8 @@ def _survey(pieces: Pieces, *, by_building: bool) -> _Survey:
         piece = pieces.read(k)
         if piece.region is not None and piece.region.any():
             raise ConfigError(
-                "cgns: the mesh has soil, and the file holds one zone, of air; use openfoam, msh or xdmf"
+                "cgns: the mesh has soil or cells in buildings, and the file holds one zone, of air; use "
+                "openfoam, msh or xdmf"
             )
         n_cells += len(piece.cells)
         keys, counts = np.unique(

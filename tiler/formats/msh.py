@@ -1,7 +1,7 @@
 """Gmsh's mesh files: MSH 4.1 binary, and MSH 2.2 as text for programs that read no other.
 
-Surfaces are one entity a marker, volumes one a region, air and soil: each has a physical group with a name. The
-number of a group is that of the marker, those of volumes stand in `VOLUMES`.
+Surfaces are one entity a marker, volumes one a region, air, soil and building: each has a physical group with a
+name. The number of a group is that of the marker, those of volumes stand in `VOLUMES`.
 """
 
 from collections.abc import Iterable
@@ -22,12 +22,13 @@ from tiler.mesh_files.run_files import RunSource
 from tiler.store.atomic import replacing
 
 # No marker has one of these numbers: some programs know groups by number alone.
-VOLUMES = {Region.AIR: 10, Region.SOIL: 20}
+VOLUMES = {Region.AIR: 10, Region.SOIL: 20, Region.BUILDING: 21}
 AIR = VOLUMES[Region.AIR]
 NAMES = {number: region.name.lower() for region, number in VOLUMES.items()}
-# Markers of facets that bound one of the two regions alone.
-OF_AIR = (Marker.WALL, Marker.ROOF, Marker.TOP)
-OF_SOIL = (Marker.BOTTOM, Marker.FOUNDATION)
+# Markers of facets that do not bound the air, and the soil; those of facets that may bound buildings.
+NOT_OF_AIR = (Marker.BOTTOM, Marker.FOUNDATION)
+NOT_OF_SOIL = (Marker.WALL, Marker.ROOF, Marker.TOP)
+OF_BUILDING = (Marker.WALL, Marker.ROOF, Marker.MISSING, Marker.FOUNDATION)
 TRIANGLE, QUADRILATERAL, TETRAHEDRON, PRISM = 2, 3, 4, 6  # Gmsh's types of elements
 TEXT_FLOAT = "%24.16e"  # 17 digits, enough for any float64; each has the same width
 
@@ -255,8 +256,13 @@ def _write_entities(file: BinaryIO, survey: _Survey) -> None:
 
 
 def _bounds(key: int, group: int) -> bool:
-    """Return whether a surface bounds a volume: those of buildings and the top that of air alone."""
-    return key not in OF_SOIL if group == AIR else key < FIRST_BUILDING and key not in OF_AIR
+    """Return whether a surface bounds a volume."""
+    if group == AIR:
+        return key not in NOT_OF_AIR
+    of_building = key >= FIRST_BUILDING
+    if group == VOLUMES[Region.BUILDING]:
+        return of_building or key in OF_BUILDING
+    return not of_building and key not in NOT_OF_SOIL
 
 
 def _begin_nodes(file: BinaryIO, n: int) -> int:

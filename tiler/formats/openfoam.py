@@ -16,6 +16,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from pipeline.data.errors import CityError, ConfigError, InputError
+from pipeline.data.mesh import Region
 from tiler.export.cell_parts import ColumnsFile, divide_cells, take_whole
 from tiler.export.export import CELLS, EXPORT_RECORD, LARGEST_PART, ORIGIN, Format
 from tiler.export.foam_case import write_system
@@ -25,7 +26,7 @@ from tiler.export.foam_patches import FIRST_BUILDING, GROUND_ZONE, interface_nam
 from tiler.export.foam_prisms import write_foam_prisms
 from tiler.export.pedestrian_surface import write_pedestrian_surface
 from tiler.export.pieces import Pieces
-from tiler.export.region_faces import Ints, find_outer, survey_faces
+from tiler.export.region_faces import Ints, find_inner_ground, find_outer, survey_faces
 from tiler.export.wind_case import PEDESTRIAN, Domain, write_wind_cases
 from tiler.export.wind_profile import PEDESTRIAN_HEIGHT, Wind, WindWords, make_wind
 from tiler.mesh_files.mesh_pieces import MeshPiece, open_pieces
@@ -75,7 +76,8 @@ def export_openfoam(
     ------
     ConfigError
         If there are too few columns for so many parts, or prisms are to be in parts or zones, no side for the wind
-        to come from, soil where it should blow, or a mesh of several parts that share no face.
+        to come from, soil or cells in buildings where it should blow, or a mesh of several parts that share no
+        face.
     InputError
         If the run is not finished, or a file of it is missing or damaged.
     OutputError
@@ -88,10 +90,17 @@ def export_openfoam(
         option = "--buildings zones" if parts is None else "--parts"
         raise ConfigError(f"{option}: not with --cells prism; leave one out, and divide the case by decomposePar")
     pieces = open_pieces(source)
+    solids = Region.BUILDING in pieces.files.regions
     if case is not None and pieces.files.depth:
         raise ConfigError(
             f"--case {case}: the mesh has soil to {pieces.files.depth:g} m below ground, where no wind blows; "
             "leave --case out, or mesh without --underground"
+        )
+    if solids and (case is not None or buildings is not None):
+        option = f"--buildings {buildings}" if case is None else f"--case {case}"
+        raise ConfigError(
+            f"{option}: buildings of this mesh have cells, so walls and roofs are no patches; leave it out, or "
+            "mesh without --solids"
         )
     if case is not None and pieces.files.parts != 1:
         raise _refuse_parts(case, pieces.files)
@@ -269,7 +278,7 @@ def _by_zone(piece: MeshPiece) -> Ints:
 
 
 def _by_ground(piece: MeshPiece) -> Ints:
-    return np.where(find_outer(piece), -1, GROUND_ZONE)
+    return np.where(find_inner_ground(piece), GROUND_ZONE, -1)
 
 
 def _by_volume(piece: MeshPiece) -> Ints:

@@ -1,8 +1,8 @@
 """XDMF with HDF5: cells and marked facets in two grids on the same points, for FEniCS and ParaView.
 
 The first grid, ``mesh``, has the tetrahedra, the second, ``facets``, the boundary's triangles with ``marker`` and
-``building``: what `XDMFFile.read_mesh` and `read_meshtags` of DOLFINx take. With soil, ``mesh`` has ``region``.
-With prisms a third one, ``sides``, has the boundary's quadrilaterals.
+``building``: what `XDMFFile.read_mesh` and `read_meshtags` of DOLFINx take. With soil or cells in buildings,
+``mesh`` has ``region``. With prisms a third one, ``sides``, has the boundary's quadrilaterals.
 """
 
 from pathlib import Path
@@ -93,7 +93,7 @@ def _write_data(path: Path, pieces: MeshPieces, n_cells: int, n_facets: int) -> 
         "marker": n_facets,
         "building": n_facets,
     }
-    if pieces.files.depth:
+    if len(pieces.files.regions) > 1:
         rows["region"] = n_cells
     if pieces.files.leaves:
         rows[LEAVES] = n_cells

@@ -301,7 +301,7 @@ class CityMesh:
         -------
         meshio.Mesh
             Block ``tetra`` with all cells, by tile, and ``triangle`` with the facets of the boundary. Cell data:
-            ``marker`` (0 of cells), ``building`` (-1 where there is none), and with soil ``region``.
+            ``marker`` (0 of cells), ``building`` (-1 where there is none), and with soil or solids ``region``.
 
         Raises
         ------
@@ -330,7 +330,7 @@ class CityMesh:
             "marker": [np.zeros(len(cells), marker.dtype), marker],
             "building": [np.full(len(cells), NO_BUILDING, building.dtype), building],
         }
-        if self._files.depth:
+        if len(self._files.regions) > 1:
             regions = [part.region for part in parts if part.region is not None]
             data["region"] = [np.concatenate(regions), np.full(len(facets), -1, np.int8)]
         return meshio.Mesh(points, [("tetra", cells), ("triangle", facets)], cell_data=data)

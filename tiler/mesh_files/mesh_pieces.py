@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import GROUND_PATCHES, Marker, Region
+from pipeline.data.mesh import GROUND_PATCHES, Marker, Region, Regions
 from stitch.pieces.numbering import Numbering
 from tiler.mesh_files.merged import VERTEX_ID, number_piece, read_numbering
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource, find_files
@@ -34,7 +34,8 @@ class MeshPiece:
         Tetrahedra of positive volume, as rows of `points`.
     facets : int32, (f, 3)
         Facets of the region's boundary, as rows of `points`, counter-clockwise seen from outside; faces that it
-        shares with another tile are not among them. With soil, the ground is there although it is inside.
+        shares with another tile are not among them. Ground above soil, and walls and roofs of
+        buildings with cells, are there although they are inside.
     marker : int32, (f,)
         `pipeline.data.mesh.Marker` of each facet; with land cover, `GROUND_PATCHES` and the number of its patch on
         ground that has one.
@@ -47,6 +48,8 @@ class MeshPiece:
         `pipeline.data.mesh.Region` of each cell; None where all is air.
     leaves : float32, (m,), or None
         Leaf area density of each cell (m2/m3), 0 in open air; None in a run without trees.
+    regions : tuple of Region
+        What cells of the whole mesh are filled with.
     """
 
     name: str
@@ -58,6 +61,7 @@ class MeshPiece:
     ids: NDArray[np.int64]
     region: NDArray[np.int8] | None = None
     leaves: NDArray[np.float32] | None = None
+    regions: Regions = (Region.AIR,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +110,9 @@ class MeshPieces:
             mark_facets(self.files, self.files.boundaries[k], boundary),
             boundary.boundary.building,
             number_piece(path, volume.point_data.get(VERTEX_ID), self.numbering),
-            read_regions(path, volume) if self.files.depth else None,
+            read_regions(path, volume, self.files.regions) if len(self.files.regions) > 1 else None,
             read_leaves(path, volume) if self.files.leaves else None,
+            self.files.regions,
         )
 
 
@@ -204,11 +209,12 @@ def read_leaves(path: Path, volume: VolumePiece) -> NDArray[np.float32]:
     return leaves
 
 
-def read_regions(path: Path, volume: VolumePiece) -> NDArray[np.int8]:
-    """Take the `pipeline.data.mesh.Region` of each cell of a piece; InputError where it has none."""
+def read_regions(path: Path, volume: VolumePiece, regions: Regions) -> NDArray[np.int8]:
+    """Take the `pipeline.data.mesh.Region` of each cell of a piece; InputError where it has none, or others."""
     region = volume.cell_data.get(REGION)
-    if region is None or region.dtype != np.int8 or not np.isin(region, list(Region)).all():
-        raise InputError(f"{path}: has no cell array {REGION!r} of 0 (air) and 1 (soil) alone; run the tile again")
+    if region is None or region.dtype != np.int8 or not np.isin(region, regions).all():
+        known = " and ".join(f"{value:d} ({value.name.lower()})" for value in regions)
+        raise InputError(f"{path}: has no cell array {REGION!r} of {known} alone; run the tile again")
     return region
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.errors import InputError
+from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.mesh import Region
 from stitch.pieces.conformity import group_rows
 from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces
 
@@ -79,6 +80,8 @@ def read_prisms(pieces: MeshPieces) -> PrismMesh:
 
     Raises
     ------
+    ConfigError
+        If buildings have cells.
     InputError
         If some of its cells are no thirds of prisms, or a piece is damaged.
 
@@ -86,6 +89,8 @@ def read_prisms(pieces: MeshPieces) -> PrismMesh:
     -----
     Memory is some 700 bytes for each prism.
     """
+    if Region.BUILDING in pieces.files.regions:
+        raise ConfigError("--cells prism: not with cells in buildings; leave it out, or mesh without --solids")
     points = np.empty((pieces.n_points, 3))
     cells, facets, marker, building = [], [], [], []
     leaves: list[NDArray[np.float32]] = []

@@ -5,6 +5,7 @@ from math import floor
 from pathlib import Path
 
 from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.mesh import Region, Regions
 
 RUN_RECORD, VOLUME_INDEX, BOUNDARY_INDEX = "run.json", "mesh.pvtu", "boundary.pvtp"
 MOST_ORIGIN = 1e9  # m
@@ -33,6 +34,8 @@ class RunFiles:
         Patches of the ground by number: names and roughness lengths (m); none without land cover.
     leaves : bool
         Whether cells tell their leaf area density.
+    regions : tuple of Region
+        What cells are filled with.
     """
 
     directory: Path
@@ -44,6 +47,7 @@ class RunFiles:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ground: tuple[tuple[str, float | None], ...] = ()
     leaves: bool = False
+    regions: Regions = (Region.AIR,)
 
     @property
     def ground_names(self) -> tuple[str, ...]:
@@ -90,6 +94,7 @@ def find_files(directory: Path) -> RunFiles:
         len(found.parts),
         ground=ground,
         leaves=found.leaves,
+        regions=found.regions,
     )
 
 

@@ -30,7 +30,7 @@ TRIANGLES_AN_OCTAVE = 2.4  # layered: at a wall, for each halving of the mesh si
 FULL_SPACING = 0.785  # mesh sizes; levels above open ground are this far apart where 0.8 is allowed
 CELLS_AT_WALLS = 22.0  # adaptive: in each metre of height, for each 1/m that walls are finer than the mesh
 CELLS_OF_SLOPES = 1.16  # of those with flat roofs: in Amsterdam
-BUILT_HEIGHT = 10.0  # m; height of houses, which no cells fill
+BUILT_HEIGHT = 10.0  # m; height of houses, which no cells fill without solids
 CELLS_A_POINT = 5.5
 BYTES_A_LIDAR_POINT = 7.2  # of disk
 BYTES_A_CELL = 9.5
@@ -186,7 +186,8 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
         inner = _core_area(grid, survey.region.bounds)
         houses, built, detail, octaves = _house_sums(grid, sample, np.where(there, inner, 0.0))
     thin = _thinning(survey, sample, config)
-    volume = np.maximum(area * height - built * min(BUILT_HEIGHT, height), 0.0)
+    in_air = 0.0 if config.solids and config.mesher == "layered" else min(BUILT_HEIGHT, height)
+    volume = np.maximum(area * height - built * in_air, 0.0)
     if config.mesher == "adaptive":
         spacing = h * FULL_SPACING / 0.8 * min(config.most_spacing, 1.0)
         closer = expected_levels(config, spacing) * spacing / height
@@ -197,6 +198,10 @@ def _loads(survey: Survey, sample: FootprintSample | None, config: Config) -> Ti
         layers = max(round(expected_levels(config, config.layer_height_or_default)), 1)
         triangles = TRIANGLES * area * thin / h**2 + TRIANGLES_AN_OCTAVE * octaves
         cells = 3 * layers * triangles * volume / (area * height)
+    if config.solids and config.mesher == "adaptive":
+        solid = built * thin * min(BUILT_HEIGHT, height)
+        inside = 3 * TRIANGLES * solid / (h**2 * spacing) * closer + CELLS_AT_WALLS / 2 * BUILT_HEIGHT * detail
+        cells = cells + (CELLS_OF_SLOPES * inside if config.has_sloped_roofs else inside)
     if config.underground:
         spacing = h * FULL_SPACING / 0.8 * min(config.most_spacing, 1.0)
         open_ground = 3 * TRIANGLES * area / (h**2 * spacing)

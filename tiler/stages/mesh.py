@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.columns.adaptive import AdaptiveOptions, AdaptiveReport, mesh_adaptive
-from pipeline.columns.columns import count_cells, lowest_gap
+from pipeline.columns.columns import lowest_gap
 from pipeline.columns.layered import mesh_layers
 from pipeline.columns.nodes import Levels, SeamColumns, join_levels, take_columns
-from pipeline.columns.underground import SoilMesh, SoilOptions, add_soil, count_soil_cells
+from pipeline.columns.underground import RegionMesh, SoilOptions, add_soil, count_regions
 from pipeline.data.errors import GeometryError
-from pipeline.data.mesh import ColumnMesh, PlaneMesh, SeamEdges
+from pipeline.data.mesh import ColumnMesh, PlaneMesh, Region, SeamEdges
 from pipeline.data.notes import Note
 from pipeline.data.roofs import is_flat
 from pipeline.plane_mesh.plane import signed_areas
@@ -184,28 +184,30 @@ def make_columns(task: Task) -> Facts:
     with task.step("3.2-3.5 columns"):
         terrain = cut_terrain(dtm, window_of(dtm))
         columns, report = _mesh(plane, terrain, buildings, options, seam_columns, sizes, task)
-    _check(columns)
+    _check(columns, report, solids=options.solids)
     shared = [find_vertices(plane.xy, seam.xy) for seam, _ in (*given_columns, *pinched)]
-    cells, n_cells = count_cells(columns), 0
+    mesh = RegionMesh(columns, np.zeros(len(plane.xy), np.int32), options.solids)
+    ground, lowered = sample_dtm(terrain, plane.xy), np.empty(0, np.int64)
     if soil is not None:
         below = [unpack_soil(found[names[k]].arrays) for k in inner]
         below += [part for name in names for part in unpack_pinched_soil(found[name])]
         with task.step("soil"):
-            ground = sample_dtm(terrain, plane.xy)
-            mesh, edges, lowered = _lay_soil(columns, ground, edges, shared, seam_columns, below, soil, sizes)
-        for x, y in plane.xy[lowered].tolist():
-            detail = "the terrain inside the house reaches its roof"
-            task.note(Note("soil-lowered-under-roof", task.name, x, y, detail))
+            mesh, edges, lowered = _lay_soil(mesh, ground, edges, shared, seam_columns, below, soil, sizes)
         task.put(soil=mesh.top)
-        columns, n_cells = mesh.columns, count_soil_cells(mesh)
+        columns = mesh.columns
         given_columns = [
             (seam, join_seam(part, levels))
             for (seam, levels), part in zip(given_columns, below[: len(inner)], strict=True)
         ]
+    if mesh.solids:
+        lowered = np.flatnonzero(columns.z[columns.z_start[:-1] + mesh.top] < ground)
+    for x, y in plane.xy[lowered].tolist():
+        detail = "the terrain inside the house reaches its roof"
+        task.note(Note("soil-lowered-under-roof", task.name, x, y, detail))
     edges, edge_seam = _add_straight_borders(plane, edges, sides, inner, task)
     if not complete:
-        x, y = (task.box[0] + task.box[2]) / 2, (task.box[1] + task.box[3]) / 2
-        task.note(Note("plane-refinement-stopped", task.name, x, y, "limit on added vertices reached"))
+        middle = (task.box[0] + task.box[2]) / 2, (task.box[1] + task.box[3]) / 2
+        task.note(Note("plane-refinement-stopped", task.name, *middle, "limit on added vertices reached"))
     task.put(
         **pack_columns(columns, model.numbers),
         edge=edges.vertices,
@@ -214,7 +216,6 @@ def make_columns(task: Task) -> Facts:
         edge_missing=edges.missing,
         edge_seam=edge_seam,
     )
-    gap, _ = lowest_gap(columns)
     keys = [seam_key(name) for name in names]
     lowest = [seam_ids(keys[k], levels) for k, (_, levels) in zip(inner, given_columns, strict=True)]
     for key, name in zip(keys, names, strict=True):
@@ -224,16 +225,18 @@ def make_columns(task: Task) -> Facts:
         shared=np.concatenate([np.empty(0, np.int32), *shared]),
         shared_id=np.concatenate([np.empty(0, np.int64), *lowest]),
     )
-    underground = {} if soil is None else {"soil": {"depth (m)": soil.depth, "cells": n_cells}}
+    cells = count_regions(mesh)
+    regions = {} if soil is None else {"soil": {"depth (m)": soil.depth, "cells": cells[Region.SOIL]}}
+    regions |= {"solids": {"cells": cells[Region.BUILDING]}} if options.solids else {}
     eased = {EASED: report.eased_nodes} if isinstance(report, AdaptiveReport) and report.eased_nodes else {}
     return (
-        underground
+        regions
         | _put_patches(task, plane, cover)
         | {
             "order": columns.order,
-            "facts": {"smallest gap (m)": round(gap, 4)} | asdict(report),
+            "facts": {"smallest gap (m)": round(lowest_gap(columns)[0], 4)} | asdict(report),
             "counts": {
-                "cells": cells + n_cells,
+                "cells": sum(cells.values()),
                 **eased,
                 "triangles": len(plane.triangles),
                 "columns": len(plane.xy),
@@ -343,7 +346,7 @@ def _mesh(
 
 
 def _lay_soil(
-    columns: ColumnMesh,
+    mesh: RegionMesh,
     terrain: NDArray[np.float64],
     edges: SeamEdges,
     shared: Sequence[NDArray[np.int32]],
@@ -351,7 +354,7 @@ def _lay_soil(
     soil: Sequence[Levels],
     options: SoilOptions,
     sizes: SizeField | None,
-) -> tuple[SoilMesh, SeamEdges, NDArray[np.int64]]:
+) -> tuple[RegionMesh, SeamEdges, NDArray[np.int64]]:
     """Put a tile's columns of air on columns of soil, as `add_soil` does with those that seams give.
 
     `shared` has the vertices of each seam, and of each end of one that is given alone; `air` has their columns,
@@ -360,7 +363,7 @@ def _lay_soil(
     """
     vertex, first = np.unique(np.concatenate([np.empty(0, np.int32), *shared]), return_index=True)
     below = SeamColumns(vertex, take_columns(join_levels(soil), first.astype(np.int32)))
-    mesh, raised, lowered = add_soil(columns, terrain, air, below, options, sizes=sizes)
+    mesh, raised, lowered = add_soil(mesh.columns, terrain, air, below, options, sizes=sizes, solids=mesh.solids)
     return mesh, replace(edges, bottom=edges.bottom + raised[edges.vertices]), lowered
 
 
@@ -392,11 +395,17 @@ def _on_sides(xy: NDArray[np.float64], bounds: Bounds) -> bool:
     return any(bool((xy[:, k % 2] == bounds[k]).all()) for k in range(4))
 
 
-def _check(columns: ColumnMesh) -> None:
+def _check(columns: ColumnMesh, report: Any, *, solids: bool) -> None:
     gap, inverted = lowest_gap(columns)
     if inverted:
         raise GeometryError(
             f"step 3.5: {inverted} levels do not ascend, the worst by {gap:.3g} m; raise --roof-clearance"
+        )
+    unmet = report.passed_edges + report.crossed_edges if isinstance(report, AdaptiveReport) else 0
+    if solids and unmet:
+        raise GeometryError(
+            f"step 3.5: at {unmet} ends of walls between steep roofs, cells of a building cannot have the faces "
+            "of what is beside it; mesh with --roofs flat, or without --solids"
         )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.columns.cell_blocks import CellBlocks, QualityMeter, UsedPoints, number_used
 from pipeline.columns.columns import find_used_points, split_boundary
-from pipeline.columns.underground import SoilMesh, expand_regions, find_used, split_regions
+from pipeline.columns.underground import RegionMesh, expand_regions, find_used, split_regions
 from pipeline.data.classes import BUILDING, GROUND, WATER
 from pipeline.data.errors import GeometryError
 from pipeline.data.mesh import ColumnMesh, SeamEdges
@@ -103,11 +103,15 @@ def write_piece(task: Task) -> Facts:
     )
     # A column of a seam has levels that only the tile beyond uses, below a roof whose wall is the seam.
     region: dict[str, NDArray[np.int8]] = {}
-    if "soil" in attributes["facts"]:
-        soil = SoilMesh(mesh, task.store.read("columns", task.name, names=("soil",))[0]["soil"])
-        used = find_used(soil)
-        cells, region[REGION] = expand_regions(soil)
-        boundary, shared = split_regions(soil, numbers, task.context.bounds, edges)
+    soil, solids = (name in attributes["facts"] for name in ("soil", "solids"))
+    if soil or solids:
+        top = np.zeros(len(mesh.plane.xy), np.int32)
+        if soil:
+            top = task.store.read("columns", task.name, names=("soil",))[0]["soil"]
+        whole = RegionMesh(mesh, top, solids)
+        used = find_used(whole)
+        cells, region[REGION] = expand_regions(whole)
+        boundary, shared = split_regions(whole, numbers, task.context.bounds, edges)
     else:
         used = find_used_points(mesh)
         cells = CellBlocks([(mesh, None)])

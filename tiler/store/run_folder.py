@@ -12,6 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
+from pipeline.data.mesh import Region, Regions
 from pipeline.data.roofs import Roofs, Weld
 from tiler.config.config import roofs_stay_flat
 from tiler.config.zone_levels import read_described
@@ -97,6 +98,8 @@ class RunRecord:
         Boxes of the tiles by name (m), as far as they are stated.
     depth : float
         Depth of the soil below the terrain (m), 0 where there is none.
+    solids : bool
+        Whether buildings have cells.
     core : tuple of 4 floats or None
         The region without its pad (m); None without a pad.
     rim : float
@@ -136,6 +139,12 @@ class RunRecord:
     leaf_column: float = 2.0
     zones: Zones = ()
     level_counts: Mapping[str, int] = field(default_factory=dict)
+    solids: bool = False
+
+    @property
+    def regions(self) -> Regions:
+        """What cells are filled with."""
+        return (Region.AIR, *[Region.SOIL] * (self.depth > 0), *[Region.BUILDING] * self.solids)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +206,7 @@ def read_run_record(path: Path) -> RunRecord:
         roofs = _read_roof_rules(record.get("parameters", {}))
         found = (record.get("land_cover") or {}).get("patches", [])
         given = record.get("parameters", {})
+        solids = bool(given.get("solids", False))
         leaves = bool(given.get("vegetation_classes") or given.get("trees"))
         cell = float(given.get("leaf_column", 2.0))
         zones = read_described(record.get("zones") or ())
@@ -228,6 +238,7 @@ def read_run_record(path: Path) -> RunRecord:
         cell,
         zones,
         at_levels,
+        solids,
     )
 
 

@@ -25,10 +25,10 @@ from pipeline.columns.nodes import (
 )
 from pipeline.columns.spacing import SpacingLimits
 from pipeline.columns.underground import (
-    SoilMesh,
+    RegionMesh,
     SoilOptions,
     add_soil,
-    count_soil_cells,
+    count_regions,
     expand_regions,
     fill_soil,
     find_used,
@@ -58,6 +58,7 @@ from tiler.config.config import Config, idle_parameters, make_config
 from tiler.export.export import export_run
 from tiler.mesh_files.vtk_files import BoundaryPiece, VolumePiece, read_vtp, read_vtu
 from tiler.store.results import StoredTerrain
+from tiler.store.run_folder import ROOF_MOVED
 from tiler.store.store import Store
 
 DEPTH = 25.0
@@ -161,7 +162,7 @@ def test_soil_goes_on_under_a_house() -> None:
     volume, flat = compute_cell_volumes(cells.points, cells.cells)
     assert (volume > 0).all()
     assert not flat.any()
-    assert (region == Region.SOIL).sum() == count_soil_cells(mesh)
+    assert (region == Region.SOIL).sum() == count_regions(mesh)[Region.SOIL]
     np.testing.assert_allclose(volume[region == Region.SOIL].sum(), 100 * OPTIONS.depth)
     np.testing.assert_allclose(volume[region == Region.AIR].sum(), 50 * 4 + 50 * (2 + 2 + 4) / 3)
     assert find_used(mesh).all()
@@ -218,7 +219,7 @@ def test_cells_of_soil_come_after_those_of_air_in_any_block() -> None:
             assert np.array_equal(blocks.make(begin, end), whole[begin:end])
 
 
-def _expand(mesh: SoilMesh) -> tuple[TetMesh, NDArray[np.int8]]:
+def _expand(mesh: RegionMesh) -> tuple[TetMesh, NDArray[np.int8]]:
     blocks, region = expand_regions(mesh)
     used = find_used(mesh)
     points = UsedPoints(mesh.columns, used)
@@ -226,7 +227,7 @@ def _expand(mesh: SoilMesh) -> tuple[TetMesh, NDArray[np.int8]]:
     return TetMesh(places, number_used(used)[blocks.make(0, blocks.n_cells)]), region
 
 
-def _points_and_cells(mesh: SoilMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _points_and_cells(mesh: RegionMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     cells, _ = _expand(mesh)
     return cells.points, cells.cells
 
@@ -317,20 +318,23 @@ def test_soil_depends_on_the_surroundings_of_its_tile_alone(mesher: str, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("mesher", "gone"),
+    ("mesher", "gone", "solids"),
     [
-        ("adaptive", [(0, 2), (1, 1), (2, 0)]),
-        pytest.param("layered", [(1, 1)], marks=pytest.mark.long),
-        pytest.param("layered", [(0, 2), (1, 1), (2, 0)], marks=pytest.mark.long),
+        ("adaptive", [(0, 2), (1, 1), (2, 0)], False),
+        pytest.param("adaptive", [(0, 2), (1, 1), (2, 0)], True, marks=pytest.mark.long),
+        pytest.param("layered", [(1, 1)], False, marks=pytest.mark.long),
+        pytest.param("layered", [(0, 2), (1, 1), (2, 0)], True, marks=pytest.mark.long),
     ],
 )
-def test_soil_ends_at_tiles_that_are_absent(mesher: str, gone: list[tuple[int, int]], tmp_path: Path) -> None:
+def test_soil_ends_at_tiles_that_are_absent(
+    mesher: str, gone: list[tuple[int, int]], solids: bool, tmp_path: Path
+) -> None:
     """Tiles that meet in a corner alone share its column of soil too."""
     region = (0.0, 0.0, 420.0, 420.0)
     town = make_town(region, crowded_blocks(region, 90, seed=4), relief=10)
     values = write_town(tmp_path / "city", town, files=(3, 3), without=gone)
     values |= {"tile_size": SIZE, "domain_height": 50.0, "mesher": mesher, "underground": DEPTH}
-    record = run_of(values, tmp_path / "out")
+    record = run_of(values, tmp_path / "out", solids=solids)
     report = prove(tmp_path / "out")
     assert record["counts"]["tiles"] == 9 - len(gone)
     assert report.facts["missing_facets"] > 0
@@ -344,20 +348,24 @@ Change = Callable[[VolumePiece, BoundaryPiece], tuple[VolumePiece, BoundaryPiece
 @pytest.fixture
 def damaged(four: tuple[dict[str, Any], Path], tmp_path: Path) -> Callable[[Change], Path]:
     """Change the first piece of the run in a copy of it."""
+    return lambda change: damage(four[1], tmp_path / "damaged", change)
 
-    def damage(change: Change) -> Path:
-        out = tmp_path / "damaged"
-        shutil.copytree(four[1], out)
-        paths = sorted((out / "mesh").iterdir())[0], sorted((out / "boundary").iterdir())[0]
-        volume, surface = change(read_vtu(paths[0]), read_vtp(paths[1]))
-        write_vtu(paths[0], volume.mesh, point_data=volume.point_data, cell_data=volume.cell_data)
-        points, vertex = volume.mesh.points.copy(), surface.vertex
-        points[vertex] = surface.points
-        boundary = replace(surface.boundary, facets=vertex.astype(np.int32)[surface.boundary.facets])
-        write_vtp(paths[1], points, boundary, point_data={"vertex_id": volume.point_data["vertex_id"]})
-        return out
 
-    return damage
+def damage(run: Path, out: Path, change: Change, k: int = 0) -> Path:
+    """Change a piece of a run in a copy of it."""
+    shutil.copytree(run, out)
+    paths = sorted((out / "mesh").iterdir())[k], sorted((out / "boundary").iterdir())[k]
+    volume, surface = change(read_vtu(paths[0]), read_vtp(paths[1]))
+    write_vtu(paths[0], volume.mesh, point_data=volume.point_data, cell_data=volume.cell_data)
+    points, vertex = volume.mesh.points.copy(), surface.vertex
+    points[vertex] = surface.points
+    boundary = replace(surface.boundary, facets=vertex.astype(np.int32)[surface.boundary.facets])
+    point_data = {"vertex_id": volume.point_data["vertex_id"]}
+    if ROOF_MOVED in surface.point_data:
+        point_data[ROOF_MOVED] = np.zeros(len(points))
+        point_data[ROOF_MOVED][vertex] = surface.point_data[ROOF_MOVED]
+    write_vtp(paths[1], points, boundary, point_data=point_data)
+    return out
 
 
 def keep_cells(volume: VolumePiece, kept: NDArray[np.bool_]) -> VolumePiece:
@@ -382,10 +390,13 @@ def inner_cell(volume: VolumePiece, region: Region) -> int:
     return int(np.flatnonzero(inside)[0])
 
 
-def lose_cell(volume: VolumePiece, surface: BoundaryPiece) -> tuple[VolumePiece, BoundaryPiece]:
-    kept = np.ones(len(volume.mesh.cells), np.bool_)
-    kept[inner_cell(volume, Region.SOIL)] = False
-    return keep_cells(volume, kept), surface
+def lose_cell(region: Region) -> Change:
+    def change(volume: VolumePiece, surface: BoundaryPiece) -> tuple[VolumePiece, BoundaryPiece]:
+        kept = np.ones(len(volume.mesh.cells), np.bool_)
+        kept[inner_cell(volume, region)] = False
+        return keep_cells(volume, kept), surface
+
+    return change
 
 
 def invert_cell(volume: VolumePiece, surface: BoundaryPiece) -> tuple[VolumePiece, BoundaryPiece]:
@@ -394,10 +405,13 @@ def invert_cell(volume: VolumePiece, surface: BoundaryPiece) -> tuple[VolumePiec
     return replace(volume, mesh=TetMesh(volume.mesh.points, cells)), surface
 
 
-def mix_up_cell(volume: VolumePiece, surface: BoundaryPiece) -> tuple[VolumePiece, BoundaryPiece]:
-    region = volume.cell_data["region"].copy()
-    region[inner_cell(volume, Region.SOIL)] = Region.AIR
-    return replace(volume, cell_data={"region": region}), surface
+def mix_up_cell(one: Region, two: Region) -> Change:
+    def change(volume: VolumePiece, surface: BoundaryPiece) -> tuple[VolumePiece, BoundaryPiece]:
+        region = volume.cell_data["region"].copy()
+        region[inner_cell(volume, one)] = two
+        return replace(volume, cell_data={"region": region}), surface
+
+    return change
 
 
 def part_soil(volume: VolumePiece, surface: BoundaryPiece) -> tuple[VolumePiece, BoundaryPiece]:
@@ -457,9 +471,12 @@ def move(marker: Marker, up: float, *, inside: bool = True) -> Change:
 
 
 DAMAGE: dict[str, tuple[Change, set[str]]] = {
-    "a cell of soil is lost": (lose_cell, {"facet-missing", "soil-volume", "counts"}),
+    "a cell of soil is lost": (lose_cell(Region.SOIL), {"facet-missing", "soil-volume", "counts"}),
     "a cell of soil is inverted": (invert_cell, {"cell-inverted", "face-same-side"}),
-    "a cell of soil is marked as air": (mix_up_cell, {"ground-missing", "soil-volume", "volume"}),
+    "a cell of soil is marked as air": (
+        mix_up_cell(Region.SOIL, Region.AIR),
+        {"ground-missing", "soil-volume", "volume"},
+    ),
     "soil and air have a point each": (part_soil, {"vertex-duplicate", "ground-one-sided"}),
     "a ground facet is lost": (drop(Marker.GROUND), {"ground-missing", "plan-area", "soil-area", "counts"}),
     "a ground facet points up": (turn(Marker.GROUND), {"ground-flipped", "facet-direction"}),

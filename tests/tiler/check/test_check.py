@@ -778,7 +778,7 @@ def test_a_seam_that_settles_bit_by_bit_counts_once() -> None:
     sums = _Sums.start(0)
     for pairs in ([[0, 1]], [], [[0, 1], [1, 2]]):
         seams = np.array(pairs, np.int64).reshape(-1, 2)
-        sums.add_settled(Settled(len(pairs), seams, seams, none, none, none, none, lines, lines))
+        sums.add_settled(Settled(len(pairs), seams, seams, none, none, none, none, none, lines, lines))
     assert sums.seams.tolist() == [[0, 1], [1, 2]]
 
 

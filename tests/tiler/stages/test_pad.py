@@ -385,6 +385,7 @@ def test_a_pad_goes_with_all_options_and_any_workers_and_openfoam_is_content(
         "domain_height": "6H",
         "open_size": 20.0,
         "underground": 20.0,
+        "solids": True,
     }
     hashes = []
     for workers in (0, 2):
