@@ -78,6 +78,7 @@ def list_commands(folder: Path) -> dict[str, tuple[str, ...]]:
     return {
         "`run --workers 2`": (*run, "--overwrite"),
         "the same again, nothing to do": run,
+        "`plan` of 1,000 files": ("plan", str(folder / "many"), "--footprints", f"{city}/footprints.shp"),
         "`check --workers 2`": ("check", out, "--workers", "2"),
         "`check`": ("check", out),
         **pictures,
@@ -119,8 +120,13 @@ def main(words: list[str]) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         measure("synth", str(folder / "city"), "--size", "2500", "--buildings", "3000")
+        (folder / "many").mkdir()
+        for path in (folder / "city" / "tiles").iterdir():  # 25 files, each by 40 names
+            for k in range(40):
+                os.link(path, folder / "many" / f"{k}_{path.name}")
         commands = list_commands(folder)
-        measure(*next(iter(commands.values())))  # kernels are compiled and files cached
+        for title in ("`run --workers 2`", "`check`"):  # kernels are compiled and files cached
+            measure(*commands[title])
         rows: dict[str, list[Measured]] = {title: [] for title in commands}
         for _ in range(int(words[0]) if words else 3):
             for title, command in commands.items():

@@ -15,7 +15,6 @@ from statistics import median
 from tests.benchmarks.bench_report import REPORT
 from tests.benchmarks.beside_the_mesh import measure
 from tests.benchmarks.reliability import replace_between
-from tests.benchmarks.runs import COMMAND
 
 CITY = ("--size", "5000", "--buildings", "12000")
 Row = tuple[
@@ -27,7 +26,7 @@ def measure_run(python: str, city: Path, out: Path, *options: str) -> Row:
     """Mesh the city into a new folder with one of both builds."""
     start = time.time()
     run = ("run", "tiles", "--footprints", "footprints.shp", "--out", str(out), "--overwrite")
-    wall, processor, _ = measure(*run, *options, command=(python, *COMMAND[1:]), folder=city)
+    wall, processor, _ = measure(*run, *options, command=(str(Path(python).parent / "citystitch"),), folder=city)
     with (out / "events.jsonl").open() as file:
         first = next(event["t"] for event in map(json.loads, file) if event["event"] == "done")
     peak = json.loads((out / "run.json").read_text())["peak_memory_bytes"]

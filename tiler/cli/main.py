@@ -252,7 +252,7 @@ def _view(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from tiler.report import write_report
+    from tiler.report.write import write_report
 
     refuse_strangers(options.directory)
     say(str(write_report(options.directory, truth=options.truth)))
@@ -261,7 +261,7 @@ def _report(options: argparse.Namespace) -> int:
 
 def _report_run(out: Path, *, quiet: bool) -> None:
     """Write the report of a run that has just ended; the mesh is there, whatever becomes of it."""
-    from tiler.report import write_report
+    from tiler.report.write import write_report
 
     try:
         path = write_report(out)

@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.mesh import TetMesh
-from pipeline.quality.quality import measure_cells
 from tiler.mesh_files.vtk_files import BoundaryPiece
 
 
@@ -28,6 +27,8 @@ def measure_facets(mesh: TetMesh, piece: BoundaryPiece) -> NDArray[np.float32]:
     -----
     Only cells with three corners on the boundary are measured.
     """
+    from pipeline.quality.quality import measure_cells  # with numba
+
     n = len(piece.points)
     row = np.full(len(mesh.points), -1, np.int64)
     row[piece.vertex] = np.arange(n)

@@ -12,6 +12,7 @@ from pipeline.data.mesh import Marker, Region
 from stitch.tiling.grid import Key
 from tiler.config.zone_levels import find_levels
 from tiler.engine.run_context import tile_key
+from tiler.mesh_files.facet_quality import measure_facets, name_facets
 from tiler.mesh_files.vtk_files import TETRA, BoundaryPiece, read_piece_paths, read_vtp, read_vtu
 from tiler.store.out_folder import RUN_RECORD, STORE
 from tiler.store.run_folder import REGION, read_run_record
@@ -20,6 +21,7 @@ from tiler.store.store import Store
 BOUNDARY_INDEX, VOLUME_INDEX = "boundary.pvtp", "mesh.pvtu"
 SHOWN = (Marker.GROUND, Marker.WALL, Marker.ROOF)
 MOST_BYTES = 80_000_000  # of the files of cells that are shown one by one: some 10 million cells
+STRIP_CELLS = 500_000  # whose faces are found together
 MOST_FACETS = 600_000  # of a picture of 1.6 million pixels; those of larger regions are made coarser
 FIRST_STEP = 1.0  # m, between vertices that are made one; doubled until there are few enough
 
@@ -91,8 +93,6 @@ def coarsen(facets: Facets, size: float) -> Facets:
     >>> coarse.points.tolist(), coarse.building.tolist()
     ([[1.0, 1.0, 0.0], [5.0, 1.0, 0.0], [5.0, 5.0, 0.0]], [0])
     """
-    from tiler.mesh_files.facet_quality import name_facets  # with numba
-
     cell = np.floor(facets.points / size).astype(np.int64)
     low = cell.min(axis=0)
     extent = cell.max(axis=0) - low + 1
@@ -226,9 +226,7 @@ def load_city(
     `most` facets.
     """
     paths = _find_pieces(directory / BOUNDARY_INDEX, only)
-    volumes = _find_pieces(directory / VOLUME_INDEX, only) if quality else []
-    if quality and [path.stem for path in volumes] != [path.stem for path in paths]:
-        raise InputError(f"{directory}: {VOLUME_INDEX} and {BOUNDARY_INDEX} have other pieces; run again")
+    volumes = _find_volumes(directory, paths) if quality else []
     parts: list[Facets] = []
     n_facets, n_read, step = 0, 0, 0.0
     for row, path in enumerate(paths):
@@ -297,8 +295,14 @@ def load_levels(directory: Path, city: City) -> NDArray[np.int8]:
     return levels
 
 
-def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[str] | None = None) -> Any:
-    """Read the surface of the whole tetrahedra in the northern half, from ``mesh.pvtu``.
+def load_air(
+    directory: Path,
+    origin: NDArray[np.float64],
+    *,
+    only: frozenset[str] | None = None,
+    within: float = np.inf,
+) -> Any:
+    """Read the surface of the whole tetrahedra in the northern half, but for ground, walls and roofs.
 
     Parameters
     ----------
@@ -308,6 +312,8 @@ def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[st
         Where the city was moved from (m); the cut is there.
     only : frozenset of str, optional
         Names of the pieces to read, all by default.
+    within : float
+        Half the side of a square around the origin whose cells are taken (m), all where it has none.
 
     Returns
     -------
@@ -317,7 +323,7 @@ def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[st
     Raises
     ------
     InputError
-        If the file or a piece of it is missing or damaged, or has no cell there.
+        If a file or a piece of it is missing or damaged, or has no cell there.
 
     Notes
     -----
@@ -325,19 +331,77 @@ def load_air(directory: Path, origin: NDArray[np.float64], *, only: frozenset[st
     """
     import pyvista
 
-    shells = []
-    for path in _find_pieces(directory / VOLUME_INDEX, only):
-        piece = read_vtu(path)
-        a, b, c, d = (piece.mesh.points[piece.mesh.cells[:, k], 1] for k in range(4))
-        north = (a + b + c + d) / 4 > origin[1]
+    points, corners, n_points = [], [], 0
+    paths = _find_pieces(directory / BOUNDARY_INDEX, only)
+    for path, volume in zip(paths, _find_volumes(directory, paths), strict=True):
+        rim = read_vtp(path)
+        low, high = ((end(rim.points[:, :2], axis=0) - origin[:2]) for end in (np.min, np.max))
+        if high[1] <= 0 or (low >= within).any() or (high <= -within).any():
+            continue
+        piece = read_vtu(volume)
+        x, y = (_average(piece.mesh.points[:, k], piece.mesh.cells) for k in range(2))
+        north = (y > origin[1]) & (y < origin[1] + within) & (np.abs(x - origin[0]) < within)
         if REGION in piece.cell_data:
             north &= piece.cell_data[REGION] == Region.AIR
-        if north.any():
-            grid = pyvista.UnstructuredGrid({TETRA: piece.mesh.cells[north]}, piece.mesh.points - origin)
-            shells.append(grid.extract_surface(algorithm=None))
-    if not shells:
+        if not north.any():
+            continue
+        city = rim.vertex[rim.boundary.facets[np.isin(rim.boundary.marker, SHOWN)]]
+        faces = find_outer_faces(piece.mesh.points, piece.mesh.cells[north], city)
+        used, rows = np.unique(faces, return_inverse=True)
+        points.append(piece.mesh.points[used] - origin)
+        corners.append(rows.reshape(-1, 3) + n_points)
+        n_points += len(used)
+    if not n_points and within < np.inf:
+        return load_air(directory, origin, only=only)
+    if not n_points:
         raise InputError(f"{directory / VOLUME_INDEX}: has no cell north of y = {origin[1]:.1f} m; run again")
-    return shells[0].append_polydata(*shells[1:]) if shells[1:] else shells[0]
+    return pyvista.PolyData.from_regular_faces(np.concatenate(points), np.concatenate(corners))
+
+
+def _average(values: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Mean over the four corners of cells."""
+    total: NDArray[np.float64] = values[cells[:, 0]]
+    for k in range(1, 4):
+        total += values[cells[:, k]]
+    return total / 4
+
+
+def find_outer_faces(
+    points: NDArray[np.float64], cells: NDArray[np.int32], hidden: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Find the faces of cells that no two of them have.
+
+    Parameters
+    ----------
+    points : float64, (n, 3)
+        Vertices.
+    cells : int32, (m, 4)
+        Rows of `points`.
+    hidden : int64, (h, 3)
+        Faces that are left out.
+
+    Returns
+    -------
+    int64, (k, 3)
+        Rows of `points`, counter-clockwise seen from outside.
+
+    Notes
+    -----
+    VTK finds them, for a strip of cells at a time, as it takes some 150 bytes a cell.
+    """
+    import pyvista
+
+    strips = np.array_split(np.argsort(points[cells[:, 0], 0]), max(1, len(cells) // STRIP_CELLS))
+    found = []
+    for strip in strips:
+        surface = pyvista.UnstructuredGrid({TETRA: cells[strip]}, points).extract_surface(
+            algorithm=None, pass_cellid=False
+        )
+        found.append(surface.point_data["vtkOriginalPointIds"][surface.regular_faces])
+    faces = np.concatenate(found)
+    name = name_facets(np.concatenate([faces, hidden]), len(points))
+    outer: NDArray[np.int64] = faces[(np.bincount(name) == 1)[name[: len(faces)]]]
+    return outer
 
 
 def sew(points: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -372,6 +436,15 @@ def _find_pieces(path: Path, only: frozenset[str] | None = None) -> list[Path]:
     return [piece for piece in read_piece_paths(path) if only is None or piece.stem in only]
 
 
+def _find_volumes(directory: Path, boundaries: list[Path]) -> list[Path]:
+    """Find the cells of pieces of the boundary."""
+    names = [path.stem for path in boundaries]
+    volumes = _find_pieces(directory / VOLUME_INDEX, frozenset(names))
+    if [path.stem for path in volumes] != names:
+        raise InputError(f"{directory}: {VOLUME_INDEX} and {BOUNDARY_INDEX} have other pieces; run again")
+    return volumes
+
+
 def _take_shown(piece: BoundaryPiece, row: int, volume: Path | None) -> Facets:
     """Take ground, walls and roofs, with the quality of the cells of a volume piece behind them."""
     boundary = piece.boundary
@@ -379,8 +452,6 @@ def _take_shown(piece: BoundaryPiece, row: int, volume: Path | None) -> Facets:
     used, corners = np.unique(boundary.facets[shown], return_inverse=True)
     ratio = np.full(len(shown), np.nan, np.float32)
     if volume is not None:
-        from tiler.mesh_files.facet_quality import measure_facets
-
         ratio = measure_facets(read_vtu(volume).mesh, piece)
     return Facets(
         piece.points[used],

@@ -140,8 +140,9 @@ def render_run(
     -----
     The camera follows from the region alone, but VTK samples the shade between buildings at random: two pictures
     of one run differ in some pixels.
-    Memory is bounded: facets beyond `picture_data.MOST_FACETS` are made coarser, and what is shown cell by
-    cell, ``"mesh"``, ``"overview"`` and ``"sizes"``, is the middle of a larger region (`find_middle`).
+    Memory is bounded: most of it is VTK's, some 100 bytes for each pixel drawn. Facets beyond
+    `picture_data.MOST_FACETS` are made coarser, and what is shown cell by cell, ``"mesh"``, ``"overview"`` and
+    ``"sizes"``, is the middle of a larger region (`find_middle`).
     Edges fade out as triangles get small on the picture. Everything is moved to the origin first,
     since graphics cards compute in single precision.
     """
@@ -310,6 +311,7 @@ def _plotter(size: tuple[int, int]) -> Iterator[Any]:
     with pyvista.vtk_verbosity("off"):
         window = [SAMPLES * pixels for pixels in size]
         plotter = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
+        plotter.disable_anti_aliasing()  # `SAMPLES` is that; VTK would draw each of its pixels several times
         try:
             yield plotter
         finally:

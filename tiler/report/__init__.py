@@ -1,5 +1,1 @@
 """The report of a run: one page of what was made, how good it is, what was left out, and where the time went."""
-
-from tiler.report.write import write_report
-
-__all__ = ["write_report"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError
 from tiler.pictures.picture_data import find_middle, load_air, load_city
-from tiler.pictures.render import draw_city, need_graphics
+from tiler.pictures.render import CLOSE, draw_city, need_graphics
 from tiler.report.page import figure, paragraph, text
 
 SIZE = (1120, 700)
@@ -43,7 +43,7 @@ def describe_pictures(directory: Path) -> Iterator[str]:
     )
     middle = find_middle(directory)
     part = city if middle is None and not city.step else load_city(directory, only=middle)
-    air = load_air(directory, part.origin, only=frozenset(part.names))
+    air = load_air(directory, part.origin, only=frozenset(part.names), within=2 * CLOSE)
     yield _embed(
         draw_city(part, SIZE, air=air, close=True),
         "The mesh in the middle of the region, cut open from west to east.",

@@ -21,7 +21,7 @@ from tiler.export.export import export_run
 from tiler.mesh_files.mesh_parts import TileParts, join_tiles, label_triangles, report_parts
 from tiler.mesh_files.mesh_pieces import open_pieces
 from tiler.mesh_files.run_files import find_files, take_largest_part
-from tiler.report import write_report
+from tiler.report.write import write_report
 from tiler.store.results import StoredTerrain
 from tiler.store.run_folder import read_run_record
 from tiler.workflow.run import run

@@ -21,7 +21,7 @@ from tests.helpers.written_models import read_city_model
 from tiler.mesh_files.facet_quality import measure_facets
 from tiler.mesh_files.vtk_files import read_vtp, read_vtu, write_pvtp
 from tiler.pictures.city_model_data import DEEP, load_blocks
-from tiler.pictures.picture_data import Facets, coarsen, find_middle, join_facets, load_city
+from tiler.pictures.picture_data import Facets, coarsen, find_middle, join_facets, load_air, load_city
 from tiler.pictures.picture_parts import QUALITY_COLOURS, blend, heights_above_ground
 from tiler.pictures.render import render_run
 from tiler.store.out_folder import CITY_MODEL
@@ -66,6 +66,22 @@ def test_coarsening_keeps_the_worst_of_equal_triangles() -> None:
     assert (coarse.building.tolist(), coarse.quality.tolist()) == ([8], [np.float32(0.3)])
     assert coarse.points[:, :2].tolist() == [[0.5, 0.5], [4.5, 0.5], [4.5, 4.5]]
     assert len(coarsen(join_facets([part, part]), 8.0)) == 0  # all in one cell
+
+
+def test_the_air_has_no_ground_or_building(small_run: Path) -> None:
+    city = load_city(small_run)
+    air = load_air(small_run, city.origin).cell_centers().points
+    known = set(map(tuple, city.points[city.facets].mean(axis=1).round(2).tolist()))
+    assert known.isdisjoint(map(tuple, air.round(2).tolist()))
+
+
+def test_the_air_around_the_middle_is_a_part_of_all(small_run: Path) -> None:
+    origin = load_city(small_run).origin
+    air, part = (load_air(small_run, origin, within=within).points for within in (np.inf, 60.0))
+    assert set(map(tuple, part[part[:, 1] < 1].tolist())) < set(map(tuple, air.tolist()))
+    assert np.abs(part[:, :2]).max() < 80 < np.abs(air[:, :2]).max()
+    elsewhere = load_air(small_run, origin + np.array([1e4, 0, 0]), within=60.0).points
+    assert np.array_equal(elsewhere[:, 1:], air[:, 1:])
 
 
 def spread(scene: Path, folder: Path, along: int) -> None:

@@ -17,13 +17,13 @@ from pipeline.data.errors import InputError
 from pipeline.quality.histograms import share_below
 from tests.helpers.tiles import hash_files
 from tiler.cli.main import main
-from tiler.report import write_report
 from tiler.report.charts import Series, draw_gantt, draw_histogram
 from tiler.report.maps import draw_map, gather_tiles, shade
 from tiler.report.record import SHOWN, read_run_facts
 from tiler.report.samples import measure_samples
 from tiler.report.svg_map import encode_png
 from tiler.report.timeline import BINS, read_timeline
+from tiler.report.write import write_report
 from tiler.stages.domain import LOW_DOMAIN
 from tiler.words.note_words import GROUPS, WORDS, group_of, say_notes
 
