@@ -25,7 +25,8 @@ from pipeline.columns.nodes import (
     take_columns,
 )
 from pipeline.columns.spacing import SpacingLimits, column_spacing
-from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges
+from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, SeamEdges
+from pipeline.data.regions import Region
 from pipeline.plane_mesh.edges import plane_edges
 from pipeline.plane_mesh.sizes import SizeField
 

@@ -7,6 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.data.regions import Region, Regions
+
 
 class Marker(IntEnum):
     """What a facet bounds; ground with soil below, and walls and roofs of solids, have cells on both sides."""
@@ -34,15 +36,6 @@ def is_ground(marker: NDArray[np.int32]) -> NDArray[np.bool_]:
     return found
 
 
-class Region(IntEnum):
-    """What a cell is filled with."""
-
-    AIR = 0
-    SOIL = 1
-    BUILDING = 2
-
-
-Regions = tuple[Region, ...]
 # Markers of the facets between two regions, where a mesh has both: they point out of the first.
 INTERFACES = {
     (Region.AIR, Region.SOIL): (Marker.GROUND,),

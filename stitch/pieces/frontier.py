@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import Region
+from pipeline.data.regions import Region
 from stitch.pieces.conformity import group_rows
 
 MARKED = 8  # added to the region of a face, see `Rim`

@@ -72,8 +72,8 @@ ORDER = {
     "tiler": [
         "words", "objects", "config", "store", "georeference", "engine", "monitoring", "vectors",
         "pointclouds", "footprints", "cityinput", "citymodels", "mesh_files", "stages", "landcover", "planning",
-        "dashboard", "executors", "jobs", "pictures", "report", "workflow", "editing", "export", "tiles3d", "wind",
-        "check", "formats", "convert", "towns", "generalisation", "detail", "interface", "cli",
+        "dashboard", "executors", "jobs", "pictures", "report", "workflow", "editing", "export", "tiles3d",
+        "serving", "wind", "check", "formats", "convert", "towns", "generalisation", "detail", "interface", "cli",
     ],
     "pipeline": [
         "data", "geometry", "points_terrain", "generalisation", "architecture", "facades", "skeletons", "roofs",

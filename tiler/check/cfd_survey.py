@@ -9,7 +9,8 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import Marker, Region
+from pipeline.data.mesh import Marker
+from pipeline.data.regions import Region
 from pipeline.quality.histograms import Histogram, count_values, merge_histograms, no_values
 from tiler.citymodels.building_index import BuildingIndex, index_buildings
 from tiler.export.wind_profile import SIDES, flow_of, split_sides

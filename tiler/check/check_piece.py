@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import INTERFACES, Boundary, Marker, Region, Regions, TetMesh, find_inside
+from pipeline.data.mesh import INTERFACES, Boundary, Marker, TetMesh, find_inside
+from pipeline.data.regions import Region, Regions
 from stitch.pieces import conformity
 from stitch.pieces.frontier import (
     MARKED,

@@ -7,7 +7,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import Marker, Region, Regions
+from pipeline.data.mesh import Marker
+from pipeline.data.regions import Region, Regions
 from pipeline.data.roofs import roof_heights
 from stitch.pieces.conformity import group_rows
 from stitch.pieces.frontier import group_places

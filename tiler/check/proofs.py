@@ -10,7 +10,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import Boundary, Marker, Region, TetMesh
+from pipeline.data.mesh import Boundary, Marker, TetMesh
+from pipeline.data.regions import Region
 from stitch.pieces import conformity
 from stitch.pieces.frontier import Settled, find_edges_below
 from tiler.store.run_folder import RunRecord

@@ -4,7 +4,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import INTERFACES, Marker, Region
+from pipeline.data.mesh import INTERFACES, Marker
+from pipeline.data.regions import Region
 from stitch.pieces import conformity
 from stitch.pieces.frontier import as_places
 from tiler.check.proofs import (

@@ -83,6 +83,21 @@ def join_rows(several: Sequence[ModelRows]) -> ModelRows:
     return ModelRows(**joined, start=start.astype(np.int64), roofs=roofs)
 
 
+def mean_roofs(rows: ModelRows) -> Array:
+    """Give the mean height of each roof above the building's lowest place (m): its volume over its area.
+
+    Where there is no roof it is the height that an attribute gives, NaN without one.
+    """
+    owner = np.repeat(np.arange(len(rows)), np.diff(rows.start))
+    area = shapely.area(rows.surfaces)
+    middle = shapely.get_coordinates(shapely.centroid(rows.surfaces)).reshape(-1, 2)
+    top = rows.roofs.plane[:, 2] + (rows.roofs.plane[:, :2] * (middle - rows.roofs.origin)).sum(axis=1)
+    total = np.bincount(owner, area, minlength=len(rows))
+    with np.errstate(invalid="ignore"):
+        mean = np.bincount(owner, area * top, minlength=len(rows)) / total - rows.base
+    return np.where(total > 0, mean, rows.given_height)
+
+
 def make_rows(
     buildings: Sequence[ModelBuilding], frame: Frame, asked: str, counts: Counter[str], shift: float = 0.0
 ) -> tuple[ModelRows, list[Note]]:

@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from pipeline.data.errors import InputError
+from pipeline.data.errors import ConfigError, InputError
 from tiler.cityinput.citygml import Relief, scan_citygml
 from tiler.cityinput.cityjson import read_buildings, read_objects, read_relief
 from tiler.cityinput.crs_names import NamedCrs, read_crs_name
 from tiler.cityinput.face_planes import signed_volume, upward_area
 from tiler.cityinput.faces import ModelBuilding
 from tiler.cityinput.geopackage import SIGNATURE, scan_geopackage
-from tiler.georeference.crs import horizontal_crs, is_on_its_place
+from tiler.georeference.crs import crs_text, horizontal_crs, is_on_its_place, parse_crs
+from tiler.georeference.frame import Frame
 from tiler.pointclouds.clouds import CloudHeader
 
 CLOUD, MODEL, TERRAIN = "cloud", "model", "terrain"
@@ -134,6 +135,17 @@ def read_model_header(path: Path, axis_order: str = "") -> CloudHeader:
         path, n, (*box, *heights), name.crs, unread=unread, kind=MODEL, swapped=swapped, axes=why,
         n_buildings=found.n_buildings,
     )  # fmt: skip
+
+
+def frame_of(header: CloudHeader, target: str) -> Frame:
+    """Give the way from a city model to a CRS, ``""`` for its own; ConfigError where one of them is unknown."""
+    axes = ((1, 1.0), (0, 1.0)) if header.swapped else ((0, 1.0), (1, 1.0))
+    if not target:
+        return Frame(*axes)
+    wanted, own = horizontal_crs(parse_crs(target)), horizontal_crs(header.crs)
+    if own is None or wanted is None:
+        raise ConfigError(f"{header.path}: has no CRS that --crs {target} could be reached from; leave --crs out")
+    return Frame(*axes, source=crs_text(own), target=crs_text(wanted))
 
 
 def choose_axes(

@@ -34,7 +34,6 @@ BLOCK_HEIGHTS = {"1.2": "lod12_height", "1.3": "lod13_height"}
 RUN = 512  # buildings that are written at once, and share their vertices
 # Semantic surfaces of every solid, by the numbers GROUND, ROOF and WALL.
 SURFACES = '[{"type":"GroundSurface"},{"type":"RoofSurface"},{"type":"WallSurface"}]'
-WITHOUT_COMMA = {bool, int, float, type(None)}  # types of values whose text has no comma
 Attributes = Mapping[str, Sequence[object]]
 
 
@@ -163,13 +162,16 @@ class _Writer:
         self._check_ids(model.ids)
         levels, notes = build_solids(model, self.origin, grid=GRID, blocks=_block_heights(columns))
         self.notes += notes
-        attributes = _attribute_texts(columns, model.roofs)
-        geometry = _geometry_texts(levels, self.lines.n_vertices)
-        rows = list(zip(model.ids.tolist(), model.house.tolist(), attributes, geometry, strict=True))
-        self.lines.add_objects(_object_text(*row) for row in rows)
-        for name, house, *_ in rows:
+        attributes, geometry = (
+            _attribute_texts(columns, model.roofs),
+            _geometry_texts(levels, self.lines.n_vertices),
+        )
+        ids, houses = model.ids.tolist(), model.house.tolist()
+        for name, house in zip(ids, houses, strict=True):
             if house != name:
                 self.children.setdefault(house, []).append(name)
+        rows = zip(_value_texts(ids), _value_texts(houses), attributes, geometry, strict=True)
+        self.lines.add_objects(_object_text(*texts) for texts in rows)
         if len(levels.vertices):
             places = levels.vertices * GRID + self.origin
             self.box = np.vstack((self.box, places.min(axis=0), places.max(axis=0)))
@@ -240,9 +242,9 @@ def _take_rows(block: tuple[CityModel, Attributes], rows: slice) -> tuple[CityMo
 
 
 def _object_text(name: str, house: str, attributes: str, geometry: str) -> str:
-    """Write a city object: a building, or a part of the house that the row names."""
-    kind, parents = ("Building", "") if name == house else ("BuildingPart", f',"parents":[{compact(house)}]')
-    return f'{compact(name)}:{{"type":"{kind}","attributes":{attributes},"geometry":{geometry}{parents}}}'
+    """Write a city object, its texts given: a building, or a part of the house that the row names."""
+    kind, parents = ("Building", "") if name == house else ("BuildingPart", f',"parents":[{house}]')
+    return f'{name}:{{"type":"{kind}","attributes":{attributes},"geometry":{geometry}{parents}}}'
 
 
 def _columns(model: CityModel, extra: Attributes) -> dict[str, Sequence[object]]:
@@ -267,9 +269,10 @@ def _attribute_texts(columns: Attributes, roofs: Roofs) -> list[str]:
     form = ",".join(f"{compact(name).replace('%', '%%')}:%s" for name in columns)
     texts = [_value_texts(column) for column in columns.values()]
     planes = np.column_stack((roofs.plane, roofs.origin, roofs.limits)).tolist()
+    words = compact(planes)[2:-2].split("],[")  # a list of numbers each
     last = [
-        "" if flat else f",{compact(PLANE)}:{compact(plane)}"
-        for flat, plane in zip(is_flat(roofs).tolist(), planes, strict=True)
+        "" if flat else f",{compact(PLANE)}:[{plane}]"
+        for flat, plane in zip(is_flat(roofs).tolist(), words, strict=True)
     ]
     rows = zip(*texts, strict=True)
     return [f"{{{form % row}{plane}}}" for row, plane in zip(rows, last, strict=True)]
@@ -277,11 +280,15 @@ def _attribute_texts(columns: Attributes, roofs: Roofs) -> list[str]:
 
 def _value_texts(column: Sequence[object]) -> list[str]:
     """Write each value of a column; NaN and infinity as null."""
-    plain = [value.item() if isinstance(value, np.generic) else value for value in column]
-    values = [None if isinstance(value, float) and not isfinite(value) else value for value in plain]
-    if set(map(type, values)) <= WITHOUT_COMMA:
-        return compact(values)[1:-1].split(",")  # all at once: a call for each takes ten times as long
-    return [compact(value) for value in values]
+    values = list(column)
+    if any(issubclass(kind, np.generic) for kind in set(map(type, values))):
+        values = [value.item() if isinstance(value, np.generic) else value for value in values]
+    kinds = set(map(type, values))
+    if float in kinds and not (kinds == {float} and np.isfinite(np.array(values, np.float64)).all()):
+        values = [None if isinstance(value, float) and not isfinite(value) else value for value in values]
+    # All at once: a call for each takes ten times as long. As many parts as values: no value has a comma.
+    texts = compact(values)[1:-1].split(",")
+    return texts if len(texts) == len(values) else [compact(value) for value in values]
 
 
 def _reference_system(crs: str) -> str | None:

@@ -231,17 +231,22 @@ def pack_model(buildings: Buildings, *, zoned: bool = False) -> Arrays:
 
 def find_changed(old: Arrays, new: Arrays) -> list[tuple[float, float, float, float]]:
     """Find where two states of `NEAR_ARRAYS` differ: boxes (m) of the buildings that changed, before and after."""
-    before, after = _rows_by_id(old), _rows_by_id(new)
+    before, after = rows_by_id(old), rows_by_id(new)
     changed = [name for name in before.keys() | after.keys() if before.get(name) != after.get(name)]
     return [state[name][0] for name in changed for state in (before, after) if name in state]
 
 
-def _rows_by_id(arrays: Arrays) -> dict[str, tuple[Any, ...]]:
-    """Box, and all else as bytes, of each building by its id."""
-    blobs = cut_blobs(arrays["polygon"], arrays["polygon_start"])
-    others = [arrays[name] for name in NEAR_ARRAYS if name not in ("polygon", "polygon_start", "id")]
+def rows_by_id(arrays: Arrays, names: Sequence[str] = NEAR_ARRAYS) -> dict[str, tuple[Any, ...]]:
+    """Box, and of all else the bytes, of each building of the stage ``model`` by its id."""
+    cut = {name for name in ("polygon", "member") if name in names}
+    whole = [arrays[name] for name in names if name.removesuffix("_start") not in {*cut, "id"}]
+    parts = [(arrays[name], arrays[f"{name}_start"].tolist()) for name in sorted(cut)]
     return {
-        name: (tuple(box), blobs[k], *(values[k].tobytes() for values in others))
+        name: (
+            tuple(box),
+            *(values[start[k] : start[k + 1]].tobytes() for values, start in parts),
+            *(values[k].tobytes() for values in whole),
+        )
         for k, (name, box) in enumerate(zip(arrays["id"].tolist(), arrays["extents"].tolist(), strict=True))
     }
 

@@ -251,6 +251,15 @@ def _view(options: argparse.Namespace) -> int:
     return 0
 
 
+def _serve(options: argparse.Namespace) -> int:
+    from tiler.serving.serve import Placed, read_token, show_city
+
+    placed = Placed(options.geoid_height, options.vertical_crs)
+    more = {"token": read_token(options.token_file), "workers": options.workers, "placed": placed}
+    show_city(options.directory, f"{options.host}:{options.port}", say, **more)
+    return 0
+
+
 def _report(options: argparse.Namespace) -> int:
     from tiler.report.write import write_report
 
@@ -558,6 +567,7 @@ HANDLERS: Mapping[str, Handler] = {
     "status": _status,
     "dashboard": _dashboard,
     "view": _view,
+    "serve": _serve,
     "report": _report,
     "fetch": _fetch,
     "synth": _synth,

@@ -103,6 +103,19 @@ class Parser(argparse.ArgumentParser):
         self.error(f"unrecognized arguments: {' '.join(words)}")
 
 
+ON_GLOBE: dict[str, dict[str, Any]] = {  # where 3D Tiles lie
+    "geoid_height": {
+        "type": float,
+        "metavar": "M",
+        "help": "height of the geoid above the ellipsoid, added to all heights (default: 0)",
+    },
+    "vertical_crs": {
+        "metavar": "EPSG",
+        "help": "CRS of the heights, such as EPSG:5709; PROJ adds the height of the geoid at each place",
+    },
+}
+
+
 def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     """Make the parser of all commands; the parameters of a run come from `Config`.
 
@@ -144,7 +157,9 @@ def build_parser(handlers: Mapping[str, Handler]) -> argparse.ArgumentParser:
     board.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a run")
     view = command("view", "show exported 3D Tiles in a browser")
     view.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of the tiles")
-    _add_address(board, view)
+    serve = command("serve", "show a finished run in a browser, and take edits over HTTP")
+    _add_serve(serve)
+    _add_address(board, view, serve)
     _add_report(command("report", "write report.html: output and quality of a run, and what was left out"))
     _add_fetch(command("fetch", "fetch the folder of a run from a bucket, and verify its checksums"))
     synth = command(
@@ -495,6 +510,17 @@ def _add_address(*servers: argparse.ArgumentParser) -> None:
         )
 
 
+def _add_serve(serve: argparse.ArgumentParser) -> None:
+    """Add what the service of a run folder needs."""
+    serve.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a finished run")
+    serve.add_argument(
+        "--token-file", type=Path, metavar="FILE", help="token of clients; needed where other machines ask"
+    )
+    serve.add_argument("--workers", type=int, default=0, metavar="N", help="worker processes (default: this one)")
+    for option, words in ON_GLOBE.items():
+        serve.add_argument(f"--{option.replace('_', '-')}", default=0.0 if "type" in words else "", **words)
+
+
 def _add_edit(edit: argparse.ArgumentParser) -> None:
     """Add what is done with a city and its journal."""
     edit.add_argument("directory", type=_on_disk, metavar="DIR", help="folder of a finished run")
@@ -570,15 +596,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
             "metavar": "X,Y,Z|auto",
             "help": "origin of the coordinates in whole metres; auto: the region's south-western corner",
         },
-        "geoid_height": {
-            "type": float,
-            "metavar": "M",
-            "help": "height of the geoid above the ellipsoid, added to all heights (default: 0)",
-        },
-        "vertical_crs": {
-            "metavar": "EPSG",
-            "help": "CRS of the heights, such as EPSG:5709; PROJ adds the height of the geoid at each place",
-        },
+        **ON_GLOBE,
         "slice_height": {
             "type": float,
             "action": "append",

@@ -11,11 +11,11 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.errors import InputError
 from tiler.cityinput.faces import Faces, ModelBuilding
-from tiler.cityinput.sources import MODEL, kind_of, read_model_header, scan_model
+from tiler.cityinput.sources import MODEL, frame_of, kind_of, read_model_header, scan_model
 from tiler.formats.cityjsonseq import write_cityjsonseq
-from tiler.georeference.crs import box_around, box_words, crs_name, crs_text, horizontal_crs, parse_crs, same_crs
+from tiler.georeference.crs import box_around, box_words, crs_name, parse_crs, same_crs
 from tiler.georeference.frame import Frame, box_to_region, to_region
 from tiler.mesh_files.run_files import RUN_RECORD
 from tiler.pointclouds.clouds import CloudHeader
@@ -96,7 +96,7 @@ def open_source(paths: Sequence[Path], *, crs: str = "", axis_order: str = "") -
                 raise InputError(
                     f"{other.path}: {names[1]}; {headers[0].path}: {names[0]}; convert them one by one, with --crs"
                 )
-        frames = [_frame_of(header, crs) for header in headers]
+        frames = [frame_of(header, crs) for header in headers]
         # The box of a header has the easting first already.
         straight = [Frame(source=frame.source, target=frame.target) for frame in frames]
         boxes = [box_to_region(one, header.bounds[:4]) for one, header in zip(straight, headers, strict=True)]
@@ -131,16 +131,6 @@ def _read_header(path: Path, axis_order: str, sequence: Path) -> CloudHeader:
     if not header.n_points:
         raise InputError(f"{path}: has no building with a surface; give another file")
     return replace(header, crs=known) if known is not None else header
-
-
-def _frame_of(header: CloudHeader, target: str) -> Frame:
-    axes = ((1, 1.0), (0, 1.0)) if header.swapped else ((0, 1.0), (1, 1.0))
-    if not target:
-        return Frame(*axes)
-    wanted, own = horizontal_crs(parse_crs(target)), horizontal_crs(header.crs)
-    if own is None or wanted is None:
-        raise ConfigError(f"{header.path}: has no CRS that --crs {target} could be reached from; leave --crs out")
-    return Frame(*axes, source=crs_text(own), target=crs_text(wanted))
 
 
 def _place(building: ModelBuilding, frame: Frame) -> ModelBuilding:

@@ -94,7 +94,9 @@ def serve(follower: Follower, address: str = ANYWHERE) -> Iterator[str]:
 
 
 @contextmanager
-def serve_rules(make_rules: Callable[[bool], list[Any]], address: str) -> Iterator[str]:
+def serve_rules(
+    make_rules: Callable[[bool], list[Any]], address: str, *, most_body: int = MOST_BODY
+) -> Iterator[str]:
     """Serve paths by a server of its own, in a thread; gives its URL, without a slash at its end.
 
     Parameters
@@ -103,6 +105,8 @@ def serve_rules(make_rules: Callable[[bool], list[Any]], address: str) -> Iterat
         Lists the paths for tornado, given whether only this machine reaches the address.
     address : str
         Where to listen, see `read_address`.
+    most_body : int
+        Bytes of a body that is taken.
 
     Raises
     ------
@@ -120,7 +124,7 @@ def serve_rules(make_rules: Callable[[bool], list[Any]], address: str) -> Iterat
     ready = threading.Event()
 
     async def begin() -> HTTPServer:
-        server = HTTPServer(app, max_body_size=MOST_BODY)
+        server = HTTPServer(app, max_body_size=most_body)
         server.add_sockets(sockets)
         ready.set()
         return server

@@ -1,21 +1,31 @@
 """Edits of the city of a run folder, its journal as a table, and the city of a day."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.data.errors import ConfigError, InputError
+from pipeline.data.errors import CityError, ConfigError, InputError, OutputError
 from tiler.config.config import Config, make_config
 from tiler.config.config_file import with_file
-from tiler.editing.requests import find_buildings, find_unused_heights, make_edit, read_date
+from tiler.editing.requests import (
+    Asked,
+    edit_buildings,
+    find_unused_heights,
+    make_edit,
+    read_buildings,
+    read_date,
+)
 from tiler.editing.staging import begin, commit, forget, link_folder, settle
 from tiler.editing.uploads import read_upload
+from tiler.engine.executor import Executor
+from tiler.engine.schedule import StoppedError
 from tiler.engine.watcher import Watcher
 from tiler.mesh_files.run_files import find_files
 from tiler.objects.places import refuse_bucket
 from tiler.store.atomic import replacing_folder
-from tiler.store.edit_journal import Edit, edit_path, read_journal, write_edit
+from tiler.store.edit_journal import Box, Edit, edit_path, read_journal, write_edit
 from tiler.store.folder_lock import is_held, only_run
 from tiler.store.out_folder import CONFIG, RUN_RECORD
 from tiler.words.plain_text import say_nothing
@@ -35,11 +45,41 @@ class Outcome:
         What ``run.json`` holds now.
     files : int
         Files of the folder that changed.
+    unused : tuple of str
+        Buildings whose uploaded height does not count, as roof points in the cloud tell theirs.
     """
 
     edit: Edit
     record: dict[str, Any]
     files: int
+    unused: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class City:
+    """A finished run that can be edited: its folder, its parameters, and CRS and bounds (m) of its region."""
+
+    directory: Path
+    config: Config
+    crs: str
+    bounds: Box
+
+
+@contextmanager
+def held_city(directory: Path, workers: int = 0, say: Callable[[str], None] = say_nothing) -> Iterator[City]:
+    """Hold a run folder, so that nobody else edits it; what a killed edit has left is finished or forgotten.
+
+    Raises
+    ------
+    CityError
+        If it holds no finished run, another process has it, or it cannot be edited.
+    """
+    refuse_bucket(directory, "an edit")
+    with only_run(_finished(directory), say):
+        settle(directory, say)
+        record, config = _read_run(directory, workers)
+        region = record["region"]
+        yield City(directory, config, region["crs"], tuple(region.get("core", region["bounds"])))
 
 
 def edit_city(
@@ -91,36 +131,93 @@ def edit_city(
     The edit is worked out in a second folder, which shares all results by hard links, and moved when it is there:
     whenever this is killed, the next call finishes or forgets it.
     """
-    refuse_bucket(directory, "an edit")
-    day = read_date(date)
-    with only_run(_finished(directory), say):
-        settle(directory, say)
-        record, config = _read_run(directory, workers)
-        journal = read_journal(directory)
-        region = record["region"]
-        bounds = region.get("core", region["bounds"])
-        found = None if upload is None else read_upload(upload, config, crs=region["crs"], bounds=tuple(bounds))
-        edit = make_edit(
-            *(action, name, found, "" if upload is None else upload.name),
-            buildings=find_buildings(directory, journal),
-            journal=journal,
-            date=day,
-            base=base,
-        )
+    with held_city(directory, workers, say) as city:
+        found = None if upload is None else read_upload(upload, city.config, crs=city.crs, bounds=city.bounds)
+        asked = Asked(action, name, found, "" if upload is None else upload.name, date, base)
+        (outcome,) = edit_together(city, [asked], say=say, watchers=watchers)
+    if isinstance(outcome, CityError):
+        raise outcome
+    return outcome
+
+
+def edit_together(
+    city: City,
+    asked: Sequence[Asked],
+    *,
+    executor: Executor | None = None,
+    say: Callable[[str], None] = say_nothing,
+    watchers: Sequence[Watcher] = (),
+) -> list[Outcome | CityError]:
+    """Do edits in their order, and mesh what they touch in one transaction; the caller holds the folder.
+
+    Parameters
+    ----------
+    city : City
+        What is edited.
+    asked : sequence of Asked
+        Edits that wait.
+    executor : Executor, optional
+        Runs the tasks; by default that of the city's parameters.
+    say, watchers
+        As for `edit_city`.
+
+    Returns
+    -------
+    list of Outcome or CityError
+        What came of each: one that is refused leaves the others as they are. Where the mesh cannot be made with
+        all of them, each has a transaction of its own.
+    """
+    settle(city.directory, say)
+    journal = read_journal(city.directory)
+    given, found = read_buildings(city.directory), list[Edit | CityError]()
+    for one in asked:
         try:
-            work = begin(directory)
+            edit = make_edit(one, buildings=edit_buildings(given, journal), journal=journal)
+        except CityError as error:
+            found.append(error)
+            continue
+        found.append(edit)
+        journal.append(edit)
+    edits = [one for one in found if isinstance(one, Edit)]
+    if not edits:
+        return [one for one in found if isinstance(one, CityError)]
+    try:
+        done = {outcome.edit: outcome for outcome in _mesh(city, edits, executor, say, watchers)}
+    except CityError as error:
+        if len(edits) > 1 and not isinstance(error, OutputError | StoppedError):
+            return [edit_together(city, [one], executor=executor, say=say, watchers=watchers)[0] for one in asked]
+        return [error if isinstance(one, Edit) else one for one in found]
+    return [done[one] if isinstance(one, Edit) else one for one in found]
+
+
+def _mesh(
+    city: City,
+    edits: Sequence[Edit],
+    executor: Executor | None,
+    say: Callable[[str], None],
+    watchers: Sequence[Watcher],
+) -> list[Outcome]:
+    """Mesh a city with further edits in its second folder, and commit it; CityError if that cannot be."""
+    record, _ = read_sealed_record(city.directory / RUN_RECORD)
+    try:
+        work = begin(city.directory)
+        for edit in edits:
             write_edit(work, edit)
-            made = run(config, watchers=watchers, within=work)
-            if lost := sorted(made["missing"].keys() - record["missing"].keys()):
-                raise InputError(
-                    f"edit of {', '.join(edit.ids)}: tile {lost[0]} cannot be meshed with it "
-                    f"({made['missing'][lost[0]]['reason']}); the city is as before"
-                )
-            if unused := find_unused_heights(work, edit):
-                say(f"roof points in the cloud give the height, not the upload: {', '.join(unused)}")
-            return Outcome(edit, made, commit(directory))
-        finally:
-            forget(directory)
+        made = run(city.config, watchers=watchers, within=work, executor=executor)
+        if lost := sorted(made["missing"].keys() - record["missing"].keys()):
+            names = ", ".join(name for edit in edits for name in edit.ids)
+            raise InputError(
+                f"edit of {names}: tile {lost[0]} cannot be meshed with it "
+                f"({made['missing'][lost[0]]['reason']}); the city is as before"
+            )
+        unused = [tuple(find_unused_heights(work, edit)) for edit in edits]
+        if any(unused):
+            names = ", ".join(name for some in unused for name in some)
+            say(f"roof points in the cloud give the height, not the upload: {names}")
+        files = commit(city.directory)
+        return [Outcome(edit, made, files, some) for edit, some in zip(edits, unused, strict=True)]
+    finally:
+        forget(city.directory)
 
 
 def city_at(

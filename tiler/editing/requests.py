@@ -1,8 +1,8 @@
 """What is asked for, held against the city and its journal: ids, dates, and edits that came between."""
 
 import datetime
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,8 +20,48 @@ from tiler.store.store import Store
 ACTIONS = ("replace", "remove", "add")
 
 
-def find_buildings(out: Path, journal: Sequence[Edit]) -> dict[str, Box]:
-    """List the footprints of a city as its edits have left them: id and box (m) of each."""
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """An edit as it is asked for.
+
+    Attributes
+    ----------
+    action : str
+        One of `ACTIONS`.
+    building : str
+        Id of the building; ``""`` to add those of the upload.
+    upload : Footprints or None
+        What comes.
+    source : str
+        Name of its file.
+    date : str
+        Day from which on it holds, YYYY-MM-DD; today by default.
+    base : int or None
+        Number of the last edit that the client knows of; by default of all.
+    request, digest : str
+        Name that a client gave it, and a hash of what it sent; empty without one.
+    """
+
+    action: str
+    building: str = ""
+    upload: Footprints | None = None
+    source: str = ""
+    date: str = ""
+    base: int | None = None
+    request: str = ""
+    digest: str = ""
+
+
+class ConflictError(ConfigError):
+    """A later edit is of the same building: look at `edits`, and ask again."""
+
+    def __init__(self, message: str, edits: Sequence[Edit] = ()) -> None:
+        super().__init__(message)
+        self.edits = tuple(edits)
+
+
+def read_buildings(out: Path) -> dict[str, Box]:
+    """List the footprints of the input of a city: id and box (m) of each."""
     store = Store(out / STORE)
     found: dict[str, Box] = {}
     if store.attributes("footprints", REGION_ITEM)["facts"]["n"]:
@@ -29,7 +69,12 @@ def find_buildings(out: Path, journal: Sequence[Edit]) -> dict[str, Box]:
         text, ends = arrays["id"].tobytes(), [0, *arrays["id_end"].tolist()]
         for (first, last), box in zip(pairwise(ends), arrays["box"].tolist(), strict=True):
             found[text[first:last].decode()] = tuple(box)
-    edits = add_up(journal)
+    return found
+
+
+def edit_buildings(given: Mapping[str, Box], journal: Sequence[Edit]) -> dict[str, Box]:
+    """List the footprints of a city as its edits have left those of the input, `given`."""
+    found, edits = dict(given), add_up(journal)
     for name, _ in edits.removed:
         found.pop(name, None)
     return found | {outline[0]: box for outline, box in edits.outlines}
@@ -53,44 +98,29 @@ def read_date(text: str) -> str:
         raise ConfigError(f"date {text!r}: is no day; give YYYY-MM-DD") from None
 
 
-def make_edit(
-    action: str,
-    name: str,
-    upload: Footprints | None,
-    source: str,
-    *,
-    buildings: dict[str, Box],
-    journal: Sequence[Edit],
-    date: str,
-    base: int | None,
-) -> Edit:
+def make_edit(asked: Asked, *, buildings: Mapping[str, Box], journal: Sequence[Edit]) -> Edit:
     """Make the next edit of a journal.
 
     Parameters
     ----------
-    action : str
-        One of `ACTIONS`.
-    name : str
-        Id of the building; ``""`` to add those of the upload.
-    upload : Footprints or None
-        What comes.
-    source : str
-        Name of its file.
-    buildings : dict of str to box
-        From `find_buildings`.
+    asked : Asked
+        What is asked for.
+    buildings : mapping of str to box
+        From `edit_buildings`.
     journal : sequence of Edit
         All earlier edits.
-    date : str
-        From `read_date`.
-    base : int or None
-        Number of the last edit that the client knows of; by default of all.
 
     Raises
     ------
+    ConflictError
+        For a building that an edit after ``base`` has touched.
     ConfigError
-        For an id that is not there, or is there already; for a building that an edit after `base` has touched;
-        for a date before that of its last edit.
+        For an id that is not there, or is there already; for a date before that of its last edit.
+    InputError
+        If an id comes twice, or several footprints take the place of one building.
     """
+    action, name, upload, base = asked.action, asked.building, asked.upload, asked.base
+    date = read_date(asked.date)
     last = journal[-1].number if journal else 0
     if base is not None and not 0 <= base <= last:
         raise ConfigError(f"--base {base}: the last edit is number {last}; citystitch edit DIR --list tells all")
@@ -103,7 +133,7 @@ def make_edit(
         if there := sorted(ids.intersection(buildings)):
             raise ConfigError(f"building {there[0]!r}: is there already; replace it, or give another id")
         if len(ids) < len(outlines):
-            raise InputError(f"{source}: an id comes twice; give each building its own")
+            raise InputError(f"{asked.source}: an id comes twice; give each building its own")
         # The parts of a house get such names: a footprint of the input with one makes all tiles look for it.
         if parts := sorted(one for one in ids if "-part" in one):
             raise ConfigError(f"building {parts[0]!r}: ids with '-part' are those of parts; give another id")
@@ -113,20 +143,25 @@ def make_edit(
             raise ConfigError(f"building {name!r}: is not in the city; ids are those of its footprints")
         if action == "replace" and len(outlines) != 1:
             raise InputError(
-                f"{source}: has {len(outlines)} footprints, one takes the place of a building; give one"
+                f"{asked.source}: has {len(outlines)} footprints, one takes the place of a building; give one"
             )
         removed = ((name, buildings[name]),)
-    return Edit(last + 1, date, action, source, removed, outlines, boxes)
+    return Edit(
+        *(last + 1, date, action, asked.source, removed, outlines, boxes),
+        request=asked.request,
+        digest=asked.digest,
+    )
 
 
 def _refuse_conflicts(ids: set[str], journal: Sequence[Edit], date: str, base: int) -> None:
     """Refuse an edit of a building that a later edit than `base` has touched, or one of a later day."""
-    for edit in journal:
-        for one in sorted(ids.intersection(edit.ids)):
-            told = f"building {one!r}: edit {edit.number} of {edit.date} ({edit.action}"
-            told += f", {edit.source})" if edit.source else ")"
-            if edit.number > base:
-                last = journal[-1].number
-                raise ConfigError(f"{told} came after state {base}; look at it, then give --base {last}")
-            if date < edit.date:
-                raise ConfigError(f"{told} is later than {date}; give a date from {edit.date} on")
+    same = [edit for edit in journal if ids.intersection(edit.ids)]
+    later = [edit for edit in same if edit.number > base]
+    for edit in later or same:
+        told = f"building {min(ids.intersection(edit.ids))!r}: edit {edit.number} of {edit.date} ({edit.action}"
+        told += f", {edit.source})" if edit.source else ")"
+        if later:
+            last = journal[-1].number
+            raise ConflictError(f"{told} came after state {base}; look at it, then give --base {last}", later)
+        if date < edit.date:
+            raise ConfigError(f"{told} is later than {date}; give a date from {edit.date} on")

@@ -1,5 +1,6 @@
 """Uploaded footprints: the features of a vector file, in the region's CRS, as an edit keeps them."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,11 +8,15 @@ import numpy as np
 import pyproj
 import shapely
 
-from pipeline.data.citymodel import Footprints
+from pipeline.data.citymodel import Footprints, take_footprints
 from pipeline.data.errors import InputError
+from tiler.cityinput.faces import ModelBuilding
+from tiler.cityinput.rows import make_rows, mean_roofs
+from tiler.cityinput.sources import frame_of, read_model_header, scan_model
 from tiler.config.config import Config
 from tiler.footprints.footprint_index import FootprintRows, join_footprints, scan_footprints
 from tiler.footprints.footprint_source import open_source
+from tiler.georeference.crs import parse_crs, same_crs
 from tiler.objects.places import is_missing
 from tiler.store.edit_journal import Box, Outline
 from tiler.vectors.layers import describe_layer
@@ -19,8 +24,9 @@ from tiler.vectors.layers import describe_layer
 # Notes that say that a feature is not what it should be: of a file of a city it is left out, an edit is refused.
 REFUSED = {
     *("footprint-unreadable", "footprint-not-finite", "footprint-not-polygon", "footprint-too-many-vertices"),
-    *("footprint-height-missing", "footprint-roof-unread"),
+    *("footprint-height-missing", "footprint-roof-unread", "model-fault", "model-without-place"),
 }
+HEAD = 2**20  # bytes of a file within which it says that it is CityJSON
 
 
 def read_upload(path: Path, config: Config, *, crs: str, bounds: Box) -> Footprints:
@@ -30,6 +36,7 @@ def read_upload(path: Path, config: Config, *, crs: str, bounds: Box) -> Footpri
     ----------
     path : Path
         Any vector file that `citystitch run` takes as footprints; ids, heights and roofs from the same attributes.
+        Or CityJSON, or a sequence of it: outlines, and mean heights of roofs above the lowest place of each.
     config : Config
         Parameters of the run that is edited.
     crs : str
@@ -49,6 +56,8 @@ def read_upload(path: Path, config: Config, *, crs: str, bounds: Box) -> Footpri
     """
     if is_missing(path):
         raise InputError(f"{path}: no such file; check the path of the upload")
+    if _is_cityjson(path):
+        return _check(path, _read_model(path, crs), bounds)
     layer = describe_layer(path)
     # An upload may say less than the file of the city: what has no height takes that of the points.
     names = {name: name if name in layer.fields else "" for name in (config.height_attribute, config.id_attribute)}
@@ -71,7 +80,43 @@ def read_upload(path: Path, config: Config, *, crs: str, bounds: Box) -> Footpri
             f"{path}: {n} of {layer.n_features} features meet the region "
             f"({', '.join(f'{value:.10g}' for value in bounds)}, {crs}); check their place and CRS"
         )
-    footprints = join_footprints(rows, bounds)
+    return _check(path, join_footprints(rows, bounds), bounds)
+
+
+def _is_cityjson(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            start = file.read(HEAD)
+    except OSError:  # a folder, say: the reader of vector files tells
+        return False
+    return start.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"{" and b'"CityJSON' in start
+
+
+def _read_model(path: Path, crs: str) -> Footprints:
+    """Read the buildings of CityJSON; one without a CRS is in that of the region."""
+    header = read_model_header(path)
+    is_other = header.crs is not None and not same_crs(header.crs, parse_crs(crs))
+    frame = frame_of(header, crs if is_other else "")
+    buildings = [one for one in scan_model(path) if isinstance(one, ModelBuilding)]
+    rows, notes = make_rows(buildings, frame, "auto", Counter())
+    for note in notes:
+        if note.kind in REFUSED:
+            raise InputError(f"{path}: {note.subject} {note.detail} ({note.kind}); mend the file")
+    parts = [shapely.get_parts(outline) for outline in rows.outlines]
+    for name, some in zip(rows.ids, parts, strict=True):
+        if len(some) != 1:
+            raise InputError(f"{path}: {name} stands in {len(some)} places; make a building of each")
+    polygons = np.array([shapely.force_2d(some[0]) for some in parts], np.object_)
+    order = np.argsort(rows.ids, kind="stable")
+    return take_footprints(Footprints(polygons, rows.ids, mean_roofs(rows)), order)
+
+
+def _check(path: Path, footprints: Footprints, bounds: Box) -> Footprints:
+    """Refuse invalid polygons, and none or one beyond the region."""
+    inside = int(shapely.intersects(footprints.polygons, shapely.box(*bounds)).sum())
+    if inside < max(len(footprints.ids), 1):
+        n, box = len(footprints.ids), ", ".join(f"{value:.10g}" for value in bounds)
+        raise InputError(f"{path}: {inside} of {n} buildings meet the region ({box}); check their place and CRS")
     for polygon, name in zip(footprints.polygons, footprints.ids, strict=True):
         if not shapely.is_valid(polygon):
             raise InputError(f"{path}: {name}: {shapely.is_valid_reason(polygon)}; mend the polygon")

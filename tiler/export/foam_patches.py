@@ -9,7 +9,8 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import GROUND_PATCHES, Marker, Region
+from pipeline.data.mesh import GROUND_PATCHES, Marker
+from pipeline.data.regions import Region
 from tiler.export.foam_files import foam_header
 from tiler.export.region_faces import FacetSets, Ints
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
 from pipeline.data.kernel import kernel
-from pipeline.data.mesh import Region, find_inside, is_ground
+from pipeline.data.mesh import find_inside, is_ground
+from pipeline.data.regions import Region
 from stitch.pieces.cell_faces import CellFaces, find_cell_faces
 from stitch.pieces.conformity import group_rows
 from tiler.export.pieces import Pieces

@@ -12,7 +12,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.data.mesh import Marker, Region
+from pipeline.data.mesh import Marker
+from pipeline.data.regions import Region
 from tiler.export.export import CELLS, PER_BUILDING, Format
 from tiler.export.foam_patches import FIRST_BUILDING, facets_by_key, patch_keys, patch_of_key
 from tiler.export.pieces import Pieces, blocks_of, slices, write_lines

@@ -16,7 +16,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from pipeline.data.errors import CityError, ConfigError, InputError
-from pipeline.data.mesh import Region
+from pipeline.data.regions import Region
 from tiler.export.cell_parts import ColumnsFile, divide_cells, take_whole
 from tiler.export.export import CELLS, EXPORT_RECORD, LARGEST_PART, ORIGIN, Format
 from tiler.export.foam_case import write_system

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.data.errors import ConfigError
 from pipeline.data.notes import Note
 from tiler.cityinput.faces import ModelBuilding
-from tiler.cityinput.rows import ModelRows, make_rows
+from tiler.cityinput.rows import make_rows, mean_roofs
 from tiler.convert.features import unique_name
 from tiler.convert.inputs import open_source
 from tiler.footprints.building_parts import mend_polygons
@@ -114,21 +114,6 @@ def _tell(notes: Sequence[Note], file: str, told: Told) -> None:
             told.say(f"{file}: {note.detail}")
         else:
             told.notes[note.kind] += 1
-
-
-def mean_roofs(rows: ModelRows) -> Array:
-    """Give the mean height of each roof above the building's lowest place (m): its volume over its area.
-
-    Where there is no roof it is the height that an attribute gives, NaN without one.
-    """
-    owner = np.repeat(np.arange(len(rows)), np.diff(rows.start))
-    area = shapely.area(rows.surfaces)
-    middle = shapely.get_coordinates(shapely.centroid(rows.surfaces)).reshape(-1, 2)
-    top = rows.roofs.plane[:, 2] + (rows.roofs.plane[:, :2] * (middle - rows.roofs.origin)).sum(axis=1)
-    total = np.bincount(owner, area, minlength=len(rows))
-    with np.errstate(invalid="ignore"):
-        mean = np.bincount(owner, area * top, minlength=len(rows)) / total - rows.base
-    return np.where(total > 0, mean, rows.given_height)
 
 
 def _has_tag(building: ModelBuilding, tag: str) -> bool:

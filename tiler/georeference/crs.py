@@ -39,6 +39,7 @@ def crs_or_none(text: str) -> pyproj.CRS | None:
         return None
 
 
+@lru_cache(maxsize=64)
 def horizontal_crs(crs: pyproj.CRS | None) -> pyproj.CRS | None:
     """Give the two-dimensional horizontal part of a CRS, the entry of the EPSG register where it is one.
 
@@ -80,6 +81,7 @@ def short_crs(text: str) -> str:
     return printable(text) if len(text) < 40 else "a CRS of its own"
 
 
+@lru_cache(maxsize=64)
 def same_crs(one: pyproj.CRS, other: pyproj.CRS) -> bool:
     """Whether two CRSs mean the same horizontally, however they are written.
 

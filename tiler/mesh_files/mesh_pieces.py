@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import GROUND_PATCHES, Marker, Region, Regions
+from pipeline.data.mesh import GROUND_PATCHES, Marker
+from pipeline.data.regions import Region, Regions
 from stitch.pieces.numbering import Numbering
 from tiler.mesh_files.merged import VERTEX_ID, number_piece, read_numbering
 from tiler.mesh_files.run_files import RUN_RECORD, RunFiles, RunSource, find_files

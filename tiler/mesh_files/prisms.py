@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, InputError
-from pipeline.data.mesh import Region
+from pipeline.data.regions import Region
 from stitch.pieces.conformity import group_rows
 from tiler.mesh_files.mesh_pieces import MeshPiece, MeshPieces
 

@@ -5,7 +5,7 @@ from math import floor
 from pathlib import Path
 
 from pipeline.data.errors import ConfigError, InputError
-from pipeline.data.mesh import Region, Regions
+from pipeline.data.regions import Region, Regions
 
 RUN_RECORD, VOLUME_INDEX, BOUNDARY_INDEX = "run.json", "mesh.pvtu", "boundary.pvtp"
 MOST_ORIGIN = 1e9  # m

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import Marker, Region
+from pipeline.data.mesh import Marker
+from pipeline.data.regions import Region
 from stitch.tiling.grid import Key
 from tiler.config.zone_levels import find_levels
 from tiler.engine.run_context import tile_key

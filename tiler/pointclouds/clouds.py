@@ -14,6 +14,7 @@ from tiler.georeference.las_crs import read_las_crs
 from tiler.objects.places import as_place, is_url, place
 from tiler.pointclouds.las_chunks import SLACK, box_of_points
 from tiler.pointclouds.las_header import box_of_header, read_las_header
+from tiler.store.remembered import remember
 
 _SUFFIXES = {".las", ".laz"}
 _GLOB_SIGNS = set("*?[")
@@ -109,6 +110,10 @@ def read_header(path: str | Path) -> CloudHeader:
     header is void, all points are read once for their box.
     """
     path = as_place(path)
+    return remember(path, ("header", path), lambda: _read_header(path))
+
+
+def _read_header(path: Path) -> CloudHeader:
     header = read_las_header(path, evlrs=True)
     stated = read_las_crs(header)
     bounds = box_of_points(path, header)

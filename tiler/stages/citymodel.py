@@ -114,7 +114,7 @@ def _write(task: Task, stage: str, prefix: str, file: str, fits: RoofFits | None
         survey = _survey(task, stage, prefix)
         _check_numbers(task, stage, prefix, survey)
     xmin, ymin, xmax, ymax = task.context.bounds
-    blocks = ((part.model, _tell(part, fits)) for part in _by_cell(task, stage, prefix, survey))
+    blocks = ((part.model, describe_buildings(part, fits)) for part in _by_cell(task, stage, prefix, survey))
     bounds = (xmin, ymin, survey.low, xmax, ymax, survey.high)
     with task.step("write"), task.output() as out:
         task.notes(write_city_blocks(out / file, blocks, crs=task.context.crs, bounds=bounds))
@@ -203,7 +203,8 @@ def _by_cell(task: Task, stage: str, prefix: str, survey: _Survey) -> Iterator[B
         )
 
 
-def _tell(buildings: Buildings, fits: RoofFits | None) -> Attributes:
+def describe_buildings(buildings: Buildings, fits: RoofFits | None) -> Attributes:
+    """Give the attributes of buildings; with `fits`, which they are added to, those of their roofs too."""
     told: dict[str, Sequence[object]] = report_buildings(
         buildings.model, buildings.roof_source, buildings.measured_roof, buildings.fidelity
     )

@@ -13,8 +13,9 @@ from pipeline.columns.layered import mesh_layers
 from pipeline.columns.nodes import Levels, SeamColumns, join_levels, take_columns
 from pipeline.columns.underground import RegionMesh, SoilOptions, add_soil, count_regions
 from pipeline.data.errors import GeometryError
-from pipeline.data.mesh import ColumnMesh, PlaneMesh, Region, SeamEdges
+from pipeline.data.mesh import ColumnMesh, PlaneMesh, SeamEdges
 from pipeline.data.notes import Note
+from pipeline.data.regions import Region
 from pipeline.data.roofs import is_flat
 from pipeline.plane_mesh.plane import signed_areas
 from pipeline.plane_mesh.sizes import SizeField

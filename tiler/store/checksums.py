@@ -9,6 +9,7 @@ from typing import Any, BinaryIO, cast
 from deflate import crc32
 
 from tiler.objects.places import in_bucket
+from tiler.store.remembered import remember
 
 FILES = "files"  # the fact of a result that states files beside the store
 GONE = "is not there"
@@ -72,6 +73,10 @@ def seal_file(path: Path) -> None:
 
 def find_file_damage(path: Path) -> str:
     """Describe what is wrong with a file that `seal_file` has left; nothing if every byte is as it was."""
+    return remember(path, ("damage",), lambda: _find_file_damage(path), kept=_is_sound)
+
+
+def _find_file_damage(path: Path) -> str:
     try:
         with open_binary(path) as file:
             size = file.seek(0, 2) - TAIL
@@ -114,6 +119,10 @@ def find_change(path: Path, stated: Any) -> str:
     """Describe how a file differs from its stated size and CRC-32, nothing if it does not."""
     if not _is_statement(stated):
         return "no size and checksum of it are stated"
+    return remember(path, ("change", *stated), lambda: _find_change(path, stated), kept=_is_sound)
+
+
+def _find_change(path: Path, stated: list[int]) -> str:
     try:
         size, crc = sum_file(path)
         if size != stated[0]:
@@ -123,6 +132,10 @@ def find_change(path: Path, stated: Any) -> str:
         return GONE
     except OSError as error:
         return f"cannot be read ({error.strerror})"
+
+
+def _is_sound(damage: str) -> bool:
+    return not damage
 
 
 def _is_statement(stated: Any) -> bool:

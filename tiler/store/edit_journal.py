@@ -37,6 +37,8 @@ class Edit:
         Footprints that come, in the region's CRS.
     boxes : tuple of box
         That of each of these (m).
+    request, digest : str
+        Name that a client gave it, and a hash of what it sent: who asks once more is told that it is done.
     """
 
     number: int
@@ -46,6 +48,8 @@ class Edit:
     removed: tuple[Place, ...]
     outlines: tuple[Outline, ...]
     boxes: tuple[Box, ...]
+    request: str = ""
+    digest: str = ""
 
     @property
     def ids(self) -> list[str]:

@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from pipeline.data.errors import InputError
-from pipeline.data.mesh import Region, Regions
+from pipeline.data.regions import Region, Regions
 from pipeline.data.roofs import Roofs, Weld
 from tiler.config.config import roofs_stay_flat
 from tiler.config.zone_levels import read_described

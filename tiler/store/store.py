@@ -14,6 +14,7 @@ from pipeline.data.errors import OutputError
 from tiler.objects.places import remove
 from tiler.store.atomic import disk_errors, replacing
 from tiler.store.checksums import find_file_damage, seal_file
+from tiler.store.remembered import remember
 from tiler.store.result_file import GROUP, ResultFile
 from tiler.store.result_writer import DIGEST_BYTES, Writer, hash_content, raw_bytes
 
@@ -108,8 +109,12 @@ class Store:
 
     def describe(self, stage: str, name: str) -> tuple[dict[str, Any], str]:
         """Read the attributes of a result and the digest of its content; InputError as for `read`."""
-        with self.open(stage, name) as result:
-            return result.attributes, result.digest
+
+        def look() -> tuple[dict[str, Any], str]:
+            with self.open(stage, name) as result:
+                return result.attributes, result.digest
+
+        return remember(self.file(stage, name), ("described",), look)
 
     def shapes(self, stage: str, name: str) -> dict[str, tuple[int, ...]]:
         """Return the shape of every array of a result; InputError as for `read`."""

@@ -173,6 +173,9 @@ def _read_part(
     (kinds,) = solid["semantics"]["values"]
     used = np.unique(np.concatenate([check_indices(ring, len(vertices)) for face in shell for ring in face]))
     xyz = vertices.take(used)
+    # By place: the numbers of vertices depend on the other buildings of the file.
+    order = np.lexsort(xyz.T[::-1])
+    used, xyz = used[order], xyz[order]
     places = dict(zip(used.tolist(), range(len(used)), strict=True))
     floor = xyz[:, 2].min()
     xyz[xyz[:, 2] == floor, 2] = min(floor, lowest.get(row.number, floor))

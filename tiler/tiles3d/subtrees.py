@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tiler.store.atomic import replacing
 from tiler.tiles3d.cells import Cell
 from tiler.tiles3d.content import Region
 from tiler.tiles3d.metadata import Blob, add_table, describe_class, frame_chunks
@@ -107,11 +108,18 @@ class _Walk:
         self.tiles += 1
         own[level, code] = tile
         if begins:
-            path = self._folder / f"subtrees/{level}/{x}/{y}.subtree"
+            path = subtree_path(self._folder, cell)
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(make_subtree(level, code, own))
+            with replacing(path) as part:
+                part.write_bytes(make_subtree(level, code, own))
             subtree[level, code] = tile  # as a child of the subtree above
         return tile, given
+
+
+def subtree_path(folder: Path, cell: Cell) -> Path:
+    """Give the path of the subtree whose root is a cell."""
+    level, x, y = cell
+    return folder / f"subtrees/{level}/{x}/{y}.subtree"
 
 
 def make_subtree(level: int, root: int, tiles: Mapping[tuple[int, int], Tile]) -> bytes:

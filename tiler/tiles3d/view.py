@@ -3,6 +3,7 @@
 The page and the libraries that it needs are in ``viewer/``: nothing is fetched from elsewhere.
 """
 
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -18,21 +19,21 @@ from tiler.store.out_folder import RUN_RECORD
 from tiler.tiles3d.subtrees import TILESET
 
 VIEWER = Path(__file__).parent / "viewer"
+PAGE = {"path": str(VIEWER), "default_filename": "page.html"}
 
 
-class _Files(Guarded, StaticFileHandler):
+class Files(Guarded, StaticFileHandler):
     """Files of a folder; a browser asks each time whether one has changed."""
 
-    loopback = False
+    def compute_etag(self) -> str:
+        """Tell a file by its time and size: tornado keeps the hash of one that has changed since."""
+        found = self.get_absolute_path(self.root, self.path)
+        stat = os.stat(found)
+        return f'"{stat.st_mtime_ns:x}-{stat.st_size:x}"'
 
     def set_extra_headers(self, _path: str) -> None:
+        """Let nothing be used again unasked."""
         self.set_header("Cache-Control", "no-cache")
-
-
-class _LoopbackFiles(_Files):
-    """These for this machine alone."""
-
-    loopback = True
 
 
 @contextmanager
@@ -55,15 +56,17 @@ def serve_tiles(folder: Path, address: str) -> Iterator[str]:
     """
     if not (folder / TILESET).is_file():
         if (folder / RUN_RECORD).is_file():
-            raise InputError(f"{folder}: is a run; first citystitch export {folder} --format 3dtiles -o tiles")
+            raise InputError(
+                f"{folder}: is a run; citystitch serve {folder} shows it, or first citystitch export {folder} "
+                "--format 3dtiles -o tiles"
+            )
         raise InputError(
             f"{folder}: has no {TILESET}; write one by citystitch export RUN --format 3dtiles -o tiles"
         )
 
     def rules(loopback: bool) -> list[Any]:
-        files = _LoopbackFiles if loopback else _Files
-        page = {"path": str(VIEWER), "default_filename": "page.html"}
-        return [("/tiles/(.*)", files, {"path": str(folder.resolve())}), ("/(.*)", files, page)]
+        files = type("Files", (Files,), {"loopback": loopback})
+        return [("/tiles/(.*)", files, {"path": str(folder.resolve())}), ("/(.*)", files, PAGE)]
 
     with serve_rules(rules, address) as root:
         yield f"{root}/"

@@ -86,7 +86,7 @@ class _Means:
     shown : Path
         Folder of the events that the page is made of.
     cluster : Executor or None
-        Of the scheduler that was asked for.
+        Of the scheduler that was asked for, or what the caller gave.
     """
 
     dashboard: str | None
@@ -102,6 +102,7 @@ def run(
     watchers: Sequence[Watcher] = (),
     dashboard: str | None = None,
     within: Path | None = None,
+    executor: Executor | None = None,
 ) -> dict[str, Any]:
     """Mesh a region as configured.
 
@@ -120,6 +121,8 @@ def run(
         default. Watchers get its URL.
     within : Path, optional
         Folder of a disk to work in, whose files are moved to ``out`` of `config` later; ``out`` itself by default.
+    executor : Executor, optional
+        Runs the tasks; by default one is made as `config` says, for this run alone.
 
     Returns
     -------
@@ -160,7 +163,7 @@ def run(
             earlier = check_folder(out, overwrite=config.overwrite)
             damage = _find_damage(out) if earlier and not config.overwrite else {}
             with _connect(config) as cluster:
-                means = _Means(dashboard, shown, cluster)
+                means = _Means(dashboard, shown, executor or cluster)
                 try:
                     return _run(config, out, earlier, damage, own, told, means)
                 except StoppedError:

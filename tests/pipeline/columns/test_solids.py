@@ -16,7 +16,8 @@ from pipeline.columns.nodes import FREE, GROUND_LEVEL, ROOF_LEVEL, Nodes, add_fl
 from pipeline.columns.order_keys import wall_gates
 from pipeline.columns.underground import RegionMesh, add_soil, count_regions, split_regions
 from pipeline.data.errors import ConfigError, InputError
-from pipeline.data.mesh import INTERFACES, ColumnMesh, Marker, Region, SeamEdges, find_inside
+from pipeline.data.mesh import INTERFACES, ColumnMesh, Marker, SeamEdges, find_inside
+from pipeline.data.regions import Region
 from stitch.pieces.conformity import compute_cell_volumes, match_facets, pair_cell_faces
 from stitch.pieces.frontier import as_places
 from tests.helpers.cities import crowded_blocks

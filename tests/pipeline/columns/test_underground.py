@@ -38,7 +38,8 @@ from pipeline.columns.underground import (
     split_regions,
 )
 from pipeline.data.errors import ConfigError, InputError
-from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, Region, SeamEdges, TetMesh
+from pipeline.data.mesh import Boundary, ColumnMesh, Marker, PlaneMesh, SeamEdges, TetMesh
+from pipeline.data.regions import Region
 from stitch.pieces.conformity import compute_cell_volumes, pair_cell_faces
 from tests.helpers.cities import crowded_blocks
 from tests.helpers.tiles import (

@@ -16,8 +16,11 @@ import shapely
 from shapely import affinity
 
 import tiler
+from pipeline.data.citymodel import CityModel
 from pipeline.data.errors import InputError
+from pipeline.data.roofs import flat_roofs
 from tests.runs.test_run import hashes
+from tiler.citymodels.cityjson import write_city_model
 from tiler.cli.main import main
 from tiler.config.config import make_config
 from tiler.editing.edit import list_edits
@@ -159,6 +162,25 @@ def test_an_upload_in_another_crs_is_taken_to_that_of_the_region(edited: Path, t
     path = write(tmp_path / "far.geojson", far, ids=["x"], crs="EPSG:4326")
     found = read_upload(path, make_config(record["parameters"]), crs=region["crs"], bounds=region["bounds"])
     assert shape.hausdorff_distance(found.polygons[0]) < 0.01
+
+
+def test_a_building_of_cityjson_is_an_outline_with_a_height(edited: Path, tmp_path: Path) -> None:
+    record = json.loads((edited / "run.json").read_text())
+    bounds, crs = record["region"]["bounds"], record["region"]["crs"]
+    x, y = bounds[0] + 40, bounds[1] + 30
+    square, number = shapely.box([x], [y], [x + 8], [y + 6]), np.array([7])
+    model = CityModel(
+        square, np.array(["a"]), number, np.array([2.0]), flat_roofs(np.array([11.5])), (("a",),), np.array(["a"])
+    )
+    path = tmp_path / "a.city.json"
+    write_city_model(path, model, crs=CRS, bounds=(x, y, 0, x + 9, y + 9, 20))
+    found = read_upload(path, make_config(record["parameters"]), crs=crs, bounds=bounds)
+    assert (found.ids.tolist(), found.given_height.tolist()) == (["a"], [pytest.approx(9.5)])
+    assert found.polygons[0].equals(square[0])
+    far = tmp_path / "far.city.json"
+    far.write_text(path.read_text().replace(f'"translate":[{x // 1}', f'"translate":[{x // 1 + 5000}'))
+    with pytest.raises(InputError, match="0 of 1 buildings meet the region"):
+        read_upload(far, make_config(record["parameters"]), crs=crs, bounds=bounds)
 
 
 def test_a_height_that_roof_points_overrule_is_told(small_run: Path) -> None:

@@ -14,7 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.data.errors import ConfigError, InputError
-from pipeline.data.mesh import Marker, Region
+from pipeline.data.mesh import Marker
+from pipeline.data.regions import Region
 from stitch.pieces.conformity import compute_cell_volumes
 from tests.conftest import Once
 from tests.helpers.foam_reader import PolyMesh, read_poly_mesh, read_zones

@@ -24,19 +24,11 @@ const controls = new MapControls(camera, canvas);
 controls.maxPolarAngle = 1.5;
 controls.minDistance = 5;
 
-const tiles = new TilesRenderer("tiles/tileset.json");
-tiles.registerPlugin(new ImplicitTilingPlugin());
-tiles.registerPlugin(new GLTFExtensionsPlugin({ metadata: true }));
-tiles.registerPlugin(new ReorientationPlugin());
-tiles.errorTarget = 5; // pixels
-tiles.setCamera(camera);
-scene.add(tiles.group);
-
-const state = { mode: "surface", picked: null, measuring: false, places: [], bytes: 0, frames: [], first: null, failed: [], classes: new Map() };
+const state = { mode: "surface", picked: null, measuring: false, places: [], bytes: 0, frames: [], first: null, failed: [], classes: new Map(), swaps: 0 };
 const meshes = new Set();
 let dirty = true;
 let city = null; // the sphere around the first content
-window.citystitch = { tiles, state, camera, controls, meshes };
+window.citystitch = { get tiles() { return tiles; }, state, camera, controls, meshes };
 new PerformanceObserver((list) => {
   for (const entry of list.getEntries()) if (entry.name.includes("/tiles/")) state.bytes += entry.encodedBodySize;
 }).observe({ type: "resource", buffered: true });
@@ -95,35 +87,80 @@ function showLegend() {
   for (const [key, colour] of state.classes) add(`#${colour.getHexString()}`, key);
 }
 
-tiles.addEventListener("load-model", ({ scene: model, tile }) => {
-  const { level, x, y } = tile.implicitTilingData;
-  model.traverse((mesh) => {
-    if (!mesh.isMesh) return;
-    const base = mesh.material.color.clone(), { name, side } = mesh.material;
-    mesh.material.dispose();
-    mesh.material = new MeshLambertMaterial({ vertexColors: true, name, side });
-    mesh.geometry.setAttribute("color", new BufferAttribute(new Float32Array(3 * mesh.geometry.getAttribute("position").count), 3));
-    mesh.userData.own = { base, level, x, y, rows: readRows(mesh) };
-    meshes.add(mesh);
-    paint(mesh);
+function openTiles(place) {
+  const own = new TilesRenderer("tiles/tileset.json");
+  own.registerPlugin(new ImplicitTilingPlugin());
+  own.registerPlugin(new GLTFExtensionsPlugin({ metadata: true }));
+  if (place) for (const key of ["position", "quaternion", "scale"]) own.group[key].copy(place[key]);
+  else own.registerPlugin(new ReorientationPlugin());
+  own.errorTarget = 5; // pixels
+  own.setCamera(camera);
+  own.addEventListener("load-model", ({ scene: model, tile }) => {
+    const { level, x, y } = tile.implicitTilingData;
+    model.traverse((mesh) => {
+      if (!mesh.isMesh) return;
+      const base = mesh.material.color.clone(), { name, side } = mesh.material;
+      mesh.material.dispose();
+      mesh.material = new MeshLambertMaterial({ vertexColors: true, name, side });
+      mesh.geometry.setAttribute("color", new BufferAttribute(new Float32Array(3 * mesh.geometry.getAttribute("position").count), 3));
+      mesh.userData.own = { base, level, x, y, rows: readRows(mesh) };
+      meshes.add(mesh);
+      paint(mesh);
+    });
+    showLegend();
+    dirty = true;
   });
-  showLegend();
+  own.addEventListener("dispose-model", ({ scene: model }) => model.traverse((mesh) => meshes.delete(mesh)));
+  own.addEventListener("load-error", ({ error, url }) => {
+    state.failed.push(String(url));
+    get("trouble").textContent = `${url}: ${error.message}`;
+    get("trouble").hidden = false;
+  });
+  own.addEventListener("needs-update", () => { dirty = true; });
+  own.addEventListener("tile-visibility-change", ({ scene: model, visible }) => {
+    dirty = true;
+    if (city || !visible || !model?.parent) return;
+    city = new Box3().setFromObject(model).getBoundingSphere(new Sphere());
+    showAll();
+  });
+  if (!place) own.addEventListener("load-root-tileset", showAll);
+  return own;
+}
+
+let tiles = openTiles(null);
+let coming = null; // the tiles of the edited city, until what is in view of them is there
+scene.add(tiles.group);
+
+// Show an edited city: its tiles are read beside those that are shown, unchanged ones from the browser's own store.
+function replaceTiles() {
+  coming?.dispose();
+  coming = openTiles(tiles.group);
+  coming.setResolutionFromRenderer(camera, renderer);
   dirty = true;
-});
-tiles.addEventListener("dispose-model", ({ scene: model }) => model.traverse((mesh) => meshes.delete(mesh)));
-tiles.addEventListener("load-error", ({ error, url }) => {
-  state.failed.push(String(url));
-  get("trouble").textContent = `${url}: ${error.message}`;
-  get("trouble").hidden = false;
-});
-tiles.addEventListener("needs-update", () => { dirty = true; });
-tiles.addEventListener("tile-visibility-change", ({ scene: model, visible }) => {
-  dirty = true;
-  if (city || !visible || !model?.parent) return;
-  city = new Box3().setFromObject(model).getBoundingSphere(new Sphere());
-  showAll();
-});
-tiles.addEventListener("load-root-tileset", showAll);
+}
+function swapTiles() {
+  scene.remove(tiles.group);
+  tiles.dispose();
+  tiles = coming;
+  coming = null;
+  scene.add(tiles.group);
+  state.swaps += 1;
+  if (state.picked) {
+    const mesh = [...meshes].find((one) => one.userData.own.rows.some((row) => row.id === state.picked));
+    if (mesh) showFeature(mesh, mesh.userData.own.rows.find((row) => row.id === state.picked)); else closePanel();
+  }
+  paintAll();
+}
+let version = null; // of the tiles, as the server tells it
+async function follow() {
+  try {
+    const found = (await fetch("tiles/tileset.json", { method: "HEAD", cache: "no-store" })).headers.get("ETag");
+    if (version && found && found !== version) replaceTiles();
+    version = found ?? version;
+  } catch { /* the server is away: it may come back */ }
+  setTimeout(follow, 2000);
+}
+follow();
 controls.addEventListener("change", () => { dirty = true; });
 
 function showAll() {
@@ -152,19 +189,21 @@ function pick(clientX, clientY) {
   const row = hit && hit.object.userData.own.rows[hit.object.geometry.getAttribute("_feature_id_0").getX(hit.face.a)];
   state.picked = row && row.id ? row.id : null;
   get("panel").hidden = !row;
-  if (row) {
-    get("name").textContent = row.id ?? row.patch ?? "cell of the mesh";
-    const { level, x, y } = hit.object.userData.own;
-    const facts = { ...row, surface: hit.object.material.name, tile: `level ${level}, column ${x}, row ${y}` };
-    get("facts").replaceChildren(...Object.entries(facts).filter(([key, value]) => key !== "id" && value !== "" && value !== NO_NUMBER).map(([key, value]) => {
-      const line = document.createElement("tr"), head = document.createElement("th"), cell = document.createElement("td");
-      head.textContent = key.replaceAll("_", " ");
-      cell.textContent = typeof value === "number" ? value.toFixed(2) : value;
-      line.append(head, cell);
-      return line;
-    }));
-  }
+  if (row) showFeature(hit.object, row);
   paintAll();
+}
+
+function showFeature(mesh, row) {
+  get("name").textContent = row.id ?? row.patch ?? "cell of the mesh";
+  const { level, x, y } = mesh.userData.own;
+  const facts = { ...row, surface: mesh.material.name, tile: `level ${level}, column ${x}, row ${y}` };
+  get("facts").replaceChildren(...Object.entries(facts).filter(([key, value]) => key !== "id" && value !== "" && value !== NO_NUMBER).map(([key, value]) => {
+    const line = document.createElement("tr"), head = document.createElement("th"), cell = document.createElement("td");
+    head.textContent = key.replaceAll("_", " ");
+    cell.textContent = typeof value === "number" ? value.toFixed(2) : value;
+    line.append(head, cell);
+    return line;
+  }));
 }
 
 const line = new Line(new BufferGeometry(), new LineBasicMaterial({ color: 0xd4006a, depthTest: false }));
@@ -235,7 +274,7 @@ function resize() {
   renderer.setSize(window.innerWidth, window.innerHeight, false);
   camera.aspect = window.innerWidth / window.innerHeight;
   camera.updateProjectionMatrix();
-  tiles.setResolutionFromRenderer(camera, renderer);
+  for (const one of [tiles, coming]) one?.setResolutionFromRenderer(camera, renderer);
   dirty = true;
 }
 window.addEventListener("resize", resize);
@@ -254,6 +293,11 @@ let before = null; // the time of the frame before, if that was drawn too
 renderer.setAnimationLoop((now) => {
   camera.updateMatrixWorld();
   tiles.update();
+  if (coming) {
+    coming.group.updateMatrixWorld(true);
+    coming.update();
+    if (coming.visibleTiles.size && !coming.isLoading) swapTiles();
+  }
   if (!dirty) { before = null; return; }
   dirty = false;
   renderer.render(scene, camera);

@@ -1,0 +1,164 @@
+"""Edits of several clients, done by one writer in their order: what waits together is one transaction."""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+
+from pipeline.data.errors import CityError, ConfigError, OutputError
+from tiler.editing.edit import City, Outcome, edit_together
+from tiler.editing.requests import Asked
+from tiler.engine.executor import Executor
+from tiler.store.edit_journal import Edit, read_journal
+from tiler.store.remembered import remembering
+from tiler.words.plain_text import say_nothing
+
+MOST_WAITING = 100  # edits
+REST, MESHING, TILES = "at rest", "meshing", "writing tiles"  # what the writer does
+
+
+class BusyError(OutputError):
+    """So many edits wait that no more are taken: try again later."""
+
+
+class EditQueue:
+    """The edits of a run folder that this process holds.
+
+    Parameters
+    ----------
+    city : City
+        What is edited.
+    after : callable
+        Called with the number of the last edit when some were done: it brings the tiles up to date.
+    executor : Executor, optional
+        Runs the tasks of all edits.
+    say : callable
+        Called with sentences that the user should read.
+
+    Attributes
+    ----------
+    journal : list of Edit
+        All edits that are done.
+    state : str
+        `REST`, `MESHING` or `TILES`.
+    trouble : str
+        Why the tiles are not up to date.
+    """
+
+    def __init__(
+        self,
+        city: City,
+        after: Callable[[int], None],
+        executor: Executor | None = None,
+        say: Callable[[str], None] = say_nothing,
+    ) -> None:
+        self._city, self._after, self._executor, self._say = city, after, executor, say
+        self._changed = threading.Condition()
+        self._waiting: list[tuple[Asked, Future[Outcome]]] = []
+        self._at_work: list[tuple[Asked, Future[Outcome]]] = []
+        self._ended = False
+        self.journal = read_journal(city.directory)
+        self.state, self.trouble = REST, ""
+        self._thread = threading.Thread(target=self._work, name="edits")
+
+    def __enter__(self) -> "EditQueue":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let the edits at work end; those that wait are refused."""
+        with self._changed:
+            self._ended = True
+            dropped, self._waiting = self._waiting, []
+            self._changed.notify()
+        for waiting in dropped:
+            waiting[1].set_exception(BusyError("the server ends; send the edit again when it is back"))
+        self._thread.join()
+
+    @property
+    def revision(self) -> int:
+        """Number of the last edit that is done."""
+        return self.journal[-1].number if self.journal else 0
+
+    @property
+    def n_waiting(self) -> int:
+        """Edits that are not done."""
+        return len(self._waiting) + len(self._at_work)
+
+    def put(self, asked: Asked) -> "Future[Outcome] | Edit":
+        """Let an edit wait for its turn.
+
+        Returns
+        -------
+        Future of Outcome, or Edit
+            What will come of it; the edit where one of that name is done already.
+
+        Raises
+        ------
+        ConfigError
+            If another edit has that name.
+        BusyError
+            If too many wait.
+        """
+        with self._changed:
+            known = {edit.request: edit.digest for edit in self.journal}
+            known |= {one.request: one.digest for one, _ in (*self._at_work, *self._waiting)}
+            if asked.request and known.get(asked.request, asked.digest) != asked.digest:
+                raise ConfigError(f"id {asked.request!r}: is that of another edit; give each its own")
+            if (found := self.find(asked.request)) is not None:
+                return found
+            if self._ended or len(self._waiting) >= MOST_WAITING:
+                raise BusyError(f"{len(self._waiting)} edits wait, bound {MOST_WAITING}; try again later")
+            self._waiting.append((asked, Future()))
+            self._changed.notify()
+            return self._waiting[-1][1]
+
+    def find(self, request: str) -> "Future[Outcome] | Edit | None":
+        """Find the edit that a client gave a name: done, or what will come of it; None if there is none."""
+        with self._changed:
+            done: dict[str, Edit | Future[Outcome]] = {edit.request: edit for edit in self.journal}
+            waiting = {one.request: future for one, future in (*self._at_work, *self._waiting)}
+            return (waiting | done).get(request) if request else None
+
+    def _work(self) -> None:
+        with remembering():
+            self._edit_until_ended()
+
+    def _edit_until_ended(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: bool(self._waiting) or self._ended)
+                if self._ended:
+                    return
+                self._at_work, self._waiting = self._waiting, []
+            self.state = MESHING
+            self._edit()
+            self.state = TILES
+            try:
+                self._after(self.revision)
+                self.trouble = ""
+            except Exception as error:  # the city is edited: the next edit tries again
+                self.trouble = f"{type(error).__name__}: {error}"
+                self._say(f"the 3D Tiles are not up to date: {self.trouble}")
+            self.state = REST
+
+    def _edit(self) -> None:
+        """Do all edits at work, and tell each client what came of its own."""
+        outcomes: list[Outcome | CityError] | list[Exception]
+        try:
+            asked = [one for one, _ in self._at_work]
+            outcomes = edit_together(self._city, asked, executor=self._executor, say=self._say)
+        except Exception as error:  # whatever it is: clients are told, and the next edit has its turn
+            outcomes = [error for _ in self._at_work]
+        with self._changed:
+            done, self._at_work = self._at_work, []
+            self.journal += sorted((one.edit for one in outcomes if isinstance(one, Outcome)), key=number_of)
+        for (_, future), outcome in zip(done, outcomes, strict=True):
+            if isinstance(outcome, Exception):
+                future.set_exception(outcome)
+            else:
+                future.set_result(outcome)
+
+
+def number_of(edit: Edit) -> int:
+    """Give the number of an edit."""
+    return edit.number

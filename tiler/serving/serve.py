@@ -1,0 +1,147 @@
+"""The web server of a run folder: `citystitch serve`."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.data.errors import ConfigError
+from tiler.config.config import Config
+from tiler.dashboard.server import is_loopback, serve_rules
+from tiler.editing.edit import held_city
+from tiler.engine.executor import Executor, OnDemand
+from tiler.engine.task_limits import limit_workers
+from tiler.mesh_files.run_files import find_files
+from tiler.serving.bodies import MOST_BYTES
+from tiler.serving.edit_queue import EditQueue
+from tiler.serving.handlers import COOKIE, CityState, EditList, Keyed, OneEdit, Service, cookie_of
+from tiler.tiles3d.update import TILES, update_tileset
+from tiler.tiles3d.view import PAGE, Files
+from tiler.words.plain_text import say_nothing
+
+LEAST_TOKEN = 16  # characters
+FOLDER = "view"  # below that of the run, with its 3D Tiles
+
+
+class KeyedFiles(Keyed, Files):
+    """Files of a folder for those who have the token."""
+
+
+class Page(KeyedFiles):
+    """The page; ``?token=`` is kept as a cookie, which opens the reads."""
+
+    def prepare(self) -> None:
+        """Take the token out of the address."""
+        token = self.get_query_argument("token", "") if self.service.token else ""
+        if token:
+            self.request.headers["Authorization"] = f"Bearer {token}"
+        super().prepare()
+        if token:
+            self.set_cookie(COOKIE, cookie_of(token), httponly=True, samesite="Strict")
+            self.redirect("/")
+
+
+def read_token(path: Path | None) -> str:
+    """Read the token of clients; ConfigError where the file cannot be read."""
+    try:
+        return "" if path is None else path.read_text().strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--token-file {path}: cannot be read ({error})") from None
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Where the tiles lie on the globe, see `tiler.tiles3d.globe.Globe`."""
+
+    geoid_height: float = 0.0
+    vertical_crs: str = ""
+
+
+@contextmanager
+def serve_city(
+    directory: Path,
+    address: str,
+    *,
+    token: str = "",
+    workers: int = 0,
+    placed: Placed | None = None,
+    say: Callable[[str], None] = say_nothing,
+) -> Iterator[str]:
+    """Serve a run folder: its 3D Tiles, their page, and edits; gives its URL.
+
+    Parameters
+    ----------
+    directory : Path
+        Folder of a finished run, which this process holds meanwhile.
+    address : str
+        Where to listen, ``HOST:PORT``; port 0 is a free one.
+    token : str
+        What a client must send; may be empty where only this machine reaches the address.
+    workers : int
+        Worker processes, started with the first edit and kept; 0 for this one.
+    placed : Placed, optional
+        Where the tiles lie.
+    say : callable
+        Called with sentences that the user should read.
+
+    Raises
+    ------
+    ConfigError
+        If a token is missing or short, nobody can listen there, or the run cannot be edited.
+    InputError
+        If the folder holds no finished run.
+    OutputError
+        If the tiles cannot be written.
+    """
+    host = address.rpartition(":")[0].strip("[]")
+    if not token and not is_loopback(host):
+        raise ConfigError(f"{address}: others reach it; give --token-file with a token of theirs")
+    if token and len(token) < LEAST_TOKEN:
+        raise ConfigError(
+            f"the token has {len(token)} characters, at least {LEAST_TOKEN} expected; take a longer one"
+        )
+    folder, given = directory / FOLDER, placed or Placed()
+
+    def write_tiles(_: int) -> None:
+        update_tileset(folder, find_files(directory), **vars(given))
+
+    with ExitStack() as stack:
+        city = stack.enter_context(held_city(directory, workers, say))
+        write_tiles(0)
+        executor = stack.enter_context(_warm_executor(workers, city.config)) if workers else None
+        queue = EditQueue(city, write_tiles, executor, say)
+        service = Service(city, queue, token)
+
+        def rules(loopback: bool) -> list[Any]:
+            own = {"service": service, "loopback": loopback}
+            given: list[tuple[str, type[Keyed], dict[str, str]]] = [
+                ("/city", CityState, {}),
+                ("/edits", EditList, {}),
+                ("/edits/(.+)", OneEdit, {}),
+                ("/tiles/(.*)", KeyedFiles, {"path": str((folder / TILES).resolve())}),
+                ("/(.*)", Page, PAGE),
+            ]
+            return [(path, type(kind.__name__, (kind,), own), words) for path, kind, words in given]
+
+        root = stack.enter_context(serve_rules(rules, address, most_body=2 * MOST_BYTES))
+        stack.enter_context(queue)  # ends before the server: clients are told
+        yield f"{root}/"
+
+
+@contextmanager
+def _warm_executor(workers: int, config: Config) -> Iterator[Executor]:
+    """Give workers for all edits."""
+    from tiler.executors.local_cluster import local
+
+    with ExitStack() as stack:
+        yield OnDemand(workers, lambda: stack.enter_context(local(workers, limit_workers(config))))
+
+
+def show_city(directory: Path, address: str, say: Callable[[str], None], **given: Any) -> None:
+    """Serve a run folder until the process is interrupted; what is at work then ends first. See `serve_city`."""
+    with serve_city(directory, address, say=say, **given) as url:
+        say(f"serve: {url} (Ctrl-C ends it)")
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait()
