@@ -115,8 +115,8 @@ class Kept:
         lattice = {"height": made.lattice.height.tolist(), "error": made.lattice.error}
         return self._write(_name(cell), {"lattice": lattice, "units": [_unit(unit) for unit in made.units]})
 
-    def load(self, cell: Cell) -> Made | None:
-        """Load what a cell hands up; None where there is no such cell."""
+    def read_cell(self, cell: Cell) -> Made | None:
+        """Read what a cell hands up; None where there is no such cell."""
         try:
             found = self._read(_name(cell))
         except FileNotFoundError:
@@ -128,8 +128,8 @@ class Kept:
         """Forget a cell."""
         (self._folder / f"{_name(cell)}.json").unlink(missing_ok=True)
 
-    def load_tree(self) -> dict[Cell, Tile]:
-        """Load what the tree tells of each cell by itself."""
+    def read_tree(self) -> dict[Cell, Tile]:
+        """Read what the tree tells of each cell by itself."""
         return {
             (level, x, y): Tile(tuple(region), error, content=True)
             for level, x, y, *region, error in self._read("tree")
@@ -139,8 +139,8 @@ class Kept:
         """Keep what cells took from a tile of the run."""
         self._write(f"runs/{name}", asdict(tile))
 
-    def load_run(self, name: str) -> RunTile:
-        """Load what cells took from a tile of the run."""
+    def read_run(self, name: str) -> RunTile:
+        """Read what cells took from a tile of the run."""
         return RunTile(**self._read(f"runs/{name}"))
 
     def _read(self, name: str) -> Any:

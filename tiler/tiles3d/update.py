@@ -67,7 +67,7 @@ def update_tileset(folder: Path, files: RunFiles, *, geoid_height: float = 0.0, 
     with replacing_folder(folder) as new:
         kept = Kept(new / MADE, state)
         export_tileset(new / TILES, files, geoid_height=geoid_height, vertical_crs=vertical_crs, keep=kept)
-        return len(kept.load_tree())
+        return len(kept.read_tree())
 
 
 class _Update:
@@ -84,7 +84,7 @@ class _Update:
         """Do it; returns the number of cells that were made."""
         kept, names = self._kept, self._base.surface.names
         stamps = read_stamps(self._files)
-        old = {name: kept.load_run(name) for name in names}
+        old = {name: kept.read_run(name) for name in names}
         changed = [name for name in names if (old[name].model, old[name].boundary) != stamps[name]]
         if not changed:
             return 0
@@ -112,7 +112,7 @@ class _Update:
                     for one, row in rows.items()
                 }
                 new[name] = RunTile(**(vars(new[name]) | {"parts": kept_parts}))
-        self._tree = kept.load_tree()
+        self._tree = kept.read_tree()
         self._make(sorted(dirty | came.keys()), new, gone, came)
         self._finish()
         for name in names:
@@ -160,7 +160,7 @@ class _Update:
         handed: dict[Cell, Made | None] = {}  # what differs from before
         for code in dirty:
             cell = (depth, *decode(code))
-            there = self._kept.load(cell)
+            there = self._kept.read_cell(cell)
             parts = [unit.part for unit in (there.units if there else []) if unit.part is not None]
             parts = [part for part in parts if part.id not in gone] + came.get(code, [])
             ground = [
@@ -180,7 +180,7 @@ class _Update:
         level, x, y = cell
         for row, column in product((0, 1), (0, 1)):
             child = level + 1, 2 * x + column, 2 * y + row
-            made = handed[child] if child in handed else self._kept.load(child)
+            made = handed[child] if child in handed else self._kept.read_cell(child)
             if made is not None:
                 yield (column, row), made
 
