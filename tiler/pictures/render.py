@@ -39,6 +39,7 @@ CELL_BY_CELL = ("mesh", "overview", "sizes")  # pictures that show each cell or 
 COLOURS = {"tiles": "tile", "quality": "quality", "levels": "level"}
 # Length up to which one surface darkens another (m), in regions below 2 km.
 OCCLUSION_RADIUS = 20.0
+MOST_SHADED = 10_000.0  # m; in a larger region a house is below a pixel, and the shade is of the terrain's slope
 CLOSE = 240.0  # m of a cut that are shown close by, so that its cells are seen
 SAMPLES = 2  # pixels drawn along each pixel shown
 SHADE = 32  # places around each pixel drawn that may darken it
@@ -229,7 +230,8 @@ def draw_city(
         plotter.camera.position, plotter.camera.focal_point = _aim(shown, size, cut=air is not None)
         plotter.camera.up = (0.0, 0.0, 1.0)
         plotter.reset_camera_clipping_range()
-        plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=SHADE)
+        if extent < MOST_SHADED:
+            plotter.enable_ssao(radius=max(OCCLUSION_RADIUS, extent / 100), bias=extent / 1500, kernel_size=SHADE)
         return _shoot(plotter)
 
 
