@@ -320,8 +320,9 @@ def _write_town(directory: Path, options: argparse.Namespace) -> None:
     if options.broken:
         directory.mkdir(parents=True, exist_ok=True)
         write_faults(directory / "broken.city.jsonl")
+    output = make_output(models, variants, options.degrade, truth=options.lidar > 0, seed=options.seed)
     if options.parameters or options.footprints:
-        _write_given(directory, options, make_output(models, variants, options.degrade, seed=options.seed))
+        _write_given(directory, options, output)
         return
     town = open_town(
         options.size,
@@ -335,13 +336,11 @@ def _write_town(directory: Path, options: argparse.Namespace) -> None:
     files = write_town(
         directory,
         town,
+        output,
         density=options.density,
-        models=models,
         lidar=options.lidar,
         class_errors=CLASS_ERRORS if options.class_errors is None else options.class_errors,
         workers=options.workers,
-        variants=variants,
-        degrade=options.degrade,
     )
     points = f"{len(files.clouds)} LAZ files in {files.clouds[0].parent}, " if files.clouds else ""
     say(f"{files.houses} houses: {points}{files.models.name}, {files.footprints.name} and {files.parameters.name}")

@@ -21,7 +21,6 @@ from tiler.editing.staging import begin, commit, forget, link_folder, settle
 from tiler.editing.uploads import read_upload
 from tiler.engine.executor import Executor
 from tiler.engine.schedule import StoppedError
-from tiler.engine.watcher import Watcher
 from tiler.mesh_files.run_files import find_files
 from tiler.objects.places import refuse_bucket
 from tiler.store.atomic import replacing_folder
@@ -92,7 +91,6 @@ def edit_city(
     base: int | None = None,
     workers: int = 0,
     say: Callable[[str], None] = say_nothing,
-    watchers: Sequence[Watcher] = (),
 ) -> Outcome:
     """Replace, remove or add buildings in the city of a finished run, and mesh anew what that touches.
 
@@ -114,8 +112,6 @@ def edit_city(
         Worker processes; 0 for this one.
     say : callable
         Called with sentences that the user should read.
-    watchers : sequence of Watcher
-        Of the run that makes the mesh.
 
     Returns
     -------
@@ -134,7 +130,7 @@ def edit_city(
     with held_city(directory, workers, say) as city:
         found = None if upload is None else read_upload(upload, city.config, crs=city.crs, bounds=city.bounds)
         asked = Asked(action, name, found, "" if upload is None else upload.name, date, base)
-        (outcome,) = edit_together(city, [asked], say=say, watchers=watchers)
+        (outcome,) = edit_together(city, [asked], say=say)
     if isinstance(outcome, CityError):
         raise outcome
     return outcome
@@ -146,7 +142,6 @@ def edit_together(
     *,
     executor: Executor | None = None,
     say: Callable[[str], None] = say_nothing,
-    watchers: Sequence[Watcher] = (),
 ) -> list[Outcome | CityError]:
     """Do edits in their order, and mesh what they touch in one transaction; the caller holds the folder.
 
@@ -158,7 +153,7 @@ def edit_together(
         Edits that wait.
     executor : Executor, optional
         Runs the tasks; by default that of the city's parameters.
-    say, watchers
+    say
         As for `edit_city`.
 
     Returns
@@ -182,10 +177,10 @@ def edit_together(
     if not edits:
         return [one for one in found if isinstance(one, CityError)]
     try:
-        done = {outcome.edit: outcome for outcome in _mesh(city, edits, executor, say, watchers)}
+        done = {outcome.edit: outcome for outcome in _mesh(city, edits, executor, say)}
     except CityError as error:
         if len(edits) > 1 and not isinstance(error, OutputError | StoppedError):
-            return [edit_together(city, [one], executor=executor, say=say, watchers=watchers)[0] for one in asked]
+            return [edit_together(city, [one], executor=executor, say=say)[0] for one in asked]
         return [error if isinstance(one, Edit) else one for one in found]
     return [done[one] if isinstance(one, Edit) else one for one in found]
 
@@ -195,7 +190,6 @@ def _mesh(
     edits: Sequence[Edit],
     executor: Executor | None,
     say: Callable[[str], None],
-    watchers: Sequence[Watcher],
 ) -> list[Outcome]:
     """Mesh a city with further edits in its second folder, and commit it; CityError if that cannot be."""
     record, _ = read_sealed_record(city.directory / RUN_RECORD)
@@ -203,7 +197,7 @@ def _mesh(
         work = begin(city.directory)
         for edit in edits:
             write_edit(work, edit)
-        made = run(city.config, watchers=watchers, within=work, executor=executor)
+        made = run(city.config, within=work, executor=executor)
         if lost := sorted(made["missing"].keys() - record["missing"].keys()):
             names = ", ".join(name for edit in edits for name in edit.ids)
             raise InputError(
@@ -227,7 +221,6 @@ def city_at(
     *,
     workers: int = 0,
     say: Callable[[str], None] = say_nothing,
-    watchers: Sequence[Watcher] = (),
 ) -> dict[str, Any]:
     """Make the city of a day in another folder: without the edits of a later date.
 
@@ -235,7 +228,7 @@ def city_at(
 
     Parameters
     ----------
-    directory, date, workers, say, watchers
+    directory, date, workers, say
         As for `edit_city`.
     out : Path
         Folder on the same disk, which is not there.
@@ -257,7 +250,7 @@ def city_at(
             for edit in read_journal(directory):
                 if edit.date > day:
                     edit_path(work, edit.number).unlink()
-            return run(config, watchers=watchers, within=work)
+            return run(config, within=work)
 
 
 def list_edits(directory: Path, say: Callable[[str], None] = say_nothing) -> list[Edit]:

@@ -89,14 +89,12 @@ def open_town(
 def write_town(
     directory: Path,
     town: Town,
+    output: Output,
     *,
     density: float,
-    models: ModelOptions,
     lidar: float = 0.0,
     class_errors: float = CLASS_ERRORS,
     workers: int = 0,
-    variants: Sequence[str] = (),
-    degrade: float = 0.0,
 ) -> TownFiles:
     """Write a town: the same parameters give the same bytes, whatever the workers.
 
@@ -106,23 +104,21 @@ def write_town(
         Folder to write to; made if it is missing.
     town : Town
         The town.
+    output : Output
+        Files of houses, of `make_output`; with truth where it is scanned.
     density : float
         Points per square metre, seen from right above; with 0 there are no files of points.
-    models : ModelOptions
-        Levels and variants of the city model.
     lidar : float
         Pulses per square metre of each strip of a scanner, instead of `density`; see `scan_strips`.
     class_errors : float
         Share of the scanner's points that have a wrong class.
     workers : int
         Processes that make tiles; 0 for this one.
-    variants, degrade
-        As of `make_output`.
 
     Raises
     ------
     ConfigError
-        If the folder has files of points that are not of this town, or there is no such level.
+        If the folder has files of points that are not of this town.
     OutputError
         If a file cannot be written.
 
@@ -130,7 +126,6 @@ def write_town(
     -----
     Tiles are drawn once, each for all of its files: memory does not grow with the town.
     """
-    output = make_output(models, variants, degrade, truth=lidar > 0, seed=town.seed)
     for name, value in (("density", density), ("lidar", lidar)):
         if not 0 <= value <= MOST_DENSITY:
             raise ConfigError(f"--{name} {value:g}: expected 0 to {MOST_DENSITY:g} points per m2")
@@ -168,7 +163,7 @@ def write_houses(directory: Path, houses: Iterable[House], output: Output, *, cr
 
 
 def make_output(
-    models: ModelOptions, variants: Sequence[str], degrade: float, *, truth: bool = False, seed: int = 1
+    models: ModelOptions, variants: Sequence[str] = (), degrade: float = 0.0, *, truth: bool = False, seed: int = 1
 ) -> Output:
     """Choose the files of houses.
 

@@ -14,7 +14,7 @@ from pipeline.architecture.scanner import FLIGHT, FORWARD, SPACING
 from pipeline.data.errors import ConfigError
 from pipeline.data.pointcloud import PointCloud
 from tiler.towns.styles import LOWEST
-from tiler.towns.town import open_town, write_town
+from tiler.towns.town import make_output, open_town, write_town
 from tiler.towns.town_scan import Scan, describe_truth, scan_strips
 from tiler.towns.town_tile import ModelOptions
 
@@ -92,14 +92,16 @@ def test_what_a_flight_cannot_scan_is_told(tmp_path: Path) -> None:
         town = replace(TOWN, relief=change.get("relief", 0.0))
         lidar = change.get("lidar", 1.0)
         with pytest.raises(ConfigError, match=told):
-            write_town(tmp_path / "t", town, density=0.0, models=ModelOptions(), lidar=lidar)
+            write_town(tmp_path / "t", town, make_output(ModelOptions(), truth=True), density=0.0, lidar=lidar)
 
 
 @pytest.mark.long
 def test_workers_make_the_same_bytes(tmp_path: Path) -> None:
     town = replace(TOWN, bounds=(317_900.0, 6_398_900.0, 318_100.0, 6_399_100.0))  # four tiles
     for name, workers in (("one", 0), ("two", 2)):
-        write_town(tmp_path / name, town, density=0.0, models=ModelOptions(), lidar=1.0, workers=workers)
+        write_town(
+            tmp_path / name, town, make_output(ModelOptions(), truth=True), density=0.0, lidar=1.0, workers=workers
+        )
     files = sorted(path for path in (tmp_path / "one").rglob("*") if path.is_file())
     assert len(files) == 5 + 4
     for path in files:

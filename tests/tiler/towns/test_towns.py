@@ -26,7 +26,7 @@ from tiler.cli.main import main
 from tiler.towns.parameter_files import XML_END, XML_HEAD, house_json, house_xml, read_json, read_xml
 from tiler.towns.rule_files import read_rules, rule_schema
 from tiler.towns.styles import STYLES
-from tiler.towns.town import open_town, write_town
+from tiler.towns.town import make_output, open_town, write_town
 from tiler.towns.town_models import house_feature, model_head
 from tiler.towns.town_tile import ModelOptions
 
@@ -142,7 +142,8 @@ def test_a_broken_xml_is_told_with_its_house(tmp_path: Path) -> None:
 def test_a_town_has_the_same_bytes_and_its_points_lie_on_houses_and_ground(tmp_path: Path) -> None:
     town = open_town(150.0, "detached", rules=None, seed=4, relief=10)
     one, two = (
-        write_town(tmp_path / name, town, density=5.0, models=ModelOptions(("2.2",))) for name in ("one", "two")
+        write_town(tmp_path / name, town, make_output(ModelOptions(("2.2",))), density=5.0)
+        for name in ("one", "two")
     )
     for first, second in zip(
         [*one.clouds, one.footprints, one.models, one.parameters],
@@ -234,10 +235,10 @@ def test_wrong_options_are_told(
 
 def test_files_of_another_town_are_not_mixed_with(tmp_path: Path) -> None:
     town = open_town(60.0, "grid", rules=None, seed=1, relief=0)
-    files = write_town(tmp_path, town, density=1.0, models=ModelOptions(("1.2",)))
+    files = write_town(tmp_path, town, make_output(ModelOptions(("1.2",))), density=1.0)
     shutil.copy(files.clouds[0], tmp_path / "tiles" / "other.laz")
     with pytest.raises(ConfigError, match=r"other.laz: is not of this town"):
-        write_town(tmp_path, town, density=1.0, models=ModelOptions(("1.2",)))
+        write_town(tmp_path, town, make_output(ModelOptions(("1.2",))), density=1.0)
 
 
 def test_edited_parameters_are_a_house_like_others(tmp_path: Path) -> None:
